@@ -1,0 +1,73 @@
+"""Checks at the public edge: shapes bound by name across arguments, and messages with four parts.
+
+A message says which argument, what was expected, what came, and what to do (STYLE 20). None of these checks reads
+tensor values unless its name says so, so they cost no device synchronisation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+
+def check_shapes(*arguments: tuple[str, Any, str]) -> dict[str, int]:
+    """Bind the axes of several tensors to one set of names and return their sizes.
+
+    Args:
+        arguments: triples `(name, tensor, spec)`; `spec` holds one word per axis: a letter or word binds a size at its
+            first appearance, a number must match exactly. A tensor that is None is skipped.
+
+    Returns:
+        The size of each named axis.
+
+    Raises:
+        TypeError: if an argument has no shape.
+        ValueError: if an axis disagrees; the message names the argument that bound the size.
+
+    Example:
+        >>> import torch
+        >>> check_shapes(("means", torch.zeros(5, 3), "N 3"), ("opacities", torch.zeros(5), "N"))
+        {'N': 5}
+    """
+    sizes: dict[str, int] = {}
+    bound_by: dict[str, str] = {}
+    for name, value, spec in arguments:
+        if value is None:
+            continue
+        axes = spec.split()
+        if not hasattr(value, "shape"):
+            raise TypeError(
+                f"{name}: expected a tensor of shape [{', '.join(axes)}], got {type(value).__name__}; "
+                "convert it with torch.as_tensor"
+            )
+        shape = tuple(int(n) for n in value.shape)
+        wrong = len(shape) != len(axes)
+        for axis, size in zip(axes, shape, strict=False):
+            expected = int(axis) if axis.isdigit() else sizes.get(axis, size)
+            wrong = wrong or size != expected
+        if wrong:
+            known = [f"{a} = {sizes[a]} (from {bound_by[a]})" for a in axes if a in sizes]
+            where = f" with {', '.join(known)}" if known else ""
+            raise ValueError(f"{name}: expected [{', '.join(axes)}]{where}, got {shape}; pass a tensor of that shape")
+        for axis, size in zip(axes, shape, strict=True):
+            if not axis.isdigit() and axis not in sizes:
+                sizes[axis], bound_by[axis] = size, name
+    return sizes
+
+
+def check_choice(name: str, value: object, choices: Iterable[object]) -> None:
+    """Raise a ValueError unless `value` is one of `choices`."""
+    options = list(choices)
+    if value not in options:
+        raise ValueError(f"{name}: expected one of {', '.join(map(repr, options))}, got {value!r}")
+
+
+def check_range(
+    name: str, value: float, low: float, high: float = float("inf"), *, closed: tuple[bool, bool] = (True, True)
+) -> None:
+    """Raise a ValueError unless `value` is a finite number between `low` and `high` (`closed`: are the ends included)."""
+    over = value >= low if closed[0] else value > low
+    under = value <= high if closed[1] else value < high
+    if not (over and under):  # also catches NaN
+        left, right = "[" if closed[0] else "(", "]" if closed[1] else ")"
+        raise ValueError(f"{name}: expected a number in {left}{low:g}, {high:g}{right}, got {value!r}")

@@ -1,0 +1,94 @@
+"""One posed camera: where it stands, how it projects, how large its picture is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from .._check import check_choice, check_range, check_shapes
+
+DistortionModel = Literal["brown_conrady", "kannala_brandt"]
+COEFFICIENTS = {"brown_conrady": (4, 5, 8), "kannala_brandt": (4,)}
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """Lens distortion in kornia's (= OpenCV's) order of coefficients.
+
+    `brown_conrady`: k1, k2, p1, p2[, k3[, k4, k5, k6]]; `kannala_brandt` (fisheye): k1, k2, k3, k4.
+    """
+
+    model: DistortionModel
+    coefficients: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        check_choice("model", self.model, COEFFICIENTS)
+        if len(self.coefficients) not in COEFFICIENTS[self.model]:
+            raise ValueError(
+                f"coefficients: expected {' or '.join(map(str, COEFFICIENTS[self.model]))} numbers for {self.model}, "
+                f"got {len(self.coefficients)}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera, perhaps behind a distorting lens.
+
+    **Convention** (COLMAP's): `viewmat` maps world to camera, x right, y down, z forward; the centre of the first pixel
+    is (0.5, 0.5), so a centred principal point is (width / 2, height / 2). K is in pixels, without skew.
+    A camera with distortion must be undistorted (`undistort_image`) before anything is rasterised through it.
+    """
+
+    viewmat: Tensor  # [4, 4] world to camera
+    K: Tensor  # [3, 3]
+    width: int
+    height: int
+    name: str = ""
+    distortion: Distortion | None = None
+
+    def __post_init__(self) -> None:
+        check_shapes(("viewmat", self.viewmat, "4 4"), ("K", self.K, "3 3"))
+        for name, size in (("width", self.width), ("height", self.height)):
+            if int(size) != size or size < 1:
+                raise ValueError(f"{name}: expected a positive number of pixels, got {size!r}")
+        K, E = self.K.detach().double().cpu(), self.viewmat.detach().double().cpu()  # cameras are tiny
+        if not (torch.isfinite(K).all() and torch.isfinite(E).all()):
+            raise ValueError(f"viewmat, K: expected finite numbers, got NaN or infinity (camera {self.name!r})")
+        if K[0, 1] != 0 or K[1, 0] != 0 or K[2].tolist() != [0.0, 0.0, 1.0]:
+            raise ValueError(f"K: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}")
+        check_range("K[0, 0] (fx)", float(K[0, 0]), 0, closed=(False, False))
+        check_range("K[1, 1] (fy)", float(K[1, 1]), 0, closed=(False, False))
+        R = E[:3, :3]
+        if E[3].tolist() != [0.0, 0.0, 0.0, 1.0] or (R @ R.T - torch.eye(3, dtype=R.dtype)).abs().max() > 1e-3:
+            raise ValueError(
+                f"viewmat: expected a rigid motion (orthonormal rotation, last row 0 0 0 1), got {E.tolist()}; "
+                "remove any scale from the pose first"
+            )
+        if torch.linalg.det(R) < 0:
+            raise ValueError("viewmat: expected a rotation, got a reflection (determinant -1); check the axes' handedness")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        return self.height, self.width
+
+    @property
+    def center(self) -> Tensor:  # [3]
+        """The camera's position in the world."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def resized(self, height: int, width: int) -> Camera:
+        """The same view with another number of pixels; the two axes scale independently.
+
+        With pixel centres on halves, fx and cx scale by width / self.width, fy and cy by height / self.height, exactly.
+        kornia's `PinholeCamera.scale` knows one factor for both axes, so it is not used here.
+        """
+        factors = torch.tensor([width / self.width, height / self.height, 1.0], dtype=self.K.dtype, device=self.K.device)
+        return replace(self, K=self.K * factors[:, None], width=width, height=height)
+
+    def to(self, *args: Any, **kwargs: Any) -> Camera:
+        """Move or convert the matrices as `Tensor.to` does."""
+        return replace(self, viewmat=self.viewmat.to(*args, **kwargs), K=self.K.to(*args, **kwargs))
