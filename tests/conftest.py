@@ -1,0 +1,19 @@
+"""Shared fixtures: where the real data lies, and a headless-safe environment for every test."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+if not os.environ.get("DISPLAY") and not os.environ.get("WAYLAND_DISPLAY"):
+    os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
+
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of real scenes beside the project; the test is skipped where it is missing."""
+    if not SHARED.is_dir():
+        pytest.skip(f"needs the real scenes in {SHARED}, which are not part of the project")
+    return SHARED
