@@ -1,0 +1,106 @@
+"""A run folder of finished stages, each under the hash of what it was made from.
+
+A stage is a function that fills a folder. Its name and the JSON description of its inputs give a key; a folder with
+that key that is complete is used as it is, otherwise the stage is made in a temporary folder and moved into place in
+one step. So a killed run leaves only finished stages, and the same command starts where it stopped.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from .._files import atomic_folder, digest_file, digest_value, read_json, write_json
+
+STAGE_FILE = "stage.json"
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One finished stage: where its files lie, and how it came about."""
+
+    name: str
+    key: str
+    folder: Path
+    seconds: float
+    reused: bool
+
+
+@dataclass
+class Run:
+    """The stages of one run folder, in the order they were asked for.
+
+    Example:
+        >>> import tempfile, pathlib
+        >>> run = Run(pathlib.Path(tempfile.mkdtemp()))
+        >>> one = run.stage("hello", {"who": "world"}, lambda folder: (folder / "a").write_text("hello"))
+        >>> again = run.stage("hello", {"who": "world"}, lambda folder: None)
+        >>> one.reused, again.reused, (again.folder / "a").read_text()
+        (False, True, 'hello')
+    """
+
+    folder: Path
+    report: Callable[[str], None] | None = None
+    stages: list[Stage] = field(default_factory=list)
+
+    def stage(self, name: str, inputs: dict[str, Any], make: Callable[[Path], Any]) -> Stage:
+        """Return the finished stage of these inputs, making it if it is not there.
+
+        Args:
+            name: a word for the folder's name.
+            inputs: everything that decides the result, as JSON; keys of earlier stages stand for their content.
+            make: fills the folder it is given.
+
+        Raises:
+            ValueError: if a folder of that key is damaged.
+        """
+        key = digest_value({"name": name, "inputs": inputs})[:12]
+        target = self.folder / "stages" / f"{name}-{key}"
+        if (target / STAGE_FILE).is_file():
+            about = read_json(target / STAGE_FILE)
+            if about.get("inputs") != json.loads(json.dumps(inputs)):
+                raise ValueError(f"{target}: expected the stage of these inputs, found another's; delete the folder")
+            done = Stage(name, key, target, float(about["seconds"]), True)
+            self._say(f"{name}: found in {target.name} (made in {done.seconds:.1f} s)")
+        else:
+            self._say(f"{name}: working")
+            start = time.perf_counter()
+            with atomic_folder(target) as temporary:
+                make(temporary)
+                seconds = time.perf_counter() - start
+                write_json(temporary / STAGE_FILE, {"name": name, "inputs": inputs, "seconds": seconds})
+            done = Stage(name, key, target, seconds, False)
+            self._say(f"{name}: done in {seconds:.1f} s")
+        self.stages.append(done)
+        return done
+
+    def scratch(self, name: str, inputs: dict[str, Any]) -> Path:
+        """A path for the unfinished work of a stage (checkpoints), kept until the stage is done."""
+        key = digest_value({"name": name, "inputs": inputs})[:12]
+        return self.folder / "unfinished" / f"{name}-{key}"
+
+    def digests(self, paths: Sequence[Path]) -> dict[str, str]:
+        """SHA-256 of files by file name; a file whose size and time have not changed is not read again."""
+        cache_path = self.folder / "digests.json"
+        cache: dict[str, Any] = read_json(cache_path) if cache_path.is_file() else {}
+        result, changed = {}, False
+        for path in paths:
+            info = path.stat()
+            mark = [info.st_size, info.st_mtime_ns]
+            known = cache.get(str(path.resolve()))
+            if known is None or known[:2] != mark:
+                known = [*mark, digest_file(path)]
+                cache[str(path.resolve())] = known
+                changed = True
+            result[path.name] = known[2]
+        if changed:
+            write_json(cache_path, cache)
+        return result
+
+    def _say(self, text: str) -> None:
+        if self.report is not None:
+            self.report(text)

@@ -1,0 +1,105 @@
+import numpy as np
+import pytest
+import torch
+
+from kfgs.gaussians import Gaussians
+from kfgs.scenes.ply import columns_from_gaussians, gaussians_from_columns, points_from_columns, read_ply, write_ply
+
+
+def _cloud(n: int = 7, degree: int = 3) -> Gaussians:
+    g = torch.Generator().manual_seed(3)
+    return Gaussians(
+        means=torch.randn(n, 3, generator=g),
+        quats=torch.randn(n, 4, generator=g),
+        scales=torch.rand(n, 3, generator=g) + 0.1,
+        opacities=torch.rand(n, generator=g) * 0.9 + 0.05,
+        features=torch.randn(n, 9, generator=g),
+        sh=torch.randn(n, (degree + 1) ** 2, 3, generator=g),
+        labels=torch.arange(n) - 1,
+    )
+
+
+def test_gaussians_survive_the_file(tmp_path):
+    cloud = _cloud()
+    write_ply(tmp_path / "a.ply", columns_from_gaussians(cloud))
+    back = gaussians_from_columns(read_ply(tmp_path / "a.ply"))
+    for name in ("means", "quats", "scales", "opacities", "features", "sh", "labels"):
+        torch.testing.assert_close(getattr(back, name), getattr(cloud, name), rtol=1e-5, atol=1e-6)
+
+
+def test_sh_is_stored_channel_major():
+    cloud = _cloud(2)
+    columns = columns_from_gaussians(cloud)
+    assert columns["f_rest_0"][1] == cloud.sh[1, 1, 0]  # first higher coefficient, red
+    assert columns["f_rest_15"][1] == cloud.sh[1, 1, 1]  # first higher coefficient, green
+    assert columns["f_rest_1"][1] != cloud.sh[1, 1, 1]  # coefficient-major would put green here
+
+
+def test_unknown_columns_and_types_are_kept(tmp_path):
+    columns = {"x": np.float32([1, 2]), "y": np.float64([3, 4]), "z": np.float32([5, 6]), "id": np.uint16([7, 65535])}
+    write_ply(tmp_path / "a.ply", columns, comments=("made by a test",))
+    back = read_ply(tmp_path / "a.ply")
+    assert list(back) == list(columns)
+    for name, values in columns.items():
+        assert back[name].dtype == values.dtype
+        np.testing.assert_array_equal(back[name], values)
+
+
+def test_ascii_is_read(tmp_path):
+    text = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
+    (tmp_path / "a.ply").write_text(text + "property uchar red\nend_header\n0 1 2 255\n3.5 4 5 7\n")
+    columns = read_ply(tmp_path / "a.ply")
+    assert columns["x"].tolist() == [0.0, 3.5]
+    assert columns["red"].dtype == np.uint8
+
+
+def test_file_of_another_program_opens(shared_data):
+    cloud = gaussians_from_columns(read_ply(shared_data / "splats" / "inria_9080.ply"))
+    assert len(cloud) == 9080
+    assert cloud.sh.shape == (9080, 16, 3)
+    assert bool(((cloud.opacities >= 0) & (cloud.opacities <= 1)).all())
+    again = columns_from_gaussians(cloud)
+    original = read_ply(shared_data / "splats" / "inria_9080.ply")
+    assert set(original) == set(again)
+    np.testing.assert_allclose(again["f_rest_31"], original["f_rest_31"], rtol=1e-6)
+    np.testing.assert_allclose(again["scale_1"], original["scale_1"], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"hello", "expected a PLY file"),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 5\nproperty float x\nend_header\n" + b"\0" * 19,
+            "truncated",
+        ),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n",
+            "truncated",
+        ),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex -5\nproperty float x\nend_header\n", "vertex count"),
+        (b"ply\nformat ascii 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n1\n", "truncated"),
+        (b"ply\nformat binary_little_endian 1.0\nelement face 5\nproperty float x\nend_header\n", "first element"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n", "scalar"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n", "with properties"),
+        (b"ply\nformat exotic 1.0\nelement vertex 0\nproperty float x\nend_header\n", "format 'exotic'"),
+    ],
+)
+def test_bad_files_are_named(tmp_path, content, message):
+    (tmp_path / "bad.ply").write_bytes(content)
+    with pytest.raises(ValueError, match=f"bad.ply.*{message}"):
+        read_ply(tmp_path / "bad.ply")
+
+
+def test_missing_file_and_columns(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        read_ply(tmp_path / "none.ply")
+    with pytest.raises(ValueError, match="y, z missing"):
+        points_from_columns({"x": np.zeros(1)})
+    with pytest.raises(ValueError, match="scale_0.*plain point cloud"):
+        gaussians_from_columns({"x": np.zeros(1), "y": np.zeros(1), "z": np.zeros(1), "opacity": np.zeros(1)})
+    with pytest.raises(ValueError, match="one length"):
+        write_ply(tmp_path / "a.ply", {"x": np.zeros(1), "y": np.zeros(2)})
+    with pytest.raises(ValueError, match="astype"):
+        write_ply(tmp_path / "a.ply", {"x": np.zeros(1, np.int64)})
+    assert list(tmp_path.iterdir()) == []
