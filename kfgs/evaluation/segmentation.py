@@ -1,0 +1,109 @@
+"""Segmentation scores under a named protocol: one pooled confusion matrix over the views of a split."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from ..cameras import resize_labels
+from ..metrics import ConfusionMatrix, Score
+
+VOID = 255
+PROTOCOL = (
+    "kfgs-pooled/1: one confusion matrix over all views, mean IoU over the classes that occur in truth or prediction, "
+    "void (255) ignored, predictions resized to the truth by nearest neighbour"
+)
+
+
+def load_label_map(path: str | Path) -> Tensor:  # [H, W] int64, -1 = void
+    """Read a label picture (8-bit class indices, 255 = void).
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not an 8-bit single-channel picture.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected a label picture there")
+    with Image.open(path) as picture:
+        if picture.mode not in ("L", "P"):
+            raise ValueError(f"{path}: expected 8-bit class indices (mode L or P), got mode {picture.mode}")
+        values = torch.from_numpy(np.array(picture)).long()
+    return torch.where(values == VOID, -1, values)
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentationReport:
+    """Scores of one set of predictions."""
+
+    names: tuple[str, ...]
+    confusion: Tensor  # [C, C] int64, rows = truth
+    iou: Tensor  # [C], NaN where a class occurs in neither
+    miou: Score
+    accuracy: Score
+    views: int
+
+    def __str__(self) -> str:
+        rows = [f"{self.miou}", f"{self.accuracy}", f"over {self.views} views; IoU by class:"]
+        rows += [f"  {name:<16s} {float(value):.3f}" for name, value in zip(self.names, self.iou, strict=True)]
+        return "\n".join(rows)
+
+    def to_json(self) -> dict[str, Any]:
+        """The scores as plain numbers; classes that occur in neither truth nor prediction are null."""
+        iou = [None if value != value else value for value in self.iou.tolist()]
+        return {
+            "protocol": self.miou.protocol,
+            "views": self.views,
+            "miou": self.miou.value,
+            "accuracy": self.accuracy.value,
+            "iou": dict(zip(self.names, iou, strict=True)),
+            "confusion": self.confusion.tolist(),
+        }
+
+
+def evaluate_segmentation(
+    predict: Callable[[str], Tensor],  # stem -> labels [h, w]
+    truth: dict[str, Path],  # stem -> label picture
+    names: Iterable[str],
+) -> SegmentationReport:
+    """Score predicted label maps against label pictures (protocol `kfgs-pooled/1`).
+
+    Args:
+        predict: gives the label map of a view by its stem, at any size; -1 counts as wrong wherever truth is known.
+        truth: one label picture per view.
+        names: class names; a label is an index into them.
+
+    Raises:
+        ValueError: if there is nothing to score, or a truth label has no name.
+    """
+    names = tuple(names)
+    if not truth:
+        raise ValueError("truth: expected at least one label picture, got none; is the folder of labels right?")
+    pooled = ConfusionMatrix(len(names) + 1)  # the last row and column hold "no label", which is never a true class
+    for stem, path in truth.items():
+        target = load_label_map(path)
+        if int(target.max()) >= len(names):
+            raise ValueError(f"{path}: expected labels below {len(names)} (from names), got {int(target.max())}")
+        labels = predict(stem)
+        if labels.shape != target.shape:
+            labels = resize_labels(labels, (int(target.shape[0]), int(target.shape[1])))
+        pooled.update(torch.where(labels < 0, len(names), labels), target)
+    confusion = pooled.matrix
+    hits = confusion.diag()[:-1].double()
+    union = confusion.sum(0)[:-1] + confusion.sum(1)[:-1] - confusion.diag()[:-1]
+    iou = torch.where(union > 0, hits / union, torch.nan)
+    return SegmentationReport(
+        names=names,
+        confusion=confusion[:-1, :-1],
+        iou=iou,
+        miou=Score("mIoU", float(iou.nanmean()), PROTOCOL),
+        accuracy=Score("accuracy", float(hits.sum() / confusion.sum()), PROTOCOL),
+        views=len(truth),
+    )

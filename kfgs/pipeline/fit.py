@@ -1,0 +1,270 @@
+"""Figure 2 of the paper as named calls: teacher maps and posed images in, a saved semantic field out.
+
+Each call is a stage of a run folder: finished stages are found again by the hash of their inputs, and the long one
+(the field) also resumes from its last checkpoint.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from dataclasses import field as default
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from .._check import check_choice
+from .._files import read_json, write_json
+from ..fields import FieldConfig, GaussianParams, SemanticField, fit_field
+from ..quant import (
+    Autoencoder,
+    AutoencoderConfig,
+    Codebook,
+    CodebookConfig,
+    IndexMaps,
+    LatentMaps,
+    fit_autoencoder,
+    fit_codebook,
+    quantize_maps,
+)
+from ..scenes import Scene
+from .stages import Run, Stage
+
+Mode = Literal["decouple", "adc", "adc+sc"]
+MODES: tuple[Mode, ...] = ("decouple", "adc", "adc+sc")
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """What a run does; the defaults are the paper's."""
+
+    mode: Mode = "adc+sc"
+    """Rows of Table 1: `decouple` (raw features), `adc` (+ codebook), `adc+sc` (+ codebook + autoencoder)."""
+    seed: int = 0
+    """Every random choice of the run follows from it."""
+    split: str = "train"
+    """Which views of the scene are learnt from."""
+    codebook: CodebookConfig = default(default_factory=CodebookConfig)
+    autoencoder: AutoencoderConfig = default(default_factory=AutoencoderConfig)
+    field: FieldConfig = default(default_factory=FieldConfig)
+
+    def __post_init__(self) -> None:
+        check_choice("mode", self.mode, MODES)
+
+    @staticmethod
+    def paper() -> FitConfig:
+        """The paper's schedule: 28 epochs, 5,000 autoencoder steps, 30,000 field steps. For a workstation."""
+        return FitConfig()
+
+    @staticmethod
+    def cpu() -> FitConfig:
+        """A schedule for two CPU cores: the same method, fewer steps. Minutes instead of hours."""
+        return FitConfig(codebook=CodebookConfig.cpu(), field=FieldConfig.cpu())
+
+
+class Maps(Protocol):
+    """Teacher maps on disk, one file per view, read when asked for."""
+
+    paths: Sequence[Path]
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, i: int) -> Tensor:  # [h, w, D]
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """A finished run."""
+
+    field: SemanticField
+    folder: Path
+    stages: list[Stage]
+
+    @property
+    def field_path(self) -> Path:
+        """Where the field was saved."""
+        return self.folder / "field"
+
+    @property
+    def seconds(self) -> float:
+        """Time spent making the stages, reused ones counted with what they took when they were made."""
+        return sum(stage.seconds for stage in self.stages)
+
+
+def _generator(seed: int, purpose: str) -> torch.Generator:
+    """A generator of its own for each stage, so that skipping a finished stage changes nothing downstream."""
+    digest = hashlib.sha256(f"{purpose}:{seed}".encode()).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest[:7], "little"))
+
+
+def _tensor_digest(*tensors: Tensor) -> str:
+    digest = hashlib.sha256()
+    for tensor in tensors:
+        digest.update(f"{tuple(tensor.shape)}{tensor.dtype}".encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _scene_digest(scene: Scene, views: Sequence[int]) -> str:
+    cameras = [scene.cameras[i] for i in views]
+    poses = torch.stack([camera.viewmat for camera in cameras])
+    intrinsics = torch.stack([camera.K for camera in cameras])
+    sizes = torch.tensor([camera.size for camera in cameras])
+    return _tensor_digest(poses, intrinsics, sizes, scene.points)
+
+
+def _codebook_stage(run: Run, maps: Maps, config: FitConfig, options: dict[str, Any]) -> tuple[Codebook, Stage]:
+    """Adaptive Data Compression, Sec. 3.3.1: the codebook S."""
+
+    def make(folder: Path) -> None:
+        fit = fit_codebook(maps, config.codebook, generator=_generator(config.seed, "codebook"), **options)
+        save_file({"codewords": fit.codebook.codewords.contiguous()}, folder / "codebook.safetensors")
+        write_json(folder / "history.json", fit.history)
+
+    inputs = {"features": run.digests(maps.paths), "config": asdict(config.codebook), "seed": config.seed}
+    stage = run.stage("codebook", inputs, make)
+    return Codebook(load_file(stage.folder / "codebook.safetensors")["codewords"]), stage
+
+
+def _index_stage(run: Run, maps: Maps, codebook: Codebook, upstream: Stage, progress: bool) -> tuple[IndexMaps, Stage]:
+    """Quantisation, Eq. 5: the index map M of every view."""
+    stage = run.stage(
+        "index_maps",
+        {"features": run.digests(maps.paths), "codebook": upstream.key},
+        lambda folder: quantize_maps(maps, codebook, progress=progress).save(folder / "index_maps.safetensors"),
+    )
+    return IndexMaps.load(stage.folder / "index_maps.safetensors"), stage
+
+
+def _autoencoder_stage(
+    run: Run, codebook: Codebook, upstream: Stage, config: FitConfig, options: dict[str, Any]
+) -> tuple[Autoencoder, Stage]:
+    """Semantic Compression, Sec. 3.3.2: encoder E and decoder Psi."""
+
+    def make(folder: Path) -> None:
+        fit = fit_autoencoder(codebook, config.autoencoder, generator=_generator(config.seed, "autoencoder"), **options)
+        save_file(fit.autoencoder.to_tensors(), folder / "autoencoder.safetensors")
+        write_json(folder / "history.json", fit.history)
+
+    inputs = {"codebook": upstream.key, "config": asdict(config.autoencoder), "seed": config.seed}
+    stage = run.stage("autoencoder", inputs, make)
+    return Autoencoder.from_tensors(load_file(stage.folder / "autoencoder.safetensors")), stage
+
+
+def _field_stage(
+    run: Run,
+    scene: Scene,
+    views: Sequence[int],
+    targets: Sequence[Tensor],
+    inputs: dict[str, Any],
+    config: FitConfig,
+    options: dict[str, Any],
+) -> tuple[GaussianParams, Stage]:
+    """The decoupled field, Sec. 3.2: Gaussians whose rendered latents follow the targets (Eq. 4)."""
+    inputs = inputs | {"scene": _scene_digest(scene, views), "config": asdict(config.field), "seed": config.seed}
+    scratch = run.scratch("field", inputs)
+
+    def make(folder: Path) -> None:
+        generator = _generator(config.seed, "field")
+        start = GaussianParams.from_points(scene.points, int(targets[0].shape[-1]), generator=generator)
+        cameras = [scene.cameras[i] for i in views]
+        fit = fit_field(
+            start,
+            cameras,
+            targets,
+            config.field,
+            extent=scene.extent,
+            generator=generator,
+            checkpoint=scratch,
+            **options,
+        )
+        save_file({name: value.contiguous() for name, value in fit.params.to_tensors().items()}, folder / "params.safetensors")
+        write_json(folder / "history.json", fit.history)
+
+    stage = run.stage("field", inputs, make)
+    if scratch.is_dir():
+        shutil.rmtree(scratch)
+    else:
+        scratch.unlink(missing_ok=True)
+    return GaussianParams.from_tensors(load_file(stage.folder / "params.safetensors")), stage
+
+
+def fit_scene(
+    scene: Scene,
+    maps: Maps,  # teacher maps of the views of config.split, in their order
+    folder: str | Path,
+    config: FitConfig | None = None,
+    *,
+    report: Callable[[str], None] | None = None,
+    progress: bool = False,
+    callback: Callable[[dict[str, Any]], None] | None = None,
+) -> FitResult:
+    """Fit a decoupled semantic field to a scene (Figure 2), resuming whatever a run folder already holds.
+
+    Args:
+        scene: posed, undistorted views with their sparse points.
+        maps: one teacher map [h, w, D] per training view; read one at a time.
+        folder: the run folder; `folder/field` receives the finished field.
+        config: the method's options; the paper's when not given.
+        report: receives one line per stage.
+        progress: show progress bars.
+        callback: receives the history rows of every stage as they appear.
+
+    Raises:
+        ValueError: if the counts of views and maps differ, or a camera has distortion.
+    """
+    config = config or FitConfig.paper()
+    views = scene.splits[config.split]
+    if len(views) != len(maps):
+        raise ValueError(
+            f"maps: expected one teacher map per view of split {config.split!r} ({len(views)}), got {len(maps)}; "
+            "read them with FeatureFolder(path, stems of that split)"
+        )
+    run = Run(Path(folder), report)
+    options: dict[str, Any] = {"progress": progress, "callback": callback}
+    codebook, autoencoder = None, None
+    targets: Sequence[Tensor] = maps  # type: ignore[assignment]
+    if config.mode == "decouple":
+        inputs: dict[str, Any] = {"mode": config.mode, "features": run.digests(maps.paths)}
+    else:
+        codebook, made = _codebook_stage(run, maps, config, options)
+        index_maps, indexed = _index_stage(run, maps, codebook, made, progress)
+        inputs = {"mode": config.mode, "index_maps": indexed.key}
+        targets = LatentMaps(index_maps, codebook.codewords)
+        if config.mode == "adc+sc":
+            autoencoder, compressed = _autoencoder_stage(run, codebook, made, config, options)
+            inputs["autoencoder"] = compressed.key
+            with torch.no_grad():
+                targets = LatentMaps(index_maps, autoencoder.encode(codebook.codewords))
+    params, _ = _field_stage(run, scene, views, targets, inputs, config, options)
+    info = {
+        "mode": config.mode,
+        "seed": config.seed,
+        "views": [scene.cameras[i].name for i in views],
+        "teacher_map": list(maps[0].shape),
+        "seconds": {stage.name: round(stage.seconds, 3) for stage in run.stages},
+        "kfgs": version("kfgs"),
+    }
+    result = SemanticField(params.activated().detach(), codebook, autoencoder, info)
+    done = FitResult(result, Path(folder), run.stages)
+    result.save(done.field_path)
+    return done
+
+
+def load_history(folder: Path, stage: str) -> list[dict[str, Any]]:
+    """The history rows of the newest finished stage of that name in a run folder.
+
+    Raises:
+        FileNotFoundError: if the run has no such stage.
+    """
+    found = sorted((folder / "stages").glob(f"{stage}-*/history.json"), key=lambda path: path.stat().st_mtime)
+    if not found:
+        raise FileNotFoundError(f"{folder}: expected a finished stage {stage!r} in this run folder, found none")
+    return list(read_json(found[-1]))
