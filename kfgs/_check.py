@@ -6,6 +6,7 @@ tensor values unless its name says so, so they cost no device synchronisation.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -42,8 +43,9 @@ def check_shapes(*arguments: tuple[str, Any, str]) -> dict[str, int]:
             )
         shape = tuple(int(n) for n in value.shape)
         wrong = len(shape) != len(axes)
+        own: dict[str, int] = {}  # an axis may also appear twice within one argument
         for axis, size in zip(axes, shape, strict=False):
-            expected = int(axis) if axis.isdigit() else sizes.get(axis, size)
+            expected = int(axis) if axis.isdigit() else sizes.get(axis, own.setdefault(axis, size))
             wrong = wrong or size != expected
         if wrong:
             known = [f"{a} = {sizes[a]} (from {bound_by[a]})" for a in axes if a in sizes]
@@ -68,6 +70,7 @@ def check_range(
     """Raise a ValueError unless `value` is a finite number between `low` and `high` (`closed`: are the ends included)."""
     over = value >= low if closed[0] else value > low
     under = value <= high if closed[1] else value < high
-    if not (over and under):  # also catches NaN
-        left, right = "[" if closed[0] else "(", "]" if closed[1] else ")"
+    if not (over and under and math.isfinite(value)):  # NaN fails every comparison
+        left = "[" if closed[0] and math.isfinite(low) else "("
+        right = "]" if closed[1] and math.isfinite(high) else ")"
         raise ValueError(f"{name}: expected a number in {left}{low:g}, {high:g}{right}, got {value!r}")

@@ -1,5 +1,22 @@
-"""Cameras: where a view stands, how it projects, how its maps are resampled. All mathematics through kornia."""
+"""Posed cameras, projection, lens distortion and resampling, carried by kornia."""
 
 from .camera import Camera, Distortion
+from .distortion import fold_radius
+from .projection import camera_to_pixel, project_points, projection_jacobian, unproject_depth, world_to_camera
+from .resample import resize_labels, resize_map
+from .undistort import undistort, undistort_labels
 
-__all__ = ["Camera", "Distortion"]
+__all__ = [
+    "Camera",
+    "Distortion",
+    "camera_to_pixel",
+    "fold_radius",
+    "project_points",
+    "projection_jacobian",
+    "resize_labels",
+    "resize_map",
+    "undistort",
+    "undistort_labels",
+    "unproject_depth",
+    "world_to_camera",
+]

@@ -29,8 +29,10 @@ class Distortion:
         if len(self.coefficients) not in COEFFICIENTS[self.model]:
             raise ValueError(
                 f"coefficients: expected {' or '.join(map(str, COEFFICIENTS[self.model]))} numbers for {self.model}, "
-                f"got {len(self.coefficients)}"
+                f"got {len(self.coefficients)}; pad with zeros"
             )
+        for i, coefficient in enumerate(self.coefficients):
+            check_range(f"coefficients[{i}]", coefficient, float("-inf"), closed=(False, False))
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +41,7 @@ class Camera:
 
     **Convention** (COLMAP's): `viewmat` maps world to camera, x right, y down, z forward; the centre of the first pixel
     is (0.5, 0.5), so a centred principal point is (width / 2, height / 2). K is in pixels, without skew.
-    A camera with distortion must be undistorted (`undistort_image`) before anything is rasterised through it.
+    A camera with distortion must be undistorted (`undistort`) before anything is rasterised through it.
     """
 
     viewmat: Tensor  # [4, 4] world to camera
@@ -51,14 +53,19 @@ class Camera:
 
     def __post_init__(self) -> None:
         check_shapes(("viewmat", self.viewmat, "4 4"), ("K", self.K, "3 3"))
+        for name, matrix in (("viewmat", self.viewmat), ("K", self.K)):
+            if not matrix.is_floating_point():  # a matrix of integers would truncate the points
+                raise TypeError(f"{name}: expected floating point, got {matrix.dtype}; convert it with .float()")
         for name, size in (("width", self.width), ("height", self.height)):
             if int(size) != size or size < 1:
-                raise ValueError(f"{name}: expected a positive number of pixels, got {size!r}")
+                raise ValueError(f"{name}: expected a positive whole number of pixels, got {size!r}; pass an integer")
         K, E = self.K.detach().double().cpu(), self.viewmat.detach().double().cpu()  # cameras are tiny
         if not (torch.isfinite(K).all() and torch.isfinite(E).all()):
-            raise ValueError(f"viewmat, K: expected finite numbers, got NaN or infinity (camera {self.name!r})")
+            raise ValueError(
+                f"viewmat, K: expected finite numbers, got NaN or infinity (camera {self.name!r}); leave this view out"
+            )
         if K[0, 1] != 0 or K[1, 0] != 0 or K[2].tolist() != [0.0, 0.0, 1.0]:
-            raise ValueError(f"K: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}")
+            raise ValueError(f"K: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] without skew, got {K.tolist()}")
         check_range("K[0, 0] (fx)", float(K[0, 0]), 0, closed=(False, False))
         check_range("K[1, 1] (fy)", float(K[1, 1]), 0, closed=(False, False))
         R = E[:3, :3]
@@ -68,7 +75,9 @@ class Camera:
                 "remove any scale from the pose first"
             )
         if torch.linalg.det(R) < 0:
-            raise ValueError("viewmat: expected a rotation, got a reflection (determinant -1); check the axes' handedness")
+            raise ValueError(
+                "viewmat: expected a rotation, got a reflection (determinant -1); check the axes' handedness"
+            )
 
     @property
     def size(self) -> tuple[int, int]:
@@ -80,13 +89,22 @@ class Camera:
         """The camera's position in the world."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
+    @property
+    def intrinsics_at_integer_centers(self) -> Tensor:  # [3, 3]
+        """K for functions that put the centre of the first pixel at (0, 0), as kornia's grids do: cx, cy less 0.5."""
+        shift = torch.zeros_like(self.K)
+        shift[:2, 2] = 0.5
+        return self.K - shift
+
     def resized(self, height: int, width: int) -> Camera:
         """The same view with another number of pixels; the two axes scale independently.
 
         With pixel centres on halves, fx and cx scale by width / self.width, fy and cy by height / self.height, exactly.
         kornia's `PinholeCamera.scale` knows one factor for both axes, so it is not used here.
         """
-        factors = torch.tensor([width / self.width, height / self.height, 1.0], dtype=self.K.dtype, device=self.K.device)
+        factors = torch.tensor(
+            [width / self.width, height / self.height, 1.0], dtype=self.K.dtype, device=self.K.device
+        )
         return replace(self, K=self.K * factors[:, None], width=width, height=height)
 
     def to(self, *args: Any, **kwargs: Any) -> Camera:

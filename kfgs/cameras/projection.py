@@ -1,0 +1,160 @@
+"""Between the world, the camera's frame and its pixels, in both directions."""
+
+from __future__ import annotations
+
+import torch
+from kornia.geometry.camera import dx_project_points_z1
+from kornia.geometry.conversions import convert_points_from_homogeneous
+from kornia.geometry.depth import depth_to_3d_v2
+from torch import Tensor
+
+from .._check import check_range, check_shapes
+from .camera import Camera
+from .distortion import fold_radius, plane_to_pixel
+
+
+def world_to_camera(camera: Camera, points: Tensor) -> Tensor:  # points: [N, 3] -> [N, 3]
+    """Express world points in the camera's frame: R X + t.
+
+    **Convention** (COLMAP): x right, y down, z forward; `camera.viewmat` is world to camera and follows the dtype and
+    device of `points`.
+
+    Raises:
+        TypeError: if `points` are not floating point.
+        ValueError: if `points` are not [N, 3].
+
+    Note:
+        Written out because kornia's `transform_points` divides by a homogeneous coordinate that is always 1 here, and
+        takes twice as long.
+
+    Example:
+        >>> camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48)
+        >>> world_to_camera(camera, torch.tensor([[1.0, 2.0, 3.0]]))
+        tensor([[1., 2., 3.]])
+    """
+    _check_points("points", points)
+    viewmat = camera.viewmat.to(points)
+    return points @ viewmat[:3, :3].T + viewmat[:3, 3]
+
+
+def camera_to_pixel(camera: Camera, points_cam: Tensor) -> Tensor:  # points_cam: [N, 3] -> [N, 2]
+    """Project points of the camera's frame to pixels (x, y), through the lens if the camera has one.
+
+    **Convention**: the centre of the first pixel is (0.5, 0.5). A point behind the camera gives an ordinary-looking
+    pixel, so mask by depth *before* calling (`project_points` does). At z = 0 the division is skipped: the result is
+    finite, and means nothing.
+
+    Raises:
+        TypeError: if `points_cam` are not floating point.
+        ValueError: if `points_cam` are not [N, 3].
+
+    Example:
+        >>> camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48)
+        >>> camera_to_pixel(camera, torch.tensor([[0.0, 0.0, 2.0], [0.2, 0.1, 2.0]]))
+        tensor([[32., 24.],
+                [42., 29.]])
+    """
+    _check_points("points_cam", points_cam)
+    plane = convert_points_from_homogeneous(points_cam)  # finite at z = 0, where project_points_z1 is not
+    return plane_to_pixel(plane, camera.K.to(points_cam), camera.distortion)
+
+
+def projection_jacobian(camera: Camera, points_cam: Tensor) -> Tensor:  # points_cam: [N, 3] -> [N, 2, 3]
+    """Derivative of the pinhole projection, d(u, v) / d(x, y, z), in pixels per world unit (EWA, Zwicker 2001).
+
+    The caller masks `z > near` first.
+
+    Raises:
+        TypeError: if `points_cam` are not floating point.
+        ValueError: if the camera has distortion, or `points_cam` are not [N, 3].
+    """
+    _check_points("points_cam", points_cam)
+    _refuse_distortion(camera)
+    focal = camera.K.diagonal()[:2].to(points_cam)
+    return dx_project_points_z1(points_cam) * focal[:, None]
+
+
+def project_points(
+    camera: Camera,
+    points: Tensor,  # [N, 3] world
+    *,
+    near: float = 1e-6,
+) -> tuple[Tensor, Tensor, Tensor]:  # [N, 2], [N], [N] bool
+    """Project world points to pixels and say which of them the camera sees.
+
+    Depth is tested before projecting, so a point behind the camera can never be mistaken for a visible one. With a
+    lens, a point so far off-axis that the lens model folds it back into the picture (`fold_radius`) is not visible.
+
+    Args:
+        camera: where from; its distortion is applied.
+        points: world coordinates; NaN and infinity count as not visible.
+        near: depth that a point must exceed, in world units.
+
+    Returns:
+        Pixels (x, y), with (0, 0) for points not in front of the camera; depths along the optical axis, in world
+        units; and the mask of points in front and inside the picture (0 <= x < width, 0 <= y < height). Occlusion is
+        not considered.
+
+    Raises:
+        TypeError: if `points` are not floating point.
+        ValueError: if `points` are not [N, 3], or `near` is negative.
+
+    Example:
+        >>> camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48)
+        >>> xy, depth, visible = project_points(camera, torch.tensor([[0.2, 0.1, 2.0], [0.2, 0.1, -2.0]]))
+        >>> visible.tolist(), xy[0].tolist()
+        ([True, False], [42.0, 29.0])
+    """
+    check_range("near", near, 0)
+    points_cam = world_to_camera(camera, points)
+    depth = points_cam[:, 2]
+    front = ((depth > near) & torch.isfinite(points_cam).all(dim=1)).nonzero()[:, 0]
+    seen = points_cam[front]
+    pixels = camera_to_pixel(camera, seen)
+    inside = (pixels >= 0).all(dim=1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+    if camera.distortion is not None:
+        inside &= seen[:, :2].norm(dim=1) < fold_radius(camera.distortion) * seen[:, 2]
+    xy = points.new_zeros(len(points), 2).index_put((front,), pixels)
+    visible = torch.zeros_like(depth, dtype=torch.bool).index_put((front,), inside)
+    return xy, depth, visible
+
+
+def unproject_depth(camera: Camera, depth: Tensor) -> Tensor:  # depth: [H, W] -> [H, W, 3] world
+    """Lift a depth map to one world point per pixel centre.
+
+    **Convention**: depth is the distance along the optical axis (z), not along the ray, in world units. A pixel of
+    depth 0 (often "unknown") lands on the camera's centre: mask it.
+
+    Raises:
+        TypeError: if `depth` is not floating point.
+        ValueError: if the camera has distortion, or the map is not of the camera's size.
+
+    Example:
+        >>> camera = Camera(torch.eye(4), torch.tensor([[2.0, 0, 1], [0, 2, 1], [0, 0, 1]]), 2, 2)
+        >>> unproject_depth(camera, torch.full((2, 2), 4.0))[0, 0]  # the ray of the pixel centre (0.5, 0.5)
+        tensor([-1., -1.,  4.])
+    """
+    check_shapes(("depth", depth, f"{camera.height} {camera.width}"))
+    _check_floating("depth", depth)
+    _refuse_distortion(camera)
+    K = camera.intrinsics_at_integer_centers.to(depth)  # kornia's pixel grid counts from 0, not from 0.5
+    viewmat = camera.viewmat.to(depth)
+    return (depth_to_3d_v2(depth, K[None])[0] - viewmat[:3, 3]) @ viewmat[:3, :3]  # R^T (X - t)
+
+
+def _check_points(name: str, points: Tensor) -> None:
+    check_shapes((name, points, "N 3"))
+    _check_floating(name, points)
+
+
+def _check_floating(name: str, values: Tensor) -> None:
+    if not values.is_floating_point():
+        raise TypeError(f"{name}: expected floating point, got {values.dtype}; convert it with .float()")
+
+
+def _refuse_distortion(camera: Camera) -> None:
+    if camera.distortion is not None:
+        raise ValueError(
+            f"camera: expected a pinhole camera, got {camera.distortion.model} distortion (camera {camera.name!r}); "
+            "undistort its images first (kfgs.cameras.undistort) and use the camera that returns"
+        )
