@@ -1,1 +1,1 @@
-"""TODO."""
+"""Gaussian splatting: project, bin, composite."""

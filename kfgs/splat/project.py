@@ -1,0 +1,161 @@
+"""Project 3-D Gaussians to 2-D ones on the image plane (EWA splatting)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
+from torch import Tensor
+
+from .._check import check_range
+from ..cameras.camera import Camera
+from ..cameras.projection import camera_to_pixel, projection_jacobian, world_to_camera
+from ..gaussians import Gaussians
+from .engines.contract import ALPHA_MIN
+
+FIELD_OF_VIEW_MARGIN = 1.3
+"""The projection is linearised no further out than 1.3 times the half field of view (3DGS): beyond it the linear
+footprint of a Gaussian beside the camera grows without bound and would cover the picture."""
+
+
+class Projected(NamedTuple):
+    """The M Gaussians that can be seen, on the image plane, in increasing order of `index`."""
+
+    means2d: Tensor  # [M, 2] pixels (x, y)
+    conics: Tensor  # [M, 3] (a, b, c) of the inverse 2-D covariance [[a, b], [b, c]], 1/pixels^2
+    depths: Tensor  # [M] z in the camera's frame, world units
+    opacities: Tensor  # [M]
+    extents: Tensor  # [M, 2] half-widths of the box outside of which alpha < 1/255, pixels; no gradient
+    index: Tensor  # type: ignore[assignment]  # [M] int64, which of the N Gaussians
+
+
+def project(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    near: float = 0.2,
+    low_pass: float = 0.3,
+) -> Projected:
+    """Project Gaussians through a pinhole camera and cull those that cannot touch a pixel.
+
+    The 2-D covariance is J W Sigma W^T J^T + low_pass * I (Zwicker et al. 2001, eq. 31), with W the camera's rotation
+    and J the Jacobian of the projection at the mean. J is taken no further from the picture than
+    `FIELD_OF_VIEW_MARGIN` times its half-size from its middle, in tangents, wherever the principal point is.
+    Culled are: depth <= near, opacity <= 1/255, and footprints {alpha >= 1/255} whose bounding box holds no pixel centre.
+
+    Args:
+        gaussians: the N Gaussians; `means`, `quats`, `scales` and `opacities` are differentiable.
+        camera: without distortion; cast to the Gaussians' dtype and device.
+        near: smallest depth that is drawn, world units.
+        low_pass: variance in pixels^2 added on both axes, so that nothing is smaller than a pixel.
+
+    Returns:
+        The M visible Gaussians; M = 0 is possible.
+
+    Raises:
+        ValueError: if the camera has distortion, `near` is not positive or `low_pass` is negative.
+
+    Note:
+        A Gaussian with NaN or infinite parameters is culled.
+    """
+    check_range("near", near, 0, closed=(False, False))
+    check_range("low_pass", low_pass, 0, closed=(True, False))
+    if camera.distortion is not None:
+        raise ValueError(
+            f"camera: expected a camera without distortion, got {camera.distortion.model} (camera {camera.name!r}); "
+            "undistort the images first with kfgs.cameras.undistort, which returns the camera to use"
+        )
+    if camera.K.dtype != gaussians.means.dtype or camera.K.device != gaussians.means.device:
+        camera = camera.to(gaussians.means)
+    points = world_to_camera(camera, gaussians.means)  # [N, 3]
+    index = _candidates(points.detach(), gaussians, camera, near, low_pass)
+    points = points[index]
+    opacities = gaussians.opacities[index]
+    means2d = camera_to_pixel(camera, points)
+    variances, covariances, det = _covariance_2d(
+        projection_jacobian(camera, _clamp_tangents(points, camera)) @ camera.viewmat[:3, :3],
+        gaussians.quats[index],
+        gaussians.scales[index],
+        low_pass,
+    )
+    with torch.no_grad():
+        extents = (_reach(opacities)[:, None] * variances).sqrt()
+        keep = _touches_pixel(means2d, extents, camera).nonzero().squeeze(1)
+    variance_x, variance_y = variances.unbind(1)
+    conics = torch.stack([variance_y, -covariances, variance_x], dim=1) / det[:, None]
+    depths = points[:, 2]
+    return Projected(means2d[keep], conics[keep], depths[keep], opacities[keep], extents[keep], index[keep])
+
+
+def pixel_box(
+    means2d: Tensor,  # [M, 2]
+    extents: Tensor,  # [M, 2]
+    width: int,
+    height: int,
+) -> tuple[Tensor, Tensor]:
+    """The pixels whose centres lie within `extents` of the means: first and one past the last (column, row), [M, 2] each.
+
+    Values are whole but of the input's dtype, clamped to the image; an empty box has last <= first, a NaN stays NaN.
+    """
+    size = torch.tensor([width, height], dtype=means2d.dtype, device=means2d.device)
+    rounding = 4 * torch.finfo(means2d.dtype).eps * (means2d.abs() + extents)  # never lose a pixel to it
+    first = torch.ceil(means2d - extents - 0.5 - rounding).clamp(min=0)
+    last = torch.floor(means2d + extents - 0.5 + rounding) + 1
+    return first, torch.minimum(last, size)
+
+
+def _touches_pixel(means2d: Tensor, extents: Tensor, camera: Camera) -> Tensor:  # [M] bool
+    first, last = pixel_box(means2d, extents, camera.width, camera.height)
+    return (last > first).all(dim=1)
+
+
+def _reach(opacities: Tensor) -> Tensor:
+    """Largest value of d^T C d at which opacity * exp(-0.5 d^T C d) >= ALPHA_MIN; negative for an opacity below it."""
+    return 2 * torch.log(opacities / ALPHA_MIN)
+
+
+def _clamp_tangents(points: Tensor, camera: Camera) -> Tensor:  # [M, 3] -> [M, 3]
+    """Move points along the image plane to where the projection may be linearised; depth stays."""
+    focal = camera.K.diagonal()[:2]
+    size = torch.tensor([camera.width, camera.height], dtype=points.dtype, device=points.device)
+    middle = (size / 2 - camera.K[:2, 2]) / focal
+    half = FIELD_OF_VIEW_MARGIN * size / 2 / focal
+    z = points[:, 2:]
+    tangents = torch.clamp(points[:, :2] / z, middle - half, middle + half)
+    return torch.cat([tangents * z, z], dim=1)
+
+
+@torch.no_grad()
+def _candidates(
+    points: Tensor, gaussians: Gaussians, camera: Camera, near: float, low_pass: float
+) -> Tensor:  # [m] int64
+    """Cull, without looking at rotations: the footprint is bounded by that of a ball around the Gaussian."""
+    index = ((points[:, 2] > near) & (_reach(gaussians.opacities) > 0)).nonzero().squeeze(1)
+    points = points[index]
+    J = projection_jacobian(camera, _clamp_tangents(points, camera))
+    largest = gaussians.scales[index].amax(dim=1, keepdim=True)
+    variances = (J * J).sum(dim=2) * largest**2 + low_pass
+    extents = (_reach(gaussians.opacities[index])[:, None] * variances).sqrt()
+    extents = extents * (1 + 1e-3)  # a bound stays one after rounding
+    return index[_touches_pixel(camera_to_pixel(camera, points), extents, camera)]
+
+
+def _covariance_2d(
+    JW: Tensor,  # [M, 2, 3]
+    quats: Tensor,  # [M, 4]
+    scales: Tensor,  # [M, 3]
+    low_pass: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Variances [M, 2] along x and y, covariance [M] and determinant [M] of J W R S S R^T W^T J^T + low_pass I.
+
+    Sums of elementwise products: a batch of small matrix products is several times slower on a CPU.
+    """
+    R = quaternion_to_rotation_matrix(quats)  # [M, 3, 3]
+    u = (JW[:, 0, :, None] * R).sum(dim=1) * scales  # row x of J W R S, [M, 3]
+    v = (JW[:, 1, :, None] * R).sum(dim=1) * scales
+    plain = torch.stack([(u * u).sum(dim=1), (v * v).sum(dim=1)], dim=1)
+    # |u|^2 |v|^2 - (u.v)^2 = |u x v|^2 (Lagrange): the difference cancels for needles, the cross product does not.
+    area = torch.linalg.cross(u, v)
+    det = (area * area).sum(dim=1) + low_pass * plain.sum(dim=1) + low_pass**2
+    return plain + low_pass, (u * v).sum(dim=1), det

@@ -1,0 +1,118 @@
+"""Which Gaussians touch which square of pixels, front to back."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .._check import check_range, check_shapes
+from .engines.contract import ALPHA_MIN
+from .project import Projected, pixel_box
+
+
+class Tiles(NamedTuple):
+    """For every tile, the rows of `Projected` that touch it, in order of depth, then of Gaussian index.
+
+    Tile t = row * columns + column owns `rows[offsets[t]:offsets[t + 1]]`. Tiles at the right and lower border reach
+    beyond the image where its size is no multiple of the tile's.
+    """
+
+    rows: Tensor  # [P] int32
+    offsets: Tensor  # [T + 1] int64
+    width: int  # pixels
+    height: int  # pixels
+    tile_size: int  # pixels
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Number of tiles as (rows, columns)."""
+        return -(-self.height // self.tile_size), -(-self.width // self.tile_size)
+
+
+@torch.no_grad()
+def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16) -> Tiles:
+    """List the Gaussians of every tile.
+
+    A Gaussian is listed exactly where it may have alpha >= 1/255 at the centre of one of the tile's pixels: the smallest
+    value of its quadratic form over the rectangle spanned by the pixel centres is compared with 2 ln(255 opacity), and
+    kept in doubt of rounding.
+
+    Args:
+        projected: M projected Gaussians in increasing order of index, as `project` returns them.
+        width: of the image, pixels.
+        height: of the image, pixels.
+        tile_size: side of a tile, pixels.
+
+    Returns:
+        The P (tile, Gaussian) pairs, grouped by tile; equally deep Gaussians are in order of their index.
+
+    Raises:
+        ValueError: if shapes disagree or a size is not positive.
+    """
+    check_shapes(
+        ("projected.means2d", projected.means2d, "M 2"),
+        ("projected.conics", projected.conics, "M 3"),
+        ("projected.depths", projected.depths, "M"),
+        ("projected.opacities", projected.opacities, "M"),
+        ("projected.extents", projected.extents, "M 2"),
+    )
+    for name, size in (("width", width), ("height", height), ("tile_size", tile_size)):
+        check_range(name, size, 1, closed=(True, False))
+    columns, count = -(-width // tile_size), -(-width // tile_size) * -(-height // tile_size)
+    order = torch.sort(projected.depths, stable=True).indices
+    means2d, extents = projected.means2d[order], projected.extents[order]
+    first, last = pixel_box(means2d, extents, width, height)
+    filled = (last > first).all(dim=1)
+    first = torch.where(filled[:, None], first, 0).to(torch.int32) // tile_size
+    last = torch.where(filled[:, None], last - 1, -1).to(torch.int32) // tile_size + 1  # empty box: 0 tiles
+
+    spans = last - first  # [M, 2] tiles along x and y
+    hits = spans[:, 0] * spans[:, 1]
+    near_to_far = torch.arange(len(order), dtype=torch.int32, device=order.device)
+    which = torch.repeat_interleave(near_to_far, hits)  # [P'] candidates, front to back
+    begin = torch.cumsum(hits, 0, dtype=torch.int32) - hits
+    step = torch.arange(len(which), dtype=torch.int32, device=order.device) - begin[which]
+    down = step // spans[which, 0]
+    tile_y = first[which, 1] + down
+    tile_x = first[which, 0] + step - down * spans[which, 0]
+
+    rows = order.to(torch.int32)[which]
+    touched = _touches_tile(projected, rows, tile_x * tile_size, tile_y * tile_size, tile_size)
+    tile, by_tile = torch.sort((tile_y * columns + tile_x)[touched], stable=True)
+    offsets = torch.searchsorted(tile, torch.arange(count + 1, dtype=tile.dtype, device=tile.device))
+    return Tiles(rows[touched][by_tile], offsets, width, height, tile_size)
+
+
+def _touches_tile(
+    projected: Projected,
+    rows: Tensor,  # [P] int32
+    left: Tensor,  # [P] int32, first pixel column of the tile
+    top: Tensor,  # [P] int32
+    tile_size: int,
+) -> Tensor:  # [P] bool
+    """Whether min d^T C d over the tile's pixel centres (as a solid rectangle) is at most 2 ln(255 opacity).
+
+    The form is convex with its minimum 0 at the mean. With the mean outside, the minimum over the rectangle lies on one
+    of the (at most two) sides that face it, where it is that of a parabola clamped to the side.
+    """
+    x, y = projected.means2d.unbind(1)
+    a, b, c = (column[rows] for column in projected.conics.unbind(1))
+    left, top = left + 0.5 - x[rows], top + 0.5 - y[rows]  # relative to the mean from here on
+    right, bottom = left + (tile_size - 1), top + (tile_size - 1)
+    near_x, near_y = (
+        left.clamp(min=0) + right.clamp(max=0),
+        top.clamp(min=0) + bottom.clamp(max=0),
+    )  # closest to the mean
+    along_y = torch.minimum(torch.maximum(-b / c * near_x, top), bottom)  # on the side x = near_x
+    along_x = torch.minimum(torch.maximum(-b / a * near_y, left), right)  # on the side y = near_y
+    smallest = torch.minimum(
+        a * near_x * near_x + 2 * b * near_x * along_y + c * along_y * along_y,
+        a * along_x * along_x + 2 * b * along_x * near_y + c * near_y * near_y,
+    )
+    reach = 2 * torch.log(projected.opacities / ALPHA_MIN)[rows]
+    # An engine rounds the same three terms at each pixel; they are largest, and cancel worst, in the far corner.
+    far_x, far_y = torch.maximum(-left, right), torch.maximum(-top, bottom)
+    terms = a * far_x * far_x + 2 * b.abs() * far_x * far_y + c * far_y * far_y
+    return smallest <= reach + 8 * torch.finfo(x.dtype).eps * (terms + reach.abs() + 1)
