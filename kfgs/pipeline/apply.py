@@ -113,6 +113,21 @@ def label_field(field: SemanticField, classes: LabelSet) -> tuple[Gaussians, Ten
     return field.gaussians.replace(labels=labels), scores
 
 
+def query_field(
+    field: SemanticField, classes: LabelSet, name: str, threshold: float | None = None
+) -> tuple[Gaussians, Tensor, str]:
+    """The field's Gaussians with one class labelled: those whose similarity to it exceeds gamma (Sec. 3.4).
+
+    Returns:
+        The labelled Gaussians, the similarities [N], and a sentence that names gamma and where it came from.
+    """
+    target = classes.index(name)
+    found = field.query(classes.embeddings[target], threshold)
+    labels = torch.where(found.mask, target, -1)
+    how = f"{name}: {int(found.mask.sum())} Gaussians above gamma = {found.threshold:.4f} ({found.how})"
+    return field.gaussians.replace(labels=labels), found.scores, how
+
+
 def save_labelled(path: str | Path, gaussians: Gaussians, scores: Tensor, classes: LabelSet) -> list[Path]:
     """Write labelled Gaussians as PLY (`class_id`, `score`, label colours) with a JSON file of names beside it."""
     path = Path(path)

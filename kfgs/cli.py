@@ -1,0 +1,252 @@
+"""The command line: `kfgs demo | sfm | fit | segment | label | info`.
+
+Every command names the files it wrote, shows progress on long work, and ends with 0 (done), 1 (bad input, with one
+message that says what to do), 2 (wrong usage) or 130 (interrupted; the same command goes on where it stopped).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+# Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
+
+SceneFolder = Annotated[Path, tyro.conf.Positional]
+Preset = Literal["cpu", "paper"]
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)  # noqa: T201 - this is the place that talks to a person
+
+
+def _wrote(paths: list[Path]) -> None:
+    _say("wrote:")
+    for path in paths:
+        _say(f"  {path}" + (f"  ({sum(1 for p in path.iterdir())} files)" if path.is_dir() else ""))
+
+
+def _fit_config(preset: Preset, mode: str, seed: int, steps: int | None, max_gaussians: int | None, split: str) -> Any:
+    from .pipeline import FitConfig
+
+    config = FitConfig.cpu() if preset == "cpu" else FitConfig.paper()
+    fields = config.field if steps is None else config.field.with_steps(steps)
+    if max_gaussians is not None:
+        fields = dataclasses.replace(fields, max_gaussians=max_gaussians)
+    return dataclasses.replace(config, mode=mode, seed=seed, split=split, field=fields)
+
+
+def _classes(scene: Path | None, classes: Path | None, text: Path | None) -> Any:
+    from .evaluation import load_label_set
+
+    if classes is None and scene is not None:
+        classes = scene / "classes.json"
+    if text is None and scene is not None:
+        text = scene / "text.npy"
+    if classes is None or text is None:
+        raise ValueError("classes, text: expected class names (.json) and embeddings (.npy); pass --classes and --text")
+    return load_label_set(classes, text)
+
+
+def demo(out: Path = Path("kfgs_demo"), seed: int = 0, steps: int | None = None) -> None:
+    """Make a furnished toy room, fit a semantic field to it, segment unseen views, label points: the whole main job.
+
+    Args:
+        out: folder for the scene, the run and its results; running again goes on where it stopped.
+        seed: of the room and of the fit.
+        steps: training steps of the field; the CPU preset's when not given.
+    """
+    from .pipeline import demo as run_demo
+
+    config = _fit_config("cpu", "adc+sc", seed, steps, None, "train")
+    _wrote(run_demo.run(out, config, report=_say, progress=True))
+
+
+def sfm(
+    images: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    matching: Literal["exhaustive", "sequential"] = "exhaustive",
+    camera_model: str = "SIMPLE_RADIAL",
+    min_registered: float = 0.9,
+    seed: int = 0,
+) -> None:
+    """Find the cameras of a bare folder of images (structure from motion, pycolmap).
+
+    Args:
+        images: folder of images.
+        out: scene folder to make: `out/sparse/0` receives the COLMAP model.
+        matching: `sequential` for video frames in order, `exhaustive` for everything else.
+        camera_model: COLMAP's name of the lens model, one camera for all images.
+        min_registered: share of images that must be placed; fewer is an error.
+        seed: of the geometric verification.
+    """
+    from .scenes import SfmConfig, run_sfm
+
+    config = SfmConfig(matching=matching, camera_model=camera_model, min_registered=min_registered, seed=seed)
+    _say(str(run_sfm(images, out, config=config, progress=True)))
+    _wrote([out / "sparse" / "0"])
+
+
+def fit(
+    scene: SceneFolder,
+    features: Path,
+    out: Path,
+    preset: Preset = "cpu",
+    mode: Literal["decouple", "adc", "adc+sc"] = "adc+sc",
+    split: str = "train",
+    seed: int = 0,
+    steps: int | None = None,
+    max_gaussians: int | None = None,
+) -> None:
+    """Fit a semantic field to a posed scene and its teacher features.
+
+    Args:
+        scene: folder with images and a COLMAP model or transforms.json.
+        features: folder of teacher maps, `<stem>_fmap_CxHxW.pt` or `<stem>.npy`.
+        out: run folder; running again goes on where it stopped. `out/field` receives the field.
+        preset: `cpu` (minutes on two cores) or `paper` (30,000 steps).
+        mode: `adc+sc` (codebook and autoencoder, 9 channels), `adc` (codebook), `decouple` (raw features).
+        split: views to learn from.
+        seed: every random choice follows from it.
+        steps: training steps of the field, instead of the preset's.
+        max_gaussians: stop densifying at this many Gaussians.
+    """
+    from .pipeline import fit_scene, write_training_pictures
+    from .scenes import load_scene
+    from .teachers import FeatureFolder
+
+    config = _fit_config(preset, mode, seed, steps, max_gaussians, split)
+    loaded = load_scene(scene).undistorted()
+    maps = FeatureFolder(features, [loaded.stem(i) for i in loaded.splits[split]])
+    result = fit_scene(loaded, maps, out, config, report=_say, progress=True)
+    _say(result.field.summary())
+    _wrote([result.field_path, *write_training_pictures(out)])
+
+
+def segment(
+    field: Annotated[Path, tyro.conf.Positional],
+    scene: Path,
+    out: Path,
+    split: str = "test",
+    classes: Path | None = None,
+    text: Path | None = None,
+    labels: Path | None = None,
+    decode: Literal["exact", "latent"] = "exact",
+    pictures: int = 4,
+) -> None:
+    """Segment the views of a scene with a field; score them where label pictures exist.
+
+    Args:
+        field: the folder that `kfgs fit` wrote (`RUN/field`).
+        scene: scene folder in the field's frame.
+        out: receives label maps, pictures and scores.json.
+        split: views to segment.
+        classes: JSON list of class names; SCENE/classes.json when not given.
+        text: .npy of one embedding per class in the teacher's space; SCENE/text.npy when not given.
+        labels: folder of true label pictures; SCENE/labels_scored or SCENE/labels when not given.
+        decode: `exact` decodes every pixel, `latent` compares latents.
+        pictures: how many views get pictures.
+    """
+    from .fields import SemanticField
+    from .pipeline import score_scene, segment_scene, write_report
+    from .scenes import load_scene
+    from .viz import plot_confusion
+
+    loaded, label_set = load_scene(scene).undistorted(), _classes(scene, classes, text)
+    field_ = SemanticField.load(field)
+    found = segment_scene(
+        field_, loaded, label_set, out, split=split, decode=decode, pictures=pictures, progress=True
+    )
+    written = [path for path in (out / "labels", out / "overlay", out / "features") if path.is_dir()]
+    truth = labels or next((scene / name for name in ("labels_scored", "labels") if (scene / name).is_dir()), None)
+    if truth is not None:
+        scores = score_scene(found, truth, label_set)
+        _say(str(scores))
+        write_report(out / "scores.json", segmentation=scores, truth=str(truth), field=str(field), decode=decode)
+        plot_confusion(scores.confusion, list(label_set.names), out / "confusion.png")
+        written += [out / "scores.json", out / "confusion.png"]
+    _wrote(written)
+
+
+def label(
+    field: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    classes: Path | None = None,
+    text: Path | None = None,
+    scene: Path | None = None,
+    query: str | None = None,
+    threshold: float | None = None,
+    cloud: Path | None = None,
+    distance: float | None = None,
+) -> None:
+    """Label the Gaussians of a field, and carry the labels to a colour cloud by distance.
+
+    Args:
+        field: the folder that `kfgs fit` wrote (`RUN/field`).
+        out: receives gaussians.ply (and cloud.ply).
+        classes: JSON list of class names; SCENE/classes.json when not given.
+        text: .npy of one embedding per class; SCENE/text.npy when not given.
+        scene: a scene folder that holds classes.json and text.npy.
+        query: label only the Gaussians of this class (single target with threshold).
+        threshold: the paper's gamma, a cosine; from the scores' distribution when not given.
+        cloud: PLY of points or of a colour splat in the field's frame to carry the labels to.
+        distance: the paper's lambda in world units; from the clouds' spacing when not given.
+    """
+    from .fields import SemanticField
+    from .pipeline import label_cloud, label_field, query_field, save_labelled
+
+    label_set = _classes(scene, classes, text)
+    loaded = SemanticField.load(field)
+    if query is None:
+        gaussians, scores = label_field(loaded, label_set)
+    else:
+        gaussians, scores, how = query_field(loaded, label_set, query, threshold)
+        _say(how)
+    assert gaussians.labels is not None
+    written = save_labelled(out / "gaussians.ply", gaussians, scores, label_set)
+    for i, name in enumerate(label_set.names):
+        _say(f"  {name:<16s} {int((gaussians.labels == i).sum()):8d} Gaussians")
+    if cloud is not None:
+        moved, paths = label_cloud(gaussians, cloud, out / "cloud.ply", label_set, distance=distance)
+        _say(str(moved))
+        written += paths
+    _wrote(written)
+
+
+def info(path: Annotated[Path, tyro.conf.Positional]) -> None:
+    """Say what a field, a scene, or a PLY file holds.
+
+    Args:
+        path: a field folder, a run folder, a scene folder or a .ply file.
+    """
+    from .pipeline import describe
+
+    _say(describe(path))
+
+
+COMMANDS = {"demo": demo, "sfm": sfm, "fit": fit, "segment": segment, "label": label, "info": info}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; return the exit code."""
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="kfgs",
+            description="Decoupled semantic fields of 3-D Gaussians: distil, compress, segment, label.",
+            args=arguments,
+        )
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on where it stopped", file=sys.stderr)  # noqa: T201
+        return 130
+    except (ValueError, TypeError, OSError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)  # noqa: T201
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,35 @@
+"""The paper's Figure 2 as a few named, resumable calls, and what a finished field is used for."""
+
+from .apply import (
+    label_cloud,
+    label_field,
+    query_field,
+    save_labelled,
+    score_scene,
+    score_teacher,
+    segment_scene,
+    write_report,
+)
+from .describe import describe
+from .fit import FitConfig, FitResult, fit_scene, load_history
+from .pictures import write_training_pictures
+from .stages import Run, Stage
+
+__all__ = [
+    "FitConfig",
+    "FitResult",
+    "Run",
+    "Stage",
+    "describe",
+    "fit_scene",
+    "label_cloud",
+    "label_field",
+    "load_history",
+    "query_field",
+    "save_labelled",
+    "score_scene",
+    "score_teacher",
+    "segment_scene",
+    "write_report",
+    "write_training_pictures",
+]

@@ -1,0 +1,110 @@
+"""The whole main job on a room that the package makes itself, with exact ground truth to score against."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..evaluation import load_label_set
+from ..fields import SemanticField
+from ..labels import transfer_labels
+from ..scenes import load_scene
+from ..scenes.ply import write_ply
+from ..scenes.toy import ToyConfig, make_toy_room
+from ..teachers import FeatureFolder
+from .apply import (
+    label_columns,
+    label_field,
+    save_labelled,
+    score_scene,
+    score_teacher,
+    segment_scene,
+    write_report,
+)
+from .fit import FitConfig, fit_scene
+from .pictures import write_training_pictures
+
+SURFACE_PROTOCOL = (
+    "kfgs-surface/1: share of ground-truth surface points within lambda of a labelled Gaussian, and seen by a training "
+    "view, that receive their true class; points out of reach count as wrong"
+)
+
+
+def run(
+    out: str | Path,
+    config: FitConfig | None = None,
+    *,
+    room: ToyConfig | None = None,
+    report: Callable[[str], None] | None = None,
+    progress: bool = False,
+) -> list[Path]:
+    """Make the room, fit it, segment its unseen views, label its surface; return the files written.
+
+    Args:
+        out: receives `scene/`, `run/`, `segmentation/` and `scores.json`.
+        config: how to fit; the CPU preset when not given.
+        room: what to build; the default room when not given.
+        report: receives one line per step.
+        progress: show progress bars.
+    """
+    out, say = Path(out), report or (lambda text: None)
+    config = config or FitConfig.cpu()
+    say("making the toy room")
+    folder = make_toy_room(out / "scene", room or ToyConfig())
+    scene = load_scene(folder)
+    classes = load_label_set(folder / "classes.json", folder / "text.npy")
+
+    maps = FeatureFolder(folder / "features", [scene.stem(i) for i in scene.splits["train"]])
+    fitted = fit_scene(scene, maps, out / "run", config, report=say, progress=progress)
+    say(fitted.field.summary())
+
+    found = segment_scene(fitted.field, scene, classes, out / "segmentation", progress=progress)
+    scores = score_scene(found, folder / "labels", classes)
+    truth = {stem: folder / "labels" / f"{stem}.png" for stem in found}
+    test_maps = FeatureFolder(folder / "features", list(found))
+    size = scene.cameras[scene.splits["test"][0]].size
+    teacher = score_teacher(lambda stem: test_maps[list(found).index(stem)], truth, classes, size)
+    say(f"unseen views: {scores}")
+    say(f"the teacher on the same views: {teacher.miou}")
+
+    gaussians, similarity = label_field(fitted.field, classes)
+    written = save_labelled(out / "gaussians.ply", gaussians, similarity, classes)
+    surface, report_line = _label_surface(fitted.field, folder, out / "surface.ply", gaussians.labels)
+    say(report_line)
+    write_report(out / "scores.json", unseen_views=scores, teacher=teacher, surface=surface, seconds=fitted.seconds)
+    segmentation = out / "segmentation"
+    return [
+        fitted.field_path,
+        segmentation / "labels",
+        segmentation / "overlay",
+        segmentation / "features",
+        *written,
+        out / "surface.ply",
+        *write_training_pictures(out / "run"),
+        out / "scores.json",
+    ]
+
+
+def _label_surface(
+    field: SemanticField, folder: Path, out: Path, labels: torch.Tensor | None
+) -> tuple[dict[str, object], str]:
+    """Carry the Gaussians' labels to the room's true surface points and score them (protocol `kfgs-surface/1`)."""
+    assert labels is not None
+    with np.load(folder / "surface.npz") as surface:
+        points, true = torch.from_numpy(surface["points"]).float(), torch.from_numpy(surface["labels"]).long()
+        seen = torch.from_numpy(surface["seen"]) > 0
+    moved = transfer_labels(field.gaussians.means, labels, points)
+    agreement = float((moved.labels == true)[seen].float().mean())
+    columns = {name: points[:, i].contiguous().numpy() for i, name in enumerate("xyz")}
+    write_ply(out, columns | label_columns(moved.labels), comments=("labels carried by kfgs",))
+    facts = {
+        "protocol": SURFACE_PROTOCOL,
+        "agreement": agreement,
+        "distance": moved.distance,
+        "labelled": int((moved.labels >= 0).sum()),
+        "points": len(points),
+    }
+    return facts, f"surface points: {agreement:.3f} agree  [{SURFACE_PROTOCOL}]; {moved}"
