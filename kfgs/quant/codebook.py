@@ -1,0 +1,171 @@
+"""The codebook S of Sec. 3.3.1: K codewords, and the nearest of them by cosine similarity (Eq. 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .._check import check_range, check_shapes
+from ._store import read_tensors, write_tensors
+
+EPS = 1e-8  # the one epsilon of every cosine in kfgs: a row not longer than this counts as all-zero
+
+
+def unit_rows(
+    x: Tensor,  # [..., D]
+    eps: float = EPS,
+) -> Tensor:  # [..., D]
+    """Divide each row by its length, or by `eps` where it is shorter: x / max(|x|, eps).
+
+    An all-zero row stays zero, so its cosine with anything is 0 and never NaN. In half precision, where `eps` would
+    underflow, the smallest normal number of the type takes its place.
+    """
+    return x / row_norms(x)[..., None].clamp_min(max(eps, torch.finfo(x.dtype).tiny))
+
+
+def row_norms(x: Tensor) -> Tensor:  # [..., D] -> [...]
+    """Euclidean length of each row."""
+    return torch.linalg.vector_norm(x, dim=-1)
+
+
+class Nearest(NamedTuple):
+    """The nearest codeword of each feature (Eq. 5)."""
+
+    index: Tensor  # [...] int64
+    similarity: Tensor  # [...] cosine with that codeword, in [-1, 1] up to rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Codebook:
+    """K codewords of D channels, S = {f_e} in Sec. 3.3.1. Their lengths carry no meaning: only directions are compared,
+    in the codewords' precision (features of another one are converted).
+
+    Raises:
+        ValueError: if there is no codeword, or one is all-zero or not finite.
+
+    Example:
+        >>> import torch
+        >>> book = Codebook(torch.tensor([[2.0, 0.0], [0.0, 3.0]]))
+        >>> book.quantize(torch.tensor([[1.0, 0.2], [0.1, 5.0], [1.0, 1.0]]))
+        tensor([0, 1, 0])
+    """
+
+    codewords: Tensor  # [K, D]
+
+    def __post_init__(self) -> None:
+        check_shapes(("codewords", self.codewords, "K D"))
+        if self.size < 1 or not self.codewords.is_floating_point():
+            raise ValueError(
+                f"codewords: expected at least one row of floating-point numbers, got {tuple(self.codewords.shape)} "
+                f"of {self.codewords.dtype}; fit one with fit_codebook"
+            )
+        norms = row_norms(self.codewords.detach())  # K is small: this look at the values is cheap
+        bad = (~(torch.isfinite(norms) & (norms > EPS))).nonzero()[:, 0].tolist()
+        if bad:
+            raise ValueError(
+                f"codewords: expected finite rows that are not all-zero, got bad rows {bad[:8]}; leave them out"
+            )
+
+    @property
+    def size(self) -> int:
+        """Number of codewords, K."""
+        return int(self.codewords.shape[0])
+
+    @property
+    def dim(self) -> int:
+        """Channels of a codeword, D."""
+        return int(self.codewords.shape[1])
+
+    @cached_property
+    def unit(self) -> Tensor:  # [K, D]
+        """The codewords with unit length."""
+        return unit_rows(self.codewords)
+
+    def similarity(
+        self,
+        features: Tensor,  # [..., D]
+    ) -> Tensor:  # [..., K]
+        """Cosine similarity of each feature with each codeword; 0 for an all-zero feature. Differentiable."""
+        self._check_features(features)
+        return unit_rows(features.to(self.unit.dtype)) @ self.unit.T
+
+    def nearest(
+        self,
+        features: Tensor,  # [..., D]
+        *,
+        chunk: int = 65_536,
+    ) -> Nearest:
+        """The most similar codeword of each feature and how similar it is (Eq. 5), at most `chunk` features at a time.
+
+        Note:
+            Ties go to the lowest index. An all-zero feature is equally (0) similar to all, and so gets index 0 with
+            similarity 0, by which it can be told.
+        """
+        self._check_features(features)
+        check_range("chunk", chunk, 1)
+        index = torch.empty(features.shape[:-1], dtype=torch.int64, device=features.device)
+        similarity = torch.empty(features.shape[:-1], dtype=self.unit.dtype, device=features.device)
+        rows, flat_index, flat_similarity = features.reshape(-1, self.dim), index.view(-1), similarity.view(-1)
+        with torch.no_grad():
+            for start in range(0, rows.shape[0], chunk):
+                part = rows[start : start + chunk].to(self.unit.dtype)
+                # The length of a feature changes no argmax; dividing one number by it is cheaper than D.
+                best, where = (part @ self.unit.T).max(dim=-1)  # the first of equal ones
+                flat_similarity[start : start + chunk] = best / row_norms(part).clamp_min(EPS)
+                flat_index[start : start + chunk] = where
+        return Nearest(index, similarity)
+
+    def quantize(
+        self,
+        features: Tensor,  # [..., D]
+        *,
+        chunk: int = 65_536,
+    ) -> Tensor:  # [...] int64
+        """The index map M of Eq. 5: for each feature, t = argmax_e cos(f, f_e). Ties as in `nearest`."""
+        return self.nearest(features, chunk=chunk).index
+
+    def to(self, *args: Any, **kwargs: Any) -> Codebook:
+        """Move or convert the codewords as `Tensor.to` does."""
+        return Codebook(self.codewords.to(*args, **kwargs))
+
+    def to_tensors(self) -> dict[str, Tensor]:
+        """What `from_tensors` needs to make this codebook again."""
+        return {"codewords": self.codewords}
+
+    @staticmethod
+    def from_tensors(tensors: Mapping[str, Tensor]) -> Codebook:
+        """The codebook that `to_tensors` took apart; other names are ignored.
+
+        Raises:
+            ValueError: if "codewords" is missing.
+        """
+        if "codewords" not in tensors:
+            raise ValueError(f"tensors: expected the name 'codewords', got {sorted(tensors)}; use Codebook.to_tensors")
+        return Codebook(tensors["codewords"])
+
+    def save(self, path: str | Path) -> None:
+        """Write the codewords to a .safetensors file."""
+        write_tensors(path, self.to_tensors(), kind="codebook")
+
+    @staticmethod
+    def load(path: str | Path) -> Codebook:
+        """Read what `save` wrote.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if the file is not a codebook of kfgs.
+        """
+        return Codebook.from_tensors(read_tensors(path, kind="codebook"))
+
+    def _check_features(self, features: Tensor) -> None:
+        if features.ndim < 1 or features.shape[-1] != self.dim:
+            raise ValueError(
+                f"features: expected [..., D] with D = {self.dim} (from codewords), got {tuple(features.shape)}; "
+                "pass features of the teacher that the codebook was fitted to"
+            )
