@@ -1,0 +1,301 @@
+"""Scores, each with one definition that is said out loud: mIoU, accuracy, cosine, PSNR, SSIM, and bytes.
+
+`kornia.metrics` counts and compares. What it leaves open is settled here: labels to ignore, pooling over views, classes
+that do not occur, and which SSIM.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import kornia.metrics
+import torch
+from torch import Tensor
+
+from ._check import check_range, check_shapes
+from .cameras.resample import to_bchw
+
+COSINE_EPSILON = 1e-8
+"""A feature not longer than this counts as all-zero, with cosine 0 to everything; the same as in `quant`."""
+
+MIB = 2**20
+"""Bytes in the "MB" of Table 1."""
+
+PSNR_PROTOCOL = "kornia.metrics.psnr, mean squared error over all pixels and channels"
+SSIM_WINDOW = 11
+SSIM_PROTOCOL = (
+    "kornia.metrics.ssim, Gaussian window 11x11 with sigma 1.5, padding='valid', mean over all pixels and channels"
+)
+
+_EXACT_COUNT = 2**24  # kornia returns counts as float32, exact up to here
+_ATTRIBUTES = 3 + 3 + 1 + 3 + 4  # means, normals (always zero), opacity, scales, rotation
+
+
+@dataclass(frozen=True)
+class Score:
+    """A number that does not travel without the protocol it was measured under.
+
+    Example:
+        >>> print(Score("mIoU", 0.7661, "10 classes, one confusion matrix over 90 views"))
+        mIoU 0.7661 (10 classes, one confusion matrix over 90 views)
+    """
+
+    name: str
+    value: float
+    protocol: str
+
+    def __post_init__(self) -> None:
+        for field, text in (("name", self.name), ("protocol", self.protocol)):
+            if not text.strip():
+                raise ValueError(f"{field}: expected a text, got {text!r}; say what was measured and how")
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.value:.4f} ({self.protocol})"
+
+
+def confusion_matrix(
+    pred: Tensor,  # [...] integer
+    target: Tensor,  # [...] integer
+    classes: int,
+    ignore: int | Sequence[int] = -1,
+) -> Tensor:  # [C, C] int64
+    """Count how often target class r was predicted as class c, at row r and column c.
+
+    Args:
+        pred: predicted classes in [0, classes).
+        target: true classes in [0, classes), of the same shape.
+        classes: number of classes C.
+        ignore: targets that are not scored, besides -1, which never is.
+
+    Raises:
+        TypeError: if labels are not integers.
+        ValueError: if shapes differ, or a scored label lies outside [0, classes). A prediction of -1 ("none") is such
+            a label: `ConfusionMatrix` counts it as a miss.
+
+    Note:
+        kornia counts. It has no ignored label, needs two classes, and returns float32, which is exact up to 2^24
+        counts: so labels are filtered first and counted in parts.
+
+    Example:
+        >>> confusion_matrix(torch.tensor([0, 1, 1, 0]), torch.tensor([0, 1, 0, -1]), 2)
+        tensor([[1, 1],
+                [0, 1]])
+    """
+    pred, target = _scored_labels(pred, target, classes, ignore)
+    _check_labels("pred", pred, classes, "pass such predictions to ConfusionMatrix, which counts -1 as a miss")
+    return _count(pred, target, classes)
+
+
+class ConfusionMatrix:
+    """One confusion matrix, pooled over all views of an evaluation.
+
+    **Convention**: rows are the truth. Where the truth is known and the prediction is -1 ("none"), the pixel is a miss
+    of its class: it lowers that class's IoU and the accuracy, so that abstaining never pays.
+
+    Args:
+        classes: number of classes C.
+        ignore: targets that are not scored, besides -1, which never is.
+
+    Example:
+        >>> pooled = ConfusionMatrix(3)
+        >>> pooled.update(torch.tensor([0, 0]), torch.tensor([0, 1]))  # first view
+        >>> pooled.update(torch.tensor([1]), torch.tensor([1]))  # second view
+        >>> pooled.iou()
+        tensor([0.5000, 0.5000,    nan], dtype=torch.float64)
+        >>> pooled.miou()  # class 2 occurs nowhere and is left out
+        0.5
+    """
+
+    def __init__(self, classes: int, *, ignore: int | Sequence[int] = -1) -> None:
+        check_range("classes", classes, 1)
+        self.classes = classes
+        self.ignore = ignore
+        self._counts = torch.zeros(classes, classes + 1, dtype=torch.int64)  # the last column: no prediction
+
+    @property
+    def matrix(self) -> Tensor:  # [C, C] int64
+        """Counts of (truth, prediction) where there was a prediction."""
+        return self._counts[:, : self.classes].clone()
+
+    @property
+    def misses(self) -> Tensor:  # [C] int64
+        """Scored pixels of each class that were predicted as -1 ("none")."""
+        return self._counts[:, self.classes].clone()
+
+    def update(self, pred: Tensor, target: Tensor) -> None:  # [...] integer, both
+        """Add the labels of one view, or of any part of one.
+
+        Raises:
+            TypeError: if labels are not integers.
+            ValueError: if shapes differ, or a label lies outside [0, classes) and is neither -1 nor ignored.
+        """
+        pred, target = _scored_labels(pred, target, self.classes, self.ignore)
+        pred = pred.where(pred != -1, self.classes)
+        _check_labels("pred", pred, self.classes + 1, "pass class indices, or -1 for none")
+        # one class more than there are, so that the predicted "none" has a column
+        self._counts += _count(pred, target, self.classes + 1)[: self.classes].cpu()
+
+    def iou(self) -> Tensor:  # [C] float64
+        """Intersection over union of each class; NaN for a class that occurs in neither truth nor prediction."""
+        counts = self._counts.double()
+        hits = counts.diagonal()
+        union = counts.sum(dim=1) + counts[:, : self.classes].sum(dim=0) - hits
+        return hits / union  # 0 / 0 = NaN
+
+    def miou(self) -> float:
+        """Mean IoU over the classes that occur (NaN if none does)."""
+        return float(self.iou().nanmean())
+
+    def accuracy(self) -> float:
+        """Share of scored pixels that got their true class (NaN if nothing was scored)."""
+        return float(self._counts.diagonal().sum().double() / self._counts.sum())
+
+
+def feature_cosine(
+    features: Tensor,  # [..., D]
+    target: Tensor,  # [..., D]
+) -> Tensor:  # scalar
+    """Mean cosine between corresponding feature vectors.
+
+    Each vector is divided by max(|x|, `COSINE_EPSILON`), so an all-zero vector counts as cosine 0, on either side.
+
+    Raises:
+        ValueError: if shapes differ, or there is nothing to compare.
+
+    Example:
+        >>> feature_cosine(torch.tensor([[2.0, 0.0], [0.0, 0.0]]), torch.tensor([[3.0, 0.0], [1.0, 0.0]]))
+        tensor(0.5000)
+    """
+    _check_same("features", features, target)
+    if features.numel() == 0:
+        raise ValueError(
+            f"features: expected at least one vector, got shape {tuple(features.shape)}; compare something"
+        )
+    rows = [torch.nn.functional.normalize(x, dim=-1, eps=COSINE_EPSILON) for x in (features, target)]
+    return (rows[0] * rows[1]).sum(dim=-1).mean()
+
+
+def psnr(
+    image: Tensor,  # [H, W, C]
+    target: Tensor,  # [H, W, C]
+    *,
+    peak: float = 1.0,
+) -> Tensor:  # scalar
+    """Peak signal-to-noise ratio in decibels, 10 log10(peak^2 / MSE); infinite for equal pictures (`PSNR_PROTOCOL`).
+
+    Raises:
+        ValueError: if shapes differ, or `peak` is not positive.
+
+    Example:
+        >>> psnr(torch.zeros(4, 4, 3), torch.full((4, 4, 3), 0.1))
+        tensor(20.)
+    """
+    _check_same("image", image, target)
+    check_range("peak", peak, 0, closed=(False, False))
+    return kornia.metrics.psnr(image, target, peak)
+
+
+def ssim(
+    image: Tensor,  # [H, W, C]
+    target: Tensor,  # [H, W, C]
+    *,
+    peak: float = 1.0,
+) -> Tensor:  # scalar
+    """Mean structural similarity under `SSIM_PROTOCOL`: only windows that lie wholly inside the picture count.
+
+    Raises:
+        ValueError: if shapes differ, a side is shorter than the window (11), or `peak` is not positive.
+
+    Note:
+        kornia's `eps` is set to 0: its default pulls dark pictures visibly below 1 even when they are equal.
+    """
+    check_shapes(("image", image, "H W C"), ("target", target, "H W C"))
+    check_range("peak", peak, 0, closed=(False, False))
+    if min(image.shape[:2]) < SSIM_WINDOW:
+        raise ValueError(
+            f"image: expected at least {SSIM_WINDOW} pixels on each side, got {tuple(image.shape)}; use a larger picture"
+        )
+    similarity = kornia.metrics.ssim(
+        to_bchw(image), to_bchw(target), SSIM_WINDOW, max_val=float(peak), eps=0.0, padding="valid"
+    )
+    return similarity.mean()
+
+
+def semantic_storage_bytes(
+    gaussians: int,
+    channels: int,
+    decoder_parameters: int = 0,
+    codebook_values: int = 0,
+) -> int:
+    """Bytes of a semantic field as the paper's Table 1 counts them; divide by `MIB` for its "MB".
+
+    All in float32: per Gaussian 14 + d numbers (3 means, 3 normals that are always zero, opacity, 3 scales, 4 rotation,
+    d latent channels), plus the decoder and the codebook.
+
+    Args:
+        gaussians: number of Gaussians.
+        channels: d, latent channels per Gaussian.
+        decoder_parameters: weights and biases of Psi (831,744 for the paper's 9-32-64-128-256-1024-512).
+        codebook_values: K times D.
+
+    Raises:
+        ValueError: if a count is negative.
+
+    Note:
+        This is for comparing with the table; what kfgs writes to disk is smaller and is measured on disk.
+
+    Example:
+        >>> semantic_storage_bytes(1, 9)  # 23 float32
+        92
+    """
+    for name, count in (
+        ("gaussians", gaussians),
+        ("channels", channels),
+        ("decoder_parameters", decoder_parameters),
+        ("codebook_values", codebook_values),
+    ):
+        check_range(name, count, 0)
+    return 4 * (gaussians * (_ATTRIBUTES + channels) + decoder_parameters + codebook_values)
+
+
+def _scored_labels(
+    pred: Tensor, target: Tensor, classes: int, ignore: int | Sequence[int]
+) -> tuple[Tensor, Tensor]:  # [n], [n] int64
+    """The pixels whose truth is known, flattened."""
+    _check_same("pred", pred, target)
+    check_range("classes", classes, 1)
+    for name, labels in (("pred", pred), ("target", target)):
+        if labels.is_floating_point() or labels.is_complex() or labels.dtype == torch.bool:
+            raise TypeError(
+                f"{name}: expected integer labels, got {labels.dtype}; take an argmax, or convert with .long()"
+            )
+    ignored = {-1, ignore} if isinstance(ignore, int) else {-1, *ignore}
+    target = target.flatten().long()
+    known = torch.isin(target, torch.tensor(sorted(ignored), device=target.device), invert=True)
+    target, pred = target[known], pred.flatten().long()[known]
+    _check_labels("target", target, classes, "pass other labels as `ignore`, or a larger `classes`")
+    return pred, target
+
+
+def _count(pred: Tensor, target: Tensor, classes: int) -> Tensor:  # [n], [n] -> [C, C] int64
+    counted = max(classes, 2)  # kornia's least
+    matrix = torch.zeros(counted, counted, dtype=torch.int64, device=target.device)
+    for p, t in zip(pred.split(_EXACT_COUNT), target.split(_EXACT_COUNT), strict=True):
+        matrix += kornia.metrics.confusion_matrix(p[None], t[None], counted)[0].long()
+    return matrix[:classes, :classes]
+
+
+def _check_labels(name: str, labels: Tensor, classes: int, advice: str) -> None:
+    """Reads the values, which costs a device synchronisation (kornia's own check does so too)."""
+    if labels.numel() and not (labels.min() >= 0 and labels.max() < classes):
+        raise ValueError(
+            f"{name}: expected labels in [0, {classes}), got {int(labels.min())} to {int(labels.max())}; {advice}"
+        )
+
+
+def _check_same(name: str, value: Tensor, target: Tensor) -> None:
+    if value.shape != target.shape:
+        raise ValueError(
+            f"target: expected the shape of {name}, {tuple(value.shape)}, got {tuple(target.shape)}; resize one of them"
+        )
