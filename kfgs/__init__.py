@@ -1,1 +1,88 @@
-"""TODO."""
+"""Decoupled semantic fields of 3-D Gaussians: distil, compress, segment, label, edit.
+
+Names are imported when first used, so that `import kfgs` is quick and works on a headless machine.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+_WHERE = {
+    "Gaussians": ".gaussians",
+    "Camera": ".cameras",
+    "Distortion": ".cameras",
+    "resize_map": ".cameras",
+    "Rendering": ".splat",
+    "rasterize": ".splat",
+    "available_engines": ".splat",
+    "Autoencoder": ".quant",
+    "AutoencoderConfig": ".quant",
+    "Codebook": ".quant",
+    "CodebookConfig": ".quant",
+    "fit_autoencoder": ".quant",
+    "fit_codebook": ".quant",
+    "quantize_maps": ".quant",
+    "Scene": ".scenes",
+    "SceneError": ".scenes",
+    "load_scene": ".scenes",
+    "run_sfm": ".scenes",
+    "transfer_labels": ".labels",
+    "FeatureFolder": ".teachers",
+    "FieldConfig": ".fields",
+    "GaussianParams": ".fields",
+    "SemanticField": ".fields",
+    "fit_field": ".fields",
+    "FitConfig": ".pipeline",
+    "fit_scene": ".pipeline",
+    "segment_scene": ".pipeline",
+    "score_scene": ".pipeline",
+    "LabelSet": ".evaluation",
+    "evaluate_segmentation": ".evaluation",
+    "load_label_set": ".evaluation",
+}
+__version__ = "0.1.0"
+__all__ = sorted(_WHERE)  # noqa: PLE0605 - the table is the list
+
+if TYPE_CHECKING:
+    from .cameras import Camera as Camera
+    from .cameras import Distortion as Distortion
+    from .cameras import resize_map as resize_map
+    from .evaluation import LabelSet as LabelSet
+    from .evaluation import evaluate_segmentation as evaluate_segmentation
+    from .evaluation import load_label_set as load_label_set
+    from .fields import FieldConfig as FieldConfig
+    from .fields import GaussianParams as GaussianParams
+    from .fields import SemanticField as SemanticField
+    from .fields import fit_field as fit_field
+    from .gaussians import Gaussians as Gaussians
+    from .labels import transfer_labels as transfer_labels
+    from .pipeline import FitConfig as FitConfig
+    from .pipeline import fit_scene as fit_scene
+    from .pipeline import score_scene as score_scene
+    from .pipeline import segment_scene as segment_scene
+    from .quant import Autoencoder as Autoencoder
+    from .quant import AutoencoderConfig as AutoencoderConfig
+    from .quant import Codebook as Codebook
+    from .quant import CodebookConfig as CodebookConfig
+    from .quant import fit_autoencoder as fit_autoencoder
+    from .quant import fit_codebook as fit_codebook
+    from .quant import quantize_maps as quantize_maps
+    from .scenes import Scene as Scene
+    from .scenes import SceneError as SceneError
+    from .scenes import load_scene as load_scene
+    from .scenes import run_sfm as run_sfm
+    from .splat import Rendering as Rendering
+    from .splat import available_engines as available_engines
+    from .splat import rasterize as rasterize
+    from .teachers import FeatureFolder as FeatureFolder
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _WHERE:
+        raise AttributeError(f"module 'kfgs' has no attribute {name!r}; public names: {', '.join(__all__)}")
+    return getattr(import_module(_WHERE[name], __name__), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

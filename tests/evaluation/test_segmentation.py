@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from kfgs.evaluation import PROTOCOL, evaluate_segmentation, load_label_map
+
+
+def _save(path, rows):
+    Image.fromarray(np.array(rows, np.uint8)).save(path)
+    return path
+
+
+def test_pooled_scores_by_hand(tmp_path):
+    truth = {
+        "a": _save(tmp_path / "a.png", [[0, 0], [1, 255]]),
+        "b": _save(tmp_path / "b.png", [[1, 1], [1, 1]]),
+    }
+    predictions = {"a": torch.tensor([[0, 1], [1, 0]]), "b": torch.tensor([[1, 1], [1, -1]])}
+    report = evaluate_segmentation(predictions.__getitem__, truth, ["x", "y", "absent"])
+    # x: 1 hit, union 2 (the void pixel counts nowhere); y: 4 hits, union 5 truth + 1 false; absent: left out
+    assert report.iou[0] == pytest.approx(1 / 2)
+    assert report.iou[1] == pytest.approx(4 / 6)
+    assert torch.isnan(report.iou[2])
+    assert report.miou.value == pytest.approx((1 / 2 + 4 / 6) / 2)
+    assert report.accuracy.value == pytest.approx(5 / 7)
+    assert "kfgs-pooled/1" in str(report.miou)
+    assert report.to_json()["iou"]["absent"] is None
+    assert report.to_json()["protocol"] == PROTOCOL
+
+
+def test_pooling_is_not_a_mean_over_images(tmp_path):
+    truth = {"a": _save(tmp_path / "a.png", [[0] * 4]), "b": _save(tmp_path / "b.png", [[0, 1, 1, 1]])}
+    predictions = {"a": torch.zeros(1, 4, dtype=torch.int64), "b": torch.tensor([[1, 1, 1, 1]])}
+    report = evaluate_segmentation(predictions.__getitem__, truth, ["x", "y"])
+    assert report.miou.value == pytest.approx((4 / 5 + 3 / 4) / 2)
+    per_image = (1.0 + (0 + 3 / 4) / 2) / 2
+    assert abs(report.miou.value - per_image) > 0.05
+
+
+def test_small_predictions_are_enlarged_by_nearest_neighbour(tmp_path):
+    truth = {"a": _save(tmp_path / "a.png", np.repeat(np.repeat([[0, 1], [2, 0]], 2, 0), 3, 1))}
+    report = evaluate_segmentation(lambda stem: torch.tensor([[0, 1], [2, 0]]), truth, ["x", "y", "z"])
+    assert report.miou.value == 1.0
+
+
+def test_bad_input_is_named(tmp_path):
+    with pytest.raises(ValueError, match="at least one label picture"):
+        evaluate_segmentation(lambda stem: torch.zeros(1, 1), {}, ["x"])
+    path = _save(tmp_path / "a.png", [[0, 7]])
+    with pytest.raises(ValueError, match="a.png: expected labels below 2.*got 7"):
+        evaluate_segmentation(lambda stem: torch.zeros(1, 2, dtype=torch.int64), {"a": path}, ["x", "y"])
+    with pytest.raises(FileNotFoundError, match="label picture"):
+        load_label_map(tmp_path / "none.png")
+    Image.fromarray(np.zeros((2, 2, 3), np.uint8)).save(tmp_path / "rgb.png")
+    with pytest.raises(ValueError, match="8-bit class indices.*RGB"):
+        load_label_map(tmp_path / "rgb.png")
+
+
+def test_void_is_minus_one(tmp_path):
+    path = _save(tmp_path / "a.png", [[3, 255]])
+    assert load_label_map(path).tolist() == [[3, -1]]

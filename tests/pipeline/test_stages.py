@@ -1,0 +1,77 @@
+import json
+
+import pytest
+
+from kfgs.pipeline.stages import Run
+
+
+def _maker(calls: list[str], name: str):
+    def make(folder):
+        calls.append(name)
+        (folder / "value").write_text(name)
+
+    return make
+
+
+def test_a_finished_stage_is_found_again_by_another_process(tmp_path):
+    calls: list[str] = []
+    first = Run(tmp_path).stage("a", {"x": 1}, _maker(calls, "one"))
+    again = Run(tmp_path).stage("a", {"x": 1}, _maker(calls, "two"))
+    assert calls == ["one"]
+    assert not first.reused
+    assert again.reused
+    assert again.key == first.key
+    assert again.seconds == first.seconds
+    assert (again.folder / "value").read_text() == "one"
+
+
+def test_other_inputs_make_another_stage_and_keep_the_first(tmp_path):
+    calls: list[str] = []
+    run = Run(tmp_path)
+    one = run.stage("a", {"x": 1}, _maker(calls, "one"))
+    two = run.stage("a", {"x": 2}, _maker(calls, "two"))
+    assert calls == ["one", "two"]
+    assert one.key != two.key
+    assert (one.folder / "value").read_text() == "one"
+
+
+def test_a_killed_stage_leaves_nothing_and_is_made_again(tmp_path):
+    def dies(folder):
+        (folder / "half").write_text("half")
+        raise KeyboardInterrupt
+
+    run = Run(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        run.stage("a", {}, dies)
+    assert list((tmp_path / "stages").iterdir()) == []
+    calls: list[str] = []
+    stage = run.stage("a", {}, _maker(calls, "whole"))
+    assert sorted(path.name for path in stage.folder.iterdir()) == ["stage.json", "value"]
+
+
+def test_a_stage_of_other_inputs_under_the_same_key_is_refused(tmp_path):
+    run = Run(tmp_path)
+    stage = run.stage("a", {"x": 1}, lambda folder: None)
+    about = json.loads((stage.folder / "stage.json").read_text())
+    (stage.folder / "stage.json").write_text(json.dumps(about | {"inputs": {"x": 2}}))
+    with pytest.raises(ValueError, match="found another's; delete the folder"):
+        run.stage("a", {"x": 1}, lambda folder: None)
+
+
+def test_digests_follow_content_not_names_and_are_cached(tmp_path):
+    run = Run(tmp_path / "run")
+    path = tmp_path / "f.bin"
+    path.write_bytes(b"one")
+    before = run.digests([path])["f.bin"]
+    assert run.digests([path])["f.bin"] == before
+    path.write_bytes(b"two!")
+    assert run.digests([path])["f.bin"] != before
+    path.write_bytes(b"one")
+    assert run.digests([path])["f.bin"] == before
+
+
+def test_reports_say_what_was_made_and_what_was_found(tmp_path):
+    lines: list[str] = []
+    Run(tmp_path, lines.append).stage("a", {}, lambda folder: None)
+    Run(tmp_path, lines.append).stage("a", {}, lambda folder: None)
+    assert [line.split(" in ")[0] for line in lines] == ["a: working", "a: done", "a: found"]
