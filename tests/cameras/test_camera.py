@@ -1,0 +1,102 @@
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from kfgs.cameras import Camera, Distortion
+
+K = torch.tensor([[70.0, 0.0, 50.0], [0.0, 66.0, 30.5], [0.0, 0.0, 1.0]])
+
+
+def changed(matrix, row, column, value):
+    matrix = matrix.clone()
+    matrix[row, column] = value
+    return matrix
+
+
+def test_center_maps_to_the_origin_of_the_camera():
+    rotation = pycolmap.Rotation3d(np.array([0.1, -0.2, 0.3, 0.9]) / np.linalg.norm([0.1, -0.2, 0.3, 0.9]))
+    pose = pycolmap.Rigid3d(rotation, np.array([0.5, -1.0, 2.0]))
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3] = torch.from_numpy(pose.matrix())
+    camera = Camera(viewmat, K.double(), 96, 64)
+    expected = torch.from_numpy(pose.inverse().translation)
+    torch.testing.assert_close(camera.center, expected)
+    assert (camera.viewmat[:3, 3] - expected).norm() > 1  # the wrong reading: the translation is not the position
+
+
+def test_size_is_height_then_width():
+    assert Camera(torch.eye(4), K, 96, 64).size == (64, 96)
+
+
+def test_resized_agrees_with_colmap_and_not_with_integer_centers():
+    camera = Camera(torch.eye(4), K.double(), 96, 64).resized(48, 48)
+    colmap = pycolmap.Camera(model="PINHOLE", width=96, height=64, params=[70, 66, 50, 30.5])
+    colmap.rescale(48, 48)
+    np.testing.assert_allclose(camera.K.numpy(), colmap.calibration_matrix())
+    assert camera.size == (48, 48)
+    integer_centers = (50 + 0.5) * 0.5 - 0.5  # how cx scales when centres lie on integers
+    assert abs(integer_centers - float(camera.K[0, 2])) > 0.2
+
+
+def test_resized_keeps_the_lens():
+    lens = Distortion("brown_conrady", (-0.1, 0, 0, 0))
+    assert Camera(torch.eye(4), K, 96, 64, distortion=lens).resized(32, 48).distortion == lens
+
+
+def test_intrinsics_at_integer_centers_move_only_the_principal_point():
+    shifted = Camera(torch.eye(4), K, 96, 64).intrinsics_at_integer_centers
+    assert shifted.tolist() == [[70, 0, 49.5], [0, 66, 30], [0, 0, 1]]
+    assert K[0, 2] == 50  # the camera's own matrix is left alone
+
+
+def test_to_converts_both_matrices():
+    camera = Camera(torch.eye(4), K, 96, 64).to(torch.float64)
+    assert camera.viewmat.dtype == camera.K.dtype == torch.float64
+
+
+def test_gradient_reaches_pose_and_intrinsics():
+    viewmat, intrinsics = torch.eye(4).requires_grad_(), K.clone().requires_grad_()
+    camera = Camera(viewmat, intrinsics, 96, 64).resized(32, 48)
+    (camera.center.sum() + camera.K.sum()).backward()
+    assert viewmat.grad[:3, 3].tolist() == [-1, -1, -1]
+    assert intrinsics.grad[0, 2] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "match"),
+    [
+        ({"K": torch.eye(4)}, ValueError, r"K: expected \[3, 3\]"),
+        ({"viewmat": torch.eye(3)}, ValueError, r"viewmat: expected \[4, 4\]"),
+        ({"K": torch.eye(3, dtype=torch.int64)}, TypeError, r"K: expected floating point, got torch.int64; .*float"),
+        ({"width": 0}, ValueError, "width: expected a positive whole number of pixels, got 0"),
+        ({"height": 3.5}, ValueError, "height: expected a positive whole number of pixels, got 3.5"),
+        ({"K": changed(K, 0, 0, float("nan"))}, ValueError, r"finite.*camera 'a.png'.*leave this view out"),
+        ({"viewmat": changed(torch.eye(4), 0, 3, float("inf"))}, ValueError, "viewmat, K: expected finite"),
+        ({"K": changed(K, 0, 1, 0.1)}, ValueError, r"K: expected .* without skew"),
+        ({"K": changed(K, 2, 2, 2.0)}, ValueError, r"K: expected \[\[fx"),
+        ({"K": changed(K, 0, 0, -1.0)}, ValueError, r"K\[0, 0\] \(fx\): expected a number in \(0, inf\)"),
+        ({"K": changed(K, 1, 1, 0.0)}, ValueError, r"K\[1, 1\] \(fy\)"),
+        ({"viewmat": torch.diag(torch.tensor([2.0, 2, 2, 1]))}, ValueError, "rigid motion.*remove any scale"),
+        ({"viewmat": torch.diag(torch.tensor([1.0, 1, -1, 1]))}, ValueError, "reflection.*handedness"),
+        ({"viewmat": changed(torch.eye(4), 3, 0, 1.0)}, ValueError, "last row 0 0 0 1"),
+    ],
+)
+def test_refuses(change, error, match):
+    good = {"viewmat": torch.eye(4), "K": K, "width": 96, "height": 64, "name": "a.png"}
+    Camera(**good)
+    with pytest.raises(error, match=match):
+        Camera(**good | change)
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients", "match"),
+    [
+        ("fov", (0.1,), "model: expected one of 'brown_conrady', 'kannala_brandt', got 'fov'"),
+        ("brown_conrady", (0.1,), "expected 4 or 5 or 8 numbers for brown_conrady, got 1; pad with zeros"),
+        ("kannala_brandt", (0.1, 0, 0, 0, 0), "expected 4 numbers for kannala_brandt, got 5"),
+        ("brown_conrady", (0.1, float("nan"), 0, 0), r"coefficients\[1\]: expected a number in \(-inf, inf\), got nan"),
+    ],
+)
+def test_distortion_refuses(model, coefficients, match):
+    with pytest.raises(ValueError, match=match):
+        Distortion(model, coefficients)

@@ -1,0 +1,64 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from kfgs.cameras import Distortion, fold_radius
+from kfgs.cameras.distortion import plane_to_pixel
+from oracles_cameras import LENSES
+
+K = torch.tensor([[70.0, 0.0, 50.0], [0.0, 66.0, 30.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def test_no_lens_never_folds():
+    assert fold_radius(None) == math.inf
+    assert fold_radius(Distortion("brown_conrady", (0.1, 0.2, 0, 0))) == math.inf
+
+
+def test_fisheye_fold_in_closed_form():
+    # theta - theta^3 turns at theta = 1 / sqrt(3)
+    assert fold_radius(Distortion("kannala_brandt", (-1.0, 0, 0, 0))) == pytest.approx(math.tan(1 / math.sqrt(3)))
+    # theta - theta^3 / 12 turns at 2 radians, which no ray in front of the camera reaches
+    assert fold_radius(Distortion("kannala_brandt", (-1 / 12, 0, 0, 0))) == math.inf
+
+
+def test_rational_pole_ends_the_model():
+    # k1 = 0.5, k4 = -0.25: the denominator vanishes at r = 2 and the radius grows up to there
+    assert fold_radius(Distortion("brown_conrady", (0.5, 0, 0, 0, 0, -0.25, 0, 0))) == pytest.approx(2)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [Distortion(kind, coefficients) for _, kind, coefficients in LENSES.values()]
+    + [Distortion("brown_conrady", (-0.3, 0.08, 0.0, 0.0)), Distortion("kannala_brandt", (-0.3, 0.01, 0.0, 0.0))],
+    ids=str,
+)
+def test_fold_is_where_the_radius_stops_growing(lens):
+    """Against the largest radius up to which a dense sampling of the radial map grows."""
+    if lens.model == "brown_conrady":
+        lens = Distortion(lens.model, (*lens.coefficients[:2], 0.0, 0.0, *lens.coefficients[4:]))
+    r = np.linspace(1e-4, 6, 60001)
+    plane = torch.from_numpy(np.stack([r, np.zeros_like(r)], 1))
+    mapped = plane_to_pixel(plane, torch.eye(3, dtype=torch.float64), lens)[:, 0].numpy()
+    falls = np.flatnonzero(np.diff(mapped) < 0)
+    expected = r[falls[0]] if len(falls) else math.inf
+    found = fold_radius(lens)
+    if found > r[-1]:
+        assert expected == math.inf
+    else:
+        assert found == pytest.approx(expected, abs=3e-4)
+
+
+def test_slopes_are_clamped_only_with_a_lens():
+    far = torch.tensor([[1e12, 0.0]])
+    lens = Distortion("brown_conrady", (0.0, 0.0, 0.0, 0.0, 1.0))
+    assert torch.isfinite(plane_to_pixel(far, K.float(), lens)).all()
+    assert plane_to_pixel(far.double(), K)[0, 0] == pytest.approx(70e12)
+
+
+def test_shape_of_the_plane_is_kept():
+    plane = torch.zeros(2, 5, 2, dtype=torch.float64)
+    for _, kind, coefficients in LENSES.values():
+        pixels = plane_to_pixel(plane, K, Distortion(kind, coefficients))
+        assert pixels.shape == (2, 5, 2)
+        torch.testing.assert_close(pixels[1, 3], torch.tensor([50.0, 30.5], dtype=torch.float64))
