@@ -1,1 +1,28 @@
 """Gaussian splatting: project, bin, composite."""
+
+from .covariance import covariance_3d
+from .engines import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, accumulate_pixels, available_engines, composite
+from .project import Projected, project
+from .rasterize import Rendering, rasterize
+from .sh import SH_C0, evaluate_sh, rgb_to_sh0, sh0_to_rgb
+from .tiles import Tiles, bin_tiles
+
+__all__ = [
+    "ALPHA_MAX",
+    "ALPHA_MIN",
+    "SH_C0",
+    "TRANSMITTANCE_MIN",
+    "Projected",
+    "Rendering",
+    "Tiles",
+    "accumulate_pixels",
+    "available_engines",
+    "bin_tiles",
+    "composite",
+    "covariance_3d",
+    "evaluate_sh",
+    "project",
+    "rasterize",
+    "rgb_to_sh0",
+    "sh0_to_rgb",
+]

@@ -35,9 +35,9 @@ class Tiles(NamedTuple):
 def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16) -> Tiles:
     """List the Gaussians of every tile.
 
-    A Gaussian is listed exactly where it may have alpha >= 1/255 at the centre of one of the tile's pixels: the smallest
-    value of its quadratic form over the rectangle spanned by the pixel centres is compared with 2 ln(255 opacity), and
-    kept in doubt of rounding.
+    A Gaussian is listed where alpha reaches 1/255 somewhere in the rectangle spanned by the tile's pixel centres: the
+    smallest value of its quadratic form there is compared with 2 ln(255 opacity), and in doubt of rounding it is kept.
+    So no pair that an engine would composite is missing, and few are listed for nothing.
 
     Args:
         projected: M projected Gaussians in increasing order of index, as `project` returns them.

@@ -1,0 +1,83 @@
+"""From Gaussians and a camera to a map: project, bin, composite."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+from ..cameras.camera import Camera
+from ..gaussians import Gaussians
+from .engines import composite
+from .project import Projected, project
+from .sh import evaluate_sh
+from .tiles import bin_tiles
+
+
+class Rendering(NamedTuple):
+    """What a camera sees."""
+
+    map: Tensor  # [H, W, D] features, or red, green, blue
+    alpha: Tensor  # [H, W] opacity in [0, 1): 1 - transmittance
+    projected: Projected  # the visible Gaussians on the image plane
+
+
+def rasterize(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    background: Tensor | None = None,  # [D]
+    engine: str = "auto",
+    near: float = 0.2,
+) -> Rendering:
+    """Render the Gaussians' features, or their colour where they have no features.
+
+    Colour comes from `gaussians.sh` along the direction from the camera to each mean. `projected.means2d` is part of the
+    graph: a caller may call `projected.means2d.retain_grad()` before the backward pass (densification does).
+
+    Args:
+        gaussians: with `features` or `sh`.
+        camera: a pinhole; undistort a picture from a distorting lens first.
+        background: what shows through, zeros if None; one value per channel.
+        engine: see `composite`.
+        near: smallest depth that is drawn, world units.
+
+    Returns:
+        The map, its opacity, and the projected Gaussians; differentiable in all tensors of `gaussians` and in
+        `background`. Without a visible Gaussian the map is the background.
+
+    Raises:
+        ValueError: if there is nothing to render with, the camera has distortion, or `background` has another number of
+            channels.
+        ImportError: if a named engine is missing.
+
+    Example:
+        >>> import torch
+        >>> camera = Camera(torch.eye(4), torch.tensor([[10.0, 0, 2], [0, 10, 2], [0, 0, 1]]), 4, 4)
+        >>> ball = Gaussians(
+        ...     means=torch.tensor([[0.0, 0.0, 2.0]]),
+        ...     quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        ...     scales=torch.full((1, 3), 0.1),
+        ...     opacities=torch.tensor([0.5]),
+        ...     features=torch.tensor([[1.0, 2.0]]),
+        ... )
+        >>> rendering = rasterize(ball, camera, engine="reference")
+        >>> rendering.map.shape, rendering.alpha[1, 1] > rendering.alpha[0, 0]
+        (torch.Size([4, 4, 2]), tensor(True))
+    """
+    if gaussians.features is None and gaussians.sh is None:
+        raise ValueError("gaussians: expected features or sh to render, got neither; add them with gaussians.replace()")
+    projected = project(gaussians, camera, near=near)
+    tiles = bin_tiles(projected, camera.width, camera.height)
+    splats = projected.means2d, projected.conics, projected.opacities
+    maps, alphas = composite(*splats, _seen(gaussians, camera, projected), tiles, background=background, engine=engine)
+    return Rendering(maps, alphas, projected)
+
+
+def _seen(gaussians: Gaussians, camera: Camera, projected: Projected) -> Tensor:  # [M, D]
+    """What each visible Gaussian shows to the camera."""
+    if gaussians.features is not None:
+        return gaussians.features[projected.index]
+    assert gaussians.sh is not None
+    directions = gaussians.means[projected.index] - camera.center.to(gaussians.means)
+    return evaluate_sh(gaussians.sh[projected.index], directions)

@@ -1,0 +1,86 @@
+"""View-dependent colour from real spherical harmonics, degree 0 to 3, in the order and signs of 3DGS."""
+
+from __future__ import annotations
+
+from math import pi, sqrt
+
+import torch
+from torch import Tensor
+
+from .._check import check_shapes
+
+SH_C0 = 0.5 * sqrt(1 / pi)
+"""The constant harmonic, 0.28209...: rgb = SH_C0 * coefficient + 0.5 at degree 0."""
+
+_C1 = sqrt(3 / (4 * pi))
+_C2 = sqrt(15 / (4 * pi)), sqrt(5 / (16 * pi)), sqrt(15 / (16 * pi))
+_C3 = sqrt(35 / (32 * pi)), sqrt(105 / (4 * pi)), sqrt(21 / (32 * pi)), sqrt(7 / (16 * pi)), sqrt(105 / (16 * pi))
+
+
+def evaluate_sh(
+    sh: Tensor,  # [N, K, 3], K = 1, 4, 9 or 16
+    directions: Tensor,  # [N, 3]
+) -> Tensor:  # [N, 3]
+    """Colour of each Gaussian seen along a direction: max(0, sum of sh * Y(direction) + 0.5), as 3DGS does.
+
+    **Convention**: directions point from the camera to the Gaussian, in world axes, and are normalised here. Coefficients
+    go by degree l, then order m = -l..l; the harmonics carry the Condon-Shortley phase, so band 1 is (-y, z, -x).
+
+    Args:
+        sh: coefficients for red, green, blue.
+        directions: of any length; a zero one sees the terms without x, y, z only.
+
+    Returns:
+        Colours >= 0, not bounded above; the gradient is zero where a channel is clamped.
+
+    Raises:
+        ValueError: if shapes disagree or K is not a full set of degrees up to 3.
+
+    Example:
+        >>> sh = torch.zeros(1, 4, 3)
+        >>> sh[0, 2] = 0.5  # the coefficient of z
+        >>> evaluate_sh(sh, torch.tensor([[0.0, 0.0, 2.0]]))
+        tensor([[0.7443, 0.7443, 0.7443]])
+    """
+    K = check_shapes(("sh", sh, "N K 3"), ("directions", directions, "N 3"))["K"]
+    if K not in (1, 4, 9, 16):
+        raise ValueError(f"sh: expected 1, 4, 9 or 16 coefficients (degree 0 to 3), got {K}; cut it to a full degree")
+    return (torch.einsum("nk,nkc->nc", _basis(directions, K), sh) + 0.5).clamp(min=0)
+
+
+def rgb_to_sh0(rgb: Tensor) -> Tensor:
+    """The degree-0 coefficient that shows `rgb` from everywhere; any shape."""
+    return (rgb - 0.5) / SH_C0
+
+
+def sh0_to_rgb(sh0: Tensor) -> Tensor:
+    """The colour that a degree-0 coefficient shows, unclamped; the inverse of `rgb_to_sh0`."""
+    return sh0 * SH_C0 + 0.5
+
+
+def _basis(directions: Tensor, K: int) -> Tensor:  # [N, 3] -> [N, K]
+    """The first K real spherical harmonics of each direction."""
+    x, y, z = torch.nn.functional.normalize(directions, dim=1).unbind(1)
+    terms = [torch.full_like(x, SH_C0)]
+    if K > 1:
+        terms += [-_C1 * y, _C1 * z, -_C1 * x]
+    if K > 4:
+        xx, yy, zz = x * x, y * y, z * z
+        terms += [
+            _C2[0] * x * y,
+            -_C2[0] * y * z,
+            _C2[1] * (2 * zz - xx - yy),
+            -_C2[0] * x * z,
+            _C2[2] * (xx - yy),
+        ]
+    if K > 9:
+        terms += [
+            -_C3[0] * y * (3 * xx - yy),
+            _C3[1] * x * y * z,
+            -_C3[2] * y * (4 * zz - xx - yy),
+            _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+            -_C3[2] * x * (4 * zz - xx - yy),
+            _C3[4] * z * (xx - yy),
+            -_C3[0] * x * (xx - 3 * yy),
+        ]
+    return torch.stack(terms, dim=1)
