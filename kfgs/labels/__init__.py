@@ -1,1 +1,25 @@
-"""TODO."""
+"""Labels: classes of codewords, pixels and Gaussians, their transfer to the colour field, and edits (Sec. 3.4)."""
+
+from .classify import Classification, CodewordLabels, Selection, classify, label_codewords, select_by_query
+from .edit import extract, recolor, remove
+from .segment import label_pixels, nearest_codeword
+from .threshold import similarity_threshold
+from .transfer import Transfer, default_distance, transfer_labels
+
+__all__ = [
+    "Classification",
+    "CodewordLabels",
+    "Selection",
+    "Transfer",
+    "classify",
+    "default_distance",
+    "extract",
+    "label_codewords",
+    "label_pixels",
+    "nearest_codeword",
+    "recolor",
+    "remove",
+    "select_by_query",
+    "similarity_threshold",
+    "transfer_labels",
+]

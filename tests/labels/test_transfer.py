@@ -1,0 +1,172 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from oracles_labels import transfer as oracle
+
+from kfgs.labels import default_distance, transfer_labels
+
+
+def points(n, seed, scale=1.0):
+    return torch.rand(n, 3, generator=torch.Generator().manual_seed(seed)) * scale
+
+
+@pytest.mark.parametrize("distance", [0.05, 0.2, 5.0])
+def test_agrees_with_the_oracle(distance):
+    src, dst = points(150, 0), points(200, 1)
+    labels = torch.randint(-1, 4, (150,), generator=torch.Generator().manual_seed(2))
+    result = transfer_labels(src, labels, dst, distance)
+    expected_labels, expected_sources, expected_distances = oracle(src, labels, dst, distance)
+    np.testing.assert_array_equal(result.labels, expected_labels)
+    np.testing.assert_array_equal(result.sources, expected_sources)
+    np.testing.assert_allclose(result.distances, expected_distances, rtol=1e-6)
+    assert result.labelled == (expected_labels >= 0).sum()
+    assert result.labelled + result.orphaned == 200
+    assert (result.distance, result.how) == (distance, "given")
+
+
+def test_distance_is_strict():
+    src, dst = torch.tensor([[0.0, 0.0, 0.0]]), torch.tensor([[0.5, 0.0, 0.0]])
+    assert transfer_labels(src, torch.tensor([7]), dst, 0.5).labels.tolist() == [-1]
+    assert transfer_labels(src, torch.tensor([7]), dst, math.nextafter(0.5, 1)).labels.tolist() == [7]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_tie_goes_to_the_lowest_index_in_any_order(seed):
+    """12 sources at the corners of an icosahedron-like ring, all exactly 5 away: more equals than neighbours asked for."""
+    offsets = [(x, y, 0) for x in (-3, 3) for y in (-4, 4)] + [(x, 0, z) for x in (-3, 3) for z in (-4, 4)]
+    offsets += [(0, y, z) for y in (-3, 3) for z in (-4, 4)] + [(6, 0, 0)]
+    order = torch.randperm(13, generator=torch.Generator().manual_seed(seed))
+    src = torch.tensor(offsets, dtype=torch.float32)[order] + 10
+    result = transfer_labels(src, torch.arange(13), torch.full((1, 3), 10.0), 9.0)
+    lowest = next(i for i in range(13) if order[i] != 12)
+    assert (result.sources.tolist(), result.labels.tolist()) == ([lowest], [lowest])
+    assert result.distances.tolist() == [5.0]
+
+
+def test_lattice_ties_agree_with_the_oracle():
+    axis = torch.arange(5.0)
+    src = torch.cartesian_prod(axis, axis, axis)[torch.randperm(125, generator=torch.Generator().manual_seed(3))]
+    dst = torch.cartesian_prod(axis[:4], axis[:4], axis[:4]) + torch.tensor([0.5, 0.5, 0.0])
+    dst = torch.cat([dst, dst + torch.tensor([0.0, 0.0, 0.5])])  # centres of faces and of cubes
+    result = transfer_labels(src, torch.arange(125), dst, 2.0)
+    np.testing.assert_array_equal(result.sources, oracle(src, np.arange(125), dst, 2.0)[1])
+
+
+def test_many_sources_at_one_position_are_quick_and_the_first_speaks():
+    src = torch.zeros(20000, 3)
+    labels = torch.ones(20000, dtype=torch.int64)
+    labels[0], labels[1] = -1, 2
+    result = transfer_labels(src, labels, torch.full((500, 3), 0.1), 1.0)
+    assert (result.labels == 2).all()
+    assert (result.sources == 1).all()
+    assert result.ambiguous == 500
+
+
+def test_unlabelled_sources_neither_give_nor_hide():
+    src = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    result = transfer_labels(src, torch.tensor([-1, 4]), torch.tensor([[0.1, 0.0, 0.0]]), 2.0)
+    assert (result.labels.tolist(), result.sources.tolist()) == ([4], [1])
+
+
+def test_ambiguous_counts_other_labels_in_range_only():
+    src = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
+    dst = torch.tensor([[0.4, 0.0, 0.0], [-0.5, 0.0, 0.0], [5.2, 0.0, 0.0], [50.0, 0.0, 0.0]])
+    result = transfer_labels(src, torch.tensor([0, 1, 0]), dst, 1.0)
+    assert (result.labelled, result.orphaned, result.ambiguous) == (3, 1, 1)
+
+
+@pytest.mark.parametrize("distance", [None, 0.3])
+def test_no_labelled_source_orphans_everything(distance):
+    dst = points(6, 4)
+    for src, labels in ((torch.empty(0, 3), torch.empty(0, dtype=torch.int64)), (points(3, 5), torch.full((3,), -1))):
+        result = transfer_labels(src, labels, dst, distance)
+        assert result.labels.tolist() == [-1] * 6
+        assert result.sources.tolist() == [-1] * 6
+        assert result.distances.tolist() == [math.inf] * 6
+        assert (result.labelled, result.orphaned, result.ambiguous) == (0, 6, 0)
+
+
+def test_no_destinations_are_no_trouble():
+    result = transfer_labels(points(5, 6), torch.arange(5), torch.empty(0, 3))
+    assert (result.labels.shape, result.labelled, result.orphaned) == ((0,), 0, 0)
+
+
+def test_dtypes_of_the_result():
+    result = transfer_labels(points(5, 6), torch.arange(5, dtype=torch.uint8), points(4, 7).double(), 1.0)
+    assert (result.labels.dtype, result.sources.dtype, result.distances.dtype) == (
+        torch.int64,
+        torch.int64,
+        torch.float64,
+    )
+
+
+def test_default_distance_covers_nine_in_ten_between_its_bounds():
+    axis = torch.arange(10.0)
+    grid = torch.cartesian_prod(axis, axis, torch.zeros(1))  # spacing 1
+    above = lambda height: grid + torch.tensor([0.0, 0.0, height])  # noqa: E731
+    assert default_distance(grid, above(4.0)) == pytest.approx(4)  # as far as the destinations are
+    assert default_distance(grid, above(0.5)) == pytest.approx(2)  # no less than 2 spacings
+    assert default_distance(grid, above(100.0)) == pytest.approx(10)  # no more than 10
+    tail = torch.cat([above(4.0)[:95], above(1000.0)[:5]])  # a few floaters do not stretch it
+    assert default_distance(grid, tail) == pytest.approx(4)
+
+
+def test_default_distance_scales_and_moves_with_the_scene():
+    src, dst = points(400, 8).double(), points(300, 9).double()
+    expected = default_distance(src, dst)
+    assert default_distance(src * 37, dst * 37) == pytest.approx(37 * expected)
+    assert default_distance(src + 5, dst + 5) == pytest.approx(expected)
+
+
+def test_default_distance_is_used_and_explained():
+    src, dst = points(400, 8), points(300, 9)
+    result = transfer_labels(src, torch.zeros(400, dtype=torch.int64), dst)
+    assert result.distance == default_distance(src, dst)
+    assert result.labelled >= 0.9 * 300 - 1
+    assert "source spacings" in result.how
+    assert "orphaned" in repr(result)
+
+
+def test_one_source_position_has_a_default_distance():
+    result = transfer_labels(torch.ones(3, 3), torch.tensor([5, 5, 5]), torch.ones(2, 3))
+    assert result.labels.tolist() == [5, 5]
+    assert result.distance > 0
+
+
+@pytest.mark.parametrize(
+    ("src", "labels", "dst", "distance", "error", "message"),
+    [
+        (torch.ones(2, 3), torch.zeros(3), torch.ones(1, 3), 1.0, ValueError, r"src_labels: expected \[S\] with S = 2"),
+        (torch.ones(2, 3), torch.zeros(2), torch.ones(1, 3), 1.0, TypeError, "src_labels: expected integer labels"),
+        (torch.ones(2, 3), torch.tensor([0, -5]), torch.ones(1, 3), 1.0, ValueError, "class indices or -1, got -5"),
+        (
+            torch.ones(2, 3),
+            torch.tensor([0, 1]),
+            torch.ones(1, 3),
+            0.0,
+            ValueError,
+            r"distance: expected a number in \(0",
+        ),
+        (
+            torch.ones(1, 3),
+            torch.tensor([0]),
+            torch.full((1, 3), math.nan),
+            1.0,
+            ValueError,
+            "dst_means: .*finite.*row 0",
+        ),
+        (torch.full((1, 3), math.inf), torch.tensor([0]), torch.ones(1, 3), 1.0, ValueError, "src_means: .*finite"),
+    ],
+)
+def test_wrong_input_is_named(src, labels, dst, distance, error, message):
+    with pytest.raises(error, match=message):
+        transfer_labels(src, labels, dst, distance)
+
+
+def test_default_distance_needs_two_clouds():
+    with pytest.raises(ValueError, match="src_means: expected at least one Gaussian"):
+        default_distance(torch.empty(0, 3), torch.ones(1, 3))
+    with pytest.raises(ValueError, match="dst_means: expected at least one Gaussian"):
+        default_distance(torch.ones(1, 3), torch.empty(0, 3))
