@@ -1,1 +1,21 @@
-"""TODO."""
+"""Fields of Gaussians: raw parameters, their training, and the finished semantic field (Sec. 3.2)."""
+
+from .config import FieldConfig
+from .densify import Densified, GradientStatistics, densify
+from .fit import FieldFit, fit_field
+from .loss import Loss, l1_loss
+from .optimizer import FieldOptimizer
+from .params import GaussianParams
+
+__all__ = [
+    "Densified",
+    "FieldConfig",
+    "FieldFit",
+    "FieldOptimizer",
+    "GaussianParams",
+    "GradientStatistics",
+    "Loss",
+    "densify",
+    "fit_field",
+    "l1_loss",
+]

@@ -1,0 +1,104 @@
+"""The state of an unfinished fit in one file, so that a killed run continues bit for bit."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from .._files import atomic_path, digest_value
+from ..cameras import Camera
+from .config import FieldConfig
+from .params import GaussianParams
+
+KIND, VERSION = "field checkpoint", "1"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Everything that a fit needs to go on: numbers in `state`, tensors by name."""
+
+    tensors: dict[str, Tensor]
+    state: dict[str, Any]
+
+
+def identify_fit(
+    params: GaussianParams,
+    cameras: Sequence[Camera],
+    targets: Sequence[Tensor],
+    config: FieldConfig,
+    *,
+    generator: torch.Generator,
+    others: dict[str, Any],
+) -> dict[str, str]:
+    """A digest of each thing a fit depends on. Of the targets their number and the first one are looked at."""
+    options = {name: value for name, value in asdict(config).items() if name != "checkpoint_every"}
+    views = [tensor for camera in cameras for tensor in (camera.viewmat, camera.K, torch.tensor(camera.size))]
+    return {
+        "params": _digest_tensors(list(params.to_tensors().values())),
+        "cameras": _digest_tensors(views),
+        "targets": _digest_tensors([torch.tensor(len(targets)), targets[0]]),
+        "config": digest_value(options),
+        "generator": _digest_tensors([generator.get_state()]),
+        **{name: digest_value(value) for name, value in others.items()},
+    }
+
+
+def write_checkpoint(path: Path, checkpoint: Checkpoint, identity: dict[str, str]) -> None:
+    """Write the file; it is whole or absent."""
+    tensors = {name: value.detach().cpu().contiguous() for name, value in checkpoint.tensors.items()}
+    metadata = {
+        "kfgs": KIND,
+        "version": VERSION,
+        "identity": json.dumps(identity),
+        "state": json.dumps(checkpoint.state, allow_nan=False),
+    }
+    with atomic_path(path) as temporary:
+        save_file(tensors, temporary, metadata=metadata)
+
+
+def read_checkpoint(path: Path, identity: dict[str, str]) -> Checkpoint | None:
+    """Read the file, or None if there is none.
+
+    Raises:
+        ValueError: if the file is damaged or something else, or belongs to a fit that started otherwise.
+    """
+    if not path.exists():
+        return None
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (the handle is no mapping)
+    except (SafetensorError, OSError) as error:
+        raise ValueError(
+            f"checkpoint: expected a kfgs {KIND} at {path}, but it cannot be read ({error}); delete it to start again"
+        ) from error
+    if metadata.get("kfgs") != KIND or metadata.get("version") != VERSION:
+        found = f"{metadata.get('kfgs', 'other tensors')} (version {metadata.get('version')})"
+        raise ValueError(
+            f"checkpoint: expected a kfgs {KIND} of version {VERSION} at {path}, got {found}; give another path"
+        )
+    known = json.loads(metadata["identity"])
+    differing = sorted(name for name in identity | known if identity.get(name) != known.get(name))
+    if differing:
+        raise ValueError(
+            f"checkpoint: expected one of this very fit at {path}, got one with other {', '.join(differing)}; "
+            "delete it to start again, or give another path"
+        )
+    return Checkpoint(tensors, json.loads(metadata["state"]))
+
+
+def _digest_tensors(tensors: Sequence[Tensor]) -> str:
+    digest = hashlib.sha256()
+    for tensor in tensors:
+        digest.update(f"{tuple(tensor.shape)} {tensor.dtype}".encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()

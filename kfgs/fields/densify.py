@@ -1,0 +1,131 @@
+"""Adaptive density control of 3DGS: clone small Gaussians, split large ones, prune faint and oversized ones."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
+from torch import Tensor
+
+from .config import FieldConfig
+from .params import GaussianParams
+
+SPLIT_CHILDREN = 2
+SPLIT_SHRINK = 1.6  # 0.8 times the number of children (3DGS)
+
+
+class GradientStatistics(NamedTuple):
+    """Running sum and count of screen-space gradient norms, per Gaussian."""
+
+    total: Tensor  # [N]
+    count: Tensor  # [N]
+
+    @staticmethod
+    def zeros(params: GaussianParams) -> GradientStatistics:
+        """Nothing seen yet."""
+        return GradientStatistics(*(params.means.new_zeros(len(params), requires_grad=False) for _ in range(2)))
+
+    def add_(
+        self,
+        index: Tensor,  # [M] int64, each Gaussian at most once
+        gradient: Tensor,  # [M, 2] of the loss by means2d, in pixels
+        size: tuple[int, int],  # (height, width)
+    ) -> None:
+        """Add one view. NDC spans 2 over the picture, so a gradient by NDC is half the size times one by pixels."""
+        height, width = size
+        norm = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2))
+        self.total[index] += norm
+        self.count[index] += 1
+
+    def mean(self) -> Tensor:  # [N]
+        """Mean norm over the views that saw the Gaussian; 0 where none did."""
+        return self.total / self.count.clamp(min=1)
+
+
+class Densified(NamedTuple):
+    """The new cloud, and where each of its rows comes from."""
+
+    params: GaussianParams
+    source: Tensor  # [N'] int64: row of the old cloud
+    fresh: Tensor  # [N'] bool: a new Gaussian, not the old one itself
+
+
+def densify(
+    params: GaussianParams,
+    gradient: Tensor,  # [N] mean norm, NDC units
+    config: FieldConfig,
+    *,
+    extent: float,
+    prune_large: bool = False,
+    generator: torch.Generator | None = None,
+) -> Densified:
+    """One round of adaptive density control.
+
+    A Gaussian whose gradient reaches `config.densify_gradient` is cloned (an exact copy is added) when its largest scale
+    is at most `percent_dense * extent`; otherwise two Gaussians of 1/1.6 its scales, drawn from its own distribution,
+    take its place. Then Gaussians below `prune_opacity`, and with `prune_large` those larger than `prune_extent * extent`,
+    are dropped. Order of the result: what stays, clones, children. With `max_gaussians` the strongest gradients grow
+    first (equal ones in order of index).
+
+    Args:
+        params: the cloud; not changed.
+        gradient: `GradientStatistics.mean()`.
+        config: thresholds.
+        extent: size of the scene, world units.
+        prune_large: 3DGS does so only once opacities were reset for the first time.
+        generator: draws the children's places (on its own device); None draws the same ones each time.
+
+    Note:
+        3DGS also means to prune what is larger than 20 pixels on screen, but its radii are zeroed just before
+        they are looked at; so nothing of the kind is done here either.
+    """
+    values = params.map(torch.Tensor.detach)
+    scales = values.log_scales.exp().amax(dim=1)
+    growing = _within_budget(gradient >= config.densify_gradient, gradient, config.max_gaussians)
+    large = scales > config.percent_dense * extent
+    kept = (~(growing & large)).nonzero()[:, 0]
+    cloned = (growing & ~large).nonzero()[:, 0]
+    parents = (growing & large).nonzero()[:, 0].repeat_interleave(SPLIT_CHILDREN)
+
+    source = torch.cat([kept, cloned, parents])
+    fresh = torch.arange(len(source), device=source.device) >= len(kept)
+    grown = values.map(lambda value: value[source])
+    if len(parents):
+        first = len(kept) + len(cloned)
+        grown.means[first:] = _sample(values, parents, generator)
+        grown.log_scales[first:] -= math.log(SPLIT_SHRINK)
+
+    stays = grown.logit_opacities.sigmoid() >= config.prune_opacity
+    if prune_large:
+        stays &= grown.log_scales.exp().amax(dim=1) <= config.prune_extent * extent
+    return Densified(grown.map(lambda value: value[stays]), source[stays], fresh[stays])
+
+
+def lowered_opacities(
+    logit_opacities: Tensor,  # [N]
+    opacity: float,
+) -> Tensor:  # [N]
+    """The same logits, none above that of `opacity`: the opacity reset of 3DGS."""
+    return logit_opacities.detach().clamp(max=math.log(opacity / (1 - opacity)))
+
+
+def _within_budget(growing: Tensor, gradient: Tensor, maximum: int | None) -> Tensor:  # [N] bool
+    """Keep of `growing` only as many as `maximum` allows (each adds one Gaussian), the strongest first."""
+    if maximum is None or len(growing) + int(growing.sum()) <= maximum:
+        return growing
+    strength = torch.where(growing, gradient, -torch.inf)
+    strongest = strength.argsort(descending=True, stable=True)[: max(0, maximum - len(growing))]
+    allowed = torch.zeros_like(growing)
+    allowed[strongest] = True
+    return allowed
+
+
+def _sample(values: GaussianParams, rows: Tensor, generator: torch.Generator | None) -> Tensor:  # [n, 3]
+    """One draw from each of the given Gaussians (rows may repeat)."""
+    generator = generator or torch.Generator().manual_seed(0)
+    means = values.means[rows]
+    noise = torch.randn(means.shape, dtype=means.dtype, device=generator.device, generator=generator).to(means.device)
+    rotation = quaternion_to_rotation_matrix(values.quats[rows])  # wxyz, normalises
+    return means + (rotation @ (noise * values.log_scales[rows].exp())[:, :, None])[:, :, 0]

@@ -1,0 +1,115 @@
+"""Fit a cloud of Gaussians to posed maps: render a view, compare, step, densify (Sec. 3.2 on top of 3DGS)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from .._check import check_range
+from ..cameras import Camera
+from .checkpoint import identify_fit, read_checkpoint, write_checkpoint
+from .config import FieldConfig
+from .loss import Loss, l1_loss
+from .params import GaussianParams
+from .trainer import Trainer
+
+Callback = Callable[[dict[str, Any]], None]
+
+
+@dataclass(frozen=True, eq=False)
+class FieldFit:
+    """A fitted cloud and how it came about.
+
+    Each row of `history` holds `step`, `loss` (the mean since the row before), `count` (Gaussians) and `seconds`
+    (training time so far, earlier runs of a resumed fit included).
+    """
+
+    params: GaussianParams
+    history: list[dict[str, Any]]
+
+
+def fit_field(
+    params: GaussianParams,
+    cameras: Sequence[Camera],
+    targets: Sequence[Tensor],  # C maps [h, w, D]
+    config: FieldConfig | None = None,
+    *,
+    extent: float,
+    loss: Loss = l1_loss,
+    generator: torch.Generator | None = None,
+    progress: bool = False,
+    callback: Callback | None = None,
+    checkpoint: str | Path | None = None,
+) -> FieldFit:
+    """Train Gaussians until their renderings match the targets (Eq. 4), growing and pruning them on the way.
+
+    Each step takes one view, in random order, every view once before any comes again.
+
+    Args:
+        params: where to start; not changed. Dtype and device of the fit are theirs.
+        cameras: C posed cameras without distortion.
+        targets: one map per camera, of any size; read one at a time and only by `len` and index, so they may live on
+            disk.
+        config: the paper's values when not given.
+        extent: size of the scene in world units (`Scene.extent`); scales the means' learning rate and what counts as a
+            large Gaussian.
+        loss: compares a rendered map, its alpha and the target.
+        generator: draws the views' order and the places of split Gaussians; None stands for seed 0.
+        progress: show a bar with loss, number of Gaussians and time left.
+        callback: called with each new row of the history. To stop early, raise from it; a checkpoint stays behind.
+        checkpoint: a file that is written every `checkpoint_every` steps and at the end. If it exists, the fit
+            continues from it, and its result is bit for bit that of an undisturbed run (on one machine).
+
+    Returns:
+        The fitted params, and the history.
+
+    Raises:
+        ValueError: if counts or shapes disagree, a camera has distortion, the checkpoint belongs to another fit, or no
+            Gaussian is left.
+        FloatingPointError: if the loss is no longer finite.
+    """
+    config = config or FieldConfig()
+    generator = generator or torch.Generator().manual_seed(0)
+    check_range("extent", extent, 0, closed=(False, False))
+    _check_views(params, cameras, targets)
+    trainer = Trainer(params, cameras, targets, config, extent, loss, generator)
+    path, identity = (Path(checkpoint) if checkpoint is not None else None), {}
+    if path is not None:
+        others = {"extent": float(extent), "loss": getattr(loss, "__qualname__", type(loss).__name__)}
+        identity = identify_fit(params, cameras, targets, config, generator=generator, others=others)
+        saved = read_checkpoint(path, identity)
+        if saved is not None:
+            trainer.restore_(saved)
+    with tqdm(total=config.steps, initial=trainer.step, disable=not progress, desc="field", unit="step") as bar:
+        while trainer.step < config.steps:
+            row = trainer.advance_()
+            bar.update()
+            if row is not None:
+                bar.set_postfix(loss=f"{row['loss']:.4f}", Gaussians=row["count"], refresh=False)
+                if callback is not None:
+                    callback(dict(row))
+            if path is not None and (trainer.step % config.checkpoint_every == 0 or trainer.step == config.steps):
+                write_checkpoint(path, trainer.snapshot(), identity)
+    return FieldFit(trainer.optimizer.params.map(torch.Tensor.detach), trainer.history)
+
+
+def _check_views(params: GaussianParams, cameras: Sequence[Camera], targets: Sequence[Tensor]) -> None:
+    if len(params) == 0:
+        raise ValueError("params: expected at least one Gaussian, got none; start from GaussianParams.from_points")
+    if len(cameras) == 0 or len(cameras) != len(targets):
+        raise ValueError(
+            f"targets: expected one map per camera ({len(cameras)}, at least one), got {len(targets)}; "
+            "pass the views that have maps"
+        )
+    for camera in cameras:
+        if camera.distortion is not None:
+            raise ValueError(
+                f"cameras: expected cameras without distortion, got {camera.distortion.model} (camera {camera.name!r}); "
+                "undistort the images first with kfgs.cameras.undistort, which returns the camera to use"
+            )

@@ -1,0 +1,228 @@
+"""The finished semantic field: Gaussians with latents, and what turns latents into features and classes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from dataclasses import field as default
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .._check import check_shapes
+from ..cameras import Camera
+from ..gaussians import Gaussians
+from ..labels import CodewordLabels, Selection, classify, label_codewords, label_pixels, select_by_query
+from ..labels.segment import Decode
+from ..metrics import MIB, semantic_storage_bytes
+from ..quant import Autoencoder, Codebook
+from ..splat import Rendering, rasterize
+from .store import load_field, save_field
+
+CHUNK = 8192  # latents decoded at once: the decoder's widest layer then holds 32 MB
+
+
+@dataclass(frozen=True, eq=False)
+class SemanticField:
+    """A scene's semantics in 3-D (Sec. 3.2-3.4), in any of the three rows of Table 1.
+
+    With codebook and autoencoder the Gaussians carry d latents ("decouple+ADC+SC"); with the codebook alone they carry
+    features near codewords ("decouple+ADC"); with neither, the teacher's features as they are ("just decouple").
+    """
+
+    gaussians: Gaussians
+    codebook: Codebook | None = None
+    autoencoder: Autoencoder | None = None
+    info: dict[str, Any] = default(default_factory=dict)
+    """Where it comes from; anything that JSON can hold."""
+
+    def __post_init__(self) -> None:
+        if self.gaussians.features is None:
+            raise ValueError("gaussians: expected features [N, d], got None; fit them with fit_field")
+        if self.autoencoder is not None and self.codebook is None:
+            raise ValueError("codebook: expected the one that the autoencoder was fitted to, got None; pass it as well")
+        if self.codebook is None:
+            return
+        with torch.no_grad():
+            latents = self.codebook.codewords
+            latents = latents if self.autoencoder is None else self.autoencoder.encode(latents)
+        if latents.shape[1] != self.channels:
+            raise ValueError(
+                f"gaussians: expected {latents.shape[1]} features each (from the codebook's latents), got {self.channels}; "
+                "pass the codebook and autoencoder that this field was fitted with"
+            )
+
+    @property
+    def features(self) -> Tensor:  # [N, d]
+        """The Gaussians' latents (or features, without an autoencoder)."""
+        assert self.gaussians.features is not None
+        return self.gaussians.features
+
+    @property
+    def channels(self) -> int:
+        """d, the channels of a Gaussian."""
+        return int(self.features.shape[1])
+
+    @property
+    def dim(self) -> int:
+        """D, the channels of the teacher's features."""
+        return self.channels if self.codebook is None else self.codebook.dim
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    def render(self, camera: Camera, *, engine: str = "auto") -> Rendering:
+        """The latent map F_r (Eq. 3) from a viewpoint, with its alpha. No gradient."""
+        with torch.no_grad():
+            return rasterize(self.gaussians, camera, engine=engine)
+
+    def decode(
+        self,
+        latents: Tensor,  # [..., d]
+    ) -> Tensor:  # [..., D]
+        """Bring latents back to the teacher's space (Psi of Sec. 3.3.2); features are returned as they are."""
+        if latents.shape[-1] != self.channels:
+            raise ValueError(
+                f"latents: expected [..., d] with d = {self.channels} (from gaussians), got {tuple(latents.shape)}; "
+                "pass maps or features of this field"
+            )
+        if self.autoencoder is None:
+            return latents
+        with torch.no_grad():
+            rows = latents.reshape(-1, self.channels)
+            decoded = torch.cat([self.autoencoder.decode(part) for part in rows.split(CHUNK)])
+        return decoded.reshape(*latents.shape[:-1], -1)
+
+    def feature_map(self, camera: Camera) -> Tensor:  # [H, W, D]
+        """The teacher's features as seen from a viewpoint. 512 channels at 640x480 take 630 MB."""
+        return self.decode(self.render(camera).map)
+
+    def codeword_labels(
+        self,
+        embeddings: Tensor,  # [C, D]
+    ) -> CodewordLabels:
+        """The class of each codeword (Sec. 3.4).
+
+        Raises:
+            ValueError: if the field has no codebook, or shapes disagree.
+        """
+        self._check_embeddings(embeddings)
+        if self.codebook is None:
+            raise ValueError("codebook: expected one, got None in this field; use classify or segment, which need none")
+        return label_codewords(self.codebook.codewords, embeddings)
+
+    def segment(
+        self,
+        camera: Camera,
+        embeddings: Tensor,  # [C, D]
+        *,
+        decode: Decode = "exact",
+    ) -> Tensor:  # [H, W] int64
+        """The class of each pixel from a viewpoint (Sec. 3.4): render, decode, quantise, look up.
+
+        Args:
+            camera: any viewpoint.
+            embeddings: one row per class.
+            decode: "exact" as in the paper, or "latent", which compares latents and skips the decoder.
+
+        Returns:
+            Class indices; -1 where no Gaussian was drawn.
+
+        Raises:
+            ValueError: if shapes disagree or `decode` is unknown.
+        """
+        self._check_embeddings(embeddings)
+        rendering = self.render(camera)
+        labels = None if self.codebook is None else self.codeword_labels(embeddings)
+        return label_pixels(
+            rendering.map,
+            self.codebook,
+            labels,
+            self.autoencoder,
+            decode=decode,
+            embeddings=embeddings,
+            covered=rendering.alpha > 0,
+        )
+
+    def quantized(self) -> Tensor:  # [N, D]
+        """The codeword nearest to each Gaussian's decoded feature; without a codebook the features themselves."""
+        if self.codebook is None:
+            return self.features
+        return self.codebook.codewords[self._codeword_index()]
+
+    def classify(
+        self,
+        embeddings: Tensor,  # [C, D]
+    ) -> tuple[Tensor, Tensor]:  # labels [N] int64, scores [N]
+        """The class of each Gaussian by max-similarity (Sec. 3.4), and its cosine with that class."""
+        self._check_embeddings(embeddings)
+        if self.codebook is None:
+            found = classify(self.features, embeddings)
+            return found.labels, found.scores
+        per_codeword = classify(self.codebook.codewords, embeddings)
+        index = self._codeword_index()
+        return per_codeword.labels[index], per_codeword.scores[index]
+
+    def query(
+        self,
+        embedding: Tensor,  # [D]
+        threshold: float | None = None,
+    ) -> Selection:
+        """The Gaussians whose cosine with one target exceeds a threshold (gamma of Sec. 3.4).
+
+        The paper publishes no gamma: without one it is chosen from the scores, and the result says how.
+        """
+        check_shapes(("embedding", embedding, str(self.dim)))
+        return select_by_query(self.quantized(), embedding, threshold)
+
+    def storage(self) -> int:
+        """Bytes as Table 1 counts them: every attribute of the Gaussians, the decoder and the codebook, in float32.
+
+        With no autoencoder the table's sizes hold no codebook or decoder; ours counts the codebook, which labelling needs.
+        """
+        decoder = 0
+        if self.autoencoder is not None:
+            tensors = self.autoencoder.to_tensors()
+            decoder = sum(value.numel() for name, value in tensors.items() if name.startswith("decoder"))
+        codebook = 0 if self.codebook is None else self.codebook.codewords.numel()
+        return semantic_storage_bytes(len(self), self.channels, decoder, codebook)
+
+    def summary(self) -> str:
+        """A few lines for a person: counts, channels, codewords, size."""
+        row = "just decouple" if self.codebook is None else "decouple+ADC"
+        row += "+SC" if self.autoencoder is not None else ""
+        codewords = "no codebook" if self.codebook is None else f"{self.codebook.size} codewords"
+        lines = [
+            f"semantic field ({row}): {len(self)} Gaussians, {self.channels} of {self.dim} channels, {codewords}",
+            f"  size as Table 1 counts it: {self.storage() / MIB:.2f} MB (MiB)",
+            *(f"  {name}: {value}" for name, value in self.info.items() if not isinstance(value, list | dict)),
+        ]
+        return "\n".join(lines)
+
+    def save(self, path: str | Path) -> None:
+        """Write a folder with `field.safetensors` and `field.json`, whole or not at all; an older field is replaced.
+
+        Raises:
+            FileExistsError: if something else than a field lies at `path`.
+            ValueError: if `info` is not JSON.
+        """
+        save_field(path, self.gaussians, self.codebook, self.autoencoder, self.info)
+
+    @classmethod
+    def load(cls, path: str | Path) -> SemanticField:
+        """Read what `save` wrote.
+
+        Raises:
+            FileNotFoundError: if there is no field at `path`.
+            ValueError: if it is damaged, from another version, or something else.
+        """
+        return cls(*load_field(path))
+
+    def _codeword_index(self) -> Tensor:  # [N] int64
+        """Each Gaussian's codeword; decoded in chunks, so [N, D] is never held."""
+        assert self.codebook is not None
+        return torch.cat([self.codebook.quantize(self.decode(part)) for part in self.features.split(CHUNK)])
+
+    def _check_embeddings(self, embeddings: Tensor) -> None:
+        check_shapes(("features", self.decode(self.features[:1]), "N D"), ("embeddings", embeddings, "C D"))

@@ -1,0 +1,126 @@
+import numpy as np
+import pytest
+import torch
+
+from kfgs.fields import FieldConfig, FieldOptimizer, GaussianParams
+
+CONFIG = FieldConfig(steps=100)
+RATES = {"quats": 0.001, "log_scales": 0.005, "logit_opacities": 0.05, "features": 0.005}
+
+
+def params(n=5, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(0)
+    return GaussianParams(
+        *(torch.randn(shape, generator=generator, dtype=dtype) for shape in ((n, 3), (n, 4), (n, 3), (n,), (n, 6)))
+    )
+
+
+def gradient(name, step, shape):
+    generator = torch.Generator().manual_seed(100 * step + len(name))
+    return torch.randn(shape, generator=generator, dtype=torch.float64) * 1e-3
+
+
+def give_gradients(optimizer, step):
+    for name, value in optimizer.params.to_tensors().items():
+        value.grad = gradient(name, step, value.shape)
+
+
+def adam_by_hand(start, gradients, rates, eps):
+    """Adam as Kingma and Ba wrote it (their algorithm 1), in numpy."""
+    x, m, v = start.copy(), np.zeros_like(start), np.zeros_like(start)
+    for t, (g, rate) in enumerate(zip(gradients, rates, strict=True), start=1):
+        m = 0.9 * m + 0.1 * g
+        v = 0.999 * v + 0.001 * g * g
+        x = x - rate * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + eps)
+    return x
+
+
+def test_every_group_follows_adam_at_its_rate():
+    start = params()
+    optimizer = FieldOptimizer(start, CONFIG, extent=4.0)
+    for step in range(1, 8):
+        give_gradients(optimizer, step)
+        optimizer.step_(step)
+    means_rates = [4.0 * np.exp(np.log(1.6e-4) * (1 - t / 100) + np.log(1.6e-6) * t / 100) for t in range(1, 8)]
+    for name, value in start.to_tensors().items():
+        gradients = [gradient(name, step, value.shape).numpy() for step in range(1, 8)]
+        rates = means_rates if name == "means" else [RATES[name]] * 7
+        expected = adam_by_hand(value.numpy(), gradients, rates, 1e-15)
+        np.testing.assert_allclose(getattr(optimizer.params, name).detach().numpy(), expected, rtol=1e-9, err_msg=name)
+
+
+def test_means_rate_ends():
+    optimizer = FieldOptimizer(params(), CONFIG, extent=2.0)
+    assert optimizer.means_lr(0) == pytest.approx(3.2e-4)
+    assert optimizer.means_lr(50) == pytest.approx(3.2e-5)
+    assert optimizer.means_lr(100) == pytest.approx(3.2e-6)
+
+
+def test_the_start_is_not_changed():
+    start = params()
+    before = {name: value.clone() for name, value in start.to_tensors().items()}
+    optimizer = FieldOptimizer(start, CONFIG, extent=1.0)
+    give_gradients(optimizer, 1)
+    optimizer.step_(1)
+    assert all(torch.equal(before[name], value) for name, value in start.to_tensors().items())
+
+
+def test_moments_follow_their_gaussians():
+    """Reordering and dropping Gaussians changes nothing for those that stay."""
+    source = torch.tensor([4, 0, 2])
+    plain, moved = (FieldOptimizer(params(), CONFIG, extent=1.0) for _ in range(2))
+    for optimizer in (plain, moved):
+        for step in (1, 2, 3):
+            give_gradients(optimizer, step)
+            optimizer.step_(step)
+    moved.replace_(moved.params.map(lambda value: value[source]), source, torch.zeros(3, dtype=torch.bool))
+    give_gradients(plain, 4)
+    for name, value in moved.params.to_tensors().items():
+        value.grad = getattr(plain.params, name).grad[source]
+    for optimizer in (plain, moved):
+        optimizer.step_(4)
+    for name, value in moved.params.to_tensors().items():
+        assert torch.equal(value, getattr(plain.params, name)[source]), name
+
+
+def test_new_gaussians_start_without_moments():
+    optimizer = FieldOptimizer(params(), CONFIG, extent=1.0)
+    give_gradients(optimizer, 1)
+    optimizer.step_(1)
+    before = {name: value.clone() for name, value in optimizer.state_tensors().items()}
+    source, fresh = torch.tensor([0, 1, 1]), torch.tensor([False, False, True])
+    optimizer.replace_(optimizer.params.map(lambda value: value[source]), source, fresh)
+    after = optimizer.state_tensors()
+    assert torch.equal(after["features.exp_avg"][:2], before["features.exp_avg"][:2])
+    assert torch.equal(after["features.exp_avg"][2], torch.zeros(6, dtype=torch.float64))
+    assert torch.equal(after["features.exp_avg_sq"][2], torch.zeros(6, dtype=torch.float64))
+
+
+def test_setting_opacities_forgets_only_their_moments():
+    optimizer = FieldOptimizer(params(), CONFIG, extent=1.0)
+    give_gradients(optimizer, 1)
+    optimizer.step_(1)
+    optimizer.set_opacities_(torch.full((5,), -4.0, dtype=torch.float64))
+    state = optimizer.state_tensors()
+    assert (optimizer.params.logit_opacities == -4).all()
+    assert not state["logit_opacities.exp_avg"].any()
+    assert not state["logit_opacities.exp_avg_sq"].any()
+    assert state["means.exp_avg"].all()
+
+
+def test_state_round_trip_continues_bit_for_bit():
+    one = FieldOptimizer(params(dtype=torch.float32), CONFIG, extent=1.0)
+
+    def advance(optimizer, step):
+        for name, value in optimizer.params.to_tensors().items():
+            value.grad = gradient(name, step, value.shape).float()
+        optimizer.step_(step)
+
+    for step in (1, 2):
+        advance(one, step)
+    other = FieldOptimizer(one.params, CONFIG, extent=1.0)
+    other.load_state_(one.state_tensors())
+    for step in (3, 4):
+        advance(one, step)
+        advance(other, step)
+    assert all(torch.equal(getattr(one.params, name), value) for name, value in other.params.to_tensors().items())

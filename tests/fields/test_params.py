@@ -1,0 +1,140 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from kfgs import Gaussians
+from kfgs.fields import GaussianParams
+from kfgs.fields.params import SMALLEST_SPACING, point_spacing
+
+
+def cloud(n=400, seed=0):
+    return torch.rand(n, 3, generator=torch.Generator().manual_seed(seed)) * torch.tensor([4.0, 3.0, 2.0])
+
+
+def brute_spacing(points):
+    """Root mean square distance to the three nearest others, from the full distance matrix."""
+    x = points.double().numpy()
+    distance = np.sqrt(((x[:, None] - x[None]) ** 2).sum(axis=2))
+    np.fill_diagonal(distance, np.inf)
+    return np.sqrt((np.sort(distance, axis=1)[:, :3] ** 2).mean(axis=1))
+
+
+def test_spacing_is_rms_of_three_nearest_within_bounds():
+    points = cloud()
+    expected = brute_spacing(points)
+    found = point_spacing(points).numpy()
+    free = expected <= np.quantile(expected, 0.99)
+    np.testing.assert_allclose(found[free], expected[free], rtol=1e-6)
+    assert found.max() <= np.quantile(expected, 0.99) * (1 + 1e-6)
+
+
+def test_start_values():
+    params = GaussianParams.from_points(cloud(), 9, initial_opacity=0.1)
+    gaussians = params.activated()
+    assert params.channels == 9
+    assert torch.equal(gaussians.quats, torch.tensor([1.0, 0, 0, 0]).expand(400, 4))
+    assert torch.equal(gaussians.features, torch.zeros(400, 9))
+    torch.testing.assert_close(gaussians.opacities, torch.full((400,), 0.1))
+    torch.testing.assert_close(gaussians.scales[:, 0], gaussians.scales[:, 2])
+    assert torch.equal(gaussians.means, cloud())
+
+
+def test_far_outliers_are_dropped_and_change_no_spacing():
+    inside = cloud()
+    far = torch.randn(20, 3, generator=torch.Generator().manual_seed(1)) * 5 + torch.tensor([-139.0, 40.0, 90.0])
+    with_far = GaussianParams.from_points(torch.cat([inside, far]), 2)
+    assert torch.equal(with_far.means, inside)
+    torch.testing.assert_close(with_far.log_scales, GaussianParams.from_points(inside, 2).log_scales)
+    assert len(GaussianParams.from_points(torch.cat([inside, far]), 2, outlier_range=math.inf)) == 420
+
+
+def test_a_room_without_outliers_keeps_every_point():
+    assert len(GaussianParams.from_points(cloud(2000), 1)) == 2000
+
+
+def test_a_lone_survivor_gets_no_giant_gaussian():
+    inside = cloud()
+    lone = torch.tensor([[9.0, 1.5, 1.0]])  # beyond the room, not beyond the outlier rule
+    params = GaussianParams.from_points(torch.cat([inside, lone]), 1)
+    assert len(params) == 401
+    assert params.log_scales.exp().max() < 0.7  # its neighbours are five units away
+
+
+def test_duplicates_share_the_spacing_of_their_place():
+    points = cloud(50)
+    doubled = GaussianParams.from_points(torch.cat([points, points, points, points, points]), 1)
+    single = GaussianParams.from_points(points, 1)
+    torch.testing.assert_close(doubled.log_scales.view(5, 50, 3)[3], single.log_scales)
+
+
+def test_near_duplicates_are_held_above_the_lower_bound():
+    points = cloud()
+    points[:4] = points[0] + 1e-6 * torch.rand(4, 3)
+    spacing = point_spacing(points)
+    assert spacing.min() == pytest.approx(SMALLEST_SPACING * spacing.median().item(), rel=0.02)
+
+
+def test_two_points_and_identical_points():
+    two = GaussianParams.from_points(torch.tensor([[0.0, 0, 0], [0, 0, 2]]), 1)
+    torch.testing.assert_close(two.log_scales.exp(), torch.full((2, 3), 2.0))
+    with pytest.raises(ValueError, match=r"at least two different points, got 5 point\(s\) at 1 place"):
+        GaussianParams.from_points(torch.ones(5, 3), 1)
+    with pytest.raises(ValueError, match=r"at least two different points, got 0 point"):
+        GaussianParams.from_points(torch.ones(0, 3), 1)
+
+
+def test_subset_is_seeded_and_of_the_asked_size():
+    def subset(seed):
+        return GaussianParams.from_points(
+            cloud(), 1, max_points=30, generator=torch.Generator().manual_seed(seed)
+        ).means
+
+    assert len(subset(1)) == 30
+    assert torch.equal(subset(1), subset(1))
+    assert not torch.equal(subset(1), subset(2))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"initial_opacity": 1.0}, r"initial_opacity: expected a number in \(0, 1\)"),
+        ({"channels": 0}, "channels: expected a number in"),
+        ({"outlier_range": 0.0}, "outlier_range: expected a positive number"),
+        ({"points": torch.full((4, 3), torch.nan)}, "points: expected finite floating-point"),
+        ({"points": torch.ones(4, 2)}, r"points: expected \[P, 3\], got \(4, 2\)"),
+    ],
+)
+def test_wrong_arguments(change, message):
+    arguments = {"points": cloud(10), "channels": 3} | change
+    with pytest.raises(ValueError, match=message):
+        GaussianParams.from_points(**arguments)
+
+
+def test_activation_and_its_inverse():
+    generator = torch.Generator().manual_seed(3)
+    gaussians = Gaussians(
+        means=torch.randn(7, 3, generator=generator, dtype=torch.float64),
+        quats=torch.randn(7, 4, generator=generator, dtype=torch.float64),
+        scales=torch.rand(7, 3, generator=generator, dtype=torch.float64) + 0.1,
+        opacities=torch.tensor([0.0, 1e-3, 0.1, 0.5, 0.9, 0.99, 1.0], dtype=torch.float64),
+        features=torch.randn(7, 5, generator=generator, dtype=torch.float64),
+    )
+    params = GaussianParams.from_gaussians(gaussians)
+    assert torch.isfinite(params.logit_opacities).all()
+    again = params.activated()
+    for name in ("means", "quats", "scales", "opacities", "features"):
+        torch.testing.assert_close(getattr(again, name), getattr(gaussians, name))
+    with pytest.raises(ValueError, match="gaussians: expected features"):
+        GaussianParams.from_gaussians(gaussians.replace(features=None))
+
+
+def test_tensors_round_trip_and_missing_name():
+    params = GaussianParams.from_points(cloud(10), 3)
+    again = GaussianParams.from_tensors(params.to_tensors())
+    assert all(
+        torch.equal(a, b) for a, b in zip(params.to_tensors().values(), again.to_tensors().values(), strict=True)
+    )
+    with pytest.raises(ValueError, match=r"without \['quats'\]"):
+        GaussianParams.from_tensors({k: v for k, v in params.to_tensors().items() if k != "quats"})
