@@ -272,8 +272,12 @@ def _scored_labels(
             )
     ignored = {-1, ignore} if isinstance(ignore, int) else {-1, *ignore}
     target = target.flatten().long()
-    known = torch.isin(target, torch.tensor(sorted(ignored), device=target.device), invert=True)
-    target, pred = target[known], pred.flatten().long()[known]
+    pred = pred.flatten().long()
+    known = torch.ones_like(target, dtype=torch.bool)
+    for label in ignored:
+        known &= target != label
+    if not known.all():
+        target, pred = target[known], pred[known]
     _check_labels("target", target, classes, "pass other labels as `ignore`, or a larger `classes`")
     return pred, target
 

@@ -5,15 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pycolmap
 
-# name -> (COLMAP parameters, kfgs distortion model, kfgs coefficients); 96x64, off-centre principal point, fx != fy
+# name -> (COLMAP parameters, kfgs distortion model, kfgs coefficients); 96x64, off-centre principal point.
+# FULL_OPENCV is a pincushion (undistorting looks beyond the picture), the others are barrels.
 LENSES = {
     "SIMPLE_RADIAL": ([70.0, 50.0, 30.5, -0.12], "brown_conrady", (-0.12, 0.0, 0.0, 0.0)),
     "RADIAL": ([70.0, 50.0, 30.5, -0.2, 0.05], "brown_conrady", (-0.2, 0.05, 0.0, 0.0)),
     "OPENCV": ([70.0, 66.0, 50.0, 30.5, -0.1, 0.03, 0.004, -0.006], "brown_conrady", (-0.1, 0.03, 0.004, -0.006)),
     "FULL_OPENCV": (
-        [70.0, 66.0, 50.0, 30.5, 0.1, -0.03, 0.004, -0.006, 0.02, 0.25, 0.05, -0.01],
+        [70.0, 66.0, 50.0, 30.5, 0.35, -0.03, 0.004, -0.006, 0.02, 0.1, 0.05, -0.01],
         "brown_conrady",
-        (0.1, -0.03, 0.004, -0.006, 0.02, 0.25, 0.05, -0.01),
+        (0.35, -0.03, 0.004, -0.006, 0.02, 0.1, 0.05, -0.01),
     ),
     "OPENCV_FISHEYE": (
         [70.0, 66.0, 50.0, 30.5, -0.04, 0.01, -0.003, 0.0004],

@@ -44,10 +44,12 @@ def undistort(
         raise TypeError(f"image: expected floating point, got {image.dtype}; convert it with .float() / 255")
     if camera.distortion is None:
         return image, camera, torch.ones(camera.size, dtype=torch.bool, device=image.device)
-    x, y, recorded = _source_positions(camera, torch.promote_types(image.dtype, torch.float32), image.device)
+    dtype = torch.promote_types(image.dtype, torch.float32)  # half precision cannot tell the pixels of a row apart
+    x, y, recorded = _source_positions(camera, dtype, image.device)
     # align_corners must be said: with remap's default even an identity map changes the picture (kornia#4504)
-    result = remap(to_bchw(image), x[None], y[None], padding_mode="border", align_corners=True)
-    return from_bchw(result) * recorded[..., None], replace(camera, distortion=None), recorded
+    result = remap(to_bchw(image.to(dtype)), x[None], y[None], padding_mode="border", align_corners=True)
+    result = from_bchw(result).where(recorded[..., None], 0).to(image.dtype)
+    return result, replace(camera, distortion=None), recorded
 
 
 def undistort_labels(

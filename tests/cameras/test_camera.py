@@ -2,6 +2,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+
 from kfgs.cameras import Camera, Distortion
 
 K = torch.tensor([[70.0, 0.0, 50.0], [0.0, 66.0, 30.5], [0.0, 0.0, 1.0]])

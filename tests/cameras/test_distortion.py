@@ -3,9 +3,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from oracles_cameras import LENSES
+
 from kfgs.cameras import Distortion, fold_radius
 from kfgs.cameras.distortion import plane_to_pixel
-from oracles_cameras import LENSES
 
 K = torch.tensor([[70.0, 0.0, 50.0], [0.0, 66.0, 30.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
 

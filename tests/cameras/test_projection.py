@@ -3,6 +3,8 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from oracles_cameras import HEIGHT, LENSES, WIDTH, colmap_pixels, project_pinhole
+
 from kfgs.cameras import (
     Camera,
     Distortion,
@@ -12,7 +14,6 @@ from kfgs.cameras import (
     unproject_depth,
     world_to_camera,
 )
-from oracles_cameras import HEIGHT, LENSES, WIDTH, colmap_pixels, project_pinhole
 
 K = torch.tensor([[70.0, 0.0, 50.0], [0.0, 66.0, 30.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
 QUAT_XYZW = np.array([0.1, -0.2, 0.3, 0.9]) / np.linalg.norm([0.1, -0.2, 0.3, 0.9])
@@ -142,8 +143,14 @@ def test_picture_includes_its_left_top_edge_and_excludes_the_others():
 
 
 def test_no_nan_whatever_comes():
-    points = torch.tensor([[0.0, 0, 0], [1, -1, 0], [1, 1, 1e-30], [1e30, 0, 1], [float("nan"), 0, 1], [0, 0, torch.inf]])
-    for lens in (None, Distortion("brown_conrady", (0.1, 0.2, 0, 0, 0.3)), Distortion("kannala_brandt", (0.1, 0, 0, 0))):
+    points = torch.tensor(
+        [[0.0, 0, 0], [1, -1, 0], [1, 1, 1e-30], [1e30, 0, 1], [float("nan"), 0, 1], [0, 0, torch.inf]]
+    )
+    for lens in (
+        None,
+        Distortion("brown_conrady", (0.1, 0.2, 0, 0, 0.3)),
+        Distortion("kannala_brandt", (0.1, 0, 0, 0)),
+    ):
         camera = Camera(torch.eye(4), K.float(), WIDTH, HEIGHT, distortion=lens)
         assert not camera_to_pixel(camera, points[:4]).isnan().any()
         xy, _, visible = project_points(camera, points)
@@ -213,13 +220,17 @@ def test_refusals():
     points = torch.ones(2, 3, dtype=torch.float64)
     with pytest.raises(ValueError, match=r"points: expected \[N, 3\], got \(2, 2\)"):
         project_points(camera, points[:, :2])
-    with pytest.raises(TypeError, match=r"points: expected floating point, got torch.int64; convert it with .float\(\)"):
+    with pytest.raises(
+        TypeError, match=r"points: expected floating point, got torch.int64; convert it with .float\(\)"
+    ):
         world_to_camera(camera, points.long())
     with pytest.raises(TypeError, match="points_cam: expected floating point"):
         camera_to_pixel(camera, points.long())
     with pytest.raises(ValueError, match="near: expected a number in"):
         project_points(camera, points, near=-1)
-    with pytest.raises(ValueError, match="expected a pinhole camera, got brown_conrady .*'posed'.*undistort its images"):
+    with pytest.raises(
+        ValueError, match="expected a pinhole camera, got brown_conrady .*'posed'.*undistort its images"
+    ):
         projection_jacobian(bent, points)
     with pytest.raises(ValueError, match="expected a pinhole camera"):
         unproject_depth(bent, torch.ones(camera.size))

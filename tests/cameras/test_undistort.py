@@ -1,0 +1,184 @@
+import kornia.geometry
+import numpy as np
+import pytest
+import torch
+from oracles_cameras import HEIGHT, LENSES, WIDTH, colmap_camera, colmap_pixels, pixel_rays
+
+from kfgs.cameras import Camera, Distortion, undistort, undistort_labels
+
+
+def camera_of(model, dtype=torch.float64):
+    _, kind, coefficients = LENSES[model]
+    K = torch.from_numpy(colmap_camera(model).calibration_matrix()).to(dtype)
+    return Camera(torch.eye(4, dtype=dtype), K, WIDTH, HEIGHT, model, Distortion(kind, coefficients))
+
+
+def coordinates(dtype=torch.float64):
+    """A picture [H, W, 2] that holds each pixel centre's own (x, y): bilinear sampling of it returns the position."""
+    y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    return torch.stack([x, y], -1).to(dtype)
+
+
+def colmap_positions(model):
+    """Where COLMAP says each undistorted pixel lies in the distorted picture, [H, W, 2]."""
+    rays = pixel_rays(colmap_camera(model).calibration_matrix(), WIDTH, HEIGHT)
+    return colmap_pixels(model, rays.reshape(-1, 3)).reshape(HEIGHT, WIDTH, 2)
+
+
+def between_centers(positions):
+    x, y = positions[..., 0], positions[..., 1]
+    return (x >= 0.5) & (x <= WIDTH - 0.5) & (y >= 0.5) & (y <= HEIGHT - 0.5)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_pixels_come_from_where_colmap_says(model):
+    result, camera, mask = undistort(coordinates(), camera_of(model))
+    expected = colmap_positions(model)
+    inside = between_centers(expected)
+    assert inside.mean() > 0.6
+    assert mask.numpy()[inside].all()
+    np.testing.assert_allclose(result.numpy()[inside], expected[inside], atol=1e-9)
+    assert camera.distortion is None
+    assert torch.equal(camera.K, camera_of(model).K)
+    # leaving the picture as it is shows
+    assert np.abs(coordinates().numpy() - expected)[inside].max() > 1
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_mask_is_the_area_of_the_distorted_picture(model):
+    positions = colmap_positions(model)
+    x, y = positions[..., 0], positions[..., 1]
+    recorded = (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
+    result, _, mask = undistort(torch.ones(HEIGHT, WIDTH, 1), camera_of(model))
+    assert np.array_equal(mask.numpy(), recorded)
+    torch.testing.assert_close(result[..., 0], mask.float())  # never darkened at the border
+
+
+def test_some_lens_leaves_pixels_unrecorded():
+    """So that the mask above is tested on more than all-true."""
+    assert not undistort(torch.ones(HEIGHT, WIDTH, 1), camera_of("FULL_OPENCV"))[2].all()
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV"])
+def test_kornia_needs_the_shift_to_integer_centers(model):
+    """kornia's own undistort_image equals ours with cx, cy - 0.5, and is visibly off with COLMAP's K."""
+    camera, picture = camera_of(model), coordinates()
+    coefficients = torch.tensor(camera.distortion.coefficients, dtype=torch.float64)
+    ours, _, _ = undistort(picture, camera)
+    inside = between_centers(colmap_positions(model))
+    batch = picture.permute(2, 0, 1)[None]
+    shifted, unshifted = camera.K.clone(), camera.K
+    shifted[:2, 2] -= 0.5
+    right, wrong = (
+        kornia.geometry.calibration.undistort_image(batch, K[None], coefficients[None])[0].permute(1, 2, 0)
+        for K in (shifted, unshifted)
+    )
+    assert (right - ours)[inside].abs().max() < 1e-9
+    assert (wrong - ours)[inside].abs().max() > 0.05
+
+
+def test_remap_needs_align_corners():
+    """The trap that `undistort` avoids: an identity map through kornia's default changes the picture (kornia#4504)."""
+    picture = coordinates().permute(2, 0, 1)[None]
+    x, y = coordinates()[None, ..., 0] - 0.5, coordinates()[None, ..., 1] - 0.5
+    assert (kornia.geometry.remap(picture, x, y, align_corners=True) - picture).abs().max() < 1e-9
+    assert (kornia.geometry.remap(picture, x, y) - picture).abs().max() > 0.3
+
+
+@pytest.mark.parametrize("kind", ["brown_conrady", "kannala_brandt"])
+def test_kinds_of_lens_are_not_interchangeable(kind):
+    model = "OPENCV_FISHEYE" if kind == "brown_conrady" else "OPENCV"
+    camera = camera_of(model)
+    other = Camera(camera.viewmat, camera.K, WIDTH, HEIGHT, "", Distortion(kind, camera.distortion.coefficients))
+    inside = between_centers(colmap_positions(model))
+    right, wrong = (undistort(coordinates(), c)[0].numpy()[inside] for c in (camera, other))
+    assert np.abs(right - wrong).max() > 1
+
+
+def test_zero_coefficients_change_nothing():
+    lens = Distortion("brown_conrady", (0.0, 0.0, 0.0, 0.0))
+    camera = Camera(torch.eye(4), camera_of("OPENCV").K.float(), WIDTH, HEIGHT, "", lens)
+    picture = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))
+    result, straight, mask = undistort(picture, camera)
+    torch.testing.assert_close(result, picture, atol=1e-4, rtol=0)  # float32 positions of about 100 times 1e-6
+    assert mask.all()
+    assert straight.distortion is None
+
+
+def test_pinhole_returns_what_came():
+    camera = Camera(torch.eye(4), camera_of("OPENCV").K.float(), WIDTH, HEIGHT)
+    picture, labels = coordinates(torch.float32), torch.ones(HEIGHT, WIDTH, dtype=torch.int64)
+    result, same, mask = undistort(picture, camera)
+    assert torch.equal(result, picture)
+    assert same is camera
+    assert mask.all()
+    assert torch.equal(undistort_labels(labels, camera), labels)
+
+
+def test_smaller_feature_map_with_the_resized_camera():
+    """The lens knows nothing of pixels: positions found at half the size are half the positions."""
+    camera = camera_of("OPENCV").resized(HEIGHT // 2, WIDTH // 2)
+    y, x = torch.meshgrid(torch.arange(HEIGHT // 2) + 0.5, torch.arange(WIDTH // 2) + 0.5, indexing="ij")
+    result, _, mask = undistort(torch.stack([x, y], -1).double(), camera)
+    rays = pixel_rays(camera.K.numpy(), WIDTH // 2, HEIGHT // 2)
+    expected = colmap_pixels("OPENCV", rays.reshape(-1, 3)).reshape(HEIGHT // 2, WIDTH // 2, 2) / 2
+    interior = mask.numpy().copy()
+    interior[[0, -1]] = interior[:, [0, -1]] = False
+    np.testing.assert_allclose(result.numpy()[interior], expected[interior], atol=1e-9)
+
+
+def test_folded_rays_count_as_unrecorded():
+    lens = Distortion("brown_conrady", (-1 / 3, 0.0, 0.0, 0.0))  # turns back at r = 1
+    K = torch.tensor([[20.0, 0, 48], [0, 20, 32], [0, 0, 1]])  # the picture reaches out to r = 2.9
+    _, _, mask = undistort(torch.ones(HEIGHT, WIDTH, 1), Camera(torch.eye(4), K, WIDTH, HEIGHT, "", lens))
+    y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    radius = ((x - 48) ** 2 + (y - 32) ** 2).sqrt() / 20
+    assert torch.equal(mask, radius < 1)
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
+def test_labels_come_from_the_nearest_pixel(model):
+    labels = torch.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)
+    result = undistort_labels(labels, camera_of(model))
+    positions = colmap_positions(model)
+    _, _, mask = undistort(torch.ones(HEIGHT, WIDTH, 1, dtype=torch.float64), camera_of(model))
+    expected = np.floor(positions[..., 1]) * WIDTH + np.floor(positions[..., 0])
+    assert np.array_equal(result.numpy()[mask.numpy()], expected[mask.numpy()])
+    assert (result[~mask] == -1).all()
+
+
+def test_labels_keep_their_type_and_take_the_fill():
+    labels = torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8)
+    result = undistort_labels(labels, camera_of("FULL_OPENCV"), fill=255)
+    assert result.dtype == torch.uint8
+    assert set(result.unique().tolist()) == {0, 255}
+
+
+def test_features_of_many_channels_are_differentiable():
+    camera = camera_of("OPENCV").resized(5, 6)
+    features = torch.rand(5, 6, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: undistort(x, camera)[0], features)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
+def test_dtype_follows_the_picture(dtype):
+    picture = torch.rand(HEIGHT, WIDTH, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).to(dtype)
+    result, _, _ = undistort(picture, camera_of("OPENCV"))
+    assert result.dtype == dtype
+    # positions are never in half precision: there a step at x = 90 is 1/16 pixel, and shows
+    exact, _, _ = undistort(picture.double(), camera_of("OPENCV"))
+    torch.testing.assert_close(result.double(), exact, atol=5e-4 if dtype == torch.float16 else 2e-5, rtol=0)
+
+
+def test_undistort_refusals():
+    camera = camera_of("OPENCV")
+    with pytest.raises(ValueError, match=r"image: expected \[64, 96, C\], got \(96, 64, 3\)"):
+        undistort(torch.zeros(WIDTH, HEIGHT, 3), camera)
+    with pytest.raises(TypeError, match=r"image: expected floating point, got torch.uint8; convert it with"):
+        undistort(torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8), camera)
+    with pytest.raises(ValueError, match=r"labels: expected \[64, 96\], got"):
+        undistort_labels(torch.zeros(HEIGHT, WIDTH, 1, dtype=torch.int64), camera)
+    with pytest.raises(TypeError, match="labels: expected integers, got torch.float32"):
+        undistort_labels(torch.zeros(HEIGHT, WIDTH), camera)
+    with pytest.raises(ValueError, match=r"fill: expected a value that torch.uint8 can hold, got -1; pass labels.long"):
+        undistort_labels(torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8), camera)

@@ -1,0 +1,302 @@
+import kornia.metrics
+import numpy as np
+import pytest
+import skimage.metrics
+import torch
+from oracles_metrics import mean_ssim, segmentation_scores
+
+from kfgs.metrics import (
+    COSINE_EPSILON,
+    MIB,
+    SSIM_PROTOCOL,
+    ConfusionMatrix,
+    Score,
+    confusion_matrix,
+    feature_cosine,
+    psnr,
+    semantic_storage_bytes,
+    ssim,
+)
+from kfgs.quant.codebook import unit_rows
+
+
+def labels(low, high, shape, seed):
+    return torch.randint(low, high, shape, generator=torch.Generator().manual_seed(seed))
+
+
+def pictures(height=20, width=17, seed=0):
+    rng = np.random.default_rng(seed)
+    a = rng.uniform(0, 1, (height, width, 3))
+    return a, np.clip(a + rng.normal(0, 0.2, a.shape), 0, 1)
+
+
+def pooled(classes, *views, ignore=-1):
+    matrix = ConfusionMatrix(classes, ignore=ignore)
+    for pred, target in views:
+        matrix.update(pred, target)
+    return matrix
+
+
+# confusion matrix
+
+
+def test_rows_are_the_truth():
+    matrix = confusion_matrix(torch.tensor([1, 1, 0]), torch.tensor([0, 0, 2]), 3)
+    assert matrix.tolist() == [[0, 2, 0], [0, 0, 0], [1, 0, 0]]
+    assert matrix.dtype == torch.int64
+
+
+@pytest.mark.parametrize("ignore", [255, (255, 3), [7]])
+def test_ignored_labels_and_minus_one_are_not_scored(ignore):
+    target = torch.tensor([0, 1, -1, 255, 3, 7])
+    ignored = {-1, 255, 3, 7} & ({-1, ignore} if isinstance(ignore, int) else {-1, *ignore})
+    target = target[torch.tensor([int(t) in ignored or t < 3 for t in target.tolist()])]
+    matrix = confusion_matrix(torch.zeros_like(target), target, 3, ignore)
+    assert matrix.sum() == 2
+
+
+def test_uint8_maps_with_void_255():
+    target = torch.tensor([[0, 255], [1, 1]], dtype=torch.uint8)
+    assert confusion_matrix(torch.ones(2, 2, dtype=torch.uint8), target, 2, ignore=255).tolist() == [[0, 1], [0, 2]]
+
+
+def test_counts_past_float32():
+    """kornia returns float32, where 2^24 + 1 becomes 2^24."""
+    count = 2**24 + 1
+    zeros = torch.zeros(count, dtype=torch.uint8)
+    assert int(kornia.metrics.confusion_matrix(zeros[None], zeros[None], 2)[0, 0, 0]) == 2**24
+    assert int(confusion_matrix(zeros, zeros, 2)[0, 0]) == count
+
+
+def test_one_class_is_enough():
+    assert confusion_matrix(torch.tensor([0, 0]), torch.tensor([0, -1]), 1).tolist() == [[1]]
+
+
+def test_nothing_to_score():
+    nothing = pooled(3, (torch.zeros(4, dtype=torch.int64), torch.full((4,), -1)))
+    assert nothing.matrix.sum() == 0
+    assert nothing.iou().isnan().all()
+    assert np.isnan(nothing.miou())
+    assert np.isnan(nothing.accuracy())
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_scores_agree_with_sets_of_pixels(seed):
+    views = [(labels(-1, 5, (9, 8), 10 * seed + v), labels(-1, 6, (9, 8), 100 + 10 * seed + v)) for v in range(3)]
+    matrix = pooled(6, *views, ignore=2)
+    pred, target = (torch.stack(part).numpy() for part in zip(*views, strict=True))
+    iou, miou, accuracy = segmentation_scores(pred, target, 6, {-1, 2})
+    np.testing.assert_allclose(matrix.iou().numpy(), iou, rtol=1e-12)
+    assert matrix.miou() == pytest.approx(miou, rel=1e-12)
+    assert matrix.accuracy() == pytest.approx(accuracy, rel=1e-12)
+
+
+def test_pooled_matrix_is_the_sum_of_the_views():
+    views = [(labels(0, 4, (5, 6), v), labels(-1, 4, (5, 6), 50 + v)) for v in range(4)]
+    total = sum(confusion_matrix(p, t, 4) for p, t in views)
+    assert torch.equal(pooled(4, *views).matrix, total)
+    assert torch.equal(pooled(4, *views[::-1]).matrix, total)
+
+
+def test_miou_is_pooled_and_not_a_mean_over_views():
+    """A class of 1 pixel in one view and of 99 in the other: pooling weighs pixels, averaging weighs views."""
+    first = (torch.tensor([1] + [0] * 99), torch.tensor([0] * 100))
+    second = (torch.tensor([1] * 99 + [0]), torch.tensor([1] * 99 + [0]))
+    together = pooled(2, first, second).miou()
+    apart = (pooled(2, first).miou() + pooled(2, second).miou()) / 2
+    assert together == pytest.approx((100 / 101 + 99 / 100) / 2)
+    assert apart == pytest.approx((0.99 / 2 + 1) / 2)  # the wrong reading
+
+
+def test_absent_class_is_left_out():
+    pred, target = torch.tensor([0, 1, 1, 1]), torch.tensor([0, 1, 1, 0])
+    matrix = pooled(5, (pred, target))
+    torch.testing.assert_close(
+        matrix.iou(), torch.tensor([1 / 2, 2 / 3] + [torch.nan] * 3, dtype=torch.float64), equal_nan=True
+    )
+    assert matrix.miou() == pytest.approx(7 / 12)
+    # the wrong reading: kornia's mean_iou scores the three absent classes 1
+    assert float(kornia.metrics.mean_iou(pred[None], target[None], 5).mean()) == pytest.approx((7 / 6 + 3) / 5)
+
+
+def test_class_only_predicted_counts_as_zero():
+    assert pooled(3, (torch.tensor([0, 2]), torch.tensor([0, 0]))).iou().tolist()[2] == 0
+
+
+def test_abstaining_is_a_miss():
+    target = torch.tensor([0, 0, 1, 1])
+    silent, wrong = pooled(2, (torch.tensor([0, -1, 1, 1]), target)), pooled(2, (torch.tensor([0, 0, 1, 1]), target))
+    assert silent.iou().tolist() == [0.5, 1]
+    assert silent.accuracy() == 0.75
+    assert silent.misses.tolist() == [1, 0]
+    assert silent.matrix.tolist() == [[1, 0], [0, 2]]
+    assert wrong.miou() == 1  # dropping the silent pixel instead would have given this score
+
+
+def test_matrix_is_a_copy():
+    matrix = pooled(2, (torch.tensor([0]), torch.tensor([0])))
+    matrix.matrix.zero_()
+    matrix.misses.fill_(5)
+    assert matrix.accuracy() == 1
+
+
+def test_permuting_the_classes_permutes_the_iou():
+    pred, target = labels(0, 5, (40,), 1), labels(-1, 5, (40,), 2)
+    order = torch.tensor([3, 0, 4, 1, 2])
+    renamed = torch.where(target >= 0, order[target], -1)
+    torch.testing.assert_close(pooled(5, (order[pred], renamed)).iou()[order], pooled(5, (pred, target)).iou())
+
+
+def test_label_refusals():
+    good = torch.tensor([0, 1])
+    with pytest.raises(ValueError, match=r"target: expected the shape of pred, \(2,\), got \(1, 2\); resize"):
+        confusion_matrix(good, good[None], 2)
+    with pytest.raises(TypeError, match=r"pred: expected integer labels, got torch.float32; take an argmax"):
+        confusion_matrix(good.float(), good, 2)
+    with pytest.raises(TypeError, match="target: expected integer labels, got torch.bool"):
+        confusion_matrix(good, good.bool(), 2)
+    with pytest.raises(ValueError, match=r"target: expected labels in \[0, 2\), got 0 to 255; pass other .* `ignore`"):
+        confusion_matrix(good, torch.tensor([0, 255]), 2)
+    with pytest.raises(ValueError, match=r"pred: expected labels in \[0, 2\), got -1 to 1; .*ConfusionMatrix"):
+        confusion_matrix(torch.tensor([-1, 1]), good, 2)
+    with pytest.raises(ValueError, match=r"pred: expected labels in \[0, 3\), got -2 to 1; pass class indices, or -1"):
+        ConfusionMatrix(2).update(torch.tensor([-2, 1]), good)
+    with pytest.raises(ValueError, match="classes: expected a number in"):
+        ConfusionMatrix(0)
+
+
+# scores
+
+
+def test_score_prints_its_protocol():
+    score = Score("SSIM", 0.91234, SSIM_PROTOCOL)
+    assert str(score) == f"SSIM 0.9123 ({SSIM_PROTOCOL})"
+    assert "padding='valid'" in str(score)
+
+
+@pytest.mark.parametrize("field", ["name", "protocol"])
+def test_score_refuses_to_be_anonymous(field):
+    with pytest.raises(ValueError, match=f"{field}: expected a text, got ' '; say what was measured"):
+        Score(**{"name": "mIoU", "value": 1.0, "protocol": "p"} | {field: " "})
+
+
+# features
+
+
+def test_cosine_in_closed_form():
+    a, b = torch.tensor([[3.0, 4.0], [1.0, 0.0]]), torch.tensor([[4.0, 3.0], [-2.0, 0.0]])
+    assert float(feature_cosine(a, b)) == pytest.approx((24 / 25 - 1) / 2)
+
+
+def test_zero_vector_counts_as_zero_and_never_nan():
+    features = torch.tensor([[1.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    target = torch.tensor([[1.0, 0.0], [1.0, 0.0], [0.0, 0.0]])
+    assert float(feature_cosine(features, target)) == pytest.approx(1 / 3)
+    naive = (features * target).sum(-1) / (features.norm(dim=-1) * target.norm(dim=-1))
+    assert naive.isnan().any()  # the wrong reading
+
+
+def test_cosine_shares_the_epsilon_of_the_codebook():
+    generator = torch.Generator().manual_seed(0)
+    a, b = (torch.randn(6, 4, dtype=torch.float64, generator=generator) for _ in range(2))
+    a[0] *= 0.5 * COSINE_EPSILON / a[0].norm()  # shorter than epsilon: its cosine is halved, not 1
+    b[0] = a[0]
+    torch.testing.assert_close(feature_cosine(a, b), (unit_rows(a) * unit_rows(b)).sum(-1).mean())
+    assert float(feature_cosine(a[:1], b[:1])) == pytest.approx(0.25)
+
+
+def test_cosine_gradcheck():
+    generator = torch.Generator().manual_seed(0)
+    a, b = (torch.randn(5, 4, dtype=torch.float64, generator=generator).requires_grad_() for _ in range(2))
+    assert torch.autograd.gradcheck(feature_cosine, (a, b))
+
+
+def test_cosine_refusals():
+    with pytest.raises(ValueError, match=r"target: expected the shape of features, \(2, 3\), got \(3,\)"):
+        feature_cosine(torch.zeros(2, 3), torch.zeros(3))
+    with pytest.raises(ValueError, match=r"features: expected at least one vector, got shape \(0, 3\)"):
+        feature_cosine(torch.zeros(0, 3), torch.zeros(0, 3))
+
+
+# pictures
+
+
+def test_psnr_agrees_with_skimage_and_closed_form():
+    a, b = pictures()
+    ours = psnr(torch.from_numpy(a), torch.from_numpy(b))
+    assert float(ours) == pytest.approx(skimage.metrics.peak_signal_noise_ratio(a, b, data_range=1.0), abs=1e-9)
+    assert float(psnr(torch.zeros(2, 2, 1), torch.full((2, 2, 1), 25.5), peak=255)) == pytest.approx(20, abs=1e-4)
+    assert psnr(torch.from_numpy(a), torch.from_numpy(a)) == torch.inf
+
+
+def test_ssim_agrees_with_its_definition():
+    a, b = pictures()
+    ours = float(ssim(torch.from_numpy(a), torch.from_numpy(b)))
+    assert ours == pytest.approx(mean_ssim(a, b, 1.0), abs=1e-9)
+    assert float(ssim(torch.from_numpy(255 * a), torch.from_numpy(255 * b), peak=255)) == pytest.approx(ours, abs=1e-9)
+    # the wrong readings: reflected borders; skimage's default window of 7x7 equal weights
+    batch = [torch.from_numpy(x).permute(2, 0, 1)[None] for x in (a, b)]
+    assert abs(float(kornia.metrics.ssim(*batch, 11, padding="same").mean()) - ours) > 5e-3
+    assert abs(skimage.metrics.structural_similarity(a, b, channel_axis=2, data_range=1.0) - ours) > 1e-3
+
+
+def test_ssim_agrees_with_skimage_under_the_same_protocol():
+    a, b = pictures(32, 40, seed=3)
+    theirs = skimage.metrics.structural_similarity(
+        a, b, channel_axis=2, data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
+    )
+    assert float(ssim(torch.from_numpy(a), torch.from_numpy(b))) == pytest.approx(theirs, abs=1e-6)
+
+
+def test_ssim_of_equal_pictures_is_one_even_when_black():
+    black = torch.zeros(12, 12, 3, dtype=torch.float64)
+    assert float(ssim(black, black)) == 1
+    batch = black.permute(2, 0, 1)[None]
+    assert float(kornia.metrics.ssim(batch, batch, 11).mean()) < 1 - 1e-6  # kornia's default eps
+
+
+def test_picture_refusals():
+    small = torch.zeros(10, 20, 3)
+    with pytest.raises(ValueError, match=r"image: expected at least 11 pixels on each side, got \(10, 20, 3\)"):
+        ssim(small, small)
+    with pytest.raises(ValueError, match=r"target: expected \[H, W, C\] with H = 10 \(from image\).*got \(9, 20, 3\)"):
+        ssim(small, small[1:])
+    with pytest.raises(ValueError, match="target: expected the shape of image"):
+        psnr(small, small[1:])
+    for metric in (psnr, ssim):
+        with pytest.raises(ValueError, match=r"peak: expected a number in \(0, inf\)"):
+            metric(torch.zeros(12, 12, 3), torch.zeros(12, 12, 3), peak=0)
+
+
+# storage
+
+DECODER_PARAMETERS = sum(i * o + o for i, o in [(9, 32), (32, 64), (64, 128), (128, 256), (256, 1024), (1024, 512)])
+
+
+def test_storage_reproduces_table_1():
+    """The rows of Table 1 that give their number of Gaussians to 0.1k, "MB" being MiB."""
+    assert DECODER_PARAMETERS == 831_744
+    assert round(semantic_storage_bytes(29_600, 512) / MIB, 1) == 59.4  # "just decouple"
+    assert round(semantic_storage_bytes(28_700, 512) / MIB, 1) == 57.6  # "decouple+ADC"
+    # "decouple+ADC+SC": 13.0. With all of K_max = 100 codewords the sum is 13.06; pruning leaves fewer, and any
+    # average from 43 to 93 codewords prints as 13.0
+    full = semantic_storage_bytes(110_500, 9, DECODER_PARAMETERS, 100 * 512) / MIB
+    assert full == pytest.approx(13.0, abs=0.07)
+    for codewords in (43, 93):
+        assert round(semantic_storage_bytes(110_500, 9, DECODER_PARAMETERS, codewords * 512) / MIB, 1) == 13.0
+
+
+def test_other_readings_of_table_1_fail():
+    total = semantic_storage_bytes(110_500, 9, DECODER_PARAMETERS, 100 * 512)
+    readings = {
+        "decimal megabytes": total / 1e6,
+        "without the normals": (total - 110_500 * 3 * 4) / MIB,
+        "latents only": (110_500 * 9 * 4 + (DECODER_PARAMETERS + 100 * 512) * 4) / MIB,
+        "without the decoder": semantic_storage_bytes(110_500, 9, 0, 100 * 512) / MIB,
+    }
+    assert all(abs(value - 13.0) > 0.5 for value in readings.values()), readings
+
+
+def test_storage_refuses_negative_counts():
+    with pytest.raises(ValueError, match="codebook_values: expected a number in"):
+        semantic_storage_bytes(1, 1, 0, -1)
