@@ -68,7 +68,8 @@ class GaussianParams:
         missing = [name for name in names if name not in tensors]
         if missing:
             raise ValueError(
-                f"tensors: expected the names {names}, got {sorted(tensors)} without {missing}; pass what GaussianParams.to_tensors gave"
+                f"tensors: expected the names {names}, got {sorted(tensors)} without {missing}; "
+                "pass what GaussianParams.to_tensors gave"
             )
         return cls(**{name: tensors[name] for name in names})
 

@@ -1,0 +1,316 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from kfgs import Camera, Gaussians, rasterize
+from kfgs.cameras import Distortion, resize_map
+from kfgs.fields import FieldConfig, GaussianParams, fit_field, l1_loss
+
+HEIGHT, WIDTH, CHANNELS = 24, 32, 3
+K = torch.tensor([[30.0, 0, 16.3], [0, 31.0, 11.6], [0, 0, 1]])
+SHORT = FieldConfig(
+    steps=60,
+    features_lr=0.05,
+    scales_lr=0.01,
+    means_lr=1e-3,
+    means_lr_final=1e-4,
+    densify_from=5,
+    densify_until=45,
+    densify_every=10,
+    densify_gradient=5e-4,
+    reset_every=25,
+    report_every=10,
+    checkpoint_every=20,
+)
+
+
+def look_at_origin(angle):
+    """A camera on a circle of radius 4 around the y axis, looking at the origin."""
+    c, s = torch.cos(torch.tensor(angle)), torch.sin(torch.tensor(angle))
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    viewmat[2, 3] = 4.0
+    return Camera(viewmat, K, WIDTH, HEIGHT, name=f"view {angle}")
+
+
+def blobs(n=12, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        means=torch.rand(n, 3, generator=generator) * 2 - 1,
+        quats=torch.randn(n, 4, generator=generator),
+        scales=torch.rand(n, 3, generator=generator) * 0.25 + 0.1,
+        opacities=torch.rand(n, generator=generator) * 0.6 + 0.3,
+        features=torch.rand(n, CHANNELS, generator=generator),
+    )
+
+
+def scene(views=5):
+    cameras = [look_at_origin(0.5 * i) for i in range(views)]
+    targets = [rasterize(blobs(), camera).map for camera in cameras]
+    return cameras, targets
+
+
+def start(n=60, channels=CHANNELS):
+    points = torch.rand(n, 3, generator=torch.Generator().manual_seed(7)) * 2.4 - 1.2
+    return GaussianParams.from_points(points, channels)
+
+
+def same(a, b):
+    return all(torch.equal(x, y) for x, y in zip(a.to_tensors().values(), b.to_tensors().values(), strict=True))
+
+
+def mean_loss(params, cameras, targets):
+    gaussians = params.activated()
+    return sum(
+        float((rasterize(gaussians, camera).map - target).abs().mean())
+        for camera, target in zip(cameras, targets, strict=True)
+    ) / len(cameras)
+
+
+def test_targets_are_recovered_from_a_poor_start():
+    cameras, targets = scene()
+    config = replace(
+        SHORT,
+        steps=300,
+        means_lr=5e-3,
+        quats_lr=0.01,
+        scales_lr=0.02,
+        features_lr=0.03,
+        densify_until=200,
+        densify_every=20,
+        densify_gradient=2e-3,
+        reset_every=0,
+    )
+    fit = fit_field(start(), cameras, targets, config, extent=2.0)
+    level = sum(float(target.abs().mean()) for target in targets) / len(targets)
+    assert mean_loss(fit.params, cameras, targets) < 0.05 * level
+    held_out = look_at_origin(0.75)
+    truth = rasterize(blobs(), held_out).map
+    assert mean_loss(fit.params, [held_out], [truth]) < 0.12 * level
+    assert len(fit.params) > 60  # densified
+    assert fit.history[-1]["loss"] < 0.1 * fit.history[0]["loss"]
+
+
+def test_history_and_callback_rows():
+    cameras, targets = scene(3)
+    rows = []
+    fit = fit_field(start(), cameras, targets, replace(SHORT, steps=25), extent=2.0, callback=rows.append)
+    assert [row["step"] for row in fit.history] == [10, 20, 25]
+    assert rows == fit.history
+    assert set(rows[0]) == {"step", "loss", "count", "seconds"}
+    assert rows[-1]["count"] == len(fit.params)
+    assert rows[0]["seconds"] <= rows[1]["seconds"]
+
+
+def test_reported_loss_is_the_mean_since_the_last_row():
+    cameras, targets = scene(3)
+    seen = []
+
+    def recorded(rendered, alpha, target):
+        value = l1_loss(rendered, alpha, target)
+        seen.append(float(value.detach()))
+        return value
+
+    fit = fit_field(start(), cameras, targets, replace(SHORT, steps=25), extent=2.0, loss=recorded)
+    assert fit.history[0]["loss"] == pytest.approx(sum(seen[:10]) / 10)
+    assert fit.history[2]["loss"] == pytest.approx(sum(seen[20:]) / 5)
+
+
+def test_every_view_comes_once_per_epoch_in_seeded_random_order():
+    cameras, targets = scene(4)
+
+    class Recorded(list):
+        def __init__(self, maps):
+            super().__init__(maps)
+            self.order = []
+
+        def __getitem__(self, i):
+            self.order.append(i)
+            return super().__getitem__(i)
+
+    def order(seed):
+        maps = Recorded(targets)
+        config = replace(SHORT, steps=12)
+        fit_field(start(), cameras, maps, config, extent=2.0, generator=torch.Generator().manual_seed(seed))
+        return maps.order
+
+    views = order(1)
+    assert len(views) == 12  # each target is read once per step, and no more
+    assert [sorted(views[i : i + 4]) for i in (0, 4, 8)] == [[0, 1, 2, 3]] * 3
+    assert order(1) == views
+    assert any(order(seed) != views for seed in (2, 3))
+
+
+def test_equal_seeds_give_equal_bits_and_the_start_stays():
+    cameras, targets = scene(3)
+    first = start()
+    before = first.map(torch.Tensor.clone)
+    fits = [fit_field(first, cameras, targets, SHORT, extent=2.0) for _ in range(2)]
+    assert same(fits[0].params, fits[1].params)
+    assert same(first, before)
+    assert not fits[0].params.means.requires_grad
+
+
+class Interrupt(Exception):
+    pass
+
+
+@pytest.mark.parametrize("stop_at", [30, 50])  # between checkpoints: resumes from step 20 and step 40
+def test_a_resumed_fit_equals_an_undisturbed_one_bit_for_bit(tmp_path, stop_at):
+    cameras, targets = scene(3)
+    whole = fit_field(start(), cameras, targets, SHORT, extent=2.0, generator=torch.Generator().manual_seed(3))
+    path = tmp_path / "fit.safetensors"
+
+    def interrupt(row):
+        if row["step"] == stop_at:
+            raise Interrupt
+
+    with pytest.raises(Interrupt):
+        fit_field(
+            start(),
+            cameras,
+            targets,
+            SHORT,
+            extent=2.0,
+            generator=torch.Generator().manual_seed(3),
+            callback=interrupt,
+            checkpoint=path,
+        )
+    steps, generator = [], torch.Generator().manual_seed(3)
+    resumed = fit_field(
+        start(),
+        cameras,
+        targets,
+        SHORT,
+        extent=2.0,
+        generator=generator,
+        callback=lambda row: steps.append(row["step"]),
+        checkpoint=path,
+    )
+    assert steps[0] == stop_at  # it did not start again
+    assert same(resumed.params, whole.params)
+    for key in ("step", "loss", "count"):
+        assert [row[key] for row in resumed.history] == [row[key] for row in whole.history]
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_finished_checkpoint_returns_at_once(tmp_path):
+    cameras, targets = scene(3)
+    path = tmp_path / "fit.safetensors"
+    done = fit_field(start(), cameras, targets, SHORT, extent=2.0, checkpoint=path)
+    again = fit_field(start(), cameras, targets, SHORT, extent=2.0, checkpoint=path, callback=lambda row: 1 / 0)
+    assert same(done.params, again.params)
+
+
+def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
+    cameras, targets = scene(3)
+    path = tmp_path / "fit.safetensors"
+    short = replace(SHORT, steps=5)
+    fit_field(start(), cameras, targets, short, extent=2.0, checkpoint=path)
+    with pytest.raises(ValueError, match="got one with other config; delete it"):
+        fit_field(start(), cameras, targets, replace(short, features_lr=0.1), extent=2.0, checkpoint=path)
+    with pytest.raises(ValueError, match="other cameras, targets;"):
+        fit_field(start(), cameras[:2], targets[:2], short, extent=2.0, checkpoint=path)
+    with pytest.raises(ValueError, match="other extent, generator, params"):
+        fit_field(
+            start(61), cameras, targets, short, extent=3.0, checkpoint=path, generator=torch.Generator().manual_seed(9)
+        )
+    how_often = replace(short, checkpoint_every=2)  # changes no result
+    assert len(fit_field(start(), cameras, targets, how_often, extent=2.0, checkpoint=path).history) == 1
+
+
+def test_a_damaged_or_foreign_checkpoint_is_refused(tmp_path):
+    from safetensors.torch import save_file
+
+    cameras, targets = scene(2)
+    damaged, foreign = tmp_path / "damaged", tmp_path / "foreign"
+    damaged.write_bytes(b"nothing of the kind")
+    save_file({"x": torch.zeros(2)}, foreign)
+    with pytest.raises(ValueError, match="checkpoint: expected a kfgs field checkpoint at .*damaged, but it cannot"):
+        fit_field(start(), cameras, targets, SHORT, extent=2.0, checkpoint=damaged)
+    with pytest.raises(ValueError, match="got other tensors"):
+        fit_field(start(), cameras, targets, SHORT, extent=2.0, checkpoint=foreign)
+
+
+def test_render_scale_sets_the_rendered_size_and_never_exceeds_the_camera():
+    cameras, targets = scene(2)
+    small = [resize_map(target, (6, 8)) for target in targets]
+    sizes = set()
+
+    def recorded(rendered, alpha, target):
+        sizes.add((tuple(rendered.shape), tuple(alpha.shape), tuple(target.shape)))
+        return l1_loss(rendered, alpha, target)
+
+    for scale in (None, 2.0, 100.0):
+        config = replace(SHORT, steps=2, render_scale=scale)
+        fit_field(start(), cameras, small, config, extent=2.0, loss=recorded)
+    assert sizes == {((24, 32, 3), (24, 32), (6, 8, 3)), ((12, 16, 3), (12, 16), (6, 8, 3))}
+
+
+def test_target_gradient_size_densifies_less():
+    cameras, targets = scene(3)
+    small = [resize_map(target, (6, 8)) for target in targets]
+    config = replace(SHORT, steps=16, densify_gradient=2e-3, densify_from=5, densify_every=15)
+    counts = [
+        len(fit_field(start(), cameras, small, replace(config, densify_gradient_size=size), extent=2.0).params)
+        for size in ("render", "target")
+    ]
+    assert counts[0] > counts[1]
+
+
+def test_opacities_are_reset_on_schedule():
+    cameras, targets = scene(2)
+    config = replace(SHORT, steps=10, reset_every=10, densify_from=20)
+    fit = fit_field(start(), cameras, targets, config, extent=2.0)
+    assert fit.params.activated().opacities.max() <= 0.01 + 1e-6
+    assert (
+        fit_field(start(), cameras, targets, replace(config, reset_every=0), extent=2.0).params.logit_opacities.max()
+        > -3
+    )
+
+
+def test_a_view_without_gaussians_teaches_nothing_and_breaks_nothing():
+    away = look_at_origin(0.0)
+    away.viewmat[2, 3] = -40.0  # everything lies behind it
+    target = torch.ones(HEIGHT, WIDTH, CHANNELS)
+    config = replace(SHORT, steps=3, densify_from=50)
+    fit = fit_field(start(), [away], [target], config, extent=2.0)
+    assert same(fit.params, start())
+    assert fit.history[-1]["loss"] == pytest.approx(1.0)
+
+
+def test_l1_loss_is_the_mean_over_pixels_and_channels_after_the_resize():
+    rendered = torch.tensor([[[0.0, 8.0], [2.0, 8.0]], [[4.0, 8.0], [6.0, 8.0]]])  # means 3 and 8
+    loss = l1_loss(rendered, torch.ones(2, 2), torch.tensor([[[1.0, 9.0]]]))
+    assert float(loss) == pytest.approx((2.0 + 1.0) / 2)
+
+
+def test_wrong_arguments():
+    cameras, targets = scene(2)
+    with pytest.raises(ValueError, match=r"targets: expected one map per camera \(2, at least one\), got 1"):
+        fit_field(start(), cameras, targets[:1], SHORT, extent=2.0)
+    with pytest.raises(
+        ValueError, match=r"targets\[\d\]: expected \[h, w, D\] with D = 5 \(from params\), got \(24, 32, 3\)"
+    ):
+        fit_field(start(channels=5), cameras, targets, SHORT, extent=2.0)
+    with pytest.raises(ValueError, match="extent: expected a number in"):
+        fit_field(start(), cameras, targets, SHORT, extent=0.0)
+    with pytest.raises(ValueError, match="params: expected at least one Gaussian"):
+        fit_field(start().map(lambda value: value[:0]), cameras, targets, SHORT, extent=2.0)
+    bent = replace(cameras[0], distortion=Distortion("brown_conrady", (0.1, 0.0, 0.0, 0.0)))
+    with pytest.raises(ValueError, match="cameras: expected cameras without distortion, got brown_conrady"):
+        fit_field(start(), [bent], targets[:1], SHORT, extent=2.0)
+
+
+def test_a_target_with_nan_stops_the_fit():
+    cameras, targets = scene(1)
+    with pytest.raises(FloatingPointError, match=r"loss: expected a finite number at step 1, got nan"):
+        fit_field(start(), cameras, [targets[0] * torch.nan], SHORT, extent=2.0)
+
+
+def test_losing_every_gaussian_says_so():
+    cameras, targets = scene(1)
+    config = replace(SHORT, prune_opacity=0.9)
+    with pytest.raises(ValueError, match="config: expected some Gaussian to outlast pruning, got none at step 10"):
+        fit_field(start(), cameras, targets, config, extent=2.0)
