@@ -1,1 +1,37 @@
-"""TODO."""
+"""Scenes: posed images and points, read from what COLMAP, nerfstudio, instant-ngp and Blender write, or estimated."""
+
+from .colmap import load_colmap
+from .colmap_check import ModelSummary, check_model
+from .errors import SceneError
+from .files import list_images
+from .load import load_scene
+from .names import file_stem, natural_key
+from .points import Bounds, robust_bounds
+from .scene import Scene, read_image
+from .sfm import SfmConfig, SfmReport, run_sfm
+from .splits import make_split, read_split, split_every
+from .transforms import load_transforms
+from .undistort import undistort_scene
+
+__all__ = [
+    "Bounds",
+    "ModelSummary",
+    "Scene",
+    "SceneError",
+    "SfmConfig",
+    "SfmReport",
+    "check_model",
+    "file_stem",
+    "list_images",
+    "load_colmap",
+    "load_scene",
+    "load_transforms",
+    "make_split",
+    "natural_key",
+    "read_image",
+    "read_split",
+    "robust_bounds",
+    "run_sfm",
+    "split_every",
+    "undistort_scene",
+]

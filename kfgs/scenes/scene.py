@@ -1,0 +1,184 @@
+"""A scene: posed cameras, the image files they took, a point cloud, and which views are held out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+from kornia.io import ImageLoadType, load_image
+from torch import Tensor
+
+from .._check import check_shapes
+from ..cameras.camera import Camera
+from ..cameras.undistort import undistort
+from .errors import SceneError
+from .names import file_stem
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")  # what kornia decodes
+
+
+def read_image(path: str | Path) -> Tensor:  # [H, W, 3] float32 in [0, 1]
+    """Read a PNG, JPEG, TIFF or WebP file; transparency is laid on white, EXIF orientation is ignored as COLMAP does.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        SceneError: if it cannot be decoded.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected an image there")
+    try:
+        image = load_image(str(path), ImageLoadType.RGB32)
+    except (ValueError, RuntimeError, OSError) as error:
+        raise SceneError(
+            f"{path}: expected a PNG, JPEG, TIFF or WebP image, but it cannot be decoded ({error}); "
+            "replace the file or take it out of the scene"
+        ) from error
+    return image.permute(1, 2, 0).contiguous()
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """V posed views of one place. Images are read when asked for, one at a time.
+
+    **Convention**: world to camera, pixel centres on halves (`Camera`); world units are the file's. Views are in
+    natural order of their names where a loader made the scene.
+    """
+
+    cameras: list[Camera]
+    """V cameras; a camera's name is its image's file name relative to the image folder."""
+    image_paths: list[Path]
+    """V files."""
+    points: Tensor  # [P, 3] float32
+    """The sparse cloud, possibly empty (P = 0), with outliers as it came: see `robust_bounds`."""
+    colors: Tensor  # [P, 3] uint8
+    """The cloud's colours."""
+    splits: dict[str, list[int]] = field(default_factory=dict)
+    """Named lists of views; loaders give at least `train` and `test`."""
+    notes: tuple[str, ...] = ()
+    """What a user should know about how the scene was read: what is missing, what was assumed."""
+    lenses: list[Camera] | None = None
+    """Of an undistorted scene: the cameras with the distortion that the files on disk still have."""
+
+    def __post_init__(self) -> None:
+        check_shapes(("points", self.points, "P 3"), ("colors", self.colors, "P 3"))
+        views = len(self.cameras)
+        for name, values in (("image_paths", self.image_paths), ("lenses", self.lenses)):
+            if values is not None and len(values) != views:
+                raise ValueError(f"{name}: expected {views} (one per camera), got {len(values)}; give one for each")
+        stems = [file_stem(camera.name) for camera in self.cameras]
+        if len(set(stems)) != views:
+            twice = next(stem for stem in stems if stems.count(stem) > 1)
+            raise SceneError(
+                f"cameras: expected names that differ before the suffix (features and labels are found by them), "
+                f"got {twice!r} twice; rename one of the images"
+            )
+        for name, indices in self.splits.items():
+            wrong = [i for i in indices if not 0 <= i < views]
+            if wrong:
+                raise ValueError(f"splits[{name!r}]: expected views in [0, {views}), got {wrong[0]}; correct the split")
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def __repr__(self) -> str:
+        splits = ", ".join(f"{name} {len(views)}" for name, views in self.splits.items())
+        return f"Scene({len(self)} views, {len(self.points)} points, splits: {splits or 'none'})"
+
+    def stem(self, i: int) -> str:
+        """The name of view `i` without its suffix: what feature and label files are called."""
+        return file_stem(self.cameras[i].name)
+
+    def image(self, i: int) -> Tensor:  # [H, W, 3] in [0, 1]
+        """Read the picture of view `i`; in an undistorted scene the lens is removed on the way.
+
+        Raises:
+            FileNotFoundError: if the file has gone.
+            SceneError: if it cannot be decoded, or is not of the camera's size.
+        """
+        lens = self.cameras[i] if self.lenses is None else self.lenses[i]
+        image = read_image(self.image_paths[i])
+        if image.shape[:2] != lens.size:
+            raise SceneError(
+                f"{self.image_paths[i]}: expected {lens.width}x{lens.height} pixels as its camera says, got "
+                f"{image.shape[1]}x{image.shape[0]}; give the folder of full-size images, or resize the images"
+            )
+        return image if self.lenses is None else undistort(image, lens)[0]
+
+    def mask(self, i: int) -> Tensor:  # [H, W] bool
+        """Which pixels of view `i` were recorded: all, except at the border of an undistorted picture."""
+        if self.lenses is None:
+            return torch.ones(self.cameras[i].size, dtype=torch.bool)
+        return undistort(torch.zeros(*self.lenses[i].size, 1), self.lenses[i])[2]
+
+    @property
+    def distorted(self) -> bool:
+        """Whether a camera still has its lens; such a scene cannot be rasterised before `undistorted()`."""
+        return any(camera.distortion is not None for camera in self.cameras)
+
+    def undistorted(self) -> Scene:
+        """The same scene without lens distortion: pinhole cameras of the same K and size, pictures undistorted lazily.
+
+        Where the lens saw less than the pinhole does, pictures are black and `mask` is False.
+        """
+        if not self.distorted:
+            return self
+        return replace(self, cameras=[replace(c, distortion=None) for c in self.cameras], lenses=list(self.cameras))
+
+    @property
+    def extent(self) -> float:
+        """1.1 times the largest distance of a training camera from the training cameras' mean, in world units.
+
+        The length that 3DGS scales position steps with. All views count where the `train` split is empty. Cameras that
+        all stand in one place give no length: then the median distance to the points is taken, or 1 without points.
+        """
+        chosen = self.splits.get("train") or range(len(self))
+        if len(chosen) == 0:
+            raise ValueError("cameras: expected at least one view, got none; the extent of an empty scene is unknown")
+        centers = torch.stack([self.cameras[i].center.detach().double().cpu() for i in chosen])
+        mean = centers.mean(0)
+        radius = 1.1 * float((centers - mean).norm(dim=-1).max())
+        if radius > 1e-6 * (1 + float(mean.norm())):
+            return radius
+        return float((self.points.double() - mean).norm(dim=-1).median()) if len(self.points) else 1.0
+
+    def select(self, which: str | Sequence[str] | Sequence[int]) -> Scene:
+        """The scene with some of its views; points stay, splits keep their names.
+
+        Args:
+            which: the name of a split, or a list of view names (with or without suffix), or of indices.
+
+        Raises:
+            ValueError: if a split or a view is unknown.
+        """
+        indices = self._resolve(which)
+        place = {view: position for position, view in enumerate(indices)}
+        return replace(
+            self,
+            cameras=[self.cameras[i] for i in indices],
+            image_paths=[self.image_paths[i] for i in indices],
+            lenses=None if self.lenses is None else [self.lenses[i] for i in indices],
+            splits={name: sorted(place[i] for i in views if i in place) for name, views in self.splits.items()},
+        )
+
+    def _resolve(self, which: str | Sequence[str] | Sequence[int]) -> list[int]:
+        if isinstance(which, str):
+            if which not in self.splits:
+                raise ValueError(f"which: expected one of the splits {sorted(self.splits)}, got {which!r}")
+            return list(self.splits[which])
+        by_name = {camera.name: i for i, camera in enumerate(self.cameras)}
+        by_name |= {self.stem(i): i for i in range(len(self))}
+        indices: list[int] = []
+        for view in which:
+            i = by_name.get(view) if isinstance(view, str) else view
+            if i is None or not 0 <= i < len(self):
+                raise ValueError(
+                    f"which: expected names or indices of the scene's {len(self)} views, got {view!r}; "
+                    f"names are like {self.cameras[0].name!r}"
+                )
+            indices.append(i)
+        if len(set(indices)) != len(indices):
+            raise ValueError("which: expected each view once, got one twice; remove the repetition")
+        return indices

@@ -1,0 +1,224 @@
+"""Cameras for a folder of bare images: structure from motion through pycolmap, on the CPU."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from tqdm import tqdm
+
+from .._check import check_choice, check_range
+from .._files import atomic_folder
+from ._pycolmap import quiet_pycolmap, wrapped
+from .colmap import SUPPORTED_MODELS
+from .errors import SceneError
+from .files import list_images
+from .names import some
+
+
+@dataclass(frozen=True)
+class SfmConfig:
+    """How cameras are estimated."""
+
+    matching: Literal["exhaustive", "sequential"] = "exhaustive"
+    """Which pairs of images are compared: all (90 images: minutes), or neighbours in natural order of names (video)."""
+    camera_model: str = "SIMPLE_RADIAL"
+    """COLMAP's name of the lens model that is fitted."""
+    single_camera: bool = True
+    """One camera took all images, at one zoom and size; False fits intrinsics to each image."""
+    min_registered: float = 0.9
+    """Least share of the images that one model must place, in (0, 1]."""
+    max_features: int = 8192
+    """Most SIFT features per image."""
+    seed: int = 0
+    """Of every random choice; with `num_threads=1` a rerun is bit-equal."""
+    num_threads: int = -1
+    """CPU threads; -1 takes all."""
+
+    def __post_init__(self) -> None:
+        check_choice("matching", self.matching, ("exhaustive", "sequential"))
+        check_choice("camera_model", self.camera_model, SUPPORTED_MODELS)
+        check_range("min_registered", self.min_registered, 0, 1, closed=(False, True))
+        check_range("max_features", self.max_features, 100)
+        if self.num_threads != -1:
+            check_range("num_threads", self.num_threads, 1)
+
+
+@dataclass(frozen=True)
+class SfmReport:
+    """What structure from motion found."""
+
+    registered: int
+    """Images with a pose."""
+    total: int
+    """Images in the folder."""
+    points: int
+    """3-D points."""
+    mean_reprojection_error: float
+    """Of the points, in pixels."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Wall-clock time of features, matching, mapping."""
+    missing: tuple[str, ...] = ()
+    """Images without a pose."""
+    model_sizes: tuple[int, ...] = ()
+    """Images of each model found, largest first; the first was written."""
+
+    def __str__(self) -> str:
+        lost = f"; without a pose: {some(list(self.missing))}" if self.missing else ""
+        times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in self.seconds.items())
+        return (
+            f"{self.registered} of {self.total} images registered, {self.points} points, mean reprojection error "
+            f"{self.mean_reprojection_error:.2f} px ({times}){lost}"
+        )
+
+
+def run_sfm(
+    images: str | Path, out: str | Path, *, config: SfmConfig | None = None, progress: bool = False
+) -> SfmReport:
+    """Estimate cameras and a sparse cloud, and write them to `out/sparse/0`.
+
+    Args:
+        images: folder of images (subfolders too); other files are passed over.
+        out: scene folder; `out/sparse/0` appears whole or not at all, and replaces an older one.
+        config: what to do; the default suits up to a few hundred photos of one camera.
+        progress: show a bar: images described, pairs compared, images placed.
+
+    Returns:
+        Counts, error and times.
+
+    Raises:
+        FileNotFoundError: if there is no such folder.
+        SceneError: if there are fewer than 3 images, pycolmap fails, or the largest model places fewer than
+            `min_registered` of the images (the rest is lost, or COLMAP split the scene into unconnected models).
+        ImportError: if pycolmap is not installed.
+
+    Note:
+        Every random choice is seeded; several threads may still differ in the last digits.
+    """
+    images, out, config = Path(images), Path(out), config or SfmConfig()
+    if not images.is_dir():
+        raise FileNotFoundError(f"{images}: no such folder; expected the images there")
+    names = list_images(images)
+    if len(names) < 3:
+        raise SceneError(f"{images}: expected at least 3 images (PNG, JPEG, TIFF, WebP), got {len(names)}; add views")
+    with (
+        tempfile.TemporaryDirectory(prefix="kfgs-sfm-") as scratch,
+        quiet_pycolmap() as pycolmap,
+        wrapped(f"{images}: expected images that pycolmap can register", "check the images and the free disk space"),
+        tqdm(disable=not progress, unit="image") as bar,
+    ):
+        run = _Run(pycolmap, images, names, Path(scratch), config, bar)
+        seconds = {name: _timed(stage) for name, stage in (("features", run.extract), ("matching", run.match))}
+        seconds["mapping"] = _timed(run.map)
+        models = sorted(run.models, key=lambda model: -model.num_reg_images())
+        sizes = tuple(model.num_reg_images() for model in models)
+        _require_one_model(images, sizes, names, config)
+        with atomic_folder(out / "sparse" / "0") as folder:
+            models[0].write(str(folder))
+        placed = {image.name for image in models[0].images.values() if image.has_pose}
+        return SfmReport(
+            registered=len(placed),
+            total=len(names),
+            points=len(models[0].points3D),
+            mean_reprojection_error=float(models[0].compute_mean_reprojection_error()),
+            seconds=seconds,
+            missing=tuple(name for name in names if name not in placed),
+            model_sizes=sizes,
+        )
+
+
+def _timed(stage: Callable[[], None]) -> float:
+    start = time.perf_counter()
+    stage()
+    return time.perf_counter() - start
+
+
+@dataclass
+class _Run:
+    """The three stages, over one database."""
+
+    pycolmap: Any
+    images: Path
+    names: list[str]
+    scratch: Path
+    config: SfmConfig
+    bar: Any
+    models: list[Any] = field(default_factory=list)
+
+    @property
+    def database(self) -> str:
+        return str(self.scratch / "database.db")
+
+    def _stage(self, name: str, total: int, unit: str) -> None:
+        self.bar.reset(total=total)
+        self.bar.unit = unit
+        self.bar.set_description(name)
+
+    def extract(self) -> None:
+        """Describe the images a few at a time, which lets the bar move and Ctrl-C in."""
+        colmap, config = self.pycolmap, self.config
+        colmap.set_random_seed(config.seed)
+        self._stage("features", len(self.names), "image")
+        mode = colmap.CameraMode.SINGLE if config.single_camera else colmap.CameraMode.PER_IMAGE
+        reader: dict[str, Any] = {"camera_model": config.camera_model}
+        options = {"num_threads": config.num_threads, "sift": {"max_num_features": config.max_features}}
+        for start in range(0, len(self.names), 8):
+            some_names = self.names[start : start + 8]
+            colmap.extract_features(
+                self.database, str(self.images), image_names=some_names, camera_mode=mode, reader_options=reader,
+                extraction_options=options, device=colmap.Device.cpu,
+            )  # fmt: skip
+            if config.single_camera and start == 0:
+                reader["existing_camera_id"] = self._camera_id()
+            self.bar.update(len(some_names))
+
+    def _camera_id(self) -> int:
+        with self.pycolmap.Database.open(self.database) as database:
+            return int(database.read_all_cameras()[0].camera_id)
+
+    def match(self) -> None:
+        """Compare pairs; pycolmap says nothing until it is done."""
+        colmap, config, count = self.pycolmap, self.config, len(self.names)
+        exhaustive = config.matching == "exhaustive"
+        self._stage("matching", count * (count - 1) // 2 if exhaustive else count, "pair" if exhaustive else "image")
+        match = colmap.match_exhaustive if exhaustive else colmap.match_sequential
+        match(
+            self.database, matching_options={"num_threads": config.num_threads},
+            verification_options={"ransac": {"random_seed": config.seed}}, device=colmap.Device.cpu,
+        )  # fmt: skip
+        self.bar.update(self.bar.total)
+
+    def map(self) -> None:
+        """Place the images one after the other."""
+        colmap, seed = self.pycolmap, self.config.seed
+        self._stage("mapping", len(self.names), "image")
+        options = colmap.IncrementalPipelineOptions(random_seed=seed, num_threads=self.config.num_threads)
+        options.mapper.random_seed = options.triangulation.random_seed = seed
+        (self.scratch / "models").mkdir()
+        found = colmap.incremental_mapping(
+            self.database, str(self.images), str(self.scratch / "models"), options=options,
+            initial_image_pair_callback=lambda: self.bar.update(2), next_image_callback=lambda: self.bar.update(1),
+        )  # fmt: skip
+        self.models = list(found.values())
+
+
+def _require_one_model(images: Path, sizes: tuple[int, ...], names: list[str], config: SfmConfig) -> None:
+    """Refuse a model that leaves too many images out: a scene quietly missing a room is worse than none."""
+    needed = config.min_registered * len(names)
+    if sizes and sizes[0] >= needed:
+        return
+    if len(sizes) > 1:
+        got = f"a scene split into {len(sizes)} unconnected models of {', '.join(map(str, sizes))} images"
+    else:
+        got = f"{sizes[0] if sizes else 0}"
+    advice = ["use matching='exhaustive'"] if config.matching == "sequential" else []
+    advice += ["take overlapping photos between the parts"]
+    advice += ["pass single_camera=False if sizes or zoom differ"] if config.single_camera else []
+    raise SceneError(
+        f"{images}: expected at least {needed:.0f} of {len(names)} images registered in one model (min_registered = "
+        f"{config.min_registered:g}), got {got}; {', or '.join(advice)}, or lower min_registered"
+    )

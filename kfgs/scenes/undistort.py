@@ -1,0 +1,54 @@
+"""Remove lenses that kfgs has no exact form of, with COLMAP's own undistorter."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from .._files import atomic_folder
+from ._pycolmap import quiet_pycolmap, wrapped
+from .colmap_check import check_model
+from .errors import SceneError
+
+
+def undistort_scene(images: str | Path, model: str | Path, out: str | Path) -> Path:
+    """Write a scene with pinhole cameras: `out/images` and `out/sparse/0`, undistorted by pycolmap.
+
+    For lenses that `load_scene` refuses (FOV, THIN_PRISM_FISHEYE, EUCM, ...); all others are undistorted lazily by
+    `Scene.undistorted`.
+
+    Args:
+        images: the distorted images.
+        model: their COLMAP model.
+        out: the scene folder to make; an older one of that name is replaced.
+
+    Returns:
+        `out`.
+
+    Raises:
+        FileNotFoundError: if a folder is missing.
+        SceneError: if the model is damaged, or pycolmap fails on it or on the images.
+    """
+    images, model, out = Path(images), Path(model), Path(out)
+    if not images.is_dir():
+        raise FileNotFoundError(f"{images}: no such folder; expected the images of {model} there")
+    if out.resolve() in (images.resolve(), *images.resolve().parents, model.resolve(), *model.resolve().parents):
+        raise SceneError(
+            f"{out}: expected a folder of its own, got one that holds the images or the model; choose another"
+        )
+    check_model(model)
+    advice = "check the images, or run `colmap image_undistorter` yourself"
+    with (
+        atomic_folder(out) as folder,
+        quiet_pycolmap() as pycolmap,
+        wrapped(f"{model}: expected a scene that pycolmap can undistort", advice),
+    ):
+        pycolmap.undistort_images(str(folder), str(model), str(images))
+        written = folder / "sparse"
+        (folder / "sparse_model").mkdir()
+        written.rename(folder / "sparse_model" / "0")
+        (folder / "sparse_model").rename(written)
+        if not any(file.is_file() for file in (folder / "images").rglob("*")):
+            raise SceneError(
+                f"{images}: expected the images of {model}, none could be undistorted; give the right folder"
+            )
+    return out
