@@ -1,0 +1,117 @@
+"""Can this machine draw 3-D pictures, with or without a display? Found out where a crash does no harm."""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+import sys
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from .._check import check_range
+
+if TYPE_CHECKING:
+    import pyvista as pv
+
+WINDOW_VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
+DEBIAN_PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri"
+PROBE_SECONDS = 120  # a first start of VTK from a cold disk takes tens of seconds
+PROBE = """
+import pyvista as pv
+plotter = pv.Plotter(off_screen=True, window_size=(8, 8))
+plotter.background_color = (255, 0, 0)
+plotter.add_mesh(pv.Sphere(radius=0.01))
+picture = plotter.screenshot(return_img=True)
+plotter.close()
+assert picture.shape == (8, 8, 3) and tuple(picture[0, 0]) == (255, 0, 0), picture
+"""
+
+
+class Probe(NamedTuple):
+    """Whether an 8 x 8 picture could be drawn, and what happened if not."""
+
+    works: bool
+    reason: str
+
+
+def prepare() -> None:
+    """Choose VTK's EGL window when there is no display, before the first window is made.
+
+    Sets `VTK_DEFAULT_OPENGL_WINDOW=vtkEGLRenderWindow` in this process on Linux, and only where neither DISPLAY nor
+    WAYLAND_DISPLAY is set; a value that is already there is left alone.
+    """
+    if sys.platform.startswith("linux") and not has_display():
+        os.environ.setdefault(WINDOW_VARIABLE, "vtkEGLRenderWindow")
+
+
+def has_display() -> bool:
+    """Whether a desktop is there to open a window on (Windows and macOS: always)."""
+    if not sys.platform.startswith("linux"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+@functools.cache
+def probe() -> Probe:
+    """Draw an 8 x 8 picture in another process, once: without an OpenGL driver VTK ends Python with a segfault."""
+    prepare()
+    try:
+        result = subprocess.run(
+            [sys.executable, "-c", PROBE], capture_output=True, text=True, timeout=PROBE_SECONDS, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return Probe(False, f"the trial picture did not finish ({error})")
+    if result.returncode == 0:
+        return Probe(True, "")
+    if result.returncode < 0 or result.returncode == 139:  # killed by a signal, 139 = 128 + SIGSEGV through a shell
+        return Probe(False, f"the trial picture crashed (exit status {result.returncode}): no OpenGL driver")
+    last = (result.stderr.strip().splitlines() or ["no message"])[-1]
+    return Probe(False, f"the trial picture failed ({last})")
+
+
+def available() -> bool:
+    """Whether 3-D pictures can be drawn here. The first call takes a second or two, later ones nothing."""
+    return probe().works
+
+
+def make_plotter(
+    height: int = 768,
+    width: int = 1024,
+    *,
+    shape: tuple[int, int] = (1, 1),
+    off_screen: bool | None = None,
+    background: str = "white",
+) -> pv.Plotter:
+    """A pyvista plotter that works with and without a display.
+
+    Args:
+        height: of the window, pixels.
+        width: of the window, pixels.
+        shape: (rows, columns) of subplots.
+        off_screen: draw without a window; None: only where there is no display.
+        background: a colour that pyvista knows.
+
+    Raises:
+        RuntimeError: if nothing can be drawn here; the message names the packages to install.
+        ValueError: if a size is not positive.
+    """
+    check_range("height", height, 1)
+    check_range("width", width, 1)
+    hidden = not has_display() if off_screen is None else off_screen
+    require()
+    import pyvista as pv
+
+    options: dict[str, Any] = {"shape": shape} if shape != (1, 1) else {}
+    plotter = pv.Plotter(off_screen=hidden, window_size=(width, height), **options)
+    plotter.set_background(background)
+    return plotter
+
+
+def require() -> None:
+    """Raise a RuntimeError, rather than let VTK crash, if nothing can be drawn here."""
+    found = probe()
+    if not found.works:
+        raise RuntimeError(
+            f"3-D pictures cannot be drawn here: expected a working OpenGL, but {found.reason}; "
+            f"on Debian or Ubuntu run: apt-get install {DEBIAN_PACKAGES}"
+        )
