@@ -1,0 +1,460 @@
+"""The promises of `kfgs.splat.engines.contract`, asked of every engine that is installed."""
+
+import numpy as np
+import oracles_splat as oracle
+import pytest
+import torch
+from cases_splat import TOLERANCE, assert_close_but_for_thresholds, random_splats
+
+from kfgs.splat import Tiles, accumulate_pixels, available_engines, bin_tiles, composite, engines
+
+ENGINES = available_engines()
+OTHERS = [name for name in ENGINES if name != "reference"]
+
+every_engine = pytest.mark.parametrize("engine", ENGINES)
+every_dtype = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+
+
+def _run(projected, features, width, height, *, tile_size=16, **options):
+    tiles = bin_tiles(projected, width, height, tile_size)
+    return composite(projected.means2d, projected.conics, projected.opacities, features, tiles, **options)
+
+
+def _by_oracle(projected, features, width, height, background=None):
+    values = (projected.means2d, projected.conics, projected.depths, projected.opacities, features)
+    background = None if background is None else background.double().numpy()
+    maps, alphas = oracle.composite(*(v.double().numpy() for v in values), width, height, background)
+    return torch.from_numpy(maps), torch.from_numpy(alphas)
+
+
+def _stack(opacities, dtype=torch.float64):
+    """Flat Gaussians, one behind the other, that cover one tile: alpha is the opacity everywhere (to 1e-10)."""
+    M = len(opacities)
+    means2d, conics = torch.full((M, 2), 8.0, dtype=dtype), torch.tensor([[1e-13, 0, 1e-13]], dtype=dtype).repeat(M, 1)
+    tiles = Tiles(torch.arange(M, dtype=torch.int32), torch.tensor([0, M]), 16, 16, 16)
+    return means2d, conics, torch.tensor(opacities, dtype=dtype), tiles
+
+
+def _gradients(inputs, tiles, cotangents, engine):
+    """Gradients of all five inputs, for fixed cotangents of maps and alphas."""
+    inputs = [v.detach().clone().requires_grad_() for v in inputs]
+    outputs = composite(*inputs[:4], tiles, background=inputs[4], engine=engine)
+    return torch.autograd.grad(outputs, inputs, cotangents)
+
+
+# 1. pixels and density ------------------------------------------------------------------------------------------------
+
+
+@every_engine
+@every_dtype
+@pytest.mark.parametrize(
+    ("M", "width", "height", "channels"), [(40, 24, 18, 3), (25, 16, 16, 1), (30, 33, 17, 9), (20, 7, 5, 21)]
+)
+def test_agrees_with_the_equations(engine, dtype, M, width, height, channels):
+    projected, features = random_splats(M, width, height, seed=M, dtype=dtype, channels=channels)
+    background = torch.linspace(-1, 1, channels, dtype=dtype)
+    maps, alphas = _run(projected, features, width, height, background=background, engine=engine)
+    expected_maps, expected_alphas = _by_oracle(projected, features, width, height, background)
+    assert (maps.dtype, alphas.dtype) == (dtype, dtype)
+    assert maps.shape == (height, width, channels)
+    assert expected_alphas.max() > 0.9
+    if dtype == torch.float64:
+        torch.testing.assert_close(maps, expected_maps, rtol=0, atol=TOLERANCE[dtype])
+        torch.testing.assert_close(alphas, expected_alphas, rtol=0, atol=TOLERANCE[dtype])
+    else:
+        band = float(features.abs().max() + 1) * 2 / 255
+        assert_close_but_for_thresholds(maps, expected_maps, tolerance=TOLERANCE[dtype], band=band)
+        assert_close_but_for_thresholds(alphas, expected_alphas, tolerance=TOLERANCE[dtype], band=band)
+
+
+@every_engine
+@every_dtype
+def test_first_pixel_centre_is_one_half(engine, dtype):
+    means2d = torch.tensor([[2.5, 1.5]], dtype=dtype)
+    conics = torch.tensor([[2.0, 0.0, 8.0]], dtype=dtype)  # narrower in y
+    tiles = Tiles(torch.zeros(1, dtype=torch.int32), torch.tensor([0, 1]), 8, 6, 16)
+    one = torch.ones(1, 1, dtype=dtype)
+    maps, alphas = composite(means2d, conics, 0.7 * one[0], one, tiles, engine=engine)
+    expected = torch.zeros(6, 8, dtype=dtype)
+    for j, step in ((2, 0), (1, 1), (3, 1), (0, 2), (4, 2)):
+        expected[1, j] = 0.7 * np.exp(-0.5 * 2.0 * step**2)
+    expected[[0, 2], 2] = 0.7 * np.exp(-0.5 * 8.0)
+    expected[[0, 0, 2, 2], [1, 3, 1, 3]] = 0.7 * np.exp(-0.5 * 10.0)
+    expected[expected < 1 / 255] = 0
+    torch.testing.assert_close(alphas, expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(maps[..., 0], expected, rtol=0, atol=1e-6)
+
+
+@every_engine
+def test_positive_b_leans_along_the_other_diagonal(engine):
+    means2d, opacities = torch.tensor([[4.5, 4.5]]).double(), torch.tensor([0.8]).double()
+    conics = torch.tensor([[0.5, 0.3, 0.7]]).double()
+    tiles = Tiles(torch.zeros(1, dtype=torch.int32), torch.tensor([0, 1]), 9, 9, 16)
+    _, alphas = composite(means2d, conics, opacities, opacities[:, None], tiles, engine=engine)
+    for dx, dy in ((1, 1), (1, -1), (-1, 1), (2, 1)):
+        expected = 0.8 * np.exp(-0.5 * (0.5 * dx * dx + 2 * 0.3 * dx * dy + 0.7 * dy * dy))
+        assert alphas[4 + dy, 4 + dx].item() == pytest.approx(expected, rel=1e-9)
+    assert alphas[3, 5] > alphas[5, 5]
+
+
+# 2. the three constants -----------------------------------------------------------------------------------------------
+
+
+@every_engine
+@every_dtype
+def test_alpha_is_clamped_and_then_has_no_gradient(engine, dtype):
+    means2d, conics, opacities, tiles = _stack([0.999], dtype)
+    features = torch.tensor([[2.0, -1.0]], dtype=dtype)
+    _, alphas = composite(means2d, conics, opacities, features, tiles, engine=engine)
+    torch.testing.assert_close(alphas, torch.full_like(alphas, 0.99), rtol=0, atol=1e-6)
+    inputs = (means2d, conics, opacities, features, torch.ones(2, dtype=dtype))
+    cotangents = (torch.ones(16, 16, 2, dtype=dtype), torch.ones(16, 16, dtype=dtype))
+    *shape, of_features, of_background = _gradients(inputs, tiles, cotangents, engine)
+    assert all((g == 0).all() for g in shape)
+    torch.testing.assert_close(of_features, torch.full_like(of_features, 256 * 0.99))
+    torch.testing.assert_close(of_background, torch.full_like(of_background, 256 * 0.01), rtol=1e-4, atol=0)
+
+
+@every_engine
+@every_dtype
+def test_alpha_below_one_step_is_skipped(engine, dtype):
+    means2d, conics, opacities, tiles = _stack([0.999 / 255, 1.001 / 255], dtype)
+    inputs = (means2d, conics, opacities, torch.tensor([[100.0], [1.0]], dtype=dtype), torch.zeros(1, dtype=dtype))
+    maps, alphas = composite(*inputs[:4], tiles, engine=engine)
+    torch.testing.assert_close(alphas, torch.full_like(alphas, 1.001 / 255), rtol=1e-4, atol=0)
+    torch.testing.assert_close(maps[..., 0], alphas)
+    for grad in _gradients(inputs, tiles, (torch.ones_like(maps), torch.ones_like(alphas)), engine)[:4]:
+        assert (grad[0] == 0).all()
+    assert _gradients(inputs, tiles, (torch.ones_like(maps), torch.ones_like(alphas)), engine)[2][1] > 0
+
+
+@every_engine
+@every_dtype
+def test_pixel_stops_before_its_transmittance_falls_below_the_limit(engine, dtype):
+    # 0.1^3 = 1e-3 is left; the fourth would leave 5e-5, so it is not drawn, nor the fifth, which would leave 9e-4
+    means2d, conics, opacities, tiles = _stack([0.9, 0.9, 0.9, 0.95, 0.1], dtype)
+    features = torch.eye(5, dtype=dtype)
+    maps, alphas = composite(means2d, conics, opacities, features, tiles, engine=engine)
+    expected = torch.tensor([0.9, 0.09, 0.009, 0, 0], dtype=dtype)
+    torch.testing.assert_close(maps, expected.expand(16, 16, 5), rtol=1e-5, atol=0)
+    torch.testing.assert_close(1 - alphas, torch.full_like(alphas, 1e-3), rtol=1e-4, atol=0)
+    inputs = (means2d, conics, opacities, features, torch.ones(5, dtype=dtype))
+    grads = _gradients(inputs, tiles, (torch.ones_like(maps), torch.ones_like(alphas)), engine)
+    for grad in grads[:4]:
+        assert (grad[3:] == 0).all()
+    assert (grads[3][:3] > 0).any(dim=1).all()
+    torch.testing.assert_close(grads[4], torch.full_like(grads[4], 256 * 1e-3), rtol=1e-4, atol=0)
+
+
+@every_engine
+def test_transmittance_just_above_the_limit_is_drawn(engine):
+    means2d, conics, opacities, tiles = _stack([0.9, 0.9, 0.9, 0.89])  # leaves 1.1e-4
+    maps, _ = composite(means2d, conics, opacities, torch.eye(4).double(), tiles, engine=engine)
+    torch.testing.assert_close(maps[3, 5], torch.tensor([0.9, 0.09, 0.009, 0.00089]).double(), rtol=1e-6, atol=0)
+
+
+@every_engine
+@pytest.mark.parametrize("opacity", [0.01, 0.05, 0.3])  # none stops, all stop far back, all stop at once
+def test_many_gaussians_in_one_tile(engine, opacity):
+    projected, features = random_splats(300, 12, 9, seed=11, opacities=(opacity, 2 * opacity), sigma=(3.0, 30.0))
+    maps, alphas = _run(projected, features, 12, 9, engine=engine)
+    expected_maps, expected_alphas = _by_oracle(projected, features, 12, 9)
+    torch.testing.assert_close(maps, expected_maps, rtol=0, atol=TOLERANCE[torch.float64])
+    torch.testing.assert_close(alphas, expected_alphas, rtol=0, atol=TOLERANCE[torch.float64])
+
+
+# 3. order and repeatability -------------------------------------------------------------------------------------------
+
+
+@every_engine
+def test_nearer_hides_further_and_ties_go_by_index(engine):
+    projected, _ = random_splats(3, 16, 16, seed=0)
+    flat = torch.tensor([[1e-13, 0, 1e-13]]).double().repeat(3, 1)
+    projected = projected._replace(
+        means2d=torch.full((3, 2), 8.0).double(),
+        conics=flat,
+        depths=torch.tensor([2.0, 1.0, 2.0]).double(),
+        opacities=torch.tensor([0.5, 0.6, 0.7]).double(),
+        extents=torch.full((3, 2), 100.0).double(),
+    )
+    maps, _ = _run(projected, torch.eye(3).double(), 16, 16, engine=engine)
+    expected = torch.tensor([0.4 * 0.5, 0.6, 0.4 * 0.5 * 0.7]).double()
+    torch.testing.assert_close(maps, expected.expand(16, 16, 3), rtol=1e-8, atol=0)
+
+
+@every_engine
+@every_dtype
+def test_equal_input_gives_bit_equal_output(engine, dtype):
+    projected, features = random_splats(400, 64, 48, seed=12, dtype=dtype, channels=5)
+    tiles = bin_tiles(projected, 64, 48)
+    inputs = (projected.means2d, projected.conics, projected.opacities, features, torch.ones(5, dtype=dtype))
+    g = torch.Generator().manual_seed(0)
+    cotangents = (torch.randn(48, 64, 5, generator=g, dtype=dtype), torch.randn(48, 64, generator=g, dtype=dtype))
+    first = composite(*inputs[:4], tiles, engine=engine), _gradients(inputs, tiles, cotangents, engine)
+    for _ in range(3):
+        again = composite(*inputs[:4], tiles, engine=engine), _gradients(inputs, tiles, cotangents, engine)
+        for a, b in zip((*first[0], *first[1]), (*again[0], *again[1]), strict=True):
+            assert torch.equal(a, b)
+
+
+# 4. gradients ---------------------------------------------------------------------------------------------------------
+
+
+@every_engine
+@pytest.mark.parametrize("channels", [1, 3, 18])
+def test_gradients(engine, channels):
+    projected, features = random_splats(10, 8, 8, seed=13, opacities=(0.2, 0.8), sigma=(1.0, 4.0), channels=channels)
+    tiles = bin_tiles(projected, 8, 8)
+    background = torch.linspace(-1, 1, channels).double()
+    inputs = [projected.means2d, projected.conics, projected.opacities, features, background]
+
+    def run(means2d, conics, opacities, features, background):
+        return composite(means2d, conics, opacities, features, tiles, background=background, engine=engine)
+
+    assert torch.autograd.gradcheck(run, [v.clone().requires_grad_() for v in inputs])
+
+
+@every_engine
+def test_gradients_across_many_gaussians_that_stop(engine):
+    # more Gaussians at each pixel than an engine handles at once; pixels stop at different ones
+    projected, features = random_splats(150, 3, 3, seed=14, opacities=(0.05, 0.2), sigma=(2.0, 8.0), channels=2)
+    tiles = bin_tiles(projected, 3, 3)
+    _, alphas = composite(projected.means2d, projected.conics, projected.opacities, features, tiles, engine=engine)
+    assert ((1 - alphas) < 1.3e-4).any()
+    inputs = [projected.means2d, projected.conics, projected.opacities, features]
+
+    def run(*inputs):
+        return composite(*inputs, tiles, engine=engine)
+
+    assert torch.autograd.gradcheck(run, [v.clone().requires_grad_() for v in inputs], fast_mode=True)
+
+
+@pytest.mark.parametrize("engine", OTHERS)
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-9), (torch.float32, 2e-4)])
+@pytest.mark.parametrize("channels", [1, 3, 9, 40])
+def test_gradients_agree_with_the_reference(engine, dtype, tolerance, channels):
+    """For a random cotangent. float32 sums over hundreds of pixels in another order, hence 2e-4 of the largest."""
+    projected, features = random_splats(200, 50, 37, seed=15, dtype=dtype, channels=channels)
+    tiles = bin_tiles(projected, 50, 37)
+    inputs = (projected.means2d, projected.conics, projected.opacities, features, torch.ones(channels, dtype=dtype))
+    g = torch.Generator().manual_seed(1)
+    cotangents = (
+        torch.randn(37, 50, channels, generator=g, dtype=dtype),
+        torch.randn(37, 50, generator=g, dtype=dtype),
+    )
+    ours = _gradients(inputs, tiles, cotangents, engine)
+    reference = _gradients([v.double() for v in inputs], tiles, [v.double() for v in cotangents], "reference")
+    for a, b in zip(ours, reference, strict=True):
+        error = (a.double() - b).abs().flatten()
+        limit = tolerance * float(b.abs().max())
+        assert int((error > limit).sum()) <= 0.01 * len(error)  # a threshold may fall the other way
+        assert error.max() <= 100 * limit
+
+
+@every_engine
+def test_only_what_asks_for_a_gradient_gets_one(engine):
+    projected, features = random_splats(20, 16, 16, seed=16)
+    features.requires_grad_()
+    maps, alphas = _run(projected, features, 16, 16, engine=engine)
+    (maps.sum() + alphas.sum()).backward()
+    assert features.grad.abs().sum() > 0
+    assert projected.means2d.grad is None
+
+
+# 5., 6. sizes, dtypes, manners ----------------------------------------------------------------------------------------
+
+
+@every_engine
+@every_dtype
+def test_without_gaussians_there_is_the_background(engine, dtype):
+    projected, features = random_splats(0, 20, 10, seed=0, dtype=dtype, channels=4)
+    background = torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=dtype, requires_grad=True)
+    maps, alphas = _run(projected, features.requires_grad_(), 20, 10, background=background, engine=engine)
+    assert torch.equal(maps, background.expand(10, 20, 4))
+    assert torch.equal(alphas, torch.zeros(10, 20, dtype=dtype))
+    maps.sum().backward()
+    assert torch.equal(background.grad, torch.full((4,), 200.0, dtype=dtype))
+
+
+@every_engine
+def test_empty_tiles_show_the_background(engine):
+    means2d, conics, opacities, _ = _stack([0.5])
+    tiles = Tiles(torch.zeros(1, dtype=torch.int32), torch.tensor([0, 0, 1]), 32, 16, 16)  # the right one is covered
+    background = torch.tensor([7.0]).double()
+    maps, alphas = composite(
+        means2d, conics, opacities, opacities[:, None], tiles, background=background, engine=engine
+    )
+    assert (maps[:, :16] == 7).all()
+    assert (alphas[:, :16] == 0).all()
+    torch.testing.assert_close(maps[:, 16:], torch.full((16, 16, 1), 3.75).double())
+
+
+@every_engine
+def test_inputs_may_be_views_and_are_left_alone(engine):
+    projected, features = random_splats(30, 20, 10, seed=17)
+    inputs = [projected.means2d, projected.conics, projected.opacities, features]
+    views = [torch.stack([v, v + 1], dim=-1)[..., 0] for v in inputs]
+    assert not any(v.is_contiguous() for v in views)
+    tiles = bin_tiles(projected, 20, 10)
+    for a, b in zip(composite(*views, tiles, engine=engine), composite(*inputs, tiles, engine=engine), strict=True):
+        assert torch.equal(a, b)
+    for view, value in zip(views, inputs, strict=True):
+        assert torch.equal(view, value)
+
+
+# laws -----------------------------------------------------------------------------------------------------------------
+
+
+@every_engine
+def test_alpha_and_transmittance_are_one(engine):
+    projected, features = random_splats(50, 30, 20, seed=18, channels=2)
+    ones = torch.ones_like(features)
+    maps, alphas = _run(projected, ones, 30, 20, engine=engine)
+    torch.testing.assert_close(maps, alphas[..., None].expand(20, 30, 2))
+    over_ones, _ = _run(projected, ones, 30, 20, background=ones[0], engine=engine)
+    torch.testing.assert_close(over_ones, torch.ones_like(over_ones))
+    assert ((alphas >= 0) & (alphas < 1)).all()
+
+
+@every_engine
+def test_linear_in_features(engine):
+    projected, f = random_splats(50, 30, 20, seed=19, channels=6)
+    g = f.flip(0)
+    whole, _ = _run(projected, 2 * f - 3 * g, 30, 20, engine=engine)
+    parts = 2 * _run(projected, f, 30, 20, engine=engine)[0] - 3 * _run(projected, g, 30, 20, engine=engine)[0]
+    torch.testing.assert_close(whole, parts, rtol=0, atol=1e-12)
+    alone, _ = _run(projected, f[:, 4:5], 30, 20, engine=engine)
+    torch.testing.assert_close(_run(projected, f, 30, 20, engine=engine)[0][..., 4:5], alone, rtol=0, atol=1e-13)
+
+
+@every_engine
+def test_order_of_the_rows_does_not_matter(engine):
+    projected, features = random_splats(60, 30, 20, seed=20)
+    projected = projected._replace(depths=torch.linspace(1, 5, 60).double())  # no ties
+    order = torch.randperm(60, generator=torch.Generator().manual_seed(0))
+    shuffled = type(projected)(*(v[order] for v in projected))
+    plain = _run(projected, features, 30, 20, engine=engine)
+    for a, b in zip(plain, _run(shuffled, features[order], 30, 20, engine=engine), strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-13)
+
+
+@every_engine
+@pytest.mark.parametrize("tile_size", [4, 8, 32])
+def test_tile_size_does_not_matter(engine, tile_size):
+    projected, features = random_splats(60, 45, 37, seed=21)
+    plain = _run(projected, features, 45, 37, engine=engine)
+    for a, b in zip(plain, _run(projected, features, 45, 37, tile_size=tile_size, engine=engine), strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
+
+
+@every_engine
+def test_exact_tiles_change_nothing(engine):
+    """Listing every Gaussian in every tile gives the same picture as the exact tile test."""
+    projected, features = random_splats(60, 45, 37, seed=22, sigma=(0.6, 40.0))
+    order = torch.sort(projected.depths, stable=True).indices.int()
+    all_pairs = Tiles(order.repeat(9), 60 * torch.arange(10), 45, 37, 16)
+    splats = projected.means2d, projected.conics, projected.opacities
+    everything = composite(*splats, features, all_pairs, engine=engine)
+    assert len(bin_tiles(projected, 45, 37).rows) < 9 * 60
+    for a, b in zip(_run(projected, features, 45, 37, engine=engine), everything, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-13)
+
+
+# 7. weights against pixels --------------------------------------------------------------------------------------------
+
+
+@every_engine
+def test_pixels_are_accumulated_by_weight(engine):
+    projected, _ = random_splats(30, 20, 14, seed=23)
+    weights, _ = _by_oracle(projected, torch.eye(30).double(), 20, 14)  # [H, W, M]: what each Gaussian shows at a pixel
+    pixels = torch.randn(14, 20, 4, generator=torch.Generator().manual_seed(2)).double()
+    splats = projected.means2d, projected.conics, projected.opacities
+    sums = accumulate_pixels(*splats, pixels, bin_tiles(projected, 20, 14), engine=engine)
+    torch.testing.assert_close(sums, torch.einsum("hwm,hwd->md", weights, pixels), rtol=0, atol=1e-10)
+    assert not sums.requires_grad
+    with torch.no_grad():  # as a caller in inference would
+        assert torch.equal(accumulate_pixels(*splats, pixels, bin_tiles(projected, 20, 14), engine=engine), sums)
+
+
+def test_pixels_must_fill_the_image():
+    projected, _ = random_splats(5, 20, 14, seed=0)
+    splats = projected.means2d, projected.conics, projected.opacities
+    with pytest.raises(ValueError, match=r"pixels: expected \[14, 20, D\], got \(20, 14, 3\)"):
+        accumulate_pixels(*splats, torch.zeros(20, 14, 3).double(), bin_tiles(projected, 20, 14))
+
+
+# the table ------------------------------------------------------------------------------------------------------------
+
+
+def test_reference_is_always_there():
+    assert "reference" in ENGINES
+    assert ENGINES[-1] == "reference"  # and the last choice
+
+
+def test_auto_takes_the_first_engine_for_the_cpu():
+    projected, features = random_splats(20, 16, 16, seed=24, dtype=torch.float32)
+    for a, b in zip(
+        _run(projected, features, 16, 16), _run(projected, features, 16, 16, engine=ENGINES[0]), strict=True
+    ):
+        assert torch.equal(a, b)
+
+
+@pytest.fixture
+def _without_numba(monkeypatch):
+    absent = engines._Entry("kfgs.splat.engines.absent", "surely_not_installed", "pip install surely", ("cpu",))
+    monkeypatch.setitem(engines._ENGINES, "numba", absent)
+    engines._load.cache_clear()
+    yield
+    engines._load.cache_clear()
+
+
+@pytest.mark.usefixtures("_without_numba")
+def test_missing_engine_raises_with_the_install_line_and_auto_goes_on():
+    projected, features = random_splats(20, 16, 16, seed=24)
+    assert available_engines() == ["reference"]
+    with pytest.raises(
+        ImportError, match=r"engine: expected surely_not_installed .*install it with `pip install surely`"
+    ):
+        _run(projected, features, 16, 16, engine="numba")
+    maps, _ = _run(projected, features, 16, 16)
+    assert torch.equal(maps, _run(projected, features, 16, 16, engine="reference")[0])
+
+
+def test_engine_must_be_known():
+    projected, features = random_splats(5, 16, 16, seed=0)
+    with pytest.raises(ValueError, match=r"engine: expected one of 'auto', 'numba', 'reference', got 'cuda'"):
+        _run(projected, features, 16, 16, engine="cuda")
+
+
+def test_engine_must_run_on_the_device():
+    with pytest.raises(ValueError, match=r"engine: expected one that runs on cuda .* got 'numba' for cpu"):
+        engines._load_named("numba", "cuda")
+
+
+def test_shapes_must_agree():
+    projected, features = random_splats(5, 16, 16, seed=0)
+    with pytest.raises(ValueError, match=r"features: expected \[M, D\] with M = 5 \(from means2d\), got \(4, 3\)"):
+        _run(projected, features[:4], 16, 16)
+    with pytest.raises(ValueError, match=r"background: expected \[D\] with D = 3 \(from features\), got \(1,\)"):
+        _run(projected, features, 16, 16, background=features[0, :1])
+
+
+def test_dtypes_must_agree():
+    projected, features = random_splats(5, 16, 16, seed=0)
+    with pytest.raises(
+        ValueError, match=r"features: expected torch.float64 on cpu \(from means2d\), got torch.float32"
+    ):
+        _run(projected, features.float(), 16, 16)
+    half = type(projected)(*(v.half() for v in projected[:5]), projected.index)
+    with pytest.raises(ValueError, match="means2d: expected float32 or float64, got torch.float16"):
+        _run(half, features.half(), 16, 16)
+
+
+def test_tiles_must_be_of_these_gaussians():
+    projected, features = random_splats(50, 16, 16, seed=0)
+    tiles = bin_tiles(projected, 16, 16)
+    few = type(projected)(*(v[:7] for v in projected))
+    with pytest.raises(ValueError, match=r"tiles: expected rows below M = 7 .*; bin the tiles again"):
+        composite(few.means2d, few.conics, few.opacities, features[:7], tiles)
+    with pytest.raises(ValueError, match=r"tiles.offsets: expected \[3\], got \(2,\)"):
+        composite(*projected[:2], projected.opacities, features, tiles._replace(width=32))

@@ -1,0 +1,199 @@
+from dataclasses import replace
+
+import oracles_splat as oracle
+import pytest
+import torch
+from cases_splat import TOLERANCE, a_camera, gaussians_before
+from scipy.spatial.transform import Rotation
+
+from kfgs.cameras.camera import Camera, Distortion
+from kfgs.gaussians import Gaussians
+from kfgs.splat import SH_C0, rasterize
+
+
+def _rotation(seed=0):
+    Q = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(seed)).double()).Q
+    return Q * torch.linalg.det(Q).sign()
+
+
+def test_agrees_with_the_equations_from_3d_to_the_map():
+    camera = a_camera()
+    gaussians = gaussians_before(camera, 40, seed=1, spread=1.5)
+    background = torch.tensor([0.5, -1.0, 2.0]).double()
+    rendering = rasterize(gaussians, camera, background=background, engine="reference")
+    values = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.features)
+    maps, alphas = oracle.render(
+        *(v.numpy() for v in values),
+        camera.viewmat.numpy(),
+        camera.K.numpy(),
+        camera.width,
+        camera.height,
+        background=background.numpy(),
+    )
+    torch.testing.assert_close(rendering.map, torch.from_numpy(maps), rtol=0, atol=TOLERANCE[torch.float64])
+    torch.testing.assert_close(rendering.alpha, torch.from_numpy(alphas), rtol=0, atol=TOLERANCE[torch.float64])
+    assert alphas.max() > 0.8
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_auto_engine_agrees_with_the_reference(dtype):
+    camera = a_camera(40, 30, focal=(35.0, 38.0), principal=(18.3, 16.1), dtype=dtype)
+    gaussians = gaussians_before(camera, 100, seed=2)
+    ours, reference = rasterize(gaussians, camera), rasterize(gaussians, camera, engine="reference")
+    torch.testing.assert_close(ours.map, reference.map, rtol=0, atol=10 * TOLERANCE[dtype])  # values up to 4
+    assert ours.map.dtype == dtype
+
+
+def test_point_on_the_ray_of_a_pixel_lands_there():
+    K = torch.tensor([[40.0, 0, 8.5], [0, 40.0, 4.5], [0, 0, 1]])
+    tiny = Gaussians(
+        means=torch.tensor([[0.1, -0.05, 2.0]]),  # 40 * 0.05 + 8.5 = 10.5; 40 * -0.025 + 4.5 = 3.5
+        quats=torch.tensor([[1.0, 0, 0, 0]]),
+        scales=torch.full((1, 3), 1e-4),
+        opacities=torch.tensor([0.8]),
+        features=torch.tensor([[1.0]]),
+    )
+    alpha = rasterize(tiny, Camera(torch.eye(4), K, 20, 10)).alpha
+    assert alpha.argmax() == 3 * 20 + 10
+    assert alpha[3, 10].item() == pytest.approx(0.8, rel=1e-5)
+
+
+def test_moving_world_and_camera_together_changes_nothing():
+    camera = a_camera()
+    gaussians = gaussians_before(camera, 40, seed=3)
+    R, t = _rotation(1), torch.tensor([3.0, -2.0, 5.0]).double()
+    move = torch.eye(4).double()
+    move[:3, :3], move[:3, 3] = R, t
+    w, x, y, z = gaussians.quats.unbind(1)
+    turn = Rotation.from_matrix(R.numpy()) * Rotation.from_quat(torch.stack([x, y, z, w], dim=1).numpy())
+    quats = torch.from_numpy(turn.as_quat()[:, [3, 0, 1, 2]].copy())
+    moved = gaussians.replace(means=gaussians.means @ R.T + t, quats=quats)
+    there = replace(camera, viewmat=camera.viewmat @ torch.linalg.inv(move))
+    torch.testing.assert_close(rasterize(moved, there).map, rasterize(gaussians, camera).map, rtol=0, atol=1e-9)
+
+
+def test_scaling_the_world_changes_depth_only():
+    camera = a_camera()
+    gaussians = gaussians_before(camera, 40, seed=4)
+    viewmat = camera.viewmat.clone()
+    viewmat[:3, 3] *= 10
+    large = gaussians.replace(means=10 * gaussians.means, scales=10 * gaussians.scales)
+    a, b = rasterize(large, replace(camera, viewmat=viewmat), near=2.0), rasterize(gaussians, camera)
+    torch.testing.assert_close(a.map, b.map, rtol=0, atol=1e-9)
+    torch.testing.assert_close(a.projected.depths, 10 * b.projected.depths)
+
+
+def test_order_of_the_gaussians_does_not_matter():
+    camera = a_camera()
+    gaussians = gaussians_before(camera, 40, seed=5)
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(0))
+    a, b = rasterize(gaussians, camera), rasterize(gaussians.select(order), camera)
+    torch.testing.assert_close(a.map, b.map, rtol=0, atol=1e-12)
+    torch.testing.assert_close(a.alpha, b.alpha, rtol=0, atol=1e-12)
+
+
+def test_sign_of_the_quaternion_does_not_matter():
+    camera = a_camera()
+    gaussians = gaussians_before(camera, 40, seed=6)
+    flipped = gaussians.replace(quats=-gaussians.quats)
+    torch.testing.assert_close(rasterize(flipped, camera).map, rasterize(gaussians, camera).map, rtol=0, atol=1e-12)
+
+
+def test_linear_in_features():
+    camera = a_camera()
+    gaussians = gaussians_before(camera, 40, seed=7)
+    f, g = gaussians.features, gaussians.features.flip(0)
+    parts = [rasterize(gaussians.replace(features=v), camera).map for v in (f, g, 2 * f - g)]
+    torch.testing.assert_close(parts[2], 2 * parts[0] - parts[1], rtol=0, atol=1e-12)
+
+
+def test_gaussians_behind_the_camera_do_not_show():
+    camera = a_camera()
+    gaussians = gaussians_before(camera, 20, seed=8)
+    behind = gaussians.replace(means=2 * camera.center - gaussians.means)  # projects to the same pixels
+    background = torch.tensor([1.0, 2.0, 3.0]).double()
+    rendering = rasterize(behind, camera, background=background)
+    assert len(rendering.projected.index) == 0
+    assert torch.equal(rendering.map, background.expand(18, 24, 3))
+    assert (rendering.alpha == 0).all()
+
+
+def test_colour_is_seen_from_the_camera():
+    # red grows towards -x: a Gaussian right of the camera is dark, seen from its own right side it is bright
+    sh = torch.zeros(1, 4, 3)
+    sh[0, 3, 0] = 0.8  # -C1 x
+    ball = Gaussians(
+        torch.tensor([[0.0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.4), torch.tensor([0.9]), sh=sh
+    )
+    K = torch.tensor([[10.0, 0, 8], [0, 10, 8], [0, 0, 1]])
+    for shift, sign in ((-1.0, 1), (1.0, -1)):  # of the camera along x
+        viewmat = torch.eye(4)
+        viewmat[0, 3] = -shift
+        rendering = rasterize(ball, Camera(viewmat, K, 16, 16))
+        colour = rendering.map / rendering.alpha[..., None].clamp(min=1e-6)
+        x = -shift / 5**0.5  # of the unit direction from the camera to the ball
+        expected = torch.tensor([0.5 - 0.8 * 3**0.5 * SH_C0 * x, 0.5, 0.5])
+        shown = colour[rendering.alpha > 0.1]
+        torch.testing.assert_close(shown, expected.expand(len(shown), 3), rtol=1e-5, atol=0)
+        assert (0.5 - expected[0]) * sign > 0
+
+
+def test_features_are_rendered_before_colour():
+    camera = a_camera()
+    gaussians = gaussians_before(camera, 10, seed=9, channels=5)
+    both = gaussians.replace(sh=torch.zeros(10, 1, 3).double())
+    assert torch.equal(rasterize(both, camera).map, rasterize(gaussians, camera).map)
+
+
+def test_gradient_of_the_projected_means_can_be_kept():
+    camera = a_camera()
+    gaussians = gaussians_before(camera, 20, seed=10)
+    gaussians.means.requires_grad_()
+    rendering = rasterize(gaussians, camera)
+    rendering.projected.means2d.retain_grad()
+    rendering.map.sum().backward()
+    assert rendering.projected.means2d.grad.shape == (len(rendering.projected.index), 2)
+    assert rendering.projected.means2d.grad.abs().max() > 0
+    assert gaussians.means.grad.abs().max() > 0
+
+
+@pytest.mark.parametrize("engine", ["auto", "reference"])
+def test_gradients_from_the_map_to_the_gaussians(engine):
+    camera = a_camera(8, 8, focal=(7.0, 8.0), principal=(3.7, 4.4))
+    gaussians = gaussians_before(camera, 10, seed=11, spread=0.8, sigma=(0.1, 0.3), channels=2)
+    assert len(rasterize(gaussians, camera).projected.index) == 10
+
+    def render(means, quats, scales, opacities, features):
+        return rasterize(Gaussians(means, quats, scales, opacities, features), camera, engine=engine)[:2]
+
+    inputs = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.features)
+    assert torch.autograd.gradcheck(render, [v.requires_grad_() for v in inputs])
+
+
+def test_gradients_of_colour_reach_harmonics_and_means():
+    camera = a_camera(8, 8, focal=(7.0, 8.0), principal=(3.7, 4.4))
+    gaussians = gaussians_before(camera, 5, seed=12, spread=0.8, sigma=(0.1, 0.3)).replace(features=None)
+    sh = 0.1 * torch.randn(5, 9, 3, generator=torch.Generator().manual_seed(0)).double()
+
+    def render(means, sh):
+        return rasterize(gaussians.replace(means=means, sh=sh), camera).map
+
+    assert torch.autograd.gradcheck(render, (gaussians.means.clone().requires_grad_(), sh.requires_grad_()))
+
+
+def test_something_to_render_is_needed():
+    camera = a_camera()
+    with pytest.raises(ValueError, match=r"gaussians: expected features or sh to render, got neither; add them"):
+        rasterize(gaussians_before(camera, 3, seed=0).replace(features=None), camera)
+
+
+def test_camera_with_distortion_is_refused():
+    camera = replace(a_camera(), distortion=Distortion("kannala_brandt", (0.1, 0.0, 0.0, 0.0)))
+    with pytest.raises(ValueError, match="camera: expected a camera without distortion, got kannala_brandt"):
+        rasterize(gaussians_before(camera, 3, seed=0), camera)
+
+
+def test_background_has_one_value_per_channel():
+    camera = a_camera()
+    with pytest.raises(ValueError, match=r"background: expected \[D\] with D = 3 \(from features\), got \(4,\)"):
+        rasterize(gaussians_before(camera, 3, seed=0), camera, background=torch.zeros(4).double())

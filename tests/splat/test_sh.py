@@ -1,0 +1,76 @@
+import numpy as np
+import oracles_splat as oracle
+import pytest
+import torch
+
+from kfgs.splat import SH_C0, evaluate_sh, rgb_to_sh0, sh0_to_rgb
+
+
+def _directions(N=50, seed=0):
+    return torch.randn(N, 3, generator=torch.Generator().manual_seed(seed)).double()
+
+
+def _response(coefficient, directions, K):
+    """The harmonic that belongs to one coefficient: what a small amount of it adds to grey."""
+    sh = torch.zeros(len(directions), K, 3, dtype=torch.float64)
+    sh[:, coefficient, 1] = 0.1
+    rgb = evaluate_sh(sh, directions)
+    assert (rgb[:, [0, 2]] == 0.5).all()
+    return (rgb[:, 1] - 0.5) / 0.1
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_harmonics_agree_with_legendre_functions(degree):
+    directions = _directions()
+    for order in range(-degree, degree + 1):
+        expected = [oracle.real_harmonic(degree, order, d) for d in directions.numpy()]
+        ours = _response(degree * (degree + 1) + order, directions, (degree + 1) ** 2)
+        np.testing.assert_allclose(ours.numpy(), expected, atol=1e-13)
+
+
+def test_band_one_is_minus_y_z_minus_x():
+    C1 = 0.4886025119029199
+    axes = torch.eye(3, dtype=torch.float64)
+    table = torch.stack([_response(k, axes, 4) for k in (1, 2, 3)])  # coefficients by axes x, y, z
+    torch.testing.assert_close(table, C1 * torch.tensor([[0, -1, 0], [0, 0, 1], [-1, 0, 0]]).double())
+
+
+def test_length_of_the_direction_does_not_matter():
+    sh = torch.randn(50, 16, 3, generator=torch.Generator().manual_seed(1)).double()
+    torch.testing.assert_close(evaluate_sh(sh, _directions()), evaluate_sh(sh, 7.5 * _directions()))
+
+
+def test_lower_degree_is_the_higher_one_with_zeros():
+    sh = torch.randn(50, 16, 3, generator=torch.Generator().manual_seed(1)).double()
+    for K in (1, 4, 9):
+        padded = torch.cat([sh[:, :K], torch.zeros(50, 16 - K, 3)], dim=1)
+        torch.testing.assert_close(evaluate_sh(sh[:, :K], _directions()), evaluate_sh(padded, _directions()))
+
+
+def test_negative_colour_is_clamped_and_has_no_gradient():
+    sh = torch.tensor([[[-5.0, 0.0, 5.0]]], requires_grad=True)
+    rgb = evaluate_sh(sh, torch.tensor([[0.0, 0.0, 1.0]]))
+    torch.testing.assert_close(rgb, torch.tensor([[0.0, 0.5, 0.5 + 5 * SH_C0]]))  # bright is not clamped
+    rgb.sum().backward()
+    torch.testing.assert_close(sh.grad, torch.tensor([[[0.0, SH_C0, SH_C0]]]))
+
+
+def test_rgb_survives_the_round_trip():
+    rgb = torch.rand(7, 3, generator=torch.Generator().manual_seed(2))
+    torch.testing.assert_close(sh0_to_rgb(rgb_to_sh0(rgb)), rgb)
+    torch.testing.assert_close(evaluate_sh(rgb_to_sh0(rgb)[:, None], _directions(7).float()), rgb)
+
+
+def test_gradients():
+    sh = 0.1 * torch.randn(5, 16, 3, generator=torch.Generator().manual_seed(3)).double()
+    assert torch.autograd.gradcheck(evaluate_sh, (sh.requires_grad_(), _directions(5).requires_grad_()))
+
+
+def test_number_of_coefficients_must_be_a_full_degree():
+    with pytest.raises(ValueError, match=r"sh: expected 1, 4, 9 or 16 coefficients .* got 5; cut it"):
+        evaluate_sh(torch.zeros(2, 5, 3), torch.ones(2, 3))
+
+
+def test_one_direction_per_gaussian():
+    with pytest.raises(ValueError, match=r"directions: expected \[N, 3\] with N = 2 \(from sh\), got \(1, 3\)"):
+        evaluate_sh(torch.zeros(2, 4, 3), torch.ones(1, 3))

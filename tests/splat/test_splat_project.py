@@ -1,0 +1,244 @@
+from dataclasses import replace
+
+import numpy as np
+import oracles_splat as oracle
+import pytest
+import torch
+from cases_splat import a_camera, gaussians_before
+
+from kfgs.cameras.camera import Camera, Distortion
+from kfgs.cameras.projection import camera_to_pixel, world_to_camera
+from kfgs.gaussians import Gaussians
+from kfgs.splat import project
+
+
+def _straight(width=20, height=10, focal=20.0, principal=(10.0, 5.0), dtype=torch.float64):
+    """A camera at the origin that looks along z."""
+    K = torch.tensor([[focal, 0, principal[0]], [0, focal, principal[1]], [0, 0, 1]], dtype=dtype)
+    return Camera(torch.eye(4, dtype=dtype), K, width, height)
+
+
+def _balls(means, scale=0.1, opacity=0.5, dtype=torch.float64):
+    means = torch.as_tensor(means, dtype=dtype)
+    N = len(means)
+    quats = torch.tensor([[1.0, 0, 0, 0]], dtype=dtype).repeat(N, 1)
+    return Gaussians(means, quats, torch.full((N, 3), scale, dtype=dtype), torch.full((N,), opacity, dtype=dtype))
+
+
+def _oracle(gaussians, camera, **options):
+    parts = zip(gaussians.means, gaussians.quats, gaussians.scales, strict=True)
+    return [
+        oracle.project(
+            *(p.double().numpy() for p in part),
+            camera.viewmat.numpy(),
+            camera.K.numpy(),
+            camera.width,
+            camera.height,
+            **options,
+        )
+        for part in parts
+    ]
+
+
+@pytest.mark.parametrize("spread", [1.0, 2.5])  # the second: many means lie outside the picture
+def test_agrees_with_the_equations(spread):
+    camera = a_camera()
+    gaussians = gaussians_before(camera, 60, seed=1, spread=spread)
+    projected = project(gaussians, camera)
+    assert len(projected.index) > 20
+    flat = [_oracle(gaussians, camera)[g] for g in projected.index]
+    conics = [np.linalg.inv(cov)[[0, 0, 1], [0, 1, 1]] for _, cov, _ in flat]
+    reach = [oracle.reach(o) for o in projected.opacities.numpy()]
+    extents = [np.sqrt(r * cov.diagonal()) for r, (_, cov, _) in zip(reach, flat, strict=True)]
+    np.testing.assert_allclose(projected.means2d.numpy(), [mean for mean, _, _ in flat], rtol=1e-11)
+    np.testing.assert_allclose(projected.conics.numpy(), conics, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(projected.depths.numpy(), [z for _, _, z in flat], rtol=1e-12)
+    np.testing.assert_allclose(projected.extents.numpy(), extents, rtol=1e-11)
+    torch.testing.assert_close(projected.opacities, gaussians.opacities[projected.index], rtol=0, atol=0)
+
+
+def test_jacobian_is_the_derivative_of_the_projection():
+    camera = a_camera()
+    gaussians = gaussians_before(camera, 8, seed=2, spread=0.9)
+    projected = project(gaussians, camera, low_pass=0.0)
+    for row, g in enumerate(projected.index):
+        J = torch.autograd.functional.jacobian(
+            lambda mean: camera_to_pixel(camera, world_to_camera(camera, mean[None]))[0], gaussians.means[g]
+        )
+        Sigma = torch.from_numpy(oracle.covariance(gaussians.quats[g].numpy(), gaussians.scales[g].numpy()))
+        a, b, c = projected.conics[row]
+        torch.testing.assert_close(torch.stack([a, b, b, c]).view(2, 2), torch.linalg.inv(J @ Sigma @ J.T))
+
+
+def test_ball_before_the_camera_by_hand():
+    # focal 20, depth 2, scale 0.1: 1 pixel wide, variance 1 + 0.3
+    projected = project(_balls([[0.2, 0.1, 2.0]]), _straight())
+    torch.testing.assert_close(projected.means2d, torch.tensor([[12.0, 6.0]]).double())
+    # the ball is seen aslant: J's last column adds (0.1, 0.05)^2 and their product
+    cov = torch.tensor([[1 + 0.01 + 0.3, 0.005], [0.005, 1 + 0.0025 + 0.3]]).double()
+    C = torch.linalg.inv(cov)
+    torch.testing.assert_close(projected.conics, torch.stack([C[0, 0], C[0, 1], C[1, 1]])[None])
+
+
+def test_low_pass_adds_to_the_variance():
+    point = _balls([[0.0, 0.0, 2.0]], scale=1e-9)
+    torch.testing.assert_close(project(point, _straight()).conics, torch.tensor([[1 / 0.3, 0, 1 / 0.3]]).double())
+    wide = project(point, _straight(), low_pass=2.0)
+    torch.testing.assert_close(wide.conics, torch.tensor([[0.5, 0, 0.5]]).double())
+
+
+def test_principal_point_moves_the_picture_and_nothing_else():
+    gaussians = gaussians_before(_straight(), 20, seed=3, spread=0.5)
+    here = project(gaussians, _straight())
+    there = project(gaussians, _straight(principal=(12.0, 4.0)))
+    torch.testing.assert_close(there.means2d, here.means2d + torch.tensor([2.0, -1.0]))
+    torch.testing.assert_close(there.conics, here.conics)
+
+
+@pytest.mark.parametrize(
+    ("x", "tangent"),
+    # borders at x/z = -0.2 and 0.8 (cx = 4): half the field is 0.5, so the limits are -0.2 - 0.15 and 0.8 + 0.15
+    [(-0.3, -0.3), (-0.34, -0.34), (-0.6, -0.35), (0.9, 0.9), (0.94, 0.94), (1.2, 0.95)],
+)
+def test_jacobian_is_clamped_around_the_principal_point(x, tangent):
+    camera = _straight(principal=(4.0, 5.0))
+    projected = project(_balls([[2 * x, 0.0, 2.0]], scale=1.0), camera)
+    u2 = 100 * (1 + tangent**2) + 0.3  # (focal scale / z)^2 (1 + tangent^2)
+    torch.testing.assert_close(projected.conics, torch.tensor([[1 / u2, 0, 1 / 100.3]]).double())
+    torch.testing.assert_close(projected.means2d[0, 0], torch.tensor(4.0 + 20 * x).double())  # the mean is not moved
+
+
+def test_picture_that_does_not_hold_the_principal_point():
+    # a crop far to the right of the axis: tangents from 5 to 6; a clamp at 1.3 times each border would cut it off
+    camera = _straight(principal=(-100.0, 5.0))
+    projected = project(_balls([[11.0, 0.0, 2.0]], scale=0.1), camera)
+    torch.testing.assert_close(projected.means2d[0, 0], torch.tensor(10.0).double())
+    torch.testing.assert_close(projected.conics[0, 0], torch.tensor(1 / (1 + 5.5**2 + 0.3)).double())
+
+
+def test_culled_at_and_before_the_near_plane():
+    depths = [-2.0, -0.2, 0.0, 0.2, 0.2000001, 0.3]
+    projected = project(_balls([[0.0, 0.0, z] for z in depths], scale=0.01), _straight())
+    assert projected.index.tolist() == [4, 5]
+    assert project(_balls([[0.0, 0.0, 0.3]]), _straight(), near=0.5).index.tolist() == []
+
+
+def test_culled_where_too_transparent_to_show():
+    on_a_centre = [0.05, 0.05, 2.0]
+    gaussians = _balls([on_a_centre] * 3).replace(opacities=torch.tensor([0.9 / 255, 1 / 255, 1.1 / 255]).double())
+    assert project(gaussians, _straight()).index.tolist() == [2]
+
+
+def test_culled_where_no_pixel_centre_is_touched():
+    camera = a_camera()
+    gaussians = gaussians_before(camera, 400, seed=4, spread=3.0, opacities=(0.004, 0.9))
+    seen = set(project(gaussians, camera).index.tolist())
+    x, y = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
+    touched = set()
+    for g, (mean, cov, _) in enumerate(_oracle(gaussians, camera)):
+        C = np.linalg.inv(cov)
+        dx, dy = x[None] - mean[0], y[:, None] - mean[1]
+        density = np.exp(-0.5 * (C[0, 0] * dx**2 + 2 * C[0, 1] * dx * dy + C[1, 1] * dy**2))
+        if (float(gaussians.opacities[g]) * density >= 1 / 255).any():
+            touched.add(g)
+    assert touched <= seen  # nothing that shows is lost
+    assert len(touched) > 100
+    assert len(seen - touched) < 0.1 * len(touched)  # boxes are a little larger than ellipses
+    assert len(seen) < 300  # and something was culled
+
+
+def test_extents_are_where_alpha_is_one_step():
+    camera = a_camera()
+    projected = project(gaussians_before(camera, 20, seed=5), camera)
+    for row in range(len(projected.index)):
+        a, b, c = projected.conics[row].tolist()
+        width, height = projected.extents[row].tolist()
+        # the point of the ellipse furthest right, and lowest: there the gradient of the form is along one axis
+        for dx, dy in ((width, -b / c * width), (-b / a * height, height)):
+            density = np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
+            assert float(projected.opacities[row]) * density == pytest.approx(1 / 255, rel=1e-9)
+
+
+def test_rows_keep_the_order_of_the_gaussians():
+    camera = a_camera()
+    index = project(gaussians_before(camera, 200, seed=6, spread=2.0), camera).index
+    assert index.dtype == torch.int64
+    assert 50 < len(index) < 200
+    assert (index.diff() > 0).all()
+
+
+def test_needle_keeps_its_determinant_in_float32():
+    # 2e5 pixels long, half a pixel thick, at 45 degrees: var_x var_y - cov^2 would round to noise
+    quat = torch.tensor([[np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)]])
+    gaussian = Gaussians(torch.tensor([[0.0, 0, 1]]), quat, torch.tensor([[1e4, 1e-6, 1e-6]]), torch.tensor([0.5]))
+    camera = _straight(dtype=torch.float32)
+    u, v = project(gaussian, camera).conics[0, [0, 2]].double()
+    _, cov, _ = _oracle(gaussian, camera)[0]
+    assert u.item() == pytest.approx(np.linalg.inv(cov)[0, 0], rel=1e-5)
+    assert v.item() == pytest.approx(np.linalg.inv(cov)[1, 1], rel=1e-5)
+
+
+def test_gaussians_that_are_not_finite_are_culled():
+    broken = _balls([[float("nan"), 0, 2], [0, 0, 2], [float("inf"), 0, 2], [0, 0, float("inf")], [0, 0, 2]])
+    broken.quats[1] = float("nan")
+    broken.scales[1] = float("inf")
+    assert project(broken, _straight()).index.tolist() == [4]
+
+
+def test_no_gaussians():
+    projected = project(_balls(torch.zeros(0, 3)), _straight())
+    assert [tuple(v.shape) for v in projected] == [(0, 2), (0, 3), (0,), (0,), (0, 2), (0,)]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_dtype_follows_the_gaussians(dtype):
+    gaussians = gaussians_before(a_camera(dtype=dtype), 10, seed=7)
+    for camera_dtype in (torch.float32, torch.float64):
+        projected = project(gaussians, a_camera(dtype=camera_dtype))
+        assert {v.dtype for v in projected[:5]} == {dtype}
+
+
+def test_gradients():
+    camera = a_camera()
+    gaussians = gaussians_before(camera, 6, seed=8, spread=0.8)
+    assert len(project(gaussians, camera).index) == 6
+
+    def flat(means, quats, scales, opacities):
+        return project(Gaussians(means, quats, scales, opacities), camera)[:4]
+
+    inputs = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
+    assert torch.autograd.gradcheck(flat, [v.requires_grad_() for v in inputs])
+
+
+def test_gradients_where_the_jacobian_is_clamped():
+    gaussians = _balls([[-1.2, 0.3, 2.0], [2.4, 1.0, 2.0]], scale=1.0)
+    camera = _straight(principal=(4.0, 5.0))
+    assert len(project(gaussians, camera).index) == 2
+
+    def conics(means):
+        return project(gaussians.replace(means=means), camera).conics
+
+    assert torch.autograd.gradcheck(conics, (gaussians.means.clone().requires_grad_(),))
+
+
+def test_camera_pose_has_a_gradient():
+    camera = a_camera()
+    gaussians = gaussians_before(camera, 6, seed=8)
+    viewmat = camera.viewmat.clone().requires_grad_()
+    project(gaussians, replace(camera, viewmat=viewmat)).means2d.sum().backward()
+    assert viewmat.grad[:3].abs().min() > 0
+
+
+def test_camera_with_distortion_is_refused():
+    camera = replace(a_camera(), distortion=Distortion("brown_conrady", (0.1, 0.0, 0.0, 0.0)))
+    with pytest.raises(ValueError, match=r"camera: expected a camera without distortion, got brown_conrady.*undistort"):
+        project(_balls([[0.0, 0, 2]]), camera)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"near": 0.0}, r"near: expected a number in \(0"), ({"low_pass": -0.1}, r"low_pass: expected a number in \[0")],
+)
+def test_options_out_of_range(options, message):
+    with pytest.raises(ValueError, match=message):
+        project(_balls([[0.0, 0, 2]]), _straight(), **options)

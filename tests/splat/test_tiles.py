@@ -1,0 +1,145 @@
+import numpy as np
+import oracles_splat as oracle
+import pytest
+import torch
+from cases_splat import random_splats, splats_from
+
+from kfgs.splat import bin_tiles
+
+KINDS = ["round", "needles", "huge", "subpixel", "faint"]
+
+
+def _splats(kind, dtype, M=150, width=70, height=45, seed=0):
+    """Gaussians of one kind, in and around an image that is no multiple of a tile."""
+    if kind == "round":
+        return random_splats(M, width, height, seed=seed, dtype=dtype)[0]
+    if kind == "faint":  # just visible at the centre
+        return random_splats(M, width, height, seed=seed, dtype=dtype, opacities=(1.0001 / 255, 1.2 / 255))[0]
+    if kind == "huge":
+        return random_splats(M, width, height, seed=seed, dtype=dtype, sigma=(40.0, 4000.0))[0]
+    g = torch.Generator().manual_seed(seed)
+    means2d = torch.rand(M, 2, generator=g).double() * torch.tensor([width, height])
+    means2d[::10] = means2d[::10].round() + 0.5 * (
+        torch.arange(len(means2d[::10]))[:, None] % 2
+    )  # on edges and centres
+    depths, opacities = 1 + torch.rand(M, generator=g).double(), 0.1 + 0.89 * torch.rand(M, generator=g).double()
+    angle = torch.pi * torch.rand(M, generator=g).double()
+    long = 10 ** (4 * torch.rand(M, generator=g).double()) if kind == "needles" else torch.zeros(M).double()
+    along = torch.stack([angle.cos(), angle.sin()], dim=1) * long[:, None]
+    covs = along[:, :, None] * along[:, None, :] + 0.3 * torch.eye(2).double()  # nothing is thinner than the low pass
+    return splats_from(means2d, covs, depths, opacities, dtype)
+
+
+def _pairs(tiles):
+    counts = tiles.offsets.diff()
+    tile = torch.repeat_interleave(torch.arange(len(counts)), counts)
+    return list(zip(tile.tolist(), tiles.rows.tolist(), strict=True))
+
+
+def _shown(projected, width, height, tile_size):
+    """(tile, Gaussian) wherever alpha reaches 1/255 at a pixel centre, by trying every pixel."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    tile = (y // tile_size).astype(int) * -(-width // tile_size) + (x // tile_size).astype(int)
+    found = set()
+    for g in range(len(projected.means2d)):
+        mx, my = projected.means2d[g].double().tolist()
+        a, b, c = projected.conics[g].double().tolist()
+        power = 0.5 * (a * (x - mx) ** 2 + 2 * b * (x - mx) * (y - my) + c * (y - my) ** 2)
+        shown = float(projected.opacities[g]) * np.exp(-power) >= 1 / 255
+        found |= {(int(t), g) for t in np.unique(tile[shown])}
+    return found
+
+
+@pytest.mark.parametrize("tile_size", [16, 8])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_pair_that_shows_is_missing(kind, dtype, tile_size):
+    projected = _splats(kind, dtype)
+    found = _shown(projected, 70, 45, tile_size)
+    pairs = _pairs(bin_tiles(projected, 70, 45, tile_size))
+    assert len(set(pairs)) == len(pairs)
+    assert found <= set(pairs)
+    assert len(found) > 50
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_listed_pairs_reach_the_tile(kind):
+    projected = _splats(kind, torch.float64)
+    pairs = _pairs(bin_tiles(projected, 70, 45))
+    for tile, g in pairs:
+        top, left = 16 * (tile // 5) + 0.5, 16 * (tile % 5) + 0.5
+        mx, my = projected.means2d[g].tolist()
+        smallest = oracle.smallest_in_rectangle(
+            projected.conics[g].tolist(), left - mx, left + 15 - mx, top - my, top + 15 - my
+        )
+        assert smallest <= oracle.reach(float(projected.opacities[g])) + 1e-6
+
+
+def test_exact_test_drops_what_only_the_box_touches():
+    # a needle along the diagonal of 4 x 4 tiles: its box holds all 16, it touches the 4 on the diagonal and neighbours
+    along = torch.tensor([20.0, 20.0]).double()
+    covs = (along[:, None] * along + 0.3 * torch.eye(2))[None]
+    one = torch.ones(1).double()
+    projected = splats_from(torch.tensor([[32.0, 32.0]]).double(), covs, one, 0.5 * one, torch.float64)
+    tiles = {tile for tile, _ in _pairs(bin_tiles(projected, 64, 64))}
+    assert {0, 5, 10, 15} <= tiles
+    assert not tiles & {2, 3, 7, 8, 12, 13}
+
+
+def test_order_is_depth_then_index():
+    projected = _splats("round", torch.float32)
+    assert projected.depths.unique().numel() < len(projected.depths)  # there are ties
+    tiles = bin_tiles(projected, 70, 45)
+    for t in range(15):
+        rows = tiles.rows[tiles.offsets[t] : tiles.offsets[t + 1]].tolist()
+        assert rows == sorted(rows, key=lambda g: (float(projected.depths[g]), g))
+
+
+def test_tiles_are_numbered_along_image_rows():
+    one = torch.ones(3).double()
+    means2d = torch.tensor([[8.0, 8.0], [40.0, 8.0], [8.0, 24.0]]).double()
+    covs = torch.eye(2).double().repeat(3, 1, 1)
+    tiles = bin_tiles(splats_from(means2d, covs, one, 0.5 * one, torch.float32), 48, 32)
+    assert tiles.offsets.tolist() == [0, 1, 1, 2, 3, 3, 3]
+    assert tiles.rows.tolist() == [0, 1, 2]
+    assert (tiles.rows.dtype, tiles.offsets.dtype) == (torch.int32, torch.int64)
+    assert tiles.grid == (2, 3)
+
+
+def test_gaussians_outside_the_picture_are_in_no_tile():
+    one = torch.ones(2).double()
+    means2d = torch.tensor([[-50.0, 8.0], [8.0, 500.0]]).double()
+    projected = splats_from(means2d, torch.eye(2).double().repeat(2, 1, 1), one, 0.5 * one, torch.float32)
+    assert len(bin_tiles(projected, 48, 32).rows) == 0
+
+
+def test_no_gaussians():
+    projected = _splats("round", torch.float32, M=0)
+    tiles = bin_tiles(projected, 33, 17)
+    assert tiles.rows.tolist() == []
+    assert tiles.offsets.tolist() == [0] * 7  # 2 x 3 tiles
+
+
+def test_one_tile_for_the_whole_picture():
+    tiles = bin_tiles(_splats("huge", torch.float32), 70, 45, tile_size=128)
+    assert tiles.offsets.tolist() == [0, 150]
+
+
+def test_no_gradient_is_recorded():
+    projected = _splats("round", torch.float32)
+    projected = projected._replace(means2d=projected.means2d.requires_grad_())
+    assert not bin_tiles(projected, 70, 45).rows.requires_grad
+
+
+def test_shapes_must_agree():
+    projected = _splats("round", torch.float32)._replace(depths=torch.ones(3))
+    with pytest.raises(ValueError, match=r"projected.depths: expected \[M\] with M = 150 .* got \(3,\)"):
+        bin_tiles(projected, 70, 45)
+
+
+@pytest.mark.parametrize(
+    ("size", "name"), [((0, 45, 16), "width"), ((70, 0, 16), "height"), ((70, 45, 0), "tile_size")]
+)
+def test_sizes_must_be_positive(size, name):
+    with pytest.raises(ValueError, match=rf"{name}: expected a number in \[1, inf\), got 0"):
+        bin_tiles(_splats("round", torch.float32), *size)
