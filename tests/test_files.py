@@ -1,0 +1,132 @@
+import hashlib
+import json
+import math
+import os
+import stat
+
+import pytest
+
+from kfgs._files import atomic_folder, atomic_path, digest_file, digest_value, read_json, write_json
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def write_and_fail(block, name):
+    with block as temporary:
+        (temporary / name).write_bytes(b"half")
+        raise RuntimeError("killed")
+
+
+def test_file_appears_only_when_whole(tmp_path):
+    target = tmp_path / "new" / "field.bin"
+    with atomic_path(target) as temporary:
+        temporary.write_bytes(b"half")
+        assert not target.exists()
+        assert temporary.suffix == ".bin"
+        assert temporary.parent == target.parent  # the same disk, so that moving is one step
+    assert target.read_bytes() == b"half"
+    assert names(target.parent) == ["field.bin"]
+
+
+def test_failure_leaves_the_old_file_and_nothing_else(tmp_path):
+    target = tmp_path / "field.bin"
+    target.write_bytes(b"old")
+    with pytest.raises(RuntimeError, match="killed"):
+        write_and_fail(atomic_path(target), "")
+    assert target.read_bytes() == b"old"
+    assert names(tmp_path) == ["field.bin"]
+
+
+def test_file_replaces_the_old_one(tmp_path):
+    target = tmp_path / "field.bin"
+    for content in (b"old", b"new"):
+        with atomic_path(target) as temporary:
+            temporary.write_bytes(content)
+    assert target.read_bytes() == b"new"
+    assert names(tmp_path) == ["field.bin"]
+
+
+def test_permissions_follow_the_umask(tmp_path):
+    before = os.umask(0o027)
+    try:
+        with atomic_path(tmp_path / "file") as temporary:
+            temporary.write_bytes(b"")
+        with atomic_folder(tmp_path / "folder"):
+            pass
+        assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == 0o640
+        assert stat.S_IMODE((tmp_path / "folder").stat().st_mode) == 0o750
+        assert os.umask(0o027) == 0o027  # left as it was
+    finally:
+        os.umask(before)
+
+
+def test_folder_appears_only_when_whole(tmp_path):
+    target = tmp_path / "deep" / "scene"
+    with atomic_folder(target) as temporary:
+        (temporary / "a.txt").write_text("a")
+        assert not target.exists()
+    assert names(target) == ["a.txt"]
+    assert names(target.parent) == ["scene"]
+
+
+def test_folder_replaces_the_old_one_entirely(tmp_path):
+    target = tmp_path / "scene"
+    for name in ("old.txt", "new.txt"):
+        with atomic_folder(target) as temporary:
+            (temporary / name).write_text(name)
+    assert names(target) == ["new.txt"]
+    assert names(tmp_path) == ["scene"]
+
+
+def test_failed_folder_leaves_the_old_one(tmp_path):
+    target = tmp_path / "scene"
+    target.mkdir()
+    (target / "old.txt").write_text("old")
+    with pytest.raises(RuntimeError, match="killed"):
+        write_and_fail(atomic_folder(target), "new.txt")
+    assert names(target) == ["old.txt"]
+    assert names(tmp_path) == ["scene"]
+
+
+def test_json_round_trip(tmp_path):
+    value = {"Größe": [1, 2.5, None, True], "nested": {"a": "b"}}
+    write_json(tmp_path / "deep" / "value.json", value)
+    assert read_json(tmp_path / "deep" / "value.json") == value
+    assert (tmp_path / "deep" / "value.json").read_text(encoding="utf-8").endswith("}\n")
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf])
+def test_json_refuses_what_json_cannot_hold(tmp_path, number):
+    write_json(tmp_path / "value.json", 1)
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "value.json", {"loss": number})
+    assert read_json(tmp_path / "value.json") == 1
+
+
+def test_missing_json(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"split.json: no such file; expected a JSON file there"):
+        read_json(tmp_path / "split.json")
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        read_json(tmp_path)  # a folder
+
+
+@pytest.mark.parametrize("content", [b'{"a": 1', b"\xff\xfe{}", b""])
+def test_broken_json_names_the_file(tmp_path, content):
+    (tmp_path / "split.json").write_bytes(content)
+    with pytest.raises(ValueError, match=r"split.json: expected a JSON file, but it cannot be parsed \("):
+        read_json(tmp_path / "split.json")
+
+
+def test_digests_are_sha256(tmp_path):
+    (tmp_path / "abc").write_bytes(b"abc")
+    # FIPS 180-2, appendix B.1
+    assert digest_file(tmp_path / "abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert digest_value({"b": 1, "a": [2]}) == hashlib.sha256(json.dumps({"a": [2], "b": 1}).encode()).hexdigest()
+
+
+def test_digest_depends_on_the_value_and_not_on_the_order_of_keys():
+    assert digest_value({"a": 1, "b": 2}) == digest_value({"b": 2, "a": 1})
+    assert digest_value([1, 2]) != digest_value([2, 1])
+    assert digest_value(1) != digest_value(1.5)

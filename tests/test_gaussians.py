@@ -1,0 +1,116 @@
+import pytest
+import torch
+
+from kfgs.gaussians import Gaussians
+
+
+def cloud(count=4, features=2, degree=None, labelled=True, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+
+    def rand(*shape):
+        return torch.rand(*shape, generator=generator)
+
+    return Gaussians(
+        means=rand(count, 3),
+        quats=rand(count, 4),
+        scales=rand(count, 3) + 0.1,
+        opacities=rand(count),
+        features=None if features is None else rand(count, features),
+        sh=None if degree is None else rand(count, (degree + 1) ** 2, 3),
+        labels=torch.arange(count) - 1 if labelled else None,
+    )
+
+
+def same(a, b):
+    names = ("means", "quats", "scales", "opacities", "features", "sh", "labels")
+    return all(
+        (getattr(a, n) is None and getattr(b, n) is None) or torch.equal(getattr(a, n), getattr(b, n)) for n in names
+    )
+
+
+def test_length_and_description():
+    assert len(cloud(4)) == 4
+    assert len(cloud(0)) == 0
+    assert repr(cloud(4)) == "Gaussians(4 Gaussians, 2 features, labelled, torch.float32, cpu)"
+    assert repr(cloud(3, features=None, degree=2, labelled=False)) == (
+        "Gaussians(3 Gaussians, SH degree 2, torch.float32, cpu)"
+    )
+
+
+def test_select_by_mask_and_by_index_agree():
+    gaussians = cloud(5, degree=1)
+    mask = torch.tensor([True, False, True, False, True])
+    by_mask, by_index = gaussians.select(mask), gaussians.select(torch.tensor([0, 2, 4]))
+    assert same(by_mask, by_index)
+    assert torch.equal(by_mask.means[1], gaussians.means[2])
+    assert by_mask.labels.tolist() == [-1, 1, 3]
+
+
+def test_select_keeps_the_order_of_the_index():
+    gaussians = cloud(3)
+    assert gaussians.select(torch.tensor([2, 0])).labels.tolist() == [1, -1]
+
+
+def test_select_nothing():
+    assert len(cloud(3).select(torch.zeros(3, dtype=torch.bool))) == 0
+
+
+def test_cat_undoes_a_split():
+    gaussians = cloud(6, degree=0)
+    parts = [gaussians.select(torch.arange(6) < 2), gaussians.select(torch.arange(6) >= 2)]
+    assert same(Gaussians.cat(parts), gaussians)
+
+
+def test_replace_returns_a_new_object():
+    gaussians = cloud(3)
+    before = gaussians.means.clone()
+    moved = gaussians.replace(means=gaussians.means + 1)
+    assert torch.equal(moved.means, before + 1)
+    assert torch.equal(gaussians.means, before)
+    assert moved.quats is gaussians.quats
+    with pytest.raises(AttributeError):
+        gaussians.means = before
+
+
+def test_to_leaves_labels_integer():
+    converted = cloud(3).to(torch.float64)
+    assert converted.means.dtype == converted.features.dtype == torch.float64
+    assert converted.labels.dtype == torch.int64
+
+
+def test_detach():
+    gaussians = cloud(3)
+    attached = gaussians.replace(means=gaussians.means.clone().requires_grad_())
+    assert attached.select(torch.tensor([0])).means.requires_grad
+    assert not attached.detach().means.requires_grad
+    assert same(attached.detach(), gaussians)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "match"),
+    [
+        ("means", torch.zeros(4, 2), r"means: expected \[N, 3\], got \(4, 2\)"),
+        ("quats", torch.zeros(4, 3), r"quats: expected \[N, 4\] with N = 4 \(from means\), got \(4, 3\)"),
+        ("scales", torch.zeros(3, 3), r"scales: expected \[N, 3\] with N = 4 \(from means\), got \(3, 3\)"),
+        ("opacities", torch.zeros(4, 1), r"opacities: expected \[N\] with N = 4"),
+        ("features", torch.zeros(4), r"features: expected \[N, D\] with N = 4"),
+        ("sh", torch.zeros(4, 4, 1), r"sh: expected \[N, K, 3\] with N = 4"),
+        ("sh", torch.zeros(4, 5, 3), r"sh: expected 1, 4, 9 or 16 coefficients \(degree 0 to 3\), got 5"),
+        ("labels", torch.zeros(5, dtype=torch.int64), r"labels: expected \[N\] with N = 4"),
+    ],
+)
+def test_refuses_shapes(name, value, match):
+    with pytest.raises(ValueError, match=match):
+        cloud(4).replace(**{name: value})
+
+
+def test_select_refuses_a_mask_of_another_size():
+    with pytest.raises(ValueError, match=r"which: expected a mask \[N\] with N = 4, got \(3,\)"):
+        cloud(4).select(torch.ones(3, dtype=torch.bool))
+
+
+def test_cat_refuses_nothing_and_mixtures():
+    with pytest.raises(ValueError, match="parts: expected at least one Gaussians, got none"):
+        Gaussians.cat([])
+    with pytest.raises(ValueError, match=r"parts\[1\]: expected the tensors .*'labels'.* as in parts\[0\], got"):
+        Gaussians.cat([cloud(2), cloud(2, labelled=False)])
