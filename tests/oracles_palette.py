@@ -1,0 +1,47 @@
+"""How the palette's table was made: farthest colours in CIELAB, for three kinds of eyes, after Okabe and Ito's seven."""
+
+import numpy as np
+from skimage.color import rgb2lab
+
+OKABE_ITO = ["e69f00", "56b4e9", "009e73", "f0e442", "0072b2", "d55e00", "cc79a7"]
+# Machado, Oliveira and Fernandes 2009, severity 1.0, on linear RGB
+EYES = {
+    "normal": np.eye(3),
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+}
+
+
+def linear(srgb):
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def display(rgb):
+    rgb = np.clip(rgb, 0, 1)
+    return np.where(rgb <= 0.0031308, rgb * 12.92, 1.055 * rgb ** (1 / 2.4) - 0.055)
+
+
+def seen(rgb8):
+    """CIELAB of 8-bit colours as each kind of eye sees them, [3, N, 3]."""
+    light = linear(np.asarray(rgb8, dtype=np.float64) / 255)
+    return np.stack([rgb2lab(display(light @ np.asarray(matrix).T)) for matrix in EYES.values()])
+
+
+def worst_distance(a, b):
+    """Smallest of the three eyes' CIE76 distances between colours a [N, 3] and b [M, 3] -> [N, M]."""
+    return np.linalg.norm(seen(a)[:, :, None] - seen(b)[:, None, :], axis=-1).min(axis=0)
+
+
+def make_palette(size=256, step=15):
+    levels = np.arange(0, 256, step)
+    candidates = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1).reshape(-1, 3)
+    lightness = seen(candidates)[0, :, 0]
+    candidates = candidates[(lightness > 25) & (lightness < 92)]  # seen on white and on black
+    chosen = [[int(code[i : i + 2], 16) for i in (0, 2, 4)] for code in OKABE_ITO]
+    avoid = [[128, 128, 128], [0, 0, 0], [255, 255, 255]]  # grey is "no label"
+    nearest = worst_distance(candidates, np.array(chosen + avoid)).min(axis=1)
+    while len(chosen) < size:
+        best = int(nearest.argmax())
+        chosen.append(candidates[best].tolist())
+        nearest = np.minimum(nearest, worst_distance(candidates, candidates[best : best + 1])[:, 0])
+    return np.array(chosen, dtype=np.uint8)

@@ -1,0 +1,137 @@
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from kfgs.viz import FeatureColors, legend_strip, overlay_labels, palette, save_picture
+
+
+def two_halves(height=20, width=60):
+    labels = torch.zeros(height, width, dtype=torch.int64)
+    labels[:, width // 2 :] = 3
+    labels[0, 0] = -1
+    return torch.full((height, width, 3), 0.5), labels
+
+
+def test_overlay_blends_photo_and_palette():
+    image, labels = two_halves()
+    picture = overlay_labels(image, labels, alpha=0.25, boundaries=False)
+    assert (picture.shape, picture.dtype) == ((20, 60, 3), np.uint8)
+    expected = 0.75 * 0.5 * 255 + 0.25 * palette(labels).astype(np.float64)
+    assert np.abs(picture - expected).max() <= 0.5
+    np.testing.assert_array_equal(overlay_labels(image.numpy(), labels.numpy(), alpha=0.25, boundaries=False), picture)
+
+
+def test_boundaries_are_darkened_on_both_sides_and_nowhere_else():
+    image, labels = two_halves()
+    labels[0, 0] = 0
+    plain, drawn = overlay_labels(image, labels, boundaries=False), overlay_labels(image, labels)
+    changed = np.flatnonzero((plain != drawn).any(axis=(0, 2)))
+    assert changed.tolist() == [29, 30]
+    assert (drawn[:, changed] < plain[:, changed]).all()
+
+
+def test_legend_shows_each_present_class_once_in_its_colour():
+    _, labels = two_halves()
+    names = [f"class {i}" for i in range(6)]
+    strip = legend_strip(labels, names, 200)
+    for label, there in ((-1, True), (0, True), (3, True), (1, False), (2, False)):
+        matches = (strip == palette(np.array(label))).all(axis=-1).sum()
+        assert (matches > 20) == there, label
+    image, labels = two_halves(width=200)
+    picture = overlay_labels(image, labels, names)
+    np.testing.assert_array_equal(picture[20:], strip)
+    narrow = legend_strip(labels, names, 90)
+    assert narrow.shape[1] == 90
+    assert narrow.shape[0] > strip.shape[0]  # wrapped
+
+
+def test_class_without_a_name_is_refused():
+    image, labels = two_halves()
+    with pytest.raises(ValueError, match="names: expected a name for every label up to 3, got 2 names"):
+        overlay_labels(image, labels, ["a", "b"])
+
+
+def test_wrong_overlay_input_is_named():
+    image, labels = two_halves()
+    with pytest.raises(ValueError, match=r"labels: expected \[H, W\] with H = 20 \(from image\)"):
+        overlay_labels(image, labels[:10])
+    with pytest.raises(ValueError, match=r"alpha: expected a number in \[0, 1\]"):
+        overlay_labels(image, labels, alpha=1.5)
+
+
+def cloud_of_features(seed=0, n=500, d=9):
+    generator = torch.Generator().manual_seed(seed)
+    scales = torch.tensor([5.0, 3.0, 2.0] + [0.1] * (d - 3))
+    turn = torch.linalg.qr(torch.randn(d, d, generator=generator))[0]
+    return (torch.randn(n, d, generator=generator) * scales) @ turn.T + 7, turn
+
+
+def test_axes_are_the_principal_ones():
+    features, turn = cloud_of_features()
+    axes = FeatureColors.fit(features).axes
+    assert torch.allclose((axes.float().T @ turn[:, :3]).abs(), torch.eye(3), atol=0.15)
+    torch.testing.assert_close(axes.T @ axes, torch.eye(3, dtype=torch.float64))
+
+
+def test_equal_features_have_equal_colours_in_every_view():
+    features, _ = cloud_of_features()
+    colors = FeatureColors.fit(features)
+    whole, part = colors(features.reshape(20, 25, 9)), colors(features[:40])
+    assert (whole.shape, whole.dtype) == ((20, 25, 3), np.uint8)
+    np.testing.assert_array_equal(whole.reshape(-1, 3)[:40], part)
+
+
+def test_range_is_the_first_to_ninety_ninth_percentile():
+    features, _ = cloud_of_features(n=2000)
+    rgb = FeatureColors.fit(features)(features)
+    for channel in range(3):
+        assert 0.005 <= (rgb[:, channel] == 0).mean() <= 0.02
+        assert 0.005 <= (rgb[:, channel] == 255).mean() <= 0.02
+
+
+def test_refitting_after_a_shuffle_gives_the_same_colours():
+    features, _ = cloud_of_features()
+    shuffled = features[torch.randperm(500, generator=torch.Generator().manual_seed(1))]
+    a, b = FeatureColors.fit(features)(features), FeatureColors.fit(shuffled)(features)
+    assert np.abs(a.astype(int) - b.astype(int)).max() <= 1
+
+
+def test_missing_axes_stay_in_the_middle():
+    rgb = FeatureColors.fit(torch.linspace(0, 1, 50)[:, None])(torch.linspace(0, 1, 50)[:, None])
+    assert rgb[0, 0] == 0
+    assert rgb[-1, 0] == 255
+    assert set(rgb[:, 1:].ravel().tolist()) == {128}
+    constant = FeatureColors.fit(torch.ones(4, 5))(torch.ones(4, 5))
+    assert set(constant.ravel().tolist()) == {128}
+
+
+def test_wrong_features_are_named():
+    colors = FeatureColors.fit(torch.randn(10, 4, generator=torch.Generator().manual_seed(0)))
+    with pytest.raises(ValueError, match=r"features: expected \[..., D\] with D = 4 \(from fit\)"):
+        colors(torch.ones(2, 2, 5))
+    with pytest.raises(ValueError, match="features: expected at least one row of finite numbers"):
+        FeatureColors.fit(torch.full((3, 2), torch.nan))
+    with pytest.raises(ValueError, match="features: expected at least one row"):
+        FeatureColors.fit(torch.empty(0, 3))
+
+
+@pytest.mark.parametrize("shape", [(4, 6), (4, 6, 3), (4, 6, 4)])
+def test_saved_picture_reads_back(tmp_path, shape):
+    values = torch.rand(shape, generator=torch.Generator().manual_seed(0)) * 1.2 - 0.1
+    save_picture(tmp_path / "deep" / "a.png", values)
+    expected = np.round(values.clamp(0, 1).numpy() * 255).astype(np.uint8)
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "deep" / "a.png")), expected)
+    save_picture(tmp_path / "b.png", expected)
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "b.png")), expected)
+    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["a.png"]
+
+
+def test_wrong_pictures_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"path: expected a name that ends in .png, got 'a.jpg'"):
+        save_picture(tmp_path / "a.jpg", np.zeros((2, 2)))
+    with pytest.raises(ValueError, match="picture: expected uint8 or floats"):
+        save_picture(tmp_path / "a.png", torch.zeros(2, 2, dtype=torch.int64))
+    with pytest.raises(ValueError, match=r"picture: expected \[H, W\].*got \(3, 5, 5\)"):
+        save_picture(tmp_path / "a.png", torch.zeros(3, 5, 5))
+    assert list(tmp_path.iterdir()) == []
