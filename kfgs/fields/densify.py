@@ -17,10 +17,10 @@ SPLIT_SHRINK = 1.6  # 0.8 times the number of children (3DGS)
 
 
 class GradientStatistics(NamedTuple):
-    """Running sum and count of screen-space gradient norms, per Gaussian."""
+    """Running sum of screen-space gradient norms per Gaussian, and over how many views."""
 
     total: Tensor  # [N]
-    count: Tensor  # [N]
+    views: Tensor  # [N], how many saw it
 
     @staticmethod
     def zeros(params: GaussianParams) -> GradientStatistics:
@@ -37,11 +37,11 @@ class GradientStatistics(NamedTuple):
         height, width = size
         norm = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2))
         self.total[index] += norm
-        self.count[index] += 1
+        self.views[index] += 1
 
     def mean(self) -> Tensor:  # [N]
         """Mean norm over the views that saw the Gaussian; 0 where none did."""
-        return self.total / self.count.clamp(min=1)
+        return self.total / self.views.clamp(min=1)
 
 
 class Densified(NamedTuple):

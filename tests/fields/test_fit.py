@@ -152,7 +152,7 @@ def test_equal_seeds_give_equal_bits_and_the_start_stays():
     assert not fits[0].params.means.requires_grad
 
 
-class Interrupt(Exception):
+class StopHereError(Exception):
     pass
 
 
@@ -164,9 +164,9 @@ def test_a_resumed_fit_equals_an_undisturbed_one_bit_for_bit(tmp_path, stop_at):
 
     def interrupt(row):
         if row["step"] == stop_at:
-            raise Interrupt
+            raise StopHereError
 
-    with pytest.raises(Interrupt):
+    with pytest.raises(StopHereError):
         fit_field(
             start(),
             cameras,
