@@ -16,6 +16,26 @@ def test_no_lens_never_folds():
     assert fold_radius(Distortion("brown_conrady", (0.1, 0.2, 0, 0))) == math.inf
 
 
+@pytest.mark.parametrize("i", range(4))
+def test_each_fisheye_coefficient_in_closed_form(i):
+    # theta + k theta^n has slope 1 + n k theta^(n - 1), which vanishes at theta = 1 for k = -1 / n, n = 3, 5, 7, 9
+    coefficients = [0.0] * 4
+    coefficients[i] = -1 / (2 * i + 3)
+    assert fold_radius(Distortion("kannala_brandt", tuple(coefficients))) == pytest.approx(math.tan(1))
+
+
+@pytest.mark.parametrize(
+    ("i", "value"), [(0, -1 / 3), (1, -1 / 5), (4, -1 / 7), (5, 1.0), (6, 1 / 3), (7, 1 / 5)], ids=str
+)
+def test_each_radial_coefficient_in_closed_form(i, value):
+    # r + k r^n as above; r / (1 + k r^n) has slope zero where 1 + (1 - n) k r^n = 0, at r = 1 for k = 1 / (n - 1)
+    coefficients = [0.0] * 8
+    coefficients[i] = value
+    assert fold_radius(Distortion("brown_conrady", tuple(coefficients))) == pytest.approx(1)
+    tangential = tuple(0.01 if j in (2, 3) else k for j, k in enumerate(coefficients))
+    assert fold_radius(Distortion("brown_conrady", tangential)) == pytest.approx(1)  # p1, p2 are left out
+
+
 def test_fisheye_fold_in_closed_form():
     # theta - theta^3 turns at theta = 1 / sqrt(3)
     assert fold_radius(Distortion("kannala_brandt", (-1.0, 0, 0, 0))) == pytest.approx(math.tan(1 / math.sqrt(3)))
