@@ -87,8 +87,8 @@ def test_first_pixel_centre_is_one_half(engine, dtype):
 
 @every_engine
 def test_positive_b_leans_along_the_other_diagonal(engine):
-    means2d, opacities = torch.tensor([[4.5, 4.5]]).double(), torch.tensor([0.8]).double()
-    conics = torch.tensor([[0.5, 0.3, 0.7]]).double()
+    means2d, opacities = torch.tensor([[4.5, 4.5]], dtype=torch.float64), torch.tensor([0.8], dtype=torch.float64)
+    conics = torch.tensor([[0.5, 0.3, 0.7]], dtype=torch.float64)
     tiles = Tiles(torch.zeros(1, dtype=torch.int32), torch.tensor([0, 1]), 9, 9, 16)
     _, alphas = composite(means2d, conics, opacities, opacities[:, None], tiles, engine=engine)
     for dx, dy in ((1, 1), (1, -1), (-1, 1), (2, 1)):
@@ -111,7 +111,9 @@ def test_alpha_is_clamped_and_then_has_no_gradient(engine, dtype):
     cotangents = (torch.ones(16, 16, 2, dtype=dtype), torch.ones(16, 16, dtype=dtype))
     *shape, of_features, of_background = _gradients(inputs, tiles, cotangents, engine)
     assert all((g == 0).all() for g in shape)
-    torch.testing.assert_close(of_features, torch.full_like(of_features, 256 * 0.99))
+    torch.testing.assert_close(
+        of_features, torch.full_like(of_features, 256 * 0.99), rtol=1e-5, atol=0
+    )  # 256 roundings
     torch.testing.assert_close(of_background, torch.full_like(of_background, 256 * 0.01), rtol=1e-4, atol=0)
 
 
@@ -150,7 +152,9 @@ def test_pixel_stops_before_its_transmittance_falls_below_the_limit(engine, dtyp
 def test_transmittance_just_above_the_limit_is_drawn(engine):
     means2d, conics, opacities, tiles = _stack([0.9, 0.9, 0.9, 0.89])  # leaves 1.1e-4
     maps, _ = composite(means2d, conics, opacities, torch.eye(4).double(), tiles, engine=engine)
-    torch.testing.assert_close(maps[3, 5], torch.tensor([0.9, 0.09, 0.009, 0.00089]).double(), rtol=1e-6, atol=0)
+    torch.testing.assert_close(
+        maps[3, 5], torch.tensor([0.9, 0.09, 0.009, 0.00089], dtype=torch.float64), rtol=1e-6, atol=0
+    )
 
 
 @every_engine
@@ -169,16 +173,16 @@ def test_many_gaussians_in_one_tile(engine, opacity):
 @every_engine
 def test_nearer_hides_further_and_ties_go_by_index(engine):
     projected, _ = random_splats(3, 16, 16, seed=0)
-    flat = torch.tensor([[1e-13, 0, 1e-13]]).double().repeat(3, 1)
+    flat = torch.tensor([[1e-13, 0, 1e-13]], dtype=torch.float64).repeat(3, 1)
     projected = projected._replace(
         means2d=torch.full((3, 2), 8.0).double(),
         conics=flat,
-        depths=torch.tensor([2.0, 1.0, 2.0]).double(),
-        opacities=torch.tensor([0.5, 0.6, 0.7]).double(),
+        depths=torch.tensor([2.0, 1.0, 2.0], dtype=torch.float64),
+        opacities=torch.tensor([0.5, 0.6, 0.7], dtype=torch.float64),
         extents=torch.full((3, 2), 100.0).double(),
     )
     maps, _ = _run(projected, torch.eye(3).double(), 16, 16, engine=engine)
-    expected = torch.tensor([0.4 * 0.5, 0.6, 0.4 * 0.5 * 0.7]).double()
+    expected = torch.tensor([0.4 * 0.5, 0.6, 0.4 * 0.5 * 0.7], dtype=torch.float64)
     torch.testing.assert_close(maps, expected.expand(16, 16, 3), rtol=1e-8, atol=0)
 
 
@@ -211,7 +215,8 @@ def test_gradients(engine, channels):
     def run(means2d, conics, opacities, features, background):
         return composite(means2d, conics, opacities, features, tiles, background=background, engine=engine)
 
-    assert torch.autograd.gradcheck(run, [v.clone().requires_grad_() for v in inputs])
+    # fast: one random direction, which is enough to see that many channels are treated alike
+    assert torch.autograd.gradcheck(run, [v.clone().requires_grad_() for v in inputs], fast_mode=channels > 1)
 
 
 @every_engine
@@ -280,7 +285,7 @@ def test_without_gaussians_there_is_the_background(engine, dtype):
 def test_empty_tiles_show_the_background(engine):
     means2d, conics, opacities, _ = _stack([0.5])
     tiles = Tiles(torch.zeros(1, dtype=torch.int32), torch.tensor([0, 0, 1]), 32, 16, 16)  # the right one is covered
-    background = torch.tensor([7.0]).double()
+    background = torch.tensor([7.0], dtype=torch.float64)
     maps, alphas = composite(
         means2d, conics, opacities, opacities[:, None], tiles, background=background, engine=engine
     )

@@ -125,7 +125,8 @@ def test_culled_at_and_before_the_near_plane():
 
 def test_culled_where_too_transparent_to_show():
     on_a_centre = [0.05, 0.05, 2.0]
-    gaussians = _balls([on_a_centre] * 3).replace(opacities=torch.tensor([0.9 / 255, 1 / 255, 1.1 / 255]).double())
+    opacities = torch.tensor([0.9 / 255, 1 / 255, 1.1 / 255], dtype=torch.float64)
+    gaussians = _balls([on_a_centre] * 3).replace(opacities=opacities)
     assert project(gaussians, _straight()).index.tolist() == [2]
 
 

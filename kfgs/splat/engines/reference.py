@@ -144,7 +144,8 @@ def _batches(tiles: Tiles) -> Iterator[Tensor]:
     """Tiles that have Gaussians, stacked with their likes in number: [B] int64 each."""
     counts = tiles.offsets.diff()
     order = torch.argsort(counts, descending=True, stable=True)[: int((counts > 0).sum())]
-    yield from order.split(max(1, BATCH // (CHUNK * tiles.tile_size**2)))
+    if len(order):
+        yield from order.split(max(1, BATCH // (CHUNK * tiles.tile_size**2)))
 
 
 def _front_to_back(tiles: Tiles, batch: Tensor, stopped: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
