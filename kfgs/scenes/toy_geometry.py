@@ -166,7 +166,7 @@ def sample_surface(solid: Solid, count: int, rng: np.random.Generator) -> Array:
         local = rng.uniform(-1.0, 1.0, (count, 3)) * half
         local[np.arange(count), axis] = half[axis] * rng.choice([-1.0, 1.0], size=count)
     else:
-        parts: list[Array] = []
+        parts: list[Array] = [np.empty((0, 3))]
         while sum(map(len, parts)) < count:  # reject by the area element of the map from the unit sphere
             u = rng.standard_normal((2 * count + 16, 3))
             u /= np.linalg.norm(u, axis=-1, keepdims=True)
