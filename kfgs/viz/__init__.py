@@ -3,7 +3,7 @@
 from .clouds import add_cameras, add_cloud, add_legend, add_transfer
 from .headless import available, make_plotter
 from .palette import PALETTE, palette
-from .pictures import FeatureColors, legend_strip, overlay_labels, save_picture
+from .pictures import FeatureColors, legend_column, legend_strip, overlay_labels, save_picture
 from .plots import plot_codebook_history, plot_confusion, plot_training
 from .through import look_through
 
@@ -15,6 +15,7 @@ __all__ = [
     "add_legend",
     "add_transfer",
     "available",
+    "legend_column",
     "legend_strip",
     "look_through",
     "make_plotter",

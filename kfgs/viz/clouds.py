@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from .._check import check_choice, check_range, check_shapes
@@ -20,13 +19,14 @@ from ..labels import Transfer
 from ..splat.sh import sh0_to_rgb
 from .gaussian_actor import as_gaussians
 from .palette import palette
-from .pictures import FeatureColors, check_names
+from .pictures import FeatureColors, legend_column
 
 if TYPE_CHECKING:
     import pyvista as pv
 
 Array = np.ndarray[Any, Any]
 ColorBy = Literal["label", "rgb", "opacity", "feature"]
+LEGEND_MARGIN = 10  # pixels from the corner
 LINES = 2000  # more transfer lines than this hide what they show
 
 
@@ -138,18 +138,30 @@ def add_legend(
     labels: Tensor | Array,  # any shape, int
     names: Sequence[str],
 ) -> Any:
-    """List the classes present, by name and colour, in the lower right corner of the active subplot.
+    """List the classes present, by name and colour, in the lower left corner of the active subplot.
+
+    A small picture instead of pyvista's legend, which writes each name in its own colour: yellow on white.
 
     Raises:
         ValueError: if a label has no name.
     """
-    present = np.unique(labels.detach().cpu().numpy() if isinstance(labels, torch.Tensor) else labels)
-    check_names([int(label) for label in present], names)
-    entries = [["none" if label < 0 else names[label], palette(label).tolist()] for label in present.tolist()]
-    height = min(0.95, 0.035 * len(entries) + 0.02)
-    return plotter.add_legend(
-        entries, face="rectangle", bcolor="white", border=True, size=(0.22, height), loc="lower right"
-    )
+    picture = legend_column(labels, names)
+    import pyvista as pv
+    from vtkmodules.vtkRenderingCore import vtkActor2D, vtkImageMapper
+
+    height, width, _ = picture.shape
+    image = pv.ImageData(dimensions=(width, height, 1))
+    image.point_data["rgb"] = picture[::-1].reshape(-1, 3)  # VTK counts rows from below
+    image.set_active_scalars("rgb")
+    mapper = vtkImageMapper()
+    mapper.SetInputData(image)
+    mapper.SetColorWindow(255)
+    mapper.SetColorLevel(127.5)
+    actor = vtkActor2D()
+    actor.SetMapper(mapper)
+    actor.SetPosition(LEGEND_MARGIN, LEGEND_MARGIN)
+    plotter.add_actor(actor, reset_camera=False, pickable=False)
+    return actor
 
 
 def add_cameras(

@@ -16,7 +16,7 @@ BOUND = 3.0  # standard deviations after which VTK stops drawing
 def as_gaussians(plotter: pv.Plotter, cloud: pv.PolyData, *, sort: bool) -> pv.Actor:
     """Draw a cloud with `rgb`, `scale`, `quat` (w, x, y, z; unit) and `opacity` as Gaussians.
 
-    Against kfgs's own rasteriser the sorted picture agrees to more than 40 dB (tests/viz/test_clouds.py); unsorted,
+    Against kfgs's own rasteriser the sorted picture agrees to more than 45 dB (tests/viz/test_clouds.py); unsorted,
     translucency is averaged. Depth peeling makes VTK's Gaussians vanish, so do not enable it.
     """
     actor = plotter.add_mesh(cloud, style="points_gaussian", scalars="rgb", rgb=True, emissive=False, lighting=False)

@@ -67,20 +67,38 @@ def legend_strip(
     Raises:
         ValueError: if a label has no name.
     """
+    return _draw_legend(labels, names, width, int(np.clip(width / 40, 10, 22)))
+
+
+def legend_column(
+    labels: Tensor | Array,  # any shape, int
+    names: Sequence[str],
+    size: int = 14,
+) -> Array:  # [h, w, 3] uint8
+    """A column that lists the classes present, one per line, with letters of `size` pixels.
+
+    Raises:
+        ValueError: if a label has no name.
+    """
+    return _draw_legend(labels, names, None, size)
+
+
+def _draw_legend(labels: Tensor | Array, names: Sequence[str], width: int | None, size: int) -> Array:
+    """Entries from left to right, wrapped at `width`; without a width one per line, and as wide as the longest."""
     present = [int(label) for label in np.unique(_array(labels))]
     check_names(present, names)
-    size = int(np.clip(width / 40, 10, 22))
     font = ImageFont.load_default(size=size)
     gap, line = size // 2, round(size * 1.6)
-    x, y, places = gap, gap, []
+    x, y, right, places = gap, gap, gap, []
     for label in present:
         text = "none" if label < 0 else names[label]
         length = size + gap + round(font.getlength(text)) + 2 * gap
-        if x > gap and x + length > width:
+        if x > gap and (width is None or x + length > width):
             x, y = gap, y + line
         places.append((x, y, label, text))
         x += length
-    strip = Image.new("RGB", (width, y + line + gap // 2), LEGEND_PAPER)
+        right = max(right, x)
+    strip = Image.new("RGB", (width or right, y + line + gap // 2), LEGEND_PAPER)
     draw = ImageDraw.Draw(strip)
     for x, y, label, text in places:
         color = tuple(int(v) for v in palette(np.array(label)))

@@ -133,4 +133,4 @@ def _save(figure: Figure, path: str | Path) -> None:
     if Path(path).suffix.lower() != ".png":
         raise ValueError(f"path: expected a name that ends in .png, got {Path(path).name!r}; rename it")
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png")
+        figure.savefig(temporary, format="png", bbox_inches="tight")  # else the label beside a square picture is cut

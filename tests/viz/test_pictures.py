@@ -3,7 +3,7 @@ import pytest
 import torch
 from PIL import Image
 
-from kfgs.viz import FeatureColors, legend_strip, overlay_labels, palette, save_picture
+from kfgs.viz import FeatureColors, legend_column, legend_strip, overlay_labels, palette, save_picture
 
 
 def two_halves(height=20, width=60):
@@ -44,6 +44,13 @@ def test_legend_shows_each_present_class_once_in_its_colour():
     narrow = legend_strip(labels, names, 90)
     assert narrow.shape[1] == 90
     assert narrow.shape[0] > strip.shape[0]  # wrapped
+
+
+def test_legend_column_has_one_class_per_line():
+    names = ["a", "b", "c", "a long name"]
+    rows = [legend_column(torch.arange(n), names).shape for n in (1, 2, 3, 4)]
+    assert len({rows[i + 1][0] - rows[i][0] for i in range(3)}) == 1  # each class adds one line
+    assert rows[3][1] > rows[2][1]  # as wide as the longest name
 
 
 def test_class_without_a_name_is_refused():
