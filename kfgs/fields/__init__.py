@@ -6,6 +6,7 @@ from .fit import FieldFit, fit_field
 from .loss import Loss, l1_loss
 from .optimizer import FieldOptimizer
 from .params import GaussianParams
+from .semantic_field import SemanticField
 
 __all__ = [
     "Densified",
@@ -15,6 +16,7 @@ __all__ = [
     "GaussianParams",
     "GradientStatistics",
     "Loss",
+    "SemanticField",
     "densify",
     "fit_field",
     "l1_loss",

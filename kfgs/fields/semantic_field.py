@@ -16,7 +16,8 @@ from ..gaussians import Gaussians
 from ..labels import CodewordLabels, Selection, classify, label_codewords, label_pixels, select_by_query
 from ..labels.segment import Decode
 from ..metrics import MIB, semantic_storage_bytes
-from ..quant import Autoencoder, Codebook
+from ..quant.autoencoder import Autoencoder
+from ..quant.codebook import Codebook
 from ..splat import Rendering, rasterize
 from .store import load_field, save_field
 
@@ -44,12 +45,15 @@ class SemanticField:
             raise ValueError("codebook: expected the one that the autoencoder was fitted to, got None; pass it as well")
         if self.codebook is None:
             return
-        with torch.no_grad():
-            latents = self.codebook.codewords
-            latents = latents if self.autoencoder is None else self.autoencoder.encode(latents)
-        if latents.shape[1] != self.channels:
+        expected = self.codebook.dim if self.autoencoder is None else self.autoencoder.latent
+        if self.autoencoder is not None and self.autoencoder.dim != self.codebook.dim:
             raise ValueError(
-                f"gaussians: expected {latents.shape[1]} features each (from the codebook's latents), got {self.channels}; "
+                f"autoencoder: expected {self.codebook.dim} decoded channels (from codebook), got {self.autoencoder.dim}; "
+                "pass the autoencoder that was fitted to this codebook"
+            )
+        if expected != self.channels:
+            raise ValueError(
+                f"gaussians: expected {expected} features each (from the codebook's latents), got {self.channels}; "
                 "pass the codebook and autoencoder that this field was fitted with"
             )
 
@@ -90,9 +94,7 @@ class SemanticField:
         if self.autoencoder is None:
             return latents
         with torch.no_grad():
-            rows = latents.reshape(-1, self.channels)
-            decoded = torch.cat([self.autoencoder.decode(part) for part in rows.split(CHUNK)])
-        return decoded.reshape(*latents.shape[:-1], -1)
+            return self.autoencoder.decode(latents, chunk=CHUNK)
 
     def feature_map(self, camera: Camera) -> Tensor:  # [H, W, D]
         """The teacher's features as seen from a viewpoint. 512 channels at 640x480 take 630 MB."""
@@ -181,10 +183,7 @@ class SemanticField:
 
         With no autoencoder the table's sizes hold no codebook or decoder; ours counts the codebook, which labelling needs.
         """
-        decoder = 0
-        if self.autoencoder is not None:
-            tensors = self.autoencoder.to_tensors()
-            decoder = sum(value.numel() for name, value in tensors.items() if name.startswith("decoder"))
+        decoder = 0 if self.autoencoder is None else self.autoencoder.decoder_parameters
         codebook = 0 if self.codebook is None else self.codebook.codewords.numel()
         return semantic_storage_bytes(len(self), self.channels, decoder, codebook)
 
@@ -225,4 +224,4 @@ class SemanticField:
         return torch.cat([self.codebook.quantize(self.decode(part)) for part in self.features.split(CHUNK)])
 
     def _check_embeddings(self, embeddings: Tensor) -> None:
-        check_shapes(("features", self.decode(self.features[:1]), "N D"), ("embeddings", embeddings, "C D"))
+        check_shapes(("embeddings", embeddings, f"C {self.dim}"))

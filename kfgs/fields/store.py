@@ -12,7 +12,8 @@ from torch import Tensor
 
 from .._files import atomic_folder, digest_file, read_json, write_json
 from ..gaussians import Gaussians
-from ..quant import Autoencoder, Codebook
+from ..quant.autoencoder import Autoencoder
+from ..quant.codebook import Codebook
 
 FORMAT, VERSION = "kfgs.semantic_field", 1
 TENSORS, DESCRIPTION = "field.safetensors", "field.json"

@@ -5,9 +5,11 @@ from functools import cache
 import pytest
 import torch
 
-from kfgs import Autoencoder, AutoencoderConfig, Camera, Codebook, Gaussians, fit_autoencoder
+from kfgs import Camera, Gaussians
 from kfgs.fields import SemanticField
 from kfgs.metrics import MIB
+from kfgs.quant.autoencoder import Autoencoder
+from kfgs.quant.codebook import Codebook
 
 DIM, CLASSES = 16, 3
 MODES = ["decouple", "adc", "adc+sc"]
@@ -31,8 +33,14 @@ def embeddings():
 
 @cache
 def autoencoder() -> Autoencoder:
-    config = AutoencoderConfig(latent=4, encoder=(16,), decoder=(16,), steps=400, learning_rate=1e-2)
-    return fit_autoencoder(codebook(), config, generator=torch.Generator().manual_seed(0)).autoencoder
+    """Written down, not fitted: codeword i's latent is the i-th unit vector of four, and decodes to its direction."""
+    into, out = torch.eye(4, DIM), torch.eye(DIM, 4)
+    return Autoencoder(
+        encoder=((into, torch.zeros(4)),),
+        decoder=((out, torch.zeros(DIM)), (torch.eye(DIM), torch.zeros(DIM))),
+        low=0.0,
+        high=1.0,
+    )
 
 
 def field(mode="adc+sc", n=4):
@@ -215,6 +223,8 @@ def test_parts_must_belong_together():
         SemanticField(field().gaussians, None, autoencoder())
     with pytest.raises(ValueError, match=r"gaussians: expected 16 features each .* got 4"):
         SemanticField(field().gaussians, codebook())
+    with pytest.raises(ValueError, match=r"autoencoder: expected 5 decoded channels \(from codebook\), got 16"):
+        SemanticField(field().gaussians, Codebook(torch.eye(5)), autoencoder())
     with pytest.raises(ValueError, match=r"gaussians: expected 4 features each .* got 16"):
         SemanticField(field("adc").gaussians, codebook(), autoencoder())
 
@@ -222,9 +232,9 @@ def test_parts_must_belong_together():
 @pytest.mark.parametrize("mode", MODES)
 def test_wrong_embeddings(mode):
     made = field(mode)
-    with pytest.raises(ValueError, match=r"embeddings: expected \[C, D\] with D = 16"):
+    with pytest.raises(ValueError, match=r"embeddings: expected \[C, 16\], got \(2, 5\)"):
         made.classify(torch.ones(2, 5))
-    with pytest.raises(ValueError, match=r"embeddings: expected \[C, D\] with D = 16"):
+    with pytest.raises(ValueError, match=r"embeddings: expected \[C, 16\], got \(2, 5\)"):
         made.segment(camera(), torch.ones(2, 5))
     with pytest.raises(ValueError, match=r"embedding: expected \[16\], got \(5,\)"):
         made.query(torch.ones(5))
