@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ..cameras.camera import Camera, Distortion
 from ._pycolmap import quiet_pycolmap, wrapped
@@ -108,13 +109,14 @@ def load_colmap(path: str | Path, images: str | Path) -> Scene:
     model = read_reconstruction(path)
     with wrapped(f"{path}: expected a COLMAP model with poses", "write the model again with COLMAP"):
         views = sorted(model.images.values(), key=lambda image: natural_key(image.name))
-        posed = [image for image in views if image.has_pose]
+        poses = {image.name: _pose(image) for image in views}
+        posed = [image for image in views if poses[image.name] is not None]
         cameras = {camera_id: _intrinsics(path, camera_id, model.cameras[camera_id]) for camera_id in model.cameras}
         points, colors = _points(model)
         paths = [folder / image.name for image in posed]
         found = [i for i, file in enumerate(paths) if file.is_file()]
-        matched = [_camera(posed[i], *cameras[posed[i].camera_id]) for i in found]
-    lost = [image.name for image in views if not image.has_pose]
+        matched = [_camera(posed[i].name, poses[posed[i].name], *cameras[posed[i].camera_id]) for i in found]
+    lost = [name for name, pose in poses.items() if pose is None]
     missing = [posed[i].name for i in sorted(set(range(len(posed))) - set(found))]
     if not found:
         raise SceneError(
@@ -139,10 +141,22 @@ def _intrinsics(path: Path, camera_id: int, camera: Any) -> tuple[torch.Tensor, 
     return K, distortion, int(camera.width), int(camera.height)
 
 
-def _camera(image: Any, K: torch.Tensor, distortion: Distortion | None, width: int, height: int) -> Camera:
+def _pose(image: Any) -> NDArray[np.float64] | None:
+    """World to camera [3, 4], or None where the frame, or the camera within its rig, has not been placed."""
+    if not image.has_pose:
+        return None
+    try:
+        return np.array(image.cam_from_world().matrix())
+    except RuntimeError:  # "bad optional access": has_pose looks at the frame only
+        return None
+
+
+def _camera(
+    name: str, pose: NDArray[np.float64], K: torch.Tensor, distortion: Distortion | None, width: int, height: int
+) -> Camera:
     viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3] = torch.from_numpy(np.array(image.cam_from_world().matrix()))
-    return Camera(viewmat.float(), K.float(), width, height, image.name, distortion)
+    viewmat[:3] = torch.from_numpy(pose)
+    return Camera(viewmat.float(), K.float(), width, height, name, distortion)
 
 
 def _points(model: Any) -> tuple[torch.Tensor, torch.Tensor]:

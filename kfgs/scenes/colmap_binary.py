@@ -31,7 +31,7 @@ _SENSOR = struct.Struct("<iI")
 _FRAME = struct.Struct("<II7dI")
 _DATA = struct.Struct("<iIQ")
 _POSE = struct.Struct("<7d")
-_OBSERVATION_BYTES = 24
+_OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 _TRACK = np.dtype([("image", "<u4"), ("observation", "<u4")])
 _LONGEST_NAME = 4096  # bytes, the longest path of Linux
 
@@ -116,10 +116,12 @@ def _read_images(path: Path) -> dict[int, ImageRecord]:
         tables.check_pose(where, pose)
         name = cursor.name(f"image {i}")
         tables.check_name(where, name)
-        observations = cursor.count(f"2-D points of image {i}", _OBSERVATION_BYTES)
-        cursor.advance(observations * _OBSERVATION_BYTES, f"2-D points of image {i}")
+        what = f"2-D points of image {i}"
+        count = cursor.count(what, _OBSERVATION.itemsize)
+        start = cursor.advance(count * _OBSERVATION.itemsize, what)
+        seen = np.frombuffer(cursor.data, dtype=_OBSERVATION, count=count, offset=start)["point"].astype(np.int64)
         require(image_id not in images, where, "an id of its own", f"{image_id} again")
-        images[int(image_id)] = ImageRecord(name, int(camera_id), observations)
+        images[int(image_id)] = ImageRecord(name, int(camera_id), seen)
     cursor.finish()
     return images
 

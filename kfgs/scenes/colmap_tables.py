@@ -54,8 +54,8 @@ class ImageRecord:
 
     name: str
     camera_id: int
-    observations: int
-    """2-D points of the image."""
+    points: NDArray[np.int64]
+    """[n] which 3-D point each 2-D point of the image sees, -1 = none."""
 
 
 Sensor = tuple[int, int]
@@ -157,31 +157,44 @@ def check_images(where: str, images: dict[int, ImageRecord], cameras: set[int]) 
 
 
 def check_tracks(where: str, tracks: Tracks, images: dict[int, ImageRecord]) -> None:
-    """Points have ids of their own, and observations refer to 2-D points that exist.
+    """Points have ids of their own, and points and 2-D points name each other.
 
-    pycolmap fails with an IndexError that names nothing otherwise.
+    pycolmap fails with an IndexError or a CHECK that names no file otherwise.
     """
-    ids = np.asarray(tracks.point_ids, dtype=np.uint64)
+    ids = np.asarray(tracks.point_ids, dtype=np.uint64).view(np.int64)
     require(len(np.unique(ids)) == len(ids), where, "each point id once", "a repeated id")
     if len(tracks.image_ids) == 0:
         return
     known = np.array(sorted(images), dtype=np.int64)
-    sizes = np.array([images[int(i)].observations for i in known], dtype=np.int64)
+    sizes = np.array([len(images[int(i)].points) for i in known], dtype=np.int64)
     place = np.searchsorted(known, tracks.image_ids).clip(max=max(len(known) - 1, 0))
-    exists = known[place] == tracks.image_ids if len(known) else np.zeros(len(tracks.image_ids), bool)
-    inside = exists & (tracks.observations >= 0)
-    inside[exists] &= tracks.observations[exists] < sizes[place[exists]]
-    if inside.all():
-        return
-    first = int(np.flatnonzero(~inside)[0])
-    point = int(np.searchsorted(np.cumsum(np.asarray(tracks.lengths, dtype=np.int64)), first, side="right"))
-    image_id = int(tracks.image_ids[first])
-    has = f"which has {images[image_id].observations}" if image_id in images else "which is not in the model"
+    inside = known[place] == tracks.image_ids if len(known) else np.zeros(len(tracks.image_ids), bool)
+    inside[inside] = tracks.observations[inside] < sizes[place[inside]]
+    owner = np.repeat(ids, np.asarray(tracks.lengths, dtype=np.int64))
+    good = inside.copy()
+    if inside.any():
+        flat = np.concatenate([images[int(i)].points for i in known])
+        first = np.cumsum(sizes) - sizes
+        good[inside] = flat[first[place[inside]] + tracks.observations[inside]] == owner[inside]
+    if not good.all():
+        _report_track(where, tracks, images, owner, int(np.flatnonzero(~good)[0]))
+
+
+def _report_track(
+    where: str, tracks: Tracks, images: dict[int, ImageRecord], owner: NDArray[np.int64], wrong: int
+) -> None:
+    image_id, observation = int(tracks.image_ids[wrong]), int(tracks.observations[wrong])
+    if image_id not in images:
+        says = "an image that is not in the model"
+    elif observation >= len(images[image_id].points):
+        says = f"an image that has {len(images[image_id].points)} 2-D points"
+    else:
+        says = f"which sees point {images[image_id].points[observation]}"
     require(
         False,
-        f"{where}, point {int(ids[point])}",
-        "a track over 2-D points of the model's images",
-        f"2-D point {int(tracks.observations[first])} of image {image_id}, {has}",
+        f"{where}, point {int(owner[wrong]) % 2**64}",
+        "a track over 2-D points that see it",
+        f"2-D point {observation} of image {image_id}, {says}",
         "write images and points with the same run of COLMAP; if the 2-D points were stripped, empty the tracks too",
     )
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import colmap_tables as tables
 from .colmap_tables import CAMERA_MODELS, SENSOR_NAMES, FrameRecord, ImageRecord, Model, Sensor, Tracks, require
@@ -111,18 +112,19 @@ def _read_images(path: Path) -> dict[int, ImageRecord]:
         require(below is not None, row.where, "a line of 2-D points (perhaps empty) below each image", "the end")
         assert below is not None
         require(image_id not in images, row.where, "an id of its own", f"{image_id} again")
-        images[image_id] = ImageRecord(name, camera_id, _count_observations(f"{path}, line {below[0]}", below[1]))
+        images[image_id] = ImageRecord(name, camera_id, _read_observations(f"{path}, line {below[0]}", below[1]))
     return images
 
 
-def _count_observations(where: str, line: str) -> int:
+def _read_observations(where: str, line: str) -> NDArray[np.int64]:
+    """The 3-D point of each 2-D point, -1 = none."""
     words = line.split()
     require(len(words) % 3 == 0, where, "2-D points as X Y POINT3D_ID", f"{len(words)} words")
     try:
-        np.array(words, dtype=np.float64)
-    except ValueError as error:
+        np.array(words[0::3] + words[1::3], dtype=np.float64)
+        return np.array(words[2::3], dtype=np.int64)
+    except (ValueError, OverflowError) as error:
         raise SceneError(f"{where}: expected 2-D points as X Y POINT3D_ID ({error}); {tables.ADVICE}") from error
-    return len(words) // 3
 
 
 def _read_points(path: Path) -> Tracks:
