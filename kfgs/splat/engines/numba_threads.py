@@ -1,0 +1,46 @@
+"""Run a compiled kernel over numbered bands of work on a few threads.
+
+Numba's own parallel loops are not used: its default back end aborts when two Python threads enter it, another one does
+not survive a fork, and both decide the split from the number of threads. Here the bands are fixed by the data, and each
+owns what it writes, so results do not depend on how many threads there are or on which thread runs what.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import torch
+
+_pools: dict[int, ThreadPoolExecutor] = {}  # by process: threads do not survive a fork
+
+
+def _pool() -> ThreadPoolExecutor:
+    pid = os.getpid()
+    if pid not in _pools:
+        _pools.clear()
+        _pools[pid] = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="kfgs")
+    return _pools[pid]
+
+
+def run_bands(kernel: Callable[..., None], bands: int, *arguments: Any) -> None:
+    """Call `kernel(band, *arguments)` for every band, on up to `torch.get_num_threads()` threads.
+
+    Args:
+        kernel: releases the GIL, and writes nothing that another band reads or writes.
+        bands: how many; each thread takes the next one that is left.
+        arguments: passed on as they are.
+    """
+    remaining = iter(range(bands))
+
+    def drain() -> None:
+        for band in remaining:
+            kernel(band, *arguments)
+
+    helpers = min(torch.get_num_threads(), bands) - 1
+    futures = [_pool().submit(drain) for _ in range(helpers)]
+    drain()
+    for future in futures:
+        future.result()
