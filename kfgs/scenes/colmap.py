@@ -109,14 +109,14 @@ def load_colmap(path: str | Path, images: str | Path) -> Scene:
     model = read_reconstruction(path)
     with wrapped(f"{path}: expected a COLMAP model with poses", "write the model again with COLMAP"):
         views = sorted(model.images.values(), key=lambda image: natural_key(image.name))
-        poses = {image.name: _pose(image) for image in views}
-        posed = [image for image in views if poses[image.name] is not None]
+        poses = {image.name: pose for image in views if (pose := _pose(image)) is not None}
+        posed = [image for image in views if image.name in poses]
         cameras = {camera_id: _intrinsics(path, camera_id, model.cameras[camera_id]) for camera_id in model.cameras}
         points, colors = _points(model)
         paths = [folder / image.name for image in posed]
         found = [i for i, file in enumerate(paths) if file.is_file()]
         matched = [_camera(posed[i].name, poses[posed[i].name], *cameras[posed[i].camera_id]) for i in found]
-    lost = [name for name, pose in poses.items() if pose is None]
+    lost = [image.name for image in views if image.name not in poses]
     missing = [posed[i].name for i in sorted(set(range(len(posed))) - set(found))]
     if not found:
         raise SceneError(

@@ -30,8 +30,8 @@ def robust_bounds(
 ) -> Bounds:
     """The axis-aligned box of the central `coverage` of the points along each axis, widened by `margin` of its size.
 
-    SfM clouds have points far behind every wall (room_0's reach 139 units from a room of about 7), so the plain
-    minimum and maximum say nothing.
+    SfM clouds have points far behind every wall (one of Replica's room_0 reached 139 m out of a room of about 8), so
+    the plain minimum and maximum say nothing.
 
     Args:
         points: the cloud, P >= 1, finite.

@@ -91,8 +91,12 @@ def read_split(path: str | Path, stems: Sequence[str]) -> tuple[dict[str, list[i
     """
     try:
         value = read_json(path)
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise SceneError(f"{error}; repair the file or remove it") from error
+    except RecursionError as error:
+        raise SceneError(
+            f"{path}: expected a JSON file, got brackets nested too deep; repair the file or remove it"
+        ) from error
     if not _is_split(value):
         raise SceneError(
             f'{path}: expected {{"train": [names], "test": [names]}}, got {str(value)[:80]}; '

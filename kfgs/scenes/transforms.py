@@ -114,8 +114,12 @@ def _read_frames(reader: _Reader) -> dict[str, Any]:
     """Fill `reader.views`; return the file's top level."""
     try:
         top = read_json(reader.path)
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise SceneError(f"{error}; write the file again") from error
+    except RecursionError as error:
+        raise SceneError(
+            f"{reader.path}: expected a JSON file, got brackets nested too deep; write the file again"
+        ) from error
     if not isinstance(top, dict) or not isinstance(top.get("frames"), list) or not top["frames"]:
         raise reader.fail("top level", "an object with a list of 'frames'", top, "is this a transforms.json?")
     sizes: dict[str, tuple[int, int]] = {}

@@ -1,0 +1,96 @@
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from colmap_models import write_model, write_picture
+
+from kfgs.scenes import SceneError, list_images, load_scene
+
+
+def _pictures(folder: Path, names: list[str]) -> None:
+    for name in names:
+        write_picture(folder / name)
+
+
+@pytest.mark.parametrize("where", ["sparse/0", "sparse", "colmap/sparse/0", "colmap_ground_truth", "."])
+def test_models_are_found_where_programs_put_them(tmp_path: Path, where: str) -> None:
+    write_model(tmp_path / where, ["a.png", "b.png"])
+    _pictures(tmp_path / "images", ["a.png", "b.png"])
+    scene = load_scene(tmp_path)
+    assert [c.name for c in scene.cameras] == ["a.png", "b.png"]
+    assert scene.splits == {"train": [0, 1], "test": []}
+    assert scene.notes == ("split all: 2 of 2 views train, 0 test",)
+
+
+def test_a_model_folder_or_a_given_image_folder_will_do(tmp_path: Path) -> None:
+    model = write_model(tmp_path / "sparse/0", ["a.png"])
+    _pictures(tmp_path / "images", ["a.png"])
+    assert len(load_scene(model)) == 1
+    shutil.move(tmp_path / "images", tmp_path / "photos")
+    assert load_scene(tmp_path, images=tmp_path / "photos").image_paths[0].parent.name == "photos"
+    with pytest.raises(SceneError, match="give the right image folder"):
+        load_scene(tmp_path)
+    shutil.copy(tmp_path / "photos/a.png", tmp_path / "a.png")
+    assert load_scene(tmp_path).image_paths == [tmp_path / "a.png"]  # beside the model, without images/
+
+
+def test_a_second_model_is_mentioned(tmp_path: Path) -> None:
+    for number in "01":
+        write_model(tmp_path / "sparse" / number, ["a.png"])
+    _pictures(tmp_path / "images", ["a.png"])
+    assert any("holds other models too (1)" in note for note in load_scene(tmp_path).notes)
+
+
+def test_the_split_file_wins(tmp_path: Path) -> None:
+    names = [f"rgb_{i}.png" for i in range(24)]
+    write_model(tmp_path / "sparse/0", names)
+    _pictures(tmp_path / "images", names)
+    paper = load_scene(tmp_path)
+    assert paper.splits == {"train": [5, 15], "test": [0, 10, 20]}
+    assert any("split df3dgs: 2 of 24 views train, 3 test" in n and 'split="holdout8"' in n for n in paper.notes)
+    (tmp_path / "split.json").write_text(json.dumps({"train": ["rgb_10", "rgb_2"], "test": ["rgb_0", "rgb_99"]}))
+    scene = load_scene(tmp_path)
+    assert scene.splits == {"train": [2, 10], "test": [0]}
+    assert any("1 names in" in note and "rgb_99" in note for note in scene.notes)
+    assert load_scene(tmp_path, split="holdout8").splits["test"] == [0, 8, 16]
+    (tmp_path / "split.json").unlink()
+    with pytest.raises(FileNotFoundError, match="split.json"):
+        load_scene(tmp_path, split="file")
+
+
+def test_what_cannot_be_loaded_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="expected a scene there"):
+        load_scene(tmp_path / "nothing")
+    with pytest.raises(SceneError, match=r"a COLMAP model .* or a transforms.json, found neither; .*`kfgs sfm"):
+        load_scene(tmp_path)
+    with pytest.raises(ValueError, match="split: expected one of 'auto'"):
+        load_scene(tmp_path, split="random")  # type: ignore[arg-type]
+    write_model(tmp_path / "sparse/0", ["a.png"])
+    (tmp_path / "sparse/0/points3D.bin").unlink()
+    with pytest.raises(SceneError, match="got cameras.bin, images.bin; copy the missing files"):
+        load_scene(tmp_path)
+    write_model(tmp_path / "sparse/0", ["a.png"])
+    _pictures(tmp_path / "images", ["a.png"])
+    with pytest.raises(SceneError, match="at least 6 views for the split 'df3dgs', got 1"):
+        load_scene(tmp_path, split="df3dgs")
+
+
+def test_images_are_listed_in_natural_order(tmp_path: Path) -> None:
+    _pictures(tmp_path, ["b10.png", "b9.png", "sub/a.png", ".hidden/x.png", ".y.png"])
+    (tmp_path / "b1.JPG").write_bytes(b"")
+    (tmp_path / "notes.txt").write_text("")
+    assert list_images(tmp_path) == ["b1.JPG", "b9.png", "b10.png", "sub/a.png"]
+
+
+def test_the_real_scenes(shared_data: Path) -> None:
+    room = load_scene(shared_data / "room_0")
+    assert (len(room), len(room.splits["train"]), len(room.splits["test"]), room.notes) == (180, 90, 90, ())
+    assert room.stem(room.splits["train"][0]) == "rgb_5"
+    assert room.image(0).shape == (479, 639, 3)
+    assert room.extent == pytest.approx(2.548, abs=0.01)
+    door = load_scene(shared_data / "lund_door")
+    assert (len(door), door.distorted, door.splits["test"]) == (12, True, [0, 8])
+    fox = load_scene(shared_data / "fox", split="holdout8")
+    assert (len(fox), len(fox.points), len(fox.splits["train"])) == (50, 0, 43)
+    assert [c.name for c in load_scene(shared_data / "fox/transforms.json").cameras] == [c.name for c in fox.cameras]

@@ -1,0 +1,47 @@
+from pathlib import Path
+
+import pytest
+import torch
+
+from kfgs.scenes import load_scene, robust_bounds
+
+
+def test_outliers_do_not_move_the_box() -> None:
+    g = torch.Generator().manual_seed(3)
+    cloud = torch.rand(1000, 3, generator=g) * torch.tensor([4.0, 2.0, 1.0])
+    far = torch.tensor([[-139.0, 5.0, 0.5], [2.0, 300.0, 0.5], [2.0, 1.0, -77.0]])
+    bounds = robust_bounds(torch.cat([cloud, far]))
+    assert bounds.inside[:1000].float().mean() > 0.99
+    assert not bounds.inside[1000:].any()
+    torch.testing.assert_close(bounds.center, torch.tensor([2.0, 1.0, 0.5]), rtol=0, atol=0.15)
+    torch.testing.assert_close(bounds.high - bounds.low, torch.tensor([4.0, 2.0, 1.0]) * 1.2, rtol=0.05, atol=0)
+
+
+def test_full_coverage_is_the_plain_box() -> None:
+    points = torch.tensor([[0.0, 1.0, 2.0], [4.0, -1.0, 2.0], [1.0, 0.0, 5.0]])
+    bounds = robust_bounds(points, coverage=1.0, margin=0.0)
+    assert bounds.low.tolist() == [0, -1, 2]
+    assert bounds.high.tolist() == [4, 1, 5]
+    assert bounds.center.tolist() == [1, 0, 2]
+    assert bounds.inside.all()
+
+
+def test_one_point_is_its_own_box() -> None:
+    bounds = robust_bounds(torch.tensor([[1.0, 2.0, 3.0]]))
+    assert bounds.low.tolist() == bounds.high.tolist() == [1, 2, 3]
+
+
+def test_room_0_is_a_room(shared_data: Path) -> None:
+    points = load_scene(shared_data / "room_0").points
+    bounds = robust_bounds(points)
+    size, plain = bounds.high - bounds.low, points.amax(0) - points.amin(0)
+    assert float(plain[0] - size[0]) > 1  # metres, of stray points behind the walls
+    assert float(size.max()) < 11
+    assert float(bounds.inside.float().mean()) > 0.95
+
+
+def test_arguments_are_checked() -> None:
+    with pytest.raises(ValueError, match="points: expected at least one point"):
+        robust_bounds(torch.zeros(0, 3))
+    with pytest.raises(ValueError, match="coverage: expected a number"):
+        robust_bounds(torch.zeros(2, 3), coverage=0.0)

@@ -1,0 +1,127 @@
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from colmap_models import write_picture
+
+from kfgs.cameras import Camera, Distortion
+from kfgs.cameras.undistort import undistort
+from kfgs.scenes import Scene, SceneError, read_image
+
+K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+LENS = Distortion("brown_conrady", (0.3, 0.0, 0.0, 0.0))  # pincushion: the picture does not fill the pinhole's
+
+
+def _camera(name: str, x: float = 0.0, distortion: Distortion | None = None) -> Camera:
+    viewmat = torch.eye(4)
+    viewmat[0, 3] = -x
+    return Camera(viewmat, K, 64, 48, name, distortion)
+
+
+def _scene(tmp_path: Path, distortion: Distortion | None = None, positions: tuple[float, ...] = (0, 2, 7)) -> Scene:
+    names = [f"rgb_{5 * i}.png" for i in range(len(positions))]
+    cameras = [_camera(name, x, distortion) for name, x in zip(names, positions, strict=True)]
+    paths = [write_picture(tmp_path / name) for name in names]
+    points, colors = torch.tensor([[0.0, 0, 3], [0, 0, 5]]), torch.zeros(2, 3, dtype=torch.uint8)
+    return Scene(cameras, paths, points, colors, {"train": [0, 1], "test": [2]})
+
+
+def test_images_are_rgb_between_0_and_1(tmp_path: Path) -> None:
+    image = _scene(tmp_path).image(1)
+    assert image.shape == (48, 64, 3)
+    assert image.dtype == torch.float32
+    torch.testing.assert_close(image[10, 20], torch.tensor([60.0, 40.0, 9.0]) / 255)
+
+
+def test_a_picture_of_another_size_is_an_error(tmp_path: Path) -> None:
+    scene = _scene(tmp_path)
+    write_picture(scene.image_paths[1], 24, 32)
+    with pytest.raises(
+        SceneError, match=r"rgb_5.png: expected 64x48 pixels .* got 32x24; give the folder of full-size"
+    ):
+        scene.image(1)
+
+
+def test_broken_and_missing_pictures_are_named(tmp_path: Path) -> None:
+    scene = _scene(tmp_path)
+    scene.image_paths[0].write_bytes(b"not an image")
+    with pytest.raises(SceneError, match=r"rgb_0.png: expected a PNG, JPEG, TIFF or WebP image.*replace the file"):
+        scene.image(0)
+    whole = scene.image_paths[1].read_bytes()
+    scene.image_paths[1].write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(SceneError, match="rgb_5.png: expected a PNG"):
+        scene.image(1)
+    scene.image_paths[2].unlink()
+    with pytest.raises(FileNotFoundError, match="rgb_10.png: no such file"):
+        scene.image(2)
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        read_image(tmp_path)
+
+
+def test_undistorted_scenes_undistort_lazily(tmp_path: Path) -> None:
+    scene = _scene(tmp_path, LENS)
+    assert scene.distorted
+    straight = scene.undistorted()
+    assert not straight.distorted
+    expected, camera, recorded = undistort(scene.image(1), scene.cameras[1])
+    torch.testing.assert_close(straight.image(1), expected)
+    assert torch.equal(straight.mask(1), recorded)
+    assert not recorded.all()  # the corners
+    assert torch.equal(camera.K, straight.cameras[1].K)
+    assert camera.size == straight.cameras[1].size
+    assert camera.distortion is straight.cameras[1].distortion is None
+    assert straight.undistorted() is straight
+    assert torch.equal(straight.select([1]).image(0), expected)
+
+
+def test_a_pinhole_scene_is_undistorted_already(tmp_path: Path) -> None:
+    scene = _scene(tmp_path)
+    assert scene.undistorted() is scene
+    assert scene.mask(0).all()
+    assert scene.mask(0).shape == (48, 64)
+
+
+def test_extent_is_of_the_training_cameras(tmp_path: Path) -> None:
+    scene = _scene(tmp_path)  # training cameras at x = 0 and 2
+    assert scene.extent == pytest.approx(1.1)
+    assert replace(scene, splits={}).extent == pytest.approx(1.1 * 4)  # mean 3, farthest 7
+    assert scene.select("test").extent == pytest.approx(
+        ((7**2 + 9) ** 0.5), rel=1e-6
+    )  # one camera: lower median distance
+    alone = replace(scene.select("test"), points=torch.zeros(0, 3), colors=torch.zeros(0, 3, dtype=torch.uint8))
+    assert alone.extent == 1.0
+    with pytest.raises(ValueError, match="extent of an empty scene"):
+        _ = scene.select([]).extent
+
+
+def test_select_by_split_name_stem_and_index(tmp_path: Path) -> None:
+    scene = _scene(tmp_path)
+    assert [c.name for c in scene.select("train").cameras] == ["rgb_0.png", "rgb_5.png"]
+    chosen = scene.select(["rgb_10", "rgb_0.png"])
+    assert [c.name for c in chosen.cameras] == ["rgb_10.png", "rgb_0.png"]
+    assert chosen.splits == {"train": [1], "test": [0]}
+    assert chosen.image_paths[0].name == "rgb_10.png"
+    assert len(scene.select([2])) == 1
+    for which, message in (
+        ("val", r"one of the splits \['test', 'train'\], got 'val'"),
+        (["rgb_1"], "got 'rgb_1'; names are like 'rgb_0.png'"),
+        ([3], "got 3"),
+        ([-1], "got -1"),
+        ([1, 1], "expected each view once"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            scene.select(which)  # type: ignore[arg-type]
+
+
+def test_scenes_are_checked(tmp_path: Path) -> None:
+    scene = _scene(tmp_path)
+    with pytest.raises(ValueError, match=r"image_paths: expected 3 \(one per camera\), got 1"):
+        replace(scene, image_paths=scene.image_paths[:1])
+    with pytest.raises(ValueError, match=r"colors: expected \[P, 3\] with P = 2"):
+        replace(scene, colors=torch.zeros(3, 3, dtype=torch.uint8))
+    with pytest.raises(ValueError, match=r"splits\['train'\]: expected views in \[0, 3\), got 9"):
+        replace(scene, splits={"train": [0, 9]})
+    with pytest.raises(SceneError, match="names that differ before the suffix .* got 'a' twice"):
+        replace(scene, cameras=[_camera("a.png"), _camera("a.jpg"), _camera("b.png")])
+    assert repr(scene) == "Scene(3 views, 2 points, splits: train 2, test 1)"

@@ -1,0 +1,108 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from kornia.geometry import resize
+from kornia.io import write_image
+from oracles_alignment import align_similarity
+
+from kfgs.scenes import SceneError, SfmConfig, load_scene, read_image, run_sfm
+from kfgs.scenes.sfm import SfmReport, _require_one_model
+
+WIDTH = 320
+
+
+def _downsized(source: Path, target: Path, count: int) -> Path:
+    target.mkdir()
+    for file in sorted(source.iterdir())[:count]:
+        image = read_image(file).permute(2, 0, 1)[None]
+        height = round(image.shape[2] * WIDTH / image.shape[3])
+        small = resize(image, (height, WIDTH), antialias=True)[0].clamp(0, 1)
+        write_image(str(target / f"{file.stem}.png"), (small * 255).round().to(torch.uint8))
+    return target
+
+
+def test_sfm_finds_the_true_poses(shared_data: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    images = _downsized(shared_data / "lund_door/images", tmp_path / "images", 8)
+    (images / "notes.txt").write_text("not an image")
+    report = run_sfm(images, tmp_path, config=SfmConfig(max_features=3000), progress=True)
+    assert (report.registered, report.total, report.missing, report.model_sizes) == (8, 8, (), (8,))
+    assert report.points > 500
+    assert report.mean_reprojection_error < 0.6
+    assert "8 of 8 images registered" in str(report)
+    assert set(report.seconds) == {"features", "matching", "mapping"}
+    shown = capfd.readouterr().err
+    assert all(stage in shown for stage in ("features", "matching", "mapping", "8/8"))
+
+    found, truth = (
+        load_scene(tmp_path, split="all"),
+        load_scene(shared_data / "lund_door", split="all").select(range(8)),
+    )
+    assert [found.stem(i) for i in range(8)] == [truth.stem(i) for i in range(8)]
+    ours = torch.stack([c.center for c in found.cameras]).double().numpy()
+    theirs = torch.stack([c.center for c in truth.cameras]).double().numpy()
+    scale, rotation, translation = align_similarity(ours, theirs)
+    error = np.linalg.norm(scale * ours @ rotation.T + translation - theirs, axis=1)
+    span = np.linalg.norm(theirs - theirs.mean(0), axis=1).max()
+    assert error.max() < 0.02 * span
+    for mine, other in zip(found.cameras, truth.cameras, strict=True):
+        turn = mine.viewmat[:3, :3].double().numpy() @ rotation.T @ other.viewmat[:3, :3].double().numpy().T
+        assert np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))) < 1.0
+    factor = WIDTH / truth.cameras[0].width
+    assert float(found.cameras[0].K[0, 0]) == pytest.approx(float(truth.cameras[0].K[0, 0]) * factor, rel=0.05)
+
+
+def test_images_that_share_nothing_are_refused(tmp_path: Path) -> None:
+    g = torch.Generator().manual_seed(0)
+    images = tmp_path / "images"
+    images.mkdir()
+    for i in range(3):
+        write_image(str(images / f"{i}.png"), torch.randint(0, 255, (3, 60, 80), generator=g, dtype=torch.uint8))
+    with pytest.raises(
+        SceneError, match=r"expected at least 3 of 3 images .*min_registered = 0.9\), got 0; take overlap"
+    ):
+        run_sfm(images, tmp_path / "out", config=SfmConfig(num_threads=1))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_split_scene_is_refused_with_counts_and_advice() -> None:
+    names = [str(i) for i in range(90)]
+    message = r"expected at least 81 of 90 images .*split into 2 unconnected models of 72, 19 images; use matching='exh"
+    with pytest.raises(SceneError, match=message):
+        _require_one_model(Path("images"), (72, 19), names, SfmConfig(matching="sequential"))
+    _require_one_model(Path("images"), (81, 9), names, SfmConfig())
+    _require_one_model(Path("images"), (72, 19), names, SfmConfig(min_registered=0.8))
+    with pytest.raises(
+        SceneError, match="got 80; take overlapping photos between the parts, or pass single_camera=False"
+    ):
+        _require_one_model(Path("images"), (80,), names, SfmConfig())
+
+
+def test_folders_without_enough_images(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="expected the images there"):
+        run_sfm(tmp_path / "nothing", tmp_path / "out")
+    (tmp_path / "a.png").write_bytes(b"")
+    with pytest.raises(SceneError, match="expected at least 3 images .*got 1; add views"):
+        run_sfm(tmp_path, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"matching": "vocabulary"}, "matching: expected one of 'exhaustive', 'sequential'"),
+        ({"camera_model": "FOV"}, "camera_model: expected one of 'SIMPLE_PINHOLE'"),
+        ({"min_registered": 0.0}, "min_registered: expected a number"),
+        ({"max_features": 5}, "max_features: expected a number"),
+        ({"num_threads": 0}, "num_threads: expected a number"),
+    ],
+)
+def test_config_is_checked(values: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        SfmConfig(**values)  # type: ignore[arg-type]
+
+
+def test_the_report_reads_well() -> None:
+    report = SfmReport(9, 10, 500, 0.456, {"features": 1.0, "matching": 2.0}, ("x.png",), (9,))
+    said = "9 of 10 images registered, 500 points, mean reprojection error 0.46 px (features 1.0 s, matching 2.0 s)"
+    assert str(report) == said + "; without a pose: x.png"

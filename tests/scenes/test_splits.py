@@ -1,0 +1,80 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from kfgs.scenes import SceneError, make_split, natural_key, read_split, split_every
+from kfgs.scenes.splits import choose_split
+
+
+def test_the_papers_split_takes_every_10th_from_the_1st_and_6th() -> None:
+    split = make_split(900, "df3dgs")
+    assert split["test"][:3] == [0, 10, 20]
+    assert split["train"][:3] == [5, 15, 25]
+    assert (len(split["train"]), len(split["test"])) == (90, 90)
+
+
+def test_holdout8_and_all() -> None:
+    split = make_split(17, "holdout8")
+    assert split == {"train": [1, 2, 3, 4, 5, 6, 7, 9, 10, 11, 12, 13, 14, 15], "test": [0, 8, 16]}
+    assert make_split(3, "all") == {"train": [0, 1, 2], "test": []}
+
+
+@pytest.mark.parametrize(("count", "rule"), [(0, "all"), (7, "all"), (8, "holdout8"), (19, "holdout8"), (20, "df3dgs")])
+def test_the_rule_without_a_split_file(count: int, rule: str) -> None:
+    assert choose_split(count) == rule
+
+
+def test_split_every_checks_its_numbers() -> None:
+    with pytest.raises(ValueError, match="step: expected a positive number"):
+        split_every(10, step=0)
+    with pytest.raises(ValueError, match=r"train_start: expected a view in \[0, 10\).*got 10"):
+        split_every(10, step=10, train_start=10)
+    with pytest.raises(ValueError, match="test_start: expected a view"):
+        split_every(10, step=10, test_start=-1)
+    with pytest.raises(ValueError, match="another view than test_start, got 0"):
+        split_every(10, step=10, train_start=0)
+    with pytest.raises(ValueError, match="split: expected one of 'df3dgs', 'holdout8', 'all', got 'llff'"):
+        make_split(10, "llff")  # type: ignore[arg-type]
+
+
+def test_numbers_sort_as_numbers() -> None:
+    names = ["rgb_10", "rgb_5", "rgb_100", "a", "rgb_05b", "10", "9"]
+    assert sorted(names, key=natural_key) == ["9", "10", "a", "rgb_05b", "rgb_5", "rgb_10", "rgb_100"]
+    assert sorted(["²", "1", "x1y2", "x1y10"], key=natural_key) == ["1", "x1y2", "x1y10", "²"]  # ² is no digit to int()
+
+
+def _write(path: Path, value: object) -> Path:
+    path.write_text(value if isinstance(value, str) else json.dumps(value))
+    return path
+
+
+def test_a_split_file_lists_stems(tmp_path: Path) -> None:
+    file = _write(tmp_path / "split.json", {"train": ["c", "a.png"], "test": ["b", "gone"], "hard": ["a"]})
+    splits, unknown = read_split(file, ["a", "b", "c"])
+    assert splits == {"train": [0, 2], "test": [1], "hard": [0]}
+    assert unknown == ["gone"]
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("{", "expected a JSON file, but it cannot be parsed .*; repair the file or remove it"),
+        ("[" * 100_000, "repair the file or remove it"),
+        ([], 'expected {"train": .names., "test": .names.}, got'),
+        ({"test": ["a"]}, "list file stems under at least 'train'"),
+        ({"train": [1]}, "list file stems"),
+        ({"train": ["x"], "test": ["a"]}, "none of the 1 listed is there .x.; correct the names"),
+        ({"train": ["a", "b"], "test": ["b"]}, "without a common view, b and 0 more are in both"),
+    ],
+)
+def test_wrong_split_files_are_refused(tmp_path: Path, value: object, message: str) -> None:
+    with pytest.raises(SceneError, match=message):
+        read_split(_write(tmp_path / "split.json", value), ["a", "b"])
+
+
+def test_the_shipped_split(shared_data: Path) -> None:
+    names = sorted((p.stem for p in (shared_data / "room_0/images").iterdir()), key=natural_key)
+    splits, unknown = read_split(shared_data / "room_0/split.json", names)
+    assert (len(splits["train"]), len(splits["test"]), unknown) == (90, 90, [])
+    assert [names[i] for i in splits["train"][:2] + splits["test"][:2]] == ["rgb_5", "rgb_15", "rgb_0", "rgb_10"]

@@ -1,0 +1,235 @@
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from colmap_models import write_picture
+
+from kfgs.cameras.projection import project_points
+from kfgs.scenes import SceneError, load_transforms
+from kfgs.scenes.ply import write_ply
+
+TOP = {"w": 64, "h": 48, "fl_x": 50.0, "fl_y": 55.0, "cx": 31.0, "cy": 25.0}
+# camera at (1, 2, 3), looking along world +x with world +z up: OpenGL axes right = -y, up = +z, back = -x
+LOOK_X = [[0, 0, -1, 1], [-1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]]
+
+
+def _write(folder: Path, frames: list[dict[str, Any]] | None = None, name: str = "transforms.json", **top: Any) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    frames = [{"file_path": "images/a.png", "transform_matrix": LOOK_X}] if frames is None else frames
+    for frame in frames:
+        if isinstance(frame, dict) and str(frame.get("file_path", "")).startswith("images/"):
+            write_picture(folder / frame["file_path"])
+    values = {key: value for key, value in {**TOP, **top}.items() if value is not None}
+    (folder / name).write_text(json.dumps({**values, "frames": frames}))
+    return folder / name
+
+
+def test_opengl_poses_become_colmap_cameras(tmp_path: Path) -> None:
+    scene = load_transforms(_write(tmp_path))
+    camera = scene.cameras[0]
+    torch.testing.assert_close(camera.center, torch.tensor([1.0, 2.0, 3.0]))
+    # 5 units ahead (+x): on the principal point; 1 to the right (-y): fx / 5 further; 1 up (+z): fy / 5 higher
+    points = torch.tensor([[6.0, 2.0, 3.0], [6.0, 1.0, 3.0], [6.0, 2.0, 4.0], [-4.0, 2.0, 3.0]])
+    xy, depth, visible = project_points(camera, points)
+    torch.testing.assert_close(xy[:3], torch.tensor([[31.0, 25.0], [41.0, 25.0], [31.0, 14.0]]))
+    torch.testing.assert_close(depth, torch.tensor([5.0, 5.0, 5.0, -5.0]))
+    assert visible.tolist() == [True, True, True, False]
+    assert (camera.name, scene.stem(0), scene.points.shape) == ("a.png", "a", (0, 3))
+    assert any(note.startswith("no points") for note in scene.notes)
+
+
+def test_intrinsics_of_a_frame_count_over_those_at_the_top(tmp_path: Path) -> None:
+    frames = [
+        {"file_path": "images/a.png", "transform_matrix": LOOK_X},
+        {"file_path": "images/b.png", "transform_matrix": LOOK_X[:3], "fl_x": 70.0, "cx": 30.0, "k1": 0.1},
+    ]
+    scene = load_transforms(_write(tmp_path, frames))
+    assert [float(c.K[0, 0]) for c in scene.cameras] == [50, 70]
+    assert [float(c.K[0, 2]) for c in scene.cameras] == [31, 30]
+    assert scene.cameras[0].distortion is None
+    assert scene.cameras[1].distortion is not None
+    torch.testing.assert_close(scene.cameras[0].viewmat, scene.cameras[1].viewmat)
+
+
+def test_blender_scenes(tmp_path: Path) -> None:
+    angle = 2 * math.atan(0.5)  # half the width over the focal length is 0.5
+    for split, number in (("train", 2), ("test", 1)):
+        frames = [{"file_path": f"./{split}/r_{i}", "transform_matrix": LOOK_X} for i in range(number)]
+        for i in range(number):
+            write_picture(tmp_path / split / f"r_{i}.png", 40, 60)
+        file = tmp_path / f"transforms_{split}.json"
+        file.write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    scene = load_transforms(tmp_path)
+    assert [c.name for c in scene.cameras] == ["test/r_0.png", "train/r_0.png", "train/r_1.png"]
+    assert scene.splits == {"train": [1, 2], "test": [0]}
+    camera = scene.cameras[0]
+    assert camera.size == (40, 60)
+    torch.testing.assert_close(camera.K, torch.tensor([[60.0, 0, 30], [0, 60, 20], [0, 0, 1]]))
+    assert scene.image(1).shape == (40, 60, 3)
+
+
+def test_both_angles_give_both_focal_lengths(tmp_path: Path) -> None:
+    angles = {"camera_angle_x": 2 * math.atan(0.5), "camera_angle_y": 2 * math.atan(0.25)}
+    K = load_transforms(_write(tmp_path, fl_x=None, fl_y=None, **angles)).cameras[0].K
+    assert (float(K[0, 0]), float(K[1, 1])) == pytest.approx((64.0, 96.0))
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({"k1": 0, "k2": 0.0, "p1": 0, "p2": 0}, None),
+        ({"camera_model": "PINHOLE", "k1": 0.5}, None),
+        ({"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4}, ("brown_conrady", (0.1, 0.2, 0.3, 0.4))),
+        ({"k1": 0.1, "k3": 0.5, "k4": 0}, ("brown_conrady", (0.1, 0.0, 0.0, 0.0, 0.5))),
+        (
+            {
+                "camera_model": "FULL_OPENCV",
+                "k1": 0.1,
+                "k2": 0.2,
+                "p1": 0.3,
+                "p2": 0.4,
+                "k3": 0.5,
+                "k4": 0.6,
+                "k6": 0.8,
+            },
+            ("brown_conrady", (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.0, 0.8)),
+        ),
+        ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k4": 0.4}, ("kannala_brandt", (0.1, 0.0, 0.0, 0.4))),
+        ({"is_fisheye": True, "k2": 0.2}, ("kannala_brandt", (0.0, 0.2, 0.0, 0.0))),
+    ],
+)
+def test_lenses(tmp_path: Path, values: dict[str, Any], expected: tuple[str, tuple[float, ...]] | None) -> None:
+    lens = load_transforms(_write(tmp_path, **values)).cameras[0].distortion
+    assert (None if lens is None else (lens.model, lens.coefficients)) == expected
+
+
+def test_missing_files_are_skipped_and_counted(tmp_path: Path) -> None:
+    frames = [{"file_path": f"images/{i}.png", "transform_matrix": LOOK_X} for i in range(4)]
+    file = _write(tmp_path, frames)
+    (tmp_path / "images/1.png").unlink()
+    (tmp_path / "images/3.png").unlink()
+    scene = load_transforms(file)
+    assert [c.name for c in scene.cameras] == ["0.png", "2.png"]
+    assert "2 of 4 frames have no image file: images/1.png, images/3.png" in scene.notes
+    for i in (0, 2):
+        (tmp_path / f"images/{i}.png").unlink()
+    with pytest.raises(SceneError, match="none of 4 has one .*copy the images beside the file or give their folder"):
+        load_transforms(file)
+
+
+def test_images_are_looked_up_in_the_given_folder_first(tmp_path: Path) -> None:
+    file = _write(tmp_path / "scene")
+    write_picture(tmp_path / "small/a.png")
+    assert load_transforms(file, tmp_path / "small").image_paths[0].parent.name == "small"
+    assert load_transforms(file, tmp_path / "empty").image_paths[0].parent.name == "images"
+
+
+def test_paths_out_of_the_folder_must_be_images_and_are_noted(tmp_path: Path) -> None:
+    write_picture(tmp_path / "elsewhere/b.png")
+    (tmp_path / "secret.txt").write_text("secret")
+    frames = [
+        {"file_path": name, "transform_matrix": LOOK_X}
+        for name in ("images/a.png", "../elsewhere/b.png", "../secret.txt", "/etc/passwd", "images\\c.png", "x\0y")
+    ]
+    file = _write(tmp_path / "scene", frames)
+    write_picture(tmp_path / "scene/images/c.png")
+    scene = load_transforms(file)
+    assert [c.name for c in scene.cameras] == ["a.png", "b.png", "c.png"]
+    assert any("1 image files lie outside" in note and "b.png" in note for note in scene.notes)
+    assert any("3 of 6 frames have no image file" in note for note in scene.notes)
+
+
+def test_the_point_cloud_comes_along(tmp_path: Path) -> None:
+    columns = {name: np.arange(3, dtype=np.float32) + i for i, name in enumerate("xyz")}
+    columns |= {name: np.array([i, 100, 255], dtype=np.uint8) for i, name in enumerate(("red", "green", "blue"))}
+    write_ply(tmp_path / "sparse_pc.ply", columns)
+    matrix = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]
+    scene = load_transforms(_write(tmp_path, ply_file_path="sparse_pc.ply", applied_transform=matrix))
+    assert scene.points.tolist() == [[0, 1, 2], [1, 2, 3], [2, 3, 4]]  # in the frame of the poses: nothing is undone
+    assert scene.colors.tolist() == [[0, 1, 2], [100, 100, 100], [255, 255, 255]]
+    assert scene.notes == ()
+
+
+def test_point_clouds_elsewhere_or_broken(tmp_path: Path) -> None:
+    write_ply(tmp_path / "out.ply", {name: np.zeros(1, np.float32) for name in "xyz"})
+    for listed in ("../out.ply", "gone.ply", 7, "a\0b"):
+        scene = load_transforms(_write(tmp_path / "scene", ply_file_path=listed))
+        assert len(scene.points) == 0
+        assert any("is no file inside" in note for note in scene.notes)
+    (tmp_path / "scene/bad.ply").write_bytes(b"ply\nrubbish")
+    with pytest.raises(SceneError, match="named by ply_file_path in .*remove the entry"):
+        load_transforms(_write(tmp_path / "scene", ply_file_path="bad.ply"))
+    write_ply(tmp_path / "scene/nan.ply", {name: np.full(1, np.nan, np.float32) for name in "xyz"})
+    with pytest.raises(SceneError, match="nan.ply: expected finite coordinates"):
+        load_transforms(_write(tmp_path / "scene", ply_file_path="nan.ply"))
+
+
+def test_splits_and_masks_of_nerfstudio(tmp_path: Path) -> None:
+    frames = [{"file_path": f"images/{i}.png", "transform_matrix": LOOK_X, "mask_path": "m.png"} for i in range(3)]
+    names = {"train_filenames": ["images/2.png", "./images/0.png"], "test_filenames": ["images/1.png"]}
+    scene = load_transforms(_write(tmp_path, frames, **names))
+    assert scene.splits == {"train": [0, 2], "test": [1]}
+    assert "3 frames have a mask_path; it is not used" in scene.notes
+
+
+def _frame(**changes: Any) -> list[dict[str, Any]]:
+    return [{"file_path": "images/a.png", "transform_matrix": LOOK_X, **changes}]
+
+
+BAD = [
+    ([], {}, "top level: expected an object with a list of 'frames'.*is this a transforms.json"),
+    ([3], {}, "frame 0: expected an object with a 'file_path', got 3"),
+    (_frame(transform_matrix=None), {}, "transform_matrix: expected 4 rows of 4 numbers, got None"),
+    (_frame(transform_matrix=[[1, 2], [3]]), {}, "transform_matrix: expected 4 rows"),
+    (_frame(transform_matrix=[[1.0, 2.0]]), {}, "transform_matrix: expected 4 rows of 4 finite numbers"),
+    (_frame(transform_matrix=[["a"] * 4] * 4), {}, "transform_matrix: expected 4 rows"),
+    (_frame(transform_matrix=[[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]), {}, "expected a rigid motion"),
+    (_frame(transform_matrix=[[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), {}, "got a reflection"),
+    (_frame(fl_x="wide"), {}, "fl_x: expected a finite number, got 'wide'"),
+    (_frame(fl_x=True), {}, "fl_x: expected a finite number, got True"),
+    (_frame(fl_x=-5), {}, r"\(a.png\): K\[0, 0\] \(fx\): expected a number in"),
+    (_frame(cx=1e300), {}, "cx: expected a finite number"),
+    (_frame(), {"fl_x": None}, "expected 'fl_x' or 'camera_angle_x'"),
+    (_frame(), {"fl_x": None, "camera_angle_x": 4.0}, r"camera_angle_x: expected an angle in \(0, pi\)"),
+    (_frame(), {"w": 64.5}, "w and h of 1 to 100000 whole pixels"),
+    (_frame(), {"h": 0}, "w and h of 1 to 100000 whole pixels"),
+    (_frame(), {"camera_model": "EQUIRECTANGULAR"}, "camera_model: expected one of .*undistort the images first"),
+    (_frame(), {"k4": 0.1}, 'at most k1 k2 k3 p1 p2.*"camera_model": "FULL_OPENCV"'),
+]
+
+
+@pytest.mark.parametrize(("frames", "top", "message"), BAD)
+def test_bad_files_are_refused(tmp_path: Path, frames: list[Any], top: dict[str, Any], message: str) -> None:
+    with pytest.raises(SceneError, match=message):
+        load_transforms(_write(tmp_path, frames, **top))
+
+
+def test_what_is_no_json_is_refused(tmp_path: Path) -> None:
+    for text in ("", "{", "[" * 100_000, "\xff", '{"frames": NaN}', "[]"):
+        (tmp_path / "transforms.json").write_text(text, encoding="latin-1")
+        with pytest.raises(SceneError, match="transforms.json"):
+            load_transforms(tmp_path)
+    with pytest.raises(FileNotFoundError, match="no transforms.json and no transforms_train.json"):
+        load_transforms(tmp_path / "..")
+
+
+def test_the_fox(shared_data: Path) -> None:
+    scene = load_transforms(shared_data / "fox")
+    assert len(scene.cameras) == len(list((shared_data / "fox/images").iterdir())) == 50
+    assert any(note.startswith("17 of 67 frames have no image file: images/0005.jpg") for note in scene.notes)
+    assert scene.cameras[0].name == "0001.jpg"
+    assert scene.cameras[0].size == (1920, 1080)
+    assert scene.distorted
+    centers = torch.stack([c.center for c in scene.cameras])
+    forward = torch.stack([c.viewmat[2, :3] for c in scene.cameras])
+    # the photos circle the fox: all axes pass close to one point, which lies in front of every camera
+    A = torch.eye(3) - forward[:, :, None] * forward[:, None, :]
+    focus = torch.linalg.solve(A.sum(0), (A @ centers[:, :, None]).sum(0))[:, 0]
+    distance = (focus - centers).norm(dim=1)
+    assert (((focus - centers) * forward).sum(1) > 0.5 * distance).all()
+    _, _, visible = zip(*(project_points(c, focus[None]) for c in scene.undistorted().cameras), strict=True)
+    assert torch.cat(visible).float().mean() > 0.9

@@ -1,0 +1,37 @@
+from pathlib import Path
+
+import pytest
+import torch
+from colmap_models import write_model, write_picture
+
+from kfgs.scenes import SceneError, load_scene, undistort_scene
+
+
+def test_a_lens_that_kfgs_refuses_is_removed_by_pycolmap(tmp_path: Path) -> None:
+    model = write_model(tmp_path / "in/sparse/0", ["a.png", "b.png"], model="FOV", params=[50, 55, 31, 25, 0.3])
+    for name in ("a.png", "b.png"):
+        write_picture(tmp_path / "in/images" / name)
+    with pytest.raises(SceneError, match="got FOV; undistort the images first"):
+        load_scene(tmp_path / "in")
+    scene = load_scene(undistort_scene(tmp_path / "in/images", model, tmp_path / "out"))
+    assert [c.name for c in scene.cameras] == ["a.png", "b.png"]
+    assert not scene.distorted
+    image, camera = scene.image(0), scene.cameras[0]
+    assert image.shape[:2] == camera.size
+    row, column = round(float(camera.K[1, 2]) - 0.5), round(float(camera.K[0, 2]) - 0.5)
+    expected = torch.tensor([30.5 * 3, 24.5 * 4, 9]) / 255  # the old picture at its principal point (31, 25)
+    torch.testing.assert_close(image[row, column], expected, rtol=0, atol=0.02)
+    assert len(scene.points) == 5
+
+
+def test_wrong_folders_are_refused(tmp_path: Path) -> None:
+    model = write_model(tmp_path / "sparse/0", ["a.png"])
+    with pytest.raises(FileNotFoundError, match="expected the images of"):
+        undistort_scene(tmp_path / "images", model, tmp_path / "out")
+    write_picture(tmp_path / "images/a.png")
+    with pytest.raises(SceneError, match="expected a folder of its own, got one that holds the images or the model"):
+        undistort_scene(tmp_path / "images", model, tmp_path)
+    (tmp_path / "images/a.png").rename(tmp_path / "images/b.png")
+    with pytest.raises(SceneError, match="sparse/0|images"):
+        undistort_scene(tmp_path / "images", model, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
