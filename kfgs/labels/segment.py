@@ -31,8 +31,8 @@ def label_pixels(
     """Label each rendered latent: decode it (Psi), quantise it by cosine to the codebook (Eq. 5), look its class up.
 
     `decode="exact"` is the paper's way and the reference. `decode="latent"` takes the codeword whose **latent** is
-    nearest (Euclidean) instead, which skips the decoder (about 0.83 M multiply-adds per pixel) and nearly always finds
-    the same codeword. Without an autoencoder the map already holds features and is quantised as it is (`decode` is not
+    nearest (Euclidean) instead, which skips the decoder (about 0.83 M multiply-adds per pixel) and mostly finds the same
+    class (98.9 % of pixels that mixed two latents, 72 codewords; 30 times faster). Without an autoencoder the map already holds features and is quantised as it is (`decode` is not
     used). Without a codebook each decoded feature takes the class of the most similar of `embeddings`.
 
     Args:
