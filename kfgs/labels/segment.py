@@ -32,8 +32,9 @@ def label_pixels(
 
     `decode="exact"` is the paper's way and the reference. `decode="latent"` takes the codeword whose **latent** is
     nearest (Euclidean) instead, which skips the decoder (about 0.83 M multiply-adds per pixel) and mostly finds the same
-    class (98.9 % of pixels that mixed two latents, 72 codewords; 30 times faster). Without an autoencoder the map already holds features and is quantised as it is (`decode` is not
-    used). Without a codebook each decoded feature takes the class of the most similar of `embeddings`.
+    class (98.9 % of pixels that mixed two latents, 72 codewords; 30 times faster). Without an autoencoder the
+    map already holds features and is quantised as it is (`decode` is not used). Without a codebook each
+    decoded feature takes the class of the most similar of `embeddings`.
 
     Args:
         latent_map: a rendered map [H, W, d], or the latents of N Gaussians [N, d]: the paper classifies both alike.
