@@ -1,1 +1,35 @@
-"""TODO."""
+"""Hierarchical compression (Sec. 3.3): the adaptive codebook, index maps, and the scene's autoencoder."""
+
+from .autoencoder import Autoencoder
+from .codebook import EPS, Codebook, Nearest, row_norms, unit_rows
+from .evolve import expand, prune
+from .fit_autoencoder import AutoencoderConfig, AutoencoderFit, fit_autoencoder
+from .fit_codebook import CodebookConfig, CodebookFit, fit_codebook
+from .loss import BalancedLoss, class_balanced_loss
+from .maps import IndexMaps, LatentMaps, quantize_maps
+from .sampling import choose_grid_step, farthest_points, sample_grid
+
+__all__ = [
+    "EPS",
+    "Autoencoder",
+    "AutoencoderConfig",
+    "AutoencoderFit",
+    "BalancedLoss",
+    "Codebook",
+    "CodebookConfig",
+    "CodebookFit",
+    "IndexMaps",
+    "LatentMaps",
+    "Nearest",
+    "choose_grid_step",
+    "class_balanced_loss",
+    "expand",
+    "farthest_points",
+    "fit_autoencoder",
+    "fit_codebook",
+    "prune",
+    "quantize_maps",
+    "row_norms",
+    "sample_grid",
+    "unit_rows",
+]

@@ -1,0 +1,176 @@
+"""Training the autoencoder on the codewords of one scene (Sec. 3.3.2, Eq. 10)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from .._check import check_range
+from .autoencoder import Autoencoder, Layer, mlp
+from .codebook import Codebook, row_norms, unit_rows
+
+NORM_EPS = 1e-5  # added to the variance in batch normalisation, torch's default
+
+
+@dataclass(frozen=True)
+class AutoencoderConfig:
+    """How the autoencoder is built and trained; the defaults are the paper's, or its script's where the paper is silent."""
+
+    latent: int = 9
+    """Channels of a latent (d)."""
+    encoder: tuple[int, ...] = (256, 128, 64, 32)
+    """Hidden widths of E, with batch normalisation and ReLU after each (script)."""
+    decoder: tuple[int, ...] = (32, 64, 128, 256, 1024)
+    """Hidden widths of Psi, with ReLU after each (script)."""
+    steps: int = 5000
+    """Adam steps, each on all codewords."""
+    learning_rate: float = 1e-4
+    """Adam's learning rate."""
+    weight_decay: float = 5e-6
+    """L2 penalty in Adam's gradient (script)."""
+    record_every: int = 100
+    """Steps between two records of the history."""
+
+    def __post_init__(self) -> None:
+        for name in ("latent", "steps", "record_every"):
+            check_range(name, getattr(self, name), 1)
+        for name in ("encoder", "decoder"):
+            for i, width in enumerate(getattr(self, name)):
+                check_range(f"{name}[{i}]", width, 1)
+        check_range("learning_rate", self.learning_rate, 0, closed=(False, True))
+        check_range("weight_decay", self.weight_decay, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class AutoencoderFit:
+    """A fitted autoencoder and what it does to the codebook it was fitted to."""
+
+    autoencoder: Autoencoder
+    history: list[dict[str, Any]] = field(repr=False)
+    """Every `record_every` steps: step (from 1), loss (Eq. 10, mean over codewords)."""
+    latents: Tensor  # [K, d]
+    """S' of Sec. 3.3.2: the codewords' latents in [0, 1]."""
+    recovered: float
+    """Share of codewords whose decoded latent is quantised to that codeword again; below 1, some classes are lost
+    whatever the field does: fit longer, or with more latent channels."""
+    loss: float
+    """Eq. 10 of the finished autoencoder, mean over codewords."""
+    min_latent_distance: float
+    """Smallest Euclidean distance between two codewords' latents (infinite for one codeword)."""
+
+
+def fit_autoencoder(
+    codebook: Codebook,
+    config: AutoencoderConfig = AutoencoderConfig(),
+    *,
+    generator: torch.Generator | None = None,
+    progress: bool = False,
+    callback: Callable[[dict[str, Any]], None] | None = None,
+) -> AutoencoderFit:
+    """Fit the scene's autoencoder to its codewords (Eq. 10): the mean over codewords of |Psi(E(f)) - f|_2.
+
+    All codewords are one batch, so batch normalisation and the range of the latents are functions of the weights alone.
+    When training ends, both are frozen exactly as the decoder saw them last.
+
+    Args:
+        codebook: its K codewords, K >= 1; targets are their unit directions.
+        config: see `AutoencoderConfig`.
+        generator: draws the initial weights; None stands for a fresh one with seed 0.
+        progress: show a progress bar.
+        callback: called with each record as it is written to the history.
+
+    Returns:
+        The autoencoder, the history, the latents, and how many codewords are recovered.
+
+    Note:
+        The released script compares unit outputs with codewords of any length (an error that cannot vanish), and uses
+        running statistics that the decoder was not trained with. Unit latents of one channel are -1 or 1: d = 1 tells
+        two codewords apart and no more.
+    """
+    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    target = codebook.unit.detach()
+    encoder = _linears((codebook.dim, *config.encoder, config.latent), generator, target)
+    decoder = _linears((config.latent, *config.decoder, codebook.dim), generator, target)
+    norms = [(torch.ones_like(bias), torch.zeros_like(bias)) for _, bias in encoder[:-1]]
+    weights = [tensor.requires_grad_() for layer in (*encoder, *norms, *decoder) for tensor in layer]
+    optimizer = torch.optim.Adam(weights, lr=config.learning_rate, weight_decay=config.weight_decay, fused=True)
+    history: list[dict[str, Any]] = []
+    for step in tqdm(range(1, config.steps + 1), desc="autoencoder", disable=not progress):
+        latents = unit_rows(_normalised_mlp(encoder, norms, target))
+        low, high = latents.amin(), latents.amax()
+        decoded = unit_rows(mlp(decoder, (latents - low) / (high - low).clamp_min(_SMALLEST)))
+        loss = row_norms(decoded - target).mean()
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+        if step % config.record_every == 0 or step == config.steps:
+            history.append({"step": step, "loss": float(loss.detach())})
+            if callback is not None:
+                callback(dict(history[-1]))
+    with torch.no_grad():
+        autoencoder = _freeze(encoder, norms, decoder, target)
+        return _report(codebook, autoencoder, history)
+
+
+_SMALLEST = 1e-6  # range of the latents of one codeword with one channel
+
+
+def _linears(widths: Sequence[int], generator: torch.Generator, like: Tensor) -> list[Layer]:
+    """Layers with torch.nn.Linear's initial distribution, uniform within 1 / sqrt(inputs), from our own generator."""
+    layers = []
+    for inputs, outputs in pairwise(widths):
+        drawn = torch.rand(outputs, inputs + 1, generator=generator, device=generator.device, dtype=torch.float64)
+        both = ((2 * drawn - 1) / inputs**0.5).to(like)
+        layers.append((both[:, 1:].contiguous(), both[:, 0].contiguous()))
+    return layers
+
+
+def _statistics(rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation that batch normalisation divides by (the variance is the biased one)."""
+    return rows.mean(dim=0), (rows.var(dim=0, correction=0) + NORM_EPS).sqrt()
+
+
+def _normalised_mlp(layers: Sequence[Layer], norms: Sequence[Layer], rows: Tensor) -> Tensor:
+    """`mlp` with batch normalisation before each ReLU; written out because torch's refuses a single row."""
+    for (weight, bias), (scale, shift) in zip(layers[:-1], norms, strict=True):
+        rows = torch.nn.functional.linear(rows, weight, bias)
+        mean, deviation = _statistics(rows)
+        rows = torch.relu((rows - mean) / deviation * scale + shift)
+    return torch.nn.functional.linear(rows, *layers[-1])
+
+
+def _freeze(encoder: list[Layer], norms: list[Layer], decoder: list[Layer], target: Tensor) -> Autoencoder:
+    """Fold batch normalisation, with its statistics over the codebook, into the encoder, and fix the latents' range."""
+    folded: list[Layer] = []
+    rows = target
+    for (weight, bias), (scale, shift) in zip(encoder[:-1], norms, strict=True):
+        mean, deviation = _statistics(torch.nn.functional.linear(rows, weight, bias))
+        gain = scale / deviation
+        folded.append((gain[:, None] * weight, gain * (bias - mean) + shift))
+        rows = torch.nn.functional.linear(rows, *folded[-1]).relu()
+    folded.append((encoder[-1][0].detach().clone(), encoder[-1][1].detach().clone()))
+    latents = unit_rows(mlp(folded, target))
+    low = float(latents.min())
+    high = max(float(latents.max()), low + _SMALLEST)
+    return Autoencoder(tuple(folded), tuple((w.detach().clone(), b.detach().clone()) for w, b in decoder), low, high)
+
+
+def _report(codebook: Codebook, autoencoder: Autoencoder, history: list[dict[str, Any]]) -> AutoencoderFit:
+    latents = autoencoder.encode(codebook.codewords)
+    decoded = autoencoder.decode(latents)
+    own = torch.arange(codebook.size, device=latents.device)
+    distances = torch.cdist(latents, latents, compute_mode="donot_use_mm_for_euclid_dist").fill_diagonal_(torch.inf)
+    return AutoencoderFit(
+        autoencoder,
+        history,
+        latents,
+        recovered=float((codebook.quantize(decoded) == own).double().mean()),
+        loss=float(row_norms(decoded - codebook.unit).mean()),
+        min_latent_distance=float(distances.min()),
+    )

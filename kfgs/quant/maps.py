@@ -1,0 +1,142 @@
+"""What is left of a scene's feature maps after quantisation: an index per pixel, and what the indices stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from tqdm import tqdm
+
+from .._check import check_shapes
+from ._store import read_tensors, write_tensors
+from .codebook import Codebook
+
+
+class IndexMaps(Sequence[NDArray[Any]]):
+    """The index maps M of Eq. 5: one [h, w] array of codeword numbers per image, one or two bytes per pixel.
+
+    uint8 up to 256 codewords, uint16 up to 65,536. Sizes may differ between images.
+
+    Args:
+        maps: whole numbers in [0, size), one [h, w] array per image.
+        size: number of codewords, K.
+
+    Raises:
+        ValueError: if a map is not [h, w], or holds anything but numbers of codewords.
+    """
+
+    def __init__(self, maps: Sequence[NDArray[Any]], size: int) -> None:
+        if not 1 <= size <= 65_536:
+            raise ValueError(f"size: expected 1 to 65536 codewords (two bytes a pixel), got {size}; lower K_max")
+        kind = np.uint8 if size <= 256 else np.uint16
+        self.size = size
+        self._maps: list[NDArray[Any]] = []
+        for i, indices in enumerate(maps):
+            check_shapes((f"maps[{i}]", indices, "h w"))
+            if not np.issubdtype(indices.dtype, np.integer):
+                raise ValueError(f"maps[{i}]: expected whole numbers, got {indices.dtype}; use Codebook.quantize")
+            if indices.size and not (indices.min() >= 0 and indices.max() < size):
+                raise ValueError(
+                    f"maps[{i}]: expected numbers from 0 to {size - 1} (size - 1), got {indices.min()} to "
+                    f"{indices.max()}; quantise it with the codebook of that size"
+                )
+            self._maps.append(np.ascontiguousarray(indices, dtype=kind))
+
+    def __len__(self) -> int:
+        return len(self._maps)
+
+    def __getitem__(self, i: int) -> NDArray[Any]:  # type: ignore[override]  # [h, w], one map at a time
+        return self._maps[i]
+
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        return iter(self._maps)
+
+    def __repr__(self) -> str:
+        return f"IndexMaps({len(self)} maps, {self.size} codewords, {self.nbytes} bytes)"
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in memory."""
+        return sum(indices.nbytes for indices in self._maps)
+
+    @property
+    def usage(self) -> NDArray[np.int64]:  # [K]
+        """Pixels of each codeword over all maps."""
+        return sum((np.bincount(m.ravel(), minlength=self.size) for m in self._maps), np.zeros(self.size, np.int64))
+
+    def save(self, path: str | Path) -> None:
+        """Write the maps to a .safetensors file."""
+        tensors = {f"map.{i}": torch.from_numpy(indices) for i, indices in enumerate(self._maps)}
+        write_tensors(path, tensors | {"size": torch.tensor(self.size)}, kind="index maps")
+
+    @staticmethod
+    def load(path: str | Path) -> IndexMaps:
+        """Read what `save` wrote.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if the file holds no index maps of kfgs.
+        """
+        tensors = read_tensors(path, kind="index maps")
+        return IndexMaps([tensors[f"map.{i}"].numpy() for i in range(len(tensors) - 1)], int(tensors["size"]))
+
+
+class LatentMaps(Sequence[Tensor]):
+    """The maps F_l = S'[M] that the field learns (Sec. 3.3.2), each looked up when asked for.
+
+    Args:
+        index_maps: M, per image.
+        latents: what each codeword stands for: latents S', or the codewords themselves.
+
+    Raises:
+        ValueError: if `latents` does not have a row per codeword.
+    """
+
+    def __init__(
+        self,
+        index_maps: IndexMaps,
+        latents: Tensor,  # [K, d]
+    ) -> None:
+        check_shapes(("latents", latents, "K d"))
+        if latents.shape[0] != index_maps.size:
+            raise ValueError(
+                f"latents: expected [K, d] with K = {index_maps.size} (from index_maps), got {tuple(latents.shape)}; "
+                "encode the codebook that the maps were quantised with"
+            )
+        self.index_maps, self.latents = index_maps, latents
+
+    def __len__(self) -> int:
+        return len(self.index_maps)
+
+    def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [h, w, d], one map at a time
+        index = torch.from_numpy(self.index_maps[i].astype(np.int64)).to(self.latents.device)
+        return self.latents[index]
+
+    def __iter__(self) -> Iterator[Tensor]:
+        return (self[i] for i in range(len(self)))
+
+
+def quantize_maps(
+    maps: Sequence[Tensor],  # each [h, w, D]
+    codebook: Codebook,
+    *,
+    progress: bool = False,
+) -> IndexMaps:
+    """Quantise every pixel of every map (Eq. 5), with one map in memory at a time.
+
+    An all-zero feature gets index 0, see `Codebook.nearest`.
+
+    Raises:
+        ValueError: if a map is not [h, w, D] with the codebook's D.
+    """
+    quantised = []
+    for i in tqdm(range(len(maps)), desc="quantise", disable=not progress):
+        feature_map = maps[i]  # once: this may read a file
+        check_shapes((f"maps[{i}]", feature_map, f"h w {codebook.dim}"))
+        quantised.append(codebook.quantize(feature_map).cpu().numpy().astype(np.uint16))
+    return IndexMaps(quantised, codebook.size)
