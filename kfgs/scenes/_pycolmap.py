@@ -1,8 +1,8 @@
-"""The only door to pycolmap: imported late, after Pillow, quietly, and with one kind of error.
+"""The door to pycolmap: imported late, after Pillow, quietly, and with one kind of error.
 
 Pillow's C module must be loaded **before** pycolmap: in the other order (pycolmap 4.2.1, Pillow 13.0.0, Linux wheels)
 the first PNG that Pillow writes corrupts the heap and aborts the process ("corrupted size vs. prev_size" in
-ImagingZipEncode). So nothing in kfgs imports pycolmap by itself.
+ImagingZipEncode). So Pillow, where it is installed, is loaded with this file, which every import of `kfgs.scenes` reads.
 """
 
 from __future__ import annotations
@@ -13,6 +13,9 @@ from typing import Any
 
 from .errors import SceneError
 
+with contextlib.suppress(ImportError):
+    import PIL.Image  # noqa: F401  # see above: the order matters
+
 # What pycolmap raises on files that it cannot make sense of (a failed CHECK is a ValueError, a missing id an IndexError).
 FAILURES = (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OSError)
 
@@ -20,13 +23,11 @@ _FATAL = 3  # glog's levels: 0 info, 1 warning, 2 error, 3 fatal
 
 
 def import_pycolmap() -> Any:
-    """pycolmap, imported after Pillow.
+    """pycolmap itself.
 
     Raises:
         ImportError: if it is not installed, with the install line.
     """
-    with contextlib.suppress(ImportError):
-        import PIL.Image  # noqa: F401  # see above: the order matters
     try:
         import pycolmap
     except ImportError as error:

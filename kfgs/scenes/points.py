@@ -42,6 +42,7 @@ def robust_bounds(
         ValueError: if there are no points, or a number is out of range.
 
     Example:
+        >>> import torch
         >>> cloud = torch.cat([torch.rand(999, 3), torch.tensor([[-139.0, 0.0, 0.0]])])
         >>> bool(robust_bounds(cloud).low[0] > -1)
         True

@@ -19,21 +19,21 @@ def undistort_scene(images: str | Path, model: str | Path, out: str | Path) -> P
     Args:
         images: the distorted images.
         model: their COLMAP model.
-        out: the scene folder to make; an older one of that name is replaced.
+        out: the scene folder to make, new or empty.
 
     Returns:
         `out`.
 
     Raises:
         FileNotFoundError: if a folder is missing.
-        SceneError: if the model is damaged, or pycolmap fails on it or on the images.
+        SceneError: if `out` holds files, the model is damaged, or pycolmap fails on it or on the images.
     """
     images, model, out = Path(images), Path(model), Path(out)
     if not images.is_dir():
         raise FileNotFoundError(f"{images}: no such folder; expected the images of {model} there")
-    if out.resolve() in (images.resolve(), *images.resolve().parents, model.resolve(), *model.resolve().parents):
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise SceneError(
-            f"{out}: expected a folder of its own, got one that holds the images or the model; choose another"
+            f"{out}: expected a new or empty folder for the undistorted scene, got one in use; choose another"
         )
     check_model(model)
     advice = "check the images, or run `colmap image_undistorter` yourself"

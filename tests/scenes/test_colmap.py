@@ -134,8 +134,9 @@ def test_the_log_level_is_put_back() -> None:
 def test_pillow_can_write_png_after_pycolmap(tmp_path: Path) -> None:
     code = """
 import sys
-from kfgs.scenes._pycolmap import import_pycolmap
-import_pycolmap()
+import kfgs.scenes
+assert "pycolmap" not in sys.modules, "kfgs.scenes must not load pycolmap before it is needed"
+import pycolmap
 import numpy as np
 from PIL import Image
 noise = np.random.default_rng(0).integers(0, 255, (700, 500, 3), dtype=np.uint8)
