@@ -172,13 +172,15 @@ class _Run:
                 self.database, str(self.images), image_names=some_names, camera_mode=mode, reader_options=reader,
                 extraction_options=options, device=colmap.Device.cpu,
             )  # fmt: skip
-            if config.single_camera and start == 0:
-                reader["existing_camera_id"] = self._camera_id()
+            if config.single_camera and "existing_camera_id" not in reader:
+                reader.update(self._first_camera())
             self.bar.update(len(some_names))
 
-    def _camera_id(self) -> int:
+    def _first_camera(self) -> dict[str, Any]:
+        """What makes the next images share the camera of the first; nothing while no image could be read."""
         with self.pycolmap.Database.open(self.database) as database:
-            return int(database.read_all_cameras()[0].camera_id)
+            cameras = database.read_all_cameras()
+        return {"existing_camera_id": int(cameras[0].camera_id)} if cameras else {}
 
     def match(self) -> None:
         """Compare pairs; pycolmap says nothing until it is done."""
