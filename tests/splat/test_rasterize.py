@@ -118,6 +118,14 @@ def test_gaussians_behind_the_camera_do_not_show():
     assert (rendering.alpha == 0).all()
 
 
+def test_near_plane_is_the_callers():
+    camera = a_camera()
+    gaussians = gaussians_before(camera, 20, seed=13)
+    depths = rasterize(gaussians, camera, near=4.0).projected.depths
+    assert (depths > 4).all()
+    assert (rasterize(gaussians, camera).projected.depths < 4).any()
+
+
 def test_colour_is_seen_from_the_camera():
     # red grows towards -x: a Gaussian right of the camera is dark, seen from its own right side it is bright
     sh = torch.zeros(1, 4, 3)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from cases_splat import random_splats, splats_from
 
-from kfgs.splat import bin_tiles
+from kfgs.splat import Projected, bin_tiles
 
 KINDS = ["round", "needles", "huge", "subpixel", "faint"]
 
@@ -60,6 +60,27 @@ def test_no_pair_that_shows_is_missing(kind, dtype, tile_size):
     assert len(set(pairs)) == len(pairs)
     assert found <= set(pairs)
     assert len(found) > 50
+
+
+def test_rounding_loses_no_pair():
+    """Gaussians that show at the corner pixel of the tile by one float32 rounding step, and nowhere else."""
+    g = torch.Generator().manual_seed(0)
+    M = 2000
+    dx, dy = 1 + 300 * torch.rand(M, generator=g), 1 + 300 * torch.rand(M, generator=g)  # the corner, from the mean
+    means2d = 0.5 - torch.stack([dx, dy], dim=1)
+    dx, dy = (0.5 - means2d).unbind(1)
+    share = torch.rand(M, generator=g)
+    a, c = 8 * share / dx**2, 8 * (1 - share) / dy**2
+    b = 0.5 * torch.rand(M, generator=g) * (a * c).sqrt()  # positive: the form grows away from the corner
+    a, b, c = (v * 8 / (a * dx**2 + 2 * b * dx * dy + c * dy**2) for v in (a, b, c))
+    density = torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+    opacities = 1 / (255 * density)
+    while (faint := opacities * density < 1 / 255).any():
+        opacities = torch.where(faint, opacities * (1 + 1e-7), opacities)
+    extents = torch.full((M, 2), 1e3)
+    projected = Projected(means2d, torch.stack([a, b, c], dim=1), torch.ones(M), opacities, extents, torch.arange(M))
+    assert bin_tiles(projected, 16, 16).rows.tolist() == list(range(M))
+    assert len(bin_tiles(projected._replace(opacities=0.99 * opacities), 16, 16).rows) == 0
 
 
 @pytest.mark.parametrize("kind", KINDS)
