@@ -15,10 +15,11 @@ from .numba_cells import (
     CELL_WIDTH,
     CHUNK,
     LIGHT,
+    OPTIONS,
     PIXELS,
     SHARE,
     STATE,
-    _options,
+    SUMS,
     add_colors,
     any_light,
     find_run,
@@ -44,7 +45,7 @@ class Splats(NamedTuple):
     conics: Any  # [M, 3]
     opacities: Any  # [M]
     features: Any  # [M, D]
-    ellipses: Any  # [M, 2] float64, reach 2 ln(opacity / ALPHA_MIN) and determinant a c - b^2
+    ellipses: Any  # [M, 8] float64, see `find_run`; reach = 2 ln(opacity / ALPHA_MIN)
     slack: float  # relative rounding error of the power of the density
 
 
@@ -59,7 +60,7 @@ class Grid(NamedTuple):
     tile_size: int
 
 
-@njit(**_options)
+@njit(**OPTIONS)
 def _chunk_scratch(dtype_of: Any) -> tuple[Any, Any, Any, Any, Any]:
     """Weights and ratios of a chunk, and its Gaussians: their rows and where their runs start and stop."""
     planes = np.empty((2, CHUNK * PIXELS), dtype_of.dtype)
@@ -67,7 +68,7 @@ def _chunk_scratch(dtype_of: Any) -> tuple[Any, Any, Any, Any, Any]:
     return planes[0], planes[1], lists[0], lists[1], lists[2]
 
 
-@njit(**_options)
+@njit(**OPTIONS)
 def _weigh_chunk(
     splats: Splats, grid: Grid, position: int, end: int, corner: tuple[int, int], state: Any, chunk: Any
 ) -> tuple[int, int]:
@@ -80,7 +81,7 @@ def _weigh_chunk(
     while position < end and count < CHUNK:
         row = grid.rows[position]
         position += 1
-        run = find_run(means2d, conics, ellipses, row, left, top, rows, slack)
+        run = find_run(ellipses, row, left, top, rows, slack)
         if run[1] > run[0]:
             splat = (means2d[row, 0], means2d[row, 1], conics[row, 0], conics[row, 1], conics[row, 2], opacities[row])
             weigh(state, weights, ratios, count * PIXELS, run, splat)
@@ -89,13 +90,13 @@ def _weigh_chunk(
     return count, position
 
 
-@njit(**_options)
+@njit(**OPTIONS)
 def _cells(grid: Grid) -> tuple[int, int]:
     """Rows and columns of cells in a tile."""
     return (grid.tile_size + CELL_HEIGHT - 1) // CELL_HEIGHT, (grid.tile_size + CELL_WIDTH - 1) // CELL_WIDTH
 
 
-@njit(**_options)
+@njit(**OPTIONS)
 def _box(grid: Grid, tile: int, cell: int) -> tuple[int, int, int, int]:
     """Left, top, right and bottom pixel of a cell of a tile, cut off at the tile's and the image's border."""
     columns = (grid.width + grid.tile_size - 1) // grid.tile_size
@@ -107,7 +108,7 @@ def _box(grid: Grid, tile: int, cell: int) -> tuple[int, int, int, int]:
     return left, top, right, bottom
 
 
-@njit(cache=True, **_options)
+@njit(cache=True, **OPTIONS)
 def composite_band(
     band: int, splats: Splats, grid: Grid, background: Any, maps: Any, alphas: Any, ends: Any, sources: int = _SOURCES
 ) -> None:
@@ -147,7 +148,7 @@ def composite_band(
                         maps[top + i, left + j, c] = colors[c * PIXELS + p] + light * background[c]
 
 
-@njit(cache=True, **_options)
+@njit(cache=True, **OPTIONS)
 def number_slots(band: int, grid: Grid, slots: Any, counts: Any) -> None:
     """Number the distinct Gaussians of one band: slots [B, M] int32, -1 where absent, and counts [B]."""
     slots[band] = -1
@@ -160,7 +161,7 @@ def number_slots(band: int, grid: Grid, slots: Any, counts: Any) -> None:
     counts[band] = count
 
 
-@njit(fastmath={"contract", "nsz"}, **_options)
+@njit(fastmath=SUMS, **OPTIONS)
 def _load_cell(
     box: tuple[int, int, int, int],
     background: Any,
@@ -189,15 +190,15 @@ def _load_cell(
                 continue
             through, total = none, none
             for c in range(maps.shape[2]):
-                slope = grad_maps[y, x, c]
-                grads[c * PIXELS + p] = slope
-                through += slope * background[c]
-                total += slope * maps[y, x, c]
+                through += grad_maps[y, x, c] * background[c]
+                total += grad_maps[y, x, c] * maps[y, x, c]
+            for c in range(maps.shape[2]):
+                grads[c * PIXELS + p] = grad_maps[y, x, c]
             state[SHARE + p] = grad_alphas[y, x] - through
             state[BEHIND + p] = total - (1 - alphas[y, x]) * through + alphas[y, x] * state[SHARE + p]
 
 
-@njit(cache=True, **_options)
+@njit(cache=True, **OPTIONS)
 def differentiate_band(
     band: int,
     splats: Splats,
@@ -258,7 +259,7 @@ def differentiate_band(
                 sum_features(own, MOMENTS, slots[band], weights, grads, which, starts, stops, count)
 
 
-@njit(cache=True, **_options)
+@njit(cache=True, **OPTIONS)
 def gather_band(
     band: int, bands: int, splats: Splats, slots: Any, firsts: Any, rows: Any, out: tuple[Any, Any, Any, Any]
 ) -> None:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 from numba import njit
 
 from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
@@ -28,12 +27,12 @@ X, Y, LIGHT, BEHIND, SHARE = 0, PIXELS, 2 * PIXELS, 3 * PIXELS, 4 * PIXELS
 loss that comes from what is still behind; and the slope of the loss that a weight has apart from its features."""
 STATE = 5 * PIXELS
 
-_PLAIN = {"contract", "nsz"}  # a * b + c in one instruction
-_SUMS = {"contract", "nsz", "reassoc"}  # sums in another order, which is always the same one
-_options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+PLAIN = {"contract", "nsz"}  # a * b + c in one instruction
+SUMS = {"contract", "nsz", "reassoc"}  # sums in another order, which is always the same one
+OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 
-@njit(fastmath=_PLAIN, **_options)
+@njit(fastmath=PLAIN, **OPTIONS)
 def start_cell(state: Any, left: int, top: int, right: int, bottom: int) -> None:
     """Place the pixel centres; pixels at or beyond (right, bottom), the image's border, count as stopped."""
     one = state.dtype.type(1)
@@ -46,7 +45,7 @@ def start_cell(state: Any, left: int, top: int, right: int, bottom: int) -> None
             state[LIGHT + p] = one if top + i < bottom and left + j < right else -one
 
 
-@njit(fastmath=_PLAIN, **_options)
+@njit(fastmath=PLAIN, **OPTIONS)
 def any_light(state: Any) -> bool:
     """Whether some pixel of the cell has not stopped."""
     most = state[LIGHT]
@@ -55,50 +54,46 @@ def any_light(state: Any) -> bool:
     return most > 0
 
 
-@njit(fastmath=_PLAIN, **_options)
-def find_run(
-    means2d: Any, conics: Any, ellipses: Any, row: int, left: int, top: int, rows: int, slack: float
-) -> tuple[int, int]:
+@njit(fastmath=PLAIN, **OPTIONS)
+def find_run(ellipses: Any, row: int, left: int, top: int, rows: int, slack: float) -> tuple[int, int]:
     """The run of pixels whose image rows meet the ellipse alpha >= ALPHA_MIN within the cell; (0, 0) if none does.
 
-    On the ellipse a x^2 + 2 b x y + c y^2 = reach the highest point is y = height at x = lean. Where that x lies beside
-    the cell, the highest point within the cell is on its nearer side. The lowest point mirrors it. All in float64.
+    The ellipse is a x^2 + 2 b x y + c y^2 = reach about the mean. Where its highest point lies beside the cell, the
+    highest point within the cell is on the nearer side. The lowest point mirrors it. All in float64.
 
     Args:
-        means2d: [M, 2].
-        conics: [M, 3].
-        ellipses: [M, 2] float64, reach and determinant a c - b^2.
+        ellipses: [M, 8] float64: mean (x, y), conic (a, b, c), reach, determinant a c - b^2 (not positive: any
+            pixel may be touched), and x of the highest point for reach 1.
         row: which Gaussian.
         left: first pixel column of the cell.
         top: first pixel row of the cell.
         rows: how many rows of the cell lie in the image.
         slack: relative rounding error of the power of the density as it is computed for each pixel.
     """
-    reach, determinant = ellipses[row, 0], ellipses[row, 1]
+    a, b, c = ellipses[row, 2], ellipses[row, 3], ellipses[row, 4]
+    reach, determinant = ellipses[row, 5], ellipses[row, 6]
     if not reach > 0:
         return 0, 0
-    a, b, c = np.float64(conics[row, 0]), np.float64(conics[row, 1]), np.float64(conics[row, 2])
-    if not (a > 0 and c > 0 and determinant > 0):
+    if not determinant > 0:
         return 0, CELL_WIDTH * rows
-    x_low, y_low = left + 0.5 - np.float64(means2d[row, 0]), top + 0.5 - np.float64(means2d[row, 1])
+    x_low, y_low = left + 0.5 - ellipses[row, 0], top + 0.5 - ellipses[row, 1]
     x_high, y_high = x_low + (CELL_WIDTH - 1), y_low + (CELL_HEIGHT - 1)
     # The terms of the form are largest, and cancel worst, in the far corner.
     x_far, y_far = max(-x_low, x_high), max(-y_low, y_high)
     reach += slack * (a * x_far * x_far + 2 * abs(b) * x_far * y_far + c * y_far * y_far + reach + 1)
-    lean = -b * math.sqrt(reach / (a * determinant))
+    lean = ellipses[row, 7] * math.sqrt(reach)
     x_up, x_down = min(max(lean, x_low), x_high), min(max(-lean, x_low), x_high)
     up, down = c * reach - x_up * x_up * determinant, c * reach - x_down * x_down * determinant
-    if max(up, down) < 0:
-        return 0, 0
-    y_up = (math.sqrt(max(up, 0.0)) - b * x_up) / c
-    y_down = (-math.sqrt(max(down, 0.0)) - b * x_down) / c
     margin = slack * (y_far + 1)
-    first = int(max(math.ceil(y_down - margin - y_low), 0.0))
-    last = int(min(math.floor(y_up + margin - y_low), rows - 1.0))
-    return (CELL_WIDTH * first, CELL_WIDTH * (last + 1)) if last >= first else (0, 0)
+    y_up = (math.sqrt(max(up, 0.0)) - b * x_up) / c + margin - y_low  # in rows of the cell
+    y_down = (-math.sqrt(max(down, 0.0)) - b * x_down) / c - margin - y_low
+    if not (max(up, down) >= 0 and y_up >= 0 and y_down <= rows - 1):  # NaN touches nothing
+        return 0, 0
+    first = rows - int(rows - max(y_down, 0.0))  # rounded up, and below down
+    return CELL_WIDTH * first, CELL_WIDTH * int(min(y_up + 1, float(rows)))
 
 
-@njit(fastmath=_PLAIN, **_options)
+@njit(fastmath=PLAIN, **OPTIONS)
 def weigh(
     state: Any, weights: Any, ratios: Any, plane: int, run: tuple[int, int], splat: tuple[Any, Any, Any, Any, Any, Any]
 ) -> None:
@@ -134,7 +129,7 @@ def weigh(
         weights[at + i] = alpha * light if drawn else none
 
 
-@njit(fastmath=_PLAIN, **_options)
+@njit(fastmath=PLAIN, **OPTIONS)
 def add_colors(colors: Any, weights: Any, features: Any, which: Any, starts: Any, stops: Any, count: int) -> None:
     """colors[c, p] += sum_k weights[k, p] features[which[k], c], over the runs of `count` Gaussians."""
     channels = features.shape[1]
@@ -157,7 +152,7 @@ def add_colors(colors: Any, weights: Any, features: Any, which: Any, starts: Any
                 colors[into + i] += f * weights[weight + i]
 
 
-@njit(fastmath=_PLAIN, **_options)
+@njit(fastmath=PLAIN, **OPTIONS)
 def find_slopes(
     slopes: Any, state: Any, grads: Any, features: Any, which: Any, starts: Any, stops: Any, count: int
 ) -> None:
@@ -188,7 +183,7 @@ def find_slopes(
                 slopes[into + i] += f * grads[grad + i]
 
 
-@njit(fastmath=_SUMS, **_options)
+@njit(fastmath=SUMS, **OPTIONS)
 def sum_moments(
     state: Any, weights: Any, ratios: Any, slopes: Any, plane: int, run: tuple[int, int], mean_x: Any, mean_y: Any
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
@@ -218,7 +213,7 @@ def sum_moments(
     return v_1, v_x, v_y, v_xx, v_xy, v_yy
 
 
-@njit(fastmath=_SUMS, **_options)
+@njit(fastmath=SUMS, **OPTIONS)
 def sum_features(
     out: Any, first: int, slots: Any, weights: Any, grads: Any, which: Any, starts: Any, stops: Any, count: int
 ) -> None:

@@ -91,11 +91,13 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 
 def _splats(means2d: Tensor, conics: Tensor, opacities: Tensor, features: Tensor) -> Splats:
-    a, b, c = conics.detach().double().unbind(1)
+    means, (a, b, c) = means2d.detach().double(), conics.detach().double().unbind(1)
     reach = 2 * torch.log(opacities.detach().double() / ALPHA_MIN)
-    ellipses = torch.stack([reach, a * c - b * b], dim=1)
-    slack = 8 * torch.finfo(means2d.dtype).eps
-    return Splats(*map(_array, (means2d, conics, opacities, features, ellipses)), slack)
+    determinant = torch.where((a > 0) & (c > 0), a * c - b * b, 0)
+    lean = -b / (a * determinant).sqrt()
+    ellipses = torch.stack([*means.unbind(1), a, b, c, reach, determinant, lean], dim=1)  # see `find_run`
+    arrays = (_array(value) for value in (means2d, conics, opacities, features, ellipses))
+    return Splats(*arrays, slack=8 * torch.finfo(means2d.dtype).eps)
 
 
 def _grid(tiles: Tiles) -> Grid:
