@@ -6,7 +6,7 @@ from .evolve import expand, prune
 from .fit_autoencoder import AutoencoderConfig, AutoencoderFit, fit_autoencoder
 from .fit_codebook import CodebookConfig, CodebookFit, fit_codebook
 from .loss import BalancedLoss, class_balanced_loss
-from .maps import IndexMaps, LatentMaps, quantize_maps
+from .maps import FeatureMaps, IndexMaps, LatentMaps, quantize_maps
 from .sampling import choose_grid_step, farthest_points, sample_grid
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "Codebook",
     "CodebookConfig",
     "CodebookFit",
+    "FeatureMaps",
     "IndexMaps",
     "LatentMaps",
     "Nearest",

@@ -22,10 +22,12 @@ class Autoencoder:
     """Encoder E and decoder Psi of Eq. 10: D channels to d latents and back.
 
     Both are linear layers with ReLU between. The encoder was trained with batch normalisation; when fitting ended, its
-    statistics over the whole codebook were folded into the linear layers, and the range of the latents was frozen. So each
-    row is treated alone (the latent of a codeword does not depend on what else is in the batch), and there is no training mode to forget.
+    statistics over the whole codebook were folded into the linear layers, and the range of the latents was frozen. So
+    each row is treated alone: the latent of a codeword does not depend on what else is in the batch, and there is no
+    training mode to forget.
 
-    **Convention**: a latent has unit length and is then mapped from [low, high] to [0, 1], the same for all channels.
+    **Convention**: a latent has unit length and is then mapped from [low, high] to [0, 1], the same for all channels. (A
+    single channel keeps its length: a unit scalar would only say -1 or 1, and have no gradient to learn from.)
     """
 
     encoder: tuple[Layer, ...]
@@ -108,7 +110,7 @@ class Autoencoder:
             encoder, decoder = (
                 tuple(
                     (tensors[f"{name}.{i}.weight"], tensors[f"{name}.{i}.bias"])
-                    for i in range(sum(key.startswith(f"{name}.") for key in tensors) // 2 or 1)
+                    for i in range((sum(key.startswith(f"{name}.") for key in tensors) + 1) // 2 or 1)
                 )
                 for name in ("encoder", "decoder")
             )
@@ -133,7 +135,7 @@ class Autoencoder:
         return Autoencoder.from_tensors(read_tensors(path, kind="autoencoder"))
 
     def _encode(self, rows: Tensor) -> Tensor:  # [n, D] -> [n, d]
-        unit = unit_rows(mlp(self.encoder, unit_rows(rows)))
+        unit = unit_latents(mlp(self.encoder, unit_rows(rows)))
         return ((unit - self.low) / (self.high - self.low)).clamp(0, 1)
 
     def _by_chunk(self, name: str, x: Tensor, width: int, chunk: int, function: Any) -> Tensor:
@@ -153,3 +155,8 @@ def mlp(layers: Sequence[Layer], rows: Tensor) -> Tensor:  # [n, in] -> [n, out]
     for i, (weight, bias) in enumerate(layers):
         rows = torch.nn.functional.linear(rows.relu() if i else rows, weight, bias)
     return rows
+
+
+def unit_latents(latents: Tensor) -> Tensor:  # [n, d]
+    """Unit length, unless there is only one channel."""
+    return unit_rows(latents) if latents.shape[1] > 1 else latents

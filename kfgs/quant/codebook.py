@@ -37,7 +37,7 @@ def row_norms(x: Tensor) -> Tensor:  # [..., D] -> [...]
 class Nearest(NamedTuple):
     """The nearest codeword of each feature (Eq. 5)."""
 
-    index: Tensor  # [...] int64
+    codeword: Tensor  # [...] int64
     similarity: Tensor  # [...] cosine with that codeword, in [-1, 1] up to rounding
 
 
@@ -128,7 +128,7 @@ class Codebook:
         chunk: int = 65_536,
     ) -> Tensor:  # [...] int64
         """The index map M of Eq. 5: for each feature, t = argmax_e cos(f, f_e). Ties as in `nearest`."""
-        return self.nearest(features, chunk=chunk).index
+        return self.nearest(features, chunk=chunk).codeword
 
     def to(self, *args: Any, **kwargs: Any) -> Codebook:
         """Move or convert the codewords as `Tensor.to` does."""

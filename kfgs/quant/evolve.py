@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_range, check_shapes
-from .codebook import unit_rows
+from .codebook import EPS, row_norms, unit_rows
 
 
 def expand(
@@ -53,8 +53,9 @@ def admit(
     room: int,
 ) -> Tensor:  # [m] int64
     """`expand`, for a caller who already knows each feature's similarity to its codeword and how many may join."""
-    rows = ((similarity < threshold) & features.ne(0).any(dim=1)).nonzero()[:, 0] if room > 0 else features.new_empty(0)
-    unit, best = unit_rows(features[rows.long()]), similarity[rows.long()].clone()
+    rows = (similarity < threshold).nonzero()[:, 0][: None if room > 0 else 0]
+    rows = rows[row_norms(features[rows]) > EPS]
+    unit, best = unit_rows(features[rows]), similarity[rows].clone()
     chosen: list[int] = []
     while len(chosen) < room and best.numel() > 0:
         least = int(best.argmin())
@@ -63,7 +64,7 @@ def admit(
         chosen.append(least)
         best = torch.maximum(best, unit @ unit[least])
         best[least] = torch.inf  # present now, whatever rounding makes of its cosine with itself
-    return rows.long()[torch.tensor(chosen, dtype=torch.int64, device=rows.device)]
+    return rows[torch.tensor(chosen, dtype=torch.int64, device=rows.device)]
 
 
 def prune(

@@ -12,7 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._check import check_range
-from .autoencoder import Autoencoder, Layer, mlp
+from .autoencoder import Autoencoder, Layer, mlp, unit_latents
 from .codebook import Codebook, row_norms, unit_rows
 
 NORM_EPS = 1e-5  # added to the variance in batch normalisation, torch's default
@@ -90,8 +90,7 @@ def fit_autoencoder(
 
     Note:
         The released script compares unit outputs with codewords of any length (an error that cannot vanish), and uses
-        running statistics that the decoder was not trained with. Unit latents of one channel are -1 or 1: d = 1 tells
-        two codewords apart and no more.
+        running statistics that the decoder was not trained with.
     """
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     target = codebook.unit.detach()
@@ -102,8 +101,8 @@ def fit_autoencoder(
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate, weight_decay=config.weight_decay, fused=True)
     history: list[dict[str, Any]] = []
     for step in tqdm(range(1, config.steps + 1), desc="autoencoder", disable=not progress):
-        latents = unit_rows(_normalised_mlp(encoder, norms, target))
-        low, high = latents.amin(), latents.amax()
+        latents = unit_latents(_normalised_mlp(encoder, norms, target))
+        low, high = latents.detach().amin(), latents.detach().amax()
         decoded = unit_rows(mlp(decoder, (latents - low) / (high - low).clamp_min(_SMALLEST)))
         loss = row_norms(decoded - target).mean()
         optimizer.zero_grad(set_to_none=True)
@@ -155,7 +154,7 @@ def _freeze(encoder: list[Layer], norms: list[Layer], decoder: list[Layer], targ
         folded.append((gain[:, None] * weight, gain * (bias - mean) + shift))
         rows = torch.nn.functional.linear(rows, *folded[-1]).relu()
     folded.append((encoder[-1][0].detach().clone(), encoder[-1][1].detach().clone()))
-    latents = unit_rows(mlp(folded, target))
+    latents = unit_latents(mlp(folded, target))
     low = float(latents.min())
     high = max(float(latents.max()), low + _SMALLEST)
     return Autoencoder(tuple(folded), tuple((w.detach().clone(), b.detach().clone()) for w, b in decoder), low, high)

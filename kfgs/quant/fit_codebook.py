@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,6 +14,7 @@ from .._check import check_range, check_shapes
 from .codebook import EPS, Codebook, row_norms
 from .evolve import admit, prune
 from .loss import class_balanced_loss
+from .maps import FeatureMaps
 from .row_adam import RowAdam
 from .sampling import SAMPLES, farthest_points, sample_grid
 
@@ -88,7 +89,7 @@ class CodebookFit:
 
 
 def fit_codebook(
-    maps: Sequence[Tensor],  # each [h, w, D]
+    maps: FeatureMaps,  # each [h, w, D]
     config: CodebookConfig = CodebookConfig(),
     *,
     generator: torch.Generator | None = None,
@@ -172,7 +173,7 @@ class _EvolvingCodebook:
         joining = features[admit(features, similarity, threshold=self.config.expand_below, room=room)]
         if joining.shape[0] > 0:
             newest = Codebook(joining).nearest(features)
-            index = torch.where(newest.similarity > similarity, newest.index + self.size, index)
+            index = torch.where(newest.similarity > similarity, newest.codeword + self.size, index)
             self.adam.append(joining)
             self.gradient = torch.cat([self.gradient, torch.zeros_like(joining)])
             tally.added += joining.shape[0]
@@ -225,7 +226,7 @@ class _Tally:
         }
 
 
-def _first_codewords(maps: Sequence[Tensor], config: CodebookConfig) -> Tensor:  # [K, D]
+def _first_codewords(maps: FeatureMaps, config: CodebookConfig) -> Tensor:  # [K, D]
     """Farthest-point sampling on the first image that has features."""
     for i in range(len(maps)):
         features = _samples(maps, i, config)
@@ -234,7 +235,7 @@ def _first_codewords(maps: Sequence[Tensor], config: CodebookConfig) -> Tensor: 
     raise ValueError(f"maps: expected nonzero features, got {len(maps)} all-zero maps; check the teacher")
 
 
-def _samples(maps: Sequence[Tensor], i: int, config: CodebookConfig, dim: int | None = None) -> Tensor:  # [n, D]
+def _samples(maps: FeatureMaps, i: int, config: CodebookConfig, dim: int | None = None) -> Tensor:  # [n, D]
     """The nonzero features of map i that lie on the grid, in at least single precision."""
     feature_map = maps[i]  # once: this may read a file
     check_shapes((f"maps[{i}]", feature_map, f"h w {dim or 'D'}"))

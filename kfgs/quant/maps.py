@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -15,6 +15,15 @@ from tqdm import tqdm
 from .._check import check_shapes
 from ._store import read_tensors, write_tensors
 from .codebook import Codebook
+
+
+class FeatureMaps(Protocol):
+    """Feature maps of many images, read when asked for: all that fitting and quantising need of a sequence."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, i: int, /) -> Tensor:  # [h, w, D]
+        ...
 
 
 class IndexMaps(Sequence[NDArray[Any]]):
@@ -122,7 +131,7 @@ class LatentMaps(Sequence[Tensor]):
 
 
 def quantize_maps(
-    maps: Sequence[Tensor],  # each [h, w, D]
+    maps: FeatureMaps,  # each [h, w, D]
     codebook: Codebook,
     *,
     progress: bool = False,

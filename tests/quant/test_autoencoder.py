@@ -1,0 +1,94 @@
+from itertools import pairwise
+
+import numpy as np
+import oracles_quant as oracle
+import pytest
+import torch
+
+from kfgs.quant import Autoencoder, Codebook
+
+
+def network(widths, seed):
+    generator = torch.Generator().manual_seed(seed)
+    return tuple(
+        (torch.randn(b, a, generator=generator, dtype=torch.float64), torch.randn(b, generator=generator).double())
+        for a, b in pairwise(widths)
+    )
+
+
+def example():
+    return Autoencoder(network((6, 5, 3), 0), network((3, 4, 6), 1), -0.5, 0.75)
+
+
+def rows(n, dim, seed=2):
+    return torch.randn(n, dim, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def test_encode_and_decode_against_loops():
+    features, latents = rows(9, 6), rows(9, 3)
+    found = example()
+    unit = oracle.unit(oracle.mlp(found.encoder, oracle.unit(features.numpy())))
+    expected = np.clip((unit + 0.5) / 1.25, 0, 1)
+    assert (expected == 0).any()
+    np.testing.assert_allclose(found.encode(features).numpy(), expected, atol=1e-12)
+    np.testing.assert_allclose(
+        found.decode(latents).numpy(), oracle.unit(oracle.mlp(found.decoder, latents)), atol=1e-12
+    )
+
+
+def test_each_row_is_treated_alone_and_shapes_are_kept():
+    found, features = example(), rows(24, 6).reshape(2, 3, 4, 6)
+    latents = found.encode(features)
+    assert latents.shape == (2, 3, 4, 3)
+    torch.testing.assert_close(found.encode(features[1, 2, 3]), latents[1, 2, 3])
+    torch.testing.assert_close(found.encode(features, chunk=5), latents)
+    torch.testing.assert_close(found.decode(latents, chunk=7), found.decode(latents))
+    torch.testing.assert_close(found.encode(40 * features), latents)
+
+
+def test_no_rows():
+    assert example().encode(torch.zeros(0, 6, dtype=torch.float64)).shape == (0, 3)
+    assert example().decode(torch.zeros(2, 0, 3, dtype=torch.float64)).shape == (2, 0, 6)
+
+
+def test_decode_is_differentiable():
+    assert torch.autograd.gradcheck(example().decode, rows(3, 3, seed=5).requires_grad_())
+
+
+def test_save_then_load_is_the_same(tmp_path):
+    found, features = example(), rows(5, 6)
+    found.save(tmp_path / "ae.safetensors")
+    for again in (Autoencoder.load(tmp_path / "ae.safetensors"), Autoencoder.from_tensors(found.to_tensors())):
+        assert torch.equal(again.encode(features), found.encode(features))
+        assert torch.equal(again.decode(again.encode(features)), found.decode(found.encode(features)))
+        assert (again.dim, again.latent, again.decoder_parameters) == (6, 3, (3 * 4 + 4) + (4 * 6 + 6))
+    assert found.to(torch.float32).encode(features.float()).dtype == torch.float32
+
+
+def test_bad_input(tmp_path):
+    found = example()
+    with pytest.raises(
+        ValueError, match=r"features: expected \[\.\.\., 6\] \(from the autoencoder's weights\), got \(2, 3\)"
+    ):
+        found.encode(torch.zeros(2, 3))
+    with pytest.raises(
+        ValueError, match=r"latents: expected \[\.\.\., 3\] \(from the autoencoder's weights\), got \(2, 6\)"
+    ):
+        found.decode(torch.zeros(2, 6))
+    with pytest.raises(ValueError, match=r"decoder: expected 6 output channels \(the encoder's input\), got 5"):
+        Autoencoder(found.encoder, network((3, 5), 0), 0.0, 1.0)
+    with pytest.raises(ValueError, match=r"decoder\[0\] weight: expected \[out, 3\], got \(6, 2\)"):
+        Autoencoder(found.encoder, network((2, 6), 0), 0.0, 1.0)
+    with pytest.raises(ValueError, match=r"high: expected a number in \(0.5, inf\), got 0.5"):
+        Autoencoder(found.encoder, found.decoder, 0.5, 0.5)
+    with pytest.raises(
+        ValueError, match=r"tensors: expected the name 'decoder.1.bias', got .*; use Autoencoder.to_tensors"
+    ):
+        Autoencoder.from_tensors({k: v for k, v in found.to_tensors().items() if k != "decoder.1.bias"})
+    with pytest.raises(ValueError, match=r"tensors: expected the name 'range', got \[\]"):
+        Autoencoder.from_tensors({})
+    with pytest.raises(ValueError, match=r"tensors: expected the name 'encoder.0.weight', got \['range'\]"):
+        Autoencoder.from_tensors({"range": torch.tensor([0.0, 1.0])})
+    Codebook(torch.eye(3)).save(tmp_path / "book.safetensors")
+    with pytest.raises(ValueError, match=r"expected a kfgs autoencoder, got codebook; pass another file"):
+        Autoencoder.load(tmp_path / "book.safetensors")

@@ -1,0 +1,128 @@
+import oracles_quant as oracle
+import pytest
+import torch
+
+from kfgs.quant import EPS, Codebook, IndexMaps, unit_rows
+
+
+def random_rows(n, dim, seed=0, dtype=torch.float64):
+    return torch.randn(n, dim, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def test_unit_rows_closed_form_and_zero_stays_zero():
+    assert unit_rows(torch.tensor([[3.0, 4.0], [0.0, 0.0]])).tolist() == [
+        [0.6000000238418579, 0.800000011920929],
+        [0, 0],
+    ]
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+def test_zero_rows_have_no_nan_in_any_precision(dtype):
+    assert unit_rows(torch.zeros(2, 3, dtype=dtype)).eq(0).all()
+
+
+def test_rows_shorter_than_the_epsilon_shrink_towards_zero():
+    assert unit_rows(torch.tensor([[EPS / 2, 0.0]], dtype=torch.float64))[0, 0].item() == pytest.approx(0.5)
+
+
+def test_nearest_against_loops():
+    features, codewords = random_rows(40, 6), random_rows(7, 6, seed=1)
+    found = Codebook(codewords).nearest(features, chunk=11)
+    expected = oracle.quantize(features.numpy(), codewords.numpy())
+    assert found.codeword.tolist() == expected.tolist()
+    cosines = [oracle.cosine(f, codewords.numpy()[t]) for f, t in zip(features.numpy(), expected, strict=True)]
+    torch.testing.assert_close(found.similarity, torch.tensor(cosines, dtype=torch.float64))
+
+
+def test_lengths_carry_no_meaning():
+    features, book = random_rows(30, 5), Codebook(random_rows(6, 5, seed=1))
+    factors = torch.linspace(0.1, 50, 6, dtype=torch.float64)[:, None]
+    assert torch.equal(book.quantize(features), Codebook(book.codewords * factors).quantize(features * 7))
+
+
+def test_quantize_is_idempotent_and_keeps_the_shape():
+    book = Codebook(random_rows(6, 5))
+    index = book.quantize(random_rows(24, 5, seed=2).reshape(2, 3, 4, 5))
+    assert index.shape == (2, 3, 4)
+    assert index.dtype == torch.int64
+    assert torch.equal(book.quantize(book.codewords[index]), index)
+
+
+def test_chunks_do_not_matter():
+    features, book = random_rows(50, 8), Codebook(random_rows(9, 8, seed=3))
+    assert torch.equal(book.quantize(features, chunk=1), book.quantize(features))
+
+
+def test_tie_goes_to_lowest_index():
+    book = Codebook(torch.tensor([[0.0, 1.0], [1.0, 0.0], [2.0, 0.0]]))
+    assert book.quantize(torch.tensor([[1.0, 0.0], [1.0, 1.0]])).tolist() == [1, 0]
+
+
+def test_a_zero_feature_gets_index_0_with_similarity_0():
+    found = Codebook(torch.tensor([[-1.0, 0.0], [0.0, 1.0]])).nearest(torch.zeros(1, 2))
+    assert (found.codeword.item(), found.similarity.item()) == (0, 0.0)
+
+
+def test_half_features_are_compared_in_the_codewords_precision():
+    book = Codebook(random_rows(6, 64, dtype=torch.float32))
+    features = random_rows(20, 64, seed=1, dtype=torch.float16)
+    assert book.nearest(features).similarity.dtype == torch.float32
+    assert torch.equal(book.quantize(features), book.quantize(features.float()))
+
+
+def test_similarity_is_the_cosine_and_differentiable():
+    features, book = random_rows(4, 3).requires_grad_(), Codebook(random_rows(5, 3, seed=1))
+    expected = [[oracle.cosine(f, c) for c in book.codewords.numpy()] for f in features.detach().numpy()]
+    torch.testing.assert_close(book.similarity(features).detach(), torch.tensor(expected, dtype=torch.float64))
+    assert torch.autograd.gradcheck(book.similarity, features)
+
+
+def test_no_features_give_no_indices():
+    assert Codebook(torch.eye(3)).quantize(torch.zeros(0, 3)).shape == (0,)
+
+
+def test_save_then_load_is_the_same(tmp_path):
+    book = Codebook(random_rows(4, 3, dtype=torch.float32))
+    book.save(tmp_path / "book.safetensors")
+    assert torch.equal(Codebook.load(tmp_path / "book.safetensors").codewords, book.codewords)
+    assert torch.equal(Codebook.from_tensors(book.to_tensors()).codewords, book.codewords)
+    assert book.to(torch.float64).codewords.dtype == torch.float64
+
+
+def test_bad_codewords():
+    with pytest.raises(ValueError, match=r"codewords: expected \[K, D\], got \(3,\); pass a tensor"):
+        Codebook(torch.ones(3))
+    with pytest.raises(
+        ValueError, match=r"codewords: expected at least one row of floating-point numbers, got \(0, 3\)"
+    ):
+        Codebook(torch.ones(0, 3))
+    with pytest.raises(ValueError, match=r"codewords: .* got \(2, 3\) of torch.int64; fit one with fit_codebook"):
+        Codebook(torch.ones(2, 3, dtype=torch.int64))
+    rows = torch.tensor([[1.0, 0.0], [0.0, 0.0], [float("nan"), 1.0]])
+    with pytest.raises(
+        ValueError, match=r"codewords: expected finite rows that are not all-zero, got bad rows \[1, 2\]"
+    ):
+        Codebook(rows)
+    with pytest.raises(ValueError, match=r"tensors: expected the name 'codewords', got \['words'\]"):
+        Codebook.from_tensors({"words": rows})
+
+
+def test_bad_features():
+    with pytest.raises(
+        ValueError, match=r"features: expected \[\.\.\., D\] with D = 3 \(from codewords\), got \(2, 4\)"
+    ):
+        Codebook(torch.eye(3)).quantize(torch.ones(2, 4))
+    with pytest.raises(ValueError, match=r"chunk: expected a number in \[1, inf\), got 0"):
+        Codebook(torch.eye(3)).quantize(torch.ones(2, 3), chunk=0)
+
+
+def test_bad_files(tmp_path):
+    path = tmp_path / "thing.safetensors"
+    with pytest.raises(FileNotFoundError, match=r"no such file; expected a kfgs codebook"):
+        Codebook.load(path)
+    path.write_bytes(b"nonsense")
+    with pytest.raises(ValueError, match=r"expected a kfgs codebook \(\.safetensors\), but it cannot be read"):
+        Codebook.load(path)
+    IndexMaps([], 3).save(path)
+    with pytest.raises(ValueError, match=r"expected a kfgs codebook, got index maps; pass another file"):
+        Codebook.load(path)

@@ -1,0 +1,153 @@
+import oracles_quant as oracle
+import pytest
+import torch
+
+from kfgs.quant import AutoencoderConfig, Codebook, fit_autoencoder
+from kfgs.quant.fit_autoencoder import _linears, _normalised_mlp
+
+SHORT = AutoencoderConfig(encoder=(64, 32), decoder=(32, 128), steps=600, learning_rate=2e-3)
+
+
+def realistic_codebook(groups=12, each=4, dim=96, seed=0):
+    """Groups of codewords whose cosines are about 0.95 inside a group, lengths about 11, as a fitted codebook has them."""
+    generator = torch.Generator().manual_seed(seed)
+    centres = torch.nn.functional.normalize(torch.randn(groups, dim, generator=generator), dim=1)
+    spread = 0.23 * torch.randn(groups, each, dim, generator=generator) / dim**0.5
+    return Codebook(11 * (centres[:, None] + spread).reshape(-1, dim))
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    book = realistic_codebook()
+    similarity = book.unit @ book.unit.T
+    assert 0.93 < float(similarity.fill_diagonal_(-1).amax()) < 0.99  # below the pruning threshold, near it
+    return book, fit_autoencoder(book, SHORT)
+
+
+def test_every_codeword_is_recovered(fitted):
+    book, fit = fitted
+    decoded = fit.autoencoder.decode(fit.autoencoder.encode(book.codewords))
+    assert oracle.quantize(decoded.numpy(), book.codewords.numpy()).tolist() == list(range(48))
+    assert fit.recovered == 1.0
+
+
+def test_frozen_network_is_what_training_saw_last(fitted):
+    """The loss of the finished autoencoder goes on where the history ends: nothing jumps when statistics are frozen."""
+    _, fit = fitted
+    assert fit.loss == pytest.approx(fit.history[-1]["loss"], rel=0.2)
+    assert fit.loss < 0.1 < fit.history[0]["loss"]
+
+
+def test_folding_normalisation_is_exact():
+    """Full-batch normalisation and the folded encoder agree, so freezing loses nothing (it would with running statistics)."""
+    book = Codebook(realistic_codebook(4, 3, 20).codewords.double())
+    config = AutoencoderConfig(latent=3, encoder=(16, 8), decoder=(8,), steps=1, learning_rate=1e-30, weight_decay=0)
+    fit = fit_autoencoder(book, config, generator=torch.Generator().manual_seed(4))
+    encoder = _linears((20, 16, 8, 3), torch.Generator().manual_seed(4), book.codewords)
+    rows = book.unit
+    for weight, bias in encoder[:-1]:
+        norm = torch.nn.BatchNorm1d(weight.shape[0], dtype=torch.float64)  # training mode: the batch's statistics
+        rows = norm(rows @ weight.T + bias).relu()
+    unit = torch.nn.functional.normalize(rows @ encoder[-1][0].T + encoder[-1][1], dim=1)
+    expected = (unit - unit.min()) / (unit.max() - unit.min())
+    torch.testing.assert_close(fit.latents, expected.detach())
+    ones = [(torch.ones(n, dtype=torch.float64), torch.zeros(n, dtype=torch.float64)) for n in (16, 8)]
+    torch.testing.assert_close(torch.nn.functional.normalize(_normalised_mlp(encoder, ones, book.unit)), unit.detach())
+
+
+def test_latents_fill_the_unit_range_and_are_apart(fitted):
+    _, fit = fitted
+    assert fit.latents.shape == (48, 9)
+    assert fit.latents.min() == pytest.approx(0, abs=1e-6)
+    assert fit.latents.max() == pytest.approx(1, abs=1e-6)
+    distances = [float((fit.latents[i] - fit.latents[j]).norm()) for i in range(48) for j in range(i)]
+    assert fit.min_latent_distance == pytest.approx(min(distances), rel=1e-5)
+    assert fit.min_latent_distance > 0.02
+
+
+def test_a_latent_does_not_depend_on_the_other_codewords(fitted):
+    book, fit = fitted
+    alone = torch.cat([fit.autoencoder.encode(row) for row in book.codewords[:, None]])
+    torch.testing.assert_close(alone, fit.latents)
+    torch.testing.assert_close(fit.autoencoder.encode(book.codewords.flip(0)).flip(0), fit.latents)
+
+
+def test_loss_is_eq_10_with_unit_targets(fitted):
+    book, fit = fitted
+    unit = oracle.unit(book.codewords.double().numpy())
+    decoded = fit.autoencoder.decode(fit.latents).double().numpy()
+    errors = [float(((decoded[i] - unit[i]) ** 2).sum() ** 0.5) for i in range(48)]
+    assert fit.loss == pytest.approx(sum(errors) / 48, rel=1e-5)
+
+
+def test_the_paper_s_network_has_831744_decoder_weights():
+    book = Codebook(torch.randn(5, 512, generator=torch.Generator().manual_seed(0)))
+    fit = fit_autoencoder(book, AutoencoderConfig(steps=1))
+    assert fit.autoencoder.decoder_parameters == 831_744
+    assert [weight.shape[0] for weight, _ in fit.autoencoder.encoder] == [256, 128, 64, 32, 9]
+    assert [weight.shape[0] for weight, _ in fit.autoencoder.decoder] == [32, 64, 128, 256, 1024, 512]
+    config = AutoencoderConfig()
+    assert (config.latent, config.steps, config.learning_rate, config.weight_decay) == (9, 5000, 1e-4, 5e-6)
+
+
+@pytest.mark.parametrize(("K", "dim", "latent"), [(1, 7, 3), (2, 5, 1), (2, 4, 9), (3, 2, 2)])
+def test_small_codebooks(K, dim, latent):
+    angles = torch.arange(K) * 2.0
+    rows = torch.zeros(K, dim)
+    rows[:, 0], rows[:, 1] = angles.cos(), angles.sin()
+    config = AutoencoderConfig(latent=latent, encoder=(8,), decoder=(16,), steps=200, learning_rate=5e-3)
+    fit = fit_autoencoder(Codebook(rows), config)
+    assert fit.recovered == 1.0
+    assert fit.latents.shape == (K, latent)
+    assert torch.isfinite(fit.latents).all()
+    assert (fit.min_latent_distance == float("inf")) == (K == 1)
+
+
+def test_recovered_is_honest():
+    """Cut short, the autoencoder confuses some codewords, and says so."""
+    book = realistic_codebook(12, 2)
+    fit = fit_autoencoder(book, AutoencoderConfig(latent=2, encoder=(16,), decoder=(16,), steps=60, learning_rate=1e-2))
+    found = oracle.quantize(fit.autoencoder.decode(fit.latents).numpy(), book.codewords.numpy())
+    right = sum(int(found[i]) == i for i in range(24))
+    assert fit.recovered == right / 24
+    assert 0 < right < 24
+
+
+def test_same_generator_state_same_bits_and_the_global_one_is_left_alone():
+    book, config = realistic_codebook(3, 2, 16), AutoencoderConfig(encoder=(8,), decoder=(8,), steps=10, record_every=4)
+    torch.manual_seed(0)
+    expected = torch.rand(1)
+    torch.manual_seed(0)
+    records = []
+    fits = [
+        fit_autoencoder(book, config, generator=torch.Generator().manual_seed(seed), callback=records.append)
+        for seed in (1, 1, 2)
+    ]
+    assert torch.equal(torch.rand(1), expected)
+    assert torch.equal(fits[0].latents, fits[1].latents)
+    assert not torch.equal(fits[0].latents, fits[2].latents)
+    assert [row["step"] for row in fits[0].history] == [4, 8, 10]
+    assert records == fits[0].history + fits[1].history + fits[2].history
+
+
+def test_results_carry_no_graph_and_the_codebook_is_unchanged(fitted):
+    book, fit = fitted
+    assert torch.equal(book.codewords, realistic_codebook().codewords)
+    assert not any(t.requires_grad for t in fit.autoencoder.to_tensors().values())
+    assert not fit.latents.requires_grad
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"latent": 0}, r"latent: expected a number in \[1, inf\), got 0"),
+        ({"steps": 0}, r"steps: expected a number in \[1, inf\), got 0"),
+        ({"encoder": (8, 0)}, r"encoder\[1\]: expected a number in \[1, inf\), got 0"),
+        ({"decoder": (-1,)}, r"decoder\[0\]: expected a number in \[1, inf\), got -1"),
+        ({"learning_rate": float("nan")}, r"learning_rate: expected a number in \(0, inf\), got nan"),
+        ({"weight_decay": -1.0}, r"weight_decay: expected a number in \[0, inf\), got -1.0"),
+    ],
+)
+def test_bad_config(values, message):
+    with pytest.raises(ValueError, match=message):
+        AutoencoderConfig(**values)

@@ -1,0 +1,215 @@
+import math
+
+import oracles_quant as oracle
+import pytest
+import torch
+
+from kfgs.quant import Codebook, CodebookConfig, fit_codebook
+
+
+class Lazy:
+    """Length and item only; the most maps alive at a time would show in `reads` of one pass."""
+
+    def __init__(self, maps):
+        self.maps, self.reads = maps, []
+
+    def __len__(self):
+        return len(self.maps)
+
+    def __getitem__(self, i):
+        self.reads.append(i)
+        return self.maps[i].clone()
+
+
+def scene(classes=6, images=5, size=(9, 12), dim=24, noise=0.05, seed=0):
+    """Maps of a few classes in patches, with noise, of LSeg-like length 11; image i lacks the classes above i + 2."""
+    generator = torch.Generator().manual_seed(seed)
+    centres = torch.nn.functional.normalize(torch.randn(classes, dim, generator=generator), dim=1)
+    maps, labels = [], []
+    for i in range(images):
+        label = torch.randint(0, min(classes, i + 3), (size[0] // 3, size[1] // 3), generator=generator)
+        label = label.repeat_interleave(3, 0).repeat_interleave(3, 1)
+        pixel = centres[label] + noise * torch.randn(*label.shape, dim, generator=generator) / dim**0.5 * 4
+        maps.append(11 * pixel)
+        labels.append(label)
+    return maps, labels, centres
+
+
+def test_finds_the_classes_of_a_clean_scene_though_the_first_image_lacks_some():
+    maps, labels, centres = scene()
+    fit = fit_codebook(maps, CodebookConfig(initial=2, epochs=6))
+    assert fit.codebook.size == 6
+    assert fit.coverage == 1.0
+    assert fit.history[0]["added"] == 4
+    name = fit.codebook.quantize(centres)  # codeword of each class
+    assert sorted(name.tolist()) == list(range(6))
+    for feature_map, label in zip(maps, labels, strict=True):
+        assert torch.equal(fit.codebook.quantize(feature_map), name[label])
+    assert fit.usage.tolist() == [sum(int((name[lab] == e).sum()) for lab in labels) for e in range(6)]
+
+
+def test_superfluous_codewords_are_pruned():
+    maps, *_ = scene(classes=3, noise=0.004)
+    fit = fit_codebook(maps, CodebookConfig(initial=8, epochs=1))  # 8 codewords for 3 classes
+    assert fit.codebook.size == 3
+    assert fit.history[0]["pruned"] == 8 + fit.history[0]["added"] - 3
+
+
+def test_one_step_is_the_paper_written_out():
+    """Initialisation, Eq. 8, Eq. 5-6 and Adam's first step (lr times the sign of the gradient) on one image."""
+    generator = torch.Generator().manual_seed(3)
+    feature_map = torch.randn(4, 5, 6, generator=generator, dtype=torch.float64)
+    config = CodebookConfig(initial=3, maximum=7, expand_below=0.4, epochs=1, learning_rate=1e-5)
+    fit = fit_codebook([feature_map], config)
+    features = feature_map.reshape(-1, 6).numpy()
+    start = features[oracle.farthest_points(features, 3)]
+    joined = oracle.expand(start, features, 0.4, 7)
+    book = torch.from_numpy(features[oracle.farthest_points(features, 3) + joined])
+    index = oracle.quantize(features, book.numpy())
+    record = fit.history[0]
+    assert (record["added"], record["size"], record["pruned"]) == (len(joined), len(book), 0)
+    assert record["loss"] == pytest.approx(oracle.balanced_loss(features, book.numpy(), index))
+    before = [oracle.cosine(f, start[t]) for f, t in zip(features, oracle.quantize(features, start), strict=True)]
+    assert record["mean_similarity"] == pytest.approx(sum(before) / 20)
+    assert record["coverage"] == sum(s >= 0.4 for s in before) / 20
+    moved = (fit.codebook.codewords - book).abs()
+    # A codeword that stands for itself alone already has the direction of its only feature.
+    used = torch.tensor([int((index == e).sum()) > 1 for e in range(len(book))])
+    assert used.any()
+    torch.testing.assert_close(moved[used], torch.full_like(moved[used], 1e-5), rtol=1e-3, atol=0)
+    assert oracle.balanced_loss(features, fit.codebook.codewords.numpy(), index) < record["loss"]
+
+
+def test_same_generator_state_same_bits_and_order_is_random():
+    maps, *_ = scene(noise=0.3)
+    config = CodebookConfig(maximum=20, epochs=2)
+    runs = []
+    for seed in (1, 1, 2):
+        lazy = Lazy(maps)
+        fit = fit_codebook(lazy, config, generator=torch.Generator().manual_seed(seed))
+        runs.append((fit.codebook.codewords, fit.history, lazy.reads))
+    assert torch.equal(runs[0][0], runs[1][0])
+    assert runs[0][1:] == runs[1][1:]
+    assert runs[0][2] != runs[2][2]
+    first, one, two, final = [0], runs[0][2][1:6], runs[0][2][6:11], runs[0][2][11:]
+    assert (first, sorted(one), sorted(two), final) == ([0], list(range(5)), list(range(5)), list(range(5)))
+    assert one != two
+
+
+def test_the_global_generator_is_left_alone():
+    torch.manual_seed(0)
+    expected = torch.rand(1)
+    torch.manual_seed(0)
+    fit_codebook(scene()[0], CodebookConfig(epochs=1))
+    assert torch.equal(torch.rand(1), expected)
+
+
+@pytest.mark.parametrize("step_every", [1, 8])
+def test_never_more_than_the_maximum(step_every):
+    maps, *_ = scene(classes=12, noise=1.0)
+    sizes = []
+    config = CodebookConfig(initial=4, maximum=9, epochs=3, eager_epochs=1, step_every=step_every)
+    fit = fit_codebook(maps, config, callback=lambda record: sizes.append(record["size"]))
+    assert sizes == [record["size"] for record in fit.history]
+    assert max(sizes) == 9
+    assert fit.coverage < 1
+
+
+def test_loss_falls_and_codewords_move_towards_their_features():
+    maps, *_ = scene(classes=3, noise=0.1)
+    fit = fit_codebook(maps, CodebookConfig(initial=3, maximum=3, epochs=10, step_every=1, learning_rate=0.1))
+    assert fit.history[-1]["loss"] < 0.7 * fit.history[0]["loss"]
+    assert fit.mean_similarity > fit.history[0]["mean_similarity"]
+
+
+def test_final_numbers_are_those_of_the_final_codebook():
+    maps, *_ = scene(noise=0.4)
+    fit = fit_codebook(maps, CodebookConfig(maximum=10, epochs=2))
+    similarity = torch.cat([fit.codebook.nearest(m).similarity.flatten() for m in maps])
+    assert fit.coverage == pytest.approx((similarity >= 0.9).double().mean().item())
+    assert fit.mean_similarity == pytest.approx(similarity.double().mean().item())
+    assert int(fit.usage.sum()) == similarity.numel()
+
+
+def test_zero_features_are_left_out():
+    maps, *_ = scene(classes=3)
+    clean = fit_codebook(maps, CodebookConfig(initial=3, epochs=1))
+    maps_with_zeros = [torch.zeros(9, 12, 24), *(torch.cat([m, torch.zeros(2, 12, 24)]) for m in maps)]
+    fit = fit_codebook(maps_with_zeros, CodebookConfig(initial=3, epochs=1))
+    assert int(fit.usage.sum()) == int(clean.usage.sum()) == 5 * 9 * 12
+    assert fit.coverage == 1.0
+    assert fit.codebook.size == clean.codebook.size
+    assert all(math.isfinite(value) for value in fit.history[0].values())
+
+
+def test_half_precision_maps_are_computed_in_single():
+    maps = [m.half() for m in scene()[0]]
+    config = CodebookConfig(epochs=1)
+    half, single = fit_codebook(maps, config), fit_codebook([m.float() for m in maps], config)
+    assert torch.equal(half.codebook.codewords, single.codebook.codewords)
+
+
+def test_grid_is_used():
+    maps, *_ = scene()
+    fit = fit_codebook(maps, CodebookConfig(epochs=1, grid_step=(2, 3)))
+    assert int(fit.usage.sum()) == 5 * 4 * 4
+    assert int(fit_codebook(maps, CodebookConfig(epochs=1, samples=60)).usage.sum()) == 5 * 9 * 6
+
+
+def test_a_constant_scene_has_one_codeword():
+    fit = fit_codebook([torch.full((3, 4, 5), 2.0)] * 2, CodebookConfig(epochs=2))
+    assert isinstance(fit.codebook, Codebook)
+    assert fit.codebook.size == 1
+    assert fit.mean_similarity == pytest.approx(1.0)
+
+
+def test_defaults_are_the_papers():
+    config = CodebookConfig()
+    assert config == CodebookConfig.paper()
+    assert (config.initial, config.maximum, config.expand_below, config.prune_above) == (8, 100, 0.9, 0.99)
+    assert (config.epochs, config.learning_rate, config.eps) == (28, 8e-4, 1e-9)
+
+
+def test_progress_bar_is_shown_when_asked_for(capfd):
+    fit_codebook(scene()[0], CodebookConfig(epochs=1), progress=True)
+    assert "codebook" in capfd.readouterr().err
+    fit_codebook(scene()[0], CodebookConfig(epochs=1))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_bad_maps():
+    with pytest.raises(
+        ValueError, match=r"maps: expected at least one feature map, got none; encode the training images"
+    ):
+        fit_codebook([])
+    with pytest.raises(ValueError, match=r"maps: expected nonzero features, got 2 all-zero maps; check the teacher"):
+        fit_codebook([torch.zeros(2, 3, 4)] * 2)
+    with pytest.raises(ValueError, match=r"maps\[1\]: expected \[h, w, 4\], got \(2, 3, 5\)"):
+        fit_codebook([torch.ones(2, 3, 4), torch.ones(2, 3, 5)])
+    with pytest.raises(ValueError, match=r"maps\[0\]: expected \[h, w, D\], got \(3, 4\)"):
+        fit_codebook([torch.ones(3, 4)])
+    broken = torch.ones(2, 3, 4)
+    broken[1, 2, 3] = float("nan")
+    with pytest.raises(
+        ValueError, match=r"maps\[1\]: expected finite features, got NaN or infinity; encode that image"
+    ):
+        fit_codebook([torch.ones(2, 3, 4), broken])
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"initial": 0}, r"initial: expected a number in \[1, inf\), got 0"),
+        ({"maximum": 7}, r"maximum: expected a number in \[8, inf\), got 7"),
+        ({"expand_below": 1.5}, r"expand_below: expected a number in \[-1, 1\], got 1.5"),
+        ({"prune_above": 0.8}, r"prune_above: expected a number in \[0.9, 1\], got 0.8"),
+        ({"epochs": 0}, r"epochs: expected a number in \[1, inf\), got 0"),
+        ({"step_every": 0}, r"step_every: expected a number in \[1, inf\), got 0"),
+        ({"learning_rate": 0.0}, r"learning_rate: expected a number in \(0, inf\), got 0.0"),
+        ({"eps": -1.0}, r"eps: expected a number in \(0, inf\), got -1.0"),
+        ({"eager_epochs": -1}, r"eager_epochs: expected a number in \[0, inf\), got -1"),
+    ],
+)
+def test_bad_config(values, message):
+    with pytest.raises(ValueError, match=message):
+        CodebookConfig(**values)

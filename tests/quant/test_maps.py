@@ -1,0 +1,85 @@
+import numpy as np
+import pytest
+import torch
+
+from kfgs.quant import Codebook, IndexMaps, LatentMaps, quantize_maps
+
+
+class Lazy:
+    """Counts what is read, and has nothing of a sequence but length and item."""
+
+    def __init__(self, maps):
+        self.maps, self.reads = maps, 0
+
+    def __len__(self):
+        return len(self.maps)
+
+    def __getitem__(self, i):
+        self.reads += 1
+        return self.maps[i]
+
+
+def test_quantize_maps_reads_each_map_once_and_sizes_may_differ():
+    generator = torch.Generator().manual_seed(0)
+    maps = Lazy([torch.randn(h, w, 4, generator=generator) for h, w in ((3, 5), (2, 7))])
+    book = Codebook(torch.randn(6, 4, generator=generator))
+    index_maps = quantize_maps(maps, book)
+    assert maps.reads == len(index_maps) == 2
+    for found, feature_map in zip(index_maps, maps.maps, strict=True):
+        assert found.dtype == np.uint8
+        assert np.array_equal(found, book.quantize(feature_map).numpy())
+    assert index_maps.usage.tolist() == [sum(int((m == e).sum()) for m in index_maps) for e in range(6)]
+    assert index_maps.nbytes == 3 * 5 + 2 * 7
+
+
+@pytest.mark.parametrize(("size", "kind"), [(256, np.uint8), (257, np.uint16), (65_536, np.uint16)])
+def test_as_few_bytes_as_the_codebook_allows(size, kind):
+    index_maps = IndexMaps([np.array([[0, size - 1]])], size)
+    assert index_maps[0].dtype == kind
+    assert index_maps[0].tolist() == [[0, size - 1]]
+
+
+@pytest.mark.parametrize("size", [5, 300])
+def test_save_then_load_is_the_same(tmp_path, size):
+    index_maps = IndexMaps([np.full((2, 3), size - 1), np.zeros((4, 1), dtype=np.int64)], size)
+    index_maps.save(tmp_path / "maps.safetensors")
+    again = IndexMaps.load(tmp_path / "maps.safetensors")
+    assert again.size == size
+    assert [m.dtype for m in again] == [m.dtype for m in index_maps]
+    assert all(np.array_equal(a, b) for a, b in zip(again, index_maps, strict=True))
+
+
+def test_order_survives_more_than_ten_maps(tmp_path):
+    IndexMaps([np.array([[i]]) for i in range(12)], 12).save(tmp_path / "maps.safetensors")
+    assert [int(m[0, 0]) for m in IndexMaps.load(tmp_path / "maps.safetensors")] == list(range(12))
+
+
+def test_latent_maps_look_up_rows():
+    latents = torch.arange(6, dtype=torch.float32).reshape(3, 2)
+    maps = LatentMaps(IndexMaps([np.array([[2, 0], [1, 1]])], 3), latents)
+    assert maps[0].tolist() == [[[4.0, 5.0], [0.0, 1.0]], [[2.0, 3.0], [2.0, 3.0]]]
+    assert len(maps) == len(list(maps)) == 1
+    assert maps[-1].dtype == torch.float32
+    with pytest.raises(IndexError):
+        maps[1]
+
+
+def test_bad_input():
+    with pytest.raises(
+        ValueError, match=r"maps\[0\]: expected numbers from 0 to 2 \(size - 1\), got 0 to 3; quantise it"
+    ):
+        IndexMaps([np.array([[0, 3]])], 3)
+    with pytest.raises(ValueError, match=r"maps\[1\]: expected numbers from 0 to 2 \(size - 1\), got -1 to 0"):
+        IndexMaps([np.array([[0]]), np.array([[0, -1]])], 3)
+    with pytest.raises(ValueError, match=r"maps\[0\]: expected whole numbers, got float64; use Codebook.quantize"):
+        IndexMaps([np.zeros((2, 2))], 3)
+    with pytest.raises(ValueError, match=r"maps\[0\]: expected \[h, w\], got \(4,\)"):
+        IndexMaps([np.zeros(4, dtype=np.int64)], 3)
+    with pytest.raises(ValueError, match=r"size: expected 1 to 65536 codewords \(two bytes a pixel\), got 70000"):
+        IndexMaps([], 70_000)
+    with pytest.raises(ValueError, match=r"latents: expected \[K, d\] with K = 3 \(from index_maps\), got \(4, 2\)"):
+        LatentMaps(IndexMaps([], 3), torch.zeros(4, 2))
+    with pytest.raises(ValueError, match=r"maps\[0\]: expected \[h, w, 3\], got \(2, 2, 4\)"):
+        quantize_maps([torch.ones(2, 2, 4)], Codebook(torch.eye(3)))
+    with pytest.raises(FileNotFoundError, match=r"no such file; expected a kfgs index maps"):
+        IndexMaps.load("missing.safetensors")

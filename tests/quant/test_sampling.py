@@ -1,0 +1,74 @@
+import oracles_quant as oracle
+import pytest
+import torch
+
+from kfgs.quant import choose_grid_step, farthest_points, sample_grid
+
+
+def test_grid_of_the_paper_is_rows_1_2_columns_1_3():
+    feature_map = torch.arange(360 * 480, dtype=torch.float32).reshape(360, 480, 1)
+    samples = sample_grid(feature_map)
+    assert samples.shape == (28_800, 1)
+    assert torch.equal(samples, feature_map[1::2, 1::3].reshape(-1, 1))
+
+
+@pytest.mark.parametrize(
+    ("size", "samples", "step"),
+    [
+        ((90, 120), 28_800, (1, 1)),
+        ((360, 480), 100_000, (1, 2)),
+        ((360, 480), 43_200, (2, 2)),
+        ((1, 10), 3, (2, 3)),
+        ((1, 10), 2, (3, 4)),
+    ],
+)
+def test_step_is_the_finest_within_the_limit(size, samples, step):
+    assert choose_grid_step(*size, samples) == step
+    assert 1 <= len(sample_grid(torch.zeros(*size, 1), samples=samples)) <= samples
+
+
+def test_a_map_of_one_pixel_keeps_it_whatever_the_step():
+    assert sample_grid(torch.full((1, 1, 2), 3.0), (4, 5)).tolist() == [[3.0, 3.0]]
+
+
+def test_farthest_points_closed_form():
+    angles = torch.tensor([0.0, 10.0, 170.0, 90.0, 20.0]).deg2rad()
+    points = torch.stack([angles.cos(), angles.sin()], dim=1) * torch.tensor([[1.0], [9.0], [2.0], [0.1], [5.0]])
+    # 0 and 170 degrees are the least similar pair; then 90 (80 away from both sides), then 20.
+    assert farthest_points(points, 4).tolist() == [0, 2, 3, 4]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("block", [1, 5, 64])
+def test_farthest_points_against_loops(seed, block):
+    generator = torch.Generator().manual_seed(seed)
+    features = torch.randn(17, 4, generator=generator, dtype=torch.float64)
+    assert farthest_points(features, 6, block=block).tolist() == oracle.farthest_points(features.numpy(), 6)
+
+
+def test_zero_rows_are_never_picked():
+    features = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0], [0.0, 1.0]])
+    assert farthest_points(features, 8).tolist() == [1, 3]
+    assert farthest_points(features[:3], 8).tolist() == [1]
+
+
+def test_first_pair_tie_goes_to_lowest_rows_and_equal_rows_are_picked_once_each():
+    axes = torch.eye(3)[[0, 1, 2, 0]]  # all pairs but (0, 3) are equally dissimilar
+    assert farthest_points(axes, 4, block=2).tolist() == [0, 1, 2, 3]
+
+
+def test_one_point_is_the_earlier_of_the_least_similar_pair():
+    assert farthest_points(torch.tensor([[1.0, 0.0], [1.0, 1.0], [-1.0, 0.5]]), 1).tolist() == [0]
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match=r"features: expected a nonzero row, got 3 all-zero rows; check the teacher"):
+        farthest_points(torch.zeros(3, 2), 2)
+    with pytest.raises(ValueError, match=r"count: expected a number in \[1, inf\), got 0"):
+        farthest_points(torch.ones(3, 2), 0)
+    with pytest.raises(ValueError, match=r"feature_map: expected \[h, w, D\], got \(3, 2\)"):
+        sample_grid(torch.zeros(3, 2))
+    with pytest.raises(ValueError, match=r"step\[1\]: expected a number in \[1, inf\), got 0"):
+        sample_grid(torch.zeros(3, 2, 1), (1, 0))
+    with pytest.raises(ValueError, match=r"samples: expected a number in \[1, inf\), got 0"):
+        choose_grid_step(3, 3, 0)
