@@ -122,6 +122,30 @@ def test_run_holds_every_touched_pixel_and_little_more(dtype):
     assert wasted <= 0.05 * touched
 
 
+def test_no_pixel_outside_of_the_run_is_drawn_however_it_rounds():
+    """Every Gaussian has alpha on 1/255, but for rounding, at the centre of pixel (20, 20), where its tip is."""
+    M = 20_000
+    projected = _needles(M, 40, 40, torch.float64, seed=8)
+    a, b, c = projected.conics.float().double().unbind(1)
+    g = torch.Generator().manual_seed(2)
+    length = 3.2 * torch.rand(M, generator=g)
+    along = torch.linalg.eigh(torch.stack([a, b, b, c], dim=1).view(M, 2, 2)).eigenvectors[..., 0]
+    size = (a * along[:, 0] ** 2 + 2 * b * along.prod(dim=1) + c * along[:, 1] ** 2).sqrt()
+    means2d = (20.5 + along * (length / size)[:, None]).float()
+    dx, dy = (20.5 - means2d.double()).unbind(1)
+    opacities = torch.exp((a * dx * dx + 2 * b * dx * dy + c * dy * dy) / 2) / 255
+    numbers = numba_cpu._splats(means2d, projected.conics.float(), opacities.float(), torch.ones(M, 1))
+    state, weights = np.empty(cells.STATE, np.float32), np.empty(cells.CHUNK * cells.PIXELS, np.float32)
+    inside = np.arange(cells.PIXELS)
+    for row in range(M):
+        start, stop = cells.find_run(numbers.ellipses, row, 16, 16, cells.CELL_HEIGHT, numbers.slack)
+        cells.start_cell(state, 16, 16, 40, 40)
+        splat = (*numbers.means2d[row], *numbers.conics[row], numbers.opacities[row])
+        cells.weigh(state, weights, weights.copy(), 0, (0, cells.PIXELS), splat)
+        drawn = weights[: cells.PIXELS] > 0
+        assert not drawn[(inside < start) | (inside >= stop)].any(), f"Gaussian {row}"
+
+
 def test_broken_gaussian_touches_nothing():
     projected, features = random_splats(20, 21, 19, seed=5)
     expected = _composite(projected, features, 21, 19)
@@ -192,6 +216,25 @@ def test_gradcheck(tile_size, channels):
     assert torch.autograd.gradcheck(
         lambda *v: numba_cpu.composite(*v[:4], tiles, v[4]), inputs, eps=1e-7, atol=1e-5, rtol=1e-4
     )
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_clamped_and_skipped_gaussians_have_no_shape_gradient(dtype):
+    """Flat over the tile: the first is clamped to 0.99, the second drawn, the third too faint, the fourth stopped."""
+    means2d, conics = torch.full((4, 2), 8.0, dtype=dtype), torch.tensor([[1e-13, 0, 1e-13]], dtype=dtype).repeat(4, 1)
+    opacities = torch.tensor([0.995, 0.5, 0.003, 0.98999], dtype=dtype)
+    features = torch.tensor([[2.0], [3.0], [5.0], [7.0]], dtype=dtype)
+    tiles = Tiles(torch.arange(4, dtype=torch.int32), torch.tensor([0, 4]), 16, 16, 16)
+    leaves = [v.requires_grad_() for v in (means2d, conics, opacities, features)]
+    maps, alphas = numba_cpu.composite(*leaves, tiles, None)
+    grads = torch.autograd.grad(maps.sum() + 10 * alphas.sum(), leaves)
+    torch.testing.assert_close(grads[2][[0, 2, 3]], torch.zeros(3, dtype=dtype), rtol=0, atol=0)
+    assert (grads[0][[0, 2, 3]] == 0).all()
+    assert (grads[1][[0, 2, 3]] == 0).all()
+    # the second: 256 pixels times T = 0.01 times (its feature + 10)
+    torch.testing.assert_close(grads[2][1].item(), 256 * 0.01 * 13, rtol=1e-4, atol=0)
+    expected = 256 * torch.tensor([[0.99], [0.005], [0], [0]], dtype=dtype)
+    torch.testing.assert_close(grads[3], expected, rtol=1e-4, atol=0)
 
 
 # threads --------------------------------------------------------------------------------------------------------------
