@@ -26,8 +26,8 @@ class Autoencoder:
     each row is treated alone: the latent of a codeword does not depend on what else is in the batch, and there is no
     training mode to forget.
 
-    **Convention**: a latent has unit length and is then mapped from [low, high] to [0, 1], the same for all channels. (A
-    single channel keeps its length: a unit scalar would only say -1 or 1, and have no gradient to learn from.)
+    **Convention**: a latent has unit length and is then mapped from [low, high] to [0, 1], the same for all channels.
+    (A single channel keeps its length: a unit scalar would only say -1 or 1, and have no gradient to learn from.)
     """
 
     encoder: tuple[Layer, ...]

@@ -20,7 +20,7 @@ NORM_EPS = 1e-5  # added to the variance in batch normalisation, torch's default
 
 @dataclass(frozen=True)
 class AutoencoderConfig:
-    """How the autoencoder is built and trained; the defaults are the paper's, or its script's where the paper is silent."""
+    """How the autoencoder is built and trained; defaults are the paper's, or its script's where the paper is silent."""
 
     latent: int = 9
     """Channels of a latent (d)."""

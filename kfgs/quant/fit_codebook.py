@@ -83,7 +83,8 @@ class CodebookFit:
     usage: Tensor  # [K] int64
     """Sampled features of each codeword of the final codebook; unused codewords are kept, as in the paper."""
     coverage: float
-    """Share of the sampled features whose similarity to their final codeword is at least alpha."""
+    """Share of the sampled features whose similarity to their final codeword is at least alpha. Low with a codebook of
+    K_max codewords: the teacher's features scatter by more than alpha allows, so lower `expand_below` (or raise K_max)."""
     mean_similarity: float
     """Mean similarity of the sampled features to their final codeword."""
 

@@ -12,8 +12,8 @@ class RowAdam:
     """Adam (Kingma & Ba 2015) that keeps a moment and a step count for each row.
 
     torch.optim.Adam counts steps for the whole matrix, so a row that joins late would start with wrongly corrected
-    moments and a jump of about three learning rates; and a changed number of rows would lose all moments. For rows that are
-    there from the start the two agree.
+    moments and a jump of about three learning rates; and a changed number of rows would lose all moments. For rows that
+    are there from the start the two agree.
     """
 
     def __init__(self, rows: Tensor, *, learning_rate: float, eps: float) -> None:

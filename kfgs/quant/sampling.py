@@ -76,8 +76,8 @@ def farthest_points(
         ValueError: if `features` is not [n, D], `count` is below 1, or every row is zero.
 
     Note:
-        Ties go to the lowest row number. A feature may be picked although an equal one already was, when nothing else is
-        left; pruning (Eq. 9) takes it out again.
+        Ties go to the lowest row number. A feature may be picked although an equal one already was, when nothing else
+        is left; pruning (Eq. 9) takes it out again.
     """
     check_shapes(("features", features, "n D"))
     check_range("count", count, 1)

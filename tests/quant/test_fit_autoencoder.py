@@ -9,7 +9,7 @@ SHORT = AutoencoderConfig(encoder=(64, 32), decoder=(32, 128), steps=600, learni
 
 
 def realistic_codebook(groups=12, each=4, dim=96, seed=0):
-    """Groups of codewords whose cosines are about 0.95 inside a group, lengths about 11, as a fitted codebook has them."""
+    """Groups of codewords with cosines of about 0.95 inside a group and lengths about 11, as a fitted codebook has."""
     generator = torch.Generator().manual_seed(seed)
     centres = torch.nn.functional.normalize(torch.randn(groups, dim, generator=generator), dim=1)
     spread = 0.23 * torch.randn(groups, each, dim, generator=generator) / dim**0.5
@@ -39,7 +39,7 @@ def test_frozen_network_is_what_training_saw_last(fitted):
 
 
 def test_folding_normalisation_is_exact():
-    """Full-batch normalisation and the folded encoder agree, so freezing loses nothing (it would with running statistics)."""
+    """Full-batch normalisation and the folded encoder agree; with running statistics they would not."""
     book = Codebook(realistic_codebook(4, 3, 20).codewords.double())
     config = AutoencoderConfig(latent=3, encoder=(16, 8), decoder=(8,), steps=1, learning_rate=1e-30, weight_decay=0)
     fit = fit_autoencoder(book, config, generator=torch.Generator().manual_seed(4))

@@ -26,7 +26,7 @@ def test_agrees_with_torch_when_rows_stay():
 
 
 def test_each_row_runs_as_if_it_were_alone():
-    """Rows 0 and 2 stay for 20 steps, row 1 leaves after 8, and a new row joins then: each is torch's Adam on its own."""
+    """Rows 0 and 2 stay for 20 steps, row 1 leaves after 8 and a new row joins: each is torch's Adam on its own."""
     steps = gradients(20, 4, 5)
     rows = torch.arange(20, dtype=torch.float64).reshape(4, 5)
     adam = RowAdam(rows[:3], learning_rate=8e-4, eps=1e-9)
