@@ -42,7 +42,7 @@ _WHERE = {
     "load_label_set": ".evaluation",
 }
 __version__ = "0.1.0"
-__all__ = sorted(_WHERE)  # noqa: PLE0605 - the table is the list
+__all__ = sorted(_WHERE)
 
 if TYPE_CHECKING:
     from .cameras import Camera as Camera

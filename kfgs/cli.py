@@ -17,6 +17,7 @@ import tyro
 
 SceneFolder = Annotated[Path, tyro.conf.Positional]
 Preset = Literal["cpu", "paper"]
+Mode = Literal["decouple", "adc", "adc+sc"]
 
 
 def _say(text: str) -> None:
@@ -29,7 +30,7 @@ def _wrote(paths: list[Path]) -> None:
         _say(f"  {path}" + (f"  ({sum(1 for p in path.iterdir())} files)" if path.is_dir() else ""))
 
 
-def _fit_config(preset: Preset, mode: str, seed: int, steps: int | None, max_gaussians: int | None, split: str) -> Any:
+def _fit_config(preset: Preset, mode: Mode, seed: int, steps: int | None, max_gaussians: int | None, split: str) -> Any:
     from .pipeline import FitConfig
 
     config = FitConfig.cpu() if preset == "cpu" else FitConfig.paper()
@@ -95,7 +96,7 @@ def fit(
     features: Path,
     out: Path,
     preset: Preset = "cpu",
-    mode: Literal["decouple", "adc", "adc+sc"] = "adc+sc",
+    mode: Mode = "adc+sc",
     split: str = "train",
     seed: int = 0,
     steps: int | None = None,
@@ -157,9 +158,7 @@ def segment(
 
     loaded, label_set = load_scene(scene).undistorted(), _classes(scene, classes, text)
     field_ = SemanticField.load(field)
-    found = segment_scene(
-        field_, loaded, label_set, out, split=split, decode=decode, pictures=pictures, progress=True
-    )
+    found = segment_scene(field_, loaded, label_set, out, split=split, decode=decode, pictures=pictures, progress=True)
     written = [path for path in (out / "labels", out / "overlay", out / "features") if path.is_dir()]
     truth = labels or next((scene / name for name in ("labels_scored", "labels") if (scene / name).is_dir()), None)
     if truth is not None:
@@ -227,7 +226,7 @@ def info(path: Annotated[Path, tyro.conf.Positional]) -> None:
     _say(describe(path))
 
 
-COMMANDS = {"demo": demo, "sfm": sfm, "fit": fit, "segment": segment, "label": label, "info": info}
+COMMANDS: dict[str, Any] = {"demo": demo, "sfm": sfm, "fit": fit, "segment": segment, "label": label, "info": info}
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -47,7 +47,9 @@ def load_label_set(classes: str | Path, embeddings: str | Path) -> LabelSet:
     """
     names = read_json(classes)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or not names:
-        raise ValueError(f'{classes}: expected a JSON list of class names like ["wall", "floor"], got {type(names).__name__}')
+        raise ValueError(
+            f'{classes}: expected a JSON list of class names like ["wall", "floor"], got {type(names).__name__}'
+        )
     path = Path(embeddings)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected an .npy file with one embedding row per class")

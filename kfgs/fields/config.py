@@ -110,6 +110,12 @@ class FieldConfig:
         )
         return replace(preset, **changes)
 
+    def with_steps(self, steps: int) -> FieldConfig:
+        """The same schedule stretched or compressed to another number of steps; `densify_every` stays."""
+        ratio = steps / self.steps
+        names = ("densify_from", "densify_until", "reset_every")
+        return replace(self, steps=steps, **{name: round(getattr(self, name) * ratio) for name in names})
+
 
 def _check_count(name: str, value: object, low: int) -> None:
     if isinstance(value, bool) or not isinstance(value, int) or value < low:

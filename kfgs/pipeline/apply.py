@@ -73,7 +73,11 @@ def segment_scene(
     """
     out = Path(out)
     views = scene.splits[split]
-    shown = {views[i] for i in np.linspace(0, len(views) - 1, min(pictures, len(views))).round().astype(int)} if views else set()
+    shown = (
+        {views[i] for i in np.linspace(0, len(views) - 1, min(pictures, len(views))).round().astype(int)}
+        if views
+        else set()
+    )
     colors = feature_colors(field)
     results: dict[str, Tensor] = {}
     for i in tqdm(views, desc="segment", unit="view", disable=not progress):

@@ -71,11 +71,12 @@ class FitConfig:
 class Maps(Protocol):
     """Teacher maps on disk, one file per view, read when asked for."""
 
-    paths: Sequence[Path]
+    @property
+    def files(self) -> Sequence[Path]: ...
 
     def __len__(self) -> int: ...
 
-    def __getitem__(self, i: int) -> Tensor:  # [h, w, D]
+    def __getitem__(self, i: int, /) -> Tensor:  # [h, w, D]
         ...
 
 
@@ -128,7 +129,7 @@ def _codebook_stage(run: Run, maps: Maps, config: FitConfig, options: dict[str, 
         save_file({"codewords": fit.codebook.codewords.contiguous()}, folder / "codebook.safetensors")
         write_json(folder / "history.json", fit.history)
 
-    inputs = {"features": run.digests(maps.paths), "config": asdict(config.codebook), "seed": config.seed}
+    inputs = {"features": run.digests(maps.files), "config": asdict(config.codebook), "seed": config.seed}
     stage = run.stage("codebook", inputs, make)
     return Codebook(load_file(stage.folder / "codebook.safetensors")["codewords"]), stage
 
@@ -137,7 +138,7 @@ def _index_stage(run: Run, maps: Maps, codebook: Codebook, upstream: Stage, prog
     """Quantisation, Eq. 5: the index map M of every view."""
     stage = run.stage(
         "index_maps",
-        {"features": run.digests(maps.paths), "codebook": upstream.key},
+        {"features": run.digests(maps.files), "codebook": upstream.key},
         lambda folder: quantize_maps(maps, codebook, progress=progress).save(folder / "index_maps.safetensors"),
     )
     return IndexMaps.load(stage.folder / "index_maps.safetensors"), stage
@@ -185,7 +186,9 @@ def _field_stage(
             checkpoint=scratch,
             **options,
         )
-        save_file({name: value.contiguous() for name, value in fit.params.to_tensors().items()}, folder / "params.safetensors")
+        save_file(
+            {name: value.contiguous() for name, value in fit.params.to_tensors().items()}, folder / "params.safetensors"
+        )
         write_json(folder / "history.json", fit.history)
 
     stage = run.stage("field", inputs, make)
@@ -232,7 +235,7 @@ def fit_scene(
     codebook, autoencoder = None, None
     targets: Sequence[Tensor] = maps  # type: ignore[assignment]
     if config.mode == "decouple":
-        inputs: dict[str, Any] = {"mode": config.mode, "features": run.digests(maps.paths)}
+        inputs: dict[str, Any] = {"mode": config.mode, "features": run.digests(maps.files)}
     else:
         codebook, made = _codebook_stage(run, maps, config, options)
         index_maps, indexed = _index_stage(run, maps, codebook, made, progress)

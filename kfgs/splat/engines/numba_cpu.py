@@ -91,13 +91,16 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 
 def _splats(means2d: Tensor, conics: Tensor, opacities: Tensor, features: Tensor) -> Splats:
-    means, (a, b, c) = means2d.detach().double(), conics.detach().double().unbind(1)
-    reach = 2 * torch.log(opacities.detach().double() / ALPHA_MIN)
-    determinant = torch.where((a > 0) & (c > 0), a * c - b * b, 0)
-    lean = -b / (a * determinant).sqrt()
-    ellipses = torch.stack([*means.unbind(1), a, b, c, reach, determinant, lean], dim=1)  # see `find_run`
-    arrays = (_array(value) for value in (means2d, conics, opacities, features, ellipses))
-    return Splats(*arrays, slack=8 * torch.finfo(means2d.dtype).eps)
+    """The Gaussians as arrays, with what `find_run` wants to know about their ellipses."""
+    x, y = _array(means2d).astype(np.float64).T
+    a, b, c = _array(conics).astype(np.float64).T
+    with np.errstate(all="ignore"):  # what is no ellipse, or too faint, comes out as NaN, -inf or not positive
+        reach = 2 * np.log(_array(opacities).astype(np.float64) / ALPHA_MIN)
+        determinant = np.where((a > 0) & (c > 0), a * c - b * b, 0)
+        lean = -b / np.sqrt(a * determinant)
+    ellipses = np.stack([x, y, a, b, c, reach, determinant, lean], axis=1)
+    slack = 8 * torch.finfo(means2d.dtype).eps
+    return Splats(_array(means2d), _array(conics), _array(opacities), _array(features), ellipses, slack)
 
 
 def _grid(tiles: Tiles) -> Grid:
