@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import torch
 from torch import Tensor
 
 from ..cameras import resize_map
@@ -20,7 +21,10 @@ def l1_loss(
     """Eq. 4: the rendered map F_r, resized bilinearly to the target's size, against the latent map F_l.
 
     The mean of the absolute differences over pixels and channels: the paper writes a norm, its released script takes
-    the mean, and the learning rates and the densification threshold of 3DGS are made for a mean.
+    the mean, and the learning rates and the densification threshold of 3DGS are made for a mean. Pixels whose target is
+    NaN are not known and count nowhere.
     """
-    height, width, _ = target.shape
-    return (resize_map(rendered, (height, width)) - target).abs().mean()
+    height, width, channels = target.shape
+    known = ~target[..., 0].isnan()
+    difference = torch.where(known[..., None], resize_map(rendered, (height, width)) - target, 0)
+    return difference.abs().sum() / (known.sum() * channels).clamp_min(1)

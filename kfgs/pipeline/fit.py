@@ -13,14 +13,14 @@ from dataclasses import asdict, dataclass
 from dataclasses import field as default
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from .._check import check_choice
-from .._files import read_json, write_json
+from .._files import digest_value, read_json, write_json
 from ..fields import FieldConfig, GaussianParams, SemanticField, fit_field
 from ..quant import (
     Autoencoder,
@@ -34,6 +34,7 @@ from ..quant import (
     quantize_maps,
 )
 from ..scenes import Scene
+from .maps import KnownFeatures, Maps, UndistortedMaps
 from .stages import Run, Stage
 
 Mode = Literal["decouple", "adc", "adc+sc"]
@@ -50,6 +51,8 @@ class FitConfig:
     """Every random choice of the run follows from it."""
     split: str = "train"
     """Which views of the scene are learnt from."""
+    undistorted_features: bool = False
+    """Whether the teacher saw undistorted pictures; otherwise the lens is removed from its maps as from the pictures."""
     codebook: CodebookConfig = default(default_factory=CodebookConfig)
     autoencoder: AutoencoderConfig = default(default_factory=AutoencoderConfig)
     field: FieldConfig = default(default_factory=FieldConfig)
@@ -66,18 +69,6 @@ class FitConfig:
     def cpu() -> FitConfig:
         """A schedule for two CPU cores: the same method, fewer steps. Minutes instead of hours."""
         return FitConfig(codebook=CodebookConfig.cpu(), field=FieldConfig.cpu())
-
-
-class Maps(Protocol):
-    """Teacher maps on disk, one file per view, read when asked for."""
-
-    @property
-    def files(self) -> Sequence[Path]: ...
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, i: int, /) -> Tensor:  # [h, w, D]
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +112,17 @@ def _scene_digest(scene: Scene, views: Sequence[int]) -> str:
     return _tensor_digest(poses, intrinsics, sizes, scene.points)
 
 
-def _codebook_stage(run: Run, maps: Maps, config: FitConfig, options: dict[str, Any]) -> tuple[Codebook, Stage]:
+def _lens_digest(maps: Maps) -> str | None:
+    if not isinstance(maps, UndistortedMaps):
+        return None
+    return digest_value(
+        [[lens.K.tolist(), asdict(lens.distortion) if lens.distortion else None] for lens in maps.lenses]
+    )
+
+
+def _codebook_stage(
+    run: Run, maps: Maps, features: dict[str, Any], config: FitConfig, options: dict[str, Any]
+) -> tuple[Codebook, Stage]:
     """Adaptive Data Compression, Sec. 3.3.1: the codebook S."""
 
     def make(folder: Path) -> None:
@@ -129,16 +130,18 @@ def _codebook_stage(run: Run, maps: Maps, config: FitConfig, options: dict[str, 
         save_file({"codewords": fit.codebook.codewords.contiguous()}, folder / "codebook.safetensors")
         write_json(folder / "history.json", fit.history)
 
-    inputs = {"features": run.digests(maps.files), "config": asdict(config.codebook), "seed": config.seed}
+    inputs = {"features": features, "config": asdict(config.codebook), "seed": config.seed}
     stage = run.stage("codebook", inputs, make)
     return Codebook(load_file(stage.folder / "codebook.safetensors")["codewords"]), stage
 
 
-def _index_stage(run: Run, maps: Maps, codebook: Codebook, upstream: Stage, progress: bool) -> tuple[IndexMaps, Stage]:
+def _index_stage(
+    run: Run, maps: Maps, features: dict[str, Any], codebook: Codebook, upstream: Stage, progress: bool
+) -> tuple[IndexMaps, Stage]:
     """Quantisation, Eq. 5: the index map M of every view."""
     stage = run.stage(
         "index_maps",
-        {"features": run.digests(maps.files), "codebook": upstream.key},
+        {"features": features, "codebook": upstream.key},
         lambda folder: quantize_maps(maps, codebook, progress=progress).save(folder / "index_maps.safetensors"),
     )
     return IndexMaps.load(stage.folder / "index_maps.safetensors"), stage
@@ -233,12 +236,16 @@ def fit_scene(
     run = Run(Path(folder), report)
     options: dict[str, Any] = {"progress": progress, "callback": callback}
     codebook, autoencoder = None, None
-    targets: Sequence[Tensor] = maps  # type: ignore[assignment]
+    lenses = [] if scene.lenses is None else [scene.lenses[i] for i in views]
+    if lenses and not config.undistorted_features:
+        maps = UndistortedMaps(maps, lenses)
+    targets: Sequence[Tensor] = KnownFeatures(maps)
+    features = {"files": run.digests(maps.files), "lenses": _lens_digest(maps)}
     if config.mode == "decouple":
-        inputs: dict[str, Any] = {"mode": config.mode, "features": run.digests(maps.files)}
+        inputs: dict[str, Any] = {"mode": config.mode, "features": features}
     else:
-        codebook, made = _codebook_stage(run, maps, config, options)
-        index_maps, indexed = _index_stage(run, maps, codebook, made, progress)
+        codebook, made = _codebook_stage(run, maps, features, config, options)
+        index_maps, indexed = _index_stage(run, maps, features, codebook, made, progress)
         inputs = {"mode": config.mode, "index_maps": indexed.key}
         targets = LatentMaps(index_maps, codebook.codewords)
         if config.mode == "adc+sc":

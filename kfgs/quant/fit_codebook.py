@@ -33,6 +33,9 @@ class CodebookConfig:
     """Most codewords (K_max)."""
     expand_below: float = 0.9
     """A feature joins the codebook when its similarity to its codeword is below this (alpha, Eq. 8)."""
+    joins_per_image: int | None = None
+    """Most features of one image that join in one visit, the least similar first. None shares the free slots among the
+    images, so that the first ones seen do not fill the codebook; the paper leaves the size of its batches open."""
     prune_above: float = 0.99
     """The later of two codewords is dropped when their similarity is above this (beta, Eq. 9)."""
     epochs: int = 28
@@ -53,6 +56,8 @@ class CodebookConfig:
     def __post_init__(self) -> None:
         for name in ("initial", "epochs", "step_every", "samples"):
             check_range(name, getattr(self, name), 1)
+        if self.joins_per_image is not None:
+            check_range("joins_per_image", self.joins_per_image, 1)
         check_range("maximum", self.maximum, self.initial)
         check_range("eager_epochs", self.eager_epochs, 0)
         check_range("expand_below", self.expand_below, -1, 1)
@@ -122,7 +127,7 @@ def fit_codebook(
     if len(maps) == 0:
         raise ValueError("maps: expected at least one feature map, got none; encode the training images first")
     generator = torch.Generator().manual_seed(0) if generator is None else generator
-    book = _EvolvingCodebook(_first_codewords(maps, config), config)
+    book = _EvolvingCodebook(_first_codewords(maps, config), config, images=len(maps))
     history: list[dict[str, Any]] = []
     with tqdm(total=(config.epochs + 1) * len(maps), desc="codebook", disable=not progress) as bar:
         for epoch in range(config.epochs):
@@ -151,8 +156,9 @@ def fit_codebook(
 class _EvolvingCodebook:
     """Codewords, their optimiser, and the gradients gathered since the last step, which grow and shrink together."""
 
-    def __init__(self, codewords: Tensor, config: CodebookConfig) -> None:
+    def __init__(self, codewords: Tensor, config: CodebookConfig, *, images: int) -> None:
         self.config = config
+        self.joins = config.joins_per_image or -(-(config.maximum - config.initial) // images) or 1
         self.adam = RowAdam(codewords, learning_rate=config.learning_rate, eps=config.eps)
         self.gradient, self.gathered = torch.zeros_like(codewords), 0
 
@@ -170,7 +176,7 @@ class _EvolvingCodebook:
             return
         index, similarity = Codebook(self.adam.rows).nearest(features)
         tally.see(similarity)
-        room = self.config.maximum - self.size
+        room = min(self.joins, self.config.maximum - self.size)
         joining = features[admit(features, similarity, threshold=self.config.expand_below, room=room)]
         if joining.shape[0] > 0:
             newest = Codebook(joining).nearest(features)

@@ -29,29 +29,30 @@ class FeatureMaps(Protocol):
 class IndexMaps(Sequence[NDArray[Any]]):
     """The index maps M of Eq. 5: one [h, w] array of codeword numbers per image, one or two bytes per pixel.
 
-    uint8 up to 256 codewords, uint16 up to 65,536. Sizes may differ between images.
+    The number K itself marks a hole: a pixel whose feature was all-zero, about which nothing is known. uint8 up to 255
+    codewords, uint16 up to 65,535. Sizes may differ between images.
 
     Args:
-        maps: whole numbers in [0, size), one [h, w] array per image.
+        maps: whole numbers in [0, size], one [h, w] array per image.
         size: number of codewords, K.
 
     Raises:
-        ValueError: if a map is not [h, w], or holds anything but numbers of codewords.
+        ValueError: if a map is not [h, w], or holds anything but numbers of codewords and holes.
     """
 
     def __init__(self, maps: Sequence[NDArray[Any]], size: int) -> None:
-        if not 1 <= size <= 65_536:
-            raise ValueError(f"size: expected 1 to 65536 codewords (two bytes a pixel), got {size}; lower K_max")
-        kind = np.uint8 if size <= 256 else np.uint16
+        if not 1 <= size <= 65_535:
+            raise ValueError(f"size: expected 1 to 65535 codewords (two bytes a pixel), got {size}; lower K_max")
+        kind = np.uint8 if size <= 255 else np.uint16
         self.size = size
         self._maps: list[NDArray[Any]] = []
         for i, indices in enumerate(maps):
             check_shapes((f"maps[{i}]", indices, "h w"))
             if not np.issubdtype(indices.dtype, np.integer):
                 raise ValueError(f"maps[{i}]: expected whole numbers, got {indices.dtype}; use Codebook.quantize")
-            if indices.size and not (indices.min() >= 0 and indices.max() < size):
+            if indices.size and not (indices.min() >= 0 and indices.max() <= size):
                 raise ValueError(
-                    f"maps[{i}]: expected numbers from 0 to {size - 1} (size - 1), got {indices.min()} to "
+                    f"maps[{i}]: expected numbers from 0 to {size} (size, a hole), got {indices.min()} to "
                     f"{indices.max()}; quantise it with the codebook of that size"
                 )
             self._maps.append(np.ascontiguousarray(indices, dtype=kind))
@@ -75,8 +76,9 @@ class IndexMaps(Sequence[NDArray[Any]]):
 
     @property
     def usage(self) -> NDArray[np.int64]:  # [K]
-        """Pixels of each codeword over all maps."""
-        return sum((np.bincount(m.ravel(), minlength=self.size) for m in self._maps), np.zeros(self.size, np.int64))
+        """Pixels of each codeword over all maps, holes left out."""
+        counts = (np.bincount(m.ravel(), minlength=self.size + 1) for m in self._maps)
+        return sum(counts, np.zeros(self.size + 1, np.int64))[: self.size]
 
     def save(self, path: str | Path) -> None:
         """Write the maps to a .safetensors file."""
@@ -96,7 +98,7 @@ class IndexMaps(Sequence[NDArray[Any]]):
 
 
 class LatentMaps(Sequence[Tensor]):
-    """The maps F_l = S'[M] that the field learns (Sec. 3.3.2), each looked up when asked for.
+    """The maps F_l = S'[M] that the field learns (Sec. 3.3.2), each looked up when asked for; holes are NaN.
 
     Args:
         index_maps: M, per image.
@@ -118,13 +120,14 @@ class LatentMaps(Sequence[Tensor]):
                 "encode the codebook that the maps were quantised with"
             )
         self.index_maps, self.latents = index_maps, latents
+        self._rows = torch.cat([latents, torch.full_like(latents[:1], torch.nan)])
 
     def __len__(self) -> int:
         return len(self.index_maps)
 
     def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [h, w, d], one map at a time
         index = torch.from_numpy(self.index_maps[i].astype(np.int64)).to(self.latents.device)
-        return self.latents[index]
+        return self._rows[index]
 
     def __iter__(self) -> Iterator[Tensor]:
         return (self[i] for i in range(len(self)))
@@ -138,7 +141,7 @@ def quantize_maps(
 ) -> IndexMaps:
     """Quantise every pixel of every map (Eq. 5), with one map in memory at a time.
 
-    An all-zero feature gets index 0, see `Codebook.nearest`.
+    An all-zero feature says nothing about its pixel and becomes a hole, index K.
 
     Raises:
         ValueError: if a map is not [h, w, D] with the codebook's D.
@@ -147,5 +150,6 @@ def quantize_maps(
     for i in tqdm(range(len(maps)), desc="quantise", disable=not progress):
         feature_map = maps[i]  # once: this may read a file
         check_shapes((f"maps[{i}]", feature_map, f"h w {codebook.dim}"))
-        quantised.append(codebook.quantize(feature_map).cpu().numpy().astype(np.uint16))
+        index = codebook.quantize(feature_map).masked_fill(~feature_map.any(dim=-1), codebook.size)
+        quantised.append(index.cpu().numpy().astype(np.uint16))
     return IndexMaps(quantised, codebook.size)

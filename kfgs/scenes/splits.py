@@ -13,7 +13,7 @@ from .names import file_stem
 
 SplitRule = Literal["df3dgs", "holdout8", "all"]
 
-DF3DGS_FEWEST = 20  # with fewer images every tenth would leave one training view
+DF3DGS_FEWEST = 200  # a video: the paper leaves out 4 views of 5, which a few dozen photos cannot spare
 
 
 def split_every(count: int, *, step: int, test_start: int = 0, train_start: int | None = None) -> dict[str, list[int]]:
@@ -69,7 +69,7 @@ def make_split(count: int, rule: SplitRule) -> dict[str, list[int]]:
 
 
 def choose_split(count: int) -> SplitRule:
-    """The rule for a scene that brings no split: the paper's from 20 images, `"holdout8"` from 8, else `"all"`."""
+    """The rule for a scene that brings no split: the paper's from 200 images, `"holdout8"` from 8, else `"all"`."""
     if count >= DF3DGS_FEWEST:
         return "df3dgs"
     return "holdout8" if count >= 8 else "all"

@@ -213,3 +213,17 @@ def test_bad_maps():
 def test_bad_config(values, message):
     with pytest.raises(ValueError, match=message):
         CodebookConfig(**values)
+
+
+def test_no_image_fills_the_codebook_alone():
+    generator = torch.Generator().manual_seed(5)
+    maps = [torch.randn(8, 8, 32, generator=generator) for _ in range(4)]  # nothing is similar to anything
+    seen: list[int] = []
+    fit = fit_codebook(
+        maps, CodebookConfig(initial=2, maximum=10, epochs=1), callback=lambda row: seen.append(row["added"])
+    )
+    assert seen == [8]  # two of each image
+    index = [int((fit.codebook.unit @ m.reshape(-1, 32).T / m.reshape(-1, 32).norm(dim=1)).amax() > 0.99) for m in maps]
+    assert index == [1, 1, 1, 1]  # each image has a codeword of its own
+    few = fit_codebook(maps, CodebookConfig(initial=2, maximum=10, epochs=1, joins_per_image=1))
+    assert few.codebook.size == 6

@@ -32,7 +32,7 @@ def test_quantize_maps_reads_each_map_once_and_sizes_may_differ():
     assert index_maps.nbytes == 3 * 5 + 2 * 7
 
 
-@pytest.mark.parametrize(("size", "kind"), [(256, np.uint8), (257, np.uint16), (65_536, np.uint16)])
+@pytest.mark.parametrize(("size", "kind"), [(255, np.uint8), (256, np.uint16), (65_535, np.uint16)])
 def test_as_few_bytes_as_the_codebook_allows(size, kind):
     index_maps = IndexMaps([np.array([[0, size - 1]])], size)
     assert index_maps[0].dtype == kind
@@ -66,16 +66,16 @@ def test_latent_maps_look_up_rows():
 
 def test_bad_input():
     with pytest.raises(
-        ValueError, match=r"maps\[0\]: expected numbers from 0 to 2 \(size - 1\), got 0 to 3; quantise it"
+        ValueError, match=r"maps\[0\]: expected numbers from 0 to 3 \(size, a hole\), got 0 to 4; quantise it"
     ):
-        IndexMaps([np.array([[0, 3]])], 3)
-    with pytest.raises(ValueError, match=r"maps\[1\]: expected numbers from 0 to 2 \(size - 1\), got -1 to 0"):
+        IndexMaps([np.array([[0, 4]])], 3)
+    with pytest.raises(ValueError, match=r"maps\[1\]: expected numbers from 0 to 3 \(size, a hole\), got -1 to 0"):
         IndexMaps([np.array([[0]]), np.array([[0, -1]])], 3)
     with pytest.raises(ValueError, match=r"maps\[0\]: expected whole numbers, got float64; use Codebook.quantize"):
         IndexMaps([np.zeros((2, 2))], 3)
     with pytest.raises(ValueError, match=r"maps\[0\]: expected \[h, w\], got \(4,\)"):
         IndexMaps([np.zeros(4, dtype=np.int64)], 3)
-    with pytest.raises(ValueError, match=r"size: expected 1 to 65536 codewords \(two bytes a pixel\), got 70000"):
+    with pytest.raises(ValueError, match=r"size: expected 1 to 65535 codewords \(two bytes a pixel\), got 70000"):
         IndexMaps([], 70_000)
     with pytest.raises(ValueError, match=r"latents: expected \[K, d\] with K = 3 \(from index_maps\), got \(4, 2\)"):
         LatentMaps(IndexMaps([], 3), torch.zeros(4, 2))
@@ -83,3 +83,18 @@ def test_bad_input():
         quantize_maps([torch.ones(2, 2, 4)], Codebook(torch.eye(3)))
     with pytest.raises(FileNotFoundError, match=r"no such file; expected a kfgs index maps"):
         IndexMaps.load("missing.safetensors")
+
+
+def test_holes_are_kept_apart_from_codewords_all_the_way():
+    codebook = Codebook(torch.eye(3))
+    features = torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.1, 0.0]], [[0.0, 0.2, 1.0], [0.0, 0.0, 0.0]]])
+    index_maps = quantize_maps([features], codebook)
+    assert index_maps[0].tolist() == [[3, 0], [2, 3]]
+    assert index_maps.usage.tolist() == [1, 0, 1]
+    latents = LatentMaps(index_maps, torch.tensor([[0.1], [0.2], [0.3]]))[0]
+    torch.testing.assert_close(latents[..., 0], torch.tensor([[torch.nan, 0.1], [0.3, torch.nan]]), equal_nan=True)
+
+
+def test_255_codewords_and_holes_fit_a_byte_and_256_do_not():
+    assert IndexMaps([np.full((1, 1), 255)], 255)[0].dtype == np.uint8
+    assert IndexMaps([np.full((1, 1), 256)], 256)[0].dtype == np.uint16

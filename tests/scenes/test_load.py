@@ -46,9 +46,10 @@ def test_the_split_file_wins(tmp_path: Path) -> None:
     names = [f"rgb_{i}.png" for i in range(24)]
     write_model(tmp_path / "sparse/0", names)
     _pictures(tmp_path / "images", names)
-    paper = load_scene(tmp_path)
+    assert load_scene(tmp_path).splits["test"] == [0, 8, 16]
+    paper = load_scene(tmp_path, split="df3dgs")
     assert paper.splits == {"train": [5, 15], "test": [0, 10, 20]}
-    assert any("split df3dgs: 2 of 24 views train, 3 test" in n and 'split="holdout8"' in n for n in paper.notes)
+    assert any("split df3dgs: 2 of 24 views train, 3 test" in note for note in paper.notes)
     (tmp_path / "split.json").write_text(json.dumps({"train": ["rgb_10", "rgb_2"], "test": ["rgb_0", "rgb_99"]}))
     scene = load_scene(tmp_path)
     assert scene.splits == {"train": [2, 10], "test": [0]}
