@@ -5,7 +5,7 @@ import torch
 from kfgs.quant import AutoencoderConfig, Codebook, fit_autoencoder
 from kfgs.quant.fit_autoencoder import _linears, _normalised_mlp
 
-SHORT = AutoencoderConfig(encoder=(64, 32), decoder=(32, 128), steps=600, learning_rate=2e-3)
+SHORT = AutoencoderConfig(encoder=(64, 32), decoder=(32, 128), steps=800, learning_rate=2e-3)
 
 
 def realistic_codebook(groups=12, each=4, dim=96, seed=0):
