@@ -185,7 +185,7 @@ def point_spacing(points: Tensor) -> Tensor:  # [P, 3] -> [P] world units
             "check that the reconstruction holds points"
         )
     neighbours = min(3, len(cloud) - 1)
-    distances = cKDTree(cloud).query(cloud, k=neighbours + 1)[0][:, 1:]  # the nearest is the point itself
+    distances = np.asarray(cKDTree(cloud).query(cloud, k=neighbours + 1)[0])[:, 1:]  # the nearest is the point itself
     spacing = np.sqrt((distances**2).mean(axis=1))
     lower = SMALLEST_SPACING * float(np.median(spacing))
     upper = float(np.quantile(spacing, LARGEST_SPACING_QUANTILE))

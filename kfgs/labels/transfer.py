@@ -122,7 +122,7 @@ def _default_distance(tree: cKDTree, dst: Array) -> tuple[float, str]:
     reach = float(np.quantile(tree.query(_sample(dst), workers=-1)[0], COVERAGE))
     if tree.n == 1:
         return max(1.01 * reach, tiny), f"{COVERAGE:.0%} of destinations within {reach:.4g} of the one source position"
-    spacing = float(np.median(tree.query(_sample(np.asarray(tree.data)), k=2, workers=-1)[0][:, 1]))
+    spacing = float(np.median(np.asarray(tree.query(_sample(np.asarray(tree.data)), k=2, workers=-1)[0])[:, 1]))
     chosen = min(max(reach, NEAREST * spacing), FARTHEST * spacing)
     return max(chosen, tiny), (
         f"{COVERAGE:.0%} of destinations lie within {reach:.4g}, "
@@ -180,7 +180,7 @@ class _Sources:
 
     def _query(self, points: Array, k: int, distance: float) -> tuple[Array, Array]:
         near, index = self.tree.query(points, k=k, distance_upper_bound=distance, workers=-1)
-        return near.reshape(len(points), k), index.reshape(len(points), k)
+        return np.reshape(near, (len(points), k)), np.reshape(index, (len(points), k))
 
 
 def _distinct(points: Array) -> tuple[Array, Array]:

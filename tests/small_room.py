@@ -1,0 +1,41 @@
+"""A toy room small enough to fit in seconds, shared by the tests of pipeline and command line."""
+
+import dataclasses
+from pathlib import Path
+
+from kfgs.fields import FieldConfig
+from kfgs.pipeline import FitConfig
+from kfgs.quant import AutoencoderConfig, CodebookConfig
+from kfgs.scenes.toy import ToyConfig, make_toy_room
+
+ROOM = ToyConfig(
+    train_views=6,
+    test_views=3,
+    size=(60, 80),
+    feature_size=(30, 40),
+    feature_dim=32,
+    surface_points=4_000,
+    sparse_points=1_500,
+)
+FIELD = FieldConfig.cpu(
+    steps=120,
+    features_lr=0.05,
+    densify_from=20,
+    densify_until=80,
+    densify_every=20,
+    reset_every=0,
+    checkpoint_every=7,
+)
+CONFIG = FitConfig(
+    codebook=CodebookConfig(initial=4, maximum=24, epochs=4, step_every=1, learning_rate=0.02),
+    autoencoder=AutoencoderConfig(latent=4, encoder=(24, 16), decoder=(16, 24), steps=400, learning_rate=3e-3),
+    field=FIELD,
+)
+
+
+def make_room(folder: Path) -> Path:
+    return make_toy_room(folder, ROOM)
+
+
+def config(**changes):
+    return dataclasses.replace(CONFIG, **changes)
