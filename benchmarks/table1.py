@@ -12,6 +12,7 @@ import argparse
 import dataclasses
 import platform
 import time
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -36,7 +37,13 @@ def frames_per_second(work, cameras) -> float:
     return 1 / sorted(times)[len(times) // 2]
 
 
+def segment(field, embeddings, decode, camera) -> None:
+    """One frame of labels."""
+    field.segment(camera, embeddings, decode=decode)
+
+
 def main() -> None:
+    """Fit, score and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path)
     parser.add_argument("features", type=Path)
@@ -50,7 +57,7 @@ def main() -> None:
 
     scene = load_scene(args.scene).undistorted()
     classes = load_label_set(args.scene / "classes.json", args.scene / "text.npy")
-    train, test = scene.splits["train"], scene.splits["test"]
+    train, test = scene.views("train"), scene.views("test")
     maps = FeatureFolder(args.features, [scene.stem(i) for i in train])
     stems = [scene.stem(i) for i in test]
     truth_folder = args.scene / args.truth
@@ -75,9 +82,10 @@ def main() -> None:
         cameras = [scene.cameras[i] for i in test[:12]]
         with torch.no_grad():
             fps = frames_per_second(field.render, cameras)
+            decodes = ("exact", "latent") if field.autoencoder is not None else ("exact",)
             label_fps = {
-                decode: frames_per_second(lambda c, d=decode: field.segment(c, classes.embeddings, decode=d), cameras[:5])
-                for decode in (("exact", "latent") if field.autoencoder is not None else ("exact",))
+                decode: frames_per_second(partial(segment, field, classes.embeddings, decode), cameras[:5])
+                for decode in decodes
             }
         storage = field.storage() / 2**20
         print(f"{mode}: {scores}")

@@ -88,7 +88,11 @@ def sfm(
 
     config = SfmConfig(matching=matching, camera_model=camera_model, min_registered=min_registered, seed=seed)
     _say(str(run_sfm(images, out, config=config, progress=True)))
-    _wrote([out / "sparse" / "0"])
+    written = [out / "sparse" / "0"]
+    if not (out / "images").exists():
+        (out / "images").symlink_to(images.resolve(), target_is_directory=True)
+        written.append(out / "images")  # so that `kfgs fit OUT` finds the pictures
+    _wrote(written)
 
 
 def fit(
@@ -101,6 +105,8 @@ def fit(
     seed: int = 0,
     steps: int | None = None,
     max_gaussians: int | None = None,
+    images: Path | None = None,
+    undistorted_features: bool = False,
 ) -> None:
     """Fit a semantic field to a posed scene and its teacher features.
 
@@ -114,14 +120,19 @@ def fit(
         seed: every random choice follows from it.
         steps: training steps of the field, instead of the preset's.
         max_gaussians: stop densifying at this many Gaussians.
+        images: folder of the pictures, if it is not SCENE/images.
+        undistorted_features: the teacher saw undistorted pictures already, so its maps need no lens removed.
     """
     from .pipeline import fit_scene, write_training_pictures
     from .scenes import load_scene
     from .teachers import FeatureFolder
 
     config = _fit_config(preset, mode, seed, steps, max_gaussians, split)
-    loaded = load_scene(scene).undistorted()
-    maps = FeatureFolder(features, [loaded.stem(i) for i in loaded.splits[split]])
+    config = dataclasses.replace(config, undistorted_features=undistorted_features)
+    loaded = load_scene(scene, images=images).undistorted()
+    for note in loaded.notes:
+        _say(f"note: {note}")
+    maps = FeatureFolder(features, [loaded.stem(i) for i in loaded.views(split)])
     result = fit_scene(loaded, maps, out, config, report=_say, progress=True)
     _say(result.field.summary())
     _wrote([result.field_path, *write_training_pictures(out)])
@@ -137,6 +148,7 @@ def segment(
     labels: Path | None = None,
     decode: Literal["exact", "latent"] = "exact",
     pictures: int = 4,
+    images: Path | None = None,
 ) -> None:
     """Segment the views of a scene with a field; score them where label pictures exist.
 
@@ -150,13 +162,14 @@ def segment(
         labels: folder of true label pictures; SCENE/labels_scored or SCENE/labels when not given.
         decode: `exact` decodes every pixel, `latent` compares latents.
         pictures: how many views get pictures.
+        images: folder of the pictures, if it is not SCENE/images.
     """
     from .fields import SemanticField
     from .pipeline import score_scene, segment_scene, write_report
     from .scenes import load_scene
     from .viz import plot_confusion
 
-    loaded, label_set = load_scene(scene).undistorted(), _classes(scene, classes, text)
+    loaded, label_set = load_scene(scene, images=images).undistorted(), _classes(scene, classes, text)
     field_ = SemanticField.load(field)
     found = segment_scene(field_, loaded, label_set, out, split=split, decode=decode, pictures=pictures, progress=True)
     written = [path for path in (out / "labels", out / "overlay", out / "features") if path.is_dir()]

@@ -72,7 +72,7 @@ def segment_scene(
         The label map [H, W] of each view by its stem.
     """
     out = Path(out)
-    views = scene.splits[split]
+    views = scene.views(split)
     shown = (
         {views[i] for i in np.linspace(0, len(views) - 1, min(pictures, len(views))).round().astype(int)}
         if views

@@ -57,7 +57,7 @@ def run(
     scene = load_scene(folder)
     classes = load_label_set(folder / "classes.json", folder / "text.npy")
 
-    maps = FeatureFolder(folder / "features", [scene.stem(i) for i in scene.splits["train"]])
+    maps = FeatureFolder(folder / "features", [scene.stem(i) for i in scene.views("train")])
     fitted = fit_scene(scene, maps, out / "run", config, report=say, progress=progress)
     say(fitted.field.summary())
 
@@ -65,7 +65,7 @@ def run(
     scores = score_scene(found, folder / "labels", classes)
     truth = {stem: folder / "labels" / f"{stem}.png" for stem in found}
     test_maps = FeatureFolder(folder / "features", list(found))
-    size = scene.cameras[scene.splits["test"][0]].size
+    size = scene.cameras[scene.views("test")[0]].size
     teacher = score_teacher(lambda stem: test_maps[list(found).index(stem)], truth, classes, size)
     say(f"unseen views: {scores}")
     say(f"the teacher on the same views: {teacher.miou}")

@@ -227,10 +227,7 @@ def fit_scene(
         ValueError: if the counts of views and maps differ, or a camera has distortion.
     """
     config = config or FitConfig.paper()
-    if not scene.splits.get(config.split):
-        named = ", ".join(name for name, views in scene.splits.items() if views)
-        raise ValueError(f"split: expected one of {named or '(the scene has no split)'}, got {config.split!r}")
-    views = scene.splits[config.split]
+    views = scene.views(config.split)
     if len(views) != len(maps):
         raise ValueError(
             f"maps: expected one teacher map per view of split {config.split!r} ({len(views)}), got {len(maps)}; "

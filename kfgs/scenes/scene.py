@@ -91,6 +91,17 @@ class Scene:
         """The name of view `i` without its suffix: what feature and label files are called."""
         return file_stem(self.cameras[i].name)
 
+    def views(self, split: str) -> list[int]:
+        """The views of a split.
+
+        Raises:
+            ValueError: if the scene has no such split, or it is empty.
+        """
+        if not self.splits.get(split):
+            named = ", ".join(name for name, views in self.splits.items() if views)
+            raise ValueError(f"split: expected one of {named or 'none (no split holds a view)'}, got {split!r}")
+        return self.splits[split]
+
     def image(self, i: int) -> Tensor:  # [H, W, 3] in [0, 1]
         """Read the picture of view `i`; in an undistorted scene the lens is removed on the way.
 

@@ -20,7 +20,9 @@ def test_holdout8_and_all() -> None:
     assert make_split(3, "all") == {"train": [0, 1, 2], "test": []}
 
 
-@pytest.mark.parametrize(("count", "rule"), [(0, "all"), (7, "all"), (8, "holdout8"), (199, "holdout8"), (200, "df3dgs")])
+@pytest.mark.parametrize(
+    ("count", "rule"), [(0, "all"), (7, "all"), (8, "holdout8"), (199, "holdout8"), (200, "df3dgs")]
+)
 def test_the_rule_without_a_split_file(count: int, rule: str) -> None:
     assert choose_split(count) == rule
 

@@ -1,0 +1,128 @@
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from small_room import make_room
+
+from kfgs.cli import main
+from kfgs.scenes.ply import read_ply, write_ply
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    return make_room(tmp_path_factory.mktemp("cli") / "scene")
+
+
+@pytest.fixture(scope="module")
+def run(room, tmp_path_factory):
+    """A fitted run, made through the command line, without an autoencoder for speed."""
+    out = tmp_path_factory.mktemp("run")
+    arguments = ["fit", str(room), "--features", str(room / "features"), "--out", str(out)]
+    assert main([*arguments, "--mode", "adc", "--steps", "60", "--max-gaussians", "2000"]) == 0
+    return out
+
+
+def test_fit_names_what_it_wrote(run):
+    for name in ("field/field.json", "field/field.safetensors", "codebook.png", "field.png"):
+        assert (run / name).is_file(), name
+
+
+def test_info_knows_fields_runs_scenes_and_plys(run, room, tmp_path, capsys):
+    for path in (run, run / "field"):
+        assert main(["info", str(path)]) == 0
+        assert "Gaussians" in capsys.readouterr().out
+    assert main(["info", str(room)]) == 0
+    assert "9 posed images" in capsys.readouterr().out
+    write_ply(tmp_path / "a.ply", {"x": np.zeros(3, np.float32)})
+    assert main(["info", str(tmp_path / "a.ply")]) == 0
+    assert "3 vertices; columns x" in capsys.readouterr().out
+
+
+def test_segment_scores_where_truth_is_known(run, room, tmp_path, capsys):
+    out = tmp_path / "seg"
+    assert main(["segment", str(run / "field"), "--scene", str(room), "--out", str(out), "--pictures", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "kfgs-pooled/1" in said
+    scores = json.loads((out / "scores.json").read_text())
+    assert scores["segmentation"]["views"] == 3
+    assert 0 < scores["segmentation"]["miou"] < 1
+    for name in ("labels", "overlay", "features", "confusion.png", "scores.json"):
+        assert str(out / name) in said
+
+
+def test_label_carries_classes_to_another_cloud_and_keeps_its_columns(run, room, tmp_path, capsys):
+    surface = np.load(room / "surface.npz")["points"].astype(np.float32)
+    cloud = {name: np.ascontiguousarray(surface[:, i]) for i, name in enumerate("xyz")}
+    write_ply(tmp_path / "cloud.ply", cloud | {"mass": np.arange(len(surface), dtype=np.float32)})
+    out = tmp_path / "labelled"
+    arguments = [
+        "label",
+        str(run / "field"),
+        "--scene",
+        str(room),
+        "--out",
+        str(out),
+        "--cloud",
+        str(tmp_path / "cloud.ply"),
+    ]
+    assert main(arguments) == 0
+    columns = read_ply(out / "cloud.ply")
+    np.testing.assert_array_equal(columns["mass"], np.arange(len(surface)))
+    assert (columns["class_id"] >= 0).mean() > 0.8
+    names = json.loads((out / "cloud.classes.json").read_text())
+    assert names["class_id"]["1"] == "floor"
+    assert names["distance"] > 0
+    assert {"class_id", "score", "red"} <= set(read_ply(out / "gaussians.ply"))
+
+
+def test_a_single_query_reports_its_threshold(run, room, tmp_path, capsys):
+    assert main(["label", str(run / "field"), "--scene", str(room), "--out", str(tmp_path), "--query", "chair"]) == 0
+    assert "above gamma = " in capsys.readouterr().out
+    labels = read_ply(tmp_path / "gaussians.ply")["class_id"]
+    names = json.loads((tmp_path / "gaussians.classes.json").read_text())["class_id"]
+    assert {names[str(label)] for label in labels if label >= 0} == {"chair"}
+    assert (labels == -1).any()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["info", "{tmp}/nothing"], "no such file or folder"),
+        (["segment", "{tmp}", "--scene", "{room}", "--out", "{tmp}/o"], "field.json"),
+        (["fit", "{room}", "--features", "{tmp}/nothing", "--out", "{tmp}/o"], "folder of feature maps"),
+        (["fit", "{room}", "--features", "{tmp}", "--out", "{tmp}/o"], "6 missing: view_000_fmap_CxHxW.pt"),
+        (["fit", "{tmp}", "--features", "{room}/features", "--out", "{tmp}/o"], "{tmp}"),
+        (
+            ["fit", "{room}", "--features", "{room}/features", "--out", "{tmp}/o", "--split", "val"],
+            "expected one of train, test",
+        ),
+        (["label", "{run}/field", "--out", "{tmp}/o"], "pass --classes and --text"),
+        (["label", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--query", "dragon"], "got 'dragon'"),
+        (["sfm", "{tmp}", "--out", "{tmp}/o"], "image"),
+    ],
+)
+def test_bad_input_ends_with_1_one_message_and_no_files(arguments, message, run, room, tmp_path, capsys):
+    fill = {"tmp": str(tmp_path), "room": str(room), "run": str(run)}
+    assert main([a.format(**fill) for a in arguments]) == 1
+    captured = capsys.readouterr()
+    assert message.format(**fill) in captured.err
+    assert captured.err.startswith("error: ")
+    assert "Traceback" not in captured.err
+    assert not (tmp_path / "o").exists()
+
+
+def test_wrong_usage_ends_with_2():
+    for arguments in (["fly"], ["fit"], ["fit", "x", "--out", "y", "--features", "z", "--preset", "gpu"]):
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        assert stop.value.code == 2
+
+
+def test_help_is_quick_to_ask_for_and_names_every_command():
+    code = "import sys; from kfgs.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\nprint('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    for command in ("demo", "sfm", "fit", "segment", "label", "info"):
+        assert command in done.stdout
+    assert done.stdout.strip().endswith("False")  # no heavy import for a help text
