@@ -54,8 +54,8 @@ def fit_field(
     Args:
         params: where to start; not changed. Dtype and device of the fit are theirs.
         cameras: C posed cameras without distortion.
-        targets: one map per camera, of any size; read one at a time and only by `len` and index, so they may live on
-            disk.
+        targets: one map per camera, of any size, NaN where nothing is known (`l1_loss`); read one at a time
+            and only by `len` and index, so they may live on disk.
         config: the paper's values when not given.
         extent: size of the scene in world units (`Scene.extent`); scales the means' learning rate and what counts as a
             large Gaussian.

@@ -72,7 +72,7 @@ class Trainer:
         if not math.isfinite(value):
             raise FloatingPointError(
                 f"loss: expected a finite number at step {self.step}, got {value} (view {camera.name!r}); "
-                "check the targets for NaN, or lower the learning rates"
+                "check the targets for infinities, or lower the learning rates"
             )
         self._losses += value
         if loss.requires_grad:  # not so when the view shows no Gaussian

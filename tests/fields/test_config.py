@@ -19,6 +19,12 @@ def test_cpu_preset_is_short_and_can_be_changed():
     assert FieldConfig.cpu(steps=12, features_lr=0.1).features_lr == 0.1
 
 
+def test_with_steps_keeps_the_schedule_in_proportion():
+    short = FieldConfig().with_steps(3_000)
+    assert (short.steps, short.densify_from, short.densify_until, short.reset_every) == (3_000, 50, 1_500, 300)
+    assert (short.densify_every, short.means_lr) == (100, 1.6e-4)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

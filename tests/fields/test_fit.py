@@ -303,10 +303,23 @@ def test_wrong_arguments():
         fit_field(start(), [bent], targets[:1], SHORT, extent=2.0)
 
 
-def test_a_target_with_nan_stops_the_fit():
+def test_unknown_pixels_count_nowhere():
+    rendered = torch.rand(4, 6, 2, generator=torch.Generator().manual_seed(0), requires_grad=True)
+    target = torch.rand(4, 6, 2, generator=torch.Generator().manual_seed(1))
+    holes = target.clone()
+    holes[:2] = torch.nan
+    loss = l1_loss(rendered, torch.ones(4, 6), holes)
+    assert float(loss.detach()) == pytest.approx(float((rendered - target)[2:].abs().mean().detach()))
+    loss.backward()
+    assert not rendered.grad[:2].any()
+    torch.testing.assert_close(rendered.grad[2:].abs(), torch.full((2, 6, 2), 1 / 24))
+    assert float(l1_loss(rendered, torch.ones(4, 6), holes * torch.nan).detach()) == 0.0
+
+
+def test_an_infinite_target_stops_the_fit():
     cameras, targets = scene(1)
-    with pytest.raises(FloatingPointError, match=r"loss: expected a finite number at step 1, got nan"):
-        fit_field(start(), cameras, [targets[0] * torch.nan], SHORT, extent=2.0)
+    with pytest.raises(FloatingPointError, match=r"loss: expected a finite number at step 1, got inf"):
+        fit_field(start(), cameras, [targets[0] + torch.inf], SHORT, extent=2.0)
 
 
 def test_losing_every_gaussian_says_so():
