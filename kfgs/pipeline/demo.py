@@ -95,7 +95,7 @@ def _label_surface(
     assert labels is not None
     with np.load(folder / "surface.npz") as surface:
         points, true = torch.from_numpy(surface["points"]).float(), torch.from_numpy(surface["labels"]).long()
-        seen = torch.from_numpy(surface["seen"]) > 0
+        seen = torch.from_numpy(surface["seen"] > 0)
     moved = transfer_labels(field.gaussians.means, labels, points)
     agreement = float((moved.labels == true)[seen].float().mean())
     columns = {name: points[:, i].contiguous().numpy() for i, name in enumerate("xyz")}

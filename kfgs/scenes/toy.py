@@ -28,7 +28,7 @@ from .toy_room import CLASSES, build_room
 from .toy_teacher import class_embeddings, teacher_features
 from .toy_texture import Noise
 
-VERSION = 1  # of the generator: a folder written by another version is not reused
+VERSION = 2  # of the generator: a folder written by another version is not reused
 POINT_NOISE = 0.01  # metres, standard deviation of the sparse points around the surface
 PIXEL_NOISE = 0.4  # pixels, standard deviation of their observations
 
@@ -39,13 +39,13 @@ class ToyConfig:
 
     seed: int = 0
     """Textures, hues, how the chairs stand, embeddings, and every error of the teacher."""
-    train_views: int = 24
-    """Training cameras, evenly spaced on one round through the room."""
+    train_views: int = 48
+    """Training cameras, evenly spaced on two rounds through the room."""
     test_views: int = 12
     """Test cameras, each half-way between two training cameras; at most `train_views`."""
     size: tuple[int, int] = (192, 256)
     """(height, width) of the images, pixels."""
-    feature_size: tuple[int, int] = (48, 64)
+    feature_size: tuple[int, int] = (72, 96)
     """(height, width) of the feature maps."""
     feature_dim: int = 512
     """D, channels of features and embeddings."""

@@ -54,15 +54,18 @@ def intrinsics(height: int, width: int) -> Array:  # [3, 3]
 def orbit(train_views: int, test_views: int, size: tuple[int, int]) -> tuple[list[Camera], list[bool]]:
     """Cameras in the order of the walk, named `view_000.png` and so on, and which of them are for testing.
 
-    Training cameras divide one round evenly; each test camera stands half-way between two of them.
+    Training cameras divide the walk evenly; each test camera stands half-way between two of them. The walk goes round
+    the room twice, once higher and looking up, once lower and looking down, so that most surfaces are seen often.
     """
     steps = [(i / train_views, False) for i in range(train_views)]
     steps += [((j * train_views // test_views + 0.5) / train_views, True) for j in range(test_views)]
     cameras = []
     for number, (turn, _) in enumerate(sorted(steps)):
-        a = 2 * np.pi * turn
-        position = np.array([2.15 * np.cos(a), 1.75 * np.sin(a), 1.5 + 0.28 * np.sin(3 * a + 0.5)])
-        target = np.array([0.55 * np.cos(2 * a + 1.0), 0.45 * np.sin(3 * a), 0.85 + 0.35 * np.sin(2 * a + 0.4)])
+        a = 4 * np.pi * turn
+        lift = np.sin(a / 2)  # above 0 in the first round, below in the second
+        position = np.array([2.15 * np.cos(a), 1.75 * np.sin(a), 1.5 + 0.2 * np.sin(3 * a + 0.5) + 0.25 * lift])
+        height = 0.85 + 0.35 * np.sin(2 * a + 0.4) + 0.55 * lift
+        target = np.array([0.55 * np.cos(2 * a + 1.0), 0.45 * np.sin(3 * a), height])
         viewmat = look_at(position, target - 0.35 * position * [1, 1, 0], 0.05 * float(np.sin(5 * a)))
         name = f"view_{number:03d}.png"
         K = torch.from_numpy(intrinsics(*size))
