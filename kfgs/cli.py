@@ -53,6 +53,17 @@ def _classes(scene: Path | None, classes: Path | None, text: Path | None) -> Any
     return load_label_set(classes, text)
 
 
+def _training_cameras(field: Any, scene: Path | None) -> list[Any]:
+    """The cameras that a field was trained with, found again in its scene by name; all of them if none is named so."""
+    from .scenes import load_scene
+
+    if scene is None:
+        raise ValueError("by: expected 'latents' without a scene, got 'views'; pass --scene, whose cameras vote")
+    cameras = load_scene(scene).undistorted().cameras
+    trained = set(field.info.get("views", ()))
+    return [camera for camera in cameras if camera.name in trained] or cameras
+
+
 def demo(out: Path = Path("kfgs_demo"), seed: int = 0, steps: int | None = None) -> None:
     """Make a furnished toy room, fit a semantic field to it, segment unseen views, label points: the whole main job.
 
@@ -147,7 +158,7 @@ def segment(
     classes: Path | None = None,
     text: Path | None = None,
     labels: Path | None = None,
-    decode: Literal["exact", "latent"] = "exact",
+    decode: Literal["exact", "latent"] = "latent",
     pictures: int = 4,
     images: Path | None = None,
 ) -> None:
@@ -161,7 +172,7 @@ def segment(
         classes: JSON list of class names; SCENE/classes.json when not given.
         text: .npy of one embedding per class in the teacher's space; SCENE/text.npy when not given.
         labels: folder of true label pictures; SCENE/labels_scored or SCENE/labels when not given.
-        decode: `exact` decodes every pixel, `latent` compares latents.
+        decode: `exact` decodes every pixel as the paper does, `latent` compares latents: the same question, much faster.
         pictures: how many views get pictures.
         images: folder of the pictures, if it is not SCENE/images.
     """
@@ -194,6 +205,7 @@ def label(
     threshold: float | None = None,
     cloud: Path | None = None,
     distance: float | None = None,
+    by: Literal["views", "latents"] | None = None,
 ) -> None:
     """Label the Gaussians of a field, and carry the labels to a colour cloud by distance.
 
@@ -202,11 +214,13 @@ def label(
         out: receives gaussians.ply (and cloud.ply).
         classes: JSON list of class names; SCENE/classes.json when not given.
         text: .npy of one embedding per class; SCENE/text.npy when not given.
-        scene: a scene folder that holds classes.json and text.npy.
+        scene: a scene folder that holds classes.json and text.npy, and the cameras that vote.
         query: label only the Gaussians of this class (single target with threshold).
         threshold: the paper's gamma, a cosine; from the scores' distribution when not given.
         cloud: PLY of points or of a colour splat in the field's frame to carry the labels to.
         distance: the paper's lambda in world units; from the clouds' spacing when not given.
+        by: `views`: the training views of SCENE vote on each Gaussian; `latents`: each Gaussian's own latent decides, as
+            in the paper. `views` when a scene is given.
     """
     from .fields import SemanticField
     from .pipeline import label_cloud, label_field, query_field, save_labelled
@@ -214,7 +228,8 @@ def label(
     label_set = _classes(scene, classes, text)
     loaded = SemanticField.load(field)
     if query is None:
-        gaussians, scores = label_field(loaded, label_set)
+        by = by or ("latents" if scene is None else "views")
+        gaussians, scores = label_field(loaded, label_set, _training_cameras(loaded, scene) if by == "views" else None)
     else:
         gaussians, scores, how = query_field(loaded, label_set, query, threshold)
         _say(how)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from dataclasses import field as default
 from pathlib import Path
@@ -13,7 +14,16 @@ from torch import Tensor
 from .._check import check_shapes
 from ..cameras import Camera
 from ..gaussians import Gaussians
-from ..labels import CodewordLabels, Selection, classify, label_codewords, label_pixels, select_by_query
+from ..labels import (
+    CodewordLabels,
+    Selection,
+    Votes,
+    classify,
+    label_codewords,
+    label_pixels,
+    select_by_query,
+    vote_labels,
+)
 from ..labels.segment import Decode
 from ..metrics import MIB, semantic_storage_bytes
 from ..quant.autoencoder import Autoencoder
@@ -157,7 +167,11 @@ class SemanticField:
         self,
         embeddings: Tensor,  # [C, D]
     ) -> tuple[Tensor, Tensor]:  # labels [N] int64, scores [N]
-        """The class of each Gaussian by max-similarity (Sec. 3.4), and its cosine with that class."""
+        """The class of each Gaussian by max-similarity (Sec. 3.4), and its cosine with that class.
+
+        This decodes each Gaussian's own latent, as the paper does. Training constrains only blends of latents, so
+        `classify_by_views` is more accurate where cameras are at hand.
+        """
         self._check_embeddings(embeddings)
         if self.codebook is None:
             found = classify(self.features, embeddings)
@@ -165,6 +179,27 @@ class SemanticField:
         per_codeword = classify(self.codebook.codewords, embeddings)
         index = self._codeword_index()
         return per_codeword.labels[index], per_codeword.scores[index]
+
+    def classify_by_views(
+        self,
+        embeddings: Tensor,  # [C, D]
+        cameras: Iterable[Camera],
+        *,
+        decode: Decode = "latent",
+    ) -> Votes:
+        """The class of each Gaussian by a vote of segmented views, weighted by how much each view shows it.
+
+        Args:
+            embeddings: one row per class.
+            cameras: which views vote; those that the field was trained on are the natural choice.
+            decode: as in `segment`.
+
+        Returns:
+            Labels (-1 = no view shows the Gaussian), the winner's share of the votes, and the votes cast.
+        """
+        self._check_embeddings(embeddings)
+        views = ((camera, self.segment(camera, embeddings, decode=decode)) for camera in cameras)
+        return vote_labels(self.gaussians, views, len(embeddings))
 
     def query(
         self,

@@ -5,12 +5,14 @@ from .edit import extract, recolor, remove
 from .segment import label_pixels, nearest_codeword
 from .threshold import similarity_threshold
 from .transfer import Transfer, default_distance, transfer_labels
+from .vote import Votes, vote_labels
 
 __all__ = [
     "Classification",
     "CodewordLabels",
     "Selection",
     "Transfer",
+    "Votes",
     "classify",
     "default_distance",
     "extract",
@@ -22,4 +24,5 @@ __all__ = [
     "select_by_query",
     "similarity_threshold",
     "transfer_labels",
+    "vote_labels",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._files import atomic_path, write_json
-from ..cameras import resize_labels
+from ..cameras import Camera, resize_labels
 from ..evaluation import LabelSet, SegmentationReport, evaluate_segmentation
 from ..evaluation.segmentation import VOID
 from ..fields import SemanticField
@@ -52,7 +52,7 @@ def segment_scene(
     out: str | Path,
     *,
     split: str = "test",
-    decode: Decode = "exact",
+    decode: Decode = "latent",
     pictures: int = 4,
     progress: bool = False,
 ) -> dict[str, Tensor]:
@@ -64,7 +64,8 @@ def segment_scene(
         classes: names and embeddings in the teacher's space.
         out: receives `labels/<stem>.png` and, for `pictures` evenly spread views, `overlay/` and `features/`.
         split: which views.
-        decode: `exact` decodes every pixel as the paper does, `latent` compares latents (the same question, cheaper).
+        decode: `exact` decodes every pixel as the paper does; `latent` asks the same of the latents: much faster, and
+            no worse (`docs/results.md`).
         pictures: how many views get an overlay and a feature picture.
         progress: show a progress bar.
 
@@ -111,9 +112,21 @@ def score_teacher(
     return evaluate_segmentation(predict, truth, classes.names)
 
 
-def label_field(field: SemanticField, classes: LabelSet) -> tuple[Gaussians, Tensor]:
-    """The field's Gaussians with their classes by max-similarity, and the similarity [N] of each to its class."""
-    labels, scores = field.classify(classes.embeddings)
+def label_field(
+    field: SemanticField, classes: LabelSet, cameras: Sequence[Camera] | None = None
+) -> tuple[Gaussians, Tensor]:
+    """The field's Gaussians with their classes, and a score [N] in [0, 1] or a cosine for each.
+
+    Args:
+        field: a finished field.
+        classes: names and embeddings.
+        cameras: views that vote on each Gaussian (`classify_by_views`; the score is the winner's share). Without them
+            each Gaussian's own latent decides, as in Sec. 3.4 (the score is its cosine with the class).
+    """
+    if cameras is None:
+        labels, scores = field.classify(classes.embeddings)
+    else:
+        labels, scores, _ = field.classify_by_views(classes.embeddings, cameras)
     return field.gaussians.replace(labels=labels), scores
 
 

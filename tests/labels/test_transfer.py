@@ -102,14 +102,14 @@ def test_dtypes_of_the_result():
     )
 
 
-def test_default_distance_covers_nine_in_ten_between_its_bounds():
+def test_default_distance_covers_nearly_all_between_its_bounds():
     axis = torch.arange(10.0)
     grid = torch.cartesian_prod(axis, axis, torch.zeros(1))  # spacing 1
     above = lambda height: grid + torch.tensor([0.0, 0.0, height])  # noqa: E731
     assert default_distance(grid, above(4.0)) == pytest.approx(4)  # as far as the destinations are
     assert default_distance(grid, above(0.5)) == pytest.approx(2)  # no less than 2 spacings
     assert default_distance(grid, above(100.0)) == pytest.approx(10)  # no more than 10
-    tail = torch.cat([above(4.0)[:95], above(1000.0)[:5]])  # a few floaters do not stretch it
+    tail = torch.cat([above(4.0)[:99], above(1000.0)[:1]])  # a few floaters do not stretch it
     assert default_distance(grid, tail) == pytest.approx(4)
 
 

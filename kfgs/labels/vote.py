@@ -1,0 +1,70 @@
+"""The class of each Gaussian by a vote of views: what the pixels that show it say, weighted by how much they show it.
+
+A Gaussian's own latent is trained only through blends with its neighbours, so it may decode to something that none of
+the views shows. Its rendering weights w = T * alpha say which pixels it answers for (the transpose of Eq. 3); adding
+up w per class over some views, and taking the largest, uses them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .._check import check_range
+from ..cameras import Camera
+from ..gaussians import Gaussians
+from ..splat import accumulate_pixels, bin_tiles, project
+
+
+class Votes(NamedTuple):
+    """The outcome of a vote."""
+
+    labels: Tensor  # [N] int64, -1 = no view shows this Gaussian
+    shares: Tensor  # [N] of the winner in the votes cast, 0 where none were
+    weights: Tensor  # [N] votes cast: the number of pixels, in all views, that the Gaussian fills
+
+
+def vote_labels(
+    gaussians: Gaussians,
+    views: Iterable[tuple[Camera, Tensor]],  # label maps [H, W] int64 of the cameras' sizes, -1 = none
+    classes: int,
+    *,
+    engine: str = "auto",
+) -> Votes:
+    """Label each Gaussian with the class that most of its rendering weight falls on.
+
+    Args:
+        gaussians: a cloud; only its geometry and opacity are used.
+        views: cameras with a label map each; read one at a time.
+        classes: number of classes C; labels are below it.
+        engine: compositing engine.
+
+    Returns:
+        Labels, the winner's share, and the weight. Ties go to the lowest class.
+
+    Raises:
+        ValueError: if a label map has another size than its camera, or a label is not below `classes`.
+    """
+    check_range("classes", classes, 1)
+    votes = torch.zeros(len(gaussians), classes).to(gaussians.means)
+    with torch.no_grad():
+        for camera, labels in views:
+            if tuple(labels.shape) != camera.size:
+                raise ValueError(
+                    f"views: expected a label map of the camera's size {camera.size} ({camera.name!r}), got "
+                    f"{tuple(labels.shape)}; resize it with resize_labels"
+                )
+            if int(labels.max()) >= classes:
+                raise ValueError(f"views: expected labels below {classes} (classes), got {int(labels.max())}")
+            projected = project(gaussians, camera)
+            tiles = bin_tiles(projected, camera.width, camera.height)
+            ballots = torch.nn.functional.one_hot(labels + 1, classes + 1)[..., 1:].to(votes)
+            shape = projected.means2d, projected.conics, projected.opacities
+            votes.index_add_(0, projected.index, accumulate_pixels(*shape, ballots, tiles, engine=engine))
+    weights = votes.sum(1)
+    best, labels = votes.max(1)
+    labels = torch.where(weights > 0, labels, -1)
+    return Votes(labels, best / weights.clamp_min(torch.finfo(weights.dtype).tiny), weights)

@@ -1,0 +1,59 @@
+import pytest
+import torch
+
+from kfgs.cameras import Camera
+from kfgs.gaussians import Gaussians
+from kfgs.labels import vote_labels
+
+
+def _camera(width: int = 32, height: int = 24) -> Camera:
+    K = torch.tensor([[30.0, 0.0, width / 2], [0.0, 30.0, height / 2], [0.0, 0.0, 1.0]])
+    return Camera(torch.eye(4), K, width, height)
+
+
+def _cloud(*xyz: tuple[float, float, float], opacity: float = 0.9, scale: float = 0.1) -> Gaussians:
+    n = len(xyz)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1)
+    return Gaussians(torch.tensor(xyz), quats, torch.full((n, 3), scale), torch.full((n,), opacity))
+
+
+def test_each_gaussian_takes_the_class_of_the_pixels_that_show_it():
+    cloud = _cloud((-0.5, 0.0, 2.0), (0.5, 0.0, 2.0), (0.0, 0.0, -2.0))  # left, right, behind the camera
+    labels = torch.zeros(24, 32, dtype=torch.int64)
+    labels[:, 16:] = 2
+    votes = vote_labels(cloud, [(_camera(), labels)], 3)
+    assert votes.labels.tolist() == [0, 2, -1]
+    assert votes.shares.tolist() == pytest.approx([1.0, 1.0, 0.0], abs=1e-3)
+    assert votes.weights[2] == 0
+
+
+def test_what_stands_behind_has_no_say_about_pixels_it_does_not_show():
+    front, back = (0.0, 0.0, 2.0), (0.0, 0.0, 4.0)
+    cloud = _cloud(front, back, opacity=0.99, scale=0.5)
+    votes = vote_labels(cloud, [(_camera(), torch.ones(24, 32, dtype=torch.int64))], 2)
+    assert votes.weights[1] < 0.2 * votes.weights[0]
+
+
+def test_the_majority_of_views_wins_and_unlabelled_pixels_do_not_vote():
+    cloud = _cloud((0.0, 0.0, 2.0))
+    maps = [torch.full((24, 32), label) for label in (1, 0, 1, -1, -1, -1)]
+    votes = vote_labels(cloud, [(_camera(), m) for m in maps], 2)
+    assert votes.labels.tolist() == [1]
+    assert float(votes.shares) == pytest.approx(2 / 3, abs=1e-5)
+
+
+def test_votes_are_the_sums_of_compositing_weights():
+    cloud = _cloud((0.1, 0.0, 2.0), opacity=0.5)
+    camera = _camera()
+    votes = vote_labels(cloud, [(camera, torch.zeros(24, 32, dtype=torch.int64))], 1)
+    # one Gaussian alone: the sum over pixels of o * exp(-d^2 / (2 s^2)) is o * 2 pi s^2 up to the cut at 1/255
+    s2 = (0.1 * 30 / 2) ** 2 + 0.3
+    assert float(votes.weights) == pytest.approx(0.5 * 2 * torch.pi * s2, rel=0.03)
+
+
+def test_bad_input_is_named():
+    cloud = _cloud((0.0, 0.0, 2.0))
+    with pytest.raises(ValueError, match=r"camera's size \(24, 32\).*got \(3, 3\)"):
+        vote_labels(cloud, [(_camera(), torch.zeros(3, 3, dtype=torch.int64))], 2)
+    with pytest.raises(ValueError, match="labels below 2"):
+        vote_labels(cloud, [(_camera(), torch.full((24, 32), 5))], 2)
