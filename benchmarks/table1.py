@@ -19,7 +19,7 @@ import torch
 
 from kfgs._files import write_json
 from kfgs.evaluation import load_label_set
-from kfgs.pipeline import FitConfig, fit_scene, score_scene, score_teacher, segment_scene
+from kfgs.pipeline import FitConfig, fit_scene, score_scene, score_teacher, segment_scene, true_labels
 from kfgs.scenes import load_scene
 from kfgs.teachers import FeatureFolder
 
@@ -60,11 +60,10 @@ def main() -> None:
     train, test = scene.views("train"), scene.views("test")
     maps = FeatureFolder(args.features, [scene.stem(i) for i in train])
     stems = [scene.stem(i) for i in test]
-    truth_folder = args.scene / args.truth
+    truth = true_labels(scene, args.scene / args.truth, "test")
     report: dict[str, object] = {"machine": f"{platform.processor()}, {torch.get_num_threads()} threads"}
     rows = []
 
-    truth = {stem: truth_folder / f"{stem}.png" for stem in stems}
     test_maps = FeatureFolder(args.features, stems)
     teacher = score_teacher(lambda stem: test_maps[stems.index(stem)], truth, classes, scene.cameras[test[0]].size)
     print(f"teacher on the same views: {teacher.miou}\n{teacher.accuracy}")
@@ -78,7 +77,7 @@ def main() -> None:
         result = fit_scene(scene, maps, args.out / mode, config, report=print, progress=True)
         field = result.field
         found = segment_scene(field, scene, classes, args.out / mode / "segmentation", progress=True)
-        scores = score_scene(found, truth_folder, classes)
+        scores = score_scene(found, truth, classes)
         cameras = [scene.cameras[i] for i in test[:12]]
         with torch.no_grad():
             fps = frames_per_second(field.render, cameras)

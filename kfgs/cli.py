@@ -53,15 +53,21 @@ def _classes(scene: Path | None, classes: Path | None, text: Path | None) -> Any
     return load_label_set(classes, text)
 
 
-def _training_cameras(field: Any, scene: Path | None) -> list[Any]:
-    """The cameras that a field was trained with, found again in its scene by name; all of them if none is named so."""
+def _training_cameras(field: Any, scene: Path | None, images: Path | None) -> list[Any]:
+    """The cameras that a field was trained with, found again in its scene by name."""
     from .scenes import load_scene
 
     if scene is None:
         raise ValueError("by: expected 'latents' without a scene, got 'views'; pass --scene, whose cameras vote")
-    cameras = load_scene(scene).undistorted().cameras
+    cameras = load_scene(scene, images=images).undistorted().cameras
     trained = set(field.info.get("views", ()))
-    return [camera for camera in cameras if camera.name in trained] or cameras
+    voting = [camera for camera in cameras if camera.name in trained]
+    if not voting:
+        raise ValueError(
+            f"scene: expected the views that the field was trained on ({', '.join(sorted(trained)[:3])}, ...), got "
+            f"{len(cameras)} others in {scene}; pass the field's own scene, or --by latents"
+        )
+    return voting
 
 
 def demo(out: Path = Path("kfgs_demo"), seed: int = 0, steps: int | None = None) -> None:
@@ -73,9 +79,10 @@ def demo(out: Path = Path("kfgs_demo"), seed: int = 0, steps: int | None = None)
         steps: training steps of the field; the CPU preset's when not given.
     """
     from .pipeline import demo as run_demo
+    from .scenes.toy import ToyConfig
 
     config = _fit_config("cpu", "adc+sc", seed, steps, None, "train")
-    _wrote(run_demo.run(out, config, report=_say, progress=True))
+    _wrote(run_demo.run(out, config, room=ToyConfig(seed=seed), report=_say, progress=True))
 
 
 def sfm(
@@ -101,9 +108,12 @@ def sfm(
     config = SfmConfig(matching=matching, camera_model=camera_model, min_registered=min_registered, seed=seed)
     _say(str(run_sfm(images, out, config=config, progress=True)))
     written = [out / "sparse" / "0"]
-    if not (out / "images").exists():
-        (out / "images").symlink_to(images.resolve(), target_is_directory=True)
-        written.append(out / "images")  # so that `kfgs fit OUT` finds the pictures
+    beside = out / "images"
+    if not os.path.lexists(beside):
+        beside.symlink_to(images.resolve(), target_is_directory=True)  # so that `kfgs fit OUT` finds the pictures
+        written.append(beside)
+    elif beside.resolve() != images.resolve():
+        _say(f"note: {beside} is another folder; pass --images {images} to the other commands")
     _wrote(written)
 
 
@@ -147,7 +157,7 @@ def fit(
     maps = FeatureFolder(features, [loaded.stem(i) for i in loaded.views(split)])
     result = fit_scene(loaded, maps, out, config, report=_say, progress=True)
     _say(result.field.summary())
-    _wrote([result.field_path, *write_training_pictures(out)])
+    _wrote([result.field_path, *write_training_pictures(result)])
 
 
 def segment(
@@ -177,21 +187,31 @@ def segment(
         images: folder of the pictures, if it is not SCENE/images.
     """
     from .fields import SemanticField
-    from .pipeline import score_scene, segment_scene, write_report
+    from .pipeline import score_scene, segment_scene, true_labels, write_report
     from .scenes import load_scene
     from .viz import plot_confusion
 
     loaded, label_set = load_scene(scene, images=images).undistorted(), _classes(scene, classes, text)
+    folder = labels or next((scene / name for name in ("labels_scored", "labels") if (scene / name).is_dir()), None)
+    truth = {} if folder is None else true_labels(loaded, folder, split)
+    if labels is not None and not truth:
+        raise ValueError(
+            f"labels: expected pictures <stem>.png of the views of split {split!r} in {labels}, found none"
+        )
     field_ = SemanticField.load(field)
+    seen = set(field_.info.get("views", ())) & {loaded.cameras[i].name for i in loaded.views(split)}
+    if seen:
+        _say(f"note: the field was trained on {len(seen)} of these views")
     found = segment_scene(field_, loaded, label_set, out, split=split, decode=decode, pictures=pictures, progress=True)
-    written = [path for path in (out / "labels", out / "overlay", out / "features") if path.is_dir()]
-    truth = labels or next((scene / name for name in ("labels_scored", "labels") if (scene / name).is_dir()), None)
-    if truth is not None:
+    written = [out / name for name in ("predicted", "overlay", "features") if (out / name).is_dir()]
+    if truth:
         scores = score_scene(found, truth, label_set)
         _say(str(scores))
-        write_report(out / "scores.json", segmentation=scores, truth=str(truth), field=str(field), decode=decode)
+        write_report(out / "scores.json", segmentation=scores, truth=str(folder), field=str(field), decode=decode)
         plot_confusion(scores.confusion, list(label_set.names), out / "confusion.png")
         written += [out / "scores.json", out / "confusion.png"]
+    else:
+        _say(f"note: no label pictures of split {split!r} in {scene}: nothing to score against")
     _wrote(written)
 
 
@@ -206,6 +226,7 @@ def label(
     cloud: Path | None = None,
     distance: float | None = None,
     by: Literal["views", "latents"] | None = None,
+    images: Path | None = None,
 ) -> None:
     """Label the Gaussians of a field, and carry the labels to a colour cloud by distance.
 
@@ -221,24 +242,39 @@ def label(
         distance: the paper's lambda in world units; from the clouds' spacing when not given.
         by: `views`: the training views of SCENE vote on each Gaussian; `latents`: each Gaussian's own latent decides, as
             in the paper. `views` when a scene is given.
+        images: folder of the scene's pictures, if it is not SCENE/images.
     """
     from .fields import SemanticField
-    from .pipeline import label_cloud, label_field, query_field, save_labelled
+    from .pipeline import label_cloud, label_field, query_field, read_cloud, save_labelled
 
+    for name, value, other, needed in (
+        ("threshold", threshold, "query", query),
+        ("distance", distance, "cloud", cloud),
+    ):
+        if value is not None and needed is None:
+            raise ValueError(f"{name}: expected --{other} beside it, got none; it would have no effect")
+    if query is not None and by is not None:
+        raise ValueError("by: expected none beside --query, which compares each Gaussian's own latent; leave one out")
     label_set = _classes(scene, classes, text)
     loaded = SemanticField.load(field)
+    carried = None if cloud is None else read_cloud(cloud)
+    targets = [out / "gaussians.ply"] + ([] if cloud is None else [out / "cloud.ply"])
+    if cloud is not None and cloud.resolve() in {target.resolve() for target in targets}:
+        raise ValueError(f"out: expected another folder than that of --cloud, got {out}; {cloud} would be overwritten")
     if query is None:
         by = by or ("latents" if scene is None else "views")
-        gaussians, scores = label_field(loaded, label_set, _training_cameras(loaded, scene) if by == "views" else None)
+        cameras = _training_cameras(loaded, scene, images) if by == "views" else None
+        gaussians, scores = label_field(loaded, label_set, cameras)
+        rule = "votes of the training views; score = winner's share" if cameras else "own latents; score = cosine"
     else:
-        gaussians, scores, how = query_field(loaded, label_set, query, threshold)
-        _say(how)
+        gaussians, scores, rule = query_field(loaded, label_set, query, threshold)
+    _say(f"labelled by {rule}")
     assert gaussians.labels is not None
-    written = save_labelled(out / "gaussians.ply", gaussians, scores, label_set)
+    written = save_labelled(targets[0], gaussians, scores, label_set, rule=rule)
     for i, name in enumerate(label_set.names):
         _say(f"  {name:<16s} {int((gaussians.labels == i).sum()):8d} Gaussians")
-    if cloud is not None:
-        moved, paths = label_cloud(gaussians, cloud, out / "cloud.ply", label_set, distance=distance)
+    if carried is not None:
+        moved, paths = label_cloud(gaussians, carried, targets[1], label_set, distance=distance)
         _say(str(moved))
         written += paths
     _wrote(written)
@@ -273,7 +309,7 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("interrupted; the same command goes on where it stopped", file=sys.stderr)  # noqa: T201
         return 130
-    except (ValueError, TypeError, OSError, ImportError) as error:
+    except (ValueError, TypeError, OSError, ImportError, ArithmeticError) as error:
         print(f"error: {error}", file=sys.stderr)  # noqa: T201
         return 1
     return 0

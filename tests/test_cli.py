@@ -48,7 +48,7 @@ def test_segment_scores_where_truth_is_known(run, room, tmp_path, capsys):
     scores = json.loads((out / "scores.json").read_text())
     assert scores["segmentation"]["views"] == 3
     assert 0 < scores["segmentation"]["miou"] < 1
-    for name in ("labels", "overlay", "features", "confusion.png", "scores.json"):
+    for name in ("predicted", "overlay", "features", "confusion.png", "scores.json"):
         assert str(out / name) in said
 
 
@@ -77,6 +77,33 @@ def test_label_carries_classes_to_another_cloud_and_keeps_its_columns(run, room,
     assert {"class_id", "score", "red"} <= set(read_ply(out / "gaussians.ply"))
 
 
+def test_nothing_of_the_users_is_overwritten(run, room, tmp_path, capsys):
+    before = (room / "labels" / "view_001.png").read_bytes()
+    assert main(["segment", str(run / "field"), "--scene", str(room), "--out", str(room), "--pictures", "0"]) == 0
+    assert (room / "labels" / "view_001.png").read_bytes() == before
+    cloud = tmp_path / "gaussians.ply"
+    write_ply(cloud, {name: np.zeros(3, np.float32) for name in "xyz"})
+    before = cloud.read_bytes()
+    arguments = ["label", str(run / "field"), "--scene", str(room), "--out", str(tmp_path), "--cloud", str(cloud)]
+    assert main(arguments) == 1
+    assert "would be overwritten" in capsys.readouterr().err
+    assert cloud.read_bytes() == before
+
+
+def test_a_clouds_own_colours_are_kept(run, room, tmp_path):
+    red = np.full(4, 200, np.uint8)
+    write_ply(tmp_path / "c.ply", {n: np.zeros(4, np.float32) for n in "xyz"} | {"red": red, "green": red, "blue": red})
+    arguments = ["label", str(run / "field"), "--scene", str(room), "--out", str(tmp_path / "o"), "--by", "latents"]
+    assert main([*arguments, "--cloud", str(tmp_path / "c.ply")]) == 0
+    assert read_ply(tmp_path / "o" / "cloud.ply")["red"].tolist() == [200] * 4
+
+
+def test_views_without_label_pictures_are_segmented_without_a_score(run, room, tmp_path, capsys):
+    arguments = ["segment", str(run / "field"), "--scene", str(room), "--out", str(tmp_path), "--pictures", "0"]
+    assert main([*arguments, "--split", "train"]) == 0
+    assert "trained on 6 of these views" in capsys.readouterr().out
+
+
 def test_a_single_query_reports_its_threshold(run, room, tmp_path, capsys):
     assert main(["label", str(run / "field"), "--scene", str(room), "--out", str(tmp_path), "--query", "chair"]) == 0
     assert "above gamma = " in capsys.readouterr().out
@@ -100,6 +127,16 @@ def test_a_single_query_reports_its_threshold(run, room, tmp_path, capsys):
         ),
         (["label", "{run}/field", "--out", "{tmp}/o"], "pass --classes and --text"),
         (["label", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--query", "dragon"], "got 'dragon'"),
+        (
+            ["label", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--distance", "1"],
+            "expected --cloud beside it",
+        ),
+        (
+            ["label", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--threshold", "1"],
+            "expected --query beside",
+        ),
+        (["label", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--cloud", "{room}/no.ply"], "no such file"),
+        (["segment", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--labels", "{tmp}"], "found none"),
         (["sfm", "{tmp}", "--out", "{tmp}/o"], "image"),
     ],
 )

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from ..cameras import resize_labels
@@ -32,7 +32,11 @@ def load_label_map(path: str | Path) -> Tensor:  # [H, W] int64, -1 = void
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected a label picture there")
-    with Image.open(path) as picture:
+    try:
+        picture = Image.open(path)
+    except UnidentifiedImageError as error:
+        raise ValueError(f"{path}: expected a picture of labels, but it cannot be decoded; write it again") from error
+    with picture:
         if picture.mode not in ("L", "P"):
             raise ValueError(f"{path}: expected 8-bit class indices (mode L or P), got mode {picture.mode}")
         values = torch.from_numpy(np.array(picture)).long()
@@ -70,7 +74,7 @@ class SegmentationReport:
 
 def evaluate_segmentation(
     predict: Callable[[str], Tensor],  # stem -> labels [h, w]
-    truth: dict[str, Path],  # stem -> label picture
+    truth: Mapping[str, Path | Tensor],  # stem -> label picture, or its labels [H, W] with -1 = void
     names: Iterable[str],
 ) -> SegmentationReport:
     """Score predicted label maps against label pictures (protocol `kfgs-pooled/1`).
@@ -87,15 +91,21 @@ def evaluate_segmentation(
     if not truth:
         raise ValueError("truth: expected at least one label picture, got none; is the folder of labels right?")
     pooled = ConfusionMatrix(len(names) + 1)  # the last row and column hold "no label", which is never a true class
-    for stem, path in truth.items():
-        target = load_label_map(path)
+    for stem, given in truth.items():
+        target = given if isinstance(given, Tensor) else load_label_map(given)
         if int(target.max()) >= len(names):
-            raise ValueError(f"{path}: expected labels below {len(names)} (from names), got {int(target.max())}")
+            where = f"truth[{stem!r}]" if isinstance(given, Tensor) else given
+            raise ValueError(
+                f"{where}: expected labels below {len(names)} (from names), got {int(target.max())}; "
+                "is this the label picture of another set of classes?"
+            )
         labels = predict(stem)
         if labels.shape != target.shape:
             labels = resize_labels(labels, (int(target.shape[0]), int(target.shape[1])))
         pooled.update(torch.where(labels < 0, len(names), labels), target)
     confusion = pooled.matrix
+    if int(confusion.sum()) == 0:
+        raise ValueError(f"truth: expected some pixel with a known label, got only void in {len(truth)} views")
     hits = confusion.diag()[:-1].double()
     union = confusion.sum(0)[:-1] + confusion.sum(1)[:-1] - confusion.diag()[:-1]
     iou = torch.where(union > 0, hits / union, torch.nan)

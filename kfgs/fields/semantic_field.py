@@ -158,10 +158,13 @@ class SemanticField:
         )
 
     def quantized(self) -> Tensor:  # [N, D]
-        """The codeword nearest to each Gaussian's decoded feature; without a codebook the features themselves."""
+        """The codeword nearest to each Gaussian's decoded feature; without a codebook the features themselves.
+
+        All-zero where the Gaussian was never learnt.
+        """
         if self.codebook is None:
             return self.features
-        return self.codebook.codewords[self._codeword_index()]
+        return self.codebook.codewords[self._codeword_index()] * self._learnt()[:, None]
 
     def classify(
         self,
@@ -170,15 +173,16 @@ class SemanticField:
         """The class of each Gaussian by max-similarity (Sec. 3.4), and its cosine with that class.
 
         This decodes each Gaussian's own latent, as the paper does. Training constrains only blends of latents, so
-        `classify_by_views` is more accurate where cameras are at hand.
+        `classify_by_views` is more accurate where cameras are at hand. A Gaussian that no training view ever showed
+        still has its all-zero start: label -1, score 0.
         """
         self._check_embeddings(embeddings)
         if self.codebook is None:
             found = classify(self.features, embeddings)
             return found.labels, found.scores
         per_codeword = classify(self.codebook.codewords, embeddings)
-        index = self._codeword_index()
-        return per_codeword.labels[index], per_codeword.scores[index]
+        index, learnt = self._codeword_index(), self._learnt()
+        return per_codeword.labels[index].masked_fill(~learnt, -1), per_codeword.scores[index].masked_fill(~learnt, 0)
 
     def classify_by_views(
         self,
@@ -257,6 +261,10 @@ class SemanticField:
         """Each Gaussian's codeword; decoded in chunks, so [N, D] is never held."""
         assert self.codebook is not None
         return torch.cat([self.codebook.quantize(self.decode(part)) for part in self.features.split(CHUNK)])
+
+    def _learnt(self) -> Tensor:  # [N] bool
+        """Whether a Gaussian's features left their start at 0, which those that no view shows never do."""
+        return self.features.any(dim=1)
 
     def _check_embeddings(self, embeddings: Tensor) -> None:
         check_shapes(("embeddings", embeddings, f"C {self.dim}"))

@@ -4,10 +4,12 @@ from .apply import (
     label_cloud,
     label_field,
     query_field,
+    read_cloud,
     save_labelled,
     score_scene,
     score_teacher,
     segment_scene,
+    true_labels,
     write_report,
 )
 from .describe import describe
@@ -26,10 +28,12 @@ __all__ = [
     "label_field",
     "load_history",
     "query_field",
+    "read_cloud",
     "save_labelled",
     "score_scene",
     "score_teacher",
     "segment_scene",
+    "true_labels",
     "write_report",
     "write_training_pictures",
 ]

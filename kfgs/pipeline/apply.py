@@ -12,14 +12,14 @@ from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
 
+from .._check import check_range
 from .._files import atomic_path, write_json
-from ..cameras import Camera, resize_labels
-from ..evaluation import LabelSet, SegmentationReport, evaluate_segmentation
+from ..cameras import Camera, resize_labels, undistort_labels
+from ..evaluation import LabelSet, SegmentationReport, evaluate_segmentation, load_label_map
 from ..evaluation.segmentation import VOID
 from ..fields import SemanticField
 from ..gaussians import Gaussians
-from ..labels import Transfer, transfer_labels
-from ..quant import unit_rows
+from ..labels import Transfer, classify, transfer_labels
 from ..scenes import Scene
 from ..scenes.ply import Columns, columns_from_gaussians, points_from_columns, read_ply, write_ply
 from ..viz import FeatureColors, overlay_labels, palette, save_picture
@@ -62,7 +62,7 @@ def segment_scene(
         field: a finished field in the frame of `scene`.
         scene: posed views without distortion.
         classes: names and embeddings in the teacher's space.
-        out: receives `labels/<stem>.png` and, for `pictures` evenly spread views, `overlay/` and `features/`.
+        out: receives `predicted/<stem>.png` and, for `pictures` evenly spread views, `overlay/` and `features/`.
         split: which views.
         decode: `exact` decodes every pixel as the paper does; `latent` asks the same of the latents: much faster, and
             no worse (`docs/results.md`).
@@ -73,6 +73,12 @@ def segment_scene(
         The label map [H, W] of each view by its stem.
     """
     out = Path(out)
+    check_range("pictures", pictures, 0)
+    if len(classes) > VOID:
+        raise ValueError(
+            f"classes: expected at most {VOID} (label pictures hold a byte per pixel, {VOID} = none), got {len(classes)}; "
+            "segment with fewer classes, or call SemanticField.segment, which has no such limit"
+        )
     views = scene.views(split)
     shown = (
         {views[i] for i in np.linspace(0, len(views) - 1, min(pictures, len(views))).round().astype(int)}
@@ -84,7 +90,7 @@ def segment_scene(
     for i in tqdm(views, desc="segment", unit="view", disable=not progress):
         camera, stem = scene.cameras[i], scene.stem(i)
         labels = field.segment(camera, classes.embeddings, decode=decode)
-        save_label_map(out / "labels" / f"{stem}.png", labels)
+        save_label_map(out / "predicted" / f"{stem}.png", labels)
         if i in shown:
             picture = overlay_labels(scene.image(i), labels, list(classes.names))
             save_picture(out / "overlay" / f"{stem}.png", picture)
@@ -94,20 +100,45 @@ def segment_scene(
     return results
 
 
-def score_scene(labels: dict[str, Tensor], truth: Path, classes: LabelSet) -> SegmentationReport:
-    """Score segmented views against the label pictures of a folder; views without one are left out."""
-    known = {stem: truth / f"{stem}.png" for stem in labels if (truth / f"{stem}.png").is_file()}
-    return evaluate_segmentation(lambda stem: labels[stem], known, classes.names)
+def true_labels(scene: Scene, folder: Path, split: str) -> dict[str, Tensor]:
+    """The label pictures of a split's views by stem, as [H, W] with -1 = void; views without one are left out.
+
+    Where the scene's lens was removed, it is removed from the label pictures too, which are of the pictures as taken.
+    """
+    truth = {}
+    for i in scene.views(split):
+        path = folder / f"{scene.stem(i)}.png"
+        if path.is_file():
+            labels = load_label_map(path)
+            if scene.lenses is not None and scene.lenses[i].distortion is not None:
+                lens = scene.lenses[i].resized(int(labels.shape[0]), int(labels.shape[1]))
+                labels = undistort_labels(labels, lens)
+            truth[scene.stem(i)] = labels
+    return truth
+
+
+def score_scene(labels: dict[str, Tensor], truth: dict[str, Tensor], classes: LabelSet) -> SegmentationReport:
+    """Score segmented views against the truth of those that have one (`true_labels`)."""
+    known = {stem: target for stem, target in truth.items() if stem in labels}
+    return evaluate_segmentation(labels.__getitem__, known, classes.names)
 
 
 def score_teacher(
-    maps: Callable[[str], Tensor], truth: dict[str, Path], classes: LabelSet, size: tuple[int, int]
+    maps: Callable[[str], Tensor], truth: dict[str, Tensor], classes: LabelSet, size: tuple[int, int]
 ) -> SegmentationReport:
-    """Score the teacher itself: each pixel's best class by cosine, under the protocol of `score_scene`."""
-    rows = unit_rows(classes.embeddings)
+    """Score the teacher itself: each pixel's best class by cosine, under the protocol of `score_scene`.
+
+    Args:
+        maps: gives a view's teacher map [h, w, D] by its stem, undistorted as the views are.
+        truth: what `true_labels` gives.
+        classes: names and embeddings.
+        size: (height, width) to which the teacher's labels are brought before they are compared.
+    """
 
     def predict(stem: str) -> Tensor:
-        return resize_labels((unit_rows(maps(stem)) @ rows.T).argmax(-1), size)
+        features = maps(stem)
+        labels = classify(features.flatten(0, 1), classes.embeddings).labels
+        return resize_labels(labels.view(features.shape[:2]), size)
 
     return evaluate_segmentation(predict, truth, classes.names)
 
@@ -145,18 +176,32 @@ def query_field(
     return field.gaussians.replace(labels=labels), found.scores, how
 
 
-def save_labelled(path: str | Path, gaussians: Gaussians, scores: Tensor, classes: LabelSet) -> list[Path]:
-    """Write labelled Gaussians as PLY (`class_id`, `score`, label colours) with a JSON file of names beside it."""
+def save_labelled(
+    path: str | Path, gaussians: Gaussians, scores: Tensor, classes: LabelSet, *, rule: str
+) -> list[Path]:
+    """Write labelled Gaussians as PLY (`class_id`, `score`, label colours) with a JSON file beside it.
+
+    Args:
+        path: the PLY file to write.
+        gaussians: with labels.
+        scores: one per Gaussian.
+        classes: names for the JSON file.
+        rule: how labels and scores came about, for the JSON file.
+    """
     path = Path(path)
     assert gaussians.labels is not None
     columns = columns_from_gaussians(gaussians) | label_columns(gaussians.labels, scores)
     write_ply(path, columns, comments=("kfgs labelled Gaussians",))
+    return [path, _write_names(path, classes, {"labelled by": rule})]
+
+
+def _write_names(path: Path, classes: LabelSet, facts: dict[str, Any]) -> Path:
     names = path.with_suffix(".classes.json")
-    write_json(names, {"class_id": dict(enumerate(classes.names)), "none": -1})
-    return [path, names]
+    write_json(names, {"class_id": dict(enumerate(classes.names)), "none": -1, **facts})
+    return names
 
 
-def label_columns(labels: Tensor, scores: Tensor | None = None) -> Columns:
+def label_columns(labels: Tensor, scores: Tensor | None = None) -> Columns:  # labels [N], scores [N]
     """PLY columns of labels: class_id (int, -1 = none), label colours, and scores when given."""
     rgb = palette(labels)
     columns: Columns = {"class_id": labels.to(torch.int32).numpy()}
@@ -166,25 +211,44 @@ def label_columns(labels: Tensor, scores: Tensor | None = None) -> Columns:
     return columns
 
 
+def read_cloud(path: str | Path) -> Columns:
+    """Read a PLY file whose points can be labelled.
+
+    Raises:
+        ValueError: if it has no x, y, z, or holds more than points (faces would be lost).
+    """
+    columns = read_ply(path)
+    try:
+        points_from_columns(columns)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}; give a point cloud or a 3DGS file") from error
+    return columns
+
+
 def label_cloud(
-    gaussians: Gaussians, cloud: str | Path, out: str | Path, classes: LabelSet, *, distance: float | None = None
+    gaussians: Gaussians, cloud: Columns, out: str | Path, classes: LabelSet, *, distance: float | None = None
 ) -> tuple[Transfer, list[Path]]:
-    """Carry labels to the points or Gaussians of a PLY file by distance (Sec. 3.4), keeping all its other columns.
+    """Carry labels to points or Gaussians by distance (Sec. 3.4), keeping all their other columns.
+
+    Label colours are added where the cloud has no colours of its own; `class_id` is replaced.
 
     Args:
         gaussians: labelled Gaussians of the semantic field.
-        cloud: a PLY file of points or of a colour field, in the same frame.
+        cloud: what `read_cloud` gives, in the same frame.
         out: the PLY file to write.
         classes: names for the JSON file beside it.
         distance: the paper's lambda, in world units; from the clouds' spacing when not given.
     """
     assert gaussians.labels is not None
-    columns = read_ply(cloud)
-    moved = transfer_labels(gaussians.means, gaussians.labels, points_from_columns(columns), distance)
-    write_ply(out, columns | label_columns(moved.labels), comments=("labels carried by kfgs",))
-    names = Path(out).with_suffix(".classes.json")
-    write_json(names, {"class_id": dict(enumerate(classes.names)), "none": -1, "distance": moved.distance})
-    return moved, [Path(out), names]
+    moved = transfer_labels(gaussians.means, gaussians.labels, points_from_columns(cloud), distance)
+    added = label_columns(moved.labels)
+    if {"red", "green", "blue"} & set(cloud):
+        added = {"class_id": added["class_id"]}
+    write_ply(out, cloud | added, comments=("labels carried by kfgs",))
+    return moved, [
+        Path(out),
+        _write_names(Path(out), classes, {"distance": moved.distance, "distance from": moved.how}),
+    ]
 
 
 def write_report(path: Path, **parts: Any) -> None:

@@ -23,6 +23,7 @@ from .apply import (
     score_scene,
     score_teacher,
     segment_scene,
+    true_labels,
     write_report,
 )
 from .fit import FitConfig, fit_scene
@@ -63,8 +64,8 @@ def run(
     say(fitted.field.summary())
 
     found = segment_scene(fitted.field, scene, classes, out / "segmentation", progress=progress)
-    scores = score_scene(found, folder / "labels", classes)
-    truth = {stem: folder / "labels" / f"{stem}.png" for stem in found}
+    truth = true_labels(scene, folder / "labels", "test")
+    scores = score_scene(found, truth, classes)
     test_maps = FeatureFolder(folder / "features", list(found))
     size = scene.cameras[scene.views("test")[0]].size
     teacher = score_teacher(lambda stem: test_maps[list(found).index(stem)], truth, classes, size)
@@ -72,7 +73,7 @@ def run(
     say(f"the teacher on the same views: {teacher.miou}")
 
     gaussians, shares = label_field(fitted.field, classes, [scene.cameras[i] for i in scene.views("train")])
-    written = save_labelled(out / "gaussians.ply", gaussians, shares, classes)
+    written = save_labelled(out / "gaussians.ply", gaussians, shares, classes, rule="votes of the training views")
     surface = {"votes of the training views": _label_surface(gaussians, folder, out / "surface.ply")}
     surface["own latents (Sec. 3.4)"] = _label_surface(label_field(fitted.field, classes)[0], folder, None)
     for rule, facts in surface.items():
@@ -81,12 +82,12 @@ def run(
     segmentation = out / "segmentation"
     return [
         fitted.field_path,
-        segmentation / "labels",
+        segmentation / "predicted",
         segmentation / "overlay",
         segmentation / "features",
         *written,
         out / "surface.ply",
-        *write_training_pictures(out / "run"),
+        *write_training_pictures(fitted),
         out / "scores.json",
     ]
 

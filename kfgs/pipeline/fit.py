@@ -7,7 +7,9 @@ Each call is a stage of a run folder: finished stages are found again by the has
 from __future__ import annotations
 
 import hashlib
+import json
 import shutil
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from dataclasses import field as default
@@ -172,10 +174,16 @@ def _field_stage(
     options: dict[str, Any],
 ) -> tuple[GaussianParams, Stage]:
     """The decoupled field, Sec. 3.2: Gaussians whose rendered latents follow the targets (Eq. 4)."""
-    inputs = inputs | {"scene": _scene_digest(scene, views), "config": asdict(config.field), "seed": config.seed}
+    inputs = inputs | {
+        "scene": _scene_digest(scene, views),
+        "extent": float(scene.extent),
+        "config": asdict(config.field),
+        "seed": config.seed,
+    }
     scratch = run.scratch("field", inputs)
 
-    def make(folder: Path) -> None:
+    def make(folder: Path) -> float:
+        started = time.perf_counter()
         generator = _generator(config.seed, "field")
         start = GaussianParams.from_points(scene.points, int(targets[0].shape[-1]), generator=generator)
         cameras = [scene.cameras[i] for i in views]
@@ -193,6 +201,7 @@ def _field_stage(
             {name: value.contiguous() for name, value in fit.params.to_tensors().items()}, folder / "params.safetensors"
         )
         write_json(folder / "history.json", fit.history)
+        return max(0.0, fit.history[-1]["seconds"] - (time.perf_counter() - started))  # before it was killed
 
     stage = run.stage("field", inputs, make)
     if scratch.is_dir():
@@ -233,6 +242,19 @@ def fit_scene(
             f"maps: expected one teacher map per view of split {config.split!r} ({len(views)}), got {len(maps)}; "
             "read them with FeatureFolder(path, stems of that split)"
         )
+    if scene.distorted:
+        raise ValueError("scene: expected cameras without distortion, got a lens; pass scene.undistorted()")
+    if len(scene.points) < 2:
+        raise ValueError(
+            f"scene: expected sparse points to start from, got {len(scene.points)}; a transforms.json needs a "
+            "ply_file_path, or estimate the scene with `kfgs sfm`"
+        )
+    stems = getattr(maps, "stems", None)
+    if stems is not None and [Path(stem).name for stem in stems] != [Path(scene.stem(i)).name for i in views]:
+        raise ValueError(
+            f"maps: expected the maps of the views of split {config.split!r} in their order ({scene.stem(views[0])}, "
+            f"...), got {stems[0]}, ...; read them with FeatureFolder(path, [scene.stem(i) for i in scene.views(split)])"
+        )
     run = Run(Path(folder), report)
     options: dict[str, Any] = {"progress": progress, "callback": callback}
     codebook, autoencoder = None, None
@@ -264,17 +286,23 @@ def fit_scene(
     }
     result = SemanticField(params.activated().detach(), codebook, autoencoder, info)
     done = FitResult(result, Path(folder), run.stages)
-    result.save(done.field_path)
+    if not _is_saved(result, done.field_path):
+        result.save(done.field_path)
     return done
 
 
-def load_history(folder: Path, stage: str) -> list[dict[str, Any]]:
-    """The history rows of the newest finished stage of that name in a run folder.
+def _is_saved(field: SemanticField, path: Path) -> bool:
+    """Whether this very field lies at `path` already, so that nothing there need be touched."""
+    try:
+        saved = SemanticField.load(path)
+    except (OSError, ValueError):
+        return False
+    names = ("means", "quats", "scales", "opacities", "features")
+    same = all(torch.equal(getattr(saved.gaussians, name), getattr(field.gaussians, name)) for name in names)
+    return same and saved.info == json.loads(json.dumps(field.info))
 
-    Raises:
-        FileNotFoundError: if the run has no such stage.
-    """
-    found = sorted((folder / "stages").glob(f"{stage}-*/history.json"), key=lambda path: path.stat().st_mtime)
-    if not found:
-        raise FileNotFoundError(f"{folder}: expected a finished stage {stage!r} in this run folder, found none")
-    return list(read_json(found[-1]))
+
+def load_history(stage: Stage) -> list[dict[str, Any]]:
+    """The history rows of a finished stage; none if it keeps no history."""
+    path = stage.folder / "history.json"
+    return list(read_json(path)) if path.is_file() else []

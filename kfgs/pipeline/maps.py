@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..cameras import Camera, undistort
+from ..quant import EPS, row_norms
 
 
 class Maps(Protocol):
@@ -74,4 +75,4 @@ class KnownFeatures(Sequence[Tensor]):
 
     def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [h, w, D], one map at a time
         features = self.maps[i]
-        return features.masked_fill(~features.any(dim=-1, keepdim=True), torch.nan)
+        return features.masked_fill(row_norms(features.float())[..., None] <= EPS, torch.nan)

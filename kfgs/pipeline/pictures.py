@@ -5,17 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..viz import plot_codebook_history, plot_training
-from .fit import load_history
+from .fit import FitResult, load_history
 
 
-def write_training_pictures(folder: str | Path) -> list[Path]:
-    """Draw the histories of a run folder's newest stages; return the pictures written."""
-    folder = Path(folder)
+def write_training_pictures(result: FitResult) -> list[Path]:
+    """Draw the histories of a run's codebook and field into its folder; return the pictures written."""
+    draw = {"codebook": plot_codebook_history, "field": plot_training}
     written = []
-    for stage, draw in (("codebook", plot_codebook_history), ("field", plot_training)):
-        if not list((folder / "stages").glob(f"{stage}-*")):
-            continue  # `decouple` has no codebook
-        path = folder / f"{stage}.png"
-        draw(load_history(folder, stage), path)
-        written.append(path)
+    for stage in result.stages:
+        if stage.name in draw:  # `decouple` has no codebook
+            written.append(result.folder / f"{stage.name}.png")
+            draw[stage.name](load_history(stage), written[-1])
     return written

@@ -8,6 +8,7 @@ one step. So a killed run leaves only finished stages, and the same command star
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -17,6 +18,8 @@ from typing import Any
 from .._files import atomic_folder, digest_file, digest_value, read_json, write_json
 
 STAGE_FILE = "stage.json"
+STAGE_VERSION = 1
+"""Part of every key: raised when the same inputs would give another result, so that old stages are not used again."""
 
 
 @dataclass(frozen=True)
@@ -47,32 +50,40 @@ class Run:
     report: Callable[[str], None] | None = None
     stages: list[Stage] = field(default_factory=list)
 
-    def stage(self, name: str, inputs: dict[str, Any], make: Callable[[Path], Any]) -> Stage:
+    def stage(self, name: str, inputs: dict[str, Any], make: Callable[[Path], float | None]) -> Stage:
         """Return the finished stage of these inputs, making it if it is not there.
 
         Args:
             name: a word for the folder's name.
             inputs: everything that decides the result, as JSON; keys of earlier stages stand for their content.
-            make: fills the folder it is given.
+            make: fills the folder it is given; may return the seconds of work that an earlier, killed process did for it.
 
         Raises:
             ValueError: if a folder of that key is damaged.
         """
-        key = digest_value({"name": name, "inputs": inputs})[:12]
+        key = _key(name, inputs)
         target = self.folder / "stages" / f"{name}-{key}"
         if (target / STAGE_FILE).is_file():
             about = read_json(target / STAGE_FILE)
             if about.get("inputs") != json.loads(json.dumps(inputs)):
                 raise ValueError(f"{target}: expected the stage of these inputs, found another's; delete the folder")
+            if about.get("files") != _sizes(target):
+                raise ValueError(
+                    f"{target}: expected the files {about.get('files')} (name: bytes), found {_sizes(target)}; the stage "
+                    "is damaged: delete the folder, and it will be made again"
+                )
             done = Stage(name, key, target, float(about["seconds"]), True)
             self._say(f"{name}: found in {target.name} (made in {done.seconds:.1f} s)")
         else:
             self._say(f"{name}: working")
             start = time.perf_counter()
+            for left_over in target.parent.glob(f".{target.name}.*"):  # of a process that was killed
+                shutil.rmtree(left_over, ignore_errors=True)
             with atomic_folder(target) as temporary:
-                make(temporary)
-                seconds = time.perf_counter() - start
-                write_json(temporary / STAGE_FILE, {"name": name, "inputs": inputs, "seconds": seconds})
+                earlier = make(temporary) or 0.0
+                seconds = time.perf_counter() - start + earlier
+                about = {"name": name, "inputs": inputs, "seconds": seconds, "files": _sizes(temporary)}
+                write_json(temporary / STAGE_FILE, about)
             done = Stage(name, key, target, seconds, False)
             self._say(f"{name}: done in {seconds:.1f} s")
         self.stages.append(done)
@@ -80,23 +91,22 @@ class Run:
 
     def scratch(self, name: str, inputs: dict[str, Any]) -> Path:
         """A path for the unfinished work of a stage (checkpoints), kept until the stage is done."""
-        key = digest_value({"name": name, "inputs": inputs})[:12]
-        return self.folder / "unfinished" / f"{name}-{key}"
+        return self.folder / "unfinished" / f"{name}-{_key(name, inputs)}"
 
-    def digests(self, paths: Sequence[Path]) -> dict[str, str]:
-        """SHA-256 of files by file name; a file whose size and time have not changed is not read again."""
+    def digests(self, paths: Sequence[Path]) -> list[list[str]]:
+        """[file name, SHA-256] of each file, in the order given; a file that has not changed is not read again."""
         cache_path = self.folder / "digests.json"
         cache: dict[str, Any] = read_json(cache_path) if cache_path.is_file() else {}
-        result, changed = {}, False
+        result, changed = [], False
         for path in paths:
             info = path.stat()
-            mark = [info.st_size, info.st_mtime_ns]
+            mark = [info.st_size, info.st_mtime_ns, info.st_ctime_ns]
             known = cache.get(str(path.resolve()))
-            if known is None or known[:2] != mark:
+            if known is None or known[:-1] != mark:
                 known = [*mark, digest_file(path)]
                 cache[str(path.resolve())] = known
                 changed = True
-            result[path.name] = known[2]
+            result.append([path.name, known[-1]])
         if changed:
             write_json(cache_path, cache)
         return result
@@ -104,3 +114,11 @@ class Run:
     def _say(self, text: str) -> None:
         if self.report is not None:
             self.report(text)
+
+
+def _key(name: str, inputs: dict[str, Any]) -> str:
+    return digest_value({"name": name, "inputs": inputs, "version": STAGE_VERSION})[:12]
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_size for path in sorted(folder.iterdir()) if path.name != STAGE_FILE}

@@ -50,6 +50,11 @@ def test_bad_input_is_named(tmp_path):
     path = _save(tmp_path / "a.png", [[0, 7]])
     with pytest.raises(ValueError, match="a.png: expected labels below 2.*got 7"):
         evaluate_segmentation(lambda stem: torch.zeros(1, 2, dtype=torch.int64), {"a": path}, ["x", "y"])
+    with pytest.raises(ValueError, match="expected some pixel with a known label, got only void"):
+        evaluate_segmentation(lambda stem: torch.zeros(1, 1).long(), {"a": torch.full((1, 1), -1)}, ["x"])
+    (tmp_path / "broken.png").write_bytes(b"PNG?")
+    with pytest.raises(ValueError, match="broken.png: expected a picture of labels"):
+        load_label_map(tmp_path / "broken.png")
     with pytest.raises(FileNotFoundError, match="label picture"):
         load_label_map(tmp_path / "none.png")
     Image.fromarray(np.zeros((2, 2, 3), np.uint8)).save(tmp_path / "rgb.png")

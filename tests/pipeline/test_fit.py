@@ -5,9 +5,10 @@ import pytest
 import torch
 from small_room import CONFIG, config, make_room
 
+from kfgs.cameras import Distortion
 from kfgs.evaluation import load_label_set
 from kfgs.fields import SemanticField
-from kfgs.pipeline import fit_scene, load_history, score_scene, segment_scene
+from kfgs.pipeline import fit_scene, load_history, score_scene, score_teacher, segment_scene, true_labels
 from kfgs.scenes import load_scene
 from kfgs.teachers import FeatureFolder, save_feature_map
 
@@ -46,7 +47,7 @@ def test_the_run_folder_holds_every_stage_and_the_field(fitted):
     assert _same(loaded, fitted.field)
     assert loaded.info["mode"] == "adc+sc"
     assert loaded.features.shape[1] == 4
-    losses = [row["loss"] for row in load_history(fitted.folder, "field")]
+    losses = [row["loss"] for row in load_history(fitted.stages[-1])]
     assert losses[-1] < 0.7 * losses[0]
 
 
@@ -79,6 +80,7 @@ def test_killed_in_the_middle_of_the_field_it_goes_on_and_ends_the_same(when, fi
     assert [stage.reused for stage in resumed.stages] == [True, True, True, False]
     # report_every is part of the configuration, but not of what is learnt
     assert _same(resumed.field, fitted.field)
+    assert resumed.stages[-1].seconds >= load_history(resumed.stages[-1])[-1]["seconds"]  # both processes' time
 
 
 def test_killed_in_the_codebook_it_starts_that_stage_again(fitted, scene, maps, tmp_path):
@@ -105,6 +107,19 @@ def test_the_other_rows_of_table_1_run(mode, channels, scene, maps, fitted, room
     assert len(labels.unique()) > 2
 
 
+def test_what_else_lies_in_the_field_folder_outlasts_a_second_run(fitted, scene, maps):
+    (fitted.field_path / "mine").mkdir()
+    fit_scene(scene, maps, fitted.folder, CONFIG)
+    assert (fitted.field_path / "mine").is_dir()
+
+
+def test_another_extent_is_another_field(fitted, scene, maps):
+    fewer = dataclasses.replace(scene, splits=scene.splits | {"all": scene.splits["train"], "train": [0, 1]})
+    assert fewer.extent != scene.extent
+    again = fit_scene(fewer, maps, fitted.folder, config(split="all"))
+    assert not again.stages[-1].reused
+
+
 def test_other_options_make_other_stages(fitted, scene, maps):
     changed = fit_scene(scene, maps, fitted.folder, config(seed=1))
     assert not any(stage.reused for stage in changed.stages if stage.name != "index_maps")
@@ -128,21 +143,60 @@ def test_changed_features_are_noticed(room, scene, tmp_path):
 def test_unseen_views_are_segmented_scored_and_drawn(fitted, scene, room, tmp_path):
     classes = load_label_set(room / "classes.json", room / "text.npy")
     labels = segment_scene(fitted.field, scene, classes, tmp_path, decode="latent", pictures=2)
-    scores = score_scene(labels, room / "labels", classes)
+    scores = score_scene(labels, true_labels(scene, room / "labels", "test"), classes)
     assert scores.views == 3
     assert scores.accuracy.value > 0.5  # sixty steps on a postage stamp; chance is below 0.1
-    assert len(list((tmp_path / "labels").iterdir())) == 3
+    assert len(list((tmp_path / "predicted").iterdir())) == 3
     assert len(list((tmp_path / "overlay").iterdir())) == 2
     assert len(list((tmp_path / "features").iterdir())) == 2
     assert json.dumps(scores.to_json())
 
 
-def test_wrong_number_of_maps_is_refused(scene, room, tmp_path):
+def test_bad_input_is_refused_before_any_work(scene, maps, room, tmp_path):
     two = FeatureFolder(room / "features", [scene.stem(0), scene.stem(1)])
     with pytest.raises(ValueError, match=r"one teacher map per view of split 'train' \(6\), got 2"):
         fit_scene(scene, two, tmp_path, CONFIG)
     with pytest.raises(ValueError, match="mode: expected one of 'decouple', 'adc', 'adc\\+sc', got 'all'"):
         config(mode="all")
+    backwards = FeatureFolder(room / "features", [scene.stem(i) for i in reversed(scene.splits["train"])])
+    with pytest.raises(ValueError, match=r"in their order \(view_"):
+        fit_scene(scene, backwards, tmp_path, CONFIG)
+    nothing = dataclasses.replace(scene, points=scene.points[:0], colors=scene.colors[:0])
+    with pytest.raises(ValueError, match="sparse points to start from, got 0"):
+        fit_scene(nothing, maps, tmp_path, CONFIG)
     with pytest.raises(ValueError, match=r"split: expected one of train, test.*got 'val'"):
         fit_scene(scene, two, tmp_path, config(split="val"))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_truth_is_undistorted_as_the_views_are(scene, room):
+    lens = Distortion("brown_conrady", (0.3, 0.0, 0.0, 0.0))
+    bent = dataclasses.replace(scene, cameras=[dataclasses.replace(c, distortion=lens) for c in scene.cameras])
+    plain, straight = (true_labels(s, room / "labels", "test") for s in (scene, bent.undistorted()))
+    for stem, labels in plain.items():
+        assert (labels >= 0).all()
+        assert (straight[stem] < 0).any()  # what the lens did not see
+        assert (straight[stem] != labels)[straight[stem] >= 0].float().mean() > 0.02
+        assert straight[stem][30, 40] == labels[30, 40] or straight[stem][31, 43] == labels[31, 43]  # the axis stays
+
+
+def test_the_teacher_is_wrong_where_it_knows_nothing(scene, room, maps):
+    classes = load_label_set(room / "classes.json", room / "text.npy")
+    truth = true_labels(scene, room / "labels", "test")
+    nothing = score_teacher(lambda stem: torch.zeros(30, 40, 32), truth, classes, (60, 80))
+    assert nothing.accuracy.value == 0
+    with pytest.raises(ValueError, match="embeddings: expected"):
+        score_teacher(lambda stem: torch.zeros(30, 40, 31), truth, classes, (60, 80))
+
+
+def test_gaussians_that_no_view_showed_have_no_class(fitted, room):
+    classes = load_label_set(room / "classes.json", room / "text.npy")
+    gaussians = fitted.field.gaussians
+    features = gaussians.features.clone()
+    features[:5] = 0
+    field = dataclasses.replace(fitted.field, gaussians=gaussians.replace(features=features))
+    labels, scores = field.classify(classes.embeddings)
+    assert labels[:5].tolist() == [-1] * 5
+    assert scores[:5].tolist() == [0.0] * 5
+    assert (labels[5:] >= 0).any()
+    assert not field.query(classes.embeddings[1], -1.0).mask[:5].any()

@@ -9,6 +9,7 @@ def _maker(calls: list[str], name: str):
     def make(folder):
         calls.append(name)
         (folder / "value").write_text(name)
+        return 0.0
 
     return make
 
@@ -58,16 +59,35 @@ def test_a_stage_of_other_inputs_under_the_same_key_is_refused(tmp_path):
         run.stage("a", {"x": 1}, lambda folder: None)
 
 
-def test_digests_follow_content_not_names_and_are_cached(tmp_path):
+def test_a_damaged_stage_is_named(tmp_path):
+    run = Run(tmp_path)
+    stage = run.stage("a", {"x": 1}, _maker([], "whole"))
+    (stage.folder / "value").write_text("")
+    with pytest.raises(ValueError, match=r"damaged: delete the folder"):
+        run.stage("a", {"x": 1}, _maker([], "whole"))
+
+
+def test_what_a_killed_process_left_is_swept_and_its_time_is_counted(tmp_path):
+    name = Run(tmp_path / "other").stage("a", {}, lambda folder: 0.0).folder.name
+    (tmp_path / "stages" / f".{name}.left").mkdir(parents=True)
+    stage = Run(tmp_path).stage("a", {}, lambda folder: 1000.0)
+    assert [path.name for path in (tmp_path / "stages").iterdir()] == [stage.folder.name]
+    assert stage.seconds >= 1000
+
+
+def test_digests_follow_content_and_order_and_tell_equal_names_apart(tmp_path):
     run = Run(tmp_path / "run")
-    path = tmp_path / "f.bin"
+    path, twin = tmp_path / "f.bin", tmp_path / "sub" / "f.bin"
+    twin.parent.mkdir()
     path.write_bytes(b"one")
-    before = run.digests([path])["f.bin"]
-    assert run.digests([path])["f.bin"] == before
+    twin.write_bytes(b"two")
+    before = run.digests([path, twin])
+    assert run.digests([path, twin]) == before
+    assert run.digests([twin, path]) == before[::-1] != before
     path.write_bytes(b"two!")
-    assert run.digests([path])["f.bin"] != before
+    assert run.digests([path, twin])[0] != before[0]
     path.write_bytes(b"one")
-    assert run.digests([path])["f.bin"] == before
+    assert run.digests([path, twin]) == before
 
 
 def test_reports_say_what_was_made_and_what_was_found(tmp_path):
