@@ -1,4 +1,5 @@
 import json
+import shutil
 import subprocess
 import sys
 
@@ -35,6 +36,11 @@ def test_info_knows_fields_runs_scenes_and_plys(run, room, tmp_path, capsys):
         assert "Gaussians" in capsys.readouterr().out
     assert main(["info", str(room)]) == 0
     assert "9 posed images" in capsys.readouterr().out
+    shutil.copytree(run / "stages", tmp_path / "half" / "stages")
+    assert main(["info", str(tmp_path / "half")]) == 0
+    said = capsys.readouterr().out
+    assert "unfinished run" in said
+    assert "codebook: done in" in said
     write_ply(tmp_path / "a.ply", {"x": np.zeros(3, np.float32)})
     assert main(["info", str(tmp_path / "a.ply")]) == 0
     assert "3 vertices; columns x" in capsys.readouterr().out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from .._files import read_json
 from ..fields import SemanticField
 from ..scenes import load_scene
 from ..scenes.ply import read_ply
@@ -27,6 +28,10 @@ def describe(path: str | Path) -> str:
         return SemanticField.load(path).summary()
     if (path / "field" / "field.json").is_file():
         return SemanticField.load(path / "field").summary()
+    if (path / "stages").is_dir():
+        done = [read_json(file) for file in sorted((path / "stages").glob("[!.]*/stage.json"))]
+        lines = [f"  {about['name']}: done in {about['seconds']:.1f} s" for about in done]
+        return "\n".join([f"{path}: unfinished run; start `kfgs fit` again to go on", *lines])
     scene = load_scene(path)
     sizes = sorted({camera.size for camera in scene.cameras})
     splits = ", ".join(f"{name} {len(views)}" for name, views in scene.splits.items())
@@ -36,6 +41,6 @@ def describe(path: str | Path) -> str:
         f"  distorted: {sum(camera.distortion is not None for camera in scene.cameras)}",
         f"  splits: {splits}",
         f"  extent: {scene.extent:.3f} world units",
-        *(f"  note: {note}" for note in getattr(scene, "notes", ())),
+        *(f"  note: {note}" for note in scene.notes),
     ]
     return "\n".join(lines)

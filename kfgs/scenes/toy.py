@@ -28,7 +28,7 @@ from .toy_room import CLASSES, build_room
 from .toy_teacher import class_embeddings, teacher_features
 from .toy_texture import Noise
 
-VERSION = 2  # of the generator: a folder written by another version is not reused
+VERSION = 4  # of the generator: a folder written by another version is not reused
 POINT_NOISE = 0.01  # metres, standard deviation of the sparse points around the surface
 PIXEL_NOISE = 0.4  # pixels, standard deviation of their observations
 
@@ -51,7 +51,7 @@ class ToyConfig:
     """D, channels of features and embeddings."""
     surface_points: int = 60_000
     """Ground-truth points, uniform by area over all that some training camera sees."""
-    sparse_points: int = 8_000
+    sparse_points: int = 20_000
     """Points of the COLMAP model, outliers included."""
 
     def __post_init__(self) -> None:

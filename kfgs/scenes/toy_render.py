@@ -64,7 +64,7 @@ def orbit(train_views: int, test_views: int, size: tuple[int, int]) -> tuple[lis
         a = 4 * np.pi * turn
         lift = np.sin(a / 2)  # above 0 in the first round, below in the second
         position = np.array([2.15 * np.cos(a), 1.75 * np.sin(a), 1.5 + 0.2 * np.sin(3 * a + 0.5) + 0.25 * lift])
-        height = 0.85 + 0.35 * np.sin(2 * a + 0.4) + 0.55 * lift
+        height = 1.0 + 0.3 * np.sin(2 * a + 0.4) + 0.95 * lift
         target = np.array([0.55 * np.cos(2 * a + 1.0), 0.45 * np.sin(3 * a), height])
         viewmat = look_at(position, target - 0.35 * position * [1, 1, 0], 0.05 * float(np.sin(5 * a)))
         name = f"view_{number:03d}.png"

@@ -21,6 +21,7 @@ SHARED = 0.66  # squared share of the mean direction: the cosine of unrelated cl
 RELATED = 0.12  # squared share of the group directions, divided among a class's groups
 DRIFT = 0.16  # probability that a region of one view drifts
 SHARPNESS = 5.0  # of the softmax over class evidence
+BORDER = 0.5  # pixels of the map, standard deviation of the softness of borders
 CONFUSION = 0.18  # standard deviation of the smooth confusion fields, in units of evidence
 APPEARANCE = 0.22  # how strongly colour and edges leak into the feature
 WHITE = 0.28  # norm of the white noise, of a feature of norm about 1
@@ -75,7 +76,7 @@ def _evidence(
             amount, patch = rng.uniform(0.5, 1.15), _field(rng, (h, w), 5.0 * pixel)
             if drifts:
                 evidence[other] += amount * ((regions == region) & (patch > -0.4))
-    evidence = ndimage.gaussian_filter(evidence, (0, 0.55 * pixel, 0.55 * pixel))
+    evidence = ndimage.gaussian_filter(evidence, (0, BORDER, BORDER))
     return evidence + CONFUSION * _field(rng, (C, h, w), 2.7 * pixel)
 
 
