@@ -19,6 +19,9 @@ from .errors import SceneError
 from .files import list_images
 from .names import some
 
+OVERLAP = 10
+"""Following images that each image of a video is compared with, and how many powers of two beyond (COLMAP's default)."""
+
 
 @dataclass(frozen=True)
 class SfmConfig:
@@ -187,12 +190,27 @@ class _Run:
         colmap, config, count = self.pycolmap, self.config, len(self.names)
         exhaustive = config.matching == "exhaustive"
         self._stage("matching", count * (count - 1) // 2 if exhaustive else count, "pair" if exhaustive else "image")
-        match = colmap.match_exhaustive if exhaustive else colmap.match_sequential
+        match, pairing = (colmap.match_exhaustive, {}) if exhaustive else self._sequential(colmap)
         match(
-            self.database, matching_options={"num_threads": config.num_threads},
+            self.database, matching_options={"num_threads": config.num_threads}, **pairing,
             verification_options={"ransac": {"random_seed": config.seed}}, device=colmap.Device.cpu,
         )  # fmt: skip
         self.bar.update(self.bar.total)
+
+    def _sequential(self, colmap: Any) -> tuple[Callable[..., None], dict[str, Any]]:
+        """What matches a video. COLMAP orders names letter by letter (10.png before 9.png), so it gets a list of pairs;
+        its lists are cut at blanks, so names with blanks go without, which is right where both orders are the same.
+        """
+        if any(character.isspace() for name in self.names for character in name):
+            if sorted(self.names) == self.names:
+                return colmap.match_sequential, {}
+            raise SceneError(
+                f"{self.images}: expected names without blanks, or padded with zeros, for matching='sequential', got "
+                f"{some(self.names, 3)}; rename the images or use matching='exhaustive'"
+            )
+        listed = self.scratch / "pairs.txt"
+        listed.write_text("".join(f"{a} {b}\n" for a, b in sequential_pairs(self.names)), encoding="utf-8")
+        return colmap.match_image_pairs, {"pairing_options": colmap.ImportedPairingOptions(match_list_path=str(listed))}
 
     def map(self) -> None:
         """Place the images one after the other."""
@@ -206,6 +224,14 @@ class _Run:
             initial_image_pair_callback=lambda: self.bar.update(2), next_image_callback=lambda: self.bar.update(1),
         )  # fmt: skip
         self.models = list(found.values())
+
+
+def sequential_pairs(
+    names: list[str],  # in the order of the video
+) -> list[tuple[str, str]]:
+    """Pairs of each image with the next 10, and with those 2^k further on up to 512, as COLMAP's own matcher takes."""
+    steps = sorted({*range(1, OVERLAP + 1), *(2**k for k in range(OVERLAP))})
+    return [(name, names[i + step]) for i, name in enumerate(names) for step in steps if i + step < len(names)]
 
 
 def _require_one_model(images: Path, sizes: tuple[int, ...], names: list[str], config: SfmConfig) -> None:

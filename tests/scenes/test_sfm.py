@@ -1,3 +1,4 @@
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -6,9 +7,11 @@ import torch
 from kornia.geometry import resize
 from kornia.io import write_image
 from oracles_alignment import align_similarity
+from tqdm import tqdm
 
 from kfgs.scenes import SceneError, SfmConfig, load_scene, read_image, run_sfm
-from kfgs.scenes.sfm import SfmReport, _require_one_model
+from kfgs.scenes._pycolmap import import_pycolmap
+from kfgs.scenes.sfm import SfmReport, _require_one_model, _Run, sequential_pairs
 
 WIDTH = 320
 
@@ -106,3 +109,43 @@ def test_the_report_reads_well() -> None:
     report = SfmReport(9, 10, 500, 0.456, {"features": 1.0, "matching": 2.0}, ("x.png",), (9,))
     said = "9 of 10 images registered, 500 points, mean reprojection error 0.46 px (features 1.0 s, matching 2.0 s)"
     assert str(report) == said + "; without a pose: x.png"
+
+
+def test_pairs_of_a_video_follow_the_natural_order() -> None:
+    names = [f"{i}.png" for i in range(1, 41)]
+    pairs = sequential_pairs(names)
+    assert ("9.png", "10.png") in pairs
+    assert {int(b[:-4]) for a, b in pairs if a == "8.png"} == {*range(9, 19), 24, 40}  # 8 + 16, 8 + 32
+    assert len(pairs) == len(set(pairs))
+    assert all(int(a[:-4]) < int(b[:-4]) for a, b in pairs)
+
+
+def _matched(folder: Path, names: list[str]) -> set[frozenset[str]]:
+    """Pairs that sequential matching compares."""
+    pycolmap = import_pycolmap()
+    g = torch.Generator().manual_seed(0)
+    picture = torch.randint(0, 255, (3, 24, 32), generator=g, dtype=torch.uint8).repeat_interleave(4, 1)
+    (folder / "images").mkdir(parents=True)
+    for name in names:
+        write_image(str(folder / "images" / name), picture.repeat_interleave(4, 2))
+    config = SfmConfig(matching="sequential", max_features=200, num_threads=1)
+    with tqdm(disable=True) as bar:
+        run = _Run(pycolmap, folder / "images", names, folder, config, bar)
+        run.extract()
+        run.match()
+    with pycolmap.Database.open(run.database) as database:
+        pairs = combinations(database.read_all_images(), 2)
+        return {frozenset((a.name, b.name)) for a, b in pairs if database.exists_matches(a.image_id, b.image_id)}
+
+
+def test_sequential_matching_compares_9_with_10_and_not_1_with_12(tmp_path: Path) -> None:
+    matched = _matched(tmp_path / "a", [f"{i}.png" for i in range(1, 14)])
+    assert frozenset(("9.png", "10.png")) in matched
+    assert frozenset(("1.png", "11.png")) in matched
+    assert frozenset(("1.png", "12.png")) not in matched  # 11 apart; letter by letter they are neighbours
+
+
+def test_sequential_matching_of_names_with_blanks(tmp_path: Path) -> None:
+    assert _matched(tmp_path / "a", ["a 1.png", "a 2.png"]) == {frozenset(("a 1.png", "a 2.png"))}
+    with pytest.raises(SceneError, match=r"expected names without blanks, or padded.*got a 9.png, a 10.png; rename"):
+        _matched(tmp_path / "b", ["a 9.png", "a 10.png"])

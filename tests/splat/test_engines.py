@@ -381,6 +381,19 @@ def test_pixels_are_accumulated_by_weight(engine):
         assert torch.equal(accumulate_pixels(*splats, pixels, bin_tiles(projected, 20, 14), engine=engine), sums)
 
 
+@every_engine
+def test_pixels_are_accumulated_in_inference_mode(engine):
+    projected, _ = random_splats(30, 20, 14, seed=23)
+    pixels = torch.randn(14, 20, 4, generator=torch.Generator().manual_seed(2)).double()
+    tiles = bin_tiles(projected, 20, 14)
+    expected = accumulate_pixels(*projected[:2], projected.opacities, pixels, tiles, engine=engine)
+    with torch.inference_mode():
+        inside = type(projected)(*(value.clone() for value in projected))  # inference tensors, as a render there makes
+        tiles = bin_tiles(inside, 20, 14)
+        sums = accumulate_pixels(*inside[:2], inside.opacities, pixels.clone(), tiles, engine=engine)
+    assert torch.equal(sums, expected)
+
+
 def test_pixels_must_fill_the_image():
     projected, _ = random_splats(5, 20, 14, seed=0)
     splats = projected.means2d, projected.conics, projected.opacities
@@ -459,7 +472,30 @@ def test_tiles_must_be_of_these_gaussians():
     projected, features = random_splats(50, 16, 16, seed=0)
     tiles = bin_tiles(projected, 16, 16)
     few = type(projected)(*(v[:7] for v in projected))
-    with pytest.raises(ValueError, match=r"tiles: expected rows below M = 7 .*; bin the tiles again"):
+    with pytest.raises(ValueError, match=r"tiles.rows: expected rows from 0 to below M = 7 .*; bin the tiles again"):
         composite(few.means2d, few.conics, few.opacities, features[:7], tiles)
     with pytest.raises(ValueError, match=r"tiles.offsets: expected \[3\], got \(2,\)"):
         composite(*projected[:2], projected.opacities, features, tiles._replace(width=32))
+
+
+@pytest.mark.parametrize(
+    ("rows", "offsets", "message"),
+    [
+        ([0, -1], [0, 1, 2], r"tiles.rows: expected rows from 0 to below M = 5 .*, got -1; bin"),
+        ([0, 1], [1, 1, 2], r"tiles.offsets: expected numbers that rise from 0 to P = 2 .*got \[1, 1, 2\]"),
+        ([0, 1], [0, 1, 9], r"tiles.offsets: expected numbers that rise from 0 to P = 2 .* \.\.\. 9; bin"),
+        ([0, 1], [0, 1, 1], r"tiles.offsets: expected numbers that rise from 0 to P = 2"),
+        ([0, 1], [0, 3, 2], r"tiles.offsets: expected numbers that rise from 0 to P = 2"),
+        ([0.0, 1.0], [0, 1, 2], r"tiles.rows: expected int32 or int64, got torch.float32; bin"),
+        ([0, 1], [0.0, 1.0, 2.0], r"tiles.offsets: expected int32 or int64, got torch.float32; bin"),
+    ],
+)
+def test_malformed_tiles_are_refused(rows, offsets, message):
+    projected, features = random_splats(5, 32, 16, seed=0)
+    tiles = Tiles(torch.tensor(rows), torch.tensor(offsets), 32, 16, 16)
+    with pytest.raises(ValueError, match=message):
+        composite(*projected[:2], projected.opacities, features, tiles)
+    elsewhere = bin_tiles(projected, 32, 16)
+    elsewhere = elsewhere._replace(offsets=elsewhere.offsets.to("meta"))
+    with pytest.raises(ValueError, match=r"tiles.offsets: expected it on cpu \(from means2d\), got meta; bin"):
+        composite(*projected[:2], projected.opacities, features, elsewhere)

@@ -121,11 +121,17 @@ def accumulate_pixels(
         ValueError: as `composite`, and if `pixels` is not as large as the image of `tiles`.
     """
     D = check_shapes(("pixels", pixels, f"{tiles.height} {tiles.width} D"))["D"]
-    with torch.enable_grad():
-        features = pixels.new_zeros(len(means2d), D).requires_grad_()
-        splats = means2d.detach(), conics.detach(), opacities.detach()
+    with torch.inference_mode(False), torch.enable_grad():
+        features = torch.zeros(len(means2d), D, dtype=pixels.dtype, device=pixels.device, requires_grad=True)
+        splats = _recorded(means2d), _recorded(conics), _recorded(opacities)
+        tiles = tiles._replace(rows=_recorded(tiles.rows), offsets=_recorded(tiles.offsets))
         maps, _ = composite(*splats, features, tiles, engine=engine)
-        return torch.autograd.grad(maps, features, pixels.detach())[0]
+        return torch.autograd.grad(maps, features, _recorded(pixels))[0]
+
+
+def _recorded(value: Tensor) -> Tensor:
+    """The tensor without a history, such that autograd can work with it: one made in inference mode is copied."""
+    return value.clone() if value.is_inference() else value.detach()
 
 
 def _check_kinds(others: dict[str, Tensor | None], means2d: Tensor) -> None:
@@ -142,16 +148,29 @@ def _check_kinds(others: dict[str, Tensor | None], means2d: Tensor) -> None:
 def _check_tiles(tiles: Tiles, means2d: Tensor) -> None:
     rows, columns = tiles.grid
     check_shapes(("tiles.rows", tiles.rows, "P"), ("tiles.offsets", tiles.offsets, str(rows * columns + 1)))
-    if tiles.rows.device != means2d.device:
+    again = "bin the tiles again from these Gaussians"
+    for name, value in (("rows", tiles.rows), ("offsets", tiles.offsets)):
+        if value.device != means2d.device:
+            raise ValueError(
+                f"tiles.{name}: expected it on {means2d.device} (from means2d), got {value.device}; {again}"
+            )
+        if value.dtype not in (torch.int32, torch.int64):
+            raise ValueError(f"tiles.{name}: expected int32 or int64, got {value.dtype}; {again}")
+    # What is wrong here would be read from foreign memory by a compiled engine. On a GPU the check would cost a wait.
+    if means2d.device.type != "cpu":
+        return
+    if len(tiles.rows):
+        low, high = (int(end) for end in torch.aminmax(tiles.rows))
+        if low < 0 or high >= len(means2d):
+            wrong = low if low < 0 else high
+            raise ValueError(
+                f"tiles.rows: expected rows from 0 to below M = {len(means2d)} (from means2d), got {wrong}; {again}"
+            )
+    ends = int(tiles.offsets[0]), int(tiles.offsets[-1])
+    if ends != (0, len(tiles.rows)) or bool((tiles.offsets.diff() < 0).any()):
         raise ValueError(
-            f"tiles: expected them on {means2d.device} (from means2d), got {tiles.rows.device}; "
-            "bin the tiles again from these Gaussians"
-        )
-    # A wrong row would be read from foreign memory by a compiled engine. On a GPU the check would cost a wait.
-    if means2d.device.type == "cpu" and len(tiles.rows) and int(tiles.rows.max()) >= len(means2d):
-        raise ValueError(
-            f"tiles: expected rows below M = {len(means2d)} (from means2d), got {int(tiles.rows.max())}; "
-            "bin the tiles again from these Gaussians"
+            f"tiles.offsets: expected numbers that rise from 0 to P = {len(tiles.rows)} (from tiles.rows), got "
+            f"{tiles.offsets[:8].tolist()} ... {ends[1]}; {again}"
         )
 
 
