@@ -17,6 +17,15 @@ from pathlib import Path
 from typing import Any
 
 
+def _read_umask() -> int:
+    umask = os.umask(0)
+    os.umask(umask)
+    return umask
+
+
+_UMASK = _read_umask()  # once: it can only be read by setting it, for all threads
+
+
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Give a temporary name beside `path` to write a file to, and move it to `path` if the block succeeds."""
@@ -24,9 +33,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     target.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=target.suffix, dir=target.parent)
     os.close(handle)
-    umask = os.umask(0)
-    os.umask(umask)
-    os.chmod(name, 0o666 & ~umask)  # mkstemp makes private files; ours are ordinary
+    os.chmod(name, 0o666 & ~_UMASK)  # mkstemp makes private files; ours are ordinary
     try:
         yield Path(name)
         os.replace(name, target)
@@ -40,15 +47,17 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
-    umask = os.umask(0)
-    os.umask(umask)
-    temporary.chmod(0o777 & ~umask)
+    temporary.chmod(0o777 & ~_UMASK)
     try:
         yield temporary
         if target.exists():
             old = temporary.with_name(temporary.name + ".old")
             os.replace(target, old)
-            os.replace(temporary, target)
+            try:
+                os.replace(temporary, target)
+            except BaseException:
+                os.replace(old, target)
+                raise
             shutil.rmtree(old, ignore_errors=True)
         else:
             os.replace(temporary, target)
@@ -75,7 +84,7 @@ def read_json(path: str | Path) -> Any:
         raise FileNotFoundError(f"{path}: no such file; expected a JSON file there")
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+    except ValueError as error:  # not UTF-8, not JSON, or an integer of thousands of digits
         raise ValueError(f"{path}: expected a JSON file, but it cannot be parsed ({error})") from error
 
 

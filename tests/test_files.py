@@ -6,6 +6,7 @@ import stat
 
 import pytest
 
+from kfgs import _files
 from kfgs._files import atomic_folder, atomic_path, digest_file, digest_value, read_json, write_json
 
 
@@ -48,16 +49,22 @@ def test_file_replaces_the_old_one(tmp_path):
     assert names(tmp_path) == ["field.bin"]
 
 
-def test_permissions_follow_the_umask(tmp_path):
-    before = os.umask(0o027)
+def test_permissions_follow_the_umask(tmp_path, monkeypatch):
+    monkeypatch.setattr(_files, "_UMASK", 0o027)
+    monkeypatch.setattr(os, "umask", None)  # not safe while other threads write
+    with atomic_path(tmp_path / "file") as temporary:
+        temporary.write_bytes(b"")
+    with atomic_folder(tmp_path / "folder"):
+        pass
+    assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == 0o640
+    assert stat.S_IMODE((tmp_path / "folder").stat().st_mode) == 0o750
+
+
+def test_umask_is_that_of_the_process():
+    before = os.umask(0o077)
     try:
-        with atomic_path(tmp_path / "file") as temporary:
-            temporary.write_bytes(b"")
-        with atomic_folder(tmp_path / "folder"):
-            pass
-        assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == 0o640
-        assert stat.S_IMODE((tmp_path / "folder").stat().st_mode) == 0o750
-        assert os.umask(0o027) == 0o027  # left as it was
+        assert _files._read_umask() == 0o077
+        assert os.umask(0o077) == 0o077  # left as it was
     finally:
         os.umask(before)
 
@@ -90,6 +97,25 @@ def test_failed_folder_leaves_the_old_one(tmp_path):
     assert names(tmp_path) == ["scene"]
 
 
+def test_old_folder_comes_back_when_the_new_one_cannot_be_moved(tmp_path, monkeypatch):
+    target = tmp_path / "scene"
+    target.mkdir()
+    (target / "old.txt").write_text("old")
+    replace, moves = os.replace, []
+
+    def second_fails(source, destination):
+        moves.append(destination)
+        if len(moves) == 2:
+            raise OSError("disk gone")
+        replace(source, destination)
+
+    monkeypatch.setattr(os, "replace", second_fails)
+    with pytest.raises(OSError, match="disk gone"), atomic_folder(target) as temporary:
+        (temporary / "new.txt").write_text("new")
+    assert names(target) == ["old.txt"]
+    assert names(tmp_path) == ["scene"]
+
+
 def test_json_round_trip(tmp_path):
     value = {"Größe": [1, 2.5, None, True], "nested": {"a": "b"}}
     write_json(tmp_path / "deep" / "value.json", value)
@@ -112,7 +138,7 @@ def test_missing_json(tmp_path):
         read_json(tmp_path)  # a folder
 
 
-@pytest.mark.parametrize("content", [b'{"a": 1', b"\xff\xfe{}", b""])
+@pytest.mark.parametrize("content", [b'{"a": 1', b"\xff\xfe{}", b"", b"1" * 5000])
 def test_broken_json_names_the_file(tmp_path, content):
     (tmp_path / "split.json").write_bytes(content)
     with pytest.raises(ValueError, match=r"split.json: expected a JSON file, but it cannot be parsed \("):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import numbers
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -57,8 +59,9 @@ class Camera:
             if not matrix.is_floating_point():  # a matrix of integers would truncate the points
                 raise TypeError(f"{name}: expected floating point, got {matrix.dtype}; convert it with .float()")
         for name, size in (("width", self.width), ("height", self.height)):
-            if int(size) != size or size < 1:
+            if not (isinstance(size, numbers.Real) and math.isfinite(size) and size >= 1 and int(size) == size):
                 raise ValueError(f"{name}: expected a positive whole number of pixels, got {size!r}; pass an integer")
+            object.__setattr__(self, name, int(size))
         K, E = self.K.detach().double().cpu(), self.viewmat.detach().double().cpu()  # cameras are tiny
         if not (torch.isfinite(K).all() and torch.isfinite(E).all()):
             raise ValueError(

@@ -31,7 +31,7 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
         path: the scene folder, a model folder, or a .json file.
         images: the image folder; None: `images/` beside the model or up to two folders above it, else the scene folder.
         split: `"auto"`: split.json if there is one, else the split that a transforms.json makes itself, else by number
-            of images: the paper's from 20 (which trains on every 10th image only), `"holdout8"` from 8, all below;
+            of images: the paper's from 200 (which trains on every 10th image only), `"holdout8"` from 8, all below;
             `"file"`: split.json; or a rule of `make_split`.
 
     Returns:

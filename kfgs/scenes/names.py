@@ -24,7 +24,8 @@ def file_stem(name: str) -> str:
         >>> file_stem("rgb_5.png"), file_stem("train/r_0.png")
         ('rgb_5', 'train/r_0')
     """
-    return str(PurePosixPath(name).with_suffix(""))
+    path = PurePosixPath(name)
+    return str(path.with_suffix("")) if path.name else name  # "/" and "." have no suffix to take
 
 
 def some(names: list[str], count: int = 5) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
+from ._pycolmap import import_pycolmap
 from .toy_geometry import Array, project
 
 
@@ -21,8 +22,7 @@ def write_model(
     pixel_noise: Array,  # [P, C, 2] added to the observed pixels
 ) -> None:
     """Write `cameras.bin`, `images.bin` and `points3D.bin` (one shared PINHOLE camera) into `folder` through pycolmap."""
-    import pycolmap
-
+    pycolmap = import_pycolmap()
     first = cameras[0]
     K = first.K.double().numpy()
     model = pycolmap.Reconstruction()

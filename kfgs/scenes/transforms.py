@@ -27,6 +27,7 @@ from .scene import IMAGE_SUFFIXES, Scene, read_image
 
 _PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
+_COEFFICIENTS = {"PINHOLE": (), "SIMPLE_PINHOLE": (), **dict.fromkeys(_FISHEYE, ("k1", "k2", "k3", "k4"))}
 _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # OpenGL axes to COLMAP's
 _MAX_SIDE = 100_000
 
@@ -156,13 +157,20 @@ def _find_image(reader: _Reader, listed: str) -> Path | None:
     if "\0" in listed:
         return None
     for candidate in _candidates(reader, listed):
-        if candidate.suffix.lower() in IMAGE_SUFFIXES and candidate.is_file():
+        if candidate.suffix.lower() in IMAGE_SUFFIXES and _is_file(candidate):
             return candidate
         for suffix in IMAGE_SUFFIXES:
-            with_suffix = candidate.with_name(candidate.name + suffix) if candidate.name else candidate
-            if with_suffix.is_file():
+            if candidate.name and _is_file(with_suffix := candidate.with_name(candidate.name + suffix)):
                 return with_suffix
     return None
+
+
+def _is_file(path: Path) -> bool:
+    """Is there such a file? Not under a name that is too long for the disk, over which `is_file` stumbles."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
 
 
 def _name(reader: _Reader, file: Path) -> str:
@@ -204,8 +212,9 @@ def _camera(reader: _Reader, where: str, values: dict[str, Any], name: str) -> C
     cy = _number(reader, where, values, "cy", height / 2)
     viewmat = _viewmat(reader, where, values.get("transform_matrix"))
     K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float32)
+    lens = _distortion(reader, where, values)
     try:
-        return Camera(viewmat.float(), K, int(width), int(height), name, _distortion(reader, where, values))
+        return Camera(viewmat.float(), K, int(width), int(height), name, lens)
     except ValueError as error:
         raise SceneError(f"{reader.path}, {where} ({name}): {error}") from error
 
@@ -246,9 +255,17 @@ def _distortion(reader: _Reader, where: str, values: dict[str, Any]) -> Distorti
         )
     k = [_number(reader, where, values, f"k{i}", 0.0) for i in range(1, 7)]
     p = [_number(reader, where, values, f"p{i}", 0.0) for i in (1, 2)]
+    coefficients = {**{f"k{i + 1}": value for i, value in enumerate(k)}, "p1": p[0], "p2": p[1]}
+    known = _COEFFICIENTS.get(model, tuple(coefficients))
+    dropped = {name: value for name, value in coefficients.items() if value and name not in known}
+    if dropped:
+        raise reader.fail(
+            where, f"only {' '.join(known) or 'zeros'} with camera_model {model}", dropped,
+            "correct camera_model or remove them",
+        )  # fmt: skip
     if model in _FISHEYE:
         return Distortion("kannala_brandt", tuple(k[:4]))
-    if model in ("PINHOLE", "SIMPLE_PINHOLE") or not any(k + p):
+    if not any(k + p):
         return None
     if any(k[3:]) and model != "FULL_OPENCV":
         raise reader.fail(
@@ -270,6 +287,10 @@ def _viewmat(reader: _Reader, where: str, rows: Any) -> Tensor:  # [4, 4] float6
         pose = torch.cat([pose, pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
     if pose.shape != (4, 4) or not torch.isfinite(pose).all() or float(pose.abs().max()) > 1e15:
         raise reader.fail(f"{where}, transform_matrix", "4 rows of 4 finite numbers", rows, "write the file again")
+    if pose[3].tolist() != [0, 0, 0, 1]:
+        raise reader.fail(
+            f"{where}, transform_matrix", "0 0 0 1 as the last row", pose[3].tolist(), "is it transposed?"
+        )
     pose = pose @ _FLIP
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3] = pose[:3, :3].T  # Camera refuses what is not a rotation
@@ -284,7 +305,7 @@ def _points(reader: _Reader, top: dict[str, Any]) -> tuple[Tensor, Tensor, list[
     if listed is None:
         return *nothing, ["no points: a transforms.json brings none; give the field points of your own to start from"]
     file = reader.root / listed if isinstance(listed, str) and "\0" not in listed else None
-    if file is None or not _normal(file).is_relative_to(_normal(reader.root)) or not file.is_file():
+    if file is None or not _normal(file).is_relative_to(_normal(reader.root)) or not _is_file(file):
         return *nothing, [f"no points: ply_file_path {listed!r:.200} is no file inside {reader.root}"]
     try:
         columns = read_ply(file)

@@ -71,6 +71,9 @@ def test_gradient_reaches_pose_and_intrinsics():
         ({"K": torch.eye(3, dtype=torch.int64)}, TypeError, r"K: expected floating point, got torch.int64; .*float"),
         ({"width": 0}, ValueError, "width: expected a positive whole number of pixels, got 0"),
         ({"height": 3.5}, ValueError, "height: expected a positive whole number of pixels, got 3.5"),
+        ({"width": float("nan")}, ValueError, "width: expected a positive whole number of pixels, got nan; pass an"),
+        ({"height": float("inf")}, ValueError, "height: expected a positive whole number of pixels, got inf; pass an"),
+        ({"width": "64"}, ValueError, "width: expected a positive whole number of pixels, got '64'; pass an integer"),
         ({"K": changed(K, 0, 0, float("nan"))}, ValueError, r"finite.*camera 'a.png'.*leave this view out"),
         ({"viewmat": changed(torch.eye(4), 0, 3, float("inf"))}, ValueError, "viewmat, K: expected finite"),
         ({"K": changed(K, 0, 1, 0.1)}, ValueError, r"K: expected .* without skew"),
@@ -101,3 +104,9 @@ def test_refuses(change, error, match):
 def test_distortion_refuses(model, coefficients, match):
     with pytest.raises(ValueError, match=match):
         Distortion(model, coefficients)
+
+
+def test_sizes_are_stored_as_integers() -> None:
+    camera = Camera(torch.eye(4), torch.eye(3), 64.0, np.int64(48))
+    assert [type(side) for side in (camera.width, camera.height)] == [int, int]
+    assert camera.size == (48, 64)

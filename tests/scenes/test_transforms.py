@@ -82,7 +82,7 @@ def test_both_angles_give_both_focal_lengths(tmp_path: Path) -> None:
     ("values", "expected"),
     [
         ({"k1": 0, "k2": 0.0, "p1": 0, "p2": 0}, None),
-        ({"camera_model": "PINHOLE", "k1": 0.5}, None),
+        ({"camera_model": "PINHOLE", "k1": 0.0}, None),
         ({"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4}, ("brown_conrady", (0.1, 0.2, 0.3, 0.4))),
         ({"k1": 0.1, "k3": 0.5, "k4": 0}, ("brown_conrady", (0.1, 0.0, 0.0, 0.0, 0.5))),
         (
@@ -233,3 +233,49 @@ def test_the_fox(shared_data: Path) -> None:
     assert (((focus - centers) * forward).sum(1) > 0.5 * distance).all()
     _, _, visible = zip(*(project_points(c, focus[None]) for c in scene.undistorted().cameras), strict=True)
     assert torch.cat(visible).float().mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    ("top", "message"),
+    [
+        (
+            {"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k5": 0.2},
+            r"only k1 k2 k3 k4 with .*FISHEYE, got \{'k5': 0.2\}",
+        ),
+        (
+            {"is_fisheye": True, "p1": 0.1, "p2": 0.3},
+            r"only k1 k2 k3 k4 .*got \{'p1': 0.1, 'p2': 0.3\}; correct camera",
+        ),
+        (
+            {"camera_model": "PINHOLE", "k1": 0.1},
+            r"only zeros with camera_model PINHOLE, got \{'k1': 0.1\}",
+        ),
+        ({"camera_model": "SIMPLE_PINHOLE", "p2": 0.1}, r"only zeros with camera_model SIMPLE_PINHOLE"),
+    ],
+)
+def test_coefficients_that_the_lens_does_not_know_are_refused(
+    tmp_path: Path, top: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(SceneError, match=message):
+        load_transforms(_write(tmp_path, **top))
+
+
+def test_a_transposed_pose_is_refused(tmp_path: Path) -> None:
+    transposed = [list(row) for row in zip(*LOOK_X, strict=True)]
+    frames = [{"file_path": "images/a.png", "transform_matrix": transposed}]
+    with pytest.raises(SceneError, match=r"expected 0 0 0 1 as the last row, got \[1.0, 2.0, 3.0, 1.0\]; is it transp"):
+        load_transforms(_write(tmp_path, frames))
+
+
+def test_hostile_paths_are_missing_files(tmp_path: Path) -> None:
+    frames = [{"file_path": path, "transform_matrix": LOOK_X} for path in ("images/a.png", "x" * 5000, "/", ".")]
+    scene = load_transforms(_write(tmp_path, frames, ply_file_path="y" * 5000))
+    assert len(scene) == 1
+    assert any("3 of 4 frames have no image file" in note for note in scene.notes)
+
+
+def test_huge_integers_name_the_file(tmp_path: Path) -> None:
+    path = _write(tmp_path)
+    path.write_text(path.read_text().replace("64", "6" * 5000))
+    with pytest.raises(SceneError, match=r"transforms.json: expected a JSON file.*; write the file again"):
+        load_transforms(path)
