@@ -7,6 +7,7 @@ tensor values unless its name says so, so they cost no device synchronisation.
 from __future__ import annotations
 
 import math
+import numbers
 from collections.abc import Iterable
 from typing import Any
 
@@ -74,3 +75,10 @@ def check_range(
         left = "[" if closed[0] and math.isfinite(low) else "("
         right = "]" if closed[1] and math.isfinite(high) else ")"
         raise ValueError(f"{name}: expected a number in {left}{low:g}, {high:g}{right}, got {value!r}")
+
+
+def check_whole(name: str, value: float, low: int, high: float = float("inf")) -> None:
+    """Raise a ValueError unless `value` is an integer (no float, no bool) from `low` to `high`, both included."""
+    if not isinstance(value, numbers.Integral) or isinstance(value, bool):
+        raise ValueError(f"{name}: expected a whole number, got {value!r}; pass an int")
+    check_range(name, int(value), low, high)

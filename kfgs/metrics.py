@@ -159,6 +159,7 @@ def feature_cosine(
     """Mean cosine between corresponding feature vectors.
 
     Each vector is divided by max(|x|, `COSINE_EPSILON`), so an all-zero vector counts as cosine 0, on either side.
+    Half precision is computed in float32.
 
     Raises:
         ValueError: if shapes differ, or there is nothing to compare.
@@ -172,7 +173,9 @@ def feature_cosine(
         raise ValueError(
             f"features: expected at least one vector, got shape {tuple(features.shape)}; compare something"
         )
-    rows = [torch.nn.functional.normalize(x, dim=-1, eps=COSINE_EPSILON) for x in (features, target)]
+    # in half precision the epsilon would underflow to 0, and 0 / 0 is NaN
+    wide = (x.to(torch.promote_types(x.dtype, torch.float32)) for x in (features, target))
+    rows = [torch.nn.functional.normalize(x, dim=-1, eps=COSINE_EPSILON) for x in wide]
     return (rows[0] * rows[1]).sum(dim=-1).mean()
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from kfgs._check import check_choice, check_range, check_shapes
+from kfgs._check import check_choice, check_range, check_shapes, check_whole
 
 
 def test_sizes_are_returned_by_name():
@@ -86,3 +86,12 @@ def test_range_without_an_end_is_still_finite(value):
 def test_range_prints_an_endless_side_as_open():
     with pytest.raises(ValueError, match=r"near: expected a number in \[0, inf\), got -1"):
         check_range("near", -1, 0)
+
+
+@pytest.mark.parametrize("value", [2.0, 2.5, math.nan, True, "2"])
+def test_whole_numbers_are_integers(value):
+    check_whole("epochs", 2, 1)
+    with pytest.raises(ValueError, match=r"epochs: expected a whole number, got .*; pass an int"):
+        check_whole("epochs", value, 1)
+    with pytest.raises(ValueError, match=r"epochs: expected a number in \[1, inf\), got 0"):
+        check_whole("epochs", 0, 1)

@@ -300,3 +300,9 @@ def test_other_readings_of_table_1_fail():
 def test_storage_refuses_negative_counts():
     with pytest.raises(ValueError, match="codebook_values: expected a number in"):
         semantic_storage_bytes(1, 1, 0, -1)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_feature_cosine_of_all_zero_half_precision_is_zero(dtype):
+    features = torch.tensor([[0.0, 0.0], [3.0, 4.0]], dtype=dtype)
+    assert feature_cosine(features, torch.tensor([[1.0, 0.0], [3.0, 4.0]], dtype=dtype)).item() == pytest.approx(0.5)

@@ -117,7 +117,8 @@ class Codebook:
                 part = rows[start : start + chunk].to(self.unit.dtype)
                 # The length of a feature changes no argmax; dividing one number by it is cheaper than D.
                 best, where = (part @ self.unit.T).max(dim=-1)  # the first of equal ones
-                flat_similarity[start : start + chunk] = best / row_norms(part).clamp_min(EPS)
+                shortest = max(EPS, torch.finfo(part.dtype).tiny)  # as in unit_rows
+                flat_similarity[start : start + chunk] = best / row_norms(part).clamp_min(shortest)
                 flat_index[start : start + chunk] = where
         return Nearest(index, similarity)
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from .._check import check_range
+from .._check import check_range, check_whole
 from .autoencoder import Autoencoder, Layer, mlp, unit_latents
 from .codebook import Codebook, row_norms, unit_rows
 
@@ -40,10 +40,10 @@ class AutoencoderConfig:
 
     def __post_init__(self) -> None:
         for name in ("latent", "steps", "record_every"):
-            check_range(name, getattr(self, name), 1)
+            check_whole(name, getattr(self, name), 1)
         for name in ("encoder", "decoder"):
             for i, width in enumerate(getattr(self, name)):
-                check_range(f"{name}[{i}]", width, 1)
+                check_whole(f"{name}[{i}]", width, 1)
         check_range("learning_rate", self.learning_rate, 0, closed=(False, True))
         check_range("weight_decay", self.weight_decay, 0)
 

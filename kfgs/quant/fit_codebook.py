@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from .._check import check_range, check_shapes
+from .._check import check_range, check_shapes, check_whole
 from .codebook import EPS, Codebook, row_norms
 from .evolve import admit, prune
 from .loss import class_balanced_loss
@@ -55,11 +55,13 @@ class CodebookConfig:
 
     def __post_init__(self) -> None:
         for name in ("initial", "epochs", "step_every", "samples"):
-            check_range(name, getattr(self, name), 1)
+            check_whole(name, getattr(self, name), 1)
         if self.joins_per_image is not None:
-            check_range("joins_per_image", self.joins_per_image, 1)
-        check_range("maximum", self.maximum, self.initial)
-        check_range("eager_epochs", self.eager_epochs, 0)
+            check_whole("joins_per_image", self.joins_per_image, 1)
+        check_whole("maximum", self.maximum, self.initial)
+        check_whole("eager_epochs", self.eager_epochs, 0)
+        for i, step in enumerate(self.grid_step or ()):
+            check_whole(f"grid_step[{i}]", step, 1)
         check_range("expand_below", self.expand_below, -1, 1)
         # Otherwise what joins is pruned at once, and joins again.
         check_range("prune_above", self.prune_above, self.expand_below, 1)

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from .._check import check_shapes
 from ._store import read_tensors, write_tensors
-from .codebook import Codebook
+from .codebook import EPS, Codebook, row_norms
 
 
 class FeatureMaps(Protocol):
@@ -141,15 +141,19 @@ def quantize_maps(
 ) -> IndexMaps:
     """Quantise every pixel of every map (Eq. 5), with one map in memory at a time.
 
-    An all-zero feature says nothing about its pixel and becomes a hole, index K.
+    An all-zero feature (not longer than `EPS`, as in `fit_codebook`) says nothing about its pixel and becomes a hole,
+    index K.
 
     Raises:
-        ValueError: if a map is not [h, w, D] with the codebook's D.
+        ValueError: if a map is not [h, w, D] with the codebook's D, or holds NaN or infinity.
     """
     quantised = []
     for i in tqdm(range(len(maps)), desc="quantise", disable=not progress):
         feature_map = maps[i]  # once: this may read a file
         check_shapes((f"maps[{i}]", feature_map, f"h w {codebook.dim}"))
-        index = codebook.quantize(feature_map).masked_fill(~feature_map.any(dim=-1), codebook.size)
+        norms = row_norms(feature_map.to(torch.promote_types(feature_map.dtype, torch.float32)))
+        if not bool(torch.isfinite(norms).all()):
+            raise ValueError(f"maps[{i}]: expected finite features, got NaN or infinity; encode that image again")
+        index = codebook.quantize(feature_map).masked_fill(norms <= EPS, codebook.size)
         quantised.append(index.cpu().numpy().astype(np.uint16))
     return IndexMaps(quantised, codebook.size)

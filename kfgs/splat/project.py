@@ -57,7 +57,8 @@ def project(
         ValueError: if the camera has distortion, `near` is not positive or `low_pass` is negative.
 
     Note:
-        A Gaussian with NaN or infinite parameters is culled.
+        A Gaussian with NaN or infinite parameters, or so large that its footprint overflows, is culled, and its gradients
+        are zero.
     """
     check_range("near", near, 0, closed=(False, False))
     check_range("low_pass", low_pass, 0, closed=(True, False))
@@ -68,9 +69,8 @@ def project(
         )
     if camera.K.dtype != gaussians.means.dtype or camera.K.device != gaussians.means.device:
         camera = camera.to(gaussians.means)
-    points = world_to_camera(camera, gaussians.means)  # [N, 3]
-    index = _candidates(points.detach(), gaussians, camera, near, low_pass)
-    points = points[index]
+    index = _candidates(gaussians, camera, near, low_pass)
+    points = world_to_camera(camera, gaussians.means[index])  # [m, 3]: what is culled takes no part in any gradient
     opacities = gaussians.opacities[index]
     means2d = camera_to_pixel(camera, points)
     variances, covariances, det = _covariance_2d(
@@ -127,10 +127,9 @@ def _clamp_tangents(points: Tensor, camera: Camera) -> Tensor:  # [M, 3] -> [M, 
 
 
 @torch.no_grad()
-def _candidates(
-    points: Tensor, gaussians: Gaussians, camera: Camera, near: float, low_pass: float
-) -> Tensor:  # [m] int64
+def _candidates(gaussians: Gaussians, camera: Camera, near: float, low_pass: float) -> Tensor:  # [m] int64
     """Cull, without looking at rotations: the footprint is bounded by that of a ball around the Gaussian."""
+    points = world_to_camera(camera, gaussians.means)  # [N, 3]
     index = ((points[:, 2] > near) & (_reach(gaussians.opacities) > 0)).nonzero().squeeze(1)
     points = points[index]
     J = projection_jacobian(camera, _clamp_tangents(points, camera))
@@ -138,7 +137,10 @@ def _candidates(
     variances = (J * J).sum(dim=2) * largest**2 + low_pass
     extents = (_reach(gaussians.opacities[index])[:, None] * variances).sqrt()
     extents = extents * (1 + 1e-3)  # a bound stays one after rounding
-    return index[_touches_pixel(camera_to_pixel(camera, points), extents, camera)]
+    keep = _touches_pixel(camera_to_pixel(camera, points), extents, camera)
+    # Where a number overflows or is NaN, gradients would be NaN. The determinant is at most the variances' product.
+    sizes = torch.linalg.vector_norm(gaussians.quats[index], dim=1) + extents.sum(dim=1) + variances.prod(dim=1)
+    return index[keep & torch.isfinite(sizes)]
 
 
 def _covariance_2d(

@@ -126,3 +126,10 @@ def test_bad_files(tmp_path):
     IndexMaps([], 3).save(path)
     with pytest.raises(ValueError, match=r"expected a kfgs codebook, got index maps; pass another file"):
         Codebook.load(path)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_all_zero_features_of_half_precision_have_similarity_zero(dtype):
+    found = Codebook(torch.eye(2, dtype=dtype)).nearest(torch.tensor([[0.0, 0.0], [0.0, 2.0]], dtype=dtype))
+    assert found.similarity.tolist() == [0, 1]
+    assert found.codeword.tolist() == [0, 1]

@@ -151,3 +151,9 @@ def test_results_carry_no_graph_and_the_codebook_is_unchanged(fitted):
 def test_bad_config(values, message):
     with pytest.raises(ValueError, match=message):
         AutoencoderConfig(**values)
+
+
+@pytest.mark.parametrize("name", ["latent", "steps", "record_every"])
+def test_counts_are_integers(name):
+    with pytest.raises(ValueError, match=rf"{name}: expected a whole number, got 9.5; pass an int"):
+        AutoencoderConfig(**{name: 9.5})

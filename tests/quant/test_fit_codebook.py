@@ -227,3 +227,11 @@ def test_no_image_fills_the_codebook_alone():
     assert index == [1, 1, 1, 1]  # each image has a codeword of its own
     few = fit_codebook(maps, CodebookConfig(initial=2, maximum=10, epochs=1, joins_per_image=1))
     assert few.codebook.size == 6
+
+
+@pytest.mark.parametrize(
+    "name", ["initial", "maximum", "epochs", "joins_per_image", "eager_epochs", "step_every", "samples"]
+)
+def test_counts_are_integers(name):
+    with pytest.raises(ValueError, match=rf"{name}: expected a whole number, got 9.5; pass an int"):
+        CodebookConfig(**{name: 9.5})

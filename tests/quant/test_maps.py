@@ -98,3 +98,19 @@ def test_holes_are_kept_apart_from_codewords_all_the_way():
 def test_255_codewords_and_holes_fit_a_byte_and_256_do_not():
     assert IndexMaps([np.full((1, 1), 255)], 255)[0].dtype == np.uint8
     assert IndexMaps([np.full((1, 1), 256)], 256)[0].dtype == np.uint16
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
+def test_features_too_short_for_a_direction_are_holes(dtype):
+    features = torch.tensor([[[1e-9, 0.0], [1e-6, 0.0], [0.0, 60_000.0]]], dtype=torch.float64).to(dtype)
+    book = Codebook(torch.eye(2))
+    assert quantize_maps([features], book)[0].tolist() == [[2, 0, 1]]
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_maps_that_are_not_finite_are_refused(value):
+    maps = [torch.ones(1, 2, 2), torch.tensor([[[1.0, 2.0], [value, 0.0]]])]
+    with pytest.raises(
+        ValueError, match=r"maps\[1\]: expected finite features, got NaN or infinity; encode that image"
+    ):
+        quantize_maps(maps, Codebook(torch.eye(2)))

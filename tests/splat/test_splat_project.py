@@ -186,6 +186,25 @@ def test_gaussians_that_are_not_finite_are_culled():
     assert project(broken, _straight()).index.tolist() == [4]
 
 
+def test_gradients_of_gaussians_that_are_not_finite_are_zero():
+    broken = _balls([[0, 0, 2.0]] * 5, dtype=torch.float32)
+    broken.quats[0, 2] = float("nan")
+    broken.quats[1, 0] = 1e30  # its square overflows
+    broken.scales[2, 1] = 1e25
+    broken.means[3, 1] = float("nan")
+    leaves = [v.requires_grad_() for v in (broken.means, broken.quats, broken.scales, broken.opacities)]
+    camera = _straight(dtype=torch.float32)
+    pose = camera.viewmat.clone().requires_grad_()
+    projected = project(Gaussians(*leaves), replace(camera, viewmat=pose))
+    assert projected.index.tolist() == [4]
+    sum((value**2).sum() for value in projected[:4]).backward()
+    for leaf in leaves:
+        assert torch.equal(leaf.grad[:4], torch.zeros_like(leaf[:4]))
+        assert torch.isfinite(leaf.grad).all()
+    assert leaves[2].grad[4].abs().max() > 0
+    assert torch.isfinite(pose.grad).all()
+
+
 def test_no_gaussians():
     projected = project(_balls(torch.zeros(0, 3)), _straight())
     assert [tuple(v.shape) for v in projected] == [(0, 2), (0, 3), (0,), (0,), (0, 2), (0,)]
