@@ -7,7 +7,7 @@ logarithm and rotation as (w, x, y, z). Columns that kfgs does not know are kept
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -70,6 +70,33 @@ def _parse_header(path: Path, head: bytes) -> tuple[str, int, list[tuple[str, st
     return layout, count, properties, newline + 1
 
 
+def _parse_rows(path: Path, file: BinaryIO, count: int) -> NDArray[np.float64]:  # [count, properties]
+    try:
+        return np.loadtxt(file, dtype=np.float64, max_rows=count, ndmin=2)
+    except ValueError as error:
+        raise ValueError(
+            f"{path}: expected {count} rows of numbers, but they cannot be parsed ({error}); write the file again"
+        ) from error
+
+
+def other_elements(path: str | Path) -> list[str]:
+    """Names of the elements after the vertices that hold something, such as the faces of a mesh; `read_ply` skips them.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not a PLY file that begins with vertices.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected a PLY file there")
+    with path.open("rb") as file:
+        head = file.read(_HEADER_BYTES)
+    _parse_header(path, head)
+    lines = head[: head.find(b"end_header")].decode("ascii", "replace").splitlines()
+    elements = [words for line in lines if (words := line.split())[:1] == ["element"] and len(words) == 3]
+    return [name for _, name, count in elements[1:] if count.strip("0") != ""]
+
+
 def read_ply(path: str | Path) -> Columns:
     """Read the vertex table of a PLY file as columns of N values each.
 
@@ -89,9 +116,7 @@ def read_ply(path: str | Path) -> Columns:
                     f"{path}: the header promises {count} vertices, but the file is too short; it is truncated"
                 )
             file.seek(start)
-            table = (
-                np.loadtxt(file, dtype=np.float64, max_rows=count, ndmin=2) if count else np.zeros((0, len(properties)))
-            )
+            table = _parse_rows(path, file, count) if count else np.zeros((0, len(properties)))
             if table.shape != (count, len(properties)):
                 raise ValueError(f"{path}: expected {count} rows of {len(properties)} numbers, got {table.shape}")
             return {name: table[:, i].astype(code) for i, (name, code) in enumerate(properties)}
@@ -143,11 +168,24 @@ def points_from_columns(columns: Columns) -> Tensor:  # [N, 3]
     return _stack(columns, ["x", "y", "z"])
 
 
+def _numbered(columns: Columns, group: str) -> list[str]:
+    """Names of the columns of a group, which are numbered from 0 without a gap."""
+    found = [name for name in columns if name.startswith(group)]
+    names = [f"{group}{i}" for i in range(len(found))]
+    missing = [name for name in names if name not in columns]
+    if missing:
+        odd = sorted(set(found) - set(names))
+        raise ValueError(
+            f"columns: expected {missing[0]} beside {odd[0]}, got none; number {group}* from 0 to the last"
+        )
+    return names
+
+
 def gaussians_from_columns(columns: Columns) -> Gaussians:
     """Read a 3DGS vertex table (values activated on the way).
 
     Raises:
-        ValueError: if a column of the 3DGS layout is missing.
+        ValueError: if a column of the 3DGS layout is missing, or numbered columns have gaps or an odd count.
     """
     needed = ["x", "y", "z", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     missing = [name for name in needed if name not in columns]
@@ -155,14 +193,19 @@ def gaussians_from_columns(columns: Columns) -> Gaussians:
         raise ValueError(
             f"columns: expected the 3DGS layout, {', '.join(missing)} missing; is this a plain point cloud?"
         )
-    rest = sorted((name for name in columns if name.startswith("f_rest_")), key=lambda name: int(name[7:]))
-    features = sorted((name for name in columns if name.startswith("semantic_")), key=lambda name: int(name[9:]))
+    dc_names, rest, features = (_numbered(columns, group) for group in ("f_dc_", "f_rest_", "semantic_"))
+    for group, names, counts in (("f_dc_", dc_names, (0, 3)), ("f_rest_", rest, (0, 9, 24, 45))):
+        if len(names) not in counts or (rest and not dc_names):
+            raise ValueError(
+                f"columns: expected {group}0, {group}1, ... of {' or '.join(map(str, counts))} columns (f_rest_* only "
+                f"with f_dc_0 to f_dc_2), got {len(names)} {group}*; write the file again"
+            )
     sh = None
-    if "f_dc_0" in columns:
-        dc = _stack(columns, [f"f_dc_{i}" for i in range(3)])[:, None]
-        higher = (
-            _stack(columns, rest).view(len(dc), 3, -1).transpose(1, 2) if rest else dc[:, :0]
-        )  # stored channel-major
+    if dc_names:
+        dc = _stack(columns, dc_names)[:, None]
+        higher = dc[:, :0]
+        if rest:  # stored channel-major
+            higher = _stack(columns, rest).view(len(dc), 3, len(rest) // 3).transpose(1, 2)
         sh = torch.cat([dc, higher], 1)
     return Gaussians(
         means=points_from_columns(columns),
@@ -181,7 +224,7 @@ def columns_from_gaussians(gaussians: Gaussians) -> Columns:
     opacity = g.opacities.clamp(1e-7, 1 - 1e-7)
     groups: list[tuple[str, Tensor]] = []
     if g.sh is not None:
-        groups += [("f_dc", g.sh[:, 0]), ("f_rest", g.sh[:, 1:].transpose(1, 2).reshape(len(g), -1))]
+        groups += [("f_dc", g.sh[:, 0]), ("f_rest", g.sh[:, 1:].transpose(1, 2).flatten(1))]
     groups += [("opacity", opacity.logit()[:, None]), ("scale", g.scales.log()), ("rot", g.quats)]
     if g.features is not None:
         groups.append(("semantic", g.features))

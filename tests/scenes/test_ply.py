@@ -3,7 +3,14 @@ import pytest
 import torch
 
 from kfgs.gaussians import Gaussians
-from kfgs.scenes.ply import columns_from_gaussians, gaussians_from_columns, points_from_columns, read_ply, write_ply
+from kfgs.scenes.ply import (
+    columns_from_gaussians,
+    gaussians_from_columns,
+    other_elements,
+    points_from_columns,
+    read_ply,
+    write_ply,
+)
 
 
 def _cloud(n: int = 7, degree: int = 3) -> Gaussians:
@@ -103,3 +110,63 @@ def test_missing_file_and_columns(tmp_path):
     with pytest.raises(ValueError, match="astype"):
         write_ply(tmp_path / "a.ply", {"x": np.zeros(1, np.int64)})
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_empty_clouds_survive_the_file(tmp_path, degree):
+    cloud = _cloud(0, degree)
+    write_ply(tmp_path / "a.ply", columns_from_gaussians(cloud))
+    back = gaussians_from_columns(read_ply(tmp_path / "a.ply"))
+    assert len(back) == 0
+    assert back.sh.shape == (0, (degree + 1) ** 2, 3)
+    assert back.features.shape == (0, 9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"f_rest_44": None}, r"f_rest_0, f_rest_1, .* of 0 or 9 or 24 or 45 columns .*got 44 f_rest_\*"),
+        ({"f_rest_7": None}, r"expected f_rest_7 beside f_rest_44, got none; number f_rest_\* from 0"),
+        ({"f_rest_7": None, "f_rest_x": "f_rest_7"}, r"expected f_rest_7 beside f_rest_x, got none"),
+        ({"f_dc_1": None}, r"expected f_dc_1 beside f_dc_2, got none"),
+        ({"f_dc_2": None}, r"f_dc_0, f_dc_1, .* of 0 or 3 columns .*got 2 f_dc_\*"),
+        ({"f_dc_0": None, "f_dc_1": None, "f_dc_2": None}, r"f_rest_\* only with f_dc_0 to f_dc_2\), got 0 f_dc_\*"),
+        ({"semantic_3": None}, r"expected semantic_3 beside semantic_8, got none"),
+    ],
+)
+def test_odd_columns_are_named(changes, message):
+    columns = columns_from_gaussians(_cloud())
+    values = {name: columns[source] for name, source in changes.items() if source}
+    for name, source in changes.items():
+        if source is None:
+            del columns[name]
+    with pytest.raises(ValueError, match=message):
+        gaussians_from_columns(columns | values)
+
+
+def test_ascii_that_is_no_number_names_the_file(tmp_path):
+    head = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nend_header\n"
+    (tmp_path / "a.ply").write_text(head + "0 1\n2 banana\n")
+    with pytest.raises(
+        ValueError, match=r"a.ply: expected 2 rows of numbers, but they .*banana.*; write the file again"
+    ):
+        read_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("layout", ["ascii", "binary_little_endian"])
+def test_a_mesh_is_read_and_its_faces_are_told(tmp_path, layout):
+    head = f"ply\nformat {layout} 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "element face 1\nproperty list uchar int vertex_indices\nelement edge 0\nproperty int vertex1\nend_header\n"
+    points = np.arange(9, dtype="<f4").reshape(3, 3)
+    face = b"\x03" + np.arange(3, dtype="<i4").tobytes()
+    text = "".join(f"{x:g} {y:g} {z:g}\n" for x, y, z in points) + "3 0 1 2\n"
+    (tmp_path / "a.ply").write_bytes(head.encode() + (text.encode() if layout == "ascii" else points.tobytes() + face))
+    np.testing.assert_array_equal(points_from_columns(read_ply(tmp_path / "a.ply")).numpy(), points)
+    assert other_elements(tmp_path / "a.ply") == ["face"]
+
+
+def test_a_cloud_has_no_other_elements(tmp_path):
+    write_ply(tmp_path / "a.ply", columns_from_gaussians(_cloud()))
+    assert other_elements(tmp_path / "a.ply") == []
+    with pytest.raises(FileNotFoundError, match="none.ply: no such file; expected a PLY"):
+        other_elements(tmp_path / "none.ply")
