@@ -199,7 +199,8 @@ class SemanticField:
             decode: as in `segment`.
 
         Returns:
-            Labels (-1 = no view shows the Gaussian), the winner's share of the votes, and the votes cast.
+            Labels (-1 = no view shows the Gaussian, or fewer than seven votes in ten agree), the winner's share of the
+            votes, and the votes cast.
         """
         self._check_embeddings(embeddings)
         views = ((camera, self.segment(camera, embeddings, decode=decode)) for camera in cameras)

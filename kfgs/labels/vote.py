@@ -19,10 +19,15 @@ from ..gaussians import Gaussians
 from ..splat import accumulate_pixels, bin_tiles, project
 
 
+MIN_SHARE = 0.7
+"""A class needs seven votes in ten. Gaussians with less lie across a border: of those of the toy room 65 % were labelled
+right, against 95 % of the others."""
+
+
 class Votes(NamedTuple):
     """The outcome of a vote."""
 
-    labels: Tensor  # [N] int64, -1 = no view shows this Gaussian
+    labels: Tensor  # [N] int64, -1 = no view shows this Gaussian, or the views do not agree on it
     shares: Tensor  # [N] of the winner in the votes cast, 0 where none were
     weights: Tensor  # [N] votes cast: the number of pixels, in all views, that the Gaussian fills
 
@@ -32,6 +37,7 @@ def vote_labels(
     views: Iterable[tuple[Camera, Tensor]],  # label maps [H, W] int64 of the cameras' sizes, -1 = none
     classes: int,
     *,
+    min_share: float = MIN_SHARE,
     engine: str = "auto",
 ) -> Votes:
     """Label each Gaussian with the class that most of its rendering weight falls on.
@@ -40,6 +46,7 @@ def vote_labels(
         gaussians: a cloud; only its geometry and opacity are used.
         views: cameras with a label map each; read one at a time.
         classes: number of classes C; labels are below it.
+        min_share: a winner with a smaller share of the votes gives no label; 0 labels every Gaussian that is shown.
         engine: compositing engine.
 
     Returns:
@@ -49,6 +56,7 @@ def vote_labels(
         ValueError: if a label map has another size than its camera, or a label is not below `classes`.
     """
     check_range("classes", classes, 1)
+    check_range("min_share", min_share, 0, 1)
     votes = torch.zeros(len(gaussians), classes).to(gaussians.means)
     with torch.no_grad():
         for camera, labels in views:
@@ -66,5 +74,5 @@ def vote_labels(
             votes.index_add_(0, projected.index, accumulate_pixels(*shape, ballots, tiles, engine=engine))
     weights = votes.sum(1)
     best, labels = votes.max(1)
-    labels = torch.where(weights > 0, labels, -1)
-    return Votes(labels, best / weights.clamp_min(torch.finfo(weights.dtype).tiny), weights)
+    shares = best / weights.clamp_min(torch.finfo(weights.dtype).tiny)
+    return Votes(torch.where((weights > 0) & (shares >= min_share), labels, -1), shares, weights)

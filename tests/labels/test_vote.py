@@ -36,10 +36,19 @@ def test_what_stands_behind_has_no_say_about_pixels_it_does_not_show():
 
 def test_the_majority_of_views_wins_and_unlabelled_pixels_do_not_vote():
     cloud = _cloud((0.0, 0.0, 2.0))
-    maps = [torch.full((24, 32), label) for label in (1, 0, 1, -1, -1, -1)]
+    maps = [torch.full((24, 32), label) for label in (1, 0, 1, 1, -1, -1, -1)]
     votes = vote_labels(cloud, [(_camera(), m) for m in maps], 2)
     assert votes.labels.tolist() == [1]
-    assert float(votes.shares) == pytest.approx(2 / 3, abs=1e-5)
+    assert float(votes.shares) == pytest.approx(3 / 4, abs=1e-5)
+
+
+def test_a_divided_vote_gives_no_label_unless_asked_to():
+    views = [(_camera(), torch.full((24, 32), label)) for label in (1, 0, 1, 0, 1)]
+    cloud = _cloud((0.0, 0.0, 2.0))
+    assert vote_labels(cloud, views, 2).labels.tolist() == [-1]
+    assert vote_labels(cloud, views, 2, min_share=0).labels.tolist() == [1]
+    with pytest.raises(ValueError, match="min_share"):
+        vote_labels(cloud, views, 2, min_share=1.5)
 
 
 def test_votes_are_the_sums_of_compositing_weights():
