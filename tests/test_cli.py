@@ -104,6 +104,16 @@ def test_a_clouds_own_colours_are_kept(run, room, tmp_path):
     assert read_ply(tmp_path / "o" / "cloud.ply")["red"].tolist() == [200] * 4
 
 
+def test_a_mesh_is_refused_since_its_faces_would_be_lost(run, room, tmp_path, capsys):
+    header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+    (tmp_path / "mesh.ply").write_text(header + faces)
+    arguments = ["label", str(run / "field"), "--scene", str(room), "--out", str(tmp_path / "o")]
+    assert main([*arguments, "--cloud", str(tmp_path / "mesh.ply")]) == 1
+    assert "mesh.ply: expected nothing but points, got face" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
 def test_views_without_label_pictures_are_segmented_without_a_score(run, room, tmp_path, capsys):
     arguments = ["segment", str(run / "field"), "--scene", str(room), "--out", str(tmp_path), "--pictures", "0"]
     assert main([*arguments, "--split", "train"]) == 0

@@ -48,7 +48,7 @@ def test_import_kfgs_is_quick_because_it_loads_nothing():
 def test_ci_runs_the_readmes_commands_as_written():
     readme, ci = (ROOT / "README.md").read_text(), (ROOT / ".ci" / "run").read_text()
     commands = [
-        'pip install -c constraints.txt torch==2.13.0 . && kfgs demo',
+        "pip install -c constraints.txt torch==2.13.0 . && kfgs demo",
         'pip install -c constraints.txt torch==2.13.0 ".[test]" && python -m pytest',
     ]
     for command in commands:

@@ -18,7 +18,6 @@ from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..splat import accumulate_pixels, bin_tiles, project
 
-
 MIN_SHARE = 0.7
 """A class needs seven votes in ten. Gaussians with less lie across a border: of those of the toy room 65 % were labelled
 right, against 95 % of the others."""

@@ -21,7 +21,14 @@ from ..fields import SemanticField
 from ..gaussians import Gaussians
 from ..labels import Transfer, classify, transfer_labels
 from ..scenes import Scene
-from ..scenes.ply import Columns, columns_from_gaussians, points_from_columns, read_ply, write_ply
+from ..scenes.ply import (
+    Columns,
+    columns_from_gaussians,
+    other_elements,
+    points_from_columns,
+    read_ply,
+    write_ply,
+)
 from ..viz import FeatureColors, overlay_labels, palette, save_picture
 
 Decode = Literal["exact", "latent"]
@@ -222,6 +229,12 @@ def read_cloud(path: str | Path) -> Columns:
         points_from_columns(columns)
     except ValueError as error:
         raise ValueError(f"{path}: {error}; give a point cloud or a 3DGS file") from error
+    others = other_elements(path)
+    if others:
+        raise ValueError(
+            f"{path}: expected nothing but points, got {', '.join(others)} too, which labelling would lose; save the "
+            "vertices as a point cloud"
+        )
     return columns
 
 
