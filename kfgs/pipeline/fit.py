@@ -211,6 +211,28 @@ def _field_stage(
     return GaussianParams.from_tensors(load_file(stage.folder / "params.safetensors")), stage
 
 
+def _check_inputs(scene: Scene, views: Sequence[int], maps: Maps, split: str) -> None:
+    """Refuse what would fail only after the first stages are done."""
+    if len(views) != len(maps):
+        raise ValueError(
+            f"maps: expected one teacher map per view of split {split!r} ({len(views)}), got {len(maps)}; "
+            "read them with FeatureFolder(path, stems of that split)"
+        )
+    if scene.distorted:
+        raise ValueError("scene: expected cameras without distortion, got a lens; pass scene.undistorted()")
+    if len(scene.points) < 2:
+        raise ValueError(
+            f"scene: expected sparse points to start from, got {len(scene.points)}; a transforms.json needs a "
+            "ply_file_path, or estimate the scene with `kfgs sfm`"
+        )
+    stems = getattr(maps, "stems", None)
+    if stems is not None and [Path(stem).name for stem in stems] != [Path(scene.stem(i)).name for i in views]:
+        raise ValueError(
+            f"maps: expected the maps of the views of split {split!r} in their order ({scene.stem(views[0])}, "
+            f"...), got {stems[0]}, ...; read them with FeatureFolder(path, [scene.stem(i) for i in scene.views(split)])"
+        )
+
+
 def fit_scene(
     scene: Scene,
     maps: Maps,  # teacher maps of the views of config.split, in their order
@@ -237,24 +259,7 @@ def fit_scene(
     """
     config = config or FitConfig.paper()
     views = scene.views(config.split)
-    if len(views) != len(maps):
-        raise ValueError(
-            f"maps: expected one teacher map per view of split {config.split!r} ({len(views)}), got {len(maps)}; "
-            "read them with FeatureFolder(path, stems of that split)"
-        )
-    if scene.distorted:
-        raise ValueError("scene: expected cameras without distortion, got a lens; pass scene.undistorted()")
-    if len(scene.points) < 2:
-        raise ValueError(
-            f"scene: expected sparse points to start from, got {len(scene.points)}; a transforms.json needs a "
-            "ply_file_path, or estimate the scene with `kfgs sfm`"
-        )
-    stems = getattr(maps, "stems", None)
-    if stems is not None and [Path(stem).name for stem in stems] != [Path(scene.stem(i)).name for i in views]:
-        raise ValueError(
-            f"maps: expected the maps of the views of split {config.split!r} in their order ({scene.stem(views[0])}, "
-            f"...), got {stems[0]}, ...; read them with FeatureFolder(path, [scene.stem(i) for i in scene.views(split)])"
-        )
+    _check_inputs(scene, views, maps, config.split)
     run = Run(Path(folder), report)
     options: dict[str, Any] = {"progress": progress, "callback": callback}
     codebook, autoencoder = None, None
