@@ -90,7 +90,7 @@ def evaluate_segmentation(
     names = tuple(names)
     if not truth:
         raise ValueError("truth: expected at least one label picture, got none; is the folder of labels right?")
-    pooled = ConfusionMatrix(len(names) + 1)  # the last row and column hold "no label", which is never a true class
+    pooled = ConfusionMatrix(len(names))
     for stem, given in truth.items():
         target = given if isinstance(given, Tensor) else load_label_map(given)
         if int(target.max()) >= len(names):
@@ -102,18 +102,14 @@ def evaluate_segmentation(
         labels = predict(stem)
         if labels.shape != target.shape:
             labels = resize_labels(labels, (int(target.shape[0]), int(target.shape[1])))
-        pooled.update(torch.where(labels < 0, len(names), labels), target)
-    confusion = pooled.matrix
-    if int(confusion.sum()) == 0:
+        pooled.update(labels, target)
+    if int(pooled.matrix.sum() + pooled.misses.sum()) == 0:
         raise ValueError(f"truth: expected some pixel with a known label, got only void in {len(truth)} views")
-    hits = confusion.diag()[:-1].double()
-    union = confusion.sum(0)[:-1] + confusion.sum(1)[:-1] - confusion.diag()[:-1]
-    iou = torch.where(union > 0, hits / union, torch.nan)
     return SegmentationReport(
         names=names,
-        confusion=confusion[:-1, :-1],
-        iou=iou,
-        miou=Score("mIoU", float(iou.nanmean()), PROTOCOL),
-        accuracy=Score("accuracy", float(hits.sum() / confusion.sum()), PROTOCOL),
+        confusion=pooled.matrix,
+        iou=pooled.iou(),
+        miou=Score("mIoU", pooled.miou(), PROTOCOL),
+        accuracy=Score("accuracy", pooled.accuracy(), PROTOCOL),
         views=len(truth),
     )

@@ -87,11 +87,7 @@ def segment_scene(
             "segment with fewer classes, or call SemanticField.segment, which has no such limit"
         )
     views = scene.views(split)
-    shown = (
-        {views[i] for i in np.linspace(0, len(views) - 1, min(pictures, len(views))).round().astype(int)}
-        if views
-        else set()
-    )
+    shown = {views[i] for i in np.linspace(0, len(views) - 1, min(pictures, len(views))).round().astype(int)}
     colors = feature_colors(field)
     results: dict[str, Tensor] = {}
     for i in tqdm(views, desc="segment", unit="view", disable=not progress):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -118,7 +117,7 @@ def _lens_digest(maps: Maps) -> str | None:
     if not isinstance(maps, UndistortedMaps):
         return None
     return digest_value(
-        [[lens.K.tolist(), asdict(lens.distortion) if lens.distortion else None] for lens in maps.lenses]
+        [[lens.K.tolist(), lens.size, asdict(lens.distortion) if lens.distortion else None] for lens in maps.lenses]
     )
 
 
@@ -129,12 +128,12 @@ def _codebook_stage(
 
     def make(folder: Path) -> None:
         fit = fit_codebook(maps, config.codebook, generator=_generator(config.seed, "codebook"), **options)
-        save_file({"codewords": fit.codebook.codewords.contiguous()}, folder / "codebook.safetensors")
+        fit.codebook.save(folder / "codebook.safetensors")
         write_json(folder / "history.json", fit.history)
 
     inputs = {"features": features, "config": asdict(config.codebook), "seed": config.seed}
     stage = run.stage("codebook", inputs, make)
-    return Codebook(load_file(stage.folder / "codebook.safetensors")["codewords"]), stage
+    return Codebook.load(stage.folder / "codebook.safetensors"), stage
 
 
 def _index_stage(
@@ -156,12 +155,12 @@ def _autoencoder_stage(
 
     def make(folder: Path) -> None:
         fit = fit_autoencoder(codebook, config.autoencoder, generator=_generator(config.seed, "autoencoder"), **options)
-        save_file(fit.autoencoder.to_tensors(), folder / "autoencoder.safetensors")
+        fit.autoencoder.save(folder / "autoencoder.safetensors")
         write_json(folder / "history.json", fit.history)
 
     inputs = {"codebook": upstream.key, "config": asdict(config.autoencoder), "seed": config.seed}
     stage = run.stage("autoencoder", inputs, make)
-    return Autoencoder.from_tensors(load_file(stage.folder / "autoencoder.safetensors")), stage
+    return Autoencoder.load(stage.folder / "autoencoder.safetensors"), stage
 
 
 def _field_stage(
@@ -204,10 +203,7 @@ def _field_stage(
         return max(0.0, fit.history[-1]["seconds"] - (time.perf_counter() - started))  # before it was killed
 
     stage = run.stage("field", inputs, make)
-    if scratch.is_dir():
-        shutil.rmtree(scratch)
-    else:
-        scratch.unlink(missing_ok=True)
+    scratch.unlink(missing_ok=True)
     return GaussianParams.from_tensors(load_file(stage.folder / "params.safetensors")), stage
 
 

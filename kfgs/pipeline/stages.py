@@ -18,7 +18,7 @@ from typing import Any
 from .._files import atomic_folder, digest_file, digest_value, read_json, write_json
 
 STAGE_FILE = "stage.json"
-STAGE_VERSION = 1
+STAGE_VERSION = 2
 """Part of every key: raised when the same inputs would give another result, so that old stages are not used again."""
 
 

@@ -65,5 +65,11 @@ def test_a_distorted_scene_is_fitted_through_its_lens(tmp_path):
     straightened = fit_scene(bent.undistorted(), maps, tmp_path / "run", quick)
     as_is = fit_scene(bent.undistorted(), maps, tmp_path / "run", dataclasses.replace(quick, undistorted_features=True))
     assert straightened.stages[0].key != as_is.stages[0].key  # the lens is part of what the maps are
+    larger = [
+        lens.resized(2 * lens.height, 2 * lens.width) for lens in bent.cameras
+    ]  # the same K would be another lens
+    larger = [dataclasses.replace(big, K=lens.K) for big, lens in zip(larger, bent.cameras, strict=True)]
+    other = fit_scene(dataclasses.replace(bent.undistorted(), lenses=larger), maps, tmp_path / "run", quick)
+    assert other.stages[0].key != straightened.stages[0].key
     plain = fit_scene(scene, maps, tmp_path / "run", quick)
     assert plain.stages[0].key == as_is.stages[0].key
