@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from . import colmap_tables as tables
-from .colmap_tables import CAMERA_MODELS, FrameRecord, ImageRecord, Model, Sensor, Tracks, require
+from .colmap_tables import CAMERA_MODELS, FrameRecord, ImageRecord, Model, Readers, Sensor, Tracks, require, walk_model
 from .errors import SceneError
 
 _COUNT = struct.Struct("<Q")
@@ -188,15 +188,5 @@ def _check_sensors(where: str, sensors: list[Sensor]) -> None:
 
 
 def read_binary(folder: Path) -> Model:
-    """Walk the .bin files of a model; see `colmap_check.check_model`."""
-    model = Model(_read_cameras(folder / "cameras.bin"), _read_images(folder / "images.bin"))
-    tables.check_images(str(folder / "images.bin"), model.images, model.cameras)
-    tracks = _read_points(folder / "points3D.bin")
-    tables.check_tracks(str(folder / "points3D.bin"), tracks, model.images)
-    model.points = len(tracks.point_ids)
-    if (folder / "rigs.bin").is_file():
-        model.rigs = _read_rigs(folder / "rigs.bin")
-    if (folder / "frames.bin").is_file():
-        model.frames = _read_frames(folder / "frames.bin")
-    tables.check_rigs(folder, ".bin", model)
-    return model
+    """Walk the .bin files of a model."""
+    return walk_model(folder, ".bin", Readers(_read_cameras, _read_images, _read_points, _read_rigs, _read_frames))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -93,6 +93,32 @@ class Tracks(NamedTuple):
     """[T]."""
     observations: NDArray[np.int64]
     """[T] which 2-D point of that image."""
+
+
+class Readers(NamedTuple):
+    """How the five files of one layout, binary or text, are read."""
+
+    cameras: Callable[[Path], set[int]]
+    images: Callable[[Path], dict[int, ImageRecord]]
+    points: Callable[[Path], Tracks]
+    rigs: Callable[[Path], dict[int, list[Sensor]]]
+    frames: Callable[[Path], dict[int, FrameRecord]]
+
+
+def walk_model(folder: Path, suffix: str, readers: Readers) -> Model:
+    """Read the files of a model and check that they refer to each other rightly; see `colmap_check.check_model`."""
+    paths = {name: folder / f"{name}{suffix}" for name in ("cameras", "images", "points3D", "rigs", "frames")}
+    model = Model(readers.cameras(paths["cameras"]), readers.images(paths["images"]))
+    check_images(str(paths["images"]), model.images, model.cameras)
+    tracks = readers.points(paths["points3D"])
+    check_tracks(str(paths["points3D"]), tracks, model.images)
+    model.points = len(tracks.point_ids)
+    if paths["rigs"].is_file():
+        model.rigs = readers.rigs(paths["rigs"])
+    if paths["frames"].is_file():
+        model.frames = readers.frames(paths["frames"])
+    check_rigs(folder, suffix, model)
+    return model
 
 
 def require(condition: bool, where: str, expected: str, got: object, advice: str = ADVICE) -> None:

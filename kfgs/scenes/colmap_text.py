@@ -10,7 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import colmap_tables as tables
-from .colmap_tables import CAMERA_MODELS, SENSOR_NAMES, FrameRecord, ImageRecord, Model, Sensor, Tracks, require
+from .colmap_tables import (
+    CAMERA_MODELS,
+    SENSOR_NAMES,
+    FrameRecord,
+    ImageRecord,
+    Model,
+    Readers,
+    Sensor,
+    Tracks,
+    require,
+    walk_model,
+)
 from .errors import SceneError
 
 _PARAMETERS = {name: parameters for name, parameters, _ in CAMERA_MODELS.values()}
@@ -175,15 +186,5 @@ def _read_frames(path: Path) -> dict[int, FrameRecord]:
 
 
 def read_text(folder: Path) -> Model:
-    """Walk the .txt files of a model; see `colmap_check.check_model`."""
-    model = Model(_read_cameras(folder / "cameras.txt"), _read_images(folder / "images.txt"))
-    tables.check_images(str(folder / "images.txt"), model.images, model.cameras)
-    tracks = _read_points(folder / "points3D.txt")
-    tables.check_tracks(str(folder / "points3D.txt"), tracks, model.images)
-    model.points = len(tracks.point_ids)
-    if (folder / "rigs.txt").is_file():
-        model.rigs = _read_rigs(folder / "rigs.txt")
-    if (folder / "frames.txt").is_file():
-        model.frames = _read_frames(folder / "frames.txt")
-    tables.check_rigs(folder, ".txt", model)
-    return model
+    """Walk the .txt files of a model."""
+    return walk_model(folder, ".txt", Readers(_read_cameras, _read_images, _read_points, _read_rigs, _read_frames))
