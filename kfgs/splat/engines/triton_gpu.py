@@ -39,11 +39,18 @@ class Launch(NamedTuple):
 
 
 LAUNCHES = {
-    "composite": Launch(pixels=256, chunk=32, block=64, warps=8),
-    "accumulate": Launch(pixels=256, chunk=32, block=64, warps=8),
-    "differentiate": Launch(pixels=256, chunk=16, block=64, warps=8),
+    # Nothing is shared between the programs of a tile but the loading of Gaussians: small ones, several on a processor.
+    "composite": Launch(pixels=128, chunk=16, block=64, warps=4),
+    # A program adds to a Gaussian once: a whole tile of 16 x 16 pixels, for the fewest atomics. The values of a pixel's
+    # block of channels stay in its thread's registers.
+    "accumulate": Launch(pixels=256, chunk=16, block=64, warps=8),
+    # As above. More channels at a time, or more Gaussians, and registers no longer suffice.
+    "differentiate": Launch(pixels=256, chunk=16, block=32, warps=8),
 }
-"""32 threads * warps = pixels: a thread then holds a chunk of one pixel, and no product crosses threads."""
+"""A warp has 32 threads: warps * 32 = pixels, so each thread holds a chunk of one pixel, and no running product or sum
+crosses threads. A chunk of 16 is the shortest axis that tensor-core products take. Chosen such that, compiled for sm_80,
+sm_90 and sm_100, registers (at most 255 a thread) hardly spill, and shared memory stays below the 99 KB of the smaller
+GPUs (see tests/splat/test_triton_gpu.py). Not tuned by timing: none of this has been timed on a GPU."""
 
 SMALLEST = 16
 """Least size of an axis of a tensor-core product: less is padded."""
@@ -66,8 +73,11 @@ def forward(
     width: int,
     height: int,
     tile_size: int,
-) -> tuple[Tensor, Tensor, Tensor]:  # maps [H, W, D], alphas [H, W], trace [H, W] int32
-    """Composite as `contract` promises. `trace`: how many Gaussians of its tile's list each pixel passed before it stopped.
+) -> tuple[Tensor, Tensor, Tensor]:  # maps [H, W, D], alphas [H, W], trace [2, H, W] int32
+    """Composite as `contract` promises.
+
+    `trace` is for the backward pass: how many Gaussians of its tile's list each pixel passed before it stopped, and the
+    bits of its final transmittance, of which 1 - alpha would keep few digits behind what is opaque.
 
     Raises:
         ValueError: if the tensors are not float32, or not on a device that the kernels run on.
@@ -75,17 +85,20 @@ def forward(
     _check(means2d=means2d, conics=conics, opacities=opacities, features=features, background=background)
     D = features.shape[1]
     maps, alphas = features.new_empty(height, width, D), features.new_empty(height, width)
-    stops = torch.empty(height, width, dtype=torch.int32, device=features.device)
+    trace = torch.empty(2, height, width, dtype=torch.int32, device=features.device)
+    stops, lights = trace[0], trace[1].view(torch.float32)
     if len(rows) == 0:
-        return maps.copy_(background.expand_as(maps)), alphas.zero_(), stops.zero_()
+        stops.zero_()
+        lights.fill_(1.0)
+        return maps.copy_(background.expand_as(maps)), alphas.zero_(), trace
     options = launch_options("composite", D, tile_size)
     grid = _programs(options, width, height), -(-D // options["BLOCK"])
     with _on(means2d):
         composite_kernel[grid](
-            means2d, conics, opacities, features, background, index, rows, offsets, maps, alphas, stops,
-            width, height, -(-width // tile_size), D, **options,
+            means2d, conics, opacities, features, background, index, rows, offsets,
+            maps, alphas, stops, lights, width, height, -(-width // tile_size), D, **options,
         )  # fmt: skip
-    return maps, alphas, stops
+    return maps, alphas, trace
 
 
 def backward(
@@ -121,6 +134,7 @@ def backward(
     """
     _check(grad_maps=grad_maps, grad_alphas=grad_alphas, means2d=means2d, features=features)
     of_splats, of_features = any(wanted[:3]), bool(wanted[3])
+    stops, lights = trace[0], trace[1].view(torch.float32)
     values = (means2d, conics, opacities, features)
     computed = (of_splats, of_splats, of_splats, of_features)
     grads = [torch.zeros_like(v) if c else v.new_empty(0) for v, c in zip(values, computed, strict=True)]
@@ -129,11 +143,11 @@ def backward(
         options = launch_options("differentiate", D, tile_size)
         with _on(means2d):
             differentiate_kernel[(_programs(options, width, height),)](
-                means2d, conics, opacities, features, index, rows, offsets, maps, alphas, trace,
+                means2d, conics, opacities, features, index, rows, offsets, maps, alphas, stops,
                 grad_maps.contiguous(), grad_alphas.contiguous(), *grads,
                 width, height, -(-width // tile_size), D, **options, OF_SPLATS=of_splats, OF_FEATURES=of_features,
             )  # fmt: skip
-    grads.append(torch.einsum("hwd,hw->d", grad_maps, 1 - alphas) if wanted[4] else background.new_empty(0))
+    grads.append(torch.einsum("hwd,hw->d", grad_maps, lights) if wanted[4] else background.new_empty(0))
     return [grad if want else grad.new_empty(0) for grad, want in zip(grads, wanted, strict=True)]
 
 
@@ -185,6 +199,8 @@ def launch_options(kernel: str, channels: int, tile_size: int) -> dict[str, Any]
         "BLOCK": min(launch.block, max(SMALLEST, triton.next_power_of_2(channels))),
         "PRECISION": "ieee" if INTERPRETED else PRECISION,
         "num_warps": max(1, launch.warps * pixels // launch.pixels),
+        "num_stages": 1,  # loading a block of channels ahead takes registers that the backward pass does not have
+        "enable_fp_fusion": True,  # a * b + c in one instruction
     }
 
 

@@ -8,6 +8,9 @@ is a matrix product of such a block with BLOCK channels, on the tensor cores.
 Positions in a tile's list count from its start, in int32; memory offsets that channels multiply are int64.
 """
 
+# mypy: disable-error-code="no-untyped-def"
+# Triton gives the arguments their types when it compiles; only constants are annotated.
+
 import triton
 import triton.language as tl
 
@@ -16,6 +19,9 @@ from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 MOST = tl.constexpr(ALPHA_MAX)
 LEAST = tl.constexpr(ALPHA_MIN)
 END = tl.constexpr(TRANSMITTANCE_MIN)
+
+SIZES = ["width", "height", "columns"]
+"""Arguments of every kernel that it is not compiled anew for: another image size costs no compilation."""
 
 
 @triton.jit
@@ -88,23 +94,36 @@ def load_block(base, line, lines, channel, channels):
 
 
 @triton.jit
+def sum_pixels(weight, values, CHUNK: tl.constexpr, PIXELS: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr):
+    """The product weight [CHUNK, PIXELS] · values [PIXELS, BLOCK], in slices of a warp's pixels that are added up.
+
+    As one product, every warp would hold all the weights in registers, and spill them.
+    """
+    SLICES: tl.constexpr = (PIXELS + 31) // 32
+    EACH: tl.constexpr = PIXELS // SLICES
+    left = tl.permute(tl.reshape(weight, (CHUNK, SLICES, EACH)), (1, 0, 2))
+    parts = tl.dot(left, tl.reshape(values, (SLICES, EACH, BLOCK)), input_precision=PRECISION)
+    return tl.sum(parts, 0)
+
+
+@triton.jit
 def find_features(row, listed, index):
     """Which row of the features each Gaussian shows."""
     if index is None:
         return row
-    else:  # noqa: RET505 - Triton wants both branches when it chooses between them while compiling
+    else:  # Triton takes one of the branches while it compiles
         return tl.load(index + row, mask=listed, other=0).to(tl.int64)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def composite_kernel(
     means2d, conics, opacities, features, background, index, rows, offsets,
-    maps, alphas, stops,
+    maps, alphas, stops, lights,
     width, height, columns, channels,
     SIDE: tl.constexpr, PARTS: tl.constexpr, PIXELS: tl.constexpr,
     CHUNK: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
 ):  # fmt: skip
-    """Composite BLOCK channels at PIXELS pixels; the first block also writes alphas and where each pixel stopped."""
+    """Composite BLOCK channels at PIXELS pixels; the first block also writes alphas, stops and transmittances."""
     tile, pixel, x, y, inside = place_pixels(columns, width, height, SIDE, PARTS, PIXELS)
     listed_rows, count = find_list(tile, rows, offsets)
     channel = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
@@ -128,9 +147,10 @@ def composite_kernel(
     if tl.program_id(1) == 0:
         tl.store(alphas + pixel, 1.0 - light, mask=inside)
         tl.store(stops + pixel, stop, mask=inside)
+        tl.store(lights + pixel, light, mask=inside)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def accumulate_kernel(
     means2d, conics, opacities, pixels, rows, offsets,
     sums, weights,
@@ -153,7 +173,7 @@ def accumulate_kernel(
         )
         alpha, _, _, _ = find_alphas(x, y, mean_x, mean_y, a, b, c, opacity)
         weight, light, stop = weigh(alpha, position, light, stop, count)
-        part = tl.dot(weight, values, input_precision=PRECISION)
+        part = sum_pixels(weight, values, CHUNK, PIXELS, BLOCK, PRECISION)
         there = listed[:, None] & (channel < channels)[None, :]
         tl.atomic_add(sums + row[:, None] * channels + channel[None, :], part, mask=there, sem="relaxed")
         if tl.program_id(1) == 0:

@@ -9,15 +9,27 @@ behind k is R less the w D up to k, and with alpha_k = opacity_k * density_k,
 is the slope in log(alpha_k), from which the gradients of centre, conic and opacity are six sums over the pixels.
 """
 
+# mypy: disable-error-code="no-untyped-def"
+
 import triton
 import triton.language as tl
 
-from .triton_kernels import MOST, find_alphas, find_features, find_list, load_block, load_splats, place_pixels
+from .triton_kernels import (
+    MOST,
+    SIZES,
+    find_alphas,
+    find_features,
+    find_list,
+    load_block,
+    load_splats,
+    place_pixels,
+    sum_pixels,
+)
 
 
 @triton.jit
 def find_total(maps, grad_maps, pixel, inside, channels, PIXELS: tl.constexpr, BLOCK: tl.constexpr):
-    """maps · grad_maps over all channels: [PIXELS]."""
+    """The product maps · grad_maps over all channels: [PIXELS]."""
     total = tl.zeros((PIXELS,), tl.float32)
     for start in range(0, channels, BLOCK):
         channel = start + tl.arange(0, BLOCK)
@@ -28,10 +40,17 @@ def find_total(maps, grad_maps, pixel, inside, channels, PIXELS: tl.constexpr, B
 
 @triton.jit
 def add_splat_gradients(
-    v, dx, dy, row, listed, a, b, c, opacity,
+    v, x, y, position, count, listed_rows, means2d, conics, opacities,
     grad_means2d, grad_conics, grad_opacities,
 ):  # fmt: skip
-    """Add the slopes v [CHUNK, PIXELS] in log(alpha) to the gradients of the Gaussians `row` [CHUNK]."""
+    """Add the slopes v [CHUNK, PIXELS] in log(alpha) to the gradients of the Gaussians at `position` [CHUNK].
+
+    The Gaussians are loaded again: kept since the alphas were found, they would push other registers out to memory.
+    """
+    row, listed, mean_x, mean_y, a, b, c, opacity = load_splats(
+        position, count, listed_rows, means2d, conics, opacities
+    )
+    dx, dy = x[None, :] - mean_x[:, None], y[None, :] - mean_y[:, None]
     v_dx, v_dy = v * dx, v * dy
     total, total_x, total_y = tl.sum(v, 1), tl.sum(v_dx, 1), tl.sum(v_dy, 1)
     tl.atomic_add(grad_means2d + 2 * row, a * total_x + b * total_y, mask=listed, sem="relaxed")
@@ -43,7 +62,7 @@ def add_splat_gradients(
     tl.atomic_add(grad_opacities + row, total * per_alpha, mask=listed, sem="relaxed")
 
 
-@triton.jit
+@triton.jit(do_not_specialize=SIZES)
 def differentiate_kernel(
     means2d, conics, opacities, features, index, rows, offsets,
     maps, alphas, stops, grad_maps, grad_alphas,
@@ -74,13 +93,22 @@ def differentiate_kernel(
         row, listed, mean_x, mean_y, a, b, c, opacity = load_splats(
             position, count, listed_rows, means2d, conics, opacities
         )
-        alpha, full, dx, dy = find_alphas(x, y, mean_x, mean_y, a, b, c, opacity)
+        alpha, full, _, _ = find_alphas(x, y, mean_x, mean_y, a, b, c, opacity)
         alpha = tl.where(position[:, None] < stop[None, :], alpha, 0.0)
         passed = 1.0 - alpha
         left = light[None, :] * tl.cumprod(passed, 0)
         light = tl.minimum(light, tl.min(left, 0))
         weight = alpha * (left / passed)
+        odds = tl.where(full <= MOST, alpha / passed, 0.0)
         shown_row = find_features(row, listed, index)
+        if OF_FEATURES:
+            for start in range(0, channels, BLOCK):
+                channel = start + tl.arange(0, BLOCK)
+                grad = load_block(grad_maps, pixel, inside, channel, channels)
+                part = sum_pixels(weight, grad, CHUNK, PIXELS, BLOCK, PRECISION)
+                there = listed[:, None] & (channel < channels)[None, :]
+                into = grad_features + shown_row[:, None] * channels + channel[None, :]
+                tl.atomic_add(into, part, mask=there, sem="relaxed")
         if OF_SPLATS:
             slope = tl.zeros((CHUNK, PIXELS), tl.float32) + share[None, :]
             for start in range(0, channels, BLOCK):
@@ -91,16 +119,9 @@ def differentiate_kernel(
             own = weight * slope
             rest = behind[None, :] - tl.cumsum(own, 0)
             behind -= tl.sum(own, 0)
-            v = tl.where((alpha > 0.0) & (full <= MOST), own - alpha * rest / passed, 0.0)
+            v = tl.where(odds > 0.0, own - odds * rest, 0.0)
             add_splat_gradients(
-                v, dx, dy, row, listed, a, b, c, opacity, grad_means2d, grad_conics, grad_opacities
+                v, x, y, position, count, listed_rows, means2d, conics, opacities,
+                grad_means2d, grad_conics, grad_opacities,
             )  # fmt: skip
-        if OF_FEATURES:
-            for start in range(0, channels, BLOCK):
-                channel = start + tl.arange(0, BLOCK)
-                grad = load_block(grad_maps, pixel, inside, channel, channels)
-                part = tl.dot(weight, grad, input_precision=PRECISION)
-                there = listed[:, None] & (channel < channels)[None, :]
-                into = grad_features + shown_row[:, None] * channels + channel[None, :]
-                tl.atomic_add(into, part, mask=there, sem="relaxed")
         first += CHUNK

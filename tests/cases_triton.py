@@ -1,0 +1,249 @@
+"""The Triton engine's cases, and a script that runs them in a process of its own and prints the results as JSON.
+
+    TRITON_INTERPRET=1 python tests/cases_triton.py run cpu     # the kernels in numpy
+    python tests/cases_triton.py run cuda                       # on a GPU
+    python tests/cases_triton.py compile                        # for GPUs that are not there
+
+Triton decides at its import whether it interprets, and pytest may have imported it before: hence the process.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import tempfile
+import traceback
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from cases_splat import random_splats
+from torch import Tensor
+
+from kfgs.splat import Tiles, bin_tiles, composite
+
+GRADS = ("means2d", "conics", "opacities", "features", "background")
+
+
+class Case(NamedTuple):
+    """A scene of random Gaussians, or a stack of flat ones that covers one tile."""
+
+    channels: int = 3
+    tile_size: int = 16
+    count: int = 60  # Gaussians
+    size: tuple[int, int] = (40, 24)  # width, height
+    rows_of_features: int | None = None  # index into that many rows, the last of which none shows
+    opacities: tuple[float, ...] = (0.05, 0.95)  # range of random ones, or the stack's
+    sigma: tuple[float, float] = (0.7, 6.0)
+    stack: bool = False
+    manners: bool = False  # also ask for each gradient alone, and for the same again
+    integers: tuple[torch.dtype, torch.dtype] = (torch.int32, torch.int64)  # of tiles.rows and tiles.offsets
+
+
+CASES = {
+    "one channel": Case(1),
+    "3 channels": Case(3),
+    "9 channels": Case(9),
+    "40 channels": Case(40),
+    "130 channels": Case(130),
+    "indexed": Case(9, rows_of_features=20, manners=True),
+    "indexed, more rows than Gaussians": Case(40, rows_of_features=90),
+    "tiles of 8": Case(tile_size=8),
+    "tiles of 5": Case(tile_size=5, size=(18, 13), count=40),
+    "tiles of 2": Case(tile_size=2, size=(7, 5), count=20),
+    "tiles of 12": Case(tile_size=12),
+    "tiles of 32": Case(9, tile_size=32),
+    "tiles of 32, wide": Case(70, tile_size=32),
+    "rows int64, offsets int32": Case(integers=(torch.int64, torch.int32)),
+    "many that stop": Case(count=150, size=(12, 9), opacities=(0.3, 0.6), sigma=(3.0, 30.0)),
+    "many that do not stop": Case(count=100, size=(12, 9), opacities=(0.01, 0.03), sigma=(3.0, 30.0)),
+    "opaque": Case(count=60, size=(20, 20), opacities=(0.9, 1.0), sigma=(3.0, 30.0)),
+    "clamped": Case(opacities=(0.999,), stack=True),
+    # 1e-3 is left after three; the fourth would leave 5e-5, so it is not drawn, nor the fifth, which would leave 9e-4
+    "stop": Case(5, opacities=(0.9, 0.9, 0.9, 0.95, 0.1), stack=True),
+    "stop in the third chunk": Case(opacities=(*[0.1] * 36, 0.9, 0.9, 0.995, *[0.02] * 20), stack=True),
+    "skipped": Case(opacities=(0.999 / 255, 0.5, 0.999 / 255), stack=True),
+    "opacity 0": Case(opacities=(0.0, 0.5), stack=True),
+    "empty tiles": Case(count=3, size=(100, 40), sigma=(0.7, 2.0)),
+    "no Gaussians": Case(count=0),
+    "no Gaussians, indexed": Case(count=0, rows_of_features=4, manners=True),
+}
+
+
+def make_scene(case: Case, device: str) -> tuple[list[Tensor], Tensor | None, Tiles, Tensor, Tensor]:
+    """The five differentiable inputs, index, tiles, and cotangents of maps and alphas, float32."""
+    if case.stack:
+        M = len(case.opacities)
+        means2d, flat = torch.full((M, 2), 8.0), torch.tensor([[1e-13, 0.0, 1e-13]]).repeat(M, 1)
+        tiles = Tiles(torch.arange(M, dtype=torch.int32), torch.tensor([0, M]), 16, 16, 16)
+        splats = [means2d, flat, torch.tensor(case.opacities)]
+    else:
+        M = case.count
+        projected, _ = random_splats(
+            M, *case.size, seed=3, dtype=torch.float32, opacities=case.opacities[:2], sigma=case.sigma
+        )
+        tiles = bin_tiles(projected, *case.size, case.tile_size)
+        splats = [projected.means2d, projected.conics, projected.opacities]
+    tiles = tiles._replace(rows=tiles.rows.to(case.integers[0]), offsets=tiles.offsets.to(case.integers[1]))
+    g = torch.Generator().manual_seed(4)
+    N, D = case.rows_of_features or M, case.channels
+    index = torch.randint(0, N - 1, (M,), generator=g) if case.rows_of_features else None
+    features, background = torch.randn(N, D, generator=g), torch.randn(D, generator=g)
+    cotangents = (
+        torch.randn(tiles.height, tiles.width, D, generator=g),
+        torch.randn(tiles.height, tiles.width, generator=g),
+    )
+    tiles = tiles._replace(rows=tiles.rows.to(device), offsets=tiles.offsets.to(device))
+    inputs = [value.to(device) for value in (*splats, features, background)]
+    return inputs, index if index is None else index.to(device), tiles, *(value.to(device) for value in cotangents)
+
+
+def reference(
+    inputs: list[Tensor], index: Tensor | None, tiles: Tiles, grad_maps: Tensor, grad_alphas: Tensor
+) -> dict[str, Tensor]:
+    """What the engine should give, by the reference engine in float64 on the CPU."""
+    inputs = [value.cpu().double().requires_grad_() for value in inputs]
+    index = torch.arange(len(inputs[0])) if index is None else index.cpu()
+    tiles = tiles._replace(rows=tiles.rows.cpu(), offsets=tiles.offsets.cpu())
+    grad_maps, grad_alphas = grad_maps.cpu().double(), grad_alphas.cpu().double()
+    splats = inputs[:3]
+    maps, alphas = composite(*splats, inputs[3][index], tiles, background=inputs[4], engine="reference")
+    grads = torch.autograd.grad((maps, alphas), inputs, (grad_maps, grad_alphas))
+    # the gradient in the features is weights^T · cotangent; a channel of ones gives the weights' sums
+    of = torch.zeros(len(index), grad_maps.shape[2] + 1, dtype=torch.float64, requires_grad=True)
+    seen, _ = composite(*(value.detach() for value in splats), of, tiles, engine="reference")
+    (weighted,) = torch.autograd.grad(seen, of, torch.cat([grad_maps, torch.ones_like(grad_maps[..., :1])], dim=2))
+    named = dict(zip(GRADS, grads, strict=True))
+    return {"maps": maps, "alphas": alphas, **named, "sums": weighted[:, :-1], "weights": weighted[:, -1]}
+
+
+def run_case(case: Case, device: str) -> dict[str, float | bool]:
+    """Largest errors: of maps and alphas as they are, of all else relative to the largest number; and some facts."""
+    from kfgs.splat.engines import triton_gpu as engine
+
+    inputs, index, tiles, *cotangents = make_scene(case, device)
+    before = [value.clone() for value in inputs]
+    view = (index, tiles.rows, tiles.offsets, tiles.width, tiles.height, tiles.tile_size)
+    maps, alphas, trace = engine.forward(*inputs, *view)
+    outputs = (maps, alphas, trace)
+    grads = engine.backward(*cotangents, (True,) * 5, *inputs, *view, *outputs)
+    sums, weights = engine.accumulate(*inputs[:3], cotangents[0], *view[1:])
+    actual = {"maps": maps, "alphas": alphas, "sums": sums, "weights": weights, **dict(zip(GRADS, grads, strict=True))}
+    facts: dict[str, Any] = {}
+    for name, expected in reference(inputs, index, tiles, *cotangents).items():
+        error, most = largest(actual[name].cpu().double() - expected), largest(expected)
+        if name not in ("maps", "alphas") and error > 0:
+            error = error / most if most else float("inf")
+        facts[name] = error
+        facts[f"{name}: shape"] = list(actual[name].shape) == list(expected.shape)
+    facts["float32"] = all(value.dtype == torch.float32 for value in actual.values())
+    facts["inputs untouched"] = all(torch.equal(a, b) for a, b in zip(inputs, before, strict=True))
+    if case.manners:
+        again = engine.forward(*inputs, *view)
+        facts["forward repeats to the bit"] = all(torch.equal(a, b) for a, b in zip(again, outputs, strict=True))
+        for k, name in enumerate(GRADS):
+            alone = engine.backward(*cotangents, tuple(k == j for j in range(5)), *inputs, *view, *outputs)
+            empty = all(value.numel() == 0 for j, value in enumerate(alone) if j != k)
+            facts[f"only {name} wanted"] = empty and largest(alone[k] - grads[k]) <= 1e-5 * largest(grads[k])
+    return facts
+
+
+def largest(value: Tensor) -> float:
+    """The largest absolute value, 0 of nothing."""
+    return float(value.detach().abs().max()) if value.numel() else 0.0
+
+
+class Build(NamedTuple):
+    """One of the kernels as the engine launches it, for a GPU by its compute capability."""
+
+    kernel: str  # a key of triton_gpu.LAUNCHES
+    channels: int
+    capability: int  # 90: sm_90
+    tile_size: int = 16
+    indexed: bool = True
+
+
+KERNELS = ("composite", "accumulate", "differentiate")
+BUILDS = {
+    **{f"{kernel}, 512 channels, sm_{cc}": Build(kernel, 512, cc) for kernel in KERNELS for cc in (80, 90, 100)},
+    "differentiate, 130 channels, sm_90": Build("differentiate", 130, 90),
+    **{f"{kernel}, 9 channels, sm_90": Build(kernel, 9, 90) for kernel in KERNELS},
+    "composite, 1 channel, tiles of 5": Build("composite", 1, 80, tile_size=5, indexed=False),
+    "differentiate, 1 channel, tiles of 5": Build("differentiate", 1, 80, tile_size=5, indexed=False),
+    "differentiate, 9 channels, tiles of 2": Build("differentiate", 9, 90, tile_size=2),
+}
+
+
+def compile_ahead(build: Build) -> dict[str, Any]:
+    """Compile a kernel without the GPU it is for, and say what came out."""
+    import triton
+    from triton.backends.compiler import GPUTarget
+    from triton.compiler import ASTSource
+
+    from kfgs.splat.engines import triton_gpu, triton_kernels, triton_kernels_backward
+
+    kernel = {
+        "composite": triton_kernels.composite_kernel,
+        "accumulate": triton_kernels.accumulate_kernel,
+        "differentiate": triton_kernels_backward.differentiate_kernel,
+    }[build.kernel]
+    sizes = triton_gpu.launch_options(build.kernel, build.channels, build.tile_size)
+    options = {name: sizes.pop(name) for name in ("num_warps", "num_stages", "enable_fp_fusion")}
+    if build.kernel == "differentiate":
+        sizes |= {"OF_SPLATS": True, "OF_FEATURES": True}
+    if build.channels == 1:  # as triton does with an argument that is 1
+        sizes["channels"] = 1
+    if not build.indexed and build.kernel != "accumulate":
+        sizes["index"] = None
+    types = {"index": "*i64", "rows": "*i32", "offsets": "*i64", "stops": "*i32"}
+    types |= dict.fromkeys(("width", "height", "columns", "channels"), "i32") | dict.fromkeys(sizes, "constexpr")
+    signature = {name: types.get(name, "*fp32") for name in kernel.arg_names}
+    aligned = {(k,): [["tt.divisibility", 16]] for k, of in enumerate(signature.values()) if of.startswith("*")}
+    if build.channels % 16 == 0:  # and with one that 16 divides
+        aligned[(kernel.arg_names.index("channels"),)] = [["tt.divisibility", 16]]
+    target = GPUTarget("cuda", build.capability, 32)
+    compiled = triton.compile(ASTSource(kernel, signature, sizes, aligned), target=target, options=options)
+    text = compiled.asm["ptx"]
+    return {
+        "cubin": len(compiled.asm["cubin"]),
+        "products": [name for name in ("mma.sync", "wgmma.mma_async", "tcgen05.mma") if name in text],
+        "shared": compiled.metadata.shared,
+        "warps": options["num_warps"],
+        **_read_resources(compiled.asm["cubin"], Path(triton.__file__).parent / "backends/nvidia/bin/cuobjdump"),
+    }
+
+
+def _read_resources(cubin: bytes, tool: Path) -> dict[str, int]:
+    """Registers and bytes of spills (the stack) of a thread, where triton brings the tool that reads them."""
+    if not tool.exists():
+        return {}
+    with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
+        file.write(cubin)
+        file.flush()
+        said = subprocess.run([tool, "-res-usage", file.name], capture_output=True, text=True, check=True)
+    found = re.search(r"REG:(\d+) STACK:(\d+)", said.stdout + said.stderr)
+    assert found
+    return {"registers": int(found[1]), "stack": int(found[2])}
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    if sys.argv[1] == "run":
+        results = {name: _attempt(run_case, case, sys.argv[2]) for name, case in CASES.items()}
+    else:
+        results = {name: _attempt(compile_ahead, build) for name, build in BUILDS.items()}
+    print(json.dumps(results))
+
+
+def _attempt(function: Any, *arguments: Any) -> dict[str, Any]:
+    """One case that fails does not take the others with it."""
+    try:
+        return function(*arguments)
+    except Exception:
+        return {"failed": traceback.format_exc()}
+
+
+if __name__ == "__main__":
+    main()
