@@ -70,7 +70,7 @@ def vote_labels(
             tiles = bin_tiles(projected, camera.width, camera.height)
             ballots = torch.nn.functional.one_hot(labels + 1, classes + 1)[..., 1:].to(votes)
             shape = projected.means2d, projected.conics, projected.opacities
-            votes.index_add_(0, projected.index, accumulate_pixels(*shape, ballots, tiles, engine=engine))
+            votes.index_add_(0, projected.index, accumulate_pixels(*shape, ballots, tiles, engine=engine)[0])
     weights = votes.sum(1)
     best, labels = votes.max(1)
     shares = best / weights.clamp_min(torch.finfo(weights.dtype).tiny)

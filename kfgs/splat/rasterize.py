@@ -70,14 +70,15 @@ def rasterize(
     projected = project(gaussians, camera, near=near)
     tiles = bin_tiles(projected, camera.width, camera.height)
     splats = projected.means2d, projected.conics, projected.opacities
-    maps, alphas = composite(*splats, _seen(gaussians, camera, projected), tiles, background=background, engine=engine)
+    features, index = _seen(gaussians, camera, projected)
+    maps, alphas = composite(*splats, features, tiles, background=background, index=index, engine=engine)
     return Rendering(maps, alphas, projected)
 
 
-def _seen(gaussians: Gaussians, camera: Camera, projected: Projected) -> Tensor:  # [M, D]
-    """What each visible Gaussian shows to the camera."""
+def _seen(gaussians: Gaussians, camera: Camera, projected: Projected) -> tuple[Tensor, Tensor | None]:
+    """What the Gaussians show to the camera, and which row each visible one shows (None: one row each)."""
     if gaussians.features is not None:
-        return gaussians.features[projected.index]
+        return gaussians.features, projected.index
     assert gaussians.sh is not None
     directions = gaussians.means[projected.index] - camera.center.to(gaussians.means)
-    return evaluate_sh(gaussians.sh[projected.index], directions)
+    return evaluate_sh(gaussians.sh[projected.index], directions), None

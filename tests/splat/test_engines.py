@@ -6,9 +6,10 @@ import pytest
 import torch
 from cases_splat import TOLERANCE, assert_close_but_for_thresholds, random_splats
 
-from kfgs.splat import Tiles, accumulate_pixels, available_engines, bin_tiles, composite, engines
+from kfgs.splat import Tiles, accumulate_pixels, available_engines, bin_tiles, composite
+from kfgs.splat.engines import table
 
-ENGINES = available_engines()
+ENGINES = available_engines("cpu")  # what runs on a GPU is asked the same in test_triton_gpu.py
 OTHERS = [name for name in ENGINES if name != "reference"]
 
 every_engine = pytest.mark.parametrize("engine", ENGINES)
@@ -374,11 +375,12 @@ def test_pixels_are_accumulated_by_weight(engine):
     weights, _ = _by_oracle(projected, torch.eye(30).double(), 20, 14)  # [H, W, M]: what each Gaussian shows at a pixel
     pixels = torch.randn(14, 20, 4, generator=torch.Generator().manual_seed(2)).double()
     splats = projected.means2d, projected.conics, projected.opacities
-    sums = accumulate_pixels(*splats, pixels, bin_tiles(projected, 20, 14), engine=engine)
+    sums, own = accumulate_pixels(*splats, pixels, bin_tiles(projected, 20, 14), engine=engine)
     torch.testing.assert_close(sums, torch.einsum("hwm,hwd->md", weights, pixels), rtol=0, atol=1e-10)
+    torch.testing.assert_close(own, weights.sum((0, 1)), rtol=0, atol=1e-10)
     assert not sums.requires_grad
     with torch.no_grad():  # as a caller in inference would
-        assert torch.equal(accumulate_pixels(*splats, pixels, bin_tiles(projected, 20, 14), engine=engine), sums)
+        assert torch.equal(accumulate_pixels(*splats, pixels, bin_tiles(projected, 20, 14), engine=engine)[0], sums)
 
 
 @every_engine
@@ -386,11 +388,11 @@ def test_pixels_are_accumulated_in_inference_mode(engine):
     projected, _ = random_splats(30, 20, 14, seed=23)
     pixels = torch.randn(14, 20, 4, generator=torch.Generator().manual_seed(2)).double()
     tiles = bin_tiles(projected, 20, 14)
-    expected = accumulate_pixels(*projected[:2], projected.opacities, pixels, tiles, engine=engine)
+    expected, _ = accumulate_pixels(*projected[:2], projected.opacities, pixels, tiles, engine=engine)
     with torch.inference_mode():
         inside = type(projected)(*(value.clone() for value in projected))  # inference tensors, as a render there makes
         tiles = bin_tiles(inside, 20, 14)
-        sums = accumulate_pixels(*inside[:2], inside.opacities, pixels.clone(), tiles, engine=engine)
+        sums, _ = accumulate_pixels(*inside[:2], inside.opacities, pixels.clone(), tiles, engine=engine)
     assert torch.equal(sums, expected)
 
 
@@ -419,17 +421,20 @@ def test_auto_takes_the_first_engine_for_the_cpu():
 
 @pytest.fixture
 def _without_numba(monkeypatch):
-    absent = engines._Entry("kfgs.splat.engines.absent", "surely_not_installed", "pip install surely", ("cpu",))
-    monkeypatch.setitem(engines._ENGINES, "numba", absent)
-    engines._load.cache_clear()
+    absent = table._Entry("kfgs.splat.engines.absent", "surely_not_installed", "pip install surely")
+    monkeypatch.setitem(table._ENGINES, "numba", absent)
+    for function in (table.load, table.choose):
+        function.cache_clear()
     yield
-    engines._load.cache_clear()
+    for function in (table.load, table.choose):
+        function.cache_clear()
 
 
 @pytest.mark.usefixtures("_without_numba")
 def test_missing_engine_raises_with_the_install_line_and_auto_goes_on():
     projected, features = random_splats(20, 16, 16, seed=24)
-    assert available_engines() == ["reference"]
+    assert "numba" not in available_engines()
+    assert available_engines("cpu") == ["reference"]
     with pytest.raises(
         ImportError, match=r"engine: expected surely_not_installed .*install it with `pip install surely`"
     ):
@@ -440,13 +445,13 @@ def test_missing_engine_raises_with_the_install_line_and_auto_goes_on():
 
 def test_engine_must_be_known():
     projected, features = random_splats(5, 16, 16, seed=0)
-    with pytest.raises(ValueError, match=r"engine: expected one of 'auto', 'numba', 'reference', got 'cuda'"):
+    with pytest.raises(ValueError, match=r"engine: expected one of 'auto', 'triton', 'numba', 'reference', got 'cuda'"):
         _run(projected, features, 16, 16, engine="cuda")
 
 
 def test_engine_must_run_on_the_device():
     with pytest.raises(ValueError, match=r"engine: expected one that runs on cuda .* got 'numba' for cpu"):
-        engines._load_named("numba", "cuda")
+        table.choose("numba", "cuda")
 
 
 def test_shapes_must_agree():

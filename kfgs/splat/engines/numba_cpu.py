@@ -6,107 +6,189 @@ rows are summed in the order of the bands. Reruns are therefore equal to the bit
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from .contract import ALPHA_MIN
-from .numba_bands import MOMENTS, Grid, Splats, composite_band, differentiate_band, gather_band, number_slots
-from .numba_cells import CELL_HEIGHT, CELL_WIDTH
+from . import numba_bands as kernels
+from .numba_narrow import FIRST, MOMENTS, plan_passes
+from .numba_simd import LANES
+from .numba_square import View, count_squares, pack_rows, row_length
 from .numba_threads import run_bands
+from .numba_wide import padded
 
-if TYPE_CHECKING:
-    from ..tiles import Tiles
+__all__ = ["accumulate", "backward", "devices", "forward"]
 
-__all__ = ["composite"]
+BANDS = 32
+"""Shares of the work: more of them keep more threads busy, and let more gradient rows meet at their borders."""
 
-BANDS = 16
-"""Shares of the work. More of them balance better, and let more gradient rows meet at their borders."""
+NARROW = len(FIRST) + LANES
+"""Up to so many channels stay in registers, a vector each; more are multiplied in blocks."""
 
 
-def composite(
+def devices() -> tuple[str, ...]:
+    """Where the engine runs."""
+    return ("cpu",)
+
+
+def forward(
     means2d: Tensor,  # [M, 2]
     conics: Tensor,  # [M, 3]
     opacities: Tensor,  # [M]
-    features: Tensor,  # [M, D]
-    tiles: Tiles,
-    background: Tensor | None,  # [D]
-) -> tuple[Tensor, Tensor]:  # maps [H, W, D], alphas [H, W]
-    """Composite as `contract` promises; conics must be positive definite."""
-    if background is None:
-        background = features.new_zeros(features.shape[1])
-    maps, alphas = _Composite.apply(means2d, conics, opacities, features, background, tiles)
-    return maps, alphas
+    features: Tensor,  # [N, D]
+    background: Tensor,  # [D]
+    index: Tensor | None,  # [M] int64
+    rows: Tensor,  # [P]
+    offsets: Tensor,  # [T + 1]
+    width: int,
+    height: int,
+    tile_size: int,
+) -> tuple[Tensor, Tensor, Tensor]:  # maps [H, W, D], alphas [H, W], trace int32
+    """Composite as `contract` promises; a Gaussian whose conic is not positive definite is not drawn."""
+    channels = features.shape[1]
+    view = _view(rows, offsets, width, height, tile_size)
+    maps, alphas = features.new_empty(height, width, channels), features.new_empty(height, width)
+    squares = count_squares(view)
+    trace = torch.zeros(squares * (len(view.offsets) - 1 + len(view.order)), dtype=torch.int32)
+    images, drawn = (_flat(maps), _flat(alphas)), _flat(trace)
+    packed = _pack(means2d, conics, opacities, features if channels <= NARROW else features[:, :0], index)
+    if channels <= NARROW:
+        passes = plan_passes(channels)
+        behind = _padded(background, passes[2])
+        run_bands(kernels.composite_narrow, BANDS, view, *packed, passes, behind, images, drawn)
+    else:
+        behind, begins = _padded(background, padded(channels)), _begins(index, len(means2d), channels)
+        run_bands(kernels.composite_wide, BANDS, view, *packed, _flat(features), begins, behind, images, drawn)
+    return maps, alphas, trace
 
 
-class _Composite(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any,
-        means2d: Tensor,
-        conics: Tensor,
-        opacities: Tensor,
-        features: Tensor,
-        background: Tensor,
-        tiles: Tiles,
-    ) -> tuple[Tensor, Tensor]:
-        maps = features.new_empty(tiles.height, tiles.width, features.shape[1])
-        alphas = features.new_empty(tiles.height, tiles.width)
-        splats, grid = _splats(means2d, conics, opacities, features), _grid(tiles)
-        cells = -(-tiles.tile_size // CELL_HEIGHT) * -(-tiles.tile_size // CELL_WIDTH)
-        ends = np.empty((len(grid.offsets) - 1, cells), np.int64)
-        run_bands(composite_band, BANDS, splats, grid, _array(background), _array(maps), _array(alphas), ends)
-        ctx.save_for_backward(means2d, conics, opacities, features, background, maps, alphas)
-        ctx.tiles, ctx.ends = tiles, ends
-        return maps, alphas
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_maps: Tensor, grad_alphas: Tensor) -> tuple[Tensor | None, ...]:
-        means2d, conics, opacities, features, background, maps, alphas = ctx.saved_tensors
-        wanted = ctx.needs_input_grad
-        splats, grid = _splats(means2d, conics, opacities, features), _grid(ctx.tiles)
-        grad = _array(grad_maps.contiguous()), _array(grad_alphas.contiguous())
-
-        slots, counts = np.empty((BANDS, len(opacities)), np.int32), np.empty(BANDS, np.int64)
-        run_bands(number_slots, BANDS, grid, slots, counts)
-        firsts = np.cumsum(counts) - counts
-        columns = MOMENTS + (features.shape[1] if wanted[3] else 0)
-        rows = np.zeros((int(counts.sum()), columns), grad[0].dtype)
-        forward = _array(background), _array(maps), _array(alphas), ctx.ends
-        run_bands(differentiate_band, BANDS, splats, grid, forward, grad, slots, firsts, rows, any(wanted[:3]))
-
-        grads = [torch.empty_like(value) for value in (means2d, conics, opacities, features)]
-        run_bands(gather_band, BANDS, BANDS, splats, slots, firsts, rows, tuple(map(_array, grads)))
-        behind = (grad_maps * (1 - alphas)[..., None]).sum((0, 1)) if wanted[4] else None
-        return *(value if want else None for value, want in zip(grads, wanted, strict=False)), behind, None
-
-
-def _array(tensor: Tensor) -> np.ndarray:
-    """The tensor's memory as numpy sees it."""
-    return tensor.detach().numpy()
-
-
-def _splats(means2d: Tensor, conics: Tensor, opacities: Tensor, features: Tensor) -> Splats:
-    """The Gaussians as arrays, with what `find_run` wants to know about their ellipses."""
-    x, y = _array(means2d).astype(np.float64).T
-    a, b, c = _array(conics).astype(np.float64).T
-    with np.errstate(all="ignore"):  # what is no ellipse, or too faint, comes out as NaN, -inf or not positive
-        reach = 2 * np.log(_array(opacities).astype(np.float64) / ALPHA_MIN)
-        determinant = np.where((a > 0) & (c > 0), a * c - b * b, 0)
-        lean = -b / np.sqrt(a * determinant)
-    ellipses = np.stack([x, y, a, b, c, reach, determinant, lean], axis=1)
-    slack = 8 * torch.finfo(means2d.dtype).eps
-    return Splats(_array(means2d), _array(conics), _array(opacities), _array(features), ellipses, slack)
+def backward(
+    grad_maps: Tensor,  # [H, W, D]
+    grad_alphas: Tensor,  # [H, W]
+    wanted: list[bool],
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    background: Tensor,
+    index: Tensor | None,
+    rows: Tensor,
+    offsets: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+    maps: Tensor,
+    alphas: Tensor,
+    trace: Tensor,
+) -> list[Tensor]:
+    """Gradients of means2d, conics, opacities, features and background; empty where not wanted."""
+    channels = features.shape[1]
+    view = _view(rows, offsets, width, height, tile_size)
+    images = tuple(_flat(value) for value in (maps, grad_maps, alphas, grad_alphas))
+    slots, firsts, total, chains = _number(view, len(means2d))
+    packed = _pack(means2d, conics, opacities, features if channels <= NARROW else features[:, :0], index)
+    behind, drawn = _padded(background, padded(channels)), _flat(trace)
+    if channels <= NARROW:
+        length, column = packed[1], MOMENTS
+        out = np.zeros(total * length, images[0].dtype)
+        shared = (view, *packed, plan_passes(channels), behind, images, drawn, slots, firsts, out)
+        run_bands(kernels.differentiate_narrow, BANDS, *shared)
+    else:
+        length, column = LANES + padded(channels), LANES
+        out = np.zeros(total * length, images[0].dtype)
+        source = _flat(features), _begins(index, len(means2d), channels), channels
+        shared = (view, *packed, source, behind, images, drawn, slots, firsts, out, any(wanted[:3]))
+        run_bands(kernels.differentiate_wide, BANDS, *shared)
+    grads = [
+        torch.empty_like(means2d),
+        torch.empty_like(conics),
+        torch.empty_like(opacities),
+        torch.zeros_like(features),
+    ]
+    targets, which = tuple(value.numpy() for value in grads), _index(index)
+    splats = conics.numpy(), opacities.numpy()
+    shares = BANDS if _increasing(which) else 1  # two Gaussians that show the same row must not meet
+    run_bands(kernels.gather_gradients, shares, shares, splats, chains, out, (length, column), which, targets)
+    grads.append((grad_maps * (1 - alphas)[..., None]).sum((0, 1)) if wanted[4] else background)
+    return [value if want else value.new_empty(0) for value, want in zip(grads, wanted, strict=True)]
 
 
-def _grid(tiles: Tiles) -> Grid:
+def accumulate(
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    pixels: Tensor,  # [H, W, D]
+    rows: Tensor,
+    offsets: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+) -> tuple[Tensor, Tensor]:  # sums [M, D], weights [M]
+    """Sum pixels into the Gaussians by compositing weight, in one walk."""
+    channels = pixels.shape[2]
+    view = _view(rows, offsets, width, height, tile_size)
+    slots, firsts, total, chains = _number(view, len(means2d))
+    packed = _pack(means2d, conics, opacities, pixels.new_empty(len(means2d), 0), None)
+    length = padded(channels + 1)
+    out = np.zeros(total * length, packed[0].dtype)
+    run_bands(kernels.accumulate_band, BANDS, view, *packed, _flat(pixels), channels, slots, firsts, out)
+    sums, weights = pixels.new_empty(len(means2d), channels), pixels.new_empty(len(means2d))
+    run_bands(kernels.gather_sums, BANDS, BANDS, chains, out, length, sums.numpy(), weights.numpy())
+    return sums, weights
+
+
+def _flat(tensor: Tensor) -> np.ndarray:
+    """The tensor's memory as numpy sees it, in one dimension."""
+    return tensor.detach().contiguous().view(-1).numpy()
+
+
+def _pack(
+    means2d: Tensor, conics: Tensor, opacities: Tensor, features: Tensor, index: Tensor | None
+) -> tuple[np.ndarray, int]:
+    """Packed Gaussians, on whole cache lines, and the length of a row."""
+    length = row_length(features.shape[1])
+    rows = torch.empty(len(means2d) * length, dtype=means2d.dtype).numpy()  # torch's memory is aligned, numpy's not
+    splats = means2d.detach().numpy(), conics.detach().numpy(), opacities.detach().numpy()
+    run_bands(pack_rows, BANDS, BANDS, splats, features.detach().numpy(), _index(index), length, rows)
+    return rows, length
+
+
+def _index(index: Tensor | None) -> np.ndarray:
+    return np.empty(0, np.int64) if index is None else index.numpy()
+
+
+def _increasing(index: np.ndarray) -> bool:
+    return bool((index[1:] > index[:-1]).all())
+
+
+def _begins(index: Tensor | None, count: int, channels: int) -> np.ndarray:
+    """Where each Gaussian's row of features begins, [M] int64."""
+    return channels * (np.arange(count) if index is None else index.numpy())
+
+
+def _padded(background: Tensor, channels: int) -> np.ndarray:
+    behind = np.zeros(channels, background.detach().numpy().dtype)
+    behind[: len(background)] = background.detach().numpy()
+    return behind
+
+
+def _view(rows: Tensor, offsets: Tensor, width: int, height: int, tile_size: int) -> View:
     """The tiles, and bands of consecutive tiles with about as many pairs each (an empty tile costs something, too)."""
-    rows, offsets = _array(tiles.rows), _array(tiles.offsets)
-    cost = offsets + 4 * np.arange(len(offsets))
+    ends = offsets.numpy().astype(np.int64, copy=False)
+    cost = ends + 4 * np.arange(len(ends))
     bounds = np.searchsorted(cost, np.linspace(0, cost[-1], BANDS + 1)).astype(np.int64)
-    bounds[0], bounds[-1] = 0, len(offsets) - 1
-    return Grid(rows, offsets, bounds, tiles.width, tiles.height, tiles.tile_size)
+    bounds[0], bounds[-1] = 0, len(ends) - 1
+    return View(rows.numpy().astype(np.int32, copy=False), ends, bounds, width, height, tile_size)
+
+
+def _number(view: View, count: int) -> tuple[np.ndarray, np.ndarray, int, Any]:
+    """Gradient rows: of each pair within its band, where each band's begin, how many, and which belong together."""
+    slots, owners = np.empty(len(view.order), np.int32), np.empty(len(view.order), np.int32)
+    counts = np.empty(BANDS, np.int64)
+    run_bands(kernels.number_slots, BANDS, view, slots, owners, counts, count)
+    total = int(counts.sum())
+    chains = np.empty(count, np.int32), np.empty(total, np.int32)
+    kernels.chain_slots(view, owners, counts, *chains)
+    return slots, np.cumsum(counts) - counts, total, chains

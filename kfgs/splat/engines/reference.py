@@ -9,16 +9,14 @@ after another, last to first, from the transmittance that each started with.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ..tiles import Tiles
 from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-
-if TYPE_CHECKING:
-    from ..tiles import Tiles
 
 CHUNK = 64
 """Gaussians of a tile composited at once; pixels that stop are noticed between chunks."""
@@ -42,14 +40,46 @@ def composite(
     conics: Tensor,
     opacities: Tensor,
     features: Tensor,
+    background: Tensor,
+    index: Tensor | None,
     tiles: Tiles,
-    background: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Composite as `kfgs.splat.engines.contract` says; called through `kfgs.splat.engines.composite`."""
+    features = features if index is None else features[index]
     sums, transmittance = _Composite.apply(means2d, conics, opacities, features, tiles)
-    if background is not None:
-        sums = sums + transmittance[..., None] * background
+    sums = sums + transmittance[..., None] * background
     return _to_image(sums, tiles), 1 - _to_image(transmittance[..., None], tiles)[..., 0]
+
+
+def devices() -> tuple[str, ...]:
+    """Where the engine runs."""
+    return "cpu", "cuda"
+
+
+def accumulate(
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    pixels: Tensor,  # [H, W, D]
+    rows: Tensor,
+    offsets: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+) -> tuple[Tensor, Tensor]:  # sums [M, D], weights [M]
+    """Sum pixels into the Gaussians by compositing weight, in one walk over the chunks."""
+    view = Tiles(rows, offsets, width, height, tile_size)
+    signal = _to_tiles(torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=2), view)  # [T, P, D + 1]
+    T, P = signal.shape[:2]
+    transmittance, stopped = pixels.new_ones(T, P), torch.zeros(T, P, dtype=torch.bool, device=pixels.device)
+    sums = pixels.new_zeros(len(means2d), signal.shape[2])
+    for batch in _batches(view):
+        for tile, which, present in _front_to_back(view, batch, stopped):
+            chunk = _Chunk(tile, which, present, transmittance[tile], stopped[tile])
+            splats = (value[which] for value in (means2d, conics, opacities))
+            weights, transmittance[tile], stopped[tile] = _weigh_chunk(chunk, view, chunk.transmittance, *splats)
+            sums.index_add_(0, which.flatten(), (weights.mT @ signal[tile]).flatten(0, 1))
+    return sums[:, :-1], sums[:, -1]
 
 
 class _Composite(torch.autograd.Function):
@@ -107,6 +137,19 @@ def _composite_chunk(
     features: Tensor,  # [B, C, D]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Composite C Gaussians at every pixel of B tiles: sums [B, P, D], transmittance [B, P], stopped [B, P] after them."""
+    weights, left, stopped = _weigh_chunk(chunk, tiles, transmittance, means2d, conics, opacities)
+    return weights @ features, left, stopped
+
+
+def _weigh_chunk(
+    chunk: _Chunk,
+    tiles: Tiles,
+    transmittance: Tensor,  # [B, P] at the start
+    means2d: Tensor,  # [B, C, 2]
+    conics: Tensor,  # [B, C, 3]
+    opacities: Tensor,  # [B, C]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights [B, P, C] of C Gaussians at every pixel of B tiles, transmittance [B, P], stopped [B, P] after them."""
     alphas = _alphas(_pixel_centers(chunk.tiles, tiles, means2d.dtype), means2d, conics, opacities)  # [B, P, C]
     alphas = torch.where((alphas >= ALPHA_MIN) & chunk.present[:, None], alphas, 0)
     start = transmittance[..., None]
@@ -115,7 +158,7 @@ def _composite_chunk(
         live = (left >= TRANSMITTANCE_MIN) & ~chunk.stopped[..., None]
     alphas = torch.where(live, alphas, 0)
     left = torch.cumprod(torch.cat([start, 1 - alphas], dim=2), dim=2)  # before each Gaussian, and after the last
-    return (alphas * left[..., :-1]) @ features, left[..., -1], ~live[..., -1]
+    return alphas * left[..., :-1], left[..., -1], ~live[..., -1]
 
 
 def _alphas(
@@ -167,3 +210,11 @@ def _to_image(values: Tensor, tiles: Tiles) -> Tensor:  # [T, P, D] -> [H, W, D]
     (rows, columns), side = tiles.grid, tiles.tile_size
     image = values.view(rows, columns, side, side, -1).transpose(1, 2).reshape(rows * side, columns * side, -1)
     return image[: tiles.height, : tiles.width]
+
+
+def _to_tiles(image: Tensor, tiles: Tiles) -> Tensor:  # [H, W, D] -> [T, P, D]
+    """The inverse of `_to_image`: what reaches beyond the image is 0."""
+    (rows, columns), side = tiles.grid, tiles.tile_size
+    padded = image.new_zeros(rows * side, columns * side, image.shape[2])
+    padded[: tiles.height, : tiles.width] = image
+    return padded.view(rows, side, columns, side, -1).transpose(1, 2).reshape(rows * columns, side * side, -1)

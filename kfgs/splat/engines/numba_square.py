@@ -1,0 +1,286 @@
+"""What the compiled kernels share: packed Gaussians, and squares of pixels cut into blocks of one vector each.
+
+A tile is worked on in squares of 16 x 16 pixels: 16 blocks of 4 x 4 pixels, and a block's pixels are the lanes of one
+vector. Block b of a square is in row b // 4 and column b % 4; pixel p of a square is lane p % 16 of block p // 16. What a
+square knows about its pixels is a *plane* of 256 numbers in that order.
+
+A Gaussian is packed into one row, so that it arrives in one cache line: its mean, the three numbers of its quadratic
+form, the logarithm of its opacity, then its features. The form a dx^2 + 2 b dx dy + c dy^2 is kept as
+a (dx + (b / a) dy)^2 + (c - b^2 / a) dy^2: both terms are positive, so that needles do not cancel in float32.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+from zlib import crc32
+
+import numpy as np
+from numba import njit
+
+from .contract import ALPHA_MAX, ALPHA_MIN
+from .numba_simd import (
+    LANES,
+    bits,
+    exp2,
+    fetch,
+    fma,
+    lanes_below,
+    load,
+    load_part,
+    maximum,
+    minimum,
+    prefetch,
+    put,
+    select,
+    store,
+    store_part,
+    trailing_zeros,
+)
+
+SIDE = 16
+"""Pixels along a square's side."""
+
+PIXELS = SIDE * SIDE
+BLOCK = 4
+"""Pixels along a block's side."""
+
+BLOCKS = PIXELS // LANES
+ALL_BLOCKS = np.uint32((1 << BLOCKS) - 1)
+
+CHUNK = 128
+"""Gaussians of a square listed at once."""
+
+AHEAD = 8
+"""Gaussians between the one worked on and the one asked for from memory."""
+
+MEAN_X, MEAN_Y, SQUARE, LEAN, REST, LOG_OPACITY, FEATURES = range(7)
+"""Columns of a packed row: with u = dx + LEAN dy, log2(opacity density) = LOG_OPACITY - SQUARE u^2 - REST dy^2."""
+
+X, Y, LIGHT, LEFT = 0, PIXELS, 2 * PIXELS, 3 * PIXELS
+"""Planes of a square's state: pixel centres; the transmittance as it falls on, also after a pixel has stopped; and the
+transmittance that the pixel stopped with."""
+STATE = 4 * PIXELS
+
+OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+INLINE: dict[str, Any] = OPTIONS | {"forceinline": True}
+
+LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
+_LOG2_E = math.log2(math.e)
+
+SOURCES = crc32(b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))))
+"""Numba's cache on disk notices a change in a kernel's own file alone. Kernels that call into other files take this
+number as a default argument, whose value numba counts as part of the signature."""
+
+
+def row_length(channels: int) -> int:
+    """Numbers in a packed row: whole vectors, so that rows stay aligned."""
+    return -(-(FEATURES + channels) // LANES) * LANES
+
+
+@njit(cache=True, **OPTIONS)
+def pack_rows(
+    band: int, bands: int, splats: Any, features: Any, index: Any, length: int, rows: Any, sources: int = SOURCES
+) -> None:
+    """Pack one share of the Gaussians.
+
+    Args:
+        band: which share.
+        bands: how many shares.
+        splats: means2d [M, 2], conics [M, 3] and opacities [M].
+        features: [N, D], or [N, 0] if they stay where they are.
+        index: [M], the features' row of each Gaussian; empty if row m belongs to Gaussian m.
+        length: of a packed row.
+        rows: [M * length], written; what is beyond the features is 0.
+    """
+    means2d, conics, opacities = splats
+    count, channels = len(opacities), features.shape[1]
+    for m in range(count * band // bands, count * (band + 1) // bands):
+        at = m * length
+        a, b, c = float(conics[m, 0]), float(conics[m, 1]), float(conics[m, 2])  # float64: b^2 / a cancels c
+        rest = c - b * b / a
+        rows[at + MEAN_X], rows[at + MEAN_Y] = means2d[m, 0], means2d[m, 1]
+        rows[at + SQUARE], rows[at + LEAN], rows[at + REST] = 0.5 * _LOG2_E * a, b / a, 0.5 * _LOG2_E * rest
+        rows[at + LOG_OPACITY] = math.log2(opacities[m]) if opacities[m] > 0 and a > 0 and rest > 0 else -np.inf
+        source = index[m] if len(index) else m
+        for d in range(channels):
+            rows[at + FEATURES + d] = features[source, d]
+        for d in range(FEATURES + channels, length):
+            rows[at + d] = 0
+
+
+class View(NamedTuple):
+    """`Tiles` as arrays, and the bands of work: band b owns tiles bounds[b] to bounds[b + 1]."""
+
+    order: Any  # [P] the Gaussians' numbers, tile by tile, front to back
+    offsets: Any  # [T + 1] int64
+    bounds: Any  # [B + 1] int64
+    width: int
+    height: int
+    tile_size: int
+
+
+@njit(**OPTIONS)
+def count_squares(view: View) -> int:
+    """Squares per tile."""
+    return ((view.tile_size + SIDE - 1) // SIDE) ** 2
+
+
+@njit(**OPTIONS)
+def square_box(view: View, tile: int, square: int) -> tuple[int, int, int, int]:
+    """Left, top, right and bottom pixel of a square of a tile, cut off at the tile's and the image's border."""
+    columns = (view.width + view.tile_size - 1) // view.tile_size
+    across = (view.tile_size + SIDE - 1) // SIDE
+    tile_x, tile_y = tile % columns * view.tile_size, tile // columns * view.tile_size
+    left, top = tile_x + square % across * SIDE, tile_y + square // across * SIDE
+    right = min(left + SIDE, tile_x + view.tile_size, view.width)
+    bottom = min(top + SIDE, tile_y + view.tile_size, view.height)
+    return left, top, right, bottom
+
+
+@njit(**OPTIONS)
+def start_square(state: Any, corners: Any, box: tuple[int, int, int, int]) -> Any:
+    """Place the pixel centres, with no light outside of the box; returns the bits of the blocks without any pixel."""
+    left, top, right, bottom = box
+    dark = np.uint32(0)
+    for block in range(BLOCKS):
+        x0, y0 = left + block % BLOCK * BLOCK, top + block // BLOCK * BLOCK
+        corners[block], corners[BLOCKS + block] = x0 + 0.5, y0 + 0.5
+        if x0 >= right or y0 >= bottom:
+            dark |= np.uint32(1) << np.uint32(block)
+        for lane in range(LANES):
+            p = block * LANES + lane
+            x, y = x0 + lane % BLOCK, y0 + lane // BLOCK
+            state[X + p], state[Y + p] = x + 0.5, y + 0.5
+            state[LIGHT + p] = state[LEFT + p] = 1 if x < right and y < bottom else 0
+    return dark
+
+
+@njit(**INLINE)
+def touched_blocks(rows: Any, at: int, corners: Any, epsilon: Any) -> Any:
+    """Bits of the blocks where alpha may reach ALPHA_MIN, of one packed Gaussian.
+
+    The smallest value of the form over the rectangle of a block's pixel centres is compared with that of ALPHA_MIN, all
+    blocks at once. The form is convex and 0 at the mean; beside the mean, its minimum lies on one of the (at most two)
+    sides that face it, where it is that of a parabola clamped to the side.
+
+    Args:
+        rows: packed Gaussians.
+        at: where the Gaussian begins.
+        corners: [2 * BLOCKS], x of each block's first pixel centre, then y.
+        epsilon: the rounding unit of the rows' type.
+    """
+    square, lean, rest = fetch(rows, at + SQUARE), fetch(rows, at + LEAN), fetch(rows, at + REST)
+    left = load(corners, 0) - fetch(rows, at + MEAN_X)
+    top = load(corners, BLOCKS) - fetch(rows, at + MEAN_Y)
+    right, bottom = left + (BLOCK - 1), top + (BLOCK - 1)
+    near_x = maximum(left, minimum(right, 0))
+    near_y = maximum(top, minimum(bottom, 0))
+    tilt = -(square * lean) / (square * lean * lean + rest)  # -b / c
+    along_y = maximum(top, minimum(bottom, near_x * tilt))  # on the side x = near_x
+    along_x = maximum(left, minimum(right, near_y * -lean))  # on the side y = near_y
+    u, v = fma(along_y, lean, near_x), fma(near_y, lean, along_x)
+    on_x = fma(u * square, u, along_y * along_y * rest)
+    on_y = fma(v * square, v, near_y * near_y * rest)
+    # Here and at the pixels, u is off by eps times the larger of its two parts, which may cancel, and the form follows.
+    far = epsilon * fma(maximum(top * -1, bottom), abs(lean), maximum(left * -1, right))
+    slack = far * fma(far, 8 * square, 10 * (1 + square)) + 64 * epsilon
+    limit = fetch(rows, at + LOG_OPACITY) - LOG2_ALPHA_MIN
+    return bits(minimum(on_x, on_y) <= slack + limit)
+
+
+@njit(**INLINE)
+def weigh_pixels(rows: Any, at: int, x: Any, y: Any) -> tuple[Any, Any, Any, Any]:
+    """Offsets from the mean, opacity * density, and alpha (0 where skipped) of one Gaussian at a block's pixels."""
+    dx, dy = x - fetch(rows, at + MEAN_X), y - fetch(rows, at + MEAN_Y)
+    u = fma(dy, fetch(rows, at + LEAN), dx)
+    power = fma(u * u, -fetch(rows, at + SQUARE), fma(dy * dy, -fetch(rows, at + REST), fetch(rows, at + LOG_OPACITY)))
+    full = exp2(power)
+    return dx, dy, full, select(power >= LOG2_ALPHA_MIN, minimum(full, ALPHA_MAX), 0)
+
+
+@njit(**OPTIONS)
+def list_hits(
+    rows: Any,
+    length: int,
+    order: Any,
+    span: tuple[int, int, int],
+    dark: Any,
+    corners: Any,
+    hits: Any,
+    counts: Any,
+    trace: Any,
+) -> None:
+    """List, for each block that has light, which Gaussians touch it.
+
+    Args:
+        rows: packed Gaussians.
+        length: of a packed row.
+        order: the Gaussians' numbers.
+        span: which places in `order` (first, one past the last), and where the square's trace begins.
+        dark: bits of blocks to leave out.
+        corners: see `touched_blocks`.
+        hits: [BLOCKS * CHUNK] int32, written: places in `order`.
+        counts: [BLOCKS], written.
+        trace: written: the touched blocks' bits of each Gaussian.
+    """
+    first, stop, into = span
+    epsilon = rows.dtype.type(np.finfo(rows.dtype).eps)
+    counts[:] = 0
+    for j in range(first, stop):
+        prefetch(rows, np.int64(fetch(order, min(j + AHEAD, stop - 1))) * length)
+        touched = touched_blocks(rows, np.int64(fetch(order, j)) * length, corners, epsilon) & ~dark
+        put(trace, into + j - first, touched)
+        while touched:
+            block = trailing_zeros(touched)
+            touched &= touched - np.uint32(1)
+            number = fetch(counts, block)
+            put(hits, block * CHUNK + number, j)
+            put(counts, block, number + 1)
+
+
+class Picture(NamedTuple):
+    """A map as a flat array."""
+
+    values: Any  # [H * W * D]
+    width: int
+    channels: int
+
+
+@njit(**OPTIONS)
+def read_block(picture: Picture, box: Any, block: int, channel: int, into: Any, place: int, stride: int) -> None:
+    """Copy LANES channels of a block's pixels; 0 outside of the box and beyond the last channel.
+
+    Args:
+        picture: the map.
+        box: left, top, right and bottom of the square.
+        block: which of its blocks.
+        channel: the first channel.
+        into: written: pixel p goes to into[place + p * stride:].
+        place: see `into`.
+        stride: see `into`.
+    """
+    values, width, channels = picture
+    lanes = lanes_below(values, channels - channel)
+    for pixel in range(LANES):
+        x = box[0] + block % BLOCK * BLOCK + pixel % BLOCK
+        y = box[1] + block // BLOCK * BLOCK + pixel // BLOCK
+        if x < box[2] and y < box[3]:
+            vector = load_part(values, (y * width + x) * channels + channel, lanes)
+            store(into, place + pixel * stride, vector)
+        else:
+            store(into, place + pixel * stride, 0)
+
+
+@njit(**OPTIONS)
+def write_block(picture: Picture, box: Any, block: int, channel: int, source: Any, place: int, stride: int) -> None:
+    """The inverse of `read_block`: nothing is written outside of the box and beyond the last channel."""
+    values, width, channels = picture
+    lanes = lanes_below(values, channels - channel)
+    for pixel in range(LANES):
+        x = box[0] + block % BLOCK * BLOCK + pixel % BLOCK
+        y = box[1] + block // BLOCK * BLOCK + pixel // BLOCK
+        if x < box[2] and y < box[3]:
+            vector = load(source, place + pixel * stride)
+            store_part(values, (y * width + x) * channels + channel, lanes, vector)

@@ -1,0 +1,143 @@
+"""The engines as operators of torch: what autograd, `torch.compile` and `torch.export` see of them.
+
+An engine works on plain tensors and knows nothing of gradients. Here its functions become three opaque operators,
+`kfgs::composite`, `kfgs::project` and `kfgs::bin_tiles`, with their backward passes and with fake kernels that tell the
+shapes without computing anything. How many Gaussians can be seen, and how many pairs there are, is known after the fact.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.library import custom_op
+
+from .table import load
+
+
+def check_values(count: int, sources: int, index: Tensor | None, rows: Tensor, offsets: Tensor) -> None:
+    """Refuse what a compiled engine would read from foreign memory. Not asked of a GPU, where it would cost a wait.
+
+    Raises:
+        ValueError: if `index` or `rows` point beyond what there is, or `offsets` do not rise from 0 to P.
+    """
+    if rows.device.type != "cpu":
+        return
+    again = "bin the tiles again from these Gaussians"
+    for name, value, below, origin, advice in (
+        ("tiles.rows", rows, count, "M", again),
+        ("index", index, sources, "N", "pass Projected.index of these Gaussians"),
+    ):
+        if value is None or len(value) == 0:
+            continue
+        low, high = (int(end) for end in torch.aminmax(value))
+        if low < 0 or high >= below:
+            source = "means2d" if origin == "M" else "features"
+            raise ValueError(
+                f"{name}: expected rows from 0 to below {origin} = {below} (from {source}), "
+                f"got {low if low < 0 else high}; {advice}"
+            )
+    ends = int(offsets[0]), int(offsets[-1])
+    if ends != (0, len(rows)) or bool((offsets.diff() < 0).any()):
+        raise ValueError(
+            f"tiles.offsets: expected numbers that rise from 0 to P = {len(rows)} (from tiles.rows), got "
+            f"{offsets[:8].tolist()} ... {ends[1]}; {again}"
+        )
+
+
+@custom_op("kfgs::composite", mutates_args=())
+def composite(
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    background: Tensor,
+    index: Tensor | None,
+    rows: Tensor,
+    offsets: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+    engine: str,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Maps, alphas and the engine's trace, see `kfgs.splat.engines.composite`."""
+    check_values(len(means2d), len(features), index, rows, offsets)
+    splats = means2d, conics, opacities, features, background
+    return load(engine).forward(*splats, index, rows, offsets, width, height, tile_size)
+
+
+@composite.register_fake
+def _(
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    background: Tensor,
+    index: Tensor | None,
+    rows: Tensor,
+    offsets: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+    engine: str,
+) -> tuple[Tensor, Tensor, Tensor]:
+    maps = features.new_empty(height, width, features.shape[1])
+    trace = rows.new_empty(torch.library.get_ctx().new_dynamic_size(), dtype=torch.int32)
+    return maps, features.new_empty(height, width), trace
+
+
+@custom_op("kfgs::composite_backward", mutates_args=())
+def composite_backward(
+    grad_maps: Tensor,
+    grad_alphas: Tensor,
+    wanted: list[bool],
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    background: Tensor,
+    index: Tensor | None,
+    rows: Tensor,
+    offsets: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+    maps: Tensor,
+    alphas: Tensor,
+    trace: Tensor,
+    engine: str,
+) -> list[Tensor]:
+    """Gradients of the five differentiable inputs, empty where not wanted."""
+    splats = means2d, conics, opacities, features, background
+    view = index, rows, offsets, width, height, tile_size
+    return load(engine).backward(grad_maps, grad_alphas, wanted, *splats, *view, maps, alphas, trace)
+
+
+@composite_backward.register_fake
+def _(
+    grad_maps: Tensor,
+    grad_alphas: Tensor,
+    wanted: list[bool],
+    *inputs: Any,  # noqa: ARG001
+) -> list[Tensor]:
+    return [torch.empty_like(v) if want else v.new_empty(0) for v, want in zip(inputs[:5], wanted, strict=True)]
+
+
+def _save_composite(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor, Tensor]) -> None:
+    *tensors, width, height, tile_size, engine = inputs
+    ctx.save_for_backward(*tensors, *output)
+    ctx.size, ctx.engine = (width, height, tile_size), engine
+    ctx.set_materialize_grads(True)
+
+
+def _differentiate_composite(ctx: Any, grad_maps: Tensor, grad_alphas: Tensor, _: Tensor) -> tuple[Any, ...]:
+    *inputs, maps, alphas, trace = ctx.saved_tensors
+    wanted = list(ctx.needs_input_grad[:5])
+    grads = composite_backward(
+        grad_maps.contiguous(), grad_alphas.contiguous(), wanted, *inputs, *ctx.size, maps, alphas, trace, ctx.engine
+    )
+    return *(grad if want else None for grad, want in zip(grads, wanted, strict=True)), *[None] * 7
+
+
+composite.register_autograd(_differentiate_composite, setup_context=_save_composite)

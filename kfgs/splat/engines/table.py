@@ -1,0 +1,82 @@
+"""Which engines there are, what they need, and where they run."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from types import ModuleType
+from typing import NamedTuple
+
+from ..._check import check_choice
+
+
+class _Entry(NamedTuple):
+    module: str
+    needs: str  # the package it imports
+    install: str  # how to get that
+
+
+_ENGINES = {
+    "triton": _Entry("kfgs.splat.engines.triton_gpu", "triton", "pip install triton"),
+    "numba": _Entry("kfgs.splat.engines.numba_cpu", "numba", "pip install numba"),
+    "reference": _Entry("kfgs.splat.engines.reference", "torch", "pip install torch"),
+}
+"""In order of preference: `engine="auto"` takes the first that knows the device and can be imported."""
+
+
+def available_engines(device: str | None = None) -> list[str]:
+    """Names of the engines whose packages are installed, fastest first.
+
+    Args:
+        device: "cpu" or "cuda": only those that run there, which are imported to find out; None: nothing is imported.
+    """
+    names = [name for name, entry in _ENGINES.items() if find_spec(entry.needs) and find_spec(entry.module)]
+    return names if device is None else [name for name in names if _runs(name, device)]
+
+
+@cache
+def load(name: str) -> ModuleType:
+    """The engine's module.
+
+    Raises:
+        ImportError: if the package that it needs cannot be used, with the line that installs it.
+    """
+    entry = _ENGINES[name]
+    try:
+        return import_module(entry.module)
+    except (ImportError, RuntimeError) as error:  # numba finds no place for its cache: RuntimeError
+        raise ImportError(
+            f"engine: expected {entry.needs} for engine {name!r}, but it cannot be imported ({error}); "
+            f"install it with `{entry.install}`, or choose one of {available_engines()}"
+        ) from error
+
+
+@cache
+def choose(engine: str, device: str) -> str:
+    """The engine's name for tensors on a device: the fastest one there if it is "auto".
+
+    Raises:
+        ValueError: if there is no such engine, or it does not run on the device.
+        ImportError: if the named engine's package is missing.
+    """
+    if engine == "auto":
+        return available_engines(device)[0]
+    check_choice("engine", engine, ["auto", *_ENGINES])
+    devices = load(engine).devices()
+    if device not in devices:
+        raise ValueError(
+            f"engine: expected one that runs on {device} (from means2d), got {engine!r} for {', '.join(devices)}; "
+            "use engine='auto'"
+        )
+    return engine
+
+
+def _runs(name: str, device: str) -> bool:
+    """Whether an engine works on a device; Triton's interpreter on a CPU is for proofs and does not count."""
+    if name == "triton" and device == "cpu":
+        return False
+    try:
+        return device in load(name).devices()
+    except ImportError:  # installed, but broken on this machine
+        return False
