@@ -61,10 +61,9 @@ class Composited(NamedTuple):
     left_error: np.ndarray  # of it, relative
 
 
-def _look(scene: Scene, row: int, unit: float) -> Look:
-    """Point 1 of the contract."""
-    rows, columns = np.mgrid[: scene.height, : scene.width]
-    dx, dy = columns.ravel() + 0.5 - scene.means2d[row, 0], rows.ravel() + 0.5 - scene.means2d[row, 1]
+def _look(scene: Scene, row: int, centers: np.ndarray, unit: float) -> Look:
+    """Point 1 of the contract, for pixel centres [2, H * W]."""
+    dx, dy = centers - scene.means2d[row][:, None]
     a, b, c = scene.conics[row]
     cross = b * dx * dy
     power = 0.5 * (a * dx * dx + c * dy * dy) + cross
@@ -76,7 +75,8 @@ def _look(scene: Scene, row: int, unit: float) -> Look:
 
 def composite(scene: Scene, unit: float) -> Composited:
     """Points 2 to 4 of the contract, for arithmetic with the rounding unit `unit` (2^-24 for float32)."""
-    pixels = scene.height * scene.width
+    i, j = np.mgrid[: scene.height, : scene.width]
+    centers, pixels = np.stack([j.ravel() + 0.5, i.ravel() + 0.5]), i.size
     maps, left, left_error, allowance = (
         np.zeros((pixels, scene.features.shape[1])),
         np.ones(pixels),
@@ -85,7 +85,7 @@ def composite(scene: Scene, unit: float) -> Composited:
     stopped, on_threshold, on_stop, on_clamp = np.zeros((4, pixels), bool)
     layers = []
     for row in sorted(range(len(scene.depths)), key=lambda m: (scene.depths[m], m)):
-        look = _look(scene, row, unit)
+        look = _look(scene, row, centers, unit)
         taken = ~stopped & (look.full >= ALPHA_MIN)
         on_min = ~stopped & (np.abs(look.log_full - np.log(ALPHA_MIN)) <= look.doubt)
         if not (taken | on_min).any():

@@ -1,0 +1,190 @@
+"""Every engine of kfgs and the CPU peers that can be had, side by side in one run.
+
+    python benchmarks/engines.py [--quick] [--out FOLDER] [--threads 1 2] [--repeats 9]
+
+writes engines.md (tables), engines.json (all numbers) and curves as PNG. In each configuration all engines get the same
+arrays and the same lists of tiles, and are timed in turn, round after round; the tables give medians, with the least in
+brackets. Growth is measured along three axes: N at 480x360x9, pixels at N = 110k x9, channels at 30k 640x480 and 110k
+480x360. A call that would take longer than 20 s is left out, and the table says so. `--quick` checks that all of it works,
+in about a minute; its numbers mean little.
+
+**Operations**, for the share of the machine's peak: on a pair (pixel, Gaussian) that is composited, alpha takes 24
+(two differences, seven for the power, twelve for the exponential, three for opacity, clamp and threshold), transmittance
+and weight 4, and each channel 2; the backward pass does the same again, 2 more for each channel, and 17 for the slope of
+log(alpha), what is left behind, and six moments. Work on pixels that a Gaussian does not reach counts as nothing. The
+peak is that of torch's float32 matrix product with as many threads, multiply and add counted as two.
+
+**Peers** (looked up in the package index in November 2026, Python 3.11, Linux x86-64):
+
+- the SIMD prototype and its pure-torch, tile-batched engine: measured where `../shared/reference/engine_prototype` exists;
+- gsplat 1.5.3: a wheel of CUDA sources, compiled with nvcc at first use; its torch fallback needs nerfacc and two CUDA
+  kernels to list and composite. Nothing runs on a CPU;
+- taichi-splatting 0.13.0 (with taichi 1.7.4): installs, but its rasteriser is written with shared memory and warp votes,
+  which taichi has for CUDA only; only its projection and harmonics run on a CPU;
+- warp-lang 1.19.0: installs and compiles for CPUs, but brings no rasteriser;
+- gaussian-splatting 2.11.0: wraps the CUDA rasterisers;
+- torch-splatting, opensplat, diff-gaussian-rasterization: not in the index. OpenSplat's CPU rasteriser needs a C++
+  compiler and torch-splatting a checkout; `reference/engine.md` has what they took on such a machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as kfgs sets it; before torch starts its threads
+
+import torch
+from engines_machine import describe, measure, measure_peak, peak_memory
+from engines_report import write_curves, write_tables
+from engines_runners import PROTOTYPE, Case, Inputs, calls, count_pairs, engine_names, prepare
+from engines_step import kfgs_step, prototype_step
+
+SLOWEST = 20.0  # seconds
+SIZES = (320, 240), (480, 360), (640, 480), (1280, 960)
+SLICES = {
+    "Gaussians": [Case(n, 9, 480, 360) for n in (10_000, 30_000, 110_000, 500_000)],
+    "pixels": [Case(110_000, 9, *size) for size in SIZES],
+    "channels, N=30,000": [Case(30_000, c, 640, 480) for c in (3, 9, 64, 512)],
+    "channels, N=110,000": [Case(110_000, c, 480, 360) for c in (3, 9, 64, 512)],
+}
+QUICK_SLICES = {
+    "Gaussians": [Case(n, 9, 160, 120) for n in (1_000, 3_000, 10_000)],
+    "pixels": [Case(3_000, 9, *size) for size in ((80, 60), (160, 120), (240, 180))],
+    "channels, N=3,000": [Case(3_000, c, 160, 120) for c in (3, 9, 64)],
+}
+STEP, QUICK_STEP = Case(110_000, 9, 480, 360), Case(10_000, 9, 240, 180)
+
+
+def main() -> None:
+    """Measure, and write after each configuration what is known so far."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="tiny configurations, about a minute")
+    parser.add_argument("--out", type=Path, default=Path("engines_benchmark"), help="folder for tables and curves")
+    parser.add_argument("--threads", type=int, nargs="+", help="thread counts (default: 1 and all; quick: all)")
+    parser.add_argument("--repeats", type=int, help="rounds per configuration (default 9; quick 3)")
+    parser.add_argument("--memory-of", nargs=5, metavar=("ENGINE", "N", "C", "W", "H"), help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.memory_of:
+        engine, *numbers = args.memory_of
+        print(json.dumps(memory(engine, Case(*map(int, numbers)))))
+        return
+    cores = os.cpu_count() or 1
+    threads = args.threads or ([cores] if args.quick else sorted({1, cores}))
+    repeats = args.repeats or (3 if args.quick else 9)
+    slices = QUICK_SLICES if args.quick else SLICES
+    args.out.mkdir(parents=True, exist_ok=True)
+    if not PROTOTYPE.is_dir():
+        print(f"no folder {PROTOTYPE}: the prototype and its torch engine are left out")
+
+    report: dict[str, Any] = {"machine": describe(), "quick": args.quick, "slices": {}, "peak": {}, "cases": []}
+    report |= {"steps": [], "memory": [], "repeats": repeats}
+    report["slices"] = {name: [list(case) for case in cases] for name, cases in slices.items()}
+    for count in threads:
+        torch.set_num_threads(count)
+        report["peak"][str(count)] = measure_peak()._asdict()
+        report["steps"].append(time_step(QUICK_STEP if args.quick else STEP, count, repeats))
+        save(report, args.out)
+        rates: dict[str, float] = {}
+        for case in dict.fromkeys(case for cases in slices.values() for case in cases):
+            report["cases"].append(time_case(case, count, repeats, rates))
+            save(report, args.out)
+    probed = [slices["Gaussians"][1]] if args.quick else [*slices["Gaussians"], *slices["channels, N=30,000"]]
+    for entry in report["cases"]:
+        if entry["threads"] == threads[-1] and Case(*entry["case"]) in probed:
+            report["memory"] += [probe_memory(engine, Case(*entry["case"])) for engine in entry["seconds"]]
+            save(report, args.out)
+    write_curves(report, args.out)
+    print(f"written: {', '.join(str(path) for path in sorted(args.out.glob('engines*')))}")
+
+
+def time_case(case: Case, threads: int, repeats: int, rates: dict[str, float]) -> dict[str, Any]:
+    """Time all engines on one case. `rates` is seconds per unit of work so far, by which to leave out what is too slow."""
+    inputs = prepare(case)
+    pairs = count_pairs(inputs)
+    work = pairs.listed * (20 + case.channels)
+    entry: dict[str, Any] = {"case": list(case), "threads": threads, "pairs": pairs._asdict(), "left_out": {}}
+    entry |= {"seconds": {}, "difference": {}}
+    jobs, maps = {}, None
+    for engine in engine_names():
+        expected = rates.get(engine, 0) * work
+        if expected > SLOWEST:
+            entry["left_out"][engine] = f"about {expected:.0f} s"
+            continue
+        jobs[engine] = calls(engine, inputs)
+        found = jobs[engine]["forward"]()
+        maps = found if maps is None else maps
+        entry["difference"][engine] = float((found - maps).abs().max())  # from the first engine's
+        del found
+    del maps
+    times = measure({(e, name): call for e, made in jobs.items() for name, call in made.items()}, repeats)
+    for (engine, name), seconds in times.items():
+        entry["seconds"].setdefault(engine, {})[name] = seconds._asdict()
+    for engine, seconds in entry["seconds"].items():
+        rates[engine] = max(times["median"] for times in seconds.values()) / work
+    print(f"{case}, {threads} threads: " + ", ".join(_brief(e, s) for e, s in entry["seconds"].items()), flush=True)
+    jobs.clear()
+    gc.collect()
+    return entry
+
+
+def _brief(engine: str, seconds: dict[str, dict[str, float]]) -> str:
+    return f"{engine} " + "/".join(f"{1e3 * times['median']:.1f}" for times in seconds.values())
+
+
+def time_step(case: Case, threads: int, repeats: int) -> dict[str, Any]:
+    """Time the whole training step of every engine, and the stages of the fast ones."""
+    inputs: Inputs = prepare(case)
+    whole: dict[Any, Any] = {}
+    stages: dict[Any, Any] = {}
+    for engine in engine_names():
+        if not engine.startswith("kfgs ") and engine != "prototype":
+            continue
+        step, parts = (
+            prototype_step(inputs) if engine == "prototype" else kfgs_step(engine.removeprefix("kfgs "), inputs)
+        )
+        whole[engine] = step["step"]
+        if engine != "kfgs reference":
+            stages |= {(engine, name): call for name, call in parts.items()}
+    entry: dict[str, Any] = {"case": list(case), "threads": threads, "step": {}, "stages": {}}
+    for engine, times in measure(whole, 2 * repeats + 1).items():
+        entry["step"][engine] = times._asdict()
+    for (engine, name), times in measure(stages, repeats, slow=float("inf")).items():
+        entry["stages"].setdefault(engine, {})[name] = times._asdict()
+    brief = ", ".join(f"{engine} {1e3 * times['median']:.1f} ms" for engine, times in entry["step"].items())
+    print(f"training step, {case}, {threads} threads: {brief}", flush=True)
+    return entry
+
+
+def memory(engine: str, case: Case) -> dict[str, Any]:
+    """Bytes that one forward and backward pass of compositing needs, beyond its input; kernels are compiled before."""
+    tiny = calls(engine, prepare(Case(200, case.channels, 32, 32)))
+    tiny["forward"](), tiny["backward"]()
+    job = calls(engine, prepare(case))
+    gc.collect()
+    return {"engine": engine, "case": list(case), "bytes": peak_memory(lambda: (job["forward"](), job["backward"]()))}
+
+
+def probe_memory(engine: str, case: Case) -> dict[str, Any]:
+    """`memory` in a process of its own."""
+    command = [sys.executable, __file__, "--memory-of", engine, *map(str, case)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    entry = json.loads(done.stdout.splitlines()[-1])
+    print(f"memory, {case}: {engine} {entry['bytes'] / 2**20:.0f} MiB", flush=True)
+    return entry
+
+
+def save(report: dict[str, Any], out: Path) -> None:
+    """Write the numbers and the tables."""
+    (out / "engines.json").write_text(json.dumps(report, indent=1))
+    (out / "engines.md").write_text(write_tables(report))
+
+
+if __name__ == "__main__":
+    main()
