@@ -58,6 +58,8 @@ class Case(NamedTuple):
     seed: int
     scene: oracle.Scene
     tile_size: int
+    index: np.ndarray | None  # the rows of a larger array that the scene's features are
+    count: int  # rows of that array
 
 
 def _tiles(case):
@@ -100,13 +102,19 @@ def _case(seed):
     p, q = sigmas.T**-2.0
     conics = np.stack([p * cos**2 + q * sin**2, (p - q) * cos * sin, p * sin**2 + q * cos**2], 1)
     channels = int(g.choice(CHANNELS))
-    features = g.normal(0, 1, (M, channels)) * 10 ** g.uniform(-2, 2)
+    index, count = None, M
+    if g.random() < 0.5:  # what is seen of more, in order as `project` gives it, or any of them, several times
+        count = M + int(g.integers(1, 20))
+        index = np.sort(g.permutation(count)[:M]) if g.random() < 0.5 else g.integers(0, count, M)
+    features = g.normal(0, 1, (count, channels)) * 10 ** g.uniform(-2, 2)
+    features = features if index is None else features[index]
     background = g.normal(0, 1, channels) * (g.random() < 0.5) * 10 ** g.uniform(-2, 1)
     values = (means2d, conics, depths, opacities, features, background)
     values = [v.astype(np.float32).astype(np.float64) for v in values]
     conics = values[1]
     assert (conics[:, 0] * conics[:, 2] > conics[:, 1] ** 2).all()
-    return Case(seed, oracle.Scene(*values, width, height), int(g.choice([16, 16, 16, 8, 7, 32])))
+    scene, tile_size = oracle.Scene(*values, width, height), int(g.choice([16, 16, 16, 8, 7, 32]))
+    return Case(seed, scene, tile_size, index, count)
 
 
 def _cotangents(seen, scene, seed):
@@ -118,16 +126,31 @@ def _cotangents(seen, scene, seed):
     return maps.astype(np.float32).astype(np.float64), alphas.astype(np.float32).astype(np.float64)
 
 
-def _tensors(scene, dtype):
-    """means2d, conics, opacities, features, background."""
-    return [torch.from_numpy(v).to(dtype) for v in (*scene[:2], *scene[3:6])]
+def _spread(case, values):
+    """Values [M, D] of the scene's rows of features, as sums in the rows [N, D] of the array that they come from."""
+    if case.index is None:
+        return values
+    out = np.zeros((case.count, values.shape[1]))
+    np.add.at(out, case.index, values)
+    return out
+
+
+def _table(case):
+    """The array [N, D] that the scene's features come from."""
+    if case.index is None:
+        return case.scene.features
+    table = np.full((case.count, case.scene.features.shape[1]), 1e3)  # nothing else may be read
+    table[case.index] = case.scene.features
+    return table
 
 
 def _run(case, dtype, engine, cotangents):
     """maps [H * W, D], alphas [H * W], the five gradients, and the sums and weights of the first cotangent."""
-    inputs = [v.requires_grad_() for v in _tensors(case.scene, dtype)]
-    tiles = _tiles(case)
-    maps, alphas = composite(*inputs[:4], tiles, background=inputs[4], engine=engine)
+    scene, tiles = case.scene, _tiles(case)
+    inputs = scene.means2d, scene.conics, scene.opacities, _table(case), scene.background
+    inputs = [torch.from_numpy(v).to(dtype).requires_grad_() for v in inputs]
+    index = None if case.index is None else torch.from_numpy(case.index)
+    maps, alphas = composite(*inputs[:4], tiles, background=inputs[4], index=index, engine=engine)
     upstream = [torch.from_numpy(v).to(dtype).view(o.shape) for v, o in zip(cotangents, (maps, alphas), strict=True)]
     grads = torch.autograd.grad((maps, alphas), inputs, upstream)
     splats = [v.detach() for v in inputs[:3]]
@@ -155,18 +178,13 @@ def _compare(case, dtype, engine, given=None):
     sums, weights = oracle.accumulate(scene, seen, cotangents[0])
     largest = max(np.abs(scene.features).max(initial=0), np.abs(scene.background).max())
     names = ("maps", "alphas", *oracle.Gradients._fields, "sums", "weights")
+    sum_allowance = allowed.features
+    grads, allowed = (v._replace(features=_spread(case, v.features)) for v in (grads, allowed))
     expected = (seen.maps, seen.alphas, *grads, sums, weights)
-    allowances = (
-        2 * largest * seen.allowance[:, None],
-        seen.allowance,
-        *allowed,
-        allowed.features,
-        seen.allowance.sum(),
-    )
+    allowances = (2 * largest * seen.allowance[:, None], seen.allowance, *allowed, sum_allowance, seen.allowance.sum())
+    actual = _run(given or case, dtype, engine, cotangents)
     excess, plain = {}, set()
-    for name, a, e, allowance in zip(
-        names, _run(given or case, dtype, engine, cotangents), expected, allowances, strict=True
-    ):
+    for name, a, e, allowance in zip(names, actual, expected, allowances, strict=True):
         error = np.abs(a.double().numpy() - e)
         assert np.isfinite(error).all(), f"{engine}, {dtype}, seed {case.seed}: {name} is not finite"
         limit = (MAPS if name in ("maps", "alphas") else GRADIENTS)[dtype]
@@ -189,9 +207,7 @@ def _has_needles(scene):
     """Whether some Gaussian is more than 20 times longer than wide."""
     a, b, c = scene.conics.T
     middle, product = (a + c) / 2, a * c - b * b
-    largest = middle + np.sqrt(
-        np.maximum(middle**2 - product, 0)
-    )  # the larger eigenvalue; product / largest is the other
+    largest = middle + np.sqrt(np.maximum(middle**2 - product, 0))  # eigenvalue; the other is product / largest
     return bool((largest > 20**2 * product / largest).any())
 
 
