@@ -26,7 +26,7 @@ def write_tables(report: Report) -> str:
         "",
         f"{machine['processor']}, {machine['cores']} cores, {', '.join(machine['flags'])}; {machine['system']}; Python "
         f"{machine['python']}, torch {machine['torch']}, numba {machine['numba']}. Wall-clock milliseconds, median and "
-        f"(least) of {report['repeats']} rounds in turn, or of 3 where one takes longer than a second.",
+        f"(least) of {report['repeats']} rounds in turn (at most 3 of what takes longer than a second).",
     ]
     if report["quick"]:
         lines += ["", "**A quick run: it shows that everything works, and says little about speed.**"]
@@ -37,7 +37,10 @@ def write_tables(report: Report) -> str:
         )
     off = [(value, entry["case"]) for entry in report["cases"] for value in entry["difference"].values()]
     if off:
-        lines.append(f"\nNo engine's map is further than {max(off)[0]:.1g} from the first one's (features are normal).")
+        lines.append(
+            f"\nNo engine's map is further than {max(off)[0]:.1g} from the first one's, features being normal: that is a pixel "
+            "where an alpha lies on 1/255 or T on 1e-4, and rounding decides."
+        )
     lines += _steps(report)
     for threads in report["peak"]:
         for name, cases in report["slices"].items():
