@@ -2,11 +2,11 @@
 
     python benchmarks/engines.py [--quick] [--out FOLDER] [--threads 1 2] [--repeats 9]
 
-writes engines.md (tables), engines.json (all numbers) and curves as PNG, in about half an hour on two cores. In each configuration all engines get the same
-arrays and the same lists of tiles, and are timed in turn, round after round; the tables give medians, with the least in
-brackets. Growth is measured along three axes: N at 480x360x9, pixels at N = 110k x9, channels at 30k 640x480 and 110k
-480x360. A call that would take longer than 20 s is left out, and the table says so. `--quick` checks that all of it works,
-in about a minute; its numbers mean little.
+writes engines.md (tables), engines.json (all numbers) and curves as PNG, in about half an hour on two cores. In each
+configuration all engines get the same arrays and the same lists of tiles, and are timed in turn, round after round; the
+tables give medians, with the least in brackets. Growth is measured along three axes: N at 480x360x9, pixels at N = 110k
+x9, channels at 30k 640x480 and 110k 480x360. A call that would take longer than 20 s is left out, and the table says so.
+`--quick` checks that all of it works, in about a minute; its numbers mean little.
 
 **Operations**, for the share of the machine's peak: on a pair (pixel, Gaussian) that is composited, alpha takes 24
 (two differences, seven for the power, twelve for the exponential, three for opacity, clamp and threshold), transmittance
