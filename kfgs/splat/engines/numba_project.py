@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .contract import ALPHA_MIN
 from .numba_project_backward import differentiate_band
 from .numba_project_forward import project_band
 from .numba_project_math import make_lens
+from .numba_reach import find_reach
 from .numba_threads import run_bands
 
 __all__ = ["project", "project_backward"]
@@ -58,15 +58,23 @@ def project(
     """
     N = len(means)
     bands = _bands(N)
-    reach = torch.log(opacities.detach() / ALPHA_MIN).mul_(2)
     shapes = (N, 2), (N, 3), (N,), (N,), (N, 2)
-    scratch = [*(means.new_empty(shape) for shape in shapes), torch.empty(N, dtype=torch.int64)]
+    scratch = [*(means.new_empty(shape) for shape in shapes), means.new_empty(N, dtype=torch.int64)]
     counts = np.empty(bands, np.int64)
     lens = make_lens(_array(viewmat), _array(K), width, height, near, low_pass)
     gaussians = _flat(means, quats, scales, opacities)
-    run_bands(project_band, bands, bands, lens, gaussians, _array(reach), _flat(*scratch), counts)
-    runs = [slice(N * b // bands, N * b // bands + int(counts[b])) for b in range(bands)]
-    means2d, conics, depths, seen, extents, index = (torch.cat([value[run] for run in runs]) for value in scratch)
+    run_bands(project_band, bands, bands, lens, gaussians, find_reach(opacities), _flat(*scratch), counts)
+
+    ends = np.cumsum(counts)
+    outputs = [value.new_empty((int(ends[-1]), *value.shape[1:])) for value in scratch]
+
+    def collect(band: int) -> None:
+        begin, count = N * band // bands, int(counts[band])
+        for value, output in zip(scratch, outputs, strict=True):
+            _array(output)[ends[band] - count : ends[band]] = _array(value)[begin : begin + count]
+
+    run_bands(collect, bands)
+    means2d, conics, depths, seen, extents, index = outputs
     return means2d, conics, depths, seen, extents, index
 
 
@@ -119,8 +127,8 @@ class Project(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         """One gradient for each argument of `project`."""
         *inputs, index = ctx.saved_tensors
-        given = (grad.contiguous() for grad in grads[:4])
-        return *project_backward(*given, *inputs, *ctx.options, index), *[None] * 6
+        arguments: list[Any] = [*(grad.contiguous() for grad in grads[:4]), *inputs, *ctx.options, index]
+        return *project_backward(*arguments), *[None] * 6
 
 
 def _bands(count: int) -> int:

@@ -57,8 +57,10 @@ def differentiate_band(
     """
     means, quats, scales = gaussians
     grad_means2d, grad_conics, grad_depths, grad_opacities = grads
-    row, last = len(out[3]) * band // bands, len(out[3]) * (band + 1) // bands
-    begin, end = np.searchsorted(index, row), np.searchsorted(index, last)
+    out_means, out_quats, out_scales, out_opacities = out
+    row, last = len(out_opacities) * band // bands, len(out_opacities) * (band + 1) // bands
+    begin: Any = np.searchsorted(index, row)
+    end: Any = np.searchsorted(index, last)
     state = np.zeros(_STATE, means.dtype)
     while begin < end:
         count = min(BLOCK, end - begin)
@@ -74,8 +76,8 @@ def differentiate_band(
         beyond = index[begin + count - 1] + 1
         _clear(out, row, beyond)
         for k in range(count):
-            _scatter(state, k, index[begin + k], out)
-            out[3][index[begin + k]] = grad_opacities[begin + k]
+            _scatter(state, k, index[begin + k], out_means, out_quats, out_scales)
+            out_opacities[index[begin + k]] = grad_opacities[begin + k]
         row = beyond
         begin += count
     _clear(out, row, last)
@@ -92,9 +94,8 @@ def _clear(out: tuple[Any, Any, Any, Any], first: int, last: int) -> None:
 
 
 @njit(**OPTIONS)
-def _scatter(state: Any, slot: int, row: int, out: tuple[Any, Any, Any, Any]) -> None:
+def _scatter(state: Any, slot: int, row: int, means: Any, quats: Any, scales: Any) -> None:
     """Copy one Gaussian's gradients from the planes of its values, which they replaced."""
-    means, quats, scales, _ = out
     slot, row = max(slot, 0), max(row, 0)
     for k in range(3):
         means[3 * row + k] = state[MEAN + k * BLOCK + slot]

@@ -54,8 +54,7 @@ def project_band(
         counts: [B] int64, written: how many are visible.
         source: see `SOURCE`.
     """
-    means, quats, scales, opacities = gaussians
-    first, last = len(opacities) * band // bands, len(opacities) * (band + 1) // bands
+    means, first, last = gaussians[0], len(reach) * band // bands, len(reach) * (band + 1) // bands
     state, depths = np.zeros(_STATE, means.dtype), np.empty(BLOCK, means.dtype)
     waiting = np.empty(2 * BLOCK, np.int64)
     count, end = 0, first
