@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import NamedTuple
 
 import torch
@@ -13,6 +14,7 @@ from ..cameras.camera import Camera
 from ..cameras.projection import camera_to_pixel, projection_jacobian, world_to_camera
 from ..gaussians import Gaussians
 from .engines.contract import ALPHA_MIN
+from .engines.table import choose
 
 FIELD_OF_VIEW_MARGIN = 1.3
 """The projection is linearised no further out than 1.3 times the half field of view (3DGS): beyond it the linear
@@ -36,6 +38,7 @@ def project(
     *,
     near: float = 0.2,
     low_pass: float = 0.3,
+    engine: str = "auto",
 ) -> Projected:
     """Project Gaussians through a pinhole camera and cull those that cannot touch a pixel.
 
@@ -49,16 +52,23 @@ def project(
         camera: without distortion; cast to the Gaussians' dtype and device.
         near: smallest depth that is drawn, world units.
         low_pass: variance in pixels^2 added on both axes, so that nothing is smaller than a pixel.
+        engine: as in `composite`. "numba", which "auto" takes on the CPU, computes the same with compiled code; all
+            others are kornia's functions under autograd.
 
     Returns:
         The M visible Gaussians; M = 0 is possible.
 
     Raises:
-        ValueError: if the camera has distortion, `near` is not positive or `low_pass` is negative.
+        ValueError: if the camera has distortion, `near` is not positive or `low_pass` is negative, or the engine is
+            unknown or cannot work on these tensors.
+        ImportError: if the named engine's package is missing.
 
     Note:
         A Gaussian with NaN or infinite parameters, or so large that its footprint overflows, is culled, and its gradients
         are zero.
+
+        The compiled code has no gradients of gradients. Nor has it any in the camera: where `camera.viewmat` or
+        `camera.K` requires one, kornia's functions are used whatever the engine.
     """
     check_range("near", near, 0, closed=(False, False))
     check_range("low_pass", low_pass, 0, closed=(True, False))
@@ -67,8 +77,40 @@ def project(
             f"camera: expected a camera without distortion, got {camera.distortion.model} (camera {camera.name!r}); "
             "undistort the images first with kfgs.cameras.undistort, which returns the camera to use"
         )
-    if camera.K.dtype != gaussians.means.dtype or camera.K.device != gaussians.means.device:
+    if any(m.dtype != gaussians.means.dtype or m.device != gaussians.means.device for m in (camera.viewmat, camera.K)):
         camera = camera.to(gaussians.means)
+    values = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
+    to_camera = torch.is_grad_enabled() and (camera.viewmat.requires_grad or camera.K.requires_grad)
+    if use_compiled(engine, "gaussians", *values) and not to_camera:
+        options = camera.width, camera.height, near, low_pass
+        compiled = import_module("kfgs.splat.engines.numba_project").Project.apply
+        return Projected(*compiled(*(v.contiguous() for v in (*values, camera.viewmat, camera.K)), *options))
+    return _project(gaussians, camera, near, low_pass)
+
+
+def use_compiled(engine: str, name: str, *tensors: Tensor) -> bool:
+    """Whether the numba engine's projection and binning are to work on these tensors.
+
+    Raises:
+        ValueError: if the engine is unknown or does not run on the device, or "numba" is named for tensors that are not
+            all of one dtype it knows; `name` says what they are.
+        ImportError: if the named engine's package is missing.
+    """
+    device = tensors[0].device.type
+    if (engine == "auto" and device != "cpu") or choose(engine, device) != "numba":
+        return False
+    kinds = {value.dtype for value in tensors}
+    known = len(kinds) == 1 and kinds <= {torch.float32, torch.float64}
+    if engine == "numba" and not known:
+        raise ValueError(
+            f"{name}: expected all in float32 or all in float64 for engine 'numba', got "
+            f"{', '.join(sorted(map(str, kinds)))}; convert them with .to(torch.float32)"
+        )
+    return known
+
+
+def _project(gaussians: Gaussians, camera: Camera, near: float, low_pass: float) -> Projected:
+    """The projection as kornia and autograd have it, on any device."""
     index = _candidates(gaussians, camera, near, low_pass)
     points = world_to_camera(camera, gaussians.means[index])  # [m, 3]: what is culled takes no part in any gradient
     opacities = gaussians.opacities[index]

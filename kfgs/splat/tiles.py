@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import NamedTuple
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from .._check import check_range, check_shapes
 from .engines.contract import ALPHA_MIN
-from .project import Projected, pixel_box
+from .project import Projected, pixel_box, use_compiled
 
 
 class Tiles(NamedTuple):
@@ -32,7 +33,7 @@ class Tiles(NamedTuple):
 
 
 @torch.no_grad()
-def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16) -> Tiles:
+def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16, *, engine: str = "auto") -> Tiles:
     """List the Gaussians of every tile.
 
     A Gaussian is listed where alpha reaches 1/255 somewhere in the rectangle spanned by the tile's pixel centres: the
@@ -44,12 +45,16 @@ def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16
         width: of the image, pixels.
         height: of the image, pixels.
         tile_size: side of a tile, pixels.
+        engine: as in `composite`. "numba", which "auto" takes on the CPU, finds the same lists with compiled code; all
+            others are functions of torch.
 
     Returns:
         The P (tile, Gaussian) pairs, grouped by tile; equally deep Gaussians are in order of their index.
 
     Raises:
-        ValueError: if shapes disagree or a size is not positive.
+        ValueError: if shapes disagree or a size is not positive, or the engine is unknown or cannot work on these
+            tensors.
+        ImportError: if the named engine's package is missing.
     """
     check_shapes(
         ("projected.means2d", projected.means2d, "M 2"),
@@ -60,6 +65,16 @@ def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16
     )
     for name, size in (("width", width), ("height", height), ("tile_size", tile_size)):
         check_range(name, size, 1, closed=(True, False))
+    if use_compiled(engine, "projected", *projected[:5]):
+        compiled = import_module("kfgs.splat.engines.numba_tiles").bin
+        rows, offsets = compiled(*(value.contiguous() for value in projected[:5]), width, height, tile_size)
+    else:
+        rows, offsets = _bin(projected, width, height, tile_size)
+    return Tiles(rows, offsets, width, height, tile_size)
+
+
+def _bin(projected: Projected, width: int, height: int, tile_size: int) -> tuple[Tensor, Tensor]:
+    """Rows [P] and offsets [T + 1] of `Tiles`, by sorting the pairs; on any device."""
     columns, count = -(-width // tile_size), -(-width // tile_size) * -(-height // tile_size)
     order = torch.sort(projected.depths, stable=True).indices
     means2d, extents = projected.means2d[order], projected.extents[order]
@@ -82,7 +97,7 @@ def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16
     touched = _touches_tile(projected, rows, tile_x * tile_size, tile_y * tile_size, tile_size)
     tile, by_tile = torch.sort((tile_y * columns + tile_x)[touched], stable=True)
     offsets = torch.searchsorted(tile, torch.arange(count + 1, dtype=tile.dtype, device=tile.device))
-    return Tiles(rows[touched][by_tile], offsets, width, height, tile_size)
+    return rows[touched][by_tile], offsets
 
 
 def _touches_tile(

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import oracles_splat as oracle
@@ -9,7 +10,16 @@ from cases_splat import a_camera, gaussians_before
 from kfgs.cameras.camera import Camera, Distortion
 from kfgs.cameras.projection import camera_to_pixel, world_to_camera
 from kfgs.gaussians import Gaussians
-from kfgs.splat import project
+from kfgs.splat import available_engines
+from kfgs.splat import project as project_by
+
+
+@pytest.fixture(params=["reference", "numba"])
+def project(request):
+    """Kornia's functions, and what is compiled."""
+    if request.param not in available_engines():
+        pytest.skip(f"engine {request.param} is not installed")
+    return partial(project_by, engine=request.param)
 
 
 def _straight(width=20, height=10, focal=20.0, principal=(10.0, 5.0), dtype=torch.float64):
@@ -41,7 +51,7 @@ def _oracle(gaussians, camera, **options):
 
 
 @pytest.mark.parametrize("spread", [1.0, 2.5])  # the second: many means lie outside the picture
-def test_agrees_with_the_equations(spread):
+def test_agrees_with_the_equations(project, spread):
     camera = a_camera()
     gaussians = gaussians_before(camera, 60, seed=1, spread=spread)
     projected = project(gaussians, camera)
@@ -57,7 +67,7 @@ def test_agrees_with_the_equations(spread):
     torch.testing.assert_close(projected.opacities, gaussians.opacities[projected.index], rtol=0, atol=0)
 
 
-def test_jacobian_is_the_derivative_of_the_projection():
+def test_jacobian_is_the_derivative_of_the_projection(project):
     camera = a_camera()
     gaussians = gaussians_before(camera, 8, seed=2, spread=0.9)
     projected = project(gaussians, camera, low_pass=0.0)
@@ -70,7 +80,7 @@ def test_jacobian_is_the_derivative_of_the_projection():
         torch.testing.assert_close(torch.stack([a, b, b, c]).view(2, 2), torch.linalg.inv(J @ Sigma @ J.T))
 
 
-def test_ball_before_the_camera_by_hand():
+def test_ball_before_the_camera_by_hand(project):
     # focal 20, depth 2, scale 0.1: 1 pixel wide, variance 1 + 0.3
     projected = project(_balls([[0.2, 0.1, 2.0]]), _straight())
     torch.testing.assert_close(projected.means2d, torch.tensor([[12.0, 6.0]]).double())
@@ -80,14 +90,14 @@ def test_ball_before_the_camera_by_hand():
     torch.testing.assert_close(projected.conics, torch.stack([C[0, 0], C[0, 1], C[1, 1]])[None])
 
 
-def test_low_pass_adds_to_the_variance():
+def test_low_pass_adds_to_the_variance(project):
     point = _balls([[0.0, 0.0, 2.0]], scale=1e-9)
     torch.testing.assert_close(project(point, _straight()).conics, torch.tensor([[1 / 0.3, 0, 1 / 0.3]]).double())
     wide = project(point, _straight(), low_pass=2.0)
     torch.testing.assert_close(wide.conics, torch.tensor([[0.5, 0, 0.5]]).double())
 
 
-def test_principal_point_moves_the_picture_and_nothing_else():
+def test_principal_point_moves_the_picture_and_nothing_else(project):
     gaussians = gaussians_before(_straight(), 20, seed=3, spread=0.5)
     here = project(gaussians, _straight())
     there = project(gaussians, _straight(principal=(12.0, 4.0)))
@@ -100,7 +110,7 @@ def test_principal_point_moves_the_picture_and_nothing_else():
     # borders at x/z = -0.2 and 0.8 (cx = 4): half the field is 0.5, so the limits are -0.2 - 0.15 and 0.8 + 0.15
     [(-0.3, -0.3), (-0.34, -0.34), (-0.6, -0.35), (0.9, 0.9), (0.94, 0.94), (1.2, 0.95)],
 )
-def test_jacobian_is_clamped_around_the_principal_point(x, tangent):
+def test_jacobian_is_clamped_around_the_principal_point(project, x, tangent):
     camera = _straight(principal=(4.0, 5.0))
     projected = project(_balls([[2 * x, 0.0, 2.0]], scale=1.0), camera)
     u2 = 100 * (1 + tangent**2) + 0.3  # (focal scale / z)^2 (1 + tangent^2)
@@ -108,7 +118,7 @@ def test_jacobian_is_clamped_around_the_principal_point(x, tangent):
     torch.testing.assert_close(projected.means2d[0, 0], torch.tensor(4.0 + 20 * x).double())  # the mean is not moved
 
 
-def test_picture_that_does_not_hold_the_principal_point():
+def test_picture_that_does_not_hold_the_principal_point(project):
     # a crop far to the right of the axis: tangents from 5 to 6; a clamp at 1.3 times each border would cut it off
     camera = _straight(principal=(-100.0, 5.0))
     projected = project(_balls([[11.0, 0.0, 2.0]], scale=0.1), camera)
@@ -116,21 +126,21 @@ def test_picture_that_does_not_hold_the_principal_point():
     torch.testing.assert_close(projected.conics[0, 0], torch.tensor(1 / (1 + 5.5**2 + 0.3)).double())
 
 
-def test_culled_at_and_before_the_near_plane():
+def test_culled_at_and_before_the_near_plane(project):
     depths = [-2.0, -0.2, 0.0, 0.2, 0.2000001, 0.3]
     projected = project(_balls([[0.0, 0.0, z] for z in depths], scale=0.01), _straight())
     assert projected.index.tolist() == [4, 5]
     assert project(_balls([[0.0, 0.0, 0.3]]), _straight(), near=0.5).index.tolist() == []
 
 
-def test_culled_where_too_transparent_to_show():
+def test_culled_where_too_transparent_to_show(project):
     on_a_centre = [0.05, 0.05, 2.0]
     opacities = torch.tensor([0.9 / 255, 1 / 255, 1.1 / 255], dtype=torch.float64)
     gaussians = _balls([on_a_centre] * 3).replace(opacities=opacities)
     assert project(gaussians, _straight()).index.tolist() == [2]
 
 
-def test_culled_where_no_pixel_centre_is_touched():
+def test_culled_where_no_pixel_centre_is_touched(project):
     camera = a_camera()
     gaussians = gaussians_before(camera, 400, seed=4, spread=3.0, opacities=(0.004, 0.9))
     seen = set(project(gaussians, camera).index.tolist())
@@ -148,7 +158,7 @@ def test_culled_where_no_pixel_centre_is_touched():
     assert len(seen) < 300  # and something was culled
 
 
-def test_extents_are_where_alpha_is_one_step():
+def test_extents_are_where_alpha_is_one_step(project):
     camera = a_camera()
     projected = project(gaussians_before(camera, 20, seed=5), camera)
     for row in range(len(projected.index)):
@@ -160,7 +170,7 @@ def test_extents_are_where_alpha_is_one_step():
             assert float(projected.opacities[row]) * density == pytest.approx(1 / 255, rel=1e-9)
 
 
-def test_rows_keep_the_order_of_the_gaussians():
+def test_rows_keep_the_order_of_the_gaussians(project):
     camera = a_camera()
     index = project(gaussians_before(camera, 200, seed=6, spread=2.0), camera).index
     assert index.dtype == torch.int64
@@ -168,9 +178,9 @@ def test_rows_keep_the_order_of_the_gaussians():
     assert (index.diff() > 0).all()
 
 
-def test_needle_keeps_its_determinant_in_float32():
+def test_needle_keeps_its_determinant_in_float32(project):
     # 2e5 pixels long, half a pixel thick, at 45 degrees: var_x var_y - cov^2 would round to noise
-    quat = torch.tensor([[np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)]])
+    quat = torch.tensor([[np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)]], dtype=torch.float32)
     gaussian = Gaussians(torch.tensor([[0.0, 0, 1]]), quat, torch.tensor([[1e4, 1e-6, 1e-6]]), torch.tensor([0.5]))
     camera = _straight(dtype=torch.float32)
     u, v = project(gaussian, camera).conics[0, [0, 2]].double()
@@ -179,14 +189,14 @@ def test_needle_keeps_its_determinant_in_float32():
     assert v.item() == pytest.approx(np.linalg.inv(cov)[1, 1], rel=1e-5)
 
 
-def test_gaussians_that_are_not_finite_are_culled():
+def test_gaussians_that_are_not_finite_are_culled(project):
     broken = _balls([[float("nan"), 0, 2], [0, 0, 2], [float("inf"), 0, 2], [0, 0, float("inf")], [0, 0, 2]])
     broken.quats[1] = float("nan")
     broken.scales[1] = float("inf")
     assert project(broken, _straight()).index.tolist() == [4]
 
 
-def test_gradients_of_gaussians_that_are_not_finite_are_zero():
+def test_gradients_of_gaussians_that_are_not_finite_are_zero(project):
     broken = _balls([[0, 0, 2.0]] * 5, dtype=torch.float32)
     broken.quats[0, 2] = float("nan")
     broken.quats[1, 0] = 1e30  # its square overflows
@@ -205,20 +215,20 @@ def test_gradients_of_gaussians_that_are_not_finite_are_zero():
     assert torch.isfinite(pose.grad).all()
 
 
-def test_no_gaussians():
+def test_no_gaussians(project):
     projected = project(_balls(torch.zeros(0, 3)), _straight())
     assert [tuple(v.shape) for v in projected] == [(0, 2), (0, 3), (0,), (0,), (0, 2), (0,)]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_dtype_follows_the_gaussians(dtype):
+def test_dtype_follows_the_gaussians(project, dtype):
     gaussians = gaussians_before(a_camera(dtype=dtype), 10, seed=7)
     for camera_dtype in (torch.float32, torch.float64):
         projected = project(gaussians, a_camera(dtype=camera_dtype))
         assert {v.dtype for v in projected[:5]} == {dtype}
 
 
-def test_gradients():
+def test_gradients(project):
     camera = a_camera()
     gaussians = gaussians_before(camera, 6, seed=8, spread=0.8)
     assert len(project(gaussians, camera).index) == 6
@@ -230,7 +240,7 @@ def test_gradients():
     assert torch.autograd.gradcheck(flat, [v.requires_grad_() for v in inputs])
 
 
-def test_gradients_where_the_jacobian_is_clamped():
+def test_gradients_where_the_jacobian_is_clamped(project):
     gaussians = _balls([[-1.2, 0.3, 2.0], [2.4, 1.0, 2.0]], scale=1.0)
     camera = _straight(principal=(4.0, 5.0))
     assert len(project(gaussians, camera).index) == 2
@@ -241,7 +251,7 @@ def test_gradients_where_the_jacobian_is_clamped():
     assert torch.autograd.gradcheck(conics, (gaussians.means.clone().requires_grad_(),))
 
 
-def test_camera_pose_has_a_gradient():
+def test_camera_pose_has_a_gradient(project):
     camera = a_camera()
     gaussians = gaussians_before(camera, 6, seed=8)
     viewmat = camera.viewmat.clone().requires_grad_()
@@ -249,7 +259,7 @@ def test_camera_pose_has_a_gradient():
     assert viewmat.grad[:3].abs().min() > 0
 
 
-def test_camera_with_distortion_is_refused():
+def test_camera_with_distortion_is_refused(project):
     camera = replace(a_camera(), distortion=Distortion("brown_conrady", (0.1, 0.0, 0.0, 0.0)))
     with pytest.raises(ValueError, match=r"camera: expected a camera without distortion, got brown_conrady.*undistort"):
         project(_balls([[0.0, 0, 2]]), camera)
@@ -259,6 +269,29 @@ def test_camera_with_distortion_is_refused():
     ("options", "message"),
     [({"near": 0.0}, r"near: expected a number in \(0"), ({"low_pass": -0.1}, r"low_pass: expected a number in \[0")],
 )
-def test_options_out_of_range(options, message):
+def test_options_out_of_range(project, options, message):
     with pytest.raises(ValueError, match=message):
         project(_balls([[0.0, 0, 2]]), _straight(), **options)
+
+
+def test_unknown_engine_is_refused():
+    with pytest.raises(ValueError, match=r"engine: expected one of 'auto', .*'numba'.*, got 'opengl'"):
+        project_by(_balls([[0.0, 0, 2]]), _straight(), engine="opengl")
+
+
+def test_compiled_engine_refuses_other_dtypes():
+    half = _balls([[0.0, 0, 2]], dtype=torch.float16)
+    with pytest.raises(ValueError, match=r"gaussians: expected all in float32 or all in float64 .*, got torch.float16"):
+        project_by(half, _straight(), engine="numba")
+
+
+def test_other_dtypes_are_left_to_kornia():
+    gaussians = _balls([[0.0, 0, 2]])
+    mixed = gaussians.replace(opacities=gaussians.opacities.float())
+    torch.testing.assert_close(project_by(mixed, _straight()).means2d, project_by(gaussians, _straight()).means2d)
+
+
+def test_matrices_of_two_dtypes(project):
+    camera, gaussians = a_camera(), gaussians_before(a_camera(), 10, seed=7)
+    mixed = replace(camera, viewmat=camera.viewmat.float())
+    torch.testing.assert_close(project(gaussians, mixed).means2d, project(gaussians, camera).means2d, rtol=0, atol=1e-4)

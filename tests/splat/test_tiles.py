@@ -1,12 +1,23 @@
+from functools import partial
+
 import numpy as np
 import oracles_splat as oracle
 import pytest
 import torch
 from cases_splat import random_splats, splats_from
 
-from kfgs.splat import Projected, bin_tiles
+from kfgs.splat import Projected, available_engines
+from kfgs.splat import bin_tiles as bin_tiles_by
 
 KINDS = ["round", "needles", "huge", "subpixel", "faint"]
+
+
+@pytest.fixture(params=["reference", "numba"])
+def bin_tiles(request):
+    """The functions of torch, and what is compiled."""
+    if request.param not in available_engines():
+        pytest.skip(f"engine {request.param} is not installed")
+    return partial(bin_tiles_by, engine=request.param)
 
 
 def _splats(kind, dtype, M=150, width=70, height=45, seed=0):
@@ -53,7 +64,7 @@ def _shown(projected, width, height, tile_size):
 @pytest.mark.parametrize("tile_size", [16, 8])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_pair_that_shows_is_missing(kind, dtype, tile_size):
+def test_no_pair_that_shows_is_missing(bin_tiles, kind, dtype, tile_size):
     projected = _splats(kind, dtype)
     found = _shown(projected, 70, 45, tile_size)
     pairs = _pairs(bin_tiles(projected, 70, 45, tile_size))
@@ -62,7 +73,7 @@ def test_no_pair_that_shows_is_missing(kind, dtype, tile_size):
     assert len(found) > 50
 
 
-def test_rounding_loses_no_pair():
+def test_rounding_loses_no_pair(bin_tiles):
     """Gaussians that show at the corner pixel of the tile by one float32 rounding step, and nowhere else."""
     g = torch.Generator().manual_seed(0)
     M = 2000
@@ -84,7 +95,7 @@ def test_rounding_loses_no_pair():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_listed_pairs_reach_the_tile(kind):
+def test_listed_pairs_reach_the_tile(bin_tiles, kind):
     projected = _splats(kind, torch.float64)
     pairs = _pairs(bin_tiles(projected, 70, 45))
     for tile, g in pairs:
@@ -96,7 +107,7 @@ def test_listed_pairs_reach_the_tile(kind):
         assert smallest <= oracle.reach(float(projected.opacities[g])) + 1e-6
 
 
-def test_exact_test_drops_what_only_the_box_touches():
+def test_exact_test_drops_what_only_the_box_touches(bin_tiles):
     # a needle along the diagonal of 4 x 4 tiles: its box holds all 16, it touches the 4 on the diagonal and neighbours
     along = torch.tensor([20.0, 20.0]).double()
     covs = (along[:, None] * along + 0.3 * torch.eye(2))[None]
@@ -107,7 +118,7 @@ def test_exact_test_drops_what_only_the_box_touches():
     assert not tiles & {2, 3, 7, 8, 12, 13}
 
 
-def test_order_is_depth_then_index():
+def test_order_is_depth_then_index(bin_tiles):
     projected = _splats("round", torch.float32)
     assert projected.depths.unique().numel() < len(projected.depths)  # there are ties
     tiles = bin_tiles(projected, 70, 45)
@@ -116,7 +127,7 @@ def test_order_is_depth_then_index():
         assert rows == sorted(rows, key=lambda g: (float(projected.depths[g]), g))
 
 
-def test_tiles_are_numbered_along_image_rows():
+def test_tiles_are_numbered_along_image_rows(bin_tiles):
     one = torch.ones(3).double()
     means2d = torch.tensor([[8.0, 8.0], [40.0, 8.0], [8.0, 24.0]]).double()
     covs = torch.eye(2).double().repeat(3, 1, 1)
@@ -127,32 +138,32 @@ def test_tiles_are_numbered_along_image_rows():
     assert tiles.grid == (2, 3)
 
 
-def test_gaussians_outside_the_picture_are_in_no_tile():
+def test_gaussians_outside_the_picture_are_in_no_tile(bin_tiles):
     one = torch.ones(2).double()
     means2d = torch.tensor([[-50.0, 8.0], [8.0, 500.0]]).double()
     projected = splats_from(means2d, torch.eye(2).double().repeat(2, 1, 1), one, 0.5 * one, torch.float32)
     assert len(bin_tiles(projected, 48, 32).rows) == 0
 
 
-def test_no_gaussians():
+def test_no_gaussians(bin_tiles):
     projected = _splats("round", torch.float32, M=0)
     tiles = bin_tiles(projected, 33, 17)
     assert tiles.rows.tolist() == []
     assert tiles.offsets.tolist() == [0] * 7  # 2 x 3 tiles
 
 
-def test_one_tile_for_the_whole_picture():
+def test_one_tile_for_the_whole_picture(bin_tiles):
     tiles = bin_tiles(_splats("huge", torch.float32), 70, 45, tile_size=128)
     assert tiles.offsets.tolist() == [0, 150]
 
 
-def test_no_gradient_is_recorded():
+def test_no_gradient_is_recorded(bin_tiles):
     projected = _splats("round", torch.float32)
     projected = projected._replace(means2d=projected.means2d.requires_grad_())
     assert not bin_tiles(projected, 70, 45).rows.requires_grad
 
 
-def test_shapes_must_agree():
+def test_shapes_must_agree(bin_tiles):
     projected = _splats("round", torch.float32)._replace(depths=torch.ones(3))
     with pytest.raises(ValueError, match=r"projected.depths: expected \[M\] with M = 150 .* got \(3,\)"):
         bin_tiles(projected, 70, 45)
@@ -161,6 +172,21 @@ def test_shapes_must_agree():
 @pytest.mark.parametrize(
     ("size", "name"), [((0, 45, 16), "width"), ((70, 0, 16), "height"), ((70, 45, 0), "tile_size")]
 )
-def test_sizes_must_be_positive(size, name):
+def test_sizes_must_be_positive(bin_tiles, size, name):
     with pytest.raises(ValueError, match=rf"{name}: expected a number in \[1, inf\), got 0"):
         bin_tiles(_splats("round", torch.float32), *size)
+
+
+def test_unknown_engine_is_refused():
+    with pytest.raises(ValueError, match=r"engine: expected one of 'auto', .*'numba'.*, got 'opengl'"):
+        bin_tiles_by(_splats("round", torch.float32), 70, 45, engine="opengl")
+
+
+def test_compiled_engine_refuses_mixed_dtypes():
+    projected = _splats("round", torch.float32)
+    mixed = projected._replace(depths=projected.depths.double())
+    with pytest.raises(
+        ValueError, match=r"projected: expected all in float32 or all in float64 .*, got torch.float32,"
+    ):
+        bin_tiles_by(mixed, 70, 45, engine="numba")
+    assert torch.equal(bin_tiles_by(mixed, 70, 45).rows, bin_tiles_by(projected, 70, 45).rows)

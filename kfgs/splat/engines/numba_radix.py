@@ -50,7 +50,7 @@ def _sortable(value: Any, bits: Any) -> Any:
 
 
 @njit(**_OPTIONS)
-def _digit(key: Any, number: int, bits: Any) -> int:
+def _digit(key: Any, number: int, bits: Any) -> Any:
     """One digit of a key, the lowest first."""
     kind = bits.dtype.type
     return np.int64(kind(key >> kind(_DIGIT * number)) & kind((1 << _DIGIT) - 1))

@@ -264,7 +264,8 @@ def _enlarge(a: float, b: float, c: float, limit: float, reach: float) -> tuple[
     level = (2 * limit - reach) * (1 + _ROUNDING)
     if not (a > 0 and c > 0 and det > _FLAT * a * c and 0 < level < _HUGE):
         return 0.0, 0.0, 0.0, 0.0, 0.0
-    return a, b, det, level, -b / c * math.sqrt(c * level / det)
+    lean = -b / c * math.sqrt(c * level / det)
+    return (a, b, det, level, lean) if abs(lean) < _HUGE else (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @njit(**_OPTIONS)
