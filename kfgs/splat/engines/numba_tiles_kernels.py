@@ -68,8 +68,7 @@ def find_pairs(
         if end + _count_boxes(state, count) > pairs.shape[1]:
             pairs = _grow(pairs, end, BLOCK * tiles)
         end = _append_block(state, order, begin, count, side, columns, eps, pairs[0], pairs[1], end)
-    for p in range(end):
-        counts[max(pairs[0, p], 0)] += 1
+    _count_tiles(pairs[0], end, counts)
     return pairs[0, :end], pairs[1, :end]
 
 
@@ -88,6 +87,13 @@ def list_rows(tiles: Any, which: Any, starts: Any, rows: Any) -> None:
         at = max(starts[tile], 0)
         rows[at] = which[p]
         starts[tile] = at + 1
+
+
+@njit(**_OPTIONS)
+def _count_tiles(tiles: Any, end: int, counts: Any) -> None:
+    """Count the pairs of each tile. A function of its own: numba counts references to arrays that a loop exchanges."""
+    for p in range(end):
+        counts[max(tiles[p], 0)] += 1
 
 
 @njit(**_OPTIONS)
