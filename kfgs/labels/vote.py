@@ -66,8 +66,8 @@ def vote_labels(
                 )
             if int(labels.max()) >= classes:
                 raise ValueError(f"views: expected labels below {classes} (classes), got {int(labels.max())}")
-            projected = project(gaussians, camera)
-            tiles = bin_tiles(projected, camera.width, camera.height)
+            projected = project(gaussians, camera, engine=engine)
+            tiles = bin_tiles(projected, camera.width, camera.height, engine=engine)
             ballots = torch.nn.functional.one_hot(labels + 1, classes + 1)[..., 1:].to(votes)
             shape = projected.means2d, projected.conics, projected.opacities
             votes.index_add_(0, projected.index, accumulate_pixels(*shape, ballots, tiles, engine=engine)[0])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import NamedTuple
 
 import torch
@@ -13,8 +12,9 @@ from .._check import check_range
 from ..cameras.camera import Camera
 from ..cameras.projection import camera_to_pixel, projection_jacobian, world_to_camera
 from ..gaussians import Gaussians
+from .engines import ops
 from .engines.contract import ALPHA_MIN
-from .engines.table import choose
+from .engines.table import choose_compiled
 
 FIELD_OF_VIEW_MARGIN = 1.3
 """The projection is linearised no further out than 1.3 times the half field of view (3DGS): beyond it the linear
@@ -81,32 +81,12 @@ def project(
         camera = camera.to(gaussians.means)
     values = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
     to_camera = torch.is_grad_enabled() and (camera.viewmat.requires_grad or camera.K.requires_grad)
-    if use_compiled(engine, "gaussians", *values) and not to_camera:
-        options = camera.width, camera.height, near, low_pass
-        compiled = import_module("kfgs.splat.engines.numba_project").Project.apply
-        return Projected(*compiled(*(v.contiguous() for v in (*values, camera.viewmat, camera.K)), *options))
+    compiled = choose_compiled(engine, "project", "gaussians", *values)
+    if compiled and not to_camera:
+        tensors = (value.contiguous() for value in (*values, camera.viewmat, camera.K))
+        *seen, extents, index = ops.project(*tensors, camera.width, camera.height, near, low_pass, compiled)
+        return Projected(*seen, extents.detach(), index)
     return _project(gaussians, camera, near, low_pass)
-
-
-def use_compiled(engine: str, name: str, *tensors: Tensor) -> bool:
-    """Whether the numba engine's projection and binning are to work on these tensors.
-
-    Raises:
-        ValueError: if the engine is unknown or does not run on the device, or "numba" is named for tensors that are not
-            all of one dtype it knows; `name` says what they are.
-        ImportError: if the named engine's package is missing.
-    """
-    device = tensors[0].device.type
-    if (engine == "auto" and device != "cpu") or choose(engine, device) != "numba":
-        return False
-    kinds = {value.dtype for value in tensors}
-    known = len(kinds) == 1 and kinds <= {torch.float32, torch.float64}
-    if engine == "numba" and not known:
-        raise ValueError(
-            f"{name}: expected all in float32 or all in float64 for engine 'numba', got "
-            f"{', '.join(sorted(map(str, kinds)))}; convert them with .to(torch.float32)"
-        )
-    return known
 
 
 def _project(gaussians: Gaussians, camera: Camera, near: float, low_pass: float) -> Projected:

@@ -67,8 +67,8 @@ def rasterize(
     """
     if gaussians.features is None and gaussians.sh is None:
         raise ValueError("gaussians: expected features or sh to render, got neither; add them with gaussians.replace()")
-    projected = project(gaussians, camera, near=near)
-    tiles = bin_tiles(projected, camera.width, camera.height)
+    projected = project(gaussians, camera, near=near, engine=engine)
+    tiles = bin_tiles(projected, camera.width, camera.height, engine=engine)
     splats = projected.means2d, projected.conics, projected.opacities
     features, index = _seen(gaussians, camera, projected)
     maps, alphas = composite(*splats, features, tiles, background=background, index=index, engine=engine)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from .._check import check_range, check_shapes
+from .engines import ops
 from .engines.contract import ALPHA_MIN
-from .project import Projected, pixel_box, use_compiled
+from .engines.table import choose_compiled
+from .project import Projected, pixel_box
 
 
 class Tiles(NamedTuple):
@@ -65,9 +66,10 @@ def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16
     )
     for name, size in (("width", width), ("height", height), ("tile_size", tile_size)):
         check_range(name, size, 1, closed=(True, False))
-    if use_compiled(engine, "projected", *projected[:5]):
-        compiled = import_module("kfgs.splat.engines.numba_tiles").bin
-        rows, offsets = compiled(*(value.contiguous() for value in projected[:5]), width, height, tile_size)
+    compiled = choose_compiled(engine, "bin", "projected", *projected[:5])
+    if compiled:
+        tensors = (value.contiguous() for value in projected[:5])
+        rows, offsets = ops.bin_tiles(*tensors, width, height, tile_size, compiled)
     else:
         rows, offsets = _bin(projected, width, height, tile_size)
     return Tiles(rows, offsets, width, height, tile_size)

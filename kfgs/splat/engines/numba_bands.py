@@ -9,11 +9,24 @@ from numba import njit
 
 from . import numba_narrow as narrow
 from . import numba_wide as wide
-from .numba_simd import LANES, fma, load, load_many, spread, store, store_many, sum_many, transpose
+from .numba_simd import (
+    LANES,
+    add_dot,
+    add_scaled,
+    fma,
+    load,
+    load_many,
+    spread,
+    spread_many,
+    store,
+    store_many,
+    transpose,
+)
 from .numba_square import (
     BLOCK,
     BLOCKS,
     CHUNK,
+    INLINE,
     LEFT,
     OPTIONS,
     PIXELS,
@@ -21,6 +34,7 @@ from .numba_square import (
     STATE,
     Picture,
     View,
+    aligned,
     count_squares,
     read_block,
     square_box,
@@ -32,7 +46,13 @@ SIXTEEN = (0,) * LANES
 """A block's pixels, or as many channels."""
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
+def _whole_planes(passes: Any, channels: int) -> int:
+    """Planes that hold the channels of all passes, and of whole vectors of channels."""
+    return max(passes[2], wide.padded(channels))
+
+
+@njit(**INLINE)
 def _write_alphas(state: Any, box: tuple[int, int, int, int], alphas: Any, width: int) -> None:
     """1 - transmittance of a square's pixels."""
     left, top, right, bottom = box
@@ -69,11 +89,12 @@ def composite_narrow(
     """
     maps, alphas = images
     channels = len(maps) // len(alphas)
-    picture = Picture(maps, view.width, channels)
-    state, corners = np.empty(STATE, rows.dtype), np.empty(2 * BLOCKS, rows.dtype)
-    sums, weights = np.empty(passes[2] * PIXELS, rows.dtype), np.empty(CHUNK * LANES, rows.dtype)
+    picture, planes = Picture(maps, view.width, channels), _whole_planes(passes, channels)
+    state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
+    sums, weights = aligned(planes * PIXELS, rows), aligned(CHUNK * LANES, rows)
+    sums[:] = 0
     hits, counts = np.empty(BLOCKS * CHUNK, np.int32), np.empty(BLOCKS, np.int32)
-    block_sums = np.zeros(LANES * LANES, rows.dtype)
+    block_sums = aligned(LANES * LANES, rows)
     squares = count_squares(view)
     drawn = trace[squares * (len(view.offsets) - 1) :]
     for tile in range(view.bounds[band], view.bounds[band + 1]):
@@ -83,7 +104,7 @@ def composite_narrow(
             if box[0] >= box[2] or box[1] >= box[3]:
                 continue
             dark = start_square(state, corners, box)
-            sums[:] = 0
+            sums[: passes[2] * PIXELS] = 0
             span = start, end, start * squares + square * (end - start)
             scratch = corners, sums, weights, hits, counts
             done = narrow.composite_square((rows, length, view.order), span, state, dark, passes, scratch, drawn)
@@ -93,10 +114,9 @@ def composite_narrow(
                 p = block * LANES
                 left = load(state, LEFT + p)
                 for channel in range(0, channels, LANES):
-                    for c in range(min(LANES, passes[2] - channel)):
-                        value = fma(left, background[channel + c], load(sums, (channel + c) * PIXELS + p))
-                        store(block_sums, c * LANES, value)
-                    store_many(block_sums, 0, LANES, transpose(load_many(SIXTEEN, block_sums, 0, LANES)))
+                    total = load_many(SIXTEEN, sums, channel * PIXELS + p, PIXELS)
+                    total = add_scaled(total, left, spread_many(SIXTEEN, background, channel, 1))
+                    store_many(block_sums, 0, LANES, transpose(total))
                     write_block(picture, box, block, channel, block_sums, 0, LANES)
 
 
@@ -130,8 +150,8 @@ def composite_wide(
     maps, alphas = images
     channels = len(maps) // len(alphas)
     picture, stride = Picture(maps, view.width, channels), wide.padded(channels)
-    state, corners = np.empty(STATE, rows.dtype), np.empty(2 * BLOCKS, rows.dtype)
-    sums = np.empty(PIXELS * stride, rows.dtype)
+    state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
+    sums = aligned(PIXELS * stride, rows)
     kept = wide.make_kept(rows)
     hits, counts = np.empty(BLOCKS * CHUNK, np.int32), np.empty(BLOCKS, np.int32)
     squares = count_squares(view)
@@ -198,34 +218,40 @@ def chain_slots(view: View, owners: Any, counts: Any, heads: Any, following: Any
             heads[owner] = row
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
+def _read_pixels(values: Any, width: int, box: Any, block: int, scratch: Any) -> Any:
+    """A block's pixels of an image of one channel; 0 outside of the box."""
+    left, top = box[0] + block % BLOCK * BLOCK, box[1] + block // BLOCK * BLOCK
+    store(scratch, 0, 0)
+    for y in range(min(box[3] - top, BLOCK)):
+        for x in range(min(box[2] - left, BLOCK)):
+            scratch[y * BLOCK + x] = values[(top + y) * width + left + x]
+    return load(scratch, 0)
+
+
+@njit(**INLINE)
 def _start_backward(
-    state: Any, planes: Any, box: Any, block: int, pictures: Any, background: Any, scratch: Any
+    planes: Any, box: Any, block: int, pictures: Any, background: Any, scratch: Any, keep: bool
 ) -> None:
-    """Fill the planes BEHIND and SHARE of one block, and leave nothing in them outside of the box.
+    """Fill the planes BEHIND and SHARE of one block, and GRADS if they are to be kept; 0 outside of the box.
 
     maps = sum w f + T background and alphas = sum w = 1 - T, so a weight's slope is f . grad + SHARE with
     SHARE = grad_alpha - background . grad, and all weights times their slopes are
     maps . grad - T background . grad + alphas SHARE.
     """
-    maps, grads, alphas, grad_alphas = pictures
+    maps, grad_maps, alphas, grad_alphas = pictures
     p = block * LANES
     total, through = spread(planes, 0), spread(planes, 0)
     for channel in range(0, maps.channels, LANES):
-        read_block(grads, box, block, channel, scratch, 0, LANES)
-        read_block(maps, box, block, channel, scratch, LANES * LANES, LANES)
-        behind = load(background, channel)
-        for pixel in range(LANES):
-            grad = load(scratch, pixel * LANES)
-            place = (LANES + pixel) * LANES
-            store(scratch, place, grad * load(scratch, place))
-            store(scratch, place + LANES * LANES, grad * behind)
-        total = total + sum_many(load_many(SIXTEEN, scratch, LANES * LANES, LANES))
-        through = through + sum_many(load_many(SIXTEEN, scratch, 2 * LANES * LANES, LANES))
-    read_block(alphas, box, block, 0, scratch, 0, LANES)
-    read_block(grad_alphas, box, block, 0, scratch, LANES * LANES, LANES)
-    alpha = sum_many(load_many(SIXTEEN, scratch, 0, LANES))  # one channel: the sum is its value
-    share = sum_many(load_many(SIXTEEN, scratch, LANES * LANES, LANES)) - through
+        read_block(grad_maps, box, block, channel, scratch, 0, LANES)
+        grads = transpose(load_many(SIXTEEN, scratch, 0, LANES))
+        read_block(maps, box, block, channel, scratch, 0, LANES)
+        total = add_dot(total, grads, transpose(load_many(SIXTEEN, scratch, 0, LANES)))
+        through = add_dot(through, grads, spread_many(SIXTEEN, background, channel, 1))
+        if keep:
+            store_many(planes, narrow.GRADS + channel * PIXELS + p, PIXELS, grads)
+    alpha = _read_pixels(alphas, maps.width, box, block, scratch)
+    share = _read_pixels(grad_alphas, maps.width, box, block, scratch) - through
     store(planes, narrow.SHARE + p, share)
     store(planes, narrow.BEHIND + p, total - (1 - alpha) * through + alpha * share)
 
@@ -264,10 +290,11 @@ def differentiate_narrow(
     maps, grad_maps, alphas, grad_alphas = images
     channels, width = len(maps) // len(alphas), view.width
     grads = Picture(grad_maps, width, channels)
-    pictures = Picture(maps, width, channels), grads, Picture(alphas, width, 1), Picture(grad_alphas, width, 1)
-    state, corners = np.empty(STATE, rows.dtype), np.empty(2 * BLOCKS, rows.dtype)
-    planes = np.zeros((2 + passes[2]) * PIXELS, rows.dtype)
-    weights, scratch = np.empty(PIXELS, rows.dtype), np.empty(3 * LANES * LANES, rows.dtype)
+    pictures = Picture(maps, width, channels), grads, alphas, grad_alphas
+    state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
+    planes = aligned((2 + _whole_planes(passes, channels)) * PIXELS, rows)
+    planes[:] = 0
+    weights, scratch = aligned(PIXELS, rows), aligned(LANES * LANES, rows)
     squares = count_squares(view)
     drawn = trace[squares * (len(view.offsets) - 1) :]
     own = out[firsts[band] * length :]
@@ -280,13 +307,7 @@ def differentiate_narrow(
                 continue
             start_square(state, corners, box)
             for block in range(BLOCKS):
-                _start_backward(state, planes, box, block, pictures, background, scratch)
-                for channel in range(0, channels, LANES):
-                    read_block(grads, box, block, channel, scratch, 0, LANES)
-                    store_many(scratch, 0, LANES, transpose(load_many(SIXTEEN, scratch, 0, LANES)))
-                    for c in range(min(LANES, passes[2] - channel)):
-                        place = narrow.GRADS + (channel + c) * PIXELS + block * LANES
-                        store(planes, place, load(scratch, c * LANES))
+                _start_backward(planes, box, block, pictures, background, scratch, True)
             span = start, start + looked_at, start * squares + square * (end - start)
             packed = rows, length, view.order
             narrow.differentiate_square(packed, span, state, passes, planes, weights, drawn, slots, own)
@@ -329,10 +350,10 @@ def differentiate_wide(
     channels, width = source[2], view.width
     stride = wide.padded(channels)
     grads = Picture(grad_maps, width, channels)
-    pictures = Picture(maps, width, channels), grads, Picture(alphas, width, 1), Picture(grad_alphas, width, 1)
-    state, corners = np.empty(STATE, rows.dtype), np.empty(2 * BLOCKS, rows.dtype)
-    planes, square_grads = np.empty(2 * PIXELS, rows.dtype), np.empty(PIXELS * stride, rows.dtype)
-    scratch, slopes = np.empty(3 * LANES * LANES, rows.dtype), np.empty((CHUNK + 3) * LANES, rows.dtype)
+    pictures = Picture(maps, width, channels), grads, alphas, grad_alphas
+    state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
+    planes, square_grads = aligned(2 * PIXELS, rows), aligned(PIXELS * stride, rows)
+    scratch, slopes = aligned(LANES * LANES, rows), aligned((CHUNK + 3) * LANES, rows)
     kept = wide.make_kept(rows)
     hits, counts = np.empty(BLOCKS * CHUNK, np.int32), np.empty(BLOCKS, np.int32)
     squares = count_squares(view)
@@ -348,7 +369,7 @@ def differentiate_wide(
             start_square(state, corners, box)
             for block in range(BLOCKS):
                 if geometry:
-                    _start_backward(state, planes, box, block, pictures, background, scratch)
+                    _start_backward(planes, box, block, pictures, background, scratch, False)
                 for channel in range(0, channels, LANES):
                     read_block(grads, box, block, channel, square_grads, block * LANES * stride + channel, stride)
             span = start, start + looked_at, start * squares + square * (end - start)
@@ -387,9 +408,10 @@ def accumulate_band(
     """
     width = wide.padded(channels + 1)
     picture = Picture(pixels, view.width, channels)
-    state, corners = np.empty(STATE, rows.dtype), np.empty(2 * BLOCKS, rows.dtype)
-    planes, weights = np.zeros(width * PIXELS, rows.dtype), np.empty(PIXELS, rows.dtype)
-    scratch = np.empty(LANES * LANES, rows.dtype)
+    state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
+    planes, weights = aligned(width * PIXELS, rows), aligned(PIXELS, rows)
+    planes[:] = 0
+    scratch = aligned(LANES * LANES, rows)
     own = out[firsts[band] * width :]
     for tile in range(view.bounds[band], view.bounds[band + 1]):
         start, end = view.offsets[tile], view.offsets[tile + 1]
@@ -401,12 +423,22 @@ def accumulate_band(
             for block in range(BLOCKS):
                 for channel in range(0, channels, LANES):
                     read_block(picture, box, block, channel, scratch, 0, LANES)
-                    store_many(scratch, 0, LANES, transpose(load_many(SIXTEEN, scratch, 0, LANES)))
-                    for c in range(LANES):
-                        store(planes, (channel + c) * PIXELS + block * LANES, load(scratch, c * LANES))
+                    values = transpose(load_many(SIXTEEN, scratch, 0, LANES))
+                    store_many(planes, channel * PIXELS + block * LANES, PIXELS, values)
             planes[channels * PIXELS : (channels + 1) * PIXELS] = 1
             packed = rows, length, view.order
             narrow.accumulate_square(packed, (start, end), state, dark, corners, planes, weights, slots, width, own)
+
+
+@njit(**INLINE)
+def _sum_chain(row: int, following: Any, out: Any, width: int, total: Any) -> None:
+    """Total = sum of the rows of one Gaussian; zeros if it has none."""
+    for i in range(0, width, LANES):
+        store(total, i, 0)
+    while row >= 0:
+        for i in range(0, width, LANES):
+            store(total, i, load(total, i) + load(out, row * width + i))
+        row = following[row]
 
 
 @njit(cache=True, **OPTIONS)
@@ -432,15 +464,10 @@ def gather_gradients(
     width, column = layout
     means, conics, opacities, features = grads
     count, channels = len(heads), features.shape[1]
-    total = np.zeros(column + channels, out.dtype)
+    total = aligned(width, out)
     half = out.dtype.type(0.5)
     for m in range(count * band // bands, count * (band + 1) // bands):
-        total[:] = 0
-        row = heads[m]
-        while row >= 0:
-            for i in range(column + channels):
-                total[i] += out[row * width + i]
-            row = following[row]
+        _sum_chain(heads[m], following, out, width, total)
         a, b, c = all_conics[m, 0], all_conics[m, 1], all_conics[m, 2]
         means[m, 0], means[m, 1] = a * total[1] + b * total[2], b * total[1] + c * total[2]
         conics[m, 0], conics[m, 1], conics[m, 2] = -half * total[3], -total[4], -half * total[5]
@@ -455,12 +482,9 @@ def gather_sums(band: int, bands: int, chains: Any, out: Any, width: int, sums: 
     """Sum the rows of one share of the Gaussians over all bands: sums [M, D] and weights [M], written."""
     heads, following = chains
     count, channels = len(heads), sums.shape[1]
+    total = aligned(width, out)
     for m in range(count * band // bands, count * (band + 1) // bands):
-        sums[m] = 0
-        weights[m] = 0
-        row = heads[m]
-        while row >= 0:
-            for i in range(channels):
-                sums[m, i] += out[row * width + i]
-            weights[m] += out[row * width + channels]
-            row = following[row]
+        _sum_chain(heads[m], following, out, width, total)
+        for i in range(channels):
+            sums[m, i] = total[i]
+        weights[m] = total[channels]

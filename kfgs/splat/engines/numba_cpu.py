@@ -14,12 +14,14 @@ from torch import Tensor
 
 from . import numba_bands as kernels
 from .numba_narrow import FIRST, MOMENTS, plan_passes
+from .numba_project import project, project_backward
 from .numba_simd import LANES
 from .numba_square import View, count_squares, pack_rows, row_length
 from .numba_threads import run_bands
+from .numba_tiles import bin
 from .numba_wide import padded
 
-__all__ = ["accumulate", "backward", "devices", "forward"]
+__all__ = ["accumulate", "backward", "bin", "devices", "forward", "project", "project_backward"]
 
 BANDS = 32
 """Shares of the work: more of them keep more threads busy, and let more gradient rows meet at their borders."""
@@ -56,7 +58,7 @@ def forward(
     packed = _pack(means2d, conics, opacities, features if channels <= NARROW else features[:, :0], index)
     if channels <= NARROW:
         passes = plan_passes(channels)
-        behind = _padded(background, passes[2])
+        behind = _padded(background, padded(channels))
         run_bands(kernels.composite_narrow, BANDS, view, *packed, passes, behind, images, drawn)
     else:
         behind, begins = _padded(background, padded(channels)), _begins(index, len(means2d), channels)
@@ -92,12 +94,12 @@ def backward(
     behind, drawn = _padded(background, padded(channels)), _flat(trace)
     if channels <= NARROW:
         length, column = packed[1], MOMENTS
-        out = np.zeros(total * length, images[0].dtype)
+        out = torch.zeros(total * length, dtype=means2d.dtype).numpy()
         shared = (view, *packed, plan_passes(channels), behind, images, drawn, slots, firsts, out)
         run_bands(kernels.differentiate_narrow, BANDS, *shared)
     else:
         length, column = LANES + padded(channels), LANES
-        out = np.zeros(total * length, images[0].dtype)
+        out = torch.zeros(total * length, dtype=means2d.dtype).numpy()
         source = _flat(features), _begins(index, len(means2d), channels), channels
         shared = (view, *packed, source, behind, images, drawn, slots, firsts, out, any(wanted[:3]))
         run_bands(kernels.differentiate_wide, BANDS, *shared)
@@ -132,7 +134,7 @@ def accumulate(
     slots, firsts, total, chains = _number(view, len(means2d))
     packed = _pack(means2d, conics, opacities, pixels.new_empty(len(means2d), 0), None)
     length = padded(channels + 1)
-    out = np.zeros(total * length, packed[0].dtype)
+    out = torch.zeros(total * length, dtype=pixels.dtype).numpy()
     run_bands(kernels.accumulate_band, BANDS, view, *packed, _flat(pixels), channels, slots, firsts, out)
     sums, weights = pixels.new_empty(len(means2d), channels), pixels.new_empty(len(means2d))
     run_bands(kernels.gather_sums, BANDS, BANDS, chains, out, length, sums.numpy(), weights.numpy())

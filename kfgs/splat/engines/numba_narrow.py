@@ -39,9 +39,9 @@ from .numba_square import (
     BLOCKS,
     CHUNK,
     FEATURES,
+    INLINE,
     LEFT,
     LIGHT,
-    OPTIONS,
     PIXELS,
     X,
     Y,
@@ -70,7 +70,7 @@ def plan_passes(channels: int) -> tuple[tuple[int, ...], tuple[int, ...], int]:
     return FIRST, (0,) if rest else (), len(FIRST) + rest
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def composite_square(
     packed: Any, span: tuple[int, int, int], state: Any, dark: Any, passes: Any, scratch: Any, trace: Any
 ) -> int:
@@ -99,7 +99,7 @@ def composite_square(
     return position
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def _composite_block(packed: Any, state: Any, block: int, passes: Any, scratch: Any, trace: Any, into: int) -> bool:
     """Composite the listed Gaussians into one block; returns whether some pixel has not stopped."""
     rows, length, order = packed
@@ -132,7 +132,7 @@ def _composite_block(packed: Any, state: Any, block: int, passes: Any, scratch: 
     return any_of(light >= TRANSMITTANCE_MIN)
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def _add_group(
     packed: Any, column: int, hits: Any, listed: int, count: int, weights: Any, sums: Any, into: int
 ) -> None:
@@ -145,7 +145,7 @@ def _add_group(
     store_many(sums, into, PIXELS, total)
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def differentiate_square(
     packed: Any,
     span: tuple[int, int, int],
@@ -222,7 +222,7 @@ def differentiate_square(
                 store(out, place, load(out, place) + sums)
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def _sum_group(weights: Any, planes: Any, start: int, touched: Any) -> Any:
     """Weights times LANES planes, summed over the pixels of the touched blocks."""
     total = zero_many(GROUP, planes)
@@ -233,7 +233,7 @@ def _sum_group(weights: Any, planes: Any, start: int, touched: Any) -> Any:
     return sum_many(total)
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def accumulate_square(
     packed: Any,
     span: tuple[int, int],

@@ -7,12 +7,9 @@ own rows, and each Gaussian's numbers depend on no other's, so results are equal
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from .numba_project_backward import differentiate_band
 from .numba_project_forward import project_band
@@ -107,28 +104,6 @@ def project_backward(
     given = _flat(grad_means2d, grad_conics, grad_depths, grad_opacities)
     run_bands(differentiate_band, bands, bands, lens, _flat(means, quats, scales), _array(index), given, _flat(*grads))
     return grads
-
-
-class Project(torch.autograd.Function):
-    """`project` and `project_backward` joined; there are no gradients of gradients, nor any in the camera."""
-
-    @staticmethod
-    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """The arguments and results are those of `project`."""
-        outputs = project(*inputs)
-        extents, index = outputs[4:]
-        ctx.mark_non_differentiable(extents, index)
-        ctx.save_for_backward(*inputs[:6], index)
-        ctx.options = inputs[6:]
-        return outputs
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        """One gradient for each argument of `project`."""
-        *inputs, index = ctx.saved_tensors
-        arguments: list[Any] = [*(grad.contiguous() for grad in grads[:4]), *inputs, *ctx.options, index]
-        return *project_backward(*arguments), *[None] * 6
 
 
 def _bands(count: int) -> int:

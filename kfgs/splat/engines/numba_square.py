@@ -49,7 +49,7 @@ BLOCK = 4
 BLOCKS = PIXELS // LANES
 ALL_BLOCKS = np.uint32((1 << BLOCKS) - 1)
 
-CHUNK = 128
+CHUNK = 64
 """Gaussians of a square listed at once."""
 
 AHEAD = 8
@@ -72,6 +72,15 @@ _LOG2_E = math.log2(math.e)
 SOURCES = crc32(b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))))
 """Numba's cache on disk notices a change in a kernel's own file alone. Kernels that call into other files take this
 number as a default argument, whose value numba counts as part of the signature."""
+
+
+@njit(**INLINE)
+def aligned(count: int, like: Any) -> Any:
+    """Room for `count` numbers of the array's type that begins on a cache line: vectors that straddle two cost double."""
+    size = like.itemsize
+    room = np.empty(count + 64 // size, like.dtype)
+    skip = -(room.ctypes.data // size) % (64 // size)
+    return room[skip : skip + count]
 
 
 def row_length(channels: int) -> int:
@@ -121,13 +130,13 @@ class View(NamedTuple):
     tile_size: int
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def count_squares(view: View) -> int:
     """Squares per tile."""
     return ((view.tile_size + SIDE - 1) // SIDE) ** 2
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def square_box(view: View, tile: int, square: int) -> tuple[int, int, int, int]:
     """Left, top, right and bottom pixel of a square of a tile, cut off at the tile's and the image's border."""
     columns = (view.width + view.tile_size - 1) // view.tile_size
@@ -139,7 +148,7 @@ def square_box(view: View, tile: int, square: int) -> tuple[int, int, int, int]:
     return left, top, right, bottom
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def start_square(state: Any, corners: Any, box: tuple[int, int, int, int]) -> Any:
     """Place the pixel centres, with no light outside of the box; returns the bits of the blocks without any pixel."""
     left, top, right, bottom = box
@@ -200,7 +209,7 @@ def weigh_pixels(rows: Any, at: int, x: Any, y: Any) -> tuple[Any, Any, Any, Any
     return dx, dy, full, select(power >= LOG2_ALPHA_MIN, minimum(full, ALPHA_MAX), 0)
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def list_hits(
     rows: Any,
     length: int,
@@ -248,7 +257,7 @@ class Picture(NamedTuple):
     channels: int
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def read_block(picture: Picture, box: Any, block: int, channel: int, into: Any, place: int, stride: int) -> None:
     """Copy LANES channels of a block's pixels; 0 outside of the box and beyond the last channel.
 
@@ -263,24 +272,31 @@ def read_block(picture: Picture, box: Any, block: int, channel: int, into: Any, 
     """
     values, width, channels = picture
     lanes = lanes_below(values, channels - channel)
-    for pixel in range(LANES):
-        x = box[0] + block % BLOCK * BLOCK + pixel % BLOCK
-        y = box[1] + block // BLOCK * BLOCK + pixel // BLOCK
-        if x < box[2] and y < box[3]:
-            vector = load_part(values, (y * width + x) * channels + channel, lanes)
-            store(into, place + pixel * stride, vector)
-        else:
-            store(into, place + pixel * stride, 0)
+    left, top = box[0] + block % BLOCK * BLOCK, box[1] + block // BLOCK * BLOCK
+    columns, rows = min(box[2] - left, BLOCK), min(box[3] - top, BLOCK)
+    if columns == BLOCK and rows == BLOCK:
+        for y in range(BLOCK):
+            at = ((top + y) * width + left) * channels + channel
+            for x in range(BLOCK):
+                store(into, place + (y * BLOCK + x) * stride, load_part(values, at + x * channels, lanes))
+        return
+    for y in range(BLOCK):
+        for x in range(BLOCK):
+            if x < columns and y < rows:
+                at = ((top + y) * width + left + x) * channels + channel
+                store(into, place + (y * BLOCK + x) * stride, load_part(values, at, lanes))
+            else:
+                store(into, place + (y * BLOCK + x) * stride, 0)
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def write_block(picture: Picture, box: Any, block: int, channel: int, source: Any, place: int, stride: int) -> None:
     """The inverse of `read_block`: nothing is written outside of the box and beyond the last channel."""
     values, width, channels = picture
     lanes = lanes_below(values, channels - channel)
-    for pixel in range(LANES):
-        x = box[0] + block % BLOCK * BLOCK + pixel % BLOCK
-        y = box[1] + block // BLOCK * BLOCK + pixel // BLOCK
-        if x < box[2] and y < box[3]:
-            vector = load(source, place + pixel * stride)
-            store_part(values, (y * width + x) * channels + channel, lanes, vector)
+    left, top = box[0] + block % BLOCK * BLOCK, box[1] + block // BLOCK * BLOCK
+    for y in range(min(box[3] - top, BLOCK)):
+        at = ((top + y) * width + left) * channels + channel
+        for x in range(min(box[2] - left, BLOCK)):
+            vector = load(source, place + (y * BLOCK + x) * stride)
+            store_part(values, at + x * channels, lanes, vector)

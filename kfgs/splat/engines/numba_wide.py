@@ -39,12 +39,13 @@ from .numba_square import (
     ALL_BLOCKS,
     BLOCKS,
     CHUNK,
+    INLINE,
     LEFT,
     LIGHT,
-    OPTIONS,
     PIXELS,
     X,
     Y,
+    aligned,
     list_hits,
     weigh_pixels,
 )
@@ -54,21 +55,21 @@ STEP = 4 * LANES
 """Channels of one piece."""
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def padded(channels: int) -> int:
     """Numbers in a row of whole vectors."""
     return -(-channels // LANES) * LANES
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def make_kept(like: Any) -> tuple[Any, Any, Any, Any]:
     """Room for what `weigh_block` keeps; three more, because products take four Gaussians at a time."""
-    numbers = np.empty(2 * (CHUNK + 3) * LANES, like.dtype)
+    numbers = aligned(2 * (CHUNK + 3) * LANES, like)
     places = np.empty(2 * CHUNK, np.int64)
     return numbers[: (CHUNK + 3) * LANES], numbers[(CHUNK + 3) * LANES :], places[:CHUNK], places[CHUNK:]
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def weigh_block(
     packed: Any, block: int, state: Any, hits: Any, count: int, sources: Any, kept: Any
 ) -> tuple[int, bool]:
@@ -112,7 +113,7 @@ def weigh_block(
     return drawn_count, any_of(light >= TRANSMITTANCE_MIN)
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def add_colors(
     sums: Any, into: int, stride: int, weights: Any, features: Any, begins: Any, count: int, channels: int
 ) -> None:
@@ -146,7 +147,7 @@ def add_colors(
             store_many(sums, row + channel, stride, column)
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def load_tile(values: Any, start: int, stride: int) -> Any:
     """4 rows of 4 vectors."""
     a, b = load_many(FOUR, values, start, LANES), load_many(FOUR, values, start + stride, LANES)
@@ -154,7 +155,7 @@ def load_tile(values: Any, start: int, stride: int) -> Any:
     return a + b + c + d
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def store_tile(values: Any, start: int, stride: int, tile: Any) -> None:
     """The inverse of `load_tile`."""
     store_many(values, start, LANES, tile[0:4])
@@ -163,7 +164,7 @@ def store_tile(values: Any, start: int, stride: int, tile: Any) -> None:
     store_many(values, start + 3 * stride, LANES, tile[12:16])
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def composite_square(
     packed: Any, span: tuple[int, int, int], state: Any, dark: Any, wide: Any, scratch: Any, trace: Any
 ) -> int:
@@ -197,7 +198,7 @@ def composite_square(
     return position
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def differentiate_square(
     packed: Any,
     span: tuple[int, int, int],
@@ -244,7 +245,7 @@ def differentiate_square(
             add_features(out, LANES + stride, slots, kept, grads, corner, stride, count)
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def list_traced(first: int, stop: int, into: int, hits: Any, counts: Any, trace: Any) -> None:
     """List again, for each block, the Gaussians that the forward pass found to touch it."""
     counts[:] = 0
@@ -258,7 +259,7 @@ def list_traced(first: int, stop: int, into: int, hits: Any, counts: Any, trace:
             put(counts, block, number + 1)
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def multiply_features(
     slopes: Any, features: Any, begins: Any, grads: Any, corner: int, stride: int, count: int, channels: int
 ) -> None:
@@ -278,7 +279,7 @@ def multiply_features(
         store_many(slopes, k * LANES, LANES, regroup((a, b, c, d)))
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def _multiply_quad(features: Any, four: Any, grads: Any, row: int, stride: int, channels: int) -> Any:
     """Products of four Gaussians (quarters of the vector) with four pixels (places in a quarter)."""
     f0, f1, f2, f3 = four
@@ -299,7 +300,7 @@ def _multiply_quad(features: Any, four: Any, grads: Any, row: int, stride: int, 
     return sum_many(total)
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def add_moments(
     packed: Any,
     block: int,
@@ -333,7 +334,7 @@ def add_moments(
     store(planes, p, behind)
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def add_features(out: Any, width: int, slots: Any, kept: Any, grads: Any, corner: int, stride: int, count: int) -> None:
     """out[k, c] += weights[k, pixel] grads[pixel, c], summed over a block's 16 pixels, 4 Gaussians at a time."""
     weights, _, places, _ = kept
@@ -366,7 +367,7 @@ def add_features(out: Any, width: int, slots: Any, kept: Any, grads: Any, corner
             _add_vectors(out, r3 + channel, column[3:4])
 
 
-@njit(**OPTIONS)
+@njit(**INLINE)
 def _add_vectors(out: Any, place: int, vectors: Any) -> None:
     """Add neighbouring vectors to what is there."""
     store_many(out, place, LANES, add_scaled(vectors, spread(out, 1), load_many(vectors, out, place, LANES)))

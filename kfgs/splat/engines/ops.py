@@ -119,16 +119,30 @@ def _(
     grad_maps: Tensor,
     grad_alphas: Tensor,
     wanted: list[bool],
-    *inputs: Any,  # noqa: ARG001
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    background: Tensor,
+    index: Tensor | None,
+    rows: Tensor,
+    offsets: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+    maps: Tensor,
+    alphas: Tensor,
+    trace: Tensor,
+    engine: str,
 ) -> list[Tensor]:
-    return [torch.empty_like(v) if want else v.new_empty(0) for v, want in zip(inputs[:5], wanted, strict=True)]
+    inputs = means2d, conics, opacities, features, background
+    return [torch.empty_like(v) if want else v.new_empty(0) for v, want in zip(inputs, wanted, strict=True)]
 
 
 def _save_composite(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor, Tensor]) -> None:
     *tensors, width, height, tile_size, engine = inputs
     ctx.save_for_backward(*tensors, *output)
     ctx.size, ctx.engine = (width, height, tile_size), engine
-    ctx.set_materialize_grads(True)
 
 
 def _differentiate_composite(ctx: Any, grad_maps: Tensor, grad_alphas: Tensor, _: Tensor) -> tuple[Any, ...]:
@@ -141,3 +155,135 @@ def _differentiate_composite(ctx: Any, grad_maps: Tensor, grad_alphas: Tensor, _
 
 
 composite.register_autograd(_differentiate_composite, setup_context=_save_composite)
+
+
+@custom_op("kfgs::project", mutates_args=())
+def project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    near: float,
+    low_pass: float,
+    engine: str,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """The six tensors of `kfgs.splat.Projected`."""
+    return load(engine).project(means, quats, scales, opacities, viewmat, K, width, height, near, low_pass)
+
+
+@project.register_fake
+def _(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    near: float,
+    low_pass: float,
+    engine: str,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    M = torch.library.get_ctx().new_dynamic_size()
+    means2d, conics, depths, seen, extents = (means.new_empty(shape) for shape in ((M, 2), (M, 3), (M,), (M,), (M, 2)))
+    return means2d, conics, depths, seen, extents, means.new_empty(M, dtype=torch.int64)
+
+
+@custom_op("kfgs::project_backward", mutates_args=())
+def project_backward(
+    grad_means2d: Tensor,
+    grad_conics: Tensor,
+    grad_depths: Tensor,
+    grad_opacities: Tensor,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    near: float,
+    low_pass: float,
+    index: Tensor,
+    engine: str,
+) -> list[Tensor]:
+    """Gradients of means, quats, scales and opacities."""
+    grads = grad_means2d, grad_conics, grad_depths, grad_opacities
+    gaussians = means, quats, scales, opacities
+    options = viewmat, K, width, height, near, low_pass, index
+    return load(engine).project_backward(*grads, *gaussians, *options)
+
+
+@project_backward.register_fake
+def _(
+    grad_means2d: Tensor,
+    grad_conics: Tensor,
+    grad_depths: Tensor,
+    grad_opacities: Tensor,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    near: float,
+    low_pass: float,
+    index: Tensor,
+    engine: str,
+) -> list[Tensor]:
+    return [torch.empty_like(value) for value in (means, quats, scales, opacities)]
+
+
+def _save_project(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+    *ctx.options, ctx.engine = inputs[6:]
+    ctx.save_for_backward(*inputs[:6], output[5])
+
+
+def _differentiate_project(ctx: Any, *grads: Tensor) -> tuple[Any, ...]:
+    *inputs, index = ctx.saved_tensors
+    given = (grad.contiguous() for grad in grads[:4])
+    return *project_backward(*given, *inputs, *ctx.options, index, ctx.engine), *[None] * 7
+
+
+project.register_autograd(_differentiate_project, setup_context=_save_project)
+
+
+@custom_op("kfgs::bin_tiles", mutates_args=())
+def bin_tiles(
+    means2d: Tensor,
+    conics: Tensor,
+    depths: Tensor,
+    opacities: Tensor,
+    extents: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+    engine: str,
+) -> tuple[Tensor, Tensor]:
+    """Rows and offsets of `kfgs.splat.Tiles`."""
+    return load(engine).bin(means2d, conics, depths, opacities, extents, width, height, tile_size)
+
+
+@bin_tiles.register_fake
+def _(
+    means2d: Tensor,
+    conics: Tensor,
+    depths: Tensor,
+    opacities: Tensor,
+    extents: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+    engine: str,
+) -> tuple[Tensor, Tensor]:
+    pairs = torch.library.get_ctx().new_dynamic_size()
+    tiles = -(-width // tile_size) * -(-height // tile_size)
+    return means2d.new_empty(pairs, dtype=torch.int32), means2d.new_empty(tiles + 1, dtype=torch.int64)

@@ -8,6 +8,9 @@ from importlib.util import find_spec
 from types import ModuleType
 from typing import NamedTuple
 
+import torch
+from torch import Tensor
+
 from ..._check import check_choice
 
 
@@ -70,6 +73,33 @@ def choose(engine: str, device: str) -> str:
             "use engine='auto'"
         )
     return engine
+
+
+def choose_compiled(engine: str, function: str, name: str, *tensors: Tensor) -> str | None:
+    """The engine whose own projection or binning is to work on these tensors; None: kornia's and torch's functions do.
+
+    Args:
+        engine: a name, or "auto".
+        function: what the engine should offer besides compositing, "project" or "bin".
+        name: what a message calls the tensors.
+        tensors: what it works on.
+
+    Raises:
+        ValueError: if the engine is unknown or does not run on the device, or it is named for tensors that are not
+            all of one dtype it knows.
+        ImportError: if the named engine's package is missing.
+    """
+    chosen = choose(engine, tensors[0].device.type)
+    if not hasattr(load(chosen), function):
+        return None
+    kinds = {value.dtype for value in tensors}
+    known = len(kinds) == 1 and kinds <= {torch.float32, torch.float64}
+    if engine != "auto" and not known:
+        raise ValueError(
+            f"{name}: expected all in float32 or all in float64 for engine {engine!r}, got "
+            f"{', '.join(sorted(map(str, kinds)))}; convert them with .to(torch.float32)"
+        )
+    return chosen if known else None
 
 
 def _runs(name: str, device: str) -> bool:
