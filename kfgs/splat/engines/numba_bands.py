@@ -13,13 +13,18 @@ from .numba_simd import (
     LANES,
     add_dot,
     add_scaled,
+    fetch,
     fma,
+    lanes_below,
     load,
     load_many,
+    load_part,
+    put,
     spread,
     spread_many,
     store,
     store_many,
+    store_part,
     transpose,
 )
 from .numba_square import (
@@ -443,7 +448,7 @@ def _sum_chain(row: int, following: Any, out: Any, width: int, total: Any) -> No
 
 @njit(cache=True, **OPTIONS)
 def gather_gradients(
-    band: int, bands: int, splats: Any, chains: Any, out: Any, layout: tuple[int, int], index: Any, grads: Any
+    band: int, bands: int, splats: Any, chains: Any, out: Any, layout: tuple[int, int, int], index: Any, grads: Any
 ) -> None:
     """Sum the rows of one share of the Gaussians over all bands, and turn moments into gradients.
 
@@ -451,30 +456,36 @@ def gather_gradients(
 
     Args:
         band: which share.
-        bands: how many shares.
-        splats: conics [M, 3] and opacities [M].
+        bands: how many shares; one if two Gaussians may show the same row of features.
+        splats: conics [M * 3] and opacities [M].
         chains: heads and following, from `chain_slots`.
         out: gradient rows.
-        layout: length of a gradient row, and the column where the features begin.
+        layout: length of a gradient row, the column where the features begin, and D.
         index: [M], the features' row of each Gaussian; empty if row m belongs to Gaussian m.
-        grads: of means2d [M, 2], conics [M, 3], opacities [M], written; of features [N, D], added to.
+        grads: of means2d [M * 2], conics [M * 3] and opacities [M], written; of features [N * D], added to.
     """
-    all_conics, all_opacities = splats
+    conics, opacities = splats
     heads, following = chains
-    width, column = layout
-    means, conics, opacities, features = grads
-    count, channels = len(heads), features.shape[1]
+    width, column, channels = layout
+    of_means, of_conics, of_opacities, of_features = grads
+    count = len(heads)
     total = aligned(width, out)
     half = out.dtype.type(0.5)
     for m in range(count * band // bands, count * (band + 1) // bands):
         _sum_chain(heads[m], following, out, width, total)
-        a, b, c = all_conics[m, 0], all_conics[m, 1], all_conics[m, 2]
-        means[m, 0], means[m, 1] = a * total[1] + b * total[2], b * total[1] + c * total[2]
-        conics[m, 0], conics[m, 1], conics[m, 2] = -half * total[3], -total[4], -half * total[5]
-        opacities[m] = total[0] / all_opacities[m] if total[0] != 0 else total[0]
-        into = index[m] if len(index) else m
-        for i in range(channels):
-            features[into, i] += total[column + i]
+        a, b, c = fetch(conics, 3 * m), fetch(conics, 3 * m + 1), fetch(conics, 3 * m + 2)
+        v, v_x, v_y = fetch(total, 0), fetch(total, 1), fetch(total, 2)
+        put(of_means, 2 * m, a * v_x + b * v_y)
+        put(of_means, 2 * m + 1, b * v_x + c * v_y)
+        put(of_conics, 3 * m, -half * fetch(total, 3))
+        put(of_conics, 3 * m + 1, -fetch(total, 4))
+        put(of_conics, 3 * m + 2, -half * fetch(total, 5))
+        put(of_opacities, m, v / fetch(opacities, m) if v != 0 else v)
+        into = (fetch(index, m) if len(index) else m) * channels
+        for i in range(0, channels, LANES):
+            lanes = lanes_below(out, channels - i)
+            value = load_part(total, column + i, lanes)
+            store_part(of_features, into + i, lanes, load_part(of_features, into + i, lanes) + value)
 
 
 @njit(cache=True, **OPTIONS)

@@ -52,17 +52,18 @@ def forward(
     channels = features.shape[1]
     view = _view(rows, offsets, width, height, tile_size)
     maps, alphas = features.new_empty(height, width, channels), features.new_empty(height, width)
-    squares = count_squares(view)
-    trace = torch.zeros(squares * (len(view.offsets) - 1 + len(view.order)), dtype=torch.int32)
-    images, drawn = (_flat(maps), _flat(alphas)), _flat(trace)
-    packed = _pack(means2d, conics, opacities, features if channels <= NARROW else features[:, :0], index)
+    trace, packed, ends = _make_trace(view, means2d, channels)
+    ends[: count_squares(view) * (len(view.offsets) - 1)] = 0
+    splats = _flat(means2d), _flat(conics), _flat(opacities)
+    run_bands(pack_rows, BANDS, BANDS, splats, _flat(features), _packed(channels), _index(index), packed)
+    images, length = (_flat(maps), _flat(alphas)), row_length(_packed(channels))
+    behind = _padded(background, padded(channels))
     if channels <= NARROW:
         passes = plan_passes(channels)
-        behind = _padded(background, padded(channels))
-        run_bands(kernels.composite_narrow, BANDS, view, *packed, passes, behind, images, drawn)
+        run_bands(kernels.composite_narrow, BANDS, view, packed, length, passes, behind, images, ends)
     else:
-        behind, begins = _padded(background, padded(channels)), _begins(index, len(means2d), channels)
-        run_bands(kernels.composite_wide, BANDS, view, *packed, _flat(features), begins, behind, images, drawn)
+        shared = (view, packed, length, _flat(features), _begins(index, len(means2d), channels), behind, images, ends)
+        run_bands(kernels.composite_wide, BANDS, *shared)
     return maps, alphas, trace
 
 
@@ -90,18 +91,18 @@ def backward(
     view = _view(rows, offsets, width, height, tile_size)
     images = tuple(_flat(value) for value in (maps, grad_maps, alphas, grad_alphas))
     slots, firsts, total, chains = _number(view, len(means2d))
-    packed = _pack(means2d, conics, opacities, features if channels <= NARROW else features[:, :0], index)
-    behind, drawn = _padded(background, padded(channels)), _flat(trace)
+    packed, ends = _read_trace(trace, view, means2d, channels)
+    length, behind = row_length(_packed(channels)), _padded(background, padded(channels))
     if channels <= NARROW:
-        length, column = packed[1], MOMENTS
-        out = torch.zeros(total * length, dtype=means2d.dtype).numpy()
-        shared = (view, *packed, plan_passes(channels), behind, images, drawn, slots, firsts, out)
+        width, column = length, MOMENTS
+        out = torch.zeros(total * width, dtype=means2d.dtype).numpy()
+        shared = (view, packed, length, plan_passes(channels), behind, images, ends, slots, firsts, out)
         run_bands(kernels.differentiate_narrow, BANDS, *shared)
     else:
-        length, column = LANES + padded(channels), LANES
-        out = torch.zeros(total * length, dtype=means2d.dtype).numpy()
+        width, column = LANES + padded(channels), LANES
+        out = torch.zeros(total * width, dtype=means2d.dtype).numpy()
         source = _flat(features), _begins(index, len(means2d), channels), channels
-        shared = (view, *packed, source, behind, images, drawn, slots, firsts, out, any(wanted[:3]))
+        shared = (view, packed, length, source, behind, images, ends, slots, firsts, out, any(wanted[:3]))
         run_bands(kernels.differentiate_wide, BANDS, *shared)
     grads = [
         torch.empty_like(means2d),
@@ -109,10 +110,10 @@ def backward(
         torch.empty_like(opacities),
         torch.zeros_like(features),
     ]
-    targets, which = tuple(value.numpy() for value in grads), _index(index)
-    splats = conics.numpy(), opacities.numpy()
+    which, layout = _index(index), (width, column, channels)
     shares = BANDS if _increasing(which) else 1  # two Gaussians that show the same row must not meet
-    run_bands(kernels.gather_gradients, shares, shares, splats, chains, out, (length, column), which, targets)
+    splats, targets = (_flat(conics), _flat(opacities)), tuple(_flat(value) for value in grads)
+    run_bands(kernels.gather_gradients, shares, shares, splats, chains, out, layout, which, targets)
     grads.append((grad_maps * (1 - alphas)[..., None]).sum((0, 1)) if wanted[4] else background)
     return [value if want else value.new_empty(0) for value, want in zip(grads, wanted, strict=True)]
 
@@ -132,10 +133,13 @@ def accumulate(
     channels = pixels.shape[2]
     view = _view(rows, offsets, width, height, tile_size)
     slots, firsts, total, chains = _number(view, len(means2d))
-    packed = _pack(means2d, conics, opacities, pixels.new_empty(len(means2d), 0), None)
+    packed = torch.empty(len(means2d) * row_length(0), dtype=pixels.dtype).numpy()
+    splats = _flat(means2d), _flat(conics), _flat(opacities)
+    run_bands(pack_rows, BANDS, BANDS, splats, packed[:0], 0, _index(None), packed)
     length = padded(channels + 1)
     out = torch.zeros(total * length, dtype=pixels.dtype).numpy()
-    run_bands(kernels.accumulate_band, BANDS, view, *packed, _flat(pixels), channels, slots, firsts, out)
+    shared = (view, packed, row_length(0), _flat(pixels), channels, slots, firsts, out)
+    run_bands(kernels.accumulate_band, BANDS, *shared)
     sums, weights = pixels.new_empty(len(means2d), channels), pixels.new_empty(len(means2d))
     run_bands(kernels.gather_sums, BANDS, BANDS, chains, out, length, sums.numpy(), weights.numpy())
     return sums, weights
@@ -146,15 +150,27 @@ def _flat(tensor: Tensor) -> np.ndarray:
     return tensor.detach().contiguous().view(-1).numpy()
 
 
-def _pack(
-    means2d: Tensor, conics: Tensor, opacities: Tensor, features: Tensor, index: Tensor | None
-) -> tuple[np.ndarray, int]:
-    """Packed Gaussians, on whole cache lines, and the length of a row."""
-    length = row_length(features.shape[1])
-    rows = torch.empty(len(means2d) * length, dtype=means2d.dtype).numpy()  # torch's memory is aligned, numpy's not
-    splats = means2d.detach().numpy(), conics.detach().numpy(), opacities.detach().numpy()
-    run_bands(pack_rows, BANDS, BANDS, splats, features.detach().numpy(), _index(index), length, rows)
-    return rows, length
+def _packed(channels: int) -> int:
+    """How many channels are packed with their Gaussian."""
+    return channels if channels <= NARROW else 0
+
+
+def _make_trace(view: View, like: Tensor, channels: int) -> tuple[Tensor, np.ndarray, np.ndarray]:
+    """What backward wants to know of forward, in one int32 tensor, and its two parts.
+
+    The packed Gaussians come first, on whole cache lines, which torch's memory begins with and numpy's does not; then,
+    per tile and square, how many Gaussians were looked at, and the blocks that each was drawn in.
+    """
+    numbers = len(like) * row_length(_packed(channels)) * like.element_size() // 4
+    squares = count_squares(view)
+    trace = torch.empty(numbers + squares * (len(view.offsets) - 1 + len(view.order)), dtype=torch.int32)
+    return trace, *_read_trace(trace, view, like, channels)
+
+
+def _read_trace(trace: Tensor, view: View, like: Tensor, channels: int) -> tuple[np.ndarray, np.ndarray]:
+    """The packed Gaussians and the rest of a trace."""
+    numbers = len(like) * row_length(_packed(channels)) * like.element_size() // 4
+    return trace.numpy()[:numbers].view(like.detach().numpy().dtype), trace.numpy()[numbers:]
 
 
 def _index(index: Tensor | None) -> np.ndarray:

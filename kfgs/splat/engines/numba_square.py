@@ -83,40 +83,50 @@ def aligned(count: int, like: Any) -> Any:
     return room[skip : skip + count]
 
 
+@njit(**INLINE)
 def row_length(channels: int) -> int:
     """Numbers in a packed row: whole vectors, so that rows stay aligned."""
-    return -(-(FEATURES + channels) // LANES) * LANES
+    return (FEATURES + channels + LANES - 1) // LANES * LANES
 
 
 @njit(cache=True, **OPTIONS)
 def pack_rows(
-    band: int, bands: int, splats: Any, features: Any, index: Any, length: int, rows: Any, sources: int = SOURCES
+    band: int, bands: int, splats: Any, features: Any, channels: int, index: Any, rows: Any, sources: int = SOURCES
 ) -> None:
     """Pack one share of the Gaussians.
 
     Args:
         band: which share.
         bands: how many shares.
-        splats: means2d [M, 2], conics [M, 3] and opacities [M].
-        features: [N, D], or [N, 0] if they stay where they are.
+        splats: means2d [M * 2], conics [M * 3] and opacities [M].
+        features: [N * D].
+        channels: D; 0 if the features stay where they are.
         index: [M], the features' row of each Gaussian; empty if row m belongs to Gaussian m.
-        length: of a packed row.
-        rows: [M * length], written; what is beyond the features is 0.
+        rows: [M * row_length(D)], written; what is beyond the features is 0.
+        sources: see `SOURCES`.
     """
     means2d, conics, opacities = splats
-    count, channels = len(opacities), features.shape[1]
+    count, length = len(opacities), row_length(channels)
+    lanes = lanes_below(rows, channels % LANES)
+    whole = channels // LANES * LANES
     for m in range(count * band // bands, count * (band + 1) // bands):
         at = m * length
-        a, b, c = float(conics[m, 0]), float(conics[m, 1]), float(conics[m, 2])  # float64: b^2 / a cancels c
-        rest = c - b * b / a
-        rows[at + MEAN_X], rows[at + MEAN_Y] = means2d[m, 0], means2d[m, 1]
-        rows[at + SQUARE], rows[at + LEAN], rows[at + REST] = 0.5 * _LOG2_E * a, b / a, 0.5 * _LOG2_E * rest
-        rows[at + LOG_OPACITY] = math.log2(opacities[m]) if opacities[m] > 0 and a > 0 and rest > 0 else -np.inf
-        source = index[m] if len(index) else m
-        for d in range(channels):
-            rows[at + FEATURES + d] = features[source, d]
-        for d in range(FEATURES + channels, length):
-            rows[at + d] = 0
+        for d in range(0, length, LANES):
+            store(rows, at + d, 0)
+        a, b, c = float(fetch(conics, 3 * m)), float(fetch(conics, 3 * m + 1)), float(fetch(conics, 3 * m + 2))
+        rest = c - b * b / a  # in float64: b^2 / a cancels c
+        opacity = fetch(opacities, m)
+        put(rows, at + MEAN_X, fetch(means2d, 2 * m))
+        put(rows, at + MEAN_Y, fetch(means2d, 2 * m + 1))
+        put(rows, at + SQUARE, 0.5 * _LOG2_E * a)
+        put(rows, at + LEAN, b / a)
+        put(rows, at + REST, 0.5 * _LOG2_E * rest)
+        put(rows, at + LOG_OPACITY, math.log2(opacity) if opacity > 0 and a > 0 and rest > 0 else -np.inf)
+        source = (fetch(index, m) if len(index) else m) * channels
+        for d in range(0, whole, LANES):
+            store(rows, at + FEATURES + d, load(features, source + d))
+        if whole < channels:
+            store_part(rows, at + FEATURES + whole, lanes, load_part(features, source + whole, lanes))
 
 
 class View(NamedTuple):
