@@ -9,6 +9,7 @@ from numba import njit
 
 from . import numba_narrow as narrow
 from . import numba_wide as wide
+from .numba_cache import compiled
 from .numba_simd import (
     LANES,
     add_dot,
@@ -35,7 +36,6 @@ from .numba_square import (
     LEFT,
     OPTIONS,
     PIXELS,
-    SOURCES,
     STATE,
     Picture,
     View,
@@ -67,17 +67,9 @@ def _write_alphas(state: Any, box: tuple[int, int, int, int], alphas: Any, width
             alphas[(top + y) * width + left + x] = 1 - state[LEFT + p]
 
 
-@njit(cache=True, **OPTIONS)
+@compiled(**OPTIONS)
 def composite_narrow(
-    band: int,
-    view: View,
-    rows: Any,
-    length: int,
-    passes: Any,
-    background: Any,
-    images: Any,
-    trace: Any,
-    sources: int = SOURCES,
+    band: int, view: View, rows: Any, length: int, passes: Any, background: Any, images: Any, trace: Any
 ) -> None:
     """Composite the tiles of one band, with few channels.
 
@@ -90,7 +82,6 @@ def composite_narrow(
         background: as many numbers as the passes have channels.
         images: maps [H * W * D] and alphas [H * W], written.
         trace: written: per tile and square how many Gaussians were looked at, then the blocks that each was drawn in.
-        sources: see `SOURCES`.
     """
     maps, alphas = images
     channels = len(maps) // len(alphas)
@@ -125,18 +116,9 @@ def composite_narrow(
                     write_block(picture, box, block, channel, block_sums, 0, LANES)
 
 
-@njit(cache=True, **OPTIONS)
+@compiled(**OPTIONS)
 def composite_wide(
-    band: int,
-    view: View,
-    rows: Any,
-    length: int,
-    features: Any,
-    begins: Any,
-    background: Any,
-    images: Any,
-    trace: Any,
-    sources: int = SOURCES,
+    band: int, view: View, rows: Any, length: int, features: Any, begins: Any, background: Any, images: Any, trace: Any
 ) -> None:
     """Composite the tiles of one band, with many channels.
 
@@ -150,7 +132,6 @@ def composite_wide(
         background: D numbers and zeros up to a whole vector.
         images: maps [H * W * D] and alphas [H * W], written.
         trace: see `composite_narrow`.
-        sources: see `SOURCES`.
     """
     maps, alphas = images
     channels = len(maps) // len(alphas)
@@ -185,7 +166,7 @@ def composite_wide(
                     write_block(picture, box, block, channel, sums, block * LANES * stride + channel, stride)
 
 
-@njit(cache=True, **OPTIONS)
+@compiled(**OPTIONS)
 def number_slots(band: int, view: View, slots: Any, owners: Any, counts: Any, total: int) -> None:
     """Number the distinct Gaussians of one band, in order of appearance.
 
@@ -209,7 +190,7 @@ def number_slots(band: int, view: View, slots: Any, owners: Any, counts: Any, to
     counts[band] = count
 
 
-@njit(cache=True, **OPTIONS)
+@compiled(**OPTIONS)
 def chain_slots(view: View, owners: Any, counts: Any, heads: Any, following: Any) -> None:
     """Link the rows of each Gaussian over all bands: heads [M] and following [R], in order of the bands, -1 at the end."""
     heads[:] = -1
@@ -261,7 +242,7 @@ def _start_backward(
     store(planes, narrow.BEHIND + p, total - (1 - alpha) * through + alpha * share)
 
 
-@njit(cache=True, **OPTIONS)
+@compiled(**OPTIONS)
 def differentiate_narrow(
     band: int,
     view: View,
@@ -274,7 +255,6 @@ def differentiate_narrow(
     slots: Any,
     firsts: Any,
     out: Any,
-    sources: int = SOURCES,
 ) -> None:
     """Sum the gradients of one band's tiles into its own rows of `out`, with few channels.
 
@@ -290,7 +270,6 @@ def differentiate_narrow(
         slots: [P] from `number_slots`.
         firsts: [B], where the band's rows begin.
         out: [R * length], added to.
-        sources: see `SOURCES`.
     """
     maps, grad_maps, alphas, grad_alphas = images
     channels, width = len(maps) // len(alphas), view.width
@@ -318,7 +297,7 @@ def differentiate_narrow(
             narrow.differentiate_square(packed, span, state, passes, planes, weights, drawn, slots, own)
 
 
-@njit(cache=True, **OPTIONS)
+@compiled(**OPTIONS)
 def differentiate_wide(
     band: int,
     view: View,
@@ -332,7 +311,6 @@ def differentiate_wide(
     firsts: Any,
     out: Any,
     geometry: bool,
-    sources: int = SOURCES,
 ) -> None:
     """Sum the gradients of one band's tiles into its own rows of `out`, with many channels.
 
@@ -349,7 +327,6 @@ def differentiate_wide(
         firsts: [B], where the band's rows begin.
         out: [R * (LANES + padded D)], added to.
         geometry: whether the moments are wanted.
-        sources: see `SOURCES`.
     """
     maps, grad_maps, alphas, grad_alphas = images
     channels, width = source[2], view.width
@@ -384,18 +361,9 @@ def differentiate_wide(
             )
 
 
-@njit(cache=True, **OPTIONS)
+@compiled(**OPTIONS)
 def accumulate_band(
-    band: int,
-    view: View,
-    rows: Any,
-    length: int,
-    pixels: Any,
-    channels: int,
-    slots: Any,
-    firsts: Any,
-    out: Any,
-    sources: int = SOURCES,
+    band: int, view: View, rows: Any, length: int, pixels: Any, channels: int, slots: Any, firsts: Any, out: Any
 ) -> None:
     """Sum one band's pixels into its own rows of `out`, weighted: the weights' sum follows the channels.
 
@@ -409,7 +377,6 @@ def accumulate_band(
         slots: [P] from `number_slots`.
         firsts: [B], where the band's rows begin.
         out: [R * padded(D + 1)], added to.
-        sources: see `SOURCES`.
     """
     width = wide.padded(channels + 1)
     picture = Picture(pixels, view.width, channels)
@@ -446,7 +413,7 @@ def _sum_chain(row: int, following: Any, out: Any, width: int, total: Any) -> No
         row = following[row]
 
 
-@njit(cache=True, **OPTIONS)
+@compiled(**OPTIONS)
 def gather_gradients(
     band: int, bands: int, splats: Any, chains: Any, out: Any, layout: tuple[int, int, int], index: Any, grads: Any
 ) -> None:
@@ -488,7 +455,7 @@ def gather_gradients(
             store_part(of_features, into + i, lanes, load_part(of_features, into + i, lanes) + value)
 
 
-@njit(cache=True, **OPTIONS)
+@compiled(**OPTIONS)
 def gather_sums(band: int, bands: int, chains: Any, out: Any, width: int, sums: Any, weights: Any) -> None:
     """Sum the rows of one share of the Gaussians over all bands: sums [M, D] and weights [M], written."""
     heads, following = chains

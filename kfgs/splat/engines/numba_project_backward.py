@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from .numba_cache import compiled
 from .numba_project_math import (
     BLOCK,
     MEAN,
@@ -16,7 +17,6 @@ from .numba_project_math import (
     QUAT,
     QUAT_FLOOR,
     SCALE,
-    SOURCE,
     Lens,
     cross,
     dot,
@@ -32,7 +32,7 @@ _GRAD_MEAN2D, _GRAD_CONIC, _GRAD_DEPTH = (OTHER + k * BLOCK for k in (0, 2, 5))
 _STATE = OTHER + 6 * BLOCK
 
 
-@njit(cache=True, fastmath=PLAIN, **OPTIONS)
+@compiled(fastmath=PLAIN, **OPTIONS)
 def differentiate_band(
     band: int,
     bands: int,
@@ -41,7 +41,6 @@ def differentiate_band(
     index: Any,
     grads: tuple[Any, Any, Any, Any],
     out: tuple[Any, Any, Any, Any],
-    source: int = SOURCE,
 ) -> None:
     """Write one share of the rows of the gradients: those of the visible Gaussians, and zeros between them.
 
@@ -53,7 +52,6 @@ def differentiate_band(
         index: [M] int64, increasing: the visible Gaussians.
         grads: of the loss in means2d [2 M], conics [3 M], depths [M] and opacities [M].
         out: gradients in means [3 N], quats [4 N], scales [3 N] and opacities [N], written.
-        source: see `SOURCE`.
     """
     means, quats, scales = gaussians
     grad_means2d, grad_conics, grad_depths, grad_opacities = grads

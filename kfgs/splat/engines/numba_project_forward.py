@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from .numba_cache import compiled
 from .numba_project_math import (
     BLOCK,
     MEAN,
@@ -15,7 +16,6 @@ from .numba_project_math import (
     OTHER,
     PLAIN,
     SCALE,
-    SOURCE,
     Lens,
     cross,
     dot,
@@ -31,7 +31,7 @@ _REACH, _MEAN2D, _CONIC, _EXTENT, _KEPT = (OTHER + k * BLOCK for k in (0, 1, 3, 
 _STATE = OTHER + 9 * BLOCK
 
 
-@njit(cache=True, fastmath=PLAIN, **OPTIONS)
+@compiled(fastmath=PLAIN, **OPTIONS)
 def project_band(
     band: int,
     bands: int,
@@ -40,7 +40,6 @@ def project_band(
     reach: Any,
     out: tuple[Any, Any, Any, Any, Any, Any],
     counts: Any,
-    source: int = SOURCE,
 ) -> None:
     """Project one share of the Gaussians and write the visible ones one after another from the share's beginning.
 
@@ -52,7 +51,6 @@ def project_band(
         reach: [N], 2 ln(opacity / ALPHA_MIN).
         out: means2d [2 N], conics [3 N], depths [N], opacities [N], extents [2 N], index [N] int64, written.
         counts: [B] int64, written: how many are visible.
-        source: see `SOURCE`.
     """
     means, first, last = gaussians[0], len(reach) * band // bands, len(reach) * (band + 1) // bands
     state, depths = np.zeros(_STATE, means.dtype), np.empty(BLOCK, means.dtype)

@@ -11,18 +11,12 @@ Arrays with several numbers per Gaussian are passed flat, so that these numbers'
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any, NamedTuple
-from zlib import crc32
 
 import numpy as np
 from numba import njit
 
 from ..project import FIELD_OF_VIEW_MARGIN
-
-SOURCE = crc32(Path(__file__).read_bytes())
-"""Numba's cache on disk notices a change in a kernel's own file alone. Kernels that call into this one take its number
-as a default argument, whose value numba counts as part of the signature."""
 
 BLOCK = 64
 MEAN, QUAT, SCALE = 0, 3 * BLOCK, 7 * BLOCK

@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from .numba_cache import compiled
+
 _DIGIT = 11
 """Bits sorted at once: 2048 counters stay in the first-level cache, and 32 bits take three passes."""
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 
-@njit(cache=True, **_OPTIONS)
+@compiled(**_OPTIONS)
 def sort_rows(bits: Any) -> Any:
     """Stable radix sort of floating point numbers, given as their bits [M]; returns the rows [M] int32."""
     count, passes = len(bits), (8 * bits.itemsize + _DIGIT - 1) // _DIGIT

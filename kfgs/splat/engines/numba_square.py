@@ -12,14 +12,13 @@ a (dx + (b / a) dy)^2 + (c - b^2 / a) dy^2: both terms are positive, so that nee
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any, NamedTuple
-from zlib import crc32
 
 import numpy as np
 from numba import njit
 
 from .contract import ALPHA_MAX, ALPHA_MIN
+from .numba_cache import compiled
 from .numba_simd import (
     LANES,
     bits,
@@ -69,10 +68,6 @@ INLINE: dict[str, Any] = OPTIONS | {"forceinline": True}
 LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 _LOG2_E = math.log2(math.e)
 
-SOURCES = crc32(b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))))
-"""Numba's cache on disk notices a change in a kernel's own file alone. Kernels that call into other files take this
-number as a default argument, whose value numba counts as part of the signature."""
-
 
 @njit(**INLINE)
 def aligned(count: int, like: Any) -> Any:
@@ -89,10 +84,8 @@ def row_length(channels: int) -> int:
     return (FEATURES + channels + LANES - 1) // LANES * LANES
 
 
-@njit(cache=True, **OPTIONS)
-def pack_rows(
-    band: int, bands: int, splats: Any, features: Any, channels: int, index: Any, rows: Any, sources: int = SOURCES
-) -> None:
+@compiled(**OPTIONS)
+def pack_rows(band: int, bands: int, splats: Any, features: Any, channels: int, index: Any, rows: Any) -> None:
     """Pack one share of the Gaussians.
 
     Args:
@@ -103,7 +96,6 @@ def pack_rows(
         channels: D; 0 if the features stay where they are.
         index: [M], the features' row of each Gaussian; empty if row m belongs to Gaussian m.
         rows: [M * row_length(D)], written; what is beyond the features is 0.
-        sources: see `SOURCES`.
     """
     means2d, conics, opacities = splats
     count, length = len(opacities), row_length(channels)

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from .numba_cache import compiled
+
 BLOCK = 64
 _X, _Y, _A, _B, _C, _EXTENT_X, _EXTENT_Y, _REACH = (k * BLOCK for k in range(8))
 _LEFT, _RIGHT, _TOP, _BOTTOM, _HIT = (k * BLOCK for k in range(8, 13))  # the box, in tiles, and four answers
@@ -31,7 +33,7 @@ _FLAT, _HUGE = 1e-9, 1e30
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}  # no fused multiply-add: torch rounds each product
 
 
-@njit(cache=True, **_OPTIONS)
+@compiled(**_OPTIONS)
 def find_pairs(
     band: int,
     bands: int,
@@ -72,7 +74,7 @@ def find_pairs(
     return pairs[0, :end], pairs[1, :end]
 
 
-@njit(cache=True, **_OPTIONS)
+@compiled(**_OPTIONS)
 def list_rows(tiles: Any, which: Any, starts: Any, rows: Any) -> None:
     """Write the rows of one share's pairs into the tiles' lists.
 
