@@ -12,12 +12,13 @@ from collections.abc import Iterable
 from typing import Any
 
 
-def check_shapes(*arguments: tuple[str, Any, str]) -> dict[str, int]:
+def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> dict[str, int]:
     """Bind the axes of several tensors to one set of names and return their sizes.
 
     Args:
-        arguments: triples `(name, tensor, spec)`; `spec` holds one word per axis: a letter or word binds a size at its
-            first appearance, a number must match exactly. A tensor that is None is skipped.
+        arguments: triples `(name, tensor, spec)`; `spec` holds one word per axis, or is a tuple of words and numbers: a
+            letter or word binds a size at its first appearance, a number must match exactly. A tensor that is None is
+            skipped.
 
     Returns:
         The size of each named axis.
@@ -36,24 +37,26 @@ def check_shapes(*arguments: tuple[str, Any, str]) -> dict[str, int]:
     for name, value, spec in arguments:
         if value is None:
             continue
-        axes = spec.split()
+        words = spec.split() if isinstance(spec, str) else spec
+        axes = [int(axis) if isinstance(axis, str) and axis.isdigit() else axis for axis in words]
         if not hasattr(value, "shape"):
             raise TypeError(
-                f"{name}: expected a tensor of shape [{', '.join(axes)}], got {type(value).__name__}; "
+                f"{name}: expected a tensor of shape [{', '.join(map(str, axes))}], got {type(value).__name__}; "
                 "convert it with torch.as_tensor"
             )
-        shape = tuple(int(n) for n in value.shape)
+        shape = tuple(value.shape)  # no int(): a size may be a symbol while torch.compile or torch.export traces
         wrong = len(shape) != len(axes)
         own: dict[str, int] = {}  # an axis may also appear twice within one argument
         for axis, size in zip(axes, shape, strict=False):
-            expected = int(axis) if axis.isdigit() else sizes.get(axis, own.setdefault(axis, size))
+            expected = sizes.get(axis, own.setdefault(axis, size)) if isinstance(axis, str) else axis
             wrong = wrong or size != expected
         if wrong:
-            known = [f"{a} = {sizes[a]} (from {bound_by[a]})" for a in axes if a in sizes]
+            known = [f"{a} = {sizes[a]} (from {bound_by[a]})" for a in axes if isinstance(a, str) and a in sizes]
             where = f" with {', '.join(known)}" if known else ""
-            raise ValueError(f"{name}: expected [{', '.join(axes)}]{where}, got {shape}; pass a tensor of that shape")
+            expected_shape = ", ".join(map(str, axes))
+            raise ValueError(f"{name}: expected [{expected_shape}]{where}, got {shape}; pass a tensor of that shape")
         for axis, size in zip(axes, shape, strict=True):
-            if not axis.isdigit() and axis not in sizes:
+            if isinstance(axis, str) and axis not in sizes:
                 sizes[axis], bound_by[axis] = size, name
     return sizes
 
@@ -71,7 +74,7 @@ def check_range(
     """Raise a ValueError unless `value` is a finite number between `low` and `high` (`closed`: are the ends included)."""
     over = value >= low if closed[0] else value > low
     under = value <= high if closed[1] else value < high
-    if not (over and under and math.isfinite(value)):  # NaN fails every comparison
+    if not (over and under and -math.inf < value < math.inf):  # NaN fails every comparison
         left = "[" if closed[0] and math.isfinite(low) else "("
         right = "]" if closed[1] and math.isfinite(high) else ")"
         raise ValueError(f"{name}: expected a number in {left}{low:g}, {high:g}{right}, got {value!r}")

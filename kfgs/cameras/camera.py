@@ -62,6 +62,10 @@ class Camera:
             if not (isinstance(size, numbers.Real) and math.isfinite(size) and size >= 1 and int(size) == size):
                 raise ValueError(f"{name}: expected a positive whole number of pixels, got {size!r}; pass an integer")
             object.__setattr__(self, name, int(size))
+        if not torch.compiler.is_compiling():  # a traced matrix has no values yet
+            self._check_values()
+
+    def _check_values(self) -> None:
         K, E = self.K.detach().double().cpu(), self.viewmat.detach().double().cpu()  # cameras are tiny
         if not (torch.isfinite(K).all() and torch.isfinite(E).all()):
             raise ValueError(

@@ -84,8 +84,9 @@ def project(
     compiled = choose_compiled(engine, "project", "gaussians", *values)
     if compiled and not to_camera:
         tensors = (value.contiguous() for value in (*values, camera.viewmat, camera.K))
-        *seen, extents, index = ops.project(*tensors, camera.width, camera.height, near, low_pass, compiled)
-        return Projected(*seen, extents.detach(), index)
+        options = camera.width, camera.height, near, low_pass, compiled
+        means2d, conics, depths, opacities, extents, index = ops.project(*tensors, *options)
+        return Projected(means2d, conics, depths, opacities, extents.detach(), index)
     return _project(gaussians, camera, near, low_pass)
 
 

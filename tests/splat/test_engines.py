@@ -423,10 +423,10 @@ def test_auto_takes_the_first_engine_for_the_cpu():
 def _without_numba(monkeypatch):
     absent = table._Entry("kfgs.splat.engines.absent", "surely_not_installed", "pip install surely")
     monkeypatch.setitem(table._ENGINES, "numba", absent)
-    for function in (table.load, table.choose):
+    for function in (table.load, table._choose):
         function.cache_clear()
     yield
-    for function in (table.load, table.choose):
+    for function in (table.load, table._choose):
         function.cache_clear()
 
 

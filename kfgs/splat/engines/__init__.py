@@ -115,15 +115,17 @@ def accumulate_pixels(
         ("means2d", means2d, "M 2"),
         ("conics", conics, "M 3"),
         ("opacities", opacities, "M"),
-        ("pixels", pixels, f"{tiles.height} {tiles.width} D"),
+        ("pixels", pixels, (tiles.height, tiles.width, "D")),
     )
     _check_kinds({"conics": conics, "opacities": opacities, "pixels": pixels}, means2d)
     _check_tiles(tiles, means2d)
-    rows, offsets = tiles.rows.contiguous(), tiles.offsets.contiguous()
-    check_values(len(means2d), len(means2d), None, rows, offsets)
+    name = choose(engine, means2d.device.type)
     values = (value.detach().contiguous() for value in (means2d, conics, opacities, pixels))
-    run = load(choose(engine, means2d.device.type)).accumulate
-    return run(*values, rows, offsets, tiles.width, tiles.height, tiles.tile_size)
+    view = tiles.rows.contiguous(), tiles.offsets.contiguous(), tiles.width, tiles.height, tiles.tile_size
+    if name == "reference":  # its results are parts of one tensor, which an operator's must not be
+        check_values(len(means2d), len(means2d), None, *view[:2])
+        return load(name).accumulate(*values, *view)
+    return ops.accumulate(*values, *view, name)
 
 
 def _check_kinds(others: dict[str, Tensor | None], means2d: Tensor) -> None:
@@ -149,6 +151,6 @@ def _check_integers(
 
 def _check_tiles(tiles: Tiles, means2d: Tensor) -> None:
     rows, columns = tiles.grid
-    check_shapes(("tiles.rows", tiles.rows, "P"), ("tiles.offsets", tiles.offsets, str(rows * columns + 1)))
+    check_shapes(("tiles.rows", tiles.rows, "P"), ("tiles.offsets", tiles.offsets, (rows * columns + 1,)))
     for name, value in (("rows", tiles.rows), ("offsets", tiles.offsets)):
         _check_integers(f"tiles.{name}", value, means2d, (torch.int32, torch.int64), "bin the tiles again")

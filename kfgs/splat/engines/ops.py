@@ -157,6 +157,40 @@ def _differentiate_composite(ctx: Any, grad_maps: Tensor, grad_alphas: Tensor, _
 composite.register_autograd(_differentiate_composite, setup_context=_save_composite)
 
 
+@custom_op("kfgs::accumulate", mutates_args=())
+def accumulate(
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    pixels: Tensor,
+    rows: Tensor,
+    offsets: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+    engine: str,
+) -> tuple[Tensor, Tensor]:
+    """Sums and weights, see `kfgs.splat.engines.accumulate_pixels`; without gradient."""
+    check_values(len(means2d), len(means2d), None, rows, offsets)
+    return load(engine).accumulate(means2d, conics, opacities, pixels, rows, offsets, width, height, tile_size)
+
+
+@accumulate.register_fake
+def _(
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    pixels: Tensor,
+    rows: Tensor,
+    offsets: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+    engine: str,
+) -> tuple[Tensor, Tensor]:
+    return pixels.new_empty(len(means2d), pixels.shape[2]), pixels.new_empty(len(means2d))
+
+
 @custom_op("kfgs::project", mutates_args=())
 def project(
     means: Tensor,

@@ -55,7 +55,6 @@ def load(name: str) -> ModuleType:
         ) from error
 
 
-@cache
 def choose(engine: str, device: str) -> str:
     """The engine's name for tensors on a device: the fastest one there if it is "auto".
 
@@ -63,6 +62,11 @@ def choose(engine: str, device: str) -> str:
         ValueError: if there is no such engine, or it does not run on the device.
         ImportError: if the named engine's package is missing.
     """
+    return _choose(engine, device)
+
+
+@cache
+def _choose(engine: str, device: str) -> str:
     if engine == "auto":
         return available_engines(device)[0]
     check_choice("engine", engine, ["auto", *_ENGINES])
@@ -90,7 +94,7 @@ def choose_compiled(engine: str, function: str, name: str, *tensors: Tensor) -> 
         ImportError: if the named engine's package is missing.
     """
     chosen = choose(engine, tensors[0].device.type)
-    if not hasattr(load(chosen), function):
+    if not _offers(chosen, function):
         return None
     kinds = {value.dtype for value in tensors}
     known = len(kinds) == 1 and kinds <= {torch.float32, torch.float64}
@@ -100,6 +104,16 @@ def choose_compiled(engine: str, function: str, name: str, *tensors: Tensor) -> 
             f"{', '.join(sorted(map(str, kinds)))}; convert them with .to(torch.float32)"
         )
     return chosen if known else None
+
+
+def _offers(name: str, function: str) -> bool:
+    """Whether an engine has a function besides compositing."""
+    return hasattr(load(name), function)
+
+
+# What torch.compiler.assume_constant_result does, which would import the compiler: the answers are asked for once.
+choose._dynamo_marked_constant = True  # type: ignore[attr-defined]
+_offers._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 def _runs(name: str, device: str) -> bool:
