@@ -15,7 +15,6 @@ from .numba_simd import (
     add_dot,
     add_scaled,
     fetch,
-    fma,
     lanes_below,
     load,
     load_many,
@@ -135,7 +134,7 @@ def composite_wide(
     """
     maps, alphas = images
     channels = len(maps) // len(alphas)
-    picture, stride = Picture(maps, view.width, channels), wide.padded(channels)
+    stride = wide.padded(channels)
     state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
     sums = aligned(PIXELS * stride, rows)
     kept = wide.make_kept(rows)
@@ -149,21 +148,46 @@ def composite_wide(
             if box[0] >= box[2] or box[1] >= box[3]:
                 continue
             dark = start_square(state, corners, box)
-            sums[:] = 0
             span = start, end, start * squares + square * (end - start)
             scratch = corners, sums, kept, hits, counts
             packed, source = (rows, length, view.order), (features, begins, channels)
-            done = wide.composite_square(packed, span, state, dark, source, scratch, drawn)
+            done, filled = wide.composite_square(packed, span, state, dark, source, scratch, drawn)
             trace[tile * squares + square] = done - start
             _write_alphas(state, box, alphas, view.width)
-            for block in range(BLOCKS):
-                for channel in range(0, channels, LANES):
-                    behind = load(background, channel)
-                    for p in range(block * LANES, (block + 1) * LANES):
-                        store(
-                            sums, p * stride + channel, fma(behind, state[LEFT + p], load(sums, p * stride + channel))
-                        )
-                    write_block(picture, box, block, channel, sums, block * LANES * stride + channel, stride)
+            for y in range(box[3] - box[1]):
+                for x in range(box[2] - box[0]):
+                    block = y // BLOCK * BLOCK + x // BLOCK
+                    p = block * LANES + y % BLOCK * BLOCK + x % BLOCK
+                    at = ((box[1] + y) * view.width + box[0] + x) * channels
+                    _write_pixel(
+                        maps,
+                        at,
+                        channels,
+                        sums,
+                        p * stride,
+                        (filled >> np.uint32(block)) & 1,
+                        background,
+                        state[LEFT + p],
+                    )
+
+
+@njit(**INLINE)
+def _write_pixel(
+    maps: Any, at: int, channels: int, sums: Any, place: int, filled: int, background: Any, left: Any
+) -> None:
+    """A pixel's sums, if it has any, and what shows through."""
+    whole = channels // LANES * LANES
+    lanes = lanes_below(maps, channels - whole)
+    for channel in range(0, whole, LANES):
+        value = load(background, channel) * left
+        if filled:
+            value = value + load(sums, place + channel)
+        store(maps, at + channel, value)
+    if whole < channels:
+        value = load(background, whole) * left
+        if filled:
+            value = value + load(sums, place + whole)
+        store_part(maps, at + whole, lanes, value)
 
 
 @compiled(**OPTIONS)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from . import numba_bands as kernels
+from .numba_memory import take
 from .numba_narrow import FIRST, MOMENTS, plan_passes
 from .numba_project import project, project_backward
 from .numba_simd import LANES
@@ -51,7 +52,7 @@ def forward(
     """Composite as `contract` promises; a Gaussian whose conic is not positive definite is not drawn."""
     channels = features.shape[1]
     view = _view(rows, offsets, width, height, tile_size)
-    maps, alphas = features.new_empty(height, width, channels), features.new_empty(height, width)
+    maps, alphas = take(features, height, width, channels), features.new_empty(height, width)
     trace, packed, ends = _make_trace(view, means2d, channels)
     ends[: count_squares(view) * (len(view.offsets) - 1)] = 0
     splats = _flat(means2d), _flat(conics), _flat(opacities)
@@ -95,12 +96,12 @@ def backward(
     length, behind = row_length(_packed(channels)), _padded(background, padded(channels))
     if channels <= NARROW:
         width, column = length, MOMENTS
-        out = torch.zeros(total * width, dtype=means2d.dtype).numpy()
+        out = take(means2d, total * width).zero_().numpy()
         shared = (view, packed, length, plan_passes(channels), behind, images, ends, slots, firsts, out)
         run_bands(kernels.differentiate_narrow, BANDS, *shared)
     else:
         width, column = LANES + padded(channels), LANES
-        out = torch.zeros(total * width, dtype=means2d.dtype).numpy()
+        out = take(means2d, total * width).zero_().numpy()
         source = _flat(features), _begins(index, len(means2d), channels), channels
         shared = (view, packed, length, source, behind, images, ends, slots, firsts, out, any(wanted[:3]))
         run_bands(kernels.differentiate_wide, BANDS, *shared)
@@ -137,7 +138,7 @@ def accumulate(
     splats = _flat(means2d), _flat(conics), _flat(opacities)
     run_bands(pack_rows, BANDS, BANDS, splats, packed[:0], 0, _index(None), packed)
     length = padded(channels + 1)
-    out = torch.zeros(total * length, dtype=pixels.dtype).numpy()
+    out = take(pixels, total * length).zero_().numpy()
     shared = (view, packed, row_length(0), _flat(pixels), channels, slots, firsts, out)
     run_bands(kernels.accumulate_band, BANDS, *shared)
     sums, weights = pixels.new_empty(len(means2d), channels), pixels.new_empty(len(means2d))
@@ -163,7 +164,7 @@ def _make_trace(view: View, like: Tensor, channels: int) -> tuple[Tensor, np.nda
     """
     numbers = len(like) * row_length(_packed(channels)) * like.element_size() // 4
     squares = count_squares(view)
-    trace = torch.empty(numbers + squares * (len(view.offsets) - 1 + len(view.order)), dtype=torch.int32)
+    trace = take(torch.empty(0, dtype=torch.int32), numbers + squares * (len(view.offsets) - 1 + len(view.order)))
     return trace, *_read_trace(trace, view, like, channels)
 
 

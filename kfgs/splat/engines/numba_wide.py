@@ -115,7 +115,7 @@ def weigh_block(
 
 @njit(**INLINE)
 def add_colors(
-    sums: Any, into: int, stride: int, weights: Any, features: Any, begins: Any, count: int, channels: int
+    sums: Any, into: int, stride: int, weights: Any, features: Any, begins: Any, count: int, channels: int, fresh: bool
 ) -> None:
     """sums[pixel, c] += weights[k, pixel] features[k, c] for a block's 16 pixels.
 
@@ -128,19 +128,24 @@ def add_colors(
         begins: [count], where in `features` each Gaussian's row begins.
         count: Gaussians.
         channels: D.
+        fresh: whether there is nothing in `sums` yet.
     """
     whole = channels // STEP * STEP
     for pixel in range(0, LANES, 4):
         row = into + pixel * stride
         for channel in range(0, whole, STEP):
-            total = load_tile(sums, row + channel, stride)
+            total = zero_many(SIXTEEN, sums)
+            if not fresh:
+                total = load_tile(sums, row + channel, stride)
             for k in range(count):
                 values = load_many(FOUR, features, fetch(begins, k) + channel, LANES)
                 total = add_outer(total, spread_many(FOUR, weights, k * LANES + pixel, 1), values)
             store_tile(sums, row + channel, stride, total)
         for channel in range(whole, channels, LANES):
             lanes = lanes_below(sums, channels - channel)
-            column = load_many(FOUR, sums, row + channel, stride)
+            column = zero_many(FOUR, sums)
+            if not fresh:
+                column = load_many(FOUR, sums, row + channel, stride)
             for k in range(count):
                 value = load_part(features, fetch(begins, k) + channel, lanes)
                 column = add_outer(column, spread_many(FOUR, weights, k * LANES + pixel, 1), (value,))
@@ -167,8 +172,8 @@ def store_tile(values: Any, start: int, stride: int, tile: Any) -> None:
 @njit(**INLINE)
 def composite_square(
     packed: Any, span: tuple[int, int, int], state: Any, dark: Any, wide: Any, scratch: Any, trace: Any
-) -> int:
-    """Composite a square's Gaussians; returns where in the list it was done.
+) -> tuple[int, Any]:
+    """Composite a square's Gaussians; returns where in the list it was done, and bits of the blocks that have sums.
 
     Args:
         packed: rows, their length, and the list of the Gaussians' numbers.
@@ -184,18 +189,21 @@ def composite_square(
     start, end, into = span
     corners, sums, kept, hits, counts = scratch
     stride = padded(channels)
-    position = start
+    position, filled = start, np.uint32(0)
     while position < end and dark != ALL_BLOCKS:
         stop = min(position + CHUNK, end)
         list_hits(rows, length, order, (position, stop, into + position - start), dark, corners, hits, counts, trace)
         for block in range(BLOCKS):
             if counts[block]:
+                bit = np.uint32(1) << np.uint32(block)
                 count, lit = weigh_block(packed, block, state, hits, counts[block], sources, kept)
-                add_colors(sums, block * LANES * stride, stride, kept[0], features, kept[3], count, channels)
+                place, fresh = block * LANES * stride, (filled & bit) == 0
+                add_colors(sums, place, stride, kept[0], features, kept[3], count, channels, fresh)
+                filled |= bit
                 if not lit:
-                    dark |= np.uint32(1) << np.uint32(block)
+                    dark |= bit
         position = stop
-    return position
+    return position, filled
 
 
 @njit(**INLINE)

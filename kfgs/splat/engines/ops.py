@@ -7,13 +7,33 @@ shapes without computing anything. How many Gaussians can be seen, and how many 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.library import custom_op
+from torch.library import infer_schema, register_autograd, register_fake
 
 from .table import load
+
+
+def _operator(function: Callable[..., Any]) -> Any:
+    """The function as `torch.ops.kfgs.<its name>`, on every device.
+
+    What torch.library.custom_op does, which costs a second more: at an operator's first call it imports the compiler.
+    """
+    name = function.__name__
+    torch.library.define(f"kfgs::{name}", infer_schema(function, mutates_args=()))
+    torch.library.impl(f"kfgs::{name}", "default", function)
+    return getattr(torch.ops.kfgs, name).default
+
+
+def _refuse(ctx: Any, *grads: Tensor) -> None:
+    """The gradient of what has none."""
+    raise NotImplementedError(
+        "backward: expected gradients of first order, got a second one through compositing or projection by a compiled "
+        "engine; use engine='reference'"
+    )
 
 
 def check_values(count: int, sources: int, index: Tensor | None, rows: Tensor, offsets: Tensor) -> None:
@@ -46,7 +66,7 @@ def check_values(count: int, sources: int, index: Tensor | None, rows: Tensor, o
         )
 
 
-@custom_op("kfgs::composite", mutates_args=())
+@_operator
 def composite(
     means2d: Tensor,
     conics: Tensor,
@@ -67,7 +87,7 @@ def composite(
     return load(engine).forward(*splats, index, rows, offsets, width, height, tile_size)
 
 
-@composite.register_fake
+@register_fake("kfgs::composite")
 def _(
     means2d: Tensor,
     conics: Tensor,
@@ -87,7 +107,7 @@ def _(
     return maps, features.new_empty(height, width), trace
 
 
-@custom_op("kfgs::composite_backward", mutates_args=())
+@_operator
 def composite_backward(
     grad_maps: Tensor,
     grad_alphas: Tensor,
@@ -114,7 +134,7 @@ def composite_backward(
     return load(engine).backward(grad_maps, grad_alphas, wanted, *splats, *view, maps, alphas, trace)
 
 
-@composite_backward.register_fake
+@register_fake("kfgs::composite_backward")
 def _(
     grad_maps: Tensor,
     grad_alphas: Tensor,
@@ -154,10 +174,10 @@ def _differentiate_composite(ctx: Any, grad_maps: Tensor, grad_alphas: Tensor, _
     return *(grad if want else None for grad, want in zip(grads, wanted, strict=True)), *[None] * 7
 
 
-composite.register_autograd(_differentiate_composite, setup_context=_save_composite)
+register_autograd("kfgs::composite", _differentiate_composite, setup_context=_save_composite)
 
 
-@custom_op("kfgs::accumulate", mutates_args=())
+@_operator
 def accumulate(
     means2d: Tensor,
     conics: Tensor,
@@ -175,7 +195,7 @@ def accumulate(
     return load(engine).accumulate(means2d, conics, opacities, pixels, rows, offsets, width, height, tile_size)
 
 
-@accumulate.register_fake
+@register_fake("kfgs::accumulate")
 def _(
     means2d: Tensor,
     conics: Tensor,
@@ -191,7 +211,7 @@ def _(
     return pixels.new_empty(len(means2d), pixels.shape[2]), pixels.new_empty(len(means2d))
 
 
-@custom_op("kfgs::project", mutates_args=())
+@_operator
 def project(
     means: Tensor,
     quats: Tensor,
@@ -209,7 +229,7 @@ def project(
     return load(engine).project(means, quats, scales, opacities, viewmat, K, width, height, near, low_pass)
 
 
-@project.register_fake
+@register_fake("kfgs::project")
 def _(
     means: Tensor,
     quats: Tensor,
@@ -228,7 +248,7 @@ def _(
     return means2d, conics, depths, seen, extents, means.new_empty(M, dtype=torch.int64)
 
 
-@custom_op("kfgs::project_backward", mutates_args=())
+@_operator
 def project_backward(
     grad_means2d: Tensor,
     grad_conics: Tensor,
@@ -254,7 +274,7 @@ def project_backward(
     return load(engine).project_backward(*grads, *gaussians, *options)
 
 
-@project_backward.register_fake
+@register_fake("kfgs::project_backward")
 def _(
     grad_means2d: Tensor,
     grad_conics: Tensor,
@@ -287,10 +307,10 @@ def _differentiate_project(ctx: Any, *grads: Tensor) -> tuple[Any, ...]:
     return *project_backward(*given, *inputs, *ctx.options, index, ctx.engine), *[None] * 7
 
 
-project.register_autograd(_differentiate_project, setup_context=_save_project)
+register_autograd("kfgs::project", _differentiate_project, setup_context=_save_project)
 
 
-@custom_op("kfgs::bin_tiles", mutates_args=())
+@_operator
 def bin_tiles(
     means2d: Tensor,
     conics: Tensor,
@@ -306,7 +326,7 @@ def bin_tiles(
     return load(engine).bin(means2d, conics, depths, opacities, extents, width, height, tile_size)
 
 
-@bin_tiles.register_fake
+@register_fake("kfgs::bin_tiles")
 def _(
     means2d: Tensor,
     conics: Tensor,
@@ -321,3 +341,7 @@ def _(
     pairs = torch.library.get_ctx().new_dynamic_size()
     tiles = -(-width // tile_size) * -(-height // tile_size)
     return means2d.new_empty(pairs, dtype=torch.int32), means2d.new_empty(tiles + 1, dtype=torch.int64)
+
+
+for _name in ("composite_backward", "project_backward"):
+    register_autograd(f"kfgs::{_name}", _refuse)
