@@ -12,11 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from . import numba_bands as kernels
+from .numba_bands import accumulate_band, composite_narrow, composite_wide
+from .numba_bands_backward import differentiate_narrow, differentiate_wide
 from .numba_memory import take
 from .numba_narrow import FIRST, MOMENTS, plan_passes
 from .numba_project import project, project_backward
 from .numba_simd import LANES
+from .numba_slots import chain_slots, gather_gradients, gather_sums, number_slots
 from .numba_square import View, count_squares, pack_rows, row_length
 from .numba_threads import run_bands
 from .numba_tiles import bin
@@ -61,10 +63,10 @@ def forward(
     behind = _padded(background, padded(channels))
     if channels <= NARROW:
         passes = plan_passes(channels)
-        run_bands(kernels.composite_narrow, BANDS, view, packed, length, passes, behind, images, ends)
+        run_bands(composite_narrow, BANDS, view, packed, length, passes, behind, images, ends)
     else:
         shared = (view, packed, length, _flat(features), _begins(index, len(means2d), channels), behind, images, ends)
-        run_bands(kernels.composite_wide, BANDS, *shared)
+        run_bands(composite_wide, BANDS, *shared)
     return maps, alphas, trace
 
 
@@ -98,13 +100,13 @@ def backward(
         width, column = length, MOMENTS
         out = take(means2d, total * width).zero_().numpy()
         shared = (view, packed, length, plan_passes(channels), behind, images, ends, slots, firsts, out)
-        run_bands(kernels.differentiate_narrow, BANDS, *shared)
+        run_bands(differentiate_narrow, BANDS, *shared)
     else:
         width, column = LANES + padded(channels), LANES
         out = take(means2d, total * width).zero_().numpy()
         source = _flat(features), _begins(index, len(means2d), channels), channels
         shared = (view, packed, length, source, behind, images, ends, slots, firsts, out, any(wanted[:3]))
-        run_bands(kernels.differentiate_wide, BANDS, *shared)
+        run_bands(differentiate_wide, BANDS, *shared)
     grads = [
         torch.empty_like(means2d),
         torch.empty_like(conics),
@@ -114,7 +116,7 @@ def backward(
     which, layout = _index(index), (width, column, channels)
     shares = BANDS if _increasing(which) else 1  # two Gaussians that show the same row must not meet
     splats, targets = (_flat(conics), _flat(opacities)), tuple(_flat(value) for value in grads)
-    run_bands(kernels.gather_gradients, shares, shares, splats, chains, out, layout, which, targets)
+    run_bands(gather_gradients, shares, shares, splats, chains, out, layout, which, targets)
     grads.append((grad_maps * (1 - alphas)[..., None]).sum((0, 1)) if wanted[4] else background)
     return [value if want else value.new_empty(0) for value, want in zip(grads, wanted, strict=True)]
 
@@ -140,9 +142,9 @@ def accumulate(
     length = padded(channels + 1)
     out = take(pixels, total * length).zero_().numpy()
     shared = (view, packed, row_length(0), _flat(pixels), channels, slots, firsts, out)
-    run_bands(kernels.accumulate_band, BANDS, *shared)
+    run_bands(accumulate_band, BANDS, *shared)
     sums, weights = pixels.new_empty(len(means2d), channels), pixels.new_empty(len(means2d))
-    run_bands(kernels.gather_sums, BANDS, BANDS, chains, out, length, sums.numpy(), weights.numpy())
+    run_bands(gather_sums, BANDS, BANDS, chains, out, length, sums.numpy(), weights.numpy())
     return sums, weights
 
 
@@ -206,8 +208,8 @@ def _number(view: View, count: int) -> tuple[np.ndarray, np.ndarray, int, Any]:
     """Gradient rows: of each pair within its band, where each band's begin, how many, and which belong together."""
     slots, owners = np.empty(len(view.order), np.int32), np.empty(len(view.order), np.int32)
     counts = np.empty(BANDS, np.int64)
-    run_bands(kernels.number_slots, BANDS, view, slots, owners, counts, count)
+    run_bands(number_slots, BANDS, view, slots, owners, counts, count)
     total = int(counts.sum())
     chains = np.empty(count, np.int32), np.empty(total, np.int32)
-    kernels.chain_slots(view, owners, counts, *chains)
+    chain_slots(view, owners, counts, *chains)
     return slots, np.cumsum(counts) - counts, total, chains

@@ -1,8 +1,10 @@
 """The engines as operators of torch: what autograd, `torch.compile` and `torch.export` see of them.
 
-An engine works on plain tensors and knows nothing of gradients. Here its functions become three opaque operators,
-`kfgs::composite`, `kfgs::project` and `kfgs::bin_tiles`, with their backward passes and with fake kernels that tell the
-shapes without computing anything. How many Gaussians can be seen, and how many pairs there are, is known after the fact.
+An engine works on plain tensors and knows nothing of gradients. Here its functions become opaque operators,
+`kfgs::composite`, `kfgs::project`, `kfgs::bin_tiles` and `kfgs::accumulate`, with backward passes and with fake kernels
+that tell the shapes without computing anything. How many Gaussians can be seen, how many pairs there are, and how long an
+engine's trace is (one axis, int32), is known after the fact. Whoever loads an exported program imports `kfgs.splat`
+first, which registers them.
 """
 
 from __future__ import annotations
@@ -29,10 +31,14 @@ def _operator(function: Callable[..., Any]) -> Any:
 
 
 def _refuse(ctx: Any, *grads: Tensor) -> None:
-    """The gradient of what has none."""
+    """The gradient of a backward pass.
+
+    Raises:
+        NotImplementedError: always.
+    """
     raise NotImplementedError(
-        "backward: expected gradients of first order, got a second one through compositing or projection by a compiled "
-        "engine; use engine='reference'"
+        "backward: expected one of first order, got the gradient of a gradient, which compiled engines do not have; "
+        "leave out create_graph=True (project(..., engine='reference') has second derivatives, composite has not)"
     )
 
 
