@@ -16,6 +16,7 @@ from .numba_simd import (
     lanes_below,
     load,
     load_many,
+    put,
     spread_many,
     store,
     store_many,
@@ -52,13 +53,14 @@ def whole_planes(passes: Any, channels: int) -> int:
 
 
 @njit(**INLINE)
-def _write_alphas(state: Any, box: tuple[int, int, int, int], alphas: Any, width: int) -> None:
-    """1 - transmittance of a square's pixels."""
+def _write_alphas(state: Any, box: tuple[int, int, int, int], alphas: Any, lefts: Any, width: int) -> None:
+    """Transmittance of a square's pixels, and 1 - transmittance."""
     left, top, right, bottom = box
     for y in range(bottom - top):
         for x in range(right - left):
             p = (y // BLOCK * BLOCK + x // BLOCK) * LANES + y % BLOCK * BLOCK + x % BLOCK
-            alphas[(top + y) * width + left + x] = 1 - state[LEFT + p]
+            put(lefts, (top + y) * width + left + x, state[LEFT + p])
+            put(alphas, (top + y) * width + left + x, 1 - state[LEFT + p])
 
 
 @compiled(**OPTIONS)
@@ -74,10 +76,10 @@ def composite_narrow(
         length: of a packed row.
         passes: from `plan_passes`.
         background: as many numbers as the passes have channels.
-        images: maps [H * W * D] and alphas [H * W], written.
+        images: maps [H * W * D], alphas [H * W] and transmittances [H * W], written.
         trace: written: per tile and square how many Gaussians were looked at, then the blocks that each was drawn in.
     """
-    maps, alphas = images
+    maps, alphas, lefts = images
     channels = len(maps) // len(alphas)
     picture, planes = Picture(maps, view.width, channels), whole_planes(passes, channels)
     state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
@@ -99,7 +101,7 @@ def composite_narrow(
             scratch = corners, sums, weights, hits, counts
             done = narrow.composite_square((rows, length, view.order), span, state, dark, passes, scratch, drawn)
             trace[tile * squares + square] = done - start
-            _write_alphas(state, box, alphas, view.width)
+            _write_alphas(state, box, alphas, lefts, view.width)
             for block in range(BLOCKS):
                 p = block * LANES
                 left = load(state, LEFT + p)
@@ -124,10 +126,10 @@ def composite_wide(
         features: flat.
         begins: [M], where each Gaussian's row of features begins.
         background: D numbers and zeros up to a whole vector.
-        images: maps [H * W * D] and alphas [H * W], written.
+        images: maps [H * W * D], alphas [H * W] and transmittances [H * W], written.
         trace: see `composite_narrow`.
     """
-    maps, alphas = images
+    maps, alphas, lefts = images
     channels = len(maps) // len(alphas)
     stride = wide.padded(channels)
     state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
@@ -148,7 +150,7 @@ def composite_wide(
             packed, source = (rows, length, view.order), (features, begins, channels)
             done, filled = wide.composite_square(packed, span, state, dark, source, scratch, drawn)
             trace[tile * squares + square] = done - start
-            _write_alphas(state, box, alphas, view.width)
+            _write_alphas(state, box, alphas, lefts, view.width)
             for y in range(box[3] - box[1]):
                 for x in range(box[2] - box[0]):
                     block = y // BLOCK * BLOCK + x // BLOCK

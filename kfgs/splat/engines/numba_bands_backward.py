@@ -64,7 +64,7 @@ def _start_backward(
     SHARE = grad_alpha - background . grad, and all weights times their slopes are
     maps . grad - T background . grad + alphas SHARE.
     """
-    maps, grad_maps, alphas, grad_alphas = pictures
+    maps, grad_maps, lefts, grad_alphas = pictures
     p = block * LANES
     total, through = spread(planes, 0), spread(planes, 0)
     for channel in range(0, maps.channels, LANES):
@@ -75,10 +75,10 @@ def _start_backward(
         through = add_dot(through, grads, spread_many(SIXTEEN, background, channel, 1))
         if keep:
             store_many(planes, narrow.GRADS + channel * PIXELS + p, PIXELS, grads)
-    alpha = _read_pixels(alphas, maps.width, box, block, scratch)
+    left = _read_pixels(lefts, maps.width, box, block, scratch)
     share = _read_pixels(grad_alphas, maps.width, box, block, scratch) - through
     store(planes, narrow.SHARE + p, share)
-    store(planes, narrow.BEHIND + p, total - (1 - alpha) * through + alpha * share)
+    store(planes, narrow.BEHIND + p, total - left * through + (1 - left) * share)
 
 
 @compiled(**OPTIONS)
@@ -104,16 +104,16 @@ def differentiate_narrow(
         length: of a packed row, and of a gradient row.
         passes: from `plan_passes`.
         background: D numbers, and zeros up to a whole vector.
-        images: maps, the loss's gradient in them, alphas, the loss's gradient in them, all flat.
+        images: maps, the loss's gradient in them, transmittances, the loss's gradient in the alphas, all flat.
         trace: of the forward pass.
         slots: [P] from `number_slots`.
         firsts: [B], where the band's rows begin.
         out: [R * length], added to.
     """
-    maps, grad_maps, alphas, grad_alphas = images
-    channels, width = len(maps) // len(alphas), view.width
+    maps, grad_maps, lefts, grad_alphas = images
+    channels, width = len(maps) // len(lefts), view.width
     grads = Picture(grad_maps, width, channels)
-    pictures = Picture(maps, width, channels), grads, alphas, grad_alphas
+    pictures = Picture(maps, width, channels), grads, lefts, grad_alphas
     state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
     planes = aligned((2 + whole_planes(passes, channels)) * PIXELS, rows)
     planes[:] = 0
@@ -167,11 +167,11 @@ def differentiate_wide(
         out: [R * (LANES + padded D)], added to.
         geometry: whether the moments are wanted.
     """
-    maps, grad_maps, alphas, grad_alphas = images
+    maps, grad_maps, lefts, grad_alphas = images
     channels, width = source[2], view.width
     stride = wide.padded(channels)
     grads = Picture(grad_maps, width, channels)
-    pictures = Picture(maps, width, channels), grads, alphas, grad_alphas
+    pictures = Picture(maps, width, channels), grads, lefts, grad_alphas
     state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
     planes, square_grads = aligned(2 * PIXELS, rows), aligned(PIXELS * stride, rows)
     scratch, slopes = aligned(LANES * LANES, rows), aligned((CHUNK + 3) * LANES, rows)

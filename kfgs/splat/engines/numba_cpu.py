@@ -55,11 +55,11 @@ def forward(
     channels = features.shape[1]
     view = _view(rows, offsets, width, height, tile_size)
     maps, alphas = take(features, height, width, channels), features.new_empty(height, width)
-    trace, packed, ends = _make_trace(view, means2d, channels)
+    trace, packed, lefts, ends = _make_trace(view, means2d, channels)
     ends[: count_squares(view) * (len(view.offsets) - 1)] = 0
     splats = _flat(means2d), _flat(conics), _flat(opacities)
     run_bands(pack_rows, BANDS, BANDS, splats, _flat(features), _packed(channels), _index(index), packed)
-    images, length = (_flat(maps), _flat(alphas)), row_length(_packed(channels))
+    images, length = (_flat(maps), _flat(alphas), lefts), row_length(_packed(channels))
     behind = _padded(background, padded(channels))
     if channels <= NARROW:
         passes = plan_passes(channels)
@@ -92,9 +92,9 @@ def backward(
     """Gradients of means2d, conics, opacities, features and background; empty where not wanted."""
     channels = features.shape[1]
     view = _view(rows, offsets, width, height, tile_size)
-    images = tuple(_flat(value) for value in (maps, grad_maps, alphas, grad_alphas))
     slots, firsts, total, chains = _number(view, len(means2d))
-    packed, ends = _read_trace(trace, view, means2d, channels)
+    packed, lefts, ends = _read_trace(trace, view, means2d, channels)
+    images = _flat(maps), _flat(grad_maps), lefts, _flat(grad_alphas)
     length, behind = row_length(_packed(channels)), _padded(background, padded(channels))
     if channels <= NARROW:
         width, column = length, MOMENTS
@@ -117,7 +117,7 @@ def backward(
     shares = BANDS if _increasing(which) else 1  # two Gaussians that show the same row must not meet
     splats, targets = (_flat(conics), _flat(opacities)), tuple(_flat(value) for value in grads)
     run_bands(gather_gradients, shares, shares, splats, chains, out, layout, which, targets)
-    grads.append((grad_maps * (1 - alphas)[..., None]).sum((0, 1)) if wanted[4] else background)
+    grads.append((grad_maps * torch.from_numpy(lefts).view(height, width, 1)).sum((0, 1)) if wanted[4] else background)
     return [value if want else value.new_empty(0) for value, want in zip(grads, wanted, strict=True)]
 
 
@@ -158,22 +158,30 @@ def _packed(channels: int) -> int:
     return channels if channels <= NARROW else 0
 
 
-def _make_trace(view: View, like: Tensor, channels: int) -> tuple[Tensor, np.ndarray, np.ndarray]:
-    """What backward wants to know of forward, in one int32 tensor, and its two parts.
+def _make_trace(view: View, like: Tensor, channels: int) -> tuple[Tensor, np.ndarray, np.ndarray, np.ndarray]:
+    """What backward wants to know of forward, in one int32 tensor, and its parts.
 
-    The packed Gaussians come first, on whole cache lines, which torch's memory begins with and numpy's does not; then,
-    per tile and square, how many Gaussians were looked at, and the blocks that each was drawn in.
+    The packed Gaussians come first, on whole cache lines; then each pixel's transmittance, of which 1 - alpha keeps few
+    digits; then, per tile and square, how many Gaussians were looked at, and the blocks that each was drawn in.
     """
-    numbers = len(like) * row_length(_packed(channels)) * like.element_size() // 4
     squares = count_squares(view)
-    trace = take(torch.empty(0, dtype=torch.int32), numbers + squares * (len(view.offsets) - 1 + len(view.order)))
+    numbers = sum(_floats(view, like, channels)) * like.element_size() // 4
+    length = numbers + squares * (len(view.offsets) - 1 + len(view.order))
+    trace = take(torch.empty(0, dtype=torch.int32), length)
     return trace, *_read_trace(trace, view, like, channels)
 
 
-def _read_trace(trace: Tensor, view: View, like: Tensor, channels: int) -> tuple[np.ndarray, np.ndarray]:
-    """The packed Gaussians and the rest of a trace."""
-    numbers = len(like) * row_length(_packed(channels)) * like.element_size() // 4
-    return trace.numpy()[:numbers].view(like.detach().numpy().dtype), trace.numpy()[numbers:]
+def _read_trace(trace: Tensor, view: View, like: Tensor, channels: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The packed Gaussians, the transmittances and the rest of a trace."""
+    packed, pixels = _floats(view, like, channels)
+    numbers = (packed + pixels) * like.element_size() // 4
+    floats = trace.numpy()[:numbers].view(like.detach().numpy().dtype)
+    return floats[:packed], floats[packed:], trace.numpy()[numbers:]
+
+
+def _floats(view: View, like: Tensor, channels: int) -> tuple[int, int]:
+    """How many numbers of the data's type are in a trace: packed Gaussians, and pixels."""
+    return len(like) * row_length(_packed(channels)), view.width * view.height
 
 
 def _index(index: Tensor | None) -> np.ndarray:
