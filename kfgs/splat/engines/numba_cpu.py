@@ -117,7 +117,7 @@ def backward(
     shares = BANDS if _increasing(which) else 1  # two Gaussians that show the same row must not meet
     splats, targets = (_flat(conics), _flat(opacities)), tuple(_flat(value) for value in grads)
     run_bands(gather_gradients, shares, shares, splats, chains, out, layout, which, targets)
-    grads.append((grad_maps * torch.from_numpy(lefts).view(height, width, 1)).sum((0, 1)) if wanted[4] else background)
+    grads.append((grad_maps * torch.from_numpy(lefts).view_as(alphas)[..., None]).sum((0, 1)) if wanted[4] else background)
     return [value if want else value.new_empty(0) for value, want in zip(grads, wanted, strict=True)]
 
 
