@@ -1,10 +1,21 @@
 """What every compositing engine promises, and the three constants behind it.
 
-An engine is one module with
+An engine is one module on plain tensors that knows nothing of autograd, with
 
-    composite(means2d [M, 2], conics [M, 3], opacities [M], features [M, D], tiles, background [D] | None)
-        -> maps [H, W, D], alphas [H, W]
+    devices() -> names of the device types it runs on
+    forward(means2d [M, 2], conics [M, 3], opacities [M], features [N, D], background [D], index [M] | None,
+            rows [P], offsets [T + 1], width, height, tile_size)
+        -> maps [H, W, D], alphas [H, W], trace: one int32 tensor of the engine's own, for backward
+    backward(grad_maps, grad_alphas, wanted: five bools, all arguments of forward, maps, alphas, trace)
+        -> gradients of means2d, conics, opacities, features [N, D] and background; empty where not wanted
+    accumulate(means2d, conics, opacities, pixels [H, W, D], rows, offsets, width, height, tile_size)
+        -> sums [M, D], weights [M]
 
+and, if it can do better than kornia and torch, `project`, `project_backward` and `bin`: the arguments and results are
+those of `ops`, which turns these functions into operators. The reference engine is plain torch under autograd, and has
+`composite` instead of forward and backward.
+
+Gaussian m shows row index[m] of the features, or row m without an index.
 Tile t owns `tiles.rows[tiles.offsets[t]:tiles.offsets[t + 1]]`, front to back; a row indexes the M projected Gaussians.
 Tiles are numbered along image rows. The tensors an engine receives are contiguous, of one dtype and on one device.
 
@@ -21,8 +32,8 @@ Tiles are numbered along image rows. The tensors an engine receives are contiguo
 5. D is any size from 1, chosen at run time. M = 0 or an empty tile gives the background, alpha 0.
 6. dtype in = dtype out. The CPU engines work in float64 too, so that `gradcheck` runs on them. No device moves, no
    printing, no edits to the caller's tensors.
-7. Weights against a per-pixel signal (weights^T · pixels, for uplifting and pruning) are the gradient of `maps` with
-   respect to `features`: see `accumulate_pixels`.
+7. Weights against a per-pixel signal (weights^T · pixels, for uplifting and pruning) and the sums of the weights come
+   from one walk over the view: `accumulate`.
 
 Two engines differ by rounding only. Thresholds make that visible at a few pixels where alpha lies on 1/255, or T' on
 1e-4: two opaque hits give T' = (1 - 0.99)^2, which is just below 1e-4 in float32 and just above it in float64.

@@ -73,7 +73,7 @@ def forward(
     width: int,
     height: int,
     tile_size: int,
-) -> tuple[Tensor, Tensor, Tensor]:  # maps [H, W, D], alphas [H, W], trace [2, H, W] int32
+) -> tuple[Tensor, Tensor, Tensor]:  # maps [H, W, D], alphas [H, W], trace [2 * H * W] int32
     """Composite as `contract` promises.
 
     `trace` is for the backward pass: how many Gaussians of its tile's list each pixel passed before it stopped, and the
@@ -90,7 +90,7 @@ def forward(
     if len(rows) == 0:
         stops.zero_()
         lights.fill_(1.0)
-        return maps.copy_(background.expand_as(maps)), alphas.zero_(), trace
+        return maps.copy_(background.expand_as(maps)), alphas.zero_(), trace.view(-1)
     options = launch_options("composite", D, tile_size)
     grid = _programs(options, width, height), -(-D // options["BLOCK"])
     with _on(means2d):
@@ -98,7 +98,7 @@ def forward(
             means2d, conics, opacities, features, background, index, rows, offsets,
             maps, alphas, stops, lights, width, height, -(-width // tile_size), D, **options,
         )  # fmt: skip
-    return maps, alphas, trace
+    return maps, alphas, trace.view(-1)
 
 
 def backward(
@@ -134,7 +134,8 @@ def backward(
     """
     _check(grad_maps=grad_maps, grad_alphas=grad_alphas, means2d=means2d, features=features)
     of_splats, of_features = any(wanted[:3]), bool(wanted[3])
-    stops, lights = trace[0], trace[1].view(torch.float32)
+    stops, lights = trace.view(2, -1)
+    lights = lights.view(torch.float32)
     values = (means2d, conics, opacities, features)
     computed = (of_splats, of_splats, of_splats, of_features)
     grads = [torch.zeros_like(v) if c else v.new_empty(0) for v, c in zip(values, computed, strict=True)]
