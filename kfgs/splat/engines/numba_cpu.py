@@ -99,8 +99,8 @@ def backward(
     if channels <= NARROW:
         width, column = length, MOMENTS
         out = take(means2d, total * width).zero_().numpy()
-        shared = (view, packed, length, plan_passes(channels), behind, images, ends, slots, firsts, out)
-        run_bands(differentiate_narrow, BANDS, *shared)
+        passes = plan_passes(channels)
+        run_bands(differentiate_narrow, BANDS, view, packed, length, passes, behind, images, ends, slots, firsts, out)
     else:
         width, column = LANES + padded(channels), LANES
         out = take(means2d, total * width).zero_().numpy()
@@ -117,7 +117,9 @@ def backward(
     shares = BANDS if _increasing(which) else 1  # two Gaussians that show the same row must not meet
     splats, targets = (_flat(conics), _flat(opacities)), tuple(_flat(value) for value in grads)
     run_bands(gather_gradients, shares, shares, splats, chains, out, layout, which, targets)
-    grads.append((grad_maps * torch.from_numpy(lefts).view_as(alphas)[..., None]).sum((0, 1)) if wanted[4] else background)
+    grads.append(
+        (grad_maps * torch.from_numpy(lefts).view_as(alphas)[..., None]).sum((0, 1)) if wanted[4] else background
+    )
     return [value if want else value.new_empty(0) for value, want in zip(grads, wanted, strict=True)]
 
 

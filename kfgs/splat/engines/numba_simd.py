@@ -158,7 +158,19 @@ def _element_of(kinds: tuple[Any, ...]) -> Any:
 # Operators ------------------------------------------------------------------------------------------------------------
 
 
-def _register_operator(symbol: Any, compute: Callable[[Any, Any, Any], Any], *, gives_mask: bool) -> None:
+_OPERATORS = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": operator.truediv,
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+}
+
+
+def _register_operator(symbol: Any, compute: Callable[..., Any], *, gives_mask: bool) -> None:
     @infer_global(symbol)
     class _Template(AbstractTemplate):
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
@@ -174,15 +186,18 @@ def _register_operator(symbol: Any, compute: Callable[[Any, Any, Any], Any], *, 
         lower_builtin(symbol, left, right)(lower)
 
 
-for _symbol, _name in (
-    (operator.add, "fadd"),
-    (operator.sub, "fsub"),
-    (operator.mul, "fmul"),
-    (operator.truediv, "fdiv"),
-):
-    _register_operator(_symbol, lambda b, x, y, name=_name: getattr(b, name)(x, y), gives_mask=False)
-for _symbol, _name in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
-    _register_operator(_symbol, lambda b, x, y, name=_name: b.fcmp_ordered(name, x, y), gives_mask=True)
+def _compute(name: str) -> Callable[..., Any]:
+    return lambda builder, x, y: getattr(builder, name)(x, y)
+
+
+def _compare(name: str) -> Callable[..., Any]:
+    return lambda builder, x, y: builder.fcmp_ordered(name, x, y)
+
+
+for _symbol, _name in zip("+-*/", ("fadd", "fsub", "fmul", "fdiv"), strict=True):
+    _register_operator(_OPERATORS[_symbol], _compute(_name), gives_mask=False)
+for _symbol in ("<", "<=", ">", ">="):
+    _register_operator(_OPERATORS[_symbol], _compare(_symbol), gives_mask=True)
 
 
 def _register_mask_operator(symbol: Any, name: str) -> None:

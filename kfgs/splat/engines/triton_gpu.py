@@ -134,8 +134,8 @@ def backward(
     """
     _check(grad_maps=grad_maps, grad_alphas=grad_alphas, means2d=means2d, features=features)
     of_splats, of_features = any(wanted[:3]), bool(wanted[3])
-    stops, lights = trace.view(2, -1)
-    lights = lights.view(torch.float32)
+    trace = trace.view(2, height, width)
+    stops, lights = trace[0], trace[1].view(torch.float32)
     values = (means2d, conics, opacities, features)
     computed = (of_splats, of_splats, of_splats, of_features)
     grads = [torch.zeros_like(v) if c else v.new_empty(0) for v, c in zip(values, computed, strict=True)]
