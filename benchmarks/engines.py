@@ -1,11 +1,12 @@
 """Every engine of kfgs and the CPU peers that can be had, side by side in one run.
 
-    python benchmarks/engines.py [--quick] [--out FOLDER] [--threads 1 2] [--repeats 9]
+    python benchmarks/engines.py [--quick] [--out FOLDER] [--threads 1 2] [--repeats 9] [--slowest 20]
 
 writes engines.md (tables), engines.json (all numbers) and curves as PNG, in about half an hour on two cores. In each
 configuration all engines get the same arrays and the same lists of tiles, and are timed in turn, round after round; the
 tables give medians, with the least in brackets. Growth is measured along three axes: N at 480x360x9, pixels at N = 110k
-x9, channels at 30k 640x480 and 110k 480x360. A call that would take longer than 20 s is left out, and the table says so.
+x9, channels at 30k 640x480 and 110k 480x360. A call that would take longer than `--slowest` seconds is left out, and the
+table says so.
 `--quick` checks that all of it works, in about a minute; its numbers mean little.
 
 **Operations**, for the share of the machine's peak: on a pair (pixel, Gaussian) that is composited, alpha takes 24
@@ -46,7 +47,6 @@ from engines_report import write_curves, write_tables
 from engines_runners import PROTOTYPE, Case, Inputs, calls, count_pairs, engine_names, prepare
 from engines_step import kfgs_step, prototype_step
 
-SLOWEST = 20.0  # seconds
 SIZES = (320, 240), (480, 360), (640, 480), (1280, 960)
 SLICES = {
     "Gaussians": [Case(n, 9, 480, 360) for n in (10_000, 30_000, 110_000, 500_000)],
@@ -69,6 +69,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("engines_benchmark"), help="folder for tables and curves")
     parser.add_argument("--threads", type=int, nargs="+", help="thread counts (default: 1 and all; quick: all)")
     parser.add_argument("--repeats", type=int, help="rounds per configuration (default 9; quick 3)")
+    parser.add_argument("--slowest", type=float, default=20.0, help="seconds above which an engine is left out")
     parser.add_argument("--memory-of", nargs=5, metavar=("ENGINE", "N", "C", "W", "H"), help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.memory_of:
@@ -93,7 +94,7 @@ def main() -> None:
         save(report, args.out)
         rates: dict[str, float] = {}
         for case in dict.fromkeys(case for cases in slices.values() for case in cases):
-            report["cases"].append(time_case(case, count, repeats, rates))
+            report["cases"].append(time_case(case, count, repeats, args.slowest, rates))
             save(report, args.out)
     probed = [slices["Gaussians"][1]] if args.quick else [*slices["Gaussians"], *slices["channels, N=30,000"]]
     for entry in report["cases"]:
@@ -104,7 +105,7 @@ def main() -> None:
     print(f"written: {', '.join(str(path) for path in sorted(args.out.glob('engines*')))}")
 
 
-def time_case(case: Case, threads: int, repeats: int, rates: dict[str, float]) -> dict[str, Any]:
+def time_case(case: Case, threads: int, repeats: int, slowest: float, rates: dict[str, float]) -> dict[str, Any]:
     """Time all engines on one case. `rates` is seconds per unit of work so far, by which to leave out what is too slow."""
     inputs = prepare(case)
     pairs = count_pairs(inputs)
@@ -114,7 +115,7 @@ def time_case(case: Case, threads: int, repeats: int, rates: dict[str, float]) -
     jobs, maps = {}, None
     for engine in engine_names():
         expected = rates.get(engine, 0) * work
-        if expected > SLOWEST:
+        if expected > slowest:
             entry["left_out"][engine] = f"about {expected:.0f} s"
             continue
         jobs[engine] = calls(engine, inputs)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import inspect
 import math
 import sys
 from collections.abc import Callable
@@ -64,19 +63,8 @@ def prepare(case: Case) -> Inputs:
 
 def engine_names() -> list[str]:
     """Kfgs's engines that run on a CPU, then the peers that are there."""
-    mine = [f"kfgs {name}" for name in available_engines() if _runs_on_cpu(name)]
+    mine = [f"kfgs {name}" for name in available_engines("cpu")]
     return mine + (["prototype", "torch tile-batched"] if PROTOTYPE.is_dir() else [])
-
-
-def _runs_on_cpu(name: str) -> bool:
-    tiles = Tiles(torch.zeros(1, dtype=torch.int32), torch.tensor([0, 1]), 4, 4, 16)
-    try:
-        composite(torch.ones(1, 2), torch.tensor([[1.0, 0, 1]]), torch.ones(1), torch.ones(1, 1), tiles, engine=name)
-    except ValueError as error:
-        if "runs on cpu" not in str(error):
-            raise
-        return False
-    return True
 
 
 def calls(name: str, inputs: Inputs) -> Calls:
@@ -97,18 +85,9 @@ def calls(name: str, inputs: Inputs) -> Calls:
 def composite_projected(
     projected: Projected, features: Tensor, tiles: Tiles, engine: str
 ) -> tuple[Tensor, Tensor]:  # maps, alphas
-    """Composite the features [N, D] of all Gaussians, whichever way this version of kfgs picks the visible ones."""
+    """Composite the features [N, D] of all Gaussians."""
     splats = projected.means2d, projected.conics, projected.opacities
-    if "index" in inspect.signature(composite).parameters:
-        return composite(*splats, features, tiles, index=projected.index, engine=engine)
-    return composite(*splats, features[projected.index], tiles, engine=engine)
-
-
-def with_engine(function: Callable[..., Any], engine: str) -> Callable[..., Any]:
-    """The function with its engine chosen, if it has a choice."""
-    if "engine" not in inspect.signature(function).parameters:
-        return function
-    return lambda *arguments: function(*arguments, engine=engine)
+    return composite(*splats, features, tiles, index=projected.index, engine=engine)
 
 
 def _kfgs(engine: str, inputs: Inputs) -> Calls:

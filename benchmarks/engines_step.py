@@ -14,7 +14,6 @@ from engines_runners import (
     prototype,
     prototype_camera,
     prototype_parameters,
-    with_engine,
 )
 from torch import Tensor
 
@@ -48,11 +47,11 @@ def kfgs_step(engine: str, inputs: Inputs) -> tuple[Calls, Calls]:
     kept: dict[str, Any] = {}
 
     def projecting() -> None:
-        kept["projected"] = with_engine(project, engine)(params.activated(), inputs.camera)
+        kept["projected"] = project(params.activated(), inputs.camera, engine=engine)
 
     def binning() -> None:
         projected = Projected(*(value.detach() for value in kept["projected"]))
-        kept["tiles"] = with_engine(bin_tiles, engine)(projected, width, height)
+        kept["tiles"] = bin_tiles(projected, width, height, engine=engine)
 
     def compositing() -> None:
         projected: Projected = kept["projected"]
