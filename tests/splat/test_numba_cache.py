@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from zlib import crc32
 
 import numpy as np
@@ -178,6 +179,23 @@ def test_without_a_place_to_write_to_it_is_compiled_in_memory(monkeypatch):
     double(np.arange(3.0), out)
     assert out.tolist() == [0, 2, 4]
     assert asked == [{"cache": True, "nogil": True}, {"nogil": True}]
+
+
+def test_another_numba_costs_the_cache_alone(monkeypatch):
+    """The stamp is a private attribute: where it is not, no kernel of older sources may be taken from the disk."""
+    njit = numba_cache.njit
+
+    def other(*, cache=False, **options):
+        def decorate(function):
+            kernel = njit(**options)(function)
+            return SimpleNamespace(py_func=function) if cache else kernel
+
+        return decorate
+
+    monkeypatch.setattr(numba_cache, "njit", other)
+    double = numba_cache.compiled(nogil=True)(lambda x: 2 * x)
+    assert double(21) == 42
+    assert double.stats.cache_path is None
 
 
 def test_function_of_no_file_is_compiled_in_memory():
