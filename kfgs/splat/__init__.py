@@ -1,7 +1,15 @@
 """Gaussian splatting: project, bin, composite."""
 
 from .covariance import covariance_3d
-from .engines import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, accumulate_pixels, available_engines, composite
+from .engines import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    TRANSMITTANCE_MIN,
+    accumulate_pixels,
+    available_engines,
+    composite,
+    free_memory,
+)
 from .project import Projected, project
 from .rasterize import Rendering, rasterize
 from .sh import SH_C0, evaluate_sh, rgb_to_sh0, sh0_to_rgb
@@ -21,6 +29,7 @@ __all__ = [
     "composite",
     "covariance_3d",
     "evaluate_sh",
+    "free_memory",
     "project",
     "rasterize",
     "rgb_to_sh0",

@@ -89,8 +89,8 @@ def _bin(projected: Projected, width: int, height: int, tile_size: int) -> tuple
     hits = spans[:, 0] * spans[:, 1]
     near_to_far = torch.arange(len(order), dtype=torch.int32, device=order.device)
     which = torch.repeat_interleave(near_to_far, hits)  # [P'] candidates, front to back
-    begin = torch.cumsum(hits, 0, dtype=torch.int32) - hits
-    step = torch.arange(len(which), dtype=torch.int32, device=order.device) - begin[which]
+    begin = torch.cumsum(hits, 0) - hits  # int64: candidates of huge Gaussians may be more than an int32 counts
+    step = (torch.arange(len(which), device=order.device) - begin[which]).to(torch.int32)
     down = step // spans[which, 0]
     tile_y = first[which, 1] + down
     tile_x = first[which, 0] + step - down * spans[which, 0]

@@ -1,5 +1,9 @@
 """The promises of `kfgs.splat.engines.contract`, asked of every engine that is installed."""
 
+import importlib.machinery
+import sys
+import types
+
 import numpy as np
 import oracles_splat as oracle
 import pytest
@@ -451,7 +455,26 @@ def test_engine_must_be_known():
 
 def test_engine_must_run_on_the_device():
     with pytest.raises(ValueError, match=r"engine: expected one that runs on cuda .* got 'numba' for cpu"):
-        table.choose("numba", "cuda")
+        table.choose("numba", "cuda", torch.float32)
+
+
+def test_auto_passes_over_an_engine_that_does_not_know_the_dtype(monkeypatch):
+    single = types.ModuleType("single_precision")
+    single.DTYPES, single.devices = (torch.float32,), lambda: ("cpu",)
+    monkeypatch.setitem(sys.modules, "single_precision", single)
+    single.__spec__ = importlib.machinery.ModuleSpec("single_precision", None)
+    entry = table._Entry("single_precision", "torch", "pip install torch")
+    monkeypatch.setattr(table, "_ENGINES", {"single": entry, **table._ENGINES})
+    for function in (table.load, table._choose):
+        function.cache_clear()
+    assert table.choose("auto", "cpu", torch.float32) == "single"
+    assert table.choose("auto", "cpu", torch.float64) == ENGINES[0]
+    with pytest.raises(
+        ValueError, match=r"engine: expected one for torch.float64 .* got 'single' for torch.float32; .*engine='auto'"
+    ):
+        table.choose("single", "cpu", torch.float64)
+    for function in (table.load, table._choose):
+        function.cache_clear()
 
 
 def test_shapes_must_agree():

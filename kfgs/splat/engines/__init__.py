@@ -10,6 +10,7 @@ from torch import Tensor
 from ..._check import check_shapes
 from . import ops
 from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from .numba_memory import free_memory
 from .ops import check_values
 from .table import available_engines, choose, load
 
@@ -23,6 +24,7 @@ __all__ = [
     "accumulate_pixels",
     "available_engines",
     "composite",
+    "free_memory",
 ]
 
 
@@ -56,9 +58,14 @@ def composite(
         The composited features and the opacity of every pixel, differentiable in all tensors but `tiles`.
 
     Raises:
-        ValueError: if shapes, dtypes or devices disagree, `tiles` is of other Gaussians, or the engine is unknown or
-            does not run on the device.
+        ValueError: if shapes, dtypes or devices disagree, `tiles` or `index` are of other Gaussians, or the engine is
+            unknown or does not run on the device or in the dtype.
         ImportError: if the named engine's package is missing.
+        NotImplementedError: if a gradient of a gradient is asked of a compiled engine.
+
+    Note:
+        On the CPU, the largest arrays of the last frames are kept for the next ones, up to 1 GiB per thread;
+        `free_memory` hands them back.
     """
     check_shapes(
         ("means2d", means2d, "M 2"),
@@ -71,12 +78,12 @@ def composite(
     _check_kinds({"conics": conics, "opacities": opacities, "features": features, "background": background}, means2d)
     _check_integers("index", index, means2d, (torch.int64,), "pass Projected.index")
     _check_tiles(tiles, means2d)
-    name = choose(engine, means2d.device.type)
+    name = choose(engine, means2d.device.type, means2d.dtype)
     if background is None:
         background = features.new_zeros(features.shape[1])
     values = (value.contiguous() for value in (means2d, conics, opacities, features, background))
     view = tiles.rows.contiguous(), tiles.offsets.contiguous(), tiles.width, tiles.height, tiles.tile_size
-    if name == "reference":  # differentiable as it stands
+    if hasattr(load(name), "composite"):  # differentiable as it stands
         check_values(len(means2d), len(features), index, *view[:2])
         return load(name).composite(*values, index, tiles)
     maps, alphas, _ = ops.composite(*values, index, *view, name)
@@ -119,10 +126,10 @@ def accumulate_pixels(
     )
     _check_kinds({"conics": conics, "opacities": opacities, "pixels": pixels}, means2d)
     _check_tiles(tiles, means2d)
-    name = choose(engine, means2d.device.type)
+    name = choose(engine, means2d.device.type, means2d.dtype)
     values = (value.detach().contiguous() for value in (means2d, conics, opacities, pixels))
     view = tiles.rows.contiguous(), tiles.offsets.contiguous(), tiles.width, tiles.height, tiles.tile_size
-    if name == "reference":  # its results are parts of one tensor, which an operator's must not be
+    if hasattr(load(name), "composite"):  # its results are parts of one tensor, which an operator's must not be
         check_values(len(means2d), len(means2d), None, *view[:2])
         return load(name).accumulate(*values, *view)
     return ops.accumulate(*values, *view, name)

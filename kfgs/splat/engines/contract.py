@@ -2,7 +2,7 @@
 
 An engine is one module on plain tensors that knows nothing of autograd, with
 
-    devices() -> names of the device types it runs on
+    DTYPES, devices() -> the floating-point types it computes in, and names of the device types it runs on
     forward(means2d [M, 2], conics [M, 3], opacities [M], features [N, D], background [D], index [M] | None,
             rows [P], offsets [T + 1], width, height, tile_size)
         -> maps [H, W, D], alphas [H, W], trace: one int32 tensor of the engine's own, for backward
@@ -30,7 +30,9 @@ Tiles are numbered along image rows. The tensors an engine receives are contiguo
    Both are differentiable in means2d, conics, opacities, features and background; the gradient through a Gaussian is
    zero at pixels where its alpha is clamped or it is skipped. The decision where to stop has no gradient.
 5. D is any size from 1, chosen at run time. M = 0 or an empty tile gives the background, alpha 0.
-6. dtype in = dtype out. The CPU engines work in float64 too, so that `gradcheck` runs on them. No device moves, no
+6. dtype in = dtype out. A conic that is not positive definite draws nothing on the compiled engines, whose rows and
+   index must lie within what there is: this is checked on the CPU alone, for on a GPU the check would cost a wait.
+   The CPU engines work in float64 too, so that `gradcheck` runs on them. No device moves, no
    printing, no edits to the caller's tensors.
 7. Weights against a per-pixel signal (weights^T · pixels, for uplifting and pruning) and the sums of the weights come
    from one walk over the view: `accumulate`.

@@ -201,8 +201,8 @@ def accumulate_band(
         pixels: [H * W * D].
         channels: D.
         slots: [P] from `number_slots`.
-        firsts: [B], where the band's rows begin.
-        out: [R * padded(D + 1)], added to.
+        firsts: [B + 1], where the bands' rows begin.
+        out: [R * padded(D + 1)], written.
     """
     width = wide.padded(channels + 1)
     picture = Picture(pixels, view.width, channels)
@@ -210,7 +210,8 @@ def accumulate_band(
     planes, weights = aligned(width * PIXELS, rows), aligned(PIXELS, rows)
     planes[:] = 0
     scratch = aligned(LANES * LANES, rows)
-    own = out[firsts[band] * width :]
+    own = out[firsts[band] * width : firsts[band + 1] * width]
+    own[:] = 0
     for tile in range(view.bounds[band], view.bounds[band + 1]):
         start, end = view.offsets[tile], view.offsets[tile + 1]
         for square in range(count_squares(view)):

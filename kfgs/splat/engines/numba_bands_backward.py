@@ -107,8 +107,8 @@ def differentiate_narrow(
         images: maps, the loss's gradient in them, transmittances, the loss's gradient in the alphas, all flat.
         trace: of the forward pass.
         slots: [P] from `number_slots`.
-        firsts: [B], where the band's rows begin.
-        out: [R * length], added to.
+        firsts: [B + 1], where the bands' rows begin.
+        out: [R * length], written.
     """
     maps, grad_maps, lefts, grad_alphas = images
     channels, width = len(maps) // len(lefts), view.width
@@ -120,7 +120,8 @@ def differentiate_narrow(
     weights, scratch = aligned(PIXELS, rows), aligned(LANES * LANES, rows)
     squares = count_squares(view)
     drawn = trace[squares * (len(view.offsets) - 1) :]
-    own = out[firsts[band] * length :]
+    own = out[firsts[band] * length : firsts[band + 1] * length]
+    own[:] = 0
     for tile in range(view.bounds[band], view.bounds[band + 1]):
         start, end = view.offsets[tile], view.offsets[tile + 1]
         for square in range(squares):
@@ -163,8 +164,8 @@ def differentiate_wide(
         images: as for `differentiate_narrow`.
         trace: of the forward pass.
         slots: [P] from `number_slots`.
-        firsts: [B], where the band's rows begin.
-        out: [R * (LANES + padded D)], added to.
+        firsts: [B + 1], where the bands' rows begin.
+        out: [R * (LANES + padded D)], written.
         geometry: whether the moments are wanted.
     """
     maps, grad_maps, lefts, grad_alphas = images
@@ -179,7 +180,8 @@ def differentiate_wide(
     hits, counts = np.empty(BLOCKS * CHUNK, np.int32), np.empty(BLOCKS, np.int32)
     squares = count_squares(view)
     drawn = trace[squares * (len(view.offsets) - 1) :]
-    own = out[firsts[band] * (LANES + stride) :]
+    own = out[firsts[band] * (LANES + stride) : firsts[band + 1] * (LANES + stride)]
+    own[:] = 0
     for tile in range(view.bounds[band], view.bounds[band + 1]):
         start, end = view.offsets[tile], view.offsets[tile + 1]
         for square in range(squares):

@@ -24,10 +24,10 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     def decorate(function: Callable[..., Any]) -> Any:
         try:
             kernel = njit(cache=True, **options)(function)
-        except RuntimeError:  # no place to write to
+            index = kernel._cache._cache_file
+            index._source_stamp = index._source_stamp, SOURCES
+        except (RuntimeError, AttributeError):  # no place to write to, or another numba
             return njit(**options)(function)
-        index = kernel._cache._cache_file
-        index._source_stamp = index._source_stamp, SOURCES
         return kernel
 
     return decorate

@@ -26,11 +26,15 @@ from .numba_wide import padded
 
 __all__ = ["accumulate", "backward", "bin", "devices", "forward", "project", "project_backward"]
 
-BANDS = 32
-"""Shares of the work: more of them keep more threads busy, and let more gradient rows meet at their borders."""
+BANDS, BAND = 32, 2048
+"""Shares of the work, and the fewest pairs that make one: more shares keep more threads busy, and let more gradient rows
+meet at their borders. How many there are depends on the data alone."""
 
 NARROW = len(FIRST) + LANES
 """Up to so many channels stay in registers, a vector each; more are multiplied in blocks."""
+
+
+DTYPES = torch.float32, torch.float64
 
 
 def devices() -> tuple[str, ...]:
@@ -54,19 +58,20 @@ def forward(
     """Composite as `contract` promises; a Gaussian whose conic is not positive definite is not drawn."""
     channels = features.shape[1]
     view = _view(rows, offsets, width, height, tile_size)
+    bands = len(view.bounds) - 1
     maps, alphas = take(features, height, width, channels), features.new_empty(height, width)
     trace, packed, lefts, ends = _make_trace(view, means2d, channels)
     ends[: count_squares(view) * (len(view.offsets) - 1)] = 0
     splats = _flat(means2d), _flat(conics), _flat(opacities)
-    run_bands(pack_rows, BANDS, BANDS, splats, _flat(features), _packed(channels), _index(index), packed)
+    run_bands(pack_rows, bands, bands, splats, _flat(features), _packed(channels), _index(index), packed)
     images, length = (_flat(maps), _flat(alphas), lefts), row_length(_packed(channels))
     behind = _padded(background, padded(channels))
     if channels <= NARROW:
         passes = plan_passes(channels)
-        run_bands(composite_narrow, BANDS, view, packed, length, passes, behind, images, ends)
+        run_bands(composite_narrow, bands, view, packed, length, passes, behind, images, ends)
     else:
         shared = (view, packed, length, _flat(features), _begins(index, len(means2d), channels), behind, images, ends)
-        run_bands(composite_wide, BANDS, *shared)
+        run_bands(composite_wide, bands, *shared)
     return maps, alphas, trace
 
 
@@ -92,21 +97,22 @@ def backward(
     """Gradients of means2d, conics, opacities, features and background; empty where not wanted."""
     channels = features.shape[1]
     view = _view(rows, offsets, width, height, tile_size)
+    bands = len(view.bounds) - 1
     slots, firsts, total, chains = _number(view, len(means2d))
     packed, lefts, ends = _read_trace(trace, view, means2d, channels)
     images = _flat(maps), _flat(grad_maps), lefts, _flat(grad_alphas)
     length, behind = row_length(_packed(channels)), _padded(background, padded(channels))
     if channels <= NARROW:
         width, column = length, MOMENTS
-        out = take(means2d, total * width).zero_().numpy()
+        out = take(means2d, total * width).numpy()
         passes = plan_passes(channels)
-        run_bands(differentiate_narrow, BANDS, view, packed, length, passes, behind, images, ends, slots, firsts, out)
+        run_bands(differentiate_narrow, bands, view, packed, length, passes, behind, images, ends, slots, firsts, out)
     else:
         width, column = LANES + padded(channels), LANES
-        out = take(means2d, total * width).zero_().numpy()
+        out = take(means2d, total * width).numpy()
         source = _flat(features), _begins(index, len(means2d), channels), channels
         shared = (view, packed, length, source, behind, images, ends, slots, firsts, out, any(wanted[:3]))
-        run_bands(differentiate_wide, BANDS, *shared)
+        run_bands(differentiate_wide, bands, *shared)
     grads = [
         torch.empty_like(means2d),
         torch.empty_like(conics),
@@ -114,7 +120,7 @@ def backward(
         torch.zeros_like(features),
     ]
     which, layout = _index(index), (width, column, channels)
-    shares = BANDS if _increasing(which) else 1  # two Gaussians that show the same row must not meet
+    shares = bands if _increasing(which) else 1  # two Gaussians that show the same row must not meet
     splats, targets = (_flat(conics), _flat(opacities)), tuple(_flat(value) for value in grads)
     run_bands(gather_gradients, shares, shares, splats, chains, out, layout, which, targets)
     grads.append(
@@ -137,16 +143,17 @@ def accumulate(
     """Sum pixels into the Gaussians by compositing weight, in one walk."""
     channels = pixels.shape[2]
     view = _view(rows, offsets, width, height, tile_size)
+    bands = len(view.bounds) - 1
     slots, firsts, total, chains = _number(view, len(means2d))
     packed = torch.empty(len(means2d) * row_length(0), dtype=pixels.dtype).numpy()
     splats = _flat(means2d), _flat(conics), _flat(opacities)
-    run_bands(pack_rows, BANDS, BANDS, splats, packed[:0], 0, _index(None), packed)
+    run_bands(pack_rows, bands, bands, splats, packed[:0], 0, _index(None), packed)
     length = padded(channels + 1)
-    out = take(pixels, total * length).zero_().numpy()
+    out = take(pixels, total * length).numpy()
     shared = (view, packed, row_length(0), _flat(pixels), channels, slots, firsts, out)
-    run_bands(accumulate_band, BANDS, *shared)
+    run_bands(accumulate_band, bands, *shared)
     sums, weights = pixels.new_empty(len(means2d), channels), pixels.new_empty(len(means2d))
-    run_bands(gather_sums, BANDS, BANDS, chains, out, length, sums.numpy(), weights.numpy())
+    run_bands(gather_sums, bands, bands, chains, out, length, sums.numpy(), weights.numpy())
     return sums, weights
 
 
@@ -209,7 +216,8 @@ def _view(rows: Tensor, offsets: Tensor, width: int, height: int, tile_size: int
     """The tiles, and bands of consecutive tiles with about as many pairs each (an empty tile costs something, too)."""
     ends = offsets.numpy().astype(np.int64, copy=False)
     cost = ends + 4 * np.arange(len(ends))
-    bounds = np.searchsorted(cost, np.linspace(0, cost[-1], BANDS + 1)).astype(np.int64)
+    bands = min(BANDS, 1 + int(cost[-1]) // BAND)
+    bounds = np.searchsorted(cost, np.linspace(0, cost[-1], bands + 1)).astype(np.int64)
     bounds[0], bounds[-1] = 0, len(ends) - 1
     return View(rows.numpy().astype(np.int32, copy=False), ends, bounds, width, height, tile_size)
 
@@ -217,9 +225,9 @@ def _view(rows: Tensor, offsets: Tensor, width: int, height: int, tile_size: int
 def _number(view: View, count: int) -> tuple[np.ndarray, np.ndarray, int, Any]:
     """Gradient rows: of each pair within its band, where each band's begin, how many, and which belong together."""
     slots, owners = np.empty(len(view.order), np.int32), np.empty(len(view.order), np.int32)
-    counts = np.empty(BANDS, np.int64)
-    run_bands(number_slots, BANDS, view, slots, owners, counts, count)
+    counts = np.empty(len(view.bounds) - 1, np.int64)
+    run_bands(number_slots, len(counts), view, slots, owners, counts, count)
     total = int(counts.sum())
     chains = np.empty(count, np.int32), np.empty(total, np.int32)
     chain_slots(view, owners, counts, *chains)
-    return slots, np.cumsum(counts) - counts, total, chains
+    return slots, np.concatenate([[0], np.cumsum(counts)]), total, chains

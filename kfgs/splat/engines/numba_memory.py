@@ -25,6 +25,10 @@ KEPT = 1 << 30
 """Bytes that are kept at most, by each thread."""
 
 
+_COUNTS = getattr(sys, "_is_gil_enabled", lambda: True)()
+"""Whether references are counted such that one can go by the count: not in a Python without its global lock."""
+
+
 class _Kept(threading.local):
     def __init__(self) -> None:
         self.buffers: list[np.ndarray] = []
@@ -39,16 +43,22 @@ def take(like: Tensor, *shape: int) -> Tensor:
     It is the caller's until the last tensor on it is gone: whether that is so is told by Python's count of references.
     """
     size = math.prod(shape) * like.element_size()
-    if size < SMALL:
+    if size < SMALL or not _COUNTS:
         return like.new_empty(shape)
     buffer = _find(size)
     if buffer is None:
         buffer = np.empty(size + LINE, np.uint8)  # of so much, numpy asks Linux for large pages, and torch does not
-        _kept.buffers.append(buffer)
-        while sum(kept.nbytes for kept in _kept.buffers) > KEPT:
-            del _kept.buffers[0]
+        if size <= KEPT:
+            _kept.buffers.append(buffer)
+            while sum(kept.nbytes for kept in _kept.buffers) > KEPT:
+                del _kept.buffers[0]
     skip = -buffer.ctypes.data % LINE
     return torch.from_numpy(buffer[skip : skip + size]).view(like.dtype).view(shape)
+
+
+def free_memory() -> None:
+    """Hand back what this thread keeps for its next frames: up to 1 GiB of maps and gradients nobody uses any more."""
+    _kept.buffers.clear()
 
 
 def _find(size: int) -> np.ndarray | None:

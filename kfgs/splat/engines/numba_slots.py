@@ -18,11 +18,13 @@ from .numba_simd import (
     lanes_below,
     load,
     load_part,
+    prefetch,
     put,
     store,
     store_part,
 )
 from .numba_square import (
+    AHEAD,
     INLINE,
     OPTIONS,
     View,
@@ -105,6 +107,7 @@ def gather_gradients(
     total = aligned(width, out)
     half = out.dtype.type(0.5)
     for m in range(count * band // bands, count * (band + 1) // bands):
+        prefetch(out, np.int64(heads[min(m + AHEAD, count - 1)]) * width)
         _sum_chain(heads[m], following, out, width, total)
         a, b, c = fetch(conics, 3 * m), fetch(conics, 3 * m + 1), fetch(conics, 3 * m + 2)
         v, v_x, v_y = fetch(total, 0), fetch(total, 1), fetch(total, 2)
@@ -128,6 +131,7 @@ def gather_sums(band: int, bands: int, chains: Any, out: Any, width: int, sums: 
     count, channels = len(heads), sums.shape[1]
     total = aligned(width, out)
     for m in range(count * band // bands, count * (band + 1) // bands):
+        prefetch(out, np.int64(heads[min(m + AHEAD, count - 1)]) * width)
         _sum_chain(heads[m], following, out, width, total)
         for i in range(channels):
             sums[m, i] = total[i]

@@ -50,7 +50,7 @@ from .numba_square import (
     weigh_pixels,
 )
 
-ONE, FOUR, SIXTEEN = (0,), (0,) * 4, (0,) * 16
+FOUR, SIXTEEN = (0,) * 4, (0,) * 16
 STEP = 4 * LANES
 """Channels of one piece."""
 

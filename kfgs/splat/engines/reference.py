@@ -51,6 +51,9 @@ def composite(
     return _to_image(sums, tiles), 1 - _to_image(transmittance[..., None], tiles)[..., 0]
 
 
+DTYPES = torch.float32, torch.float64
+
+
 def devices() -> tuple[str, ...]:
     """Where the engine runs."""
     return "cpu", "cuda"

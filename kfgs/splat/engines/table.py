@@ -32,10 +32,11 @@ def available_engines(device: str | None = None) -> list[str]:
     """Names of the engines whose packages are installed, fastest first.
 
     Args:
-        device: "cpu" or "cuda": only those that run there, which are imported to find out; None: nothing is imported.
+        device: "cpu" or "cuda": only those for use there, which are imported to find out; None: all, wherever they run,
+            and nothing is imported.
     """
     names = [name for name, entry in _ENGINES.items() if find_spec(entry.needs) and find_spec(entry.module)]
-    return names if device is None else [name for name in names if _runs(name, device)]
+    return names if device is None else [name for name in names if _serves(name, device)]
 
 
 @cache
@@ -48,33 +49,40 @@ def load(name: str) -> ModuleType:
     entry = _ENGINES[name]
     try:
         return import_module(entry.module)
-    except (ImportError, RuntimeError) as error:  # numba finds no place for its cache: RuntimeError
+    except ImportError as error:
         raise ImportError(
             f"engine: expected {entry.needs} for engine {name!r}, but it cannot be imported ({error}); "
             f"install it with `{entry.install}`, or choose one of {available_engines()}"
         ) from error
 
 
-def choose(engine: str, device: str) -> str:
-    """The engine's name for tensors on a device: the fastest one there if it is "auto".
+def choose(engine: str, device: str, dtype: torch.dtype) -> str:
+    """The engine's name for tensors of a device and a dtype: the fastest one for them if it is "auto".
 
     Raises:
-        ValueError: if there is no such engine, or it does not run on the device.
+        ValueError: if there is no such engine, or it does not run on the device or in the dtype.
         ImportError: if the named engine's package is missing.
     """
-    return _choose(engine, device)
+    return _choose(engine, device, dtype)
 
 
 @cache
-def _choose(engine: str, device: str) -> str:
+def _choose(engine: str, device: str, dtype: torch.dtype) -> str:
     if engine == "auto":
-        return available_engines(device)[0]
+        known = (name for name in available_engines(device) if dtype in load(name).DTYPES)
+        return next(known, "reference")  # which says what it wants instead
     check_choice("engine", engine, ["auto", *_ENGINES])
     devices = load(engine).devices()
     if device not in devices:
         raise ValueError(
             f"engine: expected one that runs on {device} (from means2d), got {engine!r} for {', '.join(devices)}; "
             "use engine='auto'"
+        )
+    if dtype not in load(engine).DTYPES:
+        kinds = " or ".join(map(str, load(engine).DTYPES))
+        raise ValueError(
+            f"engine: expected one for {dtype} (from means2d), got {engine!r} for {kinds}; convert the Gaussians with "
+            ".to(), or use engine='auto'"
         )
     return engine
 
@@ -93,7 +101,7 @@ def choose_compiled(engine: str, function: str, name: str, *tensors: Tensor) -> 
             all of one dtype it knows.
         ImportError: if the named engine's package is missing.
     """
-    chosen = choose(engine, tensors[0].device.type)
+    chosen = choose(engine, tensors[0].device.type, tensors[0].dtype)
     if not _offers(chosen, function):
         return None
     kinds = {value.dtype for value in tensors}
@@ -116,11 +124,10 @@ choose._dynamo_marked_constant = True  # type: ignore[attr-defined]
 _offers._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
-def _runs(name: str, device: str) -> bool:
-    """Whether an engine works on a device; Triton's interpreter on a CPU is for proofs and does not count."""
-    if name == "triton" and device == "cpu":
-        return False
+def _serves(name: str, device: str) -> bool:
+    """Whether an engine is for use on a device; one that runs there for proofs only has to be named."""
     try:
-        return device in load(name).devices()
+        engine = load(name)
+        return device in engine.devices() and device not in getattr(engine, "PROOFS", ())
     except ImportError:  # installed, but broken on this machine
         return False

@@ -56,6 +56,11 @@ SMALLEST = 16
 """Least size of an axis of a tensor-core product: less is padded."""
 
 
+DTYPES = (torch.float32,)
+PROOFS = ("cpu",)
+"""Where the engine runs only to show that it is right: triton's interpreter is slow."""
+
+
 def devices() -> tuple[str, ...]:
     """Device types the engine runs on: "cuda", and "cpu" where triton interprets."""
     return ("cuda", "cpu") if INTERPRETED else ("cuda",)
