@@ -19,12 +19,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from cases_splat import random_splats
+from cases_splat import a_camera, gaussians_before, random_splats
 from torch import Tensor
 
-from kfgs.splat import Tiles, bin_tiles, composite
+from kfgs.splat import Tiles, accumulate_pixels, bin_tiles, composite, rasterize
+from kfgs.splat.engines import ops
 
 GRADS = ("means2d", "conics", "opacities", "features", "background")
+OF_FRAME = ("means", "quats", "scales", "opacities", "features", "background")
 
 
 class Case(NamedTuple):
@@ -104,7 +106,7 @@ def reference(
     inputs: list[Tensor], index: Tensor | None, tiles: Tiles, grad_maps: Tensor, grad_alphas: Tensor
 ) -> dict[str, Tensor]:
     """What the engine should give, by the reference engine in float64 on the CPU."""
-    inputs = [value.cpu().double().requires_grad_() for value in inputs]
+    inputs = [value.detach().cpu().double().requires_grad_() for value in inputs]
     index = torch.arange(len(inputs[0])) if index is None else index.cpu()
     tiles = tiles._replace(rows=tiles.rows.cpu(), offsets=tiles.offsets.cpu())
     grad_maps, grad_alphas = grad_maps.cpu().double(), grad_alphas.cpu().double()
@@ -121,32 +123,93 @@ def reference(
 
 def run_case(case: Case, device: str) -> dict[str, float | bool]:
     """Largest errors: of maps and alphas as they are, of all else relative to the largest number; and some facts."""
-    from kfgs.splat.engines import triton_gpu as engine
-
     inputs, index, tiles, *cotangents = make_scene(case, device)
     before = [value.clone() for value in inputs]
-    view = (index, tiles.rows, tiles.offsets, tiles.width, tiles.height, tiles.tile_size)
-    maps, alphas, trace = engine.forward(*inputs, *view)
-    outputs = (maps, alphas, trace)
-    grads = engine.backward(*cotangents, (True,) * 5, *inputs, *view, *outputs)
-    sums, weights = engine.accumulate(*inputs[:3], cotangents[0], *view[1:])
+    inputs = [value.requires_grad_() for value in inputs]
+    maps, alphas = composite(*inputs[:4], tiles, background=inputs[4], index=index, engine="triton")
+    grads = torch.autograd.grad((maps, alphas), inputs, cotangents)
+    sums, weights = accumulate_pixels(*inputs[:3], cotangents[0], tiles, engine="triton")
     actual = {"maps": maps, "alphas": alphas, "sums": sums, "weights": weights, **dict(zip(GRADS, grads, strict=True))}
-    facts: dict[str, Any] = {}
-    for name, expected in reference(inputs, index, tiles, *cotangents).items():
-        error, most = largest(actual[name].cpu().double() - expected), largest(expected)
-        if name not in ("maps", "alphas") and error > 0:
+    facts = compare(actual, reference(inputs, index, tiles, *cotangents))
+    facts["inputs untouched"] = all(torch.equal(a, b) for a, b in zip(inputs, before, strict=True))
+    facts["differentiable"] = (
+        maps.requires_grad and alphas.requires_grad and not (sums + weights[:, None]).requires_grad
+    )
+    return facts | check_manners(inputs, index, tiles, cotangents, grads) if case.manners else facts
+
+
+def check_manners(
+    inputs: list[Tensor], index: Tensor | None, tiles: Tiles, cotangents: list[Tensor], grads: tuple[Tensor, ...]
+) -> dict[str, float | bool]:
+    """Whether the same comes out again, and whether what is asked for alone is what comes with the others."""
+    from kfgs.splat.engines import triton_gpu
+
+    facts: dict[str, float | bool] = {}
+    view = (index, *tiles)
+    values = [value.detach() for value in inputs]
+    outputs, again = (ops.composite(*values, *view, "triton") for _ in range(2))  # with the trace
+    facts["forward repeats to the bit"] = all(torch.equal(a, b) for a, b in zip(again, outputs, strict=True))
+    for k, name in enumerate(GRADS):
+        leaves = [value.clone().requires_grad_(j == k) for j, value in enumerate(values)]
+        seen = composite(*leaves[:4], tiles, background=leaves[4], index=index, engine="triton")
+        (alone,) = torch.autograd.grad(seen, leaves[k], cotangents)
+        facts[f"{name} wanted alone"] = largest(alone - grads[k]) <= 1e-5 * largest(grads[k])
+        # autograd drops what is not wanted; the engine must not have computed it
+        given = triton_gpu.backward(*cotangents, tuple(k == j for j in range(5)), *values, *view, *outputs)
+        facts[f"nothing but {name} computed"] = all(value.numel() == 0 for j, value in enumerate(given) if j != k)
+    return facts
+
+
+def run_frame(device: str) -> dict[str, float | bool]:
+    """A whole frame of 60 Gaussians, forward and backward, and what the reference engine makes of it in float64."""
+
+    def run(dtype: torch.dtype, place: str, engine: str) -> dict[str, Tensor]:
+        camera = a_camera(dtype=torch.float32)
+        gaussians = gaussians_before(camera, 60, seed=5, spread=1.5, channels=9).to(dtype).to(place)
+        leaves = {name: getattr(gaussians, name).requires_grad_() for name in OF_FRAME[:-1]}
+        g = torch.Generator().manual_seed(6)
+        shapes = (9,), (camera.height, camera.width, 9), (camera.height, camera.width)
+        background, *cotangents = (torch.randn(shape, generator=g).to(place, dtype) for shape in shapes)
+        leaves["background"] = background.requires_grad_()
+        seen = rasterize(gaussians, camera, background=background, engine=engine)
+        seen.projected.means2d.retain_grad()  # as densification does
+        torch.autograd.backward((seen.map, seen.alpha), cotangents)
+        grads = {name: leaf.grad for name, leaf in leaves.items()}
+        return {"map": seen.map, "alpha": seen.alpha, **grads, "means2d": seen.projected.means2d.grad}
+
+    expected = run(torch.float64, "cpu", "reference")
+    facts = compare(run(torch.float32, device, "triton"), expected)
+    facts["most can be seen"] = len(expected["means2d"]) > 30 and bool((expected["alpha"] > 0.1).double().mean() > 0.5)
+    return facts
+
+
+def check_operator(device: str) -> dict[str, str]:
+    """What torch says of the operator, by the name of its check; with and without an index, and with nothing to see."""
+    said = {}
+    for name in ("indexed", "9 channels", "no Gaussians"):
+        inputs, index, tiles, *_ = make_scene(CASES[name], device)
+        inputs = [value.requires_grad_() for value in inputs]
+        checks = "test_schema", "test_autograd_registration", "test_faketensor"
+        found = torch.library.opcheck(
+            ops.composite,
+            (*inputs, index, *tiles, "triton"),
+            test_utils=checks,
+            raise_exception=False,
+        )
+        said |= {f"{name}: {check}": str(answer) for check, answer in found.items()}
+    return said
+
+
+def compare(actual: dict[str, Tensor], expected: dict[str, Tensor]) -> dict[str, float | bool]:
+    """The error of each result: the first two's as it is, the others' relative to the largest number."""
+    facts: dict[str, float | bool] = {}
+    for k, (name, truth) in enumerate(expected.items()):
+        error, most = largest(actual[name].cpu().double() - truth), largest(truth)
+        if k >= 2 and error > 0:
             error = error / most if most else float("inf")
         facts[name] = error
-        facts[f"{name}: shape"] = list(actual[name].shape) == list(expected.shape)
+        facts[f"{name}: shape"] = list(actual[name].shape) == list(truth.shape)
     facts["float32"] = all(value.dtype == torch.float32 for value in actual.values())
-    facts["inputs untouched"] = all(torch.equal(a, b) for a, b in zip(inputs, before, strict=True))
-    if case.manners:
-        again = engine.forward(*inputs, *view)
-        facts["forward repeats to the bit"] = all(torch.equal(a, b) for a, b in zip(again, outputs, strict=True))
-        for k, name in enumerate(GRADS):
-            alone = engine.backward(*cotangents, tuple(k == j for j in range(5)), *inputs, *view, *outputs)
-            empty = all(value.numel() == 0 for j, value in enumerate(alone) if j != k)
-            facts[f"only {name} wanted"] = empty and largest(alone[k] - grads[k]) <= 1e-5 * largest(grads[k])
     return facts
 
 
@@ -231,7 +294,9 @@ def _read_resources(cubin: bytes, tool: Path) -> dict[str, int]:
 def main() -> None:
     torch.set_num_threads(1)
     if sys.argv[1] == "run":
-        results = {name: _attempt(run_case, case, sys.argv[2]) for name, case in CASES.items()}
+        device = sys.argv[2]
+        results = {name: _attempt(run_case, case, device) for name, case in CASES.items()}
+        results |= {"frame": _attempt(run_frame, device), "operator": _attempt(check_operator, device)}
     else:
         results = {name: _attempt(compile_ahead, build) for name, build in BUILDS.items()}
     print(json.dumps(results))

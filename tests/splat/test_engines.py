@@ -225,6 +225,22 @@ def test_gradients(engine, channels):
 
 
 @every_engine
+@pytest.mark.parametrize("channels", [3, 9, 20, 40])
+def test_a_gaussian_that_stops_a_pixel_hides_what_is_behind_it(engine, channels):
+    # The third leaves T' = 0.1 * 0.05 * 0.015 < 1e-4 at the only pixel that it touches: it is not drawn, nor is the fourth.
+    means2d = torch.tensor([[0.5, 0.5]] * 3 + [[2.0, 2.0]], dtype=torch.float64)
+    conics = torch.tensor([[11.1, 0, 11.1]] * 3 + [[0.01, 0, 0.01]], dtype=torch.float64)
+    opacities = torch.tensor([0.9, 0.95, 0.985, 0.5], dtype=torch.float64).requires_grad_()
+    features = torch.ones(4, channels, dtype=torch.float64).requires_grad_()
+    tiles = Tiles(torch.arange(4, dtype=torch.int32), torch.tensor([0, 4]), 4, 4, 16)
+    maps, _ = composite(means2d, conics, opacities, features, tiles, engine=engine)
+    of_features, of_opacities = torch.autograd.grad(maps[0, 0].sum(), (features, opacities))
+    expected = torch.tensor([0.9, 0.095, 0, 0], dtype=torch.float64)
+    torch.testing.assert_close(of_features, expected[:, None].expand(4, channels), rtol=0, atol=1e-12)
+    assert of_opacities[2:].abs().max() == 0
+
+
+@every_engine
 def test_gradients_across_many_gaussians_that_stop(engine):
     # more Gaussians at each pixel than an engine handles at once; pixels stop at different ones
     projected, features = random_splats(150, 3, 3, seed=14, opacities=(0.05, 0.2), sigma=(2.0, 8.0), channels=2)

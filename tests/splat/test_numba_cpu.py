@@ -194,8 +194,6 @@ def test_no_pixel_outside_of_touched_blocks_is_drawn_however_it_rounds(dtype):
     assert 0.1 < on_edge / (6 * M) < 0.9  # the case is what it is meant to be: some are drawn there, some are not
 
 
-MAKES_NAN = pytest.mark.xfail(strict=True, reason="gather_gradients multiplies a broken conic by 0, which is NaN")
-
 BROKEN = {
     "conic has NaN in a": ("conics", [float("nan"), 0.1, 0.3]),
     "conic has NaN in b": ("conics", [0.2, float("nan"), 0.3]),
@@ -218,7 +216,7 @@ BROKEN = {
 @pytest.mark.parametrize("channels", [3, 40])
 @pytest.mark.parametrize(
     "broken",
-    [pytest.param(name, marks=MAKES_NAN if "conic has" in name else ()) for name in BROKEN],
+    BROKEN,
 )
 def test_a_broken_gaussian_is_not_drawn_and_changes_no_gradient(broken, channels, dtype):
     M, width, height = 20, 21, 19
@@ -637,7 +635,6 @@ print(json.dumps([
 """
 
 
-@pytest.mark.xfail(strict=True, reason="numba_cpu calls count_squares, row_length and padded, which no cache keeps")
 def test_a_warm_start_compiles_nothing():
     """A fresh process takes every kernel of a frame and its backward pass from the cache."""
     root = Path(__file__).parents[2]

@@ -12,10 +12,12 @@ import torch
 
 triton = pytest.importorskip("triton", reason="the Triton engine needs `pip install triton`")
 
+from kfgs.splat import accumulate_pixels, composite  # noqa: E402
 from kfgs.splat.engines import triton_gpu  # noqa: E402 - only where triton is installed
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMITS = dict.fromkeys(("maps", "alphas"), 1e-5) | dict.fromkeys((*cases_triton.GRADS, "sums", "weights"), 1e-4)
+FRAME_LIMITS = dict.fromkeys(("map", "alpha"), 1e-5) | dict.fromkeys((*cases_triton.OF_FRAME, "means2d"), 1e-4)
 """Largest errors against the reference engine in float64: of values of about 1, and relative to the largest gradient."""
 
 every_case = pytest.mark.parametrize("case", cases_triton.CASES)
@@ -33,12 +35,18 @@ def _report(*arguments, interpret=False):
     return json.loads(done.stdout)
 
 
-def _assert_agrees(facts):
+def _assert_agrees(facts, limits=LIMITS):
     assert "failed" not in facts, facts["failed"]
-    assert set(LIMITS) <= set(facts)
-    errors = {name: facts[name] for name in LIMITS}
-    assert {name: error for name, error in errors.items() if not error <= LIMITS[name]} == {}
-    assert [name for name, fact in facts.items() if name not in LIMITS and fact is not True] == []
+    assert set(limits) <= set(facts)
+    errors = {name: facts[name] for name in limits}
+    assert {name: error for name, error in errors.items() if not error <= limits[name]} == {}
+    assert [name for name, fact in facts.items() if name not in limits and fact is not True] == []
+
+
+def _assert_operator(said):
+    assert "failed" not in said, said["failed"]
+    assert len(said) == 9
+    assert {check: answer for check, answer in said.items() if answer != "SUCCESS"} == {}
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +57,14 @@ def interpreted():
 @every_case
 def test_interpreted_kernels_agree_with_the_reference(interpreted, case):
     _assert_agrees(interpreted[case])
+
+
+def test_interpreted_frame_agrees_with_the_reference(interpreted):
+    _assert_agrees(interpreted["frame"], FRAME_LIMITS)
+
+
+def test_interpreted_operator_passes_opcheck(interpreted):
+    _assert_operator(interpreted["operator"])
 
 
 @pytest.fixture(scope="module")
@@ -62,14 +78,25 @@ class TestOnGpu:
     def test_agrees_with_the_reference(self, on_gpu, case):
         _assert_agrees(on_gpu[case])
 
+    def test_frame_agrees_with_the_reference(self, on_gpu):
+        _assert_agrees(on_gpu["frame"], FRAME_LIMITS)
+
+    def test_operator_passes_opcheck(self, on_gpu):
+        _assert_operator(on_gpu["operator"])
+
+    def test_is_what_auto_takes(self):
+        inputs, index, tiles, *_ = cases_triton.make_scene(cases_triton.CASES["indexed"], "cuda")
+        auto, named = (composite(*inputs[:4], tiles, index=index, engine=engine) for engine in ("auto", "triton"))
+        assert all(torch.equal(a, b) for a, b in zip(auto, named, strict=True))
+
     def test_does_not_wait_for_the_gpu(self):
         inputs, index, tiles, *cotangents = cases_triton.make_scene(cases_triton.CASES["indexed"], "cuda")
-        view = (index, *tiles)
+        inputs = [value.requires_grad_() for value in inputs]
         torch.cuda.set_sync_debug_mode("error")
         try:
-            outputs = triton_gpu.forward(*inputs, *view)
-            triton_gpu.backward(*cotangents, (True,) * 5, *inputs, *view, *outputs)
-            triton_gpu.accumulate(*inputs[:3], cotangents[0], *tiles)
+            outputs = composite(*inputs[:4], tiles, background=inputs[4], index=index, engine="triton")
+            torch.autograd.grad(outputs, inputs, cotangents)
+            accumulate_pixels(*inputs[:3], cotangents[0], tiles, engine="triton")
         finally:
             torch.cuda.set_sync_debug_mode("default")
 

@@ -35,7 +35,6 @@ from .numba_square import (
     Picture,
     View,
     aligned,
-    count_squares,
     read_block,
     square_box,
     start_square,
@@ -87,7 +86,7 @@ def composite_narrow(
     sums[:] = 0
     hits, counts = np.empty(BLOCKS * CHUNK, np.int32), np.empty(BLOCKS, np.int32)
     block_sums = aligned(LANES * LANES, rows)
-    squares = count_squares(view)
+    squares = view.across**2
     drawn = trace[squares * (len(view.offsets) - 1) :]
     for tile in range(view.bounds[band], view.bounds[band + 1]):
         start, end = view.offsets[tile], view.offsets[tile + 1]
@@ -136,7 +135,7 @@ def composite_wide(
     sums = aligned(PIXELS * stride, rows)
     kept = wide.make_kept(rows)
     hits, counts = np.empty(BLOCKS * CHUNK, np.int32), np.empty(BLOCKS, np.int32)
-    squares = count_squares(view)
+    squares = view.across**2
     drawn = trace[squares * (len(view.offsets) - 1) :]
     for tile in range(view.bounds[band], view.bounds[band + 1]):
         start, end = view.offsets[tile], view.offsets[tile + 1]
@@ -214,7 +213,7 @@ def accumulate_band(
     own[:] = 0
     for tile in range(view.bounds[band], view.bounds[band + 1]):
         start, end = view.offsets[tile], view.offsets[tile + 1]
-        for square in range(count_squares(view)):
+        for square in range(view.across**2):
             box = square_box(view, tile, square)
             if start == end or box[0] >= box[2] or box[1] >= box[3]:
                 continue

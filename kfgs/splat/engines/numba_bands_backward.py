@@ -33,7 +33,6 @@ from .numba_square import (
     Picture,
     View,
     aligned,
-    count_squares,
     read_block,
     square_box,
     start_square,
@@ -118,7 +117,7 @@ def differentiate_narrow(
     planes = aligned((2 + whole_planes(passes, channels)) * PIXELS, rows)
     planes[:] = 0
     weights, scratch = aligned(PIXELS, rows), aligned(LANES * LANES, rows)
-    squares = count_squares(view)
+    squares = view.across**2
     drawn = trace[squares * (len(view.offsets) - 1) :]
     own = out[firsts[band] * length : firsts[band + 1] * length]
     own[:] = 0
@@ -178,7 +177,7 @@ def differentiate_wide(
     scratch, slopes = aligned(LANES * LANES, rows), aligned((CHUNK + 3) * LANES, rows)
     kept = wide.make_kept(rows)
     hits, counts = np.empty(BLOCKS * CHUNK, np.int32), np.empty(BLOCKS, np.int32)
-    squares = count_squares(view)
+    squares = view.across**2
     drawn = trace[squares * (len(view.offsets) - 1) :]
     own = out[firsts[band] * (LANES + stride) : firsts[band + 1] * (LANES + stride)]
     own[:] = 0

@@ -19,10 +19,13 @@ from .numba_narrow import FIRST, MOMENTS, plan_passes
 from .numba_project import project, project_backward
 from .numba_simd import LANES
 from .numba_slots import chain_slots, gather_gradients, gather_sums, number_slots
-from .numba_square import View, count_squares, pack_rows, row_length
+from .numba_square import SIDE, View, pack_rows
+from .numba_square import row_length as _row_length
 from .numba_threads import run_bands
 from .numba_tiles import bin
-from .numba_wide import padded
+from .numba_wide import padded as _whole
+
+row_length, padded = _row_length.py_func, _whole.py_func  # as Python: one call is not worth a compilation
 
 __all__ = ["accumulate", "backward", "bin", "devices", "forward", "project", "project_backward"]
 
@@ -61,7 +64,7 @@ def forward(
     bands = len(view.bounds) - 1
     maps, alphas = take(features, height, width, channels), features.new_empty(height, width)
     trace, packed, lefts, ends = _make_trace(view, means2d, channels)
-    ends[: count_squares(view) * (len(view.offsets) - 1)] = 0
+    ends[: view.across**2 * (len(view.offsets) - 1)] = 0
     splats = _flat(means2d), _flat(conics), _flat(opacities)
     run_bands(pack_rows, bands, bands, splats, _flat(features), _packed(channels), _index(index), packed)
     images, length = (_flat(maps), _flat(alphas), lefts), row_length(_packed(channels))
@@ -173,7 +176,7 @@ def _make_trace(view: View, like: Tensor, channels: int) -> tuple[Tensor, np.nda
     The packed Gaussians come first, on whole cache lines; then each pixel's transmittance, of which 1 - alpha keeps few
     digits; then, per tile and square, how many Gaussians were looked at, and the blocks that each was drawn in.
     """
-    squares = count_squares(view)
+    squares = view.across**2
     numbers = sum(_floats(view, like, channels)) * like.element_size() // 4
     length = numbers + squares * (len(view.offsets) - 1 + len(view.order))
     trace = take(torch.empty(0, dtype=torch.int32), length)
@@ -219,7 +222,8 @@ def _view(rows: Tensor, offsets: Tensor, width: int, height: int, tile_size: int
     bands = min(BANDS, 1 + int(cost[-1]) // BAND)
     bounds = np.searchsorted(cost, np.linspace(0, cost[-1], bands + 1)).astype(np.int64)
     bounds[0], bounds[-1] = 0, len(ends) - 1
-    return View(rows.numpy().astype(np.int32, copy=False), ends, bounds, width, height, tile_size)
+    across = -(-min(tile_size, max(width, height)) // SIDE)
+    return View(rows.numpy().astype(np.int32, copy=False), ends, bounds, width, height, tile_size, across)
 
 
 def _number(view: View, count: int) -> tuple[np.ndarray, np.ndarray, int, Any]:

@@ -25,8 +25,19 @@ KEPT = 1 << 30
 """Bytes that are kept at most, by each thread."""
 
 
-_COUNTS = getattr(sys, "_is_gil_enabled", lambda: True)()
-"""Whether references are counted such that one can go by the count: not in a Python without its global lock."""
+def _counts_references() -> bool:
+    """Whether one can go by the count of references: not in a Python without its global lock, and not if it is lazy."""
+    probe = [np.empty(1)]
+    alone = sys.getrefcount(probe[0])
+    view = torch.from_numpy(probe[0][:])
+    return getattr(sys, "_is_gil_enabled", lambda: True)() and (alone, sys.getrefcount(probe[0]), len(view)) == (
+        2,
+        3,
+        1,
+    )
+
+
+_COUNTS = _counts_references()
 
 
 class _Kept(threading.local):
@@ -53,7 +64,10 @@ def take(like: Tensor, *shape: int) -> Tensor:
             while sum(kept.nbytes for kept in _kept.buffers) > KEPT:
                 del _kept.buffers[0]
     skip = -buffer.ctypes.data % LINE
-    return torch.from_numpy(buffer[skip : skip + size]).view(like.dtype).view(shape)
+    # Shaped by numpy: to autograd, a view of a tensor would be another thing than a tensor.
+    return torch.from_numpy(
+        buffer[skip : skip + size].view(torch.empty(0, dtype=like.dtype).numpy().dtype).reshape(shape)
+    )
 
 
 def free_memory() -> None:

@@ -83,7 +83,7 @@ def composite_square(
         dark: bits of blocks without pixels.
         passes: from `plan_passes`.
         scratch: corners; sums, one plane per channel; weights [CHUNK * LANES]; hits [BLOCKS * CHUNK]; counts [BLOCKS].
-        trace: written: the blocks that each Gaussian was drawn in, as bits.
+        trace: written: the blocks in which each Gaussian changed the light, as bits.
     """
     rows, length, order = packed
     start, end, into = span
@@ -113,6 +113,7 @@ def _composite_block(packed: Any, state: Any, block: int, passes: Any, scratch: 
         j = np.int64(fetch(hits, listed + k))
         at = np.int64(fetch(order, j)) * length
         _, _, _, alpha = weigh_pixels(rows, at, x, y)
+        changed = (light >= TRANSMITTANCE_MIN) & (alpha > 0)  # also where it stops the pixel and is not drawn itself
         weight = alpha * light
         light = light * (1 - alpha)  # falls on after a pixel has stopped, so that it never starts again
         drawn = light >= TRANSMITTANCE_MIN
@@ -121,7 +122,7 @@ def _composite_block(packed: Any, state: Any, block: int, passes: Any, scratch: 
         total = add_scaled(total, weight, spread_many(first, rows, at + FEATURES, 1))
         if len(more) > 0:
             store(weights, k * LANES, weight)
-        if not any_of(weight > 0):
+        if not any_of(changed):
             put(trace, into + j, np.uint32(fetch(trace, into + j)) & ~bit)
     store(state, LIGHT + p, light)
     store(state, LEFT + p, left)
@@ -168,7 +169,7 @@ def differentiate_square(
         passes: from `plan_passes`.
         planes: BEHIND, SHARE and GRADS.
         weights: [PIXELS], for the passes after the first.
-        trace: the blocks that each Gaussian was drawn in.
+        trace: the blocks in which each Gaussian changed the light.
         slots: where in `out` the row of each place in the list begins.
         out: gradient rows, as long as packed ones.
     """

@@ -111,8 +111,9 @@ def gather_gradients(
         _sum_chain(heads[m], following, out, width, total)
         a, b, c = fetch(conics, 3 * m), fetch(conics, 3 * m + 1), fetch(conics, 3 * m + 2)
         v, v_x, v_y = fetch(total, 0), fetch(total, 1), fetch(total, 2)
-        put(of_means, 2 * m, a * v_x + b * v_y)
-        put(of_means, 2 * m + 1, b * v_x + c * v_y)
+        drawn = v_x != 0 or v_y != 0  # a conic that is not finite draws nothing, and has the gradient 0
+        put(of_means, 2 * m, a * v_x + b * v_y if drawn else v_x)
+        put(of_means, 2 * m + 1, b * v_x + c * v_y if drawn else v_y)
         put(of_conics, 3 * m, -half * fetch(total, 3))
         put(of_conics, 3 * m + 1, -fetch(total, 4))
         put(of_conics, 3 * m + 2, -half * fetch(total, 5))

@@ -130,21 +130,15 @@ class View(NamedTuple):
     width: int
     height: int
     tile_size: int
-
-
-@njit(**INLINE)
-def count_squares(view: View) -> int:
-    """Squares per tile."""
-    return ((view.tile_size + SIDE - 1) // SIDE) ** 2
+    across: int  # squares along a tile's side, as far as the image reaches
 
 
 @njit(**INLINE)
 def square_box(view: View, tile: int, square: int) -> tuple[int, int, int, int]:
     """Left, top, right and bottom pixel of a square of a tile, cut off at the tile's and the image's border."""
     columns = (view.width + view.tile_size - 1) // view.tile_size
-    across = (view.tile_size + SIDE - 1) // SIDE
     tile_x, tile_y = tile % columns * view.tile_size, tile // columns * view.tile_size
-    left, top = tile_x + square % across * SIDE, tile_y + square // across * SIDE
+    left, top = tile_x + square % view.across * SIDE, tile_y + square // view.across * SIDE
     right = min(left + SIDE, tile_x + view.tile_size, view.width)
     bottom = min(top + SIDE, tile_y + view.tile_size, view.height)
     return left, top, right, bottom

@@ -18,11 +18,11 @@ _pools: dict[int, ThreadPoolExecutor] = {}  # by process: threads do not survive
 
 
 def _pool() -> ThreadPoolExecutor:
-    pid = os.getpid()
-    if pid not in _pools:
-        _pools.clear()
-        _pools[pid] = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="kfgs")
-    return _pools[pid]
+    pool = _pools.get(os.getpid())
+    if pool is None:  # two threads may get here at once: one pool is kept, the other has started nothing yet
+        made = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="kfgs")
+        pool = _pools.setdefault(os.getpid(), made)
+    return pool
 
 
 def run_bands(kernel: Callable[..., None], bands: int, *arguments: Any) -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.library import infer_schema, register_autograd, register_fake
@@ -57,7 +58,7 @@ def check_values(count: int, sources: int, index: Tensor | None, rows: Tensor, o
     ):
         if value is None or len(value) == 0:
             continue
-        low, high = (int(end) for end in torch.aminmax(value))
+        low, high = int(value.numpy().min()), int(value.numpy().max())  # torch's threads would hang in a forked child
         if low < 0 or high >= below:
             source = "means2d" if origin == "M" else "features"
             raise ValueError(
@@ -65,7 +66,7 @@ def check_values(count: int, sources: int, index: Tensor | None, rows: Tensor, o
                 f"got {low if low < 0 else high}; {advice}"
             )
     ends = int(offsets[0]), int(offsets[-1])
-    if ends != (0, len(rows)) or bool((offsets.diff() < 0).any()):
+    if ends != (0, len(rows)) or bool((np.diff(offsets.numpy()) < 0).any()):
         raise ValueError(
             f"tiles.offsets: expected numbers that rise from 0 to P = {len(rows)} (from tiles.rows), got "
             f"{offsets[:8].tolist()} ... {ends[1]}; {again}"
