@@ -12,7 +12,7 @@ from . import ops
 from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from .numba_memory import free_memory
 from .ops import check_values
-from .table import available_engines, choose, load
+from .table import available_engines, choose, load, offers
 
 if TYPE_CHECKING:
     from ..tiles import Tiles
@@ -83,7 +83,7 @@ def composite(
         background = features.new_zeros(features.shape[1])
     values = (value.contiguous() for value in (means2d, conics, opacities, features, background))
     view = tiles.rows.contiguous(), tiles.offsets.contiguous(), tiles.width, tiles.height, tiles.tile_size
-    if hasattr(load(name), "composite"):  # differentiable as it stands
+    if offers(name, "composite"):  # differentiable as it stands
         check_values(len(means2d), len(features), index, *view[:2])
         return load(name).composite(*values, index, tiles)
     maps, alphas, _ = ops.composite(*values, index, *view, name)
@@ -129,7 +129,7 @@ def accumulate_pixels(
     name = choose(engine, means2d.device.type, means2d.dtype)
     values = (value.detach().contiguous() for value in (means2d, conics, opacities, pixels))
     view = tiles.rows.contiguous(), tiles.offsets.contiguous(), tiles.width, tiles.height, tiles.tile_size
-    if hasattr(load(name), "composite"):  # its results are parts of one tensor, which an operator's must not be
+    if offers(name, "composite"):  # its results are parts of one tensor, which an operator's must not be
         check_values(len(means2d), len(means2d), None, *view[:2])
         return load(name).accumulate(*values, *view)
     return ops.accumulate(*values, *view, name)

@@ -102,7 +102,7 @@ def choose_compiled(engine: str, function: str, name: str, *tensors: Tensor) -> 
         ImportError: if the named engine's package is missing.
     """
     chosen = choose(engine, tensors[0].device.type, tensors[0].dtype)
-    if not _offers(chosen, function):
+    if not offers(chosen, function):
         return None
     kinds = {value.dtype for value in tensors}
     known = len(kinds) == 1 and kinds <= {torch.float32, torch.float64}
@@ -114,14 +114,14 @@ def choose_compiled(engine: str, function: str, name: str, *tensors: Tensor) -> 
     return chosen if known else None
 
 
-def _offers(name: str, function: str) -> bool:
-    """Whether an engine has a function besides compositing."""
+def offers(name: str, function: str) -> bool:
+    """Whether an engine has a function that not all have."""
     return hasattr(load(name), function)
 
 
 # What torch.compiler.assume_constant_result does, which would import the compiler: the answers are asked for once.
 choose._dynamo_marked_constant = True  # type: ignore[attr-defined]
-_offers._dynamo_marked_constant = True  # type: ignore[attr-defined]
+offers._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 def _serves(name: str, device: str) -> bool:
