@@ -32,6 +32,7 @@ GRADIENTS = {torch.float32: 1e-4, torch.float64: 1e-8}
 UNIT = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}
 BLOCK = 50  # scenes in one test
 BLOCKS = {"numba": 40, "reference": 3}  # 2,000 scenes of the engine that people get; float64 takes a tenth
+RESULTS = ("maps", "alphas", *oracle.Gradients._fields, "sums", "weights")
 CHANNELS = (1, 3, 9, 10, 11, 16, 27, 40)
 KINDS = ("ordinary", "needle", "huge", "tiny", "opaque", "faint", "outside")
 
@@ -48,6 +49,7 @@ def _runs_on_cpu(engine):
 
 
 ENGINES = [name for name in available_engines() if _runs_on_cpu(name)]
+COMPILED = "numba" if "numba" in ENGINES else "reference"  # where the test of the test is in float32
 every_engine = pytest.mark.parametrize("engine", ENGINES)
 
 
@@ -169,23 +171,25 @@ class Compared(NamedTuple):
     on_edge: int  # pixels on a threshold
 
 
-def _compare(case, dtype, engine, given=None):
-    """Compare the engine's results with the oracle's; for a test of the test, the engine may be given another case."""
+def _compare(case, dtype, engine, given=None, factors=None):
+    """Compare the engine's results with the oracle's.
+
+    For a test of the test, the engine may be `given` another case, and its results be multiplied by `factors`, by name.
+    """
     scene, unit = case.scene, UNIT[dtype]
     seen = oracle.composite(scene, unit)
     cotangents = _cotangents(seen, scene, case.seed)
     grads, allowed = oracle.differentiate(scene, seen, cotangents, unit, from_outputs=engine != "reference")
     sums, weights = oracle.accumulate(scene, seen, cotangents[0])
     largest = max(np.abs(scene.features).max(initial=0), np.abs(scene.background).max())
-    names = ("maps", "alphas", *oracle.Gradients._fields, "sums", "weights")
     sum_allowance = allowed.features
     grads, allowed = (v._replace(features=_spread(case, v.features)) for v in (grads, allowed))
     expected = (seen.maps, seen.alphas, *grads, sums, weights)
     allowances = (2 * largest * seen.allowance[:, None], seen.allowance, *allowed, sum_allowance, seen.allowance.sum())
     actual = _run(given or case, dtype, engine, cotangents)
     excess, plain = {}, set()
-    for name, a, e, allowance in zip(names, actual, expected, allowances, strict=True):
-        error = np.abs(a.double().numpy() - e)
+    for name, a, e, allowance in zip(RESULTS, actual, expected, allowances, strict=True):
+        error = np.abs(a.double().numpy() * (factors or {}).get(name, 1) - e)
         assert np.isfinite(error).all(), f"{engine}, {dtype}, seed {case.seed}: {name} is not finite"
         limit = (MAPS if name in ("maps", "alphas") else GRADIENTS)[dtype]
         limit *= 1 if name == "alphas" else np.abs(e).max(initial=0)
@@ -280,6 +284,40 @@ def test_comparison_notices_a_small_change(name, change):
         given = case._replace(scene=case.scene._replace(**{name: change(getattr(case.scene, name))}))
         noticed += max(_compare(case, torch.float64, "reference", given).excess.values()) > 1
     assert noticed >= 24  # a scene may be empty, or have nothing but one Gaussian at any pixel
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("opacities", lambda v, step: v * (1 + step)),
+        ("means2d", lambda v, step: v + 5 * step),  # pixels
+        ("conics", lambda v, step: v * (1 + step)),
+        ("features", lambda v, step: v * (1 + step)),
+        ("depths", lambda v, step: -v),
+    ],
+)
+def test_comparison_in_float32_notices_ten_times_its_bound(name, change):
+    step, noticed, needles = 10 * MAPS[torch.float32], 0, 0
+    for case in map(_case, range(30)):
+        given = case._replace(scene=case.scene._replace(**{name: change(getattr(case.scene, name), step)}))
+        found = max(_compare(case, torch.float32, COMPILED, given).excess.values()) > 1
+        noticed, needles = noticed + found, needles + (found and _has_needles(case.scene))
+    assert noticed >= 24
+    assert needles >= 8  # of 11: what is allowed where terms cancel does not cover it either
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_comparison_in_float32_notices_each_result_alone(name):
+    """Each result off by ten times its own bound, where no needle widens what is allowed."""
+    bound = (MAPS if name in ("maps", "alphas") else GRADIENTS)[torch.float32]
+    cases = [case for case in map(_case, range(30)) if len(case.scene.depths) and not _has_needles(case.scene)]
+    assert len(cases) == 18
+    noticed = sum(
+        _compare(case, torch.float32, COMPILED, factors={name: 1 + 10 * bound}).excess[name] > 1 for case in cases
+    )
+    assert (
+        noticed >= 14
+    )  # where nearly no light is left, that of the background is known to a rounding of the whole only
 
 
 def test_oracle_agrees_with_the_one_written_pixel_by_pixel():
