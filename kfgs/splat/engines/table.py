@@ -101,7 +101,8 @@ def choose_compiled(engine: str, function: str, name: str, *tensors: Tensor) -> 
             all of one dtype it knows.
         ImportError: if the named engine's package is missing.
     """
-    chosen = choose(engine, tensors[0].device.type, tensors[0].dtype)
+    dtype = tensors[0].dtype if engine == "auto" else torch.float32  # of a named engine, what is wrong is said below
+    chosen = choose(engine, tensors[0].device.type, dtype)
     if not offers(chosen, function):
         return None
     kinds = {value.dtype for value in tensors}
