@@ -105,14 +105,12 @@ def backward(
     packed, lefts, ends = _read_trace(trace, view, means2d, channels)
     images = _flat(maps), _flat(grad_maps), lefts, _flat(grad_alphas)
     length, behind = row_length(_packed(channels)), _padded(background, padded(channels))
+    row, column = (length, MOMENTS) if channels <= NARROW else (LANES + padded(channels), LANES)
+    out = take(means2d, total * row).numpy()
     if channels <= NARROW:
-        width, column = length, MOMENTS
-        out = take(means2d, total * width).numpy()
         passes = plan_passes(channels)
         run_bands(differentiate_narrow, bands, view, packed, length, passes, behind, images, ends, slots, firsts, out)
     else:
-        width, column = LANES + padded(channels), LANES
-        out = take(means2d, total * width).numpy()
         source = _flat(features), _begins(index, len(means2d), channels), channels
         shared = (view, packed, length, source, behind, images, ends, slots, firsts, out, any(wanted[:3]))
         run_bands(differentiate_wide, bands, *shared)
@@ -122,7 +120,7 @@ def backward(
         torch.empty_like(opacities),
         torch.zeros_like(features),
     ]
-    which, layout = _index(index), (width, column, channels)
+    which, layout = _index(index), (row, column, channels)
     shares = bands if _increasing(which) else 1  # two Gaussians that show the same row must not meet
     splats, targets = (_flat(conics), _flat(opacities)), tuple(_flat(value) for value in grads)
     run_bands(gather_gradients, shares, shares, splats, chains, out, layout, which, targets)

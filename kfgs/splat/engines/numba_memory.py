@@ -28,13 +28,10 @@ KEPT = 1 << 30
 def _counts_references() -> bool:
     """Whether one can go by the count of references: not in a Python without its global lock, and not if it is lazy."""
     probe = [np.empty(1)]
-    alone = sys.getrefcount(probe[0])
-    view = torch.from_numpy(probe[0][:])
-    return getattr(sys, "_is_gil_enabled", lambda: True)() and (alone, sys.getrefcount(probe[0]), len(view)) == (
-        2,
-        3,
-        1,
-    )
+    alone, tensor = sys.getrefcount(probe[0]), torch.from_numpy(probe[0][:])
+    shared = sys.getrefcount(probe[0])
+    del tensor
+    return getattr(sys, "_is_gil_enabled", lambda: True)() and (alone, shared) == (2, 3)
 
 
 _COUNTS = _counts_references()
@@ -65,9 +62,8 @@ def take(like: Tensor, *shape: int) -> Tensor:
                 del _kept.buffers[0]
     skip = -buffer.ctypes.data % LINE
     # Shaped by numpy: to autograd, a view of a tensor would be another thing than a tensor.
-    return torch.from_numpy(
-        buffer[skip : skip + size].view(torch.empty(0, dtype=like.dtype).numpy().dtype).reshape(shape)
-    )
+    dtype = like.new_empty(0).numpy().dtype
+    return torch.from_numpy(buffer[skip : skip + size].view(dtype).reshape(shape))
 
 
 def free_memory() -> None:

@@ -206,6 +206,17 @@ def weigh_pixels(rows: Any, at: int, x: Any, y: Any) -> tuple[Any, Any, Any, Any
 
 
 @njit(**INLINE)
+def list_bits(touched: Any, j: int, hits: Any, counts: Any) -> None:
+    """Append place j to the list of every block whose bit is set."""
+    while touched:
+        block = trailing_zeros(touched)
+        touched &= touched - np.uint32(1)
+        number = fetch(counts, block)
+        put(hits, block * CHUNK + number, j)
+        put(counts, block, number + 1)
+
+
+@njit(**INLINE)
 def list_hits(
     rows: Any,
     length: int,
@@ -237,12 +248,7 @@ def list_hits(
         prefetch(rows, np.int64(fetch(order, min(j + AHEAD, stop - 1))) * length)
         touched = touched_blocks(rows, np.int64(fetch(order, j)) * length, corners, epsilon) & ~dark
         put(trace, into + j - first, touched)
-        while touched:
-            block = trailing_zeros(touched)
-            touched &= touched - np.uint32(1)
-            number = fetch(counts, block)
-            put(hits, block * CHUNK + number, j)
-            put(counts, block, number + 1)
+        list_bits(touched, j, hits, counts)
 
 
 class Picture(NamedTuple):

@@ -32,7 +32,6 @@ from .numba_simd import (
     store,
     store_many,
     sum_many,
-    trailing_zeros,
     zero_many,
 )
 from .numba_square import (
@@ -46,6 +45,7 @@ from .numba_square import (
     X,
     Y,
     aligned,
+    list_bits,
     list_hits,
     weigh_pixels,
 )
@@ -258,13 +258,7 @@ def list_traced(first: int, stop: int, into: int, hits: Any, counts: Any, trace:
     """List again, for each block, the Gaussians that the forward pass found to touch it."""
     counts[:] = 0
     for j in range(first, stop):
-        touched = np.uint32(fetch(trace, into + j))
-        while touched:
-            block = trailing_zeros(touched)
-            touched &= touched - np.uint32(1)
-            number = fetch(counts, block)
-            put(hits, block * CHUNK + number, j)
-            put(counts, block, number + 1)
+        list_bits(np.uint32(fetch(trace, into + j)), j, hits, counts)
 
 
 @njit(**INLINE)
