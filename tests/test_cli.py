@@ -8,7 +8,7 @@ import pytest
 from small_room import make_room
 
 from kfgs.cli import main
-from kfgs.scenes.ply import read_ply, write_ply
+from kfgs.formats.ply import read_ply, write_ply
 
 
 @pytest.fixture(scope="module")

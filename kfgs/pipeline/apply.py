@@ -18,17 +18,11 @@ from ..cameras import Camera, resize_labels, undistort_labels
 from ..evaluation import LabelSet, SegmentationReport, evaluate_segmentation, load_label_map
 from ..evaluation.segmentation import VOID
 from ..fields import SemanticField
+from ..formats.ply import Columns, other_elements, points_from_columns, read_ply, write_ply
+from ..formats.ply_3dgs import columns_from_gaussians
 from ..gaussians import Gaussians
 from ..labels import Transfer, classify, transfer_labels
 from ..scenes import Scene
-from ..scenes.ply import (
-    Columns,
-    columns_from_gaussians,
-    other_elements,
-    points_from_columns,
-    read_ply,
-    write_ply,
-)
 from ..viz import FeatureColors, overlay_labels, palette, save_picture
 
 Decode = Literal["exact", "latent"]

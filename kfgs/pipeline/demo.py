@@ -10,10 +10,10 @@ import numpy as np
 import torch
 
 from ..evaluation import load_label_set
+from ..formats.ply import write_ply
 from ..gaussians import Gaussians
 from ..labels import transfer_labels
 from ..scenes import load_scene
-from ..scenes.ply import write_ply
 from ..scenes.toy import ToyConfig, make_toy_room
 from ..teachers import FeatureFolder
 from .apply import (

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from .._files import read_json
 from ..fields import SemanticField
+from ..formats.ply import read_ply
 from ..scenes import load_scene
-from ..scenes.ply import read_ply
 
 
 def describe(path: str | Path) -> str:

@@ -20,9 +20,9 @@ from torch import Tensor
 
 from .._files import read_json
 from ..cameras.camera import Camera, Distortion
+from ..formats.ply import points_from_columns, read_ply
 from .errors import SceneError
 from .names import natural_key, some
-from .ply import points_from_columns, read_ply
 from .scene import IMAGE_SUFFIXES, Scene, read_image
 
 _PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")

@@ -2,15 +2,9 @@ import numpy as np
 import pytest
 import torch
 
+from kfgs.formats.ply import other_elements, points_from_columns, read_ply, write_ply
+from kfgs.formats.ply_3dgs import columns_from_gaussians, gaussians_from_columns
 from kfgs.gaussians import Gaussians
-from kfgs.scenes.ply import (
-    columns_from_gaussians,
-    gaussians_from_columns,
-    other_elements,
-    points_from_columns,
-    read_ply,
-    write_ply,
-)
 
 
 def _cloud(n: int = 7, degree: int = 3) -> Gaussians:

@@ -1,8 +1,4 @@
-"""PLY files: the vertex table as named columns, and the common 3DGS layout on top of it.
-
-Layout of 3DGS files: x y z nx ny nz f_dc_* f_rest_* opacity scale_* rot_*, with opacity as a logit, scale as a natural
-logarithm and rotation as (w, x, y, z). Columns that kfgs does not know are kept by `read_ply` and `write_ply`.
-"""
+"""PLY files: the vertex table as named columns of numbers, whatever they mean."""
 
 from __future__ import annotations
 
@@ -15,7 +11,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .._files import atomic_path
-from ..gaussians import Gaussians
 
 Columns = dict[str, NDArray[Any]]
 
@@ -156,7 +151,8 @@ def write_ply(path: str | Path, columns: Columns, *, comments: tuple[str, ...] =
         rows.tofile(file)
 
 
-def _stack(columns: Columns, names: list[str]) -> Tensor:
+def stack_columns(columns: Columns, names: list[str]) -> Tensor:  # [N, len(names)] float32
+    """Some columns side by side."""
     return torch.from_numpy(np.stack([columns[name] for name in names], -1).astype(np.float32))
 
 
@@ -165,74 +161,4 @@ def points_from_columns(columns: Columns) -> Tensor:  # [N, 3]
     missing = [name for name in "xyz" if name not in columns]
     if missing:
         raise ValueError(f"columns: expected x, y and z, {', '.join(missing)} missing; got {sorted(columns)[:12]}")
-    return _stack(columns, ["x", "y", "z"])
-
-
-def _numbered(columns: Columns, group: str) -> list[str]:
-    """Names of the columns of a group, which are numbered from 0 without a gap."""
-    found = [name for name in columns if name.startswith(group)]
-    names = [f"{group}{i}" for i in range(len(found))]
-    missing = [name for name in names if name not in columns]
-    if missing:
-        odd = sorted(set(found) - set(names))
-        raise ValueError(
-            f"columns: expected {missing[0]} beside {odd[0]}, got none; number {group}* from 0 to the last"
-        )
-    return names
-
-
-def gaussians_from_columns(columns: Columns) -> Gaussians:
-    """Read a 3DGS vertex table (values activated on the way).
-
-    Raises:
-        ValueError: if a column of the 3DGS layout is missing, or numbered columns have gaps or an odd count.
-    """
-    needed = ["x", "y", "z", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-    missing = [name for name in needed if name not in columns]
-    if missing:
-        raise ValueError(
-            f"columns: expected the 3DGS layout, {', '.join(missing)} missing; is this a plain point cloud?"
-        )
-    dc_names, rest, features = (_numbered(columns, group) for group in ("f_dc_", "f_rest_", "semantic_"))
-    for group, names, counts in (("f_dc_", dc_names, (0, 3)), ("f_rest_", rest, (0, 9, 24, 45))):
-        if len(names) not in counts or (rest and not dc_names):
-            raise ValueError(
-                f"columns: expected {group}0, {group}1, ... of {' or '.join(map(str, counts))} columns (f_rest_* only "
-                f"with f_dc_0 to f_dc_2), got {len(names)} {group}*; write the file again"
-            )
-    sh = None
-    if dc_names:
-        dc = _stack(columns, dc_names)[:, None]
-        higher = dc[:, :0]
-        if rest:  # stored channel-major
-            higher = _stack(columns, rest).view(len(dc), 3, len(rest) // 3).transpose(1, 2)
-        sh = torch.cat([dc, higher], 1)
-    return Gaussians(
-        means=points_from_columns(columns),
-        quats=_stack(columns, [f"rot_{i}" for i in range(4)]),
-        scales=_stack(columns, [f"scale_{i}" for i in range(3)]).exp(),
-        opacities=_stack(columns, ["opacity"])[:, 0].sigmoid(),
-        features=_stack(columns, features) if features else None,
-        sh=sh,
-        labels=torch.from_numpy(columns["class_id"].astype(np.int64)) if "class_id" in columns else None,
-    )
-
-
-def columns_from_gaussians(gaussians: Gaussians) -> Columns:
-    """The 3DGS vertex table of a cloud: logits and logarithms, zero normals, `semantic_*` features, `class_id` labels."""
-    g = gaussians.detach().to("cpu", torch.float32)
-    opacity = g.opacities.clamp(1e-7, 1 - 1e-7)
-    groups: list[tuple[str, Tensor]] = []
-    if g.sh is not None:
-        groups += [("f_dc", g.sh[:, 0]), ("f_rest", g.sh[:, 1:].transpose(1, 2).flatten(1))]
-    groups += [("opacity", opacity.logit()[:, None]), ("scale", g.scales.log()), ("rot", g.quats)]
-    if g.features is not None:
-        groups.append(("semantic", g.features))
-    columns: Columns = {name: g.means[:, i].numpy() for i, name in enumerate("xyz")}
-    columns |= {name: np.zeros(len(g), np.float32) for name in ("nx", "ny", "nz")}
-    for group, values in groups:
-        for i in range(values.shape[1]):
-            columns[group if group == "opacity" else f"{group}_{i}"] = values[:, i].contiguous().numpy()
-    if g.labels is not None:
-        columns["class_id"] = g.labels.to(torch.int32).numpy()
-    return columns
+    return stack_columns(columns, ["x", "y", "z"])

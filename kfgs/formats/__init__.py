@@ -1,0 +1,6 @@
+"""Splat files of other programs: 3DGS PLY, compressed PLY, .splat, SPZ, SOG, .ksplat, glTF; read, written, labels kept."""
+
+from .splat_file import Precision, SplatFile
+from .table import Written, find_format, formats, read_splats, write_splats
+
+__all__ = ["Precision", "SplatFile", "Written", "find_format", "formats", "read_splats", "write_splats"]

@@ -1,0 +1,129 @@
+"""The common 3DGS layout of a PLY file, as Inria's script wrote it first and most programs read it.
+
+Columns x y z nx ny nz f_dc_* f_rest_* opacity scale_* rot_*, with opacity as a logit, scale as a natural logarithm,
+rotation as (w, x, y, z) and f_rest channel by channel. kfgs adds `class_id` and `score`; every other column is kept.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..gaussians import Gaussians
+from .ply import points_from_columns, read_ply, stack_columns, write_ply
+from .splat_file import Columns, Precision, SplatFile
+
+NAME = "ply"
+SUFFIXES = (".ply",)
+MAGIC = b"ply"
+HOLDS_LABELS = True
+NORMALS = ("nx", "ny", "nz")  # always zero in 3DGS files; written, not kept
+
+
+def matches(head: bytes) -> bool:
+    """Any PLY file: compressed ones are asked for first."""
+    return head.startswith(MAGIC)
+
+
+def read(path: Path) -> SplatFile:
+    """Read a 3DGS PLY with any degree of spherical harmonics; unknown columns go to `extra`.
+
+    Raises:
+        ValueError: if it is damaged, or no 3DGS file.
+    """
+    columns = read_ply(path)
+    try:
+        gaussians = gaussians_from_columns(columns)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    extra = {name: values for name, values in columns.items() if not _is_ours(name)}
+    return SplatFile(gaussians, extra, info={"format": NAME})
+
+
+def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
+    """Write the 3DGS layout, labels and extra columns included; nothing is lost."""
+    write_ply(path, columns_from_gaussians(splats.gaussians) | splats.extra, comments=("written by kfgs",))
+    return ()
+
+
+def precision(gaussians: Gaussians) -> Precision:
+    """float32 of logarithms and logits."""
+    return Precision(means=0.0, scales=1e-5, rotation=1e-3, opacities=1e-5, sh0=0.0, sh_rest=0.0)
+
+
+def _is_ours(name: str) -> bool:
+    known = {"x", "y", "z", "opacity", "class_id", *NORMALS}
+    return name in known or name.startswith(("f_dc_", "f_rest_", "scale_", "rot_", "semantic_"))
+
+
+def _numbered(columns: Columns, group: str) -> list[str]:
+    """Names of the columns of a group, which are numbered from 0 without a gap."""
+    found = [name for name in columns if name.startswith(group)]
+    names = [f"{group}{i}" for i in range(len(found))]
+    missing = [name for name in names if name not in columns]
+    if missing:
+        odd = sorted(set(found) - set(names))
+        raise ValueError(
+            f"columns: expected {missing[0]} beside {odd[0]}, got none; number {group}* from 0 to the last"
+        )
+    return names
+
+
+def gaussians_from_columns(columns: Columns) -> Gaussians:
+    """Read a 3DGS vertex table (values activated on the way).
+
+    Raises:
+        ValueError: if a column of the 3DGS layout is missing, or numbered columns have gaps or an odd count.
+    """
+    needed = ["x", "y", "z", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    missing = [name for name in needed if name not in columns]
+    if missing:
+        raise ValueError(
+            f"columns: expected the 3DGS layout, {', '.join(missing)} missing; is this a plain point cloud?"
+        )
+    dc_names, rest, features = (_numbered(columns, group) for group in ("f_dc_", "f_rest_", "semantic_"))
+    for group, names, counts in (("f_dc_", dc_names, (0, 3)), ("f_rest_", rest, (0, 9, 24, 45))):
+        if len(names) not in counts or (rest and not dc_names):
+            raise ValueError(
+                f"columns: expected {group}0, {group}1, ... of {' or '.join(map(str, counts))} columns (f_rest_* only "
+                f"with f_dc_0 to f_dc_2), got {len(names)} {group}*; write the file again"
+            )
+    sh = None
+    if dc_names:
+        dc = stack_columns(columns, dc_names)[:, None]
+        higher = dc[:, :0]
+        if rest:  # stored channel-major
+            higher = stack_columns(columns, rest).view(len(dc), 3, len(rest) // 3).transpose(1, 2)
+        sh = torch.cat([dc, higher], 1)
+    return Gaussians(
+        means=points_from_columns(columns),
+        quats=stack_columns(columns, [f"rot_{i}" for i in range(4)]),
+        scales=stack_columns(columns, [f"scale_{i}" for i in range(3)]).exp(),
+        opacities=stack_columns(columns, ["opacity"])[:, 0].sigmoid(),
+        features=stack_columns(columns, features) if features else None,
+        sh=sh,
+        labels=torch.from_numpy(columns["class_id"].astype(np.int64)) if "class_id" in columns else None,
+    )
+
+
+def columns_from_gaussians(gaussians: Gaussians) -> Columns:
+    """The 3DGS vertex table of a cloud: logits and logarithms, zero normals, `semantic_*` features, `class_id` labels."""
+    g = gaussians.detach().to("cpu", torch.float32)
+    opacity = g.opacities.clamp(1e-7, 1 - 1e-7)
+    groups: list[tuple[str, Tensor]] = []
+    if g.sh is not None:
+        groups += [("f_dc", g.sh[:, 0]), ("f_rest", g.sh[:, 1:].transpose(1, 2).flatten(1))]
+    groups += [("opacity", opacity.logit()[:, None]), ("scale", g.scales.log()), ("rot", g.quats)]
+    if g.features is not None:
+        groups.append(("semantic", g.features))
+    columns: Columns = {name: g.means[:, i].numpy() for i, name in enumerate("xyz")}
+    columns |= {name: np.zeros(len(g), np.float32) for name in ("nx", "ny", "nz")}
+    for group, values in groups:
+        for i in range(values.shape[1]):
+            columns[group if group == "opacity" else f"{group}_{i}"] = values[:, i].contiguous().numpy()
+    if g.labels is not None:
+        columns["class_id"] = g.labels.to(torch.int32).numpy()
+    return columns

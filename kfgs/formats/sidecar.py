@@ -1,0 +1,102 @@
+"""What travels beside a splat file: the names of its classes, and the labels where the format has no place for them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from .._files import atomic_path, digest_file, read_json, write_json
+from .splat_file import SCORE, SplatFile
+
+
+def names_path(path: str | Path) -> Path:
+    """`scene.ply` -> `scene.classes.json`: the names of the classes in a splat file."""
+    return Path(path).with_suffix(".classes.json")
+
+
+def labels_path(path: str | Path) -> Path:
+    """`scene.splat` -> `scene.splat.labels.npz`: `class_id` and `score` of a format that cannot hold them."""
+    path = Path(path)
+    return path.with_name(path.name + ".labels.npz")
+
+
+def write_names(path: str | Path, classes: tuple[str, ...], **facts: Any) -> Path:
+    """Write the names of a splat file's classes beside it, with facts about how its labels came about."""
+    target = names_path(path)
+    write_json(target, {"class_id": dict(enumerate(classes)), "none": -1, **facts})
+    return target
+
+
+def write_sidecar(path: Path, splats: SplatFile, *, holds_labels: bool) -> list[Path]:
+    """Write what the format itself could not hold, and take away labels that belonged to an older file of that name."""
+    labels, written = splats.gaussians.labels, []
+    beside = labels_path(path)
+    if labels is not None and not holds_labels:
+        arrays = {"class_id": labels.to(torch.int32).cpu().numpy(), "of": np.array(_digest(path))}
+        if SCORE in splats.extra:
+            arrays[SCORE] = splats.extra[SCORE].astype(np.float32)
+        with atomic_path(beside) as temporary, temporary.open("wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+        written.append(beside)
+    else:
+        beside.unlink(missing_ok=True)
+    if labels is not None and splats.classes:
+        facts = splats.info.get("labels", {})
+        written.append(write_names(path, splats.classes, **facts))
+    return written
+
+
+def read_sidecar(path: Path, splats: SplatFile) -> SplatFile:
+    """Add what lies beside a splat file; what the file itself says comes first.
+
+    Raises:
+        ValueError: if a file beside it is damaged, or its labels belong to another version of the splat file.
+    """
+    beside = labels_path(path)
+    if splats.gaussians.labels is None and beside.is_file():
+        splats = _with_labels(beside, path, splats)
+    if splats.gaussians.labels is not None and not splats.classes and names_path(path).is_file():
+        splats = splats.replace(classes=read_names(names_path(path)))
+    return splats
+
+
+def read_names(path: Path) -> tuple[str, ...]:
+    """The names of classes 0, 1, ... from a file that `write_names` wrote.
+
+    Raises:
+        ValueError: if it holds something else.
+    """
+    content = read_json(path)
+    table = content.get("class_id") if isinstance(content, dict) else None
+    if not isinstance(table, dict) or set(table) != {str(i) for i in range(len(table))}:
+        raise ValueError(f"{path}: expected 'class_id' with the names of classes 0, 1, ..., got {type(table).__name__}")
+    names = tuple(table[str(i)] for i in range(len(table)))
+    if not all(isinstance(name, str) for name in names):
+        raise ValueError(f"{path}: expected names, got {names!r:.80}; write each class as a string")
+    return names
+
+
+def _with_labels(beside: Path, path: Path, splats: SplatFile) -> SplatFile:
+    try:
+        with np.load(beside, allow_pickle=False) as file:
+            labels, of = file["class_id"], str(file["of"])
+            score = file.get(SCORE)
+    except (ValueError, KeyError, OSError, EOFError) as error:
+        raise ValueError(
+            f"{beside}: expected labels of {path.name}, but it cannot be read ({error}); delete it"
+        ) from error
+    if of != _digest(path) or labels.shape != (len(splats),):
+        raise ValueError(
+            f"{beside}: expected the labels of {path.name} as it is, got those of another version; delete it, or write "
+            "both again"
+        )
+    extra = splats.extra if score is None else splats.extra | {SCORE: score}
+    gaussians = splats.gaussians.replace(labels=torch.from_numpy(labels.astype(np.int64)))
+    return splats.replace(gaussians=gaussians, extra=extra)
+
+
+def _digest(path: Path) -> str:
+    return digest_file(path / "meta.json" if path.is_dir() else path)

@@ -1,0 +1,70 @@
+"""What a splat file holds, whichever program wrote it, and how exactly a format can hold it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from torch import Tensor
+
+from ..gaussians import Gaussians
+from .ply import Columns
+
+SCORE = "score"  # the extra column that says how sure a Gaussian's label is
+
+
+@dataclass(frozen=True, eq=False)
+class SplatFile:
+    """A cloud as read from, or to be written to, a splat file.
+
+    **Convention**: axes are those of the 3DGS PLY (x right, y down, z forward where the file keeps COLMAP's frame);
+    formats that store others turn them when reading and writing.
+    """
+
+    gaussians: Gaussians
+    """N Gaussians with activated values; colour in `sh`, classes in `labels`."""
+    extra: Columns = field(default_factory=dict)
+    """Whatever else the file says of each Gaussian: N values a column, by name (`score` belongs to the label)."""
+    classes: tuple[str, ...] = ()
+    """The name of each class index in `labels`; empty where the file has no names."""
+    info: dict[str, Any] = field(default_factory=dict)
+    """Facts about the file: `format`, and what its header says; anything that JSON can hold."""
+
+    def __post_init__(self) -> None:
+        for name, values in self.extra.items():
+            if np.shape(values) != (len(self.gaussians),):
+                raise ValueError(
+                    f"extra[{name!r}]: expected [N] with N = {len(self.gaussians)} (from gaussians), got "
+                    f"{np.shape(values)}; give one value per Gaussian"
+                )
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    def __repr__(self) -> str:
+        classes = f", {len(self.classes)} classes" if self.classes else ""
+        extra = f", extra {', '.join(self.extra)}" if self.extra else ""
+        return f"SplatFile({self.info.get('format', 'new')}: {self.gaussians!r}{classes}{extra})"
+
+    def replace(self, **changes: Any) -> SplatFile:
+        """A copy with some parts exchanged."""
+        return replace(self, **changes)
+
+    def select(self, which: Tensor) -> SplatFile:  # which: [N] bool or [n] int64
+        """The Gaussians under a mask or an index, with their extra columns."""
+        index = which.detach().cpu().numpy()
+        extra = {name: np.ascontiguousarray(values[index]) for name, values in self.extra.items()}
+        return replace(self, gaussians=self.gaussians.select(which), extra=extra)
+
+
+class Precision(NamedTuple):
+    """How far a value may be off after it was written and read again; what a format states and its tests ask."""
+
+    means: float | Tensor  # world units, per axis: one number, or [N, 3]
+    scales: float  # relative, of each standard deviation
+    rotation: float  # radians between the rotations
+    opacities: float  # absolute
+    sh0: float  # absolute, of the degree-0 coefficients
+    sh_rest: float  # absolute, of the higher coefficients
+    degree: int = 3  # highest degree of spherical harmonics that it holds

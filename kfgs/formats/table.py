@@ -1,0 +1,123 @@
+"""The formats of splat files: which module reads and writes which, found by content when reading, by name when writing.
+
+A format is one module of this package with
+
+- `NAME`, `SUFFIXES`: what it is called, and the endings of its files;
+- `matches(head)`: whether a file that begins with these bytes (up to 64 KiB) is one;
+- `read(path) -> SplatFile`;
+- `write(path, splats) -> tuple[str, ...]`: write the file, whole or not at all, and say in words what it could not hold
+  (formats that are only read have no `write`);
+- `precision(gaussians) -> Precision`: how exactly a written cloud comes back;
+- `HOLDS_LABELS`: whether `class_id`, `score` and names travel inside; else they go to files beside it (`sidecar`).
+
+and a line in `MODULES`.
+"""
+
+from __future__ import annotations
+
+import os
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
+
+from ..gaussians import Gaussians
+from .sidecar import read_sidecar, write_sidecar
+from .splat_file import SplatFile
+
+MODULES = (  # asked in this order: compressed PLY before PLY, whose ending it shares
+    "ply_3dgs",
+)
+_HEAD_BYTES = 1 << 16
+
+
+class Written(NamedTuple):
+    """What `write_splats` left behind."""
+
+    paths: list[Path]  # the file, and those beside it
+    lost: tuple[str, ...]  # what the format could not hold, in words
+
+
+def formats() -> dict[str, ModuleType]:
+    """Every format by name, in the order in which they are asked whether a file is theirs."""
+    modules = [import_module(f".{name}", __package__) for name in MODULES]
+    return {module.NAME: module for module in modules}
+
+
+def find_format(path: str | Path) -> ModuleType:
+    """The format of a file, by its content first, and by its name where the content has no mark (`.splat`).
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is none of the known formats.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file; expected a splat file there")
+    head = b""
+    if path.is_file():
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    for module in formats().values():
+        if module.matches(head) or (path.is_dir() and module.NAME == "sog" and (path / "meta.json").is_file()):
+            return module
+    for module in formats().values():
+        if path.is_file() and path.name.lower().endswith(module.SUFFIXES) and not hasattr(module, "MAGIC"):
+            return module
+    known = ", ".join(f"{name} ({', '.join(module.SUFFIXES)})" for name, module in formats().items())
+    raise ValueError(f"{path}: expected a splat file of a known format, got something else; known are {known}")
+
+
+def read_splats(path: str | Path) -> SplatFile:
+    """Read a splat file of any known format; labels and names come along, from the file or from those beside it.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is of no known format, or damaged: truncated, with counts that disagree or numbers that are not
+            finite.
+    """
+    path = Path(path)
+    module = find_format(path)
+    splats: SplatFile = module.read(path)
+    return read_sidecar(path, splats)
+
+
+def write_splats(path: str | Path, splats: SplatFile | Gaussians, *, format: str | None = None) -> Written:
+    """Write a cloud in the format that the file's name asks for.
+
+    Args:
+        path: the file; it is whole or absent. Its ending chooses the format.
+        splats: a cloud with colours; `labels`, `score` and class names travel with it.
+        format: a format's name, where the ending does not say it.
+
+    Returns:
+        The files written, and what the format could not hold.
+
+    Raises:
+        ValueError: if no format has such an ending, or the format cannot be written or cannot hold such a cloud.
+    """
+    path = Path(path)
+    if isinstance(splats, Gaussians):
+        splats = SplatFile(splats)
+    module = _format_to_write(path, format)
+    lost = module.write(path, splats)
+    beside = write_sidecar(path, splats, holds_labels=module.HOLDS_LABELS)
+    return Written([path, *beside], tuple(lost))
+
+
+def _format_to_write(path: Path, name: str | None) -> ModuleType:
+    known = {key: module for key, module in formats().items() if hasattr(module, "write")}
+    if name is not None:
+        if name not in known:
+            raise ValueError(
+                f"format: expected one of {', '.join(known)}, got {name!r}; leave it out to go by the name"
+            )
+        return known[name]
+    lower = os.fspath(path.name).lower()
+    for module in known.values():
+        if lower.endswith(module.SUFFIXES):
+            return module
+    endings = ", ".join(suffix for module in known.values() for suffix in module.SUFFIXES)
+    raise ValueError(
+        f"path: expected a name that ends in one of {endings}, got {path.name!r}; rename it or pass format"
+    )
