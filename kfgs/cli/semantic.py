@@ -1,56 +1,19 @@
-"""The command line: `kfgs demo | sfm | fit | segment | label | info`.
-
-Every command names the files it wrote, shows progress on long work, and ends with 0 (done), 1 (bad input, with one
-message that says what to do), 2 (wrong usage) or 130 (interrupted; the same command goes on where it stopped).
-"""
+"""Commands of the semantic field: demo, sfm, fit, segment, label, info."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
-import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
+from .say import Mode, Preset, fit_config, load_classes, say, wrote
+
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
 SceneFolder = Annotated[Path, tyro.conf.Positional]
-Preset = Literal["cpu", "paper"]
-Mode = Literal["decouple", "adc", "adc+sc"]
-
-
-def _say(text: str) -> None:
-    print(text, flush=True)  # noqa: T201 - this is the place that talks to a person
-
-
-def _wrote(paths: list[Path]) -> None:
-    _say("wrote:")
-    for path in paths:
-        _say(f"  {path}" + (f"  ({sum(1 for p in path.iterdir())} files)" if path.is_dir() else ""))
-
-
-def _fit_config(preset: Preset, mode: Mode, seed: int, steps: int | None, max_gaussians: int | None, split: str) -> Any:
-    from .pipeline import FitConfig
-
-    config = FitConfig.cpu() if preset == "cpu" else FitConfig.paper()
-    fields = config.field if steps is None else config.field.with_steps(steps)
-    if max_gaussians is not None:
-        fields = dataclasses.replace(fields, max_gaussians=max_gaussians)
-    return dataclasses.replace(config, mode=mode, seed=seed, split=split, field=fields)
-
-
-def _classes(scene: Path | None, classes: Path | None, text: Path | None) -> Any:
-    from .evaluation import load_label_set
-
-    if classes is None and scene is not None:
-        classes = scene / "classes.json"
-    if text is None and scene is not None:
-        text = scene / "text.npy"
-    if classes is None or text is None:
-        raise ValueError("classes, text: expected class names (.json) and embeddings (.npy); pass --classes and --text")
-    return load_label_set(classes, text)
 
 
 def _training_cameras(field: Any, scene: Path | None, images: Path | None) -> list[Any]:
@@ -81,8 +44,8 @@ def demo(out: Path = Path("kfgs_demo"), seed: int = 0, steps: int | None = None)
     from .pipeline import demo as run_demo
     from .scenes.toy import ToyConfig
 
-    config = _fit_config("cpu", "adc+sc", seed, steps, None, "train")
-    _wrote(run_demo.run(out, config, room=ToyConfig(seed=seed), report=_say, progress=True))
+    config = fit_config("cpu", "adc+sc", seed, steps, None, "train")
+    wrote(run_demo.run(out, config, room=ToyConfig(seed=seed), report=say, progress=True))
 
 
 def sfm(
@@ -106,15 +69,15 @@ def sfm(
     from .scenes import SfmConfig, run_sfm
 
     config = SfmConfig(matching=matching, camera_model=camera_model, min_registered=min_registered, seed=seed)
-    _say(str(run_sfm(images, out, config=config, progress=True)))
+    say(str(run_sfm(images, out, config=config, progress=True)))
     written = [out / "sparse" / "0"]
     beside = out / "images"
     if not os.path.lexists(beside):
         beside.symlink_to(images.resolve(), target_is_directory=True)  # so that `kfgs fit OUT` finds the pictures
         written.append(beside)
     elif beside.resolve() != images.resolve():
-        _say(f"note: {beside} is another folder; pass --images {images} to the other commands")
-    _wrote(written)
+        say(f"note: {beside} is another folder; pass --images {images} to the other commands")
+    wrote(written)
 
 
 def fit(
@@ -149,15 +112,15 @@ def fit(
     from .scenes import load_scene
     from .teachers import FeatureFolder
 
-    config = _fit_config(preset, mode, seed, steps, max_gaussians, split)
+    config = fit_config(preset, mode, seed, steps, max_gaussians, split)
     config = dataclasses.replace(config, undistorted_features=undistorted_features)
     loaded = load_scene(scene, images=images).undistorted()
     for note in loaded.notes:
-        _say(f"note: {note}")
+        say(f"note: {note}")
     maps = FeatureFolder(features, [loaded.stem(i) for i in loaded.views(split)])
-    result = fit_scene(loaded, maps, out, config, report=_say, progress=True)
-    _say(result.field.summary())
-    _wrote([result.field_path, *write_training_pictures(result)])
+    result = fit_scene(loaded, maps, out, config, report=say, progress=True)
+    say(result.field.summary())
+    wrote([result.field_path, *write_training_pictures(result)])
 
 
 def segment(
@@ -191,7 +154,7 @@ def segment(
     from .scenes import load_scene
     from .viz import plot_confusion
 
-    loaded, label_set = load_scene(scene, images=images).undistorted(), _classes(scene, classes, text)
+    loaded, label_set = load_scene(scene, images=images).undistorted(), load_classes(scene, classes, text)
     folder = labels or next((scene / name for name in ("labels_scored", "labels") if (scene / name).is_dir()), None)
     truth = {} if folder is None else true_labels(loaded, folder, split)
     if labels is not None and not truth:
@@ -201,18 +164,18 @@ def segment(
     field_ = SemanticField.load(field)
     seen = set(field_.info.get("views", ())) & {loaded.cameras[i].name for i in loaded.views(split)}
     if seen:
-        _say(f"note: the field was trained on {len(seen)} of these views")
+        say(f"note: the field was trained on {len(seen)} of these views")
     found = segment_scene(field_, loaded, label_set, out, split=split, decode=decode, pictures=pictures, progress=True)
     written = [out / name for name in ("predicted", "overlay", "features") if (out / name).is_dir()]
     if truth:
         scores = score_scene(found, truth, label_set)
-        _say(str(scores))
+        say(str(scores))
         write_report(out / "scores.json", segmentation=scores, truth=str(folder), field=str(field), decode=decode)
         plot_confusion(scores.confusion, list(label_set.names), out / "confusion.png")
         written += [out / "scores.json", out / "confusion.png"]
     else:
-        _say(f"note: no label pictures of split {split!r} in {scene}: nothing to score against")
-    _wrote(written)
+        say(f"note: no label pictures of split {split!r} in {scene}: nothing to score against")
+    wrote(written)
 
 
 def label(
@@ -255,7 +218,7 @@ def label(
             raise ValueError(f"{name}: expected --{other} beside it, got none; it would have no effect")
     if query is not None and by is not None:
         raise ValueError("by: expected none beside --query, which compares each Gaussian's own latent; leave one out")
-    label_set = _classes(scene, classes, text)
+    label_set = load_classes(scene, classes, text)
     loaded = SemanticField.load(field)
     carried = None if cloud is None else read_cloud(cloud)
     targets = [out / "gaussians.ply"] + ([] if cloud is None else [out / "cloud.ply"])
@@ -268,16 +231,16 @@ def label(
         rule = "votes of the training views; score = winner's share" if cameras else "own latents; score = cosine"
     else:
         gaussians, scores, rule = query_field(loaded, label_set, query, threshold)
-    _say(f"labelled by {rule}")
+    say(f"labelled by {rule}")
     assert gaussians.labels is not None
     written = save_labelled(targets[0], gaussians, scores, label_set, rule=rule)
     for i, name in enumerate(label_set.names):
-        _say(f"  {name:<16s} {int((gaussians.labels == i).sum()):8d} Gaussians")
+        say(f"  {name:<16s} {int((gaussians.labels == i).sum()):8d} Gaussians")
     if carried is not None:
         moved, paths = label_cloud(gaussians, carried, targets[1], label_set, distance=distance)
-        _say(str(moved))
+        say(str(moved))
         written += paths
-    _wrote(written)
+    wrote(written)
 
 
 def info(path: Annotated[Path, tyro.conf.Positional]) -> None:
@@ -288,32 +251,4 @@ def info(path: Annotated[Path, tyro.conf.Positional]) -> None:
     """
     from .pipeline import describe
 
-    _say(describe(path))
-
-
-COMMANDS: dict[str, Any] = {"demo": demo, "sfm": sfm, "fit": fit, "segment": segment, "label": label, "info": info}
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run one command; return the exit code."""
-    # Read when torch is first imported: waiting threads sleep instead of spinning, which beside other busy programs is
-    # the difference between 25 training steps a second and one (measured on two cores).
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    try:
-        tyro.extras.subcommand_cli_from_dict(
-            COMMANDS,
-            prog="kfgs",
-            description="Decoupled semantic fields of 3-D Gaussians: distil, compress, segment, label.",
-            args=arguments,
-        )
-    except KeyboardInterrupt:
-        print("interrupted; the same command goes on where it stopped", file=sys.stderr)  # noqa: T201
-        return 130
-    except (ValueError, TypeError, OSError, ImportError, ArithmeticError) as error:
-        print(f"error: {error}", file=sys.stderr)  # noqa: T201
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+    say(describe(path))

@@ -1,0 +1,46 @@
+"""What every command shares: talking to a person, and finding classes and configurations."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any, Literal
+
+Preset = Literal["cpu", "paper"]
+Mode = Literal["decouple", "adc", "adc+sc"]
+
+
+def say(text: str) -> None:
+    """Print a line at once."""
+    print(text, flush=True)  # noqa: T201 - this is the place that talks to a person
+
+
+def wrote(paths: list[Path]) -> None:
+    """Name the files that a command left behind."""
+    say("wrote:")
+    for path in paths:
+        say(f"  {path}" + (f"  ({sum(1 for p in path.iterdir())} files)" if path.is_dir() else ""))
+
+
+def fit_config(preset: Preset, mode: Mode, seed: int, steps: int | None, max_gaussians: int | None, split: str) -> Any:
+    """The options of a fit, from a preset and what was given beside it."""
+    from .pipeline import FitConfig
+
+    config = FitConfig.cpu() if preset == "cpu" else FitConfig.paper()
+    fields = config.field if steps is None else config.field.with_steps(steps)
+    if max_gaussians is not None:
+        fields = dataclasses.replace(fields, max_gaussians=max_gaussians)
+    return dataclasses.replace(config, mode=mode, seed=seed, split=split, field=fields)
+
+
+def load_classes(scene: Path | None, classes: Path | None, text: Path | None) -> Any:
+    """The label set of a scene folder, or of two files."""
+    from .evaluation import load_label_set
+
+    if classes is None and scene is not None:
+        classes = scene / "classes.json"
+    if text is None and scene is not None:
+        text = scene / "text.npy"
+    if classes is None or text is None:
+        raise ValueError("classes, text: expected class names (.json) and embeddings (.npy); pass --classes and --text")
+    return load_label_set(classes, text)
