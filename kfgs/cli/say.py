@@ -24,7 +24,7 @@ def wrote(paths: list[Path]) -> None:
 
 def fit_config(preset: Preset, mode: Mode, seed: int, steps: int | None, max_gaussians: int | None, split: str) -> Any:
     """The options of a fit, from a preset and what was given beside it."""
-    from .pipeline import FitConfig
+    from ..pipeline import FitConfig
 
     config = FitConfig.cpu() if preset == "cpu" else FitConfig.paper()
     fields = config.field if steps is None else config.field.with_steps(steps)
@@ -35,7 +35,7 @@ def fit_config(preset: Preset, mode: Mode, seed: int, steps: int | None, max_gau
 
 def load_classes(scene: Path | None, classes: Path | None, text: Path | None) -> Any:
     """The label set of a scene folder, or of two files."""
-    from .evaluation import load_label_set
+    from ..evaluation import load_label_set
 
     if classes is None and scene is not None:
         classes = scene / "classes.json"

@@ -18,7 +18,7 @@ SceneFolder = Annotated[Path, tyro.conf.Positional]
 
 def _training_cameras(field: Any, scene: Path | None, images: Path | None) -> list[Any]:
     """The cameras that a field was trained with, found again in its scene by name."""
-    from .scenes import load_scene
+    from ..scenes import load_scene
 
     if scene is None:
         raise ValueError("by: expected 'latents' without a scene, got 'views'; pass --scene, whose cameras vote")
@@ -41,8 +41,8 @@ def demo(out: Path = Path("kfgs_demo"), seed: int = 0, steps: int | None = None)
         seed: of the room and of the fit.
         steps: training steps of the field; the CPU preset's when not given.
     """
-    from .pipeline import demo as run_demo
-    from .scenes.toy import ToyConfig
+    from ..pipeline import demo as run_demo
+    from ..scenes.toy import ToyConfig
 
     config = fit_config("cpu", "adc+sc", seed, steps, None, "train")
     wrote(run_demo.run(out, config, room=ToyConfig(seed=seed), report=say, progress=True))
@@ -66,7 +66,7 @@ def sfm(
         min_registered: share of images that must be placed; fewer is an error.
         seed: of the geometric verification.
     """
-    from .scenes import SfmConfig, run_sfm
+    from ..scenes import SfmConfig, run_sfm
 
     config = SfmConfig(matching=matching, camera_model=camera_model, min_registered=min_registered, seed=seed)
     say(str(run_sfm(images, out, config=config, progress=True)))
@@ -108,9 +108,9 @@ def fit(
         images: folder of the pictures, if it is not SCENE/images.
         undistorted_features: the teacher saw undistorted pictures already, so its maps need no lens removed.
     """
-    from .pipeline import fit_scene, write_training_pictures
-    from .scenes import load_scene
-    from .teachers import FeatureFolder
+    from ..pipeline import fit_scene, write_training_pictures
+    from ..scenes import load_scene
+    from ..teachers import FeatureFolder
 
     config = fit_config(preset, mode, seed, steps, max_gaussians, split)
     config = dataclasses.replace(config, undistorted_features=undistorted_features)
@@ -149,10 +149,10 @@ def segment(
         pictures: how many views get pictures.
         images: folder of the pictures, if it is not SCENE/images.
     """
-    from .fields import SemanticField
-    from .pipeline import score_scene, segment_scene, true_labels, write_report
-    from .scenes import load_scene
-    from .viz import plot_confusion
+    from ..fields import SemanticField
+    from ..pipeline import score_scene, segment_scene, true_labels, write_report
+    from ..scenes import load_scene
+    from ..viz import plot_confusion
 
     loaded, label_set = load_scene(scene, images=images).undistorted(), load_classes(scene, classes, text)
     folder = labels or next((scene / name for name in ("labels_scored", "labels") if (scene / name).is_dir()), None)
@@ -207,8 +207,8 @@ def label(
             in the paper. `views` when a scene is given.
         images: folder of the scene's pictures, if it is not SCENE/images.
     """
-    from .fields import SemanticField
-    from .pipeline import label_cloud, label_field, query_field, read_cloud, save_labelled
+    from ..fields import SemanticField
+    from ..pipeline import label_cloud, label_field, query_field, read_cloud, save_labelled
 
     for name, value, other, needed in (
         ("threshold", threshold, "query", query),
@@ -249,6 +249,6 @@ def info(path: Annotated[Path, tyro.conf.Positional]) -> None:
     Args:
         path: a field folder, a run folder, a scene folder or a .ply file.
     """
-    from .pipeline import describe
+    from ..pipeline import describe
 
     say(describe(path))
