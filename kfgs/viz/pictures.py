@@ -187,9 +187,15 @@ def save_picture(
         )
     if values.ndim not in (2, 3) or (values.ndim == 3 and values.shape[2] not in (3, 4)) or 0 in values.shape:
         raise ValueError(f"picture: expected [H, W], [H, W, 3] or [H, W, 4], got {values.shape}; move channels last")
-    data = values if values.dtype == np.uint8 else _to_bytes(values)
+    data = as_bytes(values)
     with atomic_path(target) as temporary:
         Image.fromarray(np.ascontiguousarray(data)).save(temporary, format="PNG")
+
+
+def as_bytes(picture: Tensor | Array) -> Array:
+    """A picture in uint8: floats are clipped to [0, 1], bytes stay as they are."""
+    values = _array(picture)
+    return values if values.dtype == np.uint8 else _to_bytes(values)
 
 
 def check_names(labels: Sequence[int], names: Sequence[str]) -> None:

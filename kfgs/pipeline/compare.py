@@ -1,0 +1,66 @@
+"""A colour scene before and after an edit: which viewpoints show the change, and pictures from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from .._check import check_whole
+from ..cameras import Camera
+from ..gaussians import Gaussians
+from ..splat import rasterize
+from ..viz import save_picture
+from ..viz.pairs import picture_grid
+
+PREVIEW = 96  # pixels: width of the renderings that choose the viewpoints
+VISIBLE = 8 / 255  # a pixel has changed when some channel did by more than this
+APART = 30.0  # degrees between the viewing directions of chosen viewpoints, where there are such
+
+
+def render_color(gaussians: Gaussians, camera: Camera) -> Tensor:  # [H, W, 3] in [0, 1]
+    """What a camera sees of a colour field, on black."""
+    with torch.no_grad():
+        return rasterize(gaussians.replace(features=None), camera).map.clamp(0, 1)
+
+
+def changed_share(before: Gaussians, after: Gaussians, camera: Camera) -> float:
+    """The share of a (small) picture in which an edit shows."""
+    small = camera.resized(max(1, round(PREVIEW * camera.height / camera.width)), PREVIEW)
+    difference = (render_color(before, small) - render_color(after, small)).abs().amax(-1)
+    return float((difference > VISIBLE).float().mean())
+
+
+def views_of_change(before: Gaussians, after: Gaussians, cameras: Sequence[Camera], count: int = 2) -> list[int]:
+    """The viewpoints that show an edit best, each looking another way than those before it where possible.
+
+    Args:
+        before: the scene.
+        after: the edited scene.
+        cameras: viewpoints to choose from.
+        count: how many to choose at most; those in which nothing changes are never chosen.
+    """
+    check_whole("count", count, 0)
+    shares = [changed_share(before, after, camera) for camera in cameras]
+    ranked = [i for i in sorted(range(len(cameras)), key=lambda i: -shares[i]) if shares[i] > 0]
+    forward = {i: cameras[i].viewmat[2, :3].double() for i in ranked}
+    chosen: list[int] = []
+    limit = torch.cos(torch.deg2rad(torch.tensor(APART, dtype=torch.float64)))
+    for apart in (True, False):
+        for i in ranked:
+            far = all(float(forward[i] @ forward[j]) < float(limit) for j in chosen)
+            if len(chosen) < count and i not in chosen and (far or not apart):
+                chosen.append(i)
+    return chosen
+
+
+def write_comparison(
+    path: str | Path, before: Gaussians, after: Gaussians, cameras: Sequence[Camera], *, titles: tuple[str, str]
+) -> Path:
+    """Draw the scene before and after from each viewpoint, one row each, into one PNG file."""
+    rows = [[render_color(before, camera), render_color(after, camera)] for camera in cameras]
+    path = Path(path)
+    save_picture(path, picture_grid(rows, titles))
+    return path
