@@ -9,6 +9,8 @@ from torch import Tensor
 
 from .._check import check_range, check_shapes
 from ..quant.codebook import EPS, row_norms, unit_rows
+from ._rows import check_finite, unit_embeddings
+from .selection import Selection
 from .threshold import similarity_threshold
 
 CHUNK = 65_536  # rows per step: with 200 classes, 50 MB of similarities at a time
@@ -26,15 +28,6 @@ class Classification(NamedTuple):
 
     labels: Tensor  # [N] int64, -1 = none
     scores: Tensor  # [N] cosine with the winning class; 0 where there is none
-
-
-class Selection(NamedTuple):
-    """What a single query selects."""
-
-    mask: Tensor  # [N] bool, scores > threshold
-    scores: Tensor  # [N] cosine with the query
-    threshold: float  # gamma of Sec. 3.4
-    how: str  # how the threshold was chosen
 
 
 def label_codewords(
@@ -124,30 +117,6 @@ def select_by_query(
         check_range("threshold", threshold, -1, 1)
         gamma, how = float(threshold), "given"
     return Selection((scores > gamma) & something, scores, gamma, how)
-
-
-def unit_embeddings(embeddings: Tensor, name: str = "embeddings") -> Tensor:  # [C, D] -> [C, D]
-    """Normalise class embeddings, refusing none at all, all-zero rows (they would beat every opposite) and NaN."""
-    if len(embeddings) == 0:
-        raise ValueError(f"{name}: expected at least one class, got {tuple(embeddings.shape)}; pass one row per class")
-    check_finite(name, embeddings)
-    empty = row_norms(embeddings) <= EPS
-    if bool(empty.any()):
-        row = int(empty.nonzero()[0])
-        raise ValueError(
-            f"{name}: expected rows with a direction, got all zeros in row {row}; drop or replace that class"
-        )
-    return unit_rows(embeddings.detach())
-
-
-def check_finite(name: str, values: Tensor) -> None:
-    """Raise a ValueError if a number is NaN or infinite."""
-    finite = torch.isfinite(values)
-    if not bool(finite.all()):
-        row = int((~finite).nonzero()[0, 0])
-        raise ValueError(
-            f"{name}: expected finite numbers, got NaN or infinity in row {row}; remove or repair such rows"
-        )
 
 
 def _best(features: Tensor, similarity: Tensor) -> Classification:

@@ -41,8 +41,8 @@ def picture_grid(
     )
     pictures = [[as_bytes(picture) for picture in row] for row in rows]
     height, width = pictures[0][0].shape[:2]
-    font = ImageFont.load_default(size=max(12, width // 28))
-    head = (font.size * 3 // 2 if titles else 0) + GAP
+    letters = max(12, width // 28)  # pixels
+    head = (letters * 3 // 2 if titles else 0) + GAP
     columns = len(rows[0])
     sheet = np.full((head + len(rows) * (height + GAP), GAP + columns * (width + GAP), 3), PAPER, np.uint8)
     for i, row in enumerate(pictures):
@@ -50,7 +50,7 @@ def picture_grid(
             top, left = head + i * (height + GAP), GAP + j * (width + GAP)
             sheet[top : top + height, left : left + width] = picture
     canvas = Image.fromarray(sheet)
-    draw = ImageDraw.Draw(canvas)
+    draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(size=letters)
     for j, title in enumerate(titles):
         draw.text((GAP + j * (width + GAP) + width / 2, head / 2), title, fill=INK, font=font, anchor="mm")
     return np.asarray(canvas)
