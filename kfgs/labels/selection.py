@@ -1,0 +1,129 @@
+"""Selections are data: which Gaussians, how well each one fits, why, and the algebra that combines them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .._check import check_shapes
+from ..gaussians import Gaussians
+from ._rows import check_finite
+from .names import class_index
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Some of N Gaussians, with a score for every one of them.
+
+    `a & b`, `a | b`, `a ^ b`, `a - b` and `~a` combine selections of the same Gaussians. Scores follow Zadeh's rules:
+    `&` takes the smaller, `|` the larger, `~a` has 1 - score; `a - b` is `a & ~b`, and `a ^ b` is `(a - b) | (b - a)`.
+    `len` is the number selected, so an empty selection is false in an `if`.
+    """
+
+    mask: Tensor  # [N] bool
+    scores: Tensor  # [N] how well each fits: a cosine or a relevancy; 1 and 0 where a place or a label decides
+    threshold: float | None = None
+    """Gamma of Sec. 3.4; None where no threshold was applied, or several were."""
+    how: str = ""
+    """Where the threshold comes from, or what was combined."""
+
+    def __post_init__(self) -> None:
+        check_shapes(("mask", self.mask, "N"), ("scores", self.scores, "N"))
+        if self.mask.dtype != torch.bool:
+            raise TypeError(f"mask: expected a boolean mask, got {self.mask.dtype}; compare first, as in labels == 3")
+        check_finite("scores", self.scores)
+
+    def __len__(self) -> int:
+        return int(self.mask.sum())
+
+    def __repr__(self) -> str:
+        return f"Selection({len(self)} of {len(self.mask)} Gaussians: {self.words})"
+
+    @property
+    def indices(self) -> Tensor:  # [n] int64
+        """The selected Gaussians, ascending."""
+        return self.mask.nonzero()[:, 0]
+
+    @property
+    def words(self) -> str:
+        """How it was made, with its threshold, for a person."""
+        return self.how if self.threshold is None else f"score > {self.threshold:.4g} ({self.how})"
+
+    def within(self, mask: Tensor, how: str) -> Selection:  # mask: [N] bool
+        """The part of this selection under a mask: the same scores and threshold, one more reason."""
+        check_shapes(("selection.mask", self.mask, "N"), ("mask", mask, "N"))
+        return Selection(self.mask & mask, self.scores, self.threshold, f"{self.how}; {how}" if self.how else how)
+
+    def __and__(self, other: Selection) -> Selection:
+        scores = self._beside(other)
+        return Selection(self.mask & other.mask, torch.minimum(*scores), None, f"({self.words}) and ({other.words})")
+
+    def __or__(self, other: Selection) -> Selection:
+        scores = self._beside(other)
+        return Selection(self.mask | other.mask, torch.maximum(*scores), None, f"({self.words}) or ({other.words})")
+
+    def __invert__(self) -> Selection:
+        return Selection(~self.mask, 1 - self.scores, None, f"not ({self.words})")
+
+    def __sub__(self, other: Selection) -> Selection:
+        self._beside(other)
+        return self & ~other
+
+    def __xor__(self, other: Selection) -> Selection:
+        self._beside(other)
+        return (self - other) | (other - self)
+
+    def _beside(self, other: Selection) -> tuple[Tensor, Tensor]:
+        """Both scores, in one dtype; refuses what does not select among the same Gaussians."""
+        if not isinstance(other, Selection):
+            raise TypeError(
+                f"other: expected a Selection, got {type(other).__name__}; make one, as in Selection(mask, mask.float())"
+            )
+        if len(self.mask) != len(other.mask):
+            raise ValueError(
+                f"other: expected a selection among the same {len(self.mask)} Gaussians, got one among "
+                f"{len(other.mask)}; select in the same cloud, or carry the labels over with transfer_labels"
+            )
+        dtype = torch.promote_types(self.scores.dtype, other.scores.dtype)
+        return self.scores.to(dtype), other.scores.to(self.scores.device, dtype)
+
+
+def select_where(mask: Tensor, how: str = "given") -> Selection:  # mask: [N] bool
+    """A selection from a mask alone: scores are 1 inside, 0 outside.
+
+    Raises:
+        TypeError: if the mask is not boolean.
+    """
+    return Selection(mask, mask.to(torch.get_default_dtype()), None, how)
+
+
+def select_by_label(
+    gaussians: Gaussians,
+    label: int | str | Sequence[int | str],
+    classes: Sequence[str] = (),
+    scores: Tensor | None = None,  # [N]
+) -> Selection:
+    """Select the Gaussians that carry one of some labels.
+
+    Args:
+        gaussians: with labels.
+        label: a class index, -1 (none), a class name, or several of them.
+        classes: the names of the classes, in label order; needed for names.
+        scores: what each label is worth; 1 where selected and 0 elsewhere when not given.
+
+    Raises:
+        ValueError: if the Gaussians carry no labels, or a name is unknown (the message offers near ones).
+    """
+    if gaussians.labels is None:
+        raise ValueError("gaussians.labels: expected labels [N], got None; label them first, with classify or vote")
+    asked = [label] if isinstance(label, int | str) else list(label)
+    wanted = [class_index(one, classes) if isinstance(one, str) else int(one) for one in asked]
+    mask = torch.isin(gaussians.labels, torch.tensor(wanted, dtype=torch.int64, device=gaussians.labels.device))
+    how = "label " + ", ".join(str(one) for one in asked)
+    if scores is None:
+        return select_where(mask, how)
+    check_shapes(("gaussians.labels", gaussians.labels, "N"), ("scores", scores, "N"))
+    return Selection(mask, scores, None, how)
