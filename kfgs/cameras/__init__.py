@@ -4,12 +4,15 @@ from .camera import Camera, Distortion
 from .distortion import fold_radius
 from .projection import camera_to_pixel, project_points, projection_jacobian, unproject_depth, world_to_camera
 from .resample import resize_labels, resize_map
+from .similarity import Similarity, fit_similarity
 from .undistort import undistort, undistort_labels
 
 __all__ = [
     "Camera",
     "Distortion",
+    "Similarity",
     "camera_to_pixel",
+    "fit_similarity",
     "fold_radius",
     "project_points",
     "projection_jacobian",

@@ -12,8 +12,9 @@ from .engines import (
 )
 from .project import Projected, project
 from .rasterize import Rendering, rasterize
-from .sh import SH_C0, evaluate_sh, rgb_to_sh0, sh0_to_rgb
+from .sh import SH_C0, evaluate_sh, rgb_to_sh0, rotate_sh, sh0_to_rgb
 from .tiles import Tiles, bin_tiles
+from .transform import transform_gaussians
 
 __all__ = [
     "ALPHA_MAX",
@@ -33,5 +34,7 @@ __all__ = [
     "project",
     "rasterize",
     "rgb_to_sh0",
+    "rotate_sh",
     "sh0_to_rgb",
+    "transform_gaussians",
 ]

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes
+from ..cameras.similarity import exact_rotation
 
 SH_C0 = 0.5 * sqrt(1 / pi)
 """The constant harmonic, 0.28209...: rgb = SH_C0 * coefficient + 0.5 at degree 0."""
@@ -48,6 +49,44 @@ def evaluate_sh(
     return (torch.einsum("nk,nkc->nc", _basis(directions, K), sh) + 0.5).clamp(min=0)
 
 
+def rotate_sh(
+    sh: Tensor,  # [N, K, 3], K = 1, 4, 9 or 16
+    rotation: Tensor,  # [3, 3]
+) -> Tensor:  # [N, K, 3]
+    """Turn the colours with the scene: `evaluate_sh(rotate_sh(sh, R), R d)` is `evaluate_sh(sh, d)` for every d.
+
+    A rotation mixes the 2 l + 1 coefficients of a band among themselves by an orthogonal matrix D_l. It solves
+    Y_l(R d) D_l = Y_l(d), here for 32 directions spread over the sphere, in float64: exact to rounding, since both sides
+    are polynomials of degree l in d.
+
+    Args:
+        sh: coefficients for red, green, blue; differentiable.
+        rotation: R, taking old directions to new ones as columns, d' = R d.
+
+    Raises:
+        ValueError: if shapes disagree, K is not a full set of degrees, or the matrix is not a rotation (a reflection or
+            a scale included).
+
+    Example:
+        >>> quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # x to y
+        >>> sh = torch.zeros(1, 4, 3)
+        >>> sh[0, 3] = 1.0  # the coefficient of -x ...
+        >>> rotate_sh(sh, quarter)[0, :, 0].round(decimals=4).abs()  # ... becomes that of -y
+        tensor([0., 1., 0., 0.])
+    """
+    K = check_shapes(("sh", sh, "N K 3"))["K"]
+    if K not in (1, 4, 9, 16):
+        raise ValueError(f"sh: expected 1, 4, 9 or 16 coefficients (degree 0 to 3), got {K}; cut it to a full degree")
+    R = exact_rotation("rotation", rotation)
+    directions = _sphere(32)
+    before, after = _basis(directions, K), _basis(directions @ R.T, K)
+    D = torch.zeros(K, K, dtype=torch.float64)
+    for degree in range(int(K**0.5)):
+        band = slice(degree * degree, (degree + 1) ** 2)
+        D[band, band] = torch.linalg.lstsq(after[:, band], before[:, band]).solution
+    return torch.einsum("jk,nkc->njc", D.to(sh), sh)
+
+
 def rgb_to_sh0(rgb: Tensor) -> Tensor:
     """The degree-0 coefficient that shows `rgb` from everywhere; any shape."""
     return (rgb - 0.5) / SH_C0
@@ -56,6 +95,14 @@ def rgb_to_sh0(rgb: Tensor) -> Tensor:
 def sh0_to_rgb(sh0: Tensor) -> Tensor:
     """The colour that a degree-0 coefficient shows, unclamped; the inverse of `rgb_to_sh0`."""
     return sh0 * SH_C0 + 0.5
+
+
+def _sphere(count: int) -> Tensor:  # [count, 3] float64
+    """Unit vectors spread evenly over the sphere: equal steps of height, golden-angle steps of azimuth."""
+    step = torch.arange(count, dtype=torch.float64) + 0.5
+    z, azimuth = 1 - 2 * step / count, step * pi * (3 - sqrt(5))
+    radius = (1 - z * z).sqrt()
+    return torch.stack([radius * azimuth.cos(), radius * azimuth.sin(), z], dim=1)
 
 
 def _basis(directions: Tensor, K: int) -> Tensor:  # [N, 3] -> [N, K]

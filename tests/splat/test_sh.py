@@ -2,8 +2,9 @@ import numpy as np
 import oracles_splat as oracle
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
-from kfgs.splat import SH_C0, evaluate_sh, rgb_to_sh0, sh0_to_rgb
+from kfgs.splat import SH_C0, evaluate_sh, rgb_to_sh0, rotate_sh, sh0_to_rgb
 
 
 def _directions(N=50, seed=0):
@@ -74,3 +75,59 @@ def test_number_of_coefficients_must_be_a_full_degree():
 def test_one_direction_per_gaussian():
     with pytest.raises(ValueError, match=r"directions: expected \[N, 3\] with N = 2 \(from sh\), got \(1, 3\)"):
         evaluate_sh(torch.zeros(2, 4, 3), torch.ones(1, 3))
+
+
+def _rotation(seed):
+    return torch.from_numpy(Rotation.random(random_state=seed).as_matrix())
+
+
+def _coefficients(K, seed=3):
+    return 0.05 * torch.randn(50, K, 3, generator=torch.Generator().manual_seed(seed)).double()
+
+
+@pytest.mark.parametrize("K", [1, 4, 9, 16])
+@pytest.mark.parametrize("seed", range(3))
+def test_turned_colours_seen_along_turned_directions_are_the_colours(K, seed):
+    R, sh, d = _rotation(seed), _coefficients(K), _directions()
+    turned = evaluate_sh(rotate_sh(sh, R), d @ R.T)
+    torch.testing.assert_close(turned, evaluate_sh(sh, d), atol=1e-13, rtol=0)
+    if K > 1:
+        assert (evaluate_sh(rotate_sh(sh, R.T), d @ R.T) - turned).abs().max() > 1e-2  # the other way round is wrong
+
+
+def test_turning_keeps_the_norm_of_every_degree():
+    sh = _coefficients(16)
+    turned = rotate_sh(sh, _rotation(4))
+    for low, high in ((0, 1), (1, 4), (4, 9), (9, 16)):
+        torch.testing.assert_close(turned[:, low:high].norm(dim=1), sh[:, low:high].norm(dim=1))
+    torch.testing.assert_close(turned[:, 0], sh[:, 0])
+
+
+def test_turning_twice_is_turning_by_the_product():
+    A, B, sh = _rotation(5), _rotation(6), _coefficients(16)
+    torch.testing.assert_close(rotate_sh(rotate_sh(sh, B), A), rotate_sh(sh, A @ B))
+    torch.testing.assert_close(rotate_sh(rotate_sh(sh, A), A.T), sh)
+
+
+def test_half_turn_around_z_flips_the_signs_of_odd_orders():
+    half = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+    sh = _coefficients(16)
+    odd = [m % 2 for degree in range(4) for m in range(-degree, degree + 1)]
+    torch.testing.assert_close(rotate_sh(sh, half), sh * (1 - 2 * torch.tensor(odd).double())[:, None])
+
+
+def test_turned_colours_keep_dtype_and_have_gradients():
+    sh = _coefficients(9).float().requires_grad_()
+    turned = rotate_sh(sh, _rotation(7))
+    assert turned.dtype == torch.float32
+    (turned**2).sum().backward()  # turning keeps the sum of squares
+    torch.testing.assert_close(sh.grad, 2 * sh.detach(), atol=1e-6, rtol=1e-5)
+
+
+def test_what_cannot_turn_colours_is_named():
+    with pytest.raises(ValueError, match="rotation: expected a rotation, got a reflection"):
+        rotate_sh(_coefficients(4), torch.diag(torch.tensor([1.0, 1.0, -1.0])))
+    with pytest.raises(ValueError, match="rotation: expected a rotation .* divide by the scale"):
+        rotate_sh(_coefficients(4), 2 * torch.eye(3))
+    with pytest.raises(ValueError, match="sh: expected 1, 4, 9 or 16 coefficients"):
+        rotate_sh(torch.zeros(2, 5, 3), torch.eye(3))

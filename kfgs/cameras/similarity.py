@@ -1,0 +1,184 @@
+"""Similarities of space, x' = s R x + t: how a scene is moved, turned, resized, or carried into another frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from .._check import check_range, check_shapes
+from .camera import Camera
+
+ROTATION_TOLERANCE = 1e-3  # as Camera asks of its viewmat: matrices from text files carry few digits
+STRAIGHT = 1e-6  # points whose second spread is below this share of the first lie on a line
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """x' = scale * R x + t: a rotation, one factor for all axes, and a shift.
+
+    **Convention**: points are columns; values are float64 on the CPU, whatever the points are. The rotation is stored as
+    the exact rotation nearest to the matrix given.
+
+    Raises:
+        ValueError: if the scale is not positive, a number is not finite, or the matrix is not a rotation.
+
+    Example:
+        >>> quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # x to y
+        >>> Similarity(2.0, quarter, torch.tensor([0.0, 0.0, 1.0])).apply(torch.tensor([[1.0, 0.0, 0.0]]))
+        tensor([[0., 2., 1.]])
+    """
+
+    scale: float  # > 0
+    rotation: Tensor  # [3, 3] float64
+    translation: Tensor  # [3] float64, units of the destination
+
+    def __post_init__(self) -> None:
+        check_range("scale", self.scale, 0, closed=(False, False))
+        check_shapes(("rotation", self.rotation, "3 3"), ("translation", self.translation, "3"))
+        if not torch.isfinite(self.translation).all():
+            raise ValueError(f"translation: expected finite numbers, got {self.translation.tolist()}; check the fit")
+        object.__setattr__(self, "scale", float(self.scale))
+        object.__setattr__(self, "rotation", exact_rotation("rotation", self.rotation))
+        object.__setattr__(self, "translation", self.translation.detach().double().cpu())
+
+    @staticmethod
+    def identity() -> Similarity:
+        """The similarity that moves nothing."""
+        return Similarity(1.0, torch.eye(3).double(), torch.zeros(3).double())
+
+    @staticmethod
+    def from_matrix(matrix: Tensor) -> Similarity:  # [4, 4]
+        """Read scale, rotation and translation from [[s R, t], [0, 1]].
+
+        Raises:
+            ValueError: if the last row is not 0 0 0 1, or the rest shears, mirrors or scales the axes differently.
+        """
+        check_shapes(("matrix", matrix, "4 4"))
+        matrix = matrix.detach().double().cpu()
+        if matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
+            raise ValueError(f"matrix: expected the last row 0 0 0 1, got {matrix[3].tolist()}; pass points as columns")
+        determinant = float(torch.linalg.det(matrix[:3, :3]))
+        if not determinant > 0:
+            raise ValueError(
+                f"matrix: expected a rotation times a positive scale, got determinant {determinant:g}; "
+                "a mirrored or flat frame cannot be reached by a similarity"
+            )
+        scale = determinant ** (1 / 3)
+        return Similarity(scale, exact_rotation("matrix", matrix[:3, :3] / scale), matrix[:3, 3])
+
+    def matrix(self) -> Tensor:  # [4, 4] float64
+        """[[s R, t], [0, 1]]."""
+        matrix = torch.eye(4, dtype=torch.float64)
+        matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
+        return matrix
+
+    def apply(self, points: Tensor) -> Tensor:  # [N, 3] -> [N, 3]
+        """Move points; computed in float64, returned in their own dtype and on their device."""
+        check_shapes(("points", points, "N 3"))
+        R, t = self.rotation.to(points.device), self.translation.to(points.device)
+        return (self.scale * (points.double() @ R.T) + t).to(points.dtype)
+
+    def inverse(self) -> Similarity:
+        """The way back: x = R^T (x' - t) / s."""
+        return Similarity(1 / self.scale, self.rotation.T, -(self.rotation.T @ self.translation) / self.scale)
+
+    def compose(self, first: Similarity) -> Similarity:
+        """This similarity after another one: `a.compose(b).apply(x)` is `a.apply(b.apply(x))`; also written `a @ b`."""
+        return Similarity(
+            self.scale * first.scale,
+            self.rotation @ first.rotation,
+            self.scale * (self.rotation @ first.translation) + self.translation,
+        )
+
+    def __matmul__(self, first: Similarity) -> Similarity:
+        return self.compose(first)
+
+    def apply_to_camera(self, camera: Camera) -> Camera:
+        """The camera that takes the same picture of the moved scene.
+
+        Its viewmat stays a rigid motion, [R_c R^T, s t_c - R_c R^T t], so depths come out `scale` times as large; K, the
+        size and the lens stay.
+        """
+        view = camera.viewmat.detach().double().cpu()
+        moved = torch.eye(4, dtype=torch.float64)
+        moved[:3, :3] = view[:3, :3] @ self.rotation.T
+        moved[:3, 3] = self.scale * view[:3, 3] - moved[:3, :3] @ self.translation
+        return replace(camera, viewmat=moved.to(camera.viewmat))
+
+
+def fit_similarity(
+    src: Tensor,  # [N, 3]
+    dst: Tensor,  # [N, 3]
+    weights: Tensor | None = None,  # [N] >= 0
+    with_scale: bool = True,
+) -> Similarity:
+    """The similarity with the least sum of w |s R src + t - dst|^2, in closed form (Umeyama 1991).
+
+    Flat clouds are fine (of the two mirror images the rotation is taken); points on a line leave the turn around it open
+    and are refused. Outliers count in full: who expects them gives weights, or fits to samples.
+
+    Args:
+        src: points in the frame to move.
+        dst: the same points in the frame to reach.
+        weights: how much each pair counts; None counts all alike.
+        with_scale: False keeps the scale at 1 (a rigid motion).
+
+    Raises:
+        ValueError: if shapes disagree, a number is not finite, a weight is negative, or fewer than three pairs of
+            positive weight span a plane in both frames.
+
+    Note:
+        kornia has no such fit; scipy's `Rotation.align_vectors` is the rotation alone.
+    """
+    check_shapes(("src", src, "N 3"), ("dst", dst, "N 3"), ("weights", weights, "N"))
+    given = torch.ones(len(src)) if weights is None else weights
+    x, y, w = (value.detach().double().cpu() for value in (src, dst, given))
+    for name, values in (("src", x), ("dst", y), ("weights", w)):
+        if not torch.isfinite(values).all():
+            raise ValueError(f"{name}: expected finite numbers, got NaN or infinity; leave those pairs out")
+    if (w < 0).any():
+        raise ValueError(f"weights: expected numbers >= 0, got {float(w.min()):g}; clamp them first")
+    if int((w > 0).sum()) < 3:
+        raise ValueError(f"src: expected at least 3 pairs of positive weight, got {int((w > 0).sum())}; add pairs")
+    w = w / w.sum()
+    x_mean, y_mean = w @ x, w @ y
+    x, y = (x - x_mean) * w.sqrt()[:, None], (y - y_mean) * w.sqrt()[:, None]
+    for name, values in (("src", x), ("dst", y)):
+        spread = torch.linalg.svdvals(values)
+        if spread[1] <= STRAIGHT * spread[0]:
+            raise ValueError(
+                f"{name}: expected points that span a plane, got points on a line (spreads {spread.tolist()}); "
+                "add pairs beside it"
+            )
+    U, d, Vh = torch.linalg.svd(y.T @ x)
+    signs = torch.ones(3).double()
+    signs[2] = torch.sign(torch.linalg.det(U) * torch.linalg.det(Vh))  # a rotation, never a reflection
+    R = U @ (signs[:, None] * Vh)
+    scale = float((d * signs).sum() / (x * x).sum()) if with_scale else 1.0
+    if not scale > 0:
+        raise ValueError(
+            f"dst: expected points that a rotation and a scale can reach, got scale {scale:g}; check pairs"
+        )
+    return Similarity(scale, R, y_mean - scale * (R @ x_mean))
+
+
+def exact_rotation(name: str, matrix: Tensor) -> Tensor:  # [3, 3] -> [3, 3] float64
+    """The rotation nearest to a matrix that is one up to rounding; `name` is the argument an error speaks of.
+
+    Raises:
+        ValueError: if the matrix is not finite, not orthonormal to 1e-3, or a reflection.
+    """
+    check_shapes((name, matrix, "3 3"))
+    M = matrix.detach().double().cpu()
+    error = (M @ M.T - torch.eye(3, dtype=torch.float64)).abs().max()
+    if not error <= ROTATION_TOLERANCE:  # NaN fails every comparison
+        raise ValueError(
+            f"{name}: expected a rotation (orthonormal, without scale or shear), got {M.tolist()}; "
+            "divide by the scale first"
+        )
+    if torch.linalg.det(M) < 0:
+        raise ValueError(f"{name}: expected a rotation, got a reflection (determinant -1); check the axes' handedness")
+    U, _, Vh = torch.linalg.svd(M)
+    return M if error < 1e-14 else U @ Vh

@@ -1,0 +1,145 @@
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from kfgs.cameras import Camera, Similarity, fit_similarity, world_to_camera
+
+QUARTER = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # x to y
+MIRROR = torch.diag(torch.tensor([1.0, 1.0, -1.0]))
+
+
+def a_similarity(seed=0):
+    rng = np.random.default_rng(seed)
+    R = torch.from_numpy(Rotation.random(random_state=seed).as_matrix())
+    return Similarity(float(np.exp(rng.normal())), R, torch.from_numpy(rng.normal(size=3) * 5))
+
+
+def cloud(N=40, seed=0):
+    return torch.randn(N, 3, generator=torch.Generator().manual_seed(seed)).double() * torch.tensor([4.0, 2.0, 1.0])
+
+
+def close(a, b, **tolerance):
+    torch.testing.assert_close(a.matrix(), b.matrix(), **tolerance)
+
+
+def test_quarter_turn_twice_the_size_one_up():
+    similarity = Similarity(2.0, QUARTER, torch.tensor([0.0, 0.0, 1.0]))
+    assert similarity.apply(torch.tensor([[1.0, 0.0, 0.0], [0.0, 3.0, 5.0]])).tolist() == [[0, 2, 1], [-6, 0, 11]]
+    assert similarity.matrix().tolist() == [[0, -2, 0, 0], [2, 0, 0, 0], [0, 0, 2, 1], [0, 0, 0, 1]]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_group_laws(seed):
+    a, b, points = a_similarity(seed), a_similarity(seed + 10), cloud()
+    torch.testing.assert_close((a @ b).apply(points), a.apply(b.apply(points)))
+    torch.testing.assert_close(a.inverse().apply(a.apply(points)), points)
+    close(a @ a.inverse(), Similarity.identity(), atol=1e-12, rtol=0)
+    close(Similarity.identity() @ a, a)
+    close(Similarity.from_matrix(a.matrix()), a)
+    assert not torch.allclose((a @ b).matrix(), (b @ a).matrix())
+
+
+def test_matrix_moves_homogeneous_points():
+    a, points = a_similarity(4), cloud()
+    homogeneous = torch.cat([points, torch.ones(len(points), 1)], dim=1)
+    torch.testing.assert_close((homogeneous @ a.matrix().T)[:, :3], a.apply(points))
+
+
+def test_dtype_of_points_is_kept_and_numbers_are_float64():
+    a = Similarity(1.0, QUARTER, torch.zeros(3))
+    assert (a.rotation.dtype, a.translation.dtype) == (torch.float64, torch.float64)
+    assert a.apply(cloud().float()).dtype == torch.float32
+
+
+def test_rounded_rotation_becomes_exact():
+    R = torch.tensor(Rotation.random(random_state=3).as_matrix().round(5))
+    a = Similarity(1.0, R, torch.zeros(3))
+    torch.testing.assert_close(a.rotation @ a.rotation.T, torch.eye(3).double(), atol=1e-14, rtol=0)
+    assert (a.rotation - R).abs().max() < 1e-5
+
+
+def test_moved_camera_sees_moved_points_at_the_same_place():
+    a, points = a_similarity(5), cloud() + torch.tensor([0.0, 0.0, 10.0])
+    viewmat = torch.eye(4).double()
+    viewmat[:3, :3], viewmat[:3, 3] = a_similarity(6).rotation, torch.tensor([0.3, -0.2, 1.0])
+    K = torch.tensor([[50.0, 0, 20], [0, 45, 15], [0, 0, 1]]).double()
+    camera = Camera(viewmat, K, 40, 30, name="front")
+    moved = a.apply_to_camera(camera)
+    expected = a.scale * world_to_camera(camera, points)
+    torch.testing.assert_close(world_to_camera(moved, a.apply(points)), expected)
+    torch.testing.assert_close(moved.center, a.apply(camera.center[None])[0])
+    assert (moved.name, moved.size, moved.K.tolist()) == ("front", (30, 40), K.tolist())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_fit_finds_what_moved_the_points(seed):
+    truth, points = a_similarity(seed), cloud(seed=seed)
+    close(fit_similarity(points, truth.apply(points)), truth, atol=1e-10, rtol=0)
+    flat = points * torch.tensor([1.0, 1.0, 0.0])  # coplanar: det(U V^T) may be -1
+    close(fit_similarity(flat, truth.apply(flat)), truth, atol=1e-10, rtol=0)
+
+
+def test_fit_without_scale_agrees_with_scipy():
+    points, noise = cloud(), cloud(seed=1) * 0.3
+    target = a_similarity(7).apply(points) + noise
+    fit = fit_similarity(points, target, with_scale=False)
+    expected, _ = Rotation.align_vectors(target - target.mean(dim=0), points - points.mean(dim=0))
+    np.testing.assert_allclose(fit.rotation, expected.as_matrix(), atol=1e-10)
+    assert fit.scale == 1
+    torch.testing.assert_close(fit.apply(points).mean(dim=0), target.mean(dim=0))
+
+
+def test_no_nearby_similarity_fits_noisy_pairs_better():
+    """The fit is a minimum of the weighted squares in all seven directions."""
+    points, weights = cloud(), torch.rand(40, generator=torch.Generator().manual_seed(2)).double()
+    target = a_similarity(8).apply(points) + cloud(seed=3) * 0.3
+    fit = fit_similarity(points, target, weights)
+    cost = lambda s: (weights * (s.apply(points) - target).square().sum(dim=1)).sum()  # noqa: E731
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        turn = torch.from_numpy(Rotation.from_rotvec(rng.normal(size=3) * 1e-2).as_matrix())
+        nudge = Similarity(float(np.exp(rng.normal() * 1e-2)), turn, torch.from_numpy(rng.normal(size=3) * 1e-2))
+        assert cost(nudge @ fit) > cost(fit)
+
+
+def test_pairs_of_weight_zero_do_not_count():
+    truth, points = a_similarity(9), cloud()
+    target, weights = truth.apply(points), torch.ones(40)
+    target[:10] += 100
+    weights[:10] = 0
+    close(fit_similarity(points, target, weights), truth, atol=1e-10, rtol=0)
+
+
+def test_mirrored_points_get_the_best_rotation():
+    points = cloud()
+    fit = fit_similarity(points, points @ MIRROR.double())
+    assert torch.linalg.det(fit.rotation) > 0
+    assert fit.scale < 1  # the mirror image cannot be reached; a smaller copy misses by less
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: Similarity(0.0, QUARTER, torch.zeros(3)), r"scale: expected a number in \(0"),
+        (lambda: Similarity(1.0, 2 * QUARTER, torch.zeros(3)), "rotation: expected a rotation .* divide by the scale"),
+        (lambda: Similarity(1.0, QUARTER * torch.nan, torch.zeros(3)), "rotation: expected a rotation"),
+        (lambda: Similarity(1.0, MIRROR, torch.zeros(3)), "rotation: expected a rotation, got a reflection"),
+        (lambda: Similarity(1.0, QUARTER, torch.tensor([0.0, torch.inf, 0.0])), "translation: expected finite"),
+        (lambda: Similarity(1.0, QUARTER, torch.zeros(4)), r"translation: expected \[3\]"),
+        (lambda: Similarity.from_matrix(torch.ones(4, 4)), "matrix: expected the last row 0 0 0 1"),
+        (lambda: Similarity.from_matrix(torch.block_diag(2 * MIRROR, torch.ones(1, 1))), "matrix: .*determinant -8"),
+        (lambda: Similarity.from_matrix(torch.diag(torch.tensor([1.0, 2.0, 3.0, 1.0]))), "matrix: expected a rotation"),
+        (lambda: Similarity.identity().apply(torch.zeros(2, 4)), r"points: expected \[N, 3\]"),
+        (lambda: fit_similarity(cloud(5), cloud(6)), r"dst: expected \[N, 3\] with N = 5"),
+        (lambda: fit_similarity(cloud(2), cloud(2)), "src: expected at least 3 pairs of positive weight, got 2"),
+        (lambda: fit_similarity(cloud(3), cloud(3), torch.tensor([1.0, 1.0, 0.0])), "positive weight, got 2"),
+        (lambda: fit_similarity(cloud(3), cloud(3), torch.tensor([1.0, 1.0, -2.0])), "weights: expected numbers >= 0"),
+        (lambda: fit_similarity(cloud(3) * torch.nan, cloud(3)), "src: expected finite"),
+        (lambda: fit_similarity(cloud(9), cloud(9)[:, :1].repeat(1, 3)), "dst: .*points on a line"),
+        (lambda: fit_similarity(torch.ones(9, 3), cloud(9)), "src: .*points on a line"),
+    ],
+)
+def test_wrong_input_is_named(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()

@@ -1,0 +1,96 @@
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from kfgs.cameras import Camera, Similarity
+from kfgs.gaussians import Gaussians
+from kfgs.splat import covariance_3d, rasterize, transform_gaussians
+
+
+def a_similarity(seed=0):
+    R = torch.from_numpy(Rotation.random(random_state=seed).as_matrix())
+    return Similarity(1.7 + seed, R, torch.tensor([3.0, -1.0, 2.0]) * (1 + seed))
+
+
+def a_cloud(N=60, dtype=torch.float64):
+    g = torch.Generator().manual_seed(0)
+    rand = lambda *shape: torch.rand(*shape, generator=g, dtype=torch.float64)  # noqa: E731
+    return Gaussians(
+        means=rand(N, 3) * torch.tensor([2.0, 1.5, 3.0]) + torch.tensor([-1.0, -0.7, 2.0]),
+        quats=rand(N, 4) * 4 - 2,  # not unit
+        scales=0.03 + 0.2 * rand(N, 3),
+        opacities=0.2 + 0.7 * rand(N),
+        sh=rand(N, 16, 3) - 0.5,
+        labels=torch.arange(N) % 5 - 1,
+    ).to(dtype)
+
+
+def a_camera():
+    K = torch.tensor([[30.0, 0, 17], [0, 26, 11], [0, 0, 1]]).double()
+    return Camera(torch.eye(4).double(), K, 32, 24)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_moved_scene_from_moved_camera_is_the_same_picture(seed):
+    cloud, camera, similarity = a_cloud(), a_camera(), a_similarity(seed)
+    before = rasterize(cloud, camera, engine="reference")
+    moved = transform_gaussians(cloud, similarity)
+    near = 0.2 * similarity.scale  # world units, so it grows with the scene
+    after = rasterize(moved, similarity.apply_to_camera(camera), engine="reference", near=near)
+    torch.testing.assert_close(after.maps, before.maps, atol=1e-9, rtol=0)
+    torch.testing.assert_close(after.alphas, before.alphas, atol=1e-9, rtol=0)
+    assert before.alphas.mean() > 0.3
+    assert before.maps.std() > 0.1
+    stale = moved.replace(sh=cloud.sh)  # colours that did not turn are another picture
+    assert (rasterize(stale, similarity.apply_to_camera(camera), near=near).maps - before.maps).abs().max() > 0.05
+
+
+def test_covariances_turn_and_grow():
+    cloud, s = a_cloud(), a_similarity(1)
+    moved = transform_gaussians(cloud, s)
+    expected = s.scale**2 * (s.rotation @ covariance_3d(cloud.quats, cloud.scales) @ s.rotation.T)
+    torch.testing.assert_close(covariance_3d(moved.quats, moved.scales), expected)
+    torch.testing.assert_close(moved.quats.norm(dim=1), cloud.quats.norm(dim=1))
+    assert moved.opacities.equal(cloud.opacities)
+    assert moved.labels.equal(cloud.labels)
+
+
+def test_quarter_turn_in_closed_form():
+    half = 0.5**0.5
+    quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    one = Gaussians(torch.tensor([[1.0, 0, 0]]), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3), torch.ones(1))
+    moved = transform_gaussians(one, Similarity(2.0, quarter, torch.zeros(3)))
+    torch.testing.assert_close(moved.quats, torch.tensor([[half, 0, 0, half]]))
+    assert moved.means.tolist() == [[0, 2, 0]]
+    assert moved.scales.tolist() == [[2, 2, 2]]
+    assert moved.sh is None
+
+
+def test_twice_is_the_product_and_back_is_the_cloud():
+    cloud, a, b = a_cloud(), a_similarity(1), a_similarity(2)
+    twice, once = transform_gaussians(transform_gaussians(cloud, b), a), transform_gaussians(cloud, a @ b)
+    back = transform_gaussians(transform_gaussians(cloud, a), a.inverse())
+    for name in ("means", "scales", "sh"):
+        torch.testing.assert_close(getattr(twice, name), getattr(once, name))
+        torch.testing.assert_close(getattr(back, name), getattr(cloud, name))
+    for one, other in ((twice, once), (back, cloud)):  # q and -q are the same rotation
+        torch.testing.assert_close(covariance_3d(one.quats, one.scales), covariance_3d(other.quats, other.scales))
+
+
+def test_identity_changes_no_bit_of_position_or_shape():
+    cloud = a_cloud(dtype=torch.float32)
+    same = transform_gaussians(cloud, Similarity.identity())
+    for name in ("means", "quats", "scales", "opacities"):
+        assert getattr(same, name).equal(getattr(cloud, name)), name
+    torch.testing.assert_close(same.sh, cloud.sh, atol=1e-6, rtol=0)
+
+
+def test_dtype_features_and_gradients_stay():
+    cloud = a_cloud(dtype=torch.float32)
+    cloud = cloud.replace(sh=None, features=torch.randn(60, 4), means=cloud.means.requires_grad_())
+    moved = transform_gaussians(cloud, a_similarity())
+    assert moved.features is cloud.features
+    assert {moved.means.dtype, moved.quats.dtype, moved.scales.dtype} == {torch.float32}
+    moved.means.sum().backward()
+    expected = a_similarity().scale * a_similarity().rotation.sum(dim=0)
+    torch.testing.assert_close(cloud.means.grad, expected.float().expand(60, 3))
