@@ -98,8 +98,8 @@ class Similarity:
     def apply_to_camera(self, camera: Camera) -> Camera:
         """The camera that takes the same picture of the moved scene.
 
-        Its viewmat stays a rigid motion, [R_c R^T, s t_c - R_c R^T t], so depths come out `scale` times as large; K, the
-        size and the lens stay.
+        Its viewmat stays a rigid motion, [R_c R^T, s t_c - R_c R^T t], so depths come out `scale` times as large (which
+        `rasterize`'s `near` must follow); K, the size and the lens stay.
         """
         view = camera.viewmat.detach().double().cpu()
         moved = torch.eye(4, dtype=torch.float64)

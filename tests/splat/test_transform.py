@@ -37,12 +37,12 @@ def test_moved_scene_from_moved_camera_is_the_same_picture(seed):
     moved = transform_gaussians(cloud, similarity)
     near = 0.2 * similarity.scale  # world units, so it grows with the scene
     after = rasterize(moved, similarity.apply_to_camera(camera), engine="reference", near=near)
-    torch.testing.assert_close(after.maps, before.maps, atol=1e-9, rtol=0)
-    torch.testing.assert_close(after.alphas, before.alphas, atol=1e-9, rtol=0)
-    assert before.alphas.mean() > 0.3
-    assert before.maps.std() > 0.1
+    torch.testing.assert_close(after.map, before.map, atol=1e-9, rtol=0)
+    torch.testing.assert_close(after.alpha, before.alpha, atol=1e-9, rtol=0)
+    assert before.alpha.mean() > 0.3
+    assert before.map.std() > 0.1
     stale = moved.replace(sh=cloud.sh)  # colours that did not turn are another picture
-    assert (rasterize(stale, similarity.apply_to_camera(camera), near=near).maps - before.maps).abs().max() > 0.05
+    assert (rasterize(stale, similarity.apply_to_camera(camera), near=near).map - before.map).abs().max() > 0.05
 
 
 def test_covariances_turn_and_grow():
