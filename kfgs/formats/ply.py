@@ -1,9 +1,9 @@
-"""PLY files: the vertex table as named columns of numbers, whatever they mean."""
+"""PLY files: tables of named columns of numbers, whatever they mean; most often one, of vertices."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import torch
@@ -31,47 +31,118 @@ _NAMES = {
 _HEADER_BYTES = 1 << 20  # no honest header is longer
 
 
-def _parse_header(path: Path, head: bytes) -> tuple[str, int, list[tuple[str, str]], int]:
-    """Return (format, vertex count, [(property, numpy code)], byte where the data begin)."""
-    end = head.find(b"end_header")
+class _Element(NamedTuple):
+    """A table that the header promises."""
+
+    name: str
+    count: int  # rows
+    properties: list[tuple[str, str]]  # (name, numpy code)
+    lists: list[str]  # header lines of the properties that this module does not read
+
+
+class _Header(NamedTuple):
+    layout: str  # "ascii", "binary_little_endian" or "binary_big_endian"
+    elements: list[_Element]
+    comments: list[str]
+    start: int  # byte where the data begin
+
+
+def _parse_header(path: Path, file: BinaryIO) -> _Header:
+    """Read what the header says, whichever elements it names; leave `file` where the data begin."""
+    head = file.read(_HEADER_BYTES)
+    end = head.find(b"\nend_header") + 1
     newline = head.find(b"\n", end)
-    if not head.startswith(b"ply") or end < 0 or newline < 0:
+    if not head.startswith(b"ply") or end < 1 or newline < 0:
         raise ValueError(f"{path}: expected a PLY file ('ply' ... 'end_header'), got something else")
-    layout, count, properties, element = "", -1, [], ""
+    layout, elements, comments = "", [], []
     for line in head[:end].decode("ascii", "replace").splitlines():
         words = line.split()
         if words[:1] == ["format"] and len(words) > 1:
             layout = words[1]
+        elif words[:1] == ["comment"]:
+            comments.append(line[len("comment ") :].strip())
         elif words[:1] == ["element"] and len(words) == 3:
-            if element == "" and words[1] != "vertex":
-                raise ValueError(
-                    f"{path}: expected 'vertex' as the first element, got {words[1]!r}; re-export the file"
-                )
-            element = words[1]
-            if element == "vertex":
-                if not words[2].isdigit():
-                    raise ValueError(f"{path}: expected a vertex count, got {words[2]!r}")
-                count = int(words[2])
-        elif words[:1] == ["property"] and element == "vertex":
-            if len(words) != 3 or words[1] not in _TYPES:
-                raise ValueError(f"{path}: expected scalar vertex properties, got {line!r}")
-            properties.append((words[2], _TYPES[words[1]]))
+            if not (words[2].isdigit() and words[2].isascii() and len(words[2]) < 20):
+                raise ValueError(f"{path}: expected a {words[1]} count, got {words[2]!r:.40}; write the file again")
+            elements.append(_Element(words[1], int(words[2]), [], []))
+        elif words[:1] == ["property"] and elements:
+            if len(words) == 3 and words[1] in _TYPES:
+                elements[-1].properties.append((words[2], _TYPES[words[1]]))
+            else:
+                elements[-1].lists.append(line)
     if layout not in ("binary_little_endian", "binary_big_endian", "ascii"):
-        raise ValueError(f"{path}: expected a binary or ascii PLY, got format {layout!r}")
-    if count < 0 or not properties or len({name for name, _ in properties}) != len(properties):
+        raise ValueError(f"{path}: expected a binary or ascii PLY, got format {layout!r:.40}")
+    names = [element.name for element in elements]
+    if len(set(names)) != len(names):
+        raise ValueError(f"{path}: expected elements of different names, got {names!r:.80}; write the file again")
+    file.seek(newline + 1)
+    return _Header(layout, elements, comments, newline + 1)
+
+
+def _check_vertex(path: Path, header: _Header) -> _Element:
+    """The first element, if it is a vertex table."""
+    if not header.elements:
+        raise ValueError(f"{path}: expected one 'vertex' element, got none; re-export the file")
+    first = header.elements[0]
+    if first.name != "vertex":
+        raise ValueError(f"{path}: expected 'vertex' as the first element, got {first.name!r}; re-export the file")
+    return first
+
+
+def _check_scalars(path: Path, element: _Element) -> None:
+    if element.lists:
+        raise ValueError(f"{path}: expected scalar {element.name} properties, got {element.lists[0]!r:.80}")
+    names = [name for name, _ in element.properties]
+    if not names or len(set(names)) != len(names):
         raise ValueError(
-            f"{path}: expected one 'vertex' element with properties of different names, got {len(properties)}"
+            f"{path}: expected one {element.name!r} element with properties of different names, got {len(names)}"
         )
-    return layout, count, properties, newline + 1
 
 
-def _parse_rows(path: Path, file: BinaryIO, count: int) -> NDArray[np.float64]:  # [count, properties]
+def _parse_rows(path: Path, file: BinaryIO, element: _Element) -> Columns:
     try:
-        return np.loadtxt(file, dtype=np.float64, max_rows=count, ndmin=2)
+        table = np.zeros((0, len(element.properties)))
+        if element.count:
+            table = np.loadtxt(file, dtype=np.float64, max_rows=element.count, ndmin=2)
     except ValueError as error:
         raise ValueError(
-            f"{path}: expected {count} rows of numbers, but they cannot be parsed ({error}); write the file again"
+            f"{path}: expected {element.count} rows of numbers, but they cannot be parsed ({error}); write the file again"
         ) from error
+    if table.shape != (element.count, len(element.properties)):
+        raise ValueError(
+            f"{path}: expected {element.count} rows of {len(element.properties)} numbers, got {table.shape}"
+        )
+    return {name: table[:, i].astype(code) for i, (name, code) in enumerate(element.properties)}
+
+
+def _read_element(path: Path, file: BinaryIO, element: _Element, layout: str, left: int) -> Columns:
+    """Read the rows of one element from where `file` stands, if the `left` bytes of the file can hold them."""
+    if layout == "ascii":
+        if element.count * 2 * len(element.properties) > left + 1:  # a digit and a separator each, at the very least
+            raise ValueError(
+                f"{path}: the header promises {element.count} {_plural(element)}, but the file is too short; it is truncated"
+            )
+        return _parse_rows(path, file, element)
+    order = "<" if layout == "binary_little_endian" else ">"
+    dtype = np.dtype([(name, order + code) for name, code in element.properties])
+    if element.count * dtype.itemsize > left:
+        raise ValueError(
+            f"{path}: the header promises {element.count} {_plural(element)} of {dtype.itemsize} bytes, but only {left} bytes "
+            "follow; the file is truncated"
+        )
+    rows = np.fromfile(file, dtype=dtype, count=element.count)
+    return {name: np.ascontiguousarray(rows[name].astype(code)) for name, code in element.properties}
+
+
+def _plural(element: _Element) -> str:
+    return "vertices" if element.name == "vertex" else f"rows of {element.name!r}"
+
+
+def _existing(path: str | Path) -> Path:
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected a PLY file there")
+    return path
 
 
 def other_elements(path: str | Path) -> list[str]:
@@ -81,15 +152,23 @@ def other_elements(path: str | Path) -> list[str]:
         FileNotFoundError: if there is no such file.
         ValueError: if it is not a PLY file that begins with vertices.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected a PLY file there")
+    path = _existing(path)
     with path.open("rb") as file:
-        head = file.read(_HEADER_BYTES)
-    _parse_header(path, head)
-    lines = head[: head.find(b"end_header")].decode("ascii", "replace").splitlines()
-    elements = [words for line in lines if (words := line.split())[:1] == ["element"] and len(words) == 3]
-    return [name for _, name, count in elements[1:] if count.strip("0") != ""]
+        header = _parse_header(path, file)
+    _check_vertex(path, header)
+    return [element.name for element in header.elements[1:] if element.count]
+
+
+def read_comments(path: str | Path) -> list[str]:
+    """The comments of a PLY file's header, in order: which program wrote it, and what else it had to say.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not a PLY file.
+    """
+    path = _existing(path)
+    with path.open("rb") as file:
+        return _parse_header(path, file).comments
 
 
 def read_ply(path: str | Path) -> Columns:
@@ -99,36 +178,65 @@ def read_ply(path: str | Path) -> Columns:
         FileNotFoundError: if there is no such file.
         ValueError: if it is not a PLY file with scalar vertex properties, or is shorter than its header says.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected a PLY file there")
+    path = _existing(path)
     size = path.stat().st_size
     with path.open("rb") as file:
-        layout, count, properties, start = _parse_header(path, file.read(_HEADER_BYTES))
-        if layout == "ascii":
-            if count * (2 * len(properties)) > size - start + 1:  # a digit and a separator each, at the very least
-                raise ValueError(
-                    f"{path}: the header promises {count} vertices, but the file is too short; it is truncated"
-                )
-            file.seek(start)
-            table = _parse_rows(path, file, count) if count else np.zeros((0, len(properties)))
-            if table.shape != (count, len(properties)):
-                raise ValueError(f"{path}: expected {count} rows of {len(properties)} numbers, got {table.shape}")
-            return {name: table[:, i].astype(code) for i, (name, code) in enumerate(properties)}
-        order = "<" if layout == "binary_little_endian" else ">"
-        dtype = np.dtype([(name, order + code) for name, code in properties])
-        if count * dtype.itemsize > size - start:
-            raise ValueError(
-                f"{path}: the header promises {count} vertices of {dtype.itemsize} bytes, but only {size - start} bytes "
-                "follow; the file is truncated"
-            )
-        file.seek(start)
-        rows = np.fromfile(file, dtype=dtype, count=count)
-    return {name: np.ascontiguousarray(rows[name].astype(code)) for name, code in properties}
+        header = _parse_header(path, file)
+        vertex = _check_vertex(path, header)
+        _check_scalars(path, vertex)
+        return _read_element(path, file, vertex, header.layout, size - header.start)
+
+
+def read_ply_elements(path: str | Path) -> dict[str, Columns]:
+    """Read every table of a PLY file, by the element's name and in the file's order.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not a PLY file, an element has lists (the faces of a mesh) or no properties, or the file is
+            shorter than its header says.
+    """
+    path = _existing(path)
+    size = path.stat().st_size
+    tables: dict[str, Columns] = {}
+    with path.open("rb") as file:
+        header = _parse_header(path, file)
+        for element in header.elements:
+            _check_scalars(path, element)
+        for element in header.elements:
+            tables[element.name] = _read_element(path, file, element, header.layout, size - file.tell())
+    return tables
 
 
 def write_ply(path: str | Path, columns: Columns, *, comments: tuple[str, ...] = ()) -> None:
-    """Write columns of equal length as the vertex table of a binary little-endian PLY file, atomically."""
+    """Write columns of equal length as the vertex table of a binary little-endian PLY file, atomically.
+
+    Raises:
+        ValueError: if the columns have several lengths, or a type that PLY has no name for.
+    """
+    write_ply_elements(path, {"vertex": columns}, comments=comments)
+
+
+def write_ply_elements(path: str | Path, elements: dict[str, Columns], *, comments: tuple[str, ...] = ()) -> None:
+    """Write tables as the elements of a binary little-endian PLY file, in their order, atomically.
+
+    Raises:
+        ValueError: if the columns of a table have several lengths, or a type that PLY has no name for.
+    """
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    tables = []
+    for name, columns in elements.items():
+        rows = _pack_rows(columns)
+        names = rows.dtype.names or ()
+        header.append(f"element {name} {len(rows)}")
+        header += [f"property {_NAMES[rows.dtype[column].str[1:]]} {column}" for column in names]
+        tables.append(rows)
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
+        for rows in tables:
+            rows.tofile(file)
+
+
+def _pack_rows(columns: Columns) -> NDArray[Any]:
     lengths = {name: len(values) for name, values in columns.items()}
     if len(set(lengths.values())) != 1:
         raise ValueError(f"columns: expected columns of one length, got {lengths}")
@@ -139,16 +247,7 @@ def write_ply(path: str | Path, columns: Columns, *, comments: tuple[str, ...] =
     rows = np.empty(next(iter(lengths.values())), dtype=[(name, "<" + code) for name, code in codes.items()])
     for name, values in columns.items():
         rows[name] = values
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        *(f"comment {c}" for c in comments),
-        f"element vertex {len(rows)}",
-    ]
-    header += [f"property {_NAMES[code]} {name}" for name, code in codes.items()] + ["end_header\n"]
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        file.write("\n".join(header).encode("ascii"))
-        rows.tofile(file)
+    return rows
 
 
 def stack_columns(columns: Columns, names: list[str]) -> Tensor:  # [N, len(names)] float32
