@@ -1,0 +1,205 @@
+"""A semantic field meets any splat: check or find the common frame, carry the classes over, say how it went."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from .._check import check_choice, check_range
+from ..cameras import Camera
+from ..cameras.similarity import Similarity
+from ..evaluation import LabelSet
+from ..fields import SemanticField
+from ..formats.splat_file import SCORE, SplatFile
+from ..labels import Transfer, transfer_labels, vote_labels
+from ..scenes.align import Alignment, align_by_cameras
+from ..scenes.frames import frames_agree
+from ..scenes.register import align_clouds
+from .apply import label_field
+
+By = Literal["distance", "views"]
+WAYS: tuple[By, ...] = ("distance", "views")
+SOLID = 0.05  # opacity from which a Gaussian takes part in finding the frame: fainter ones float anywhere
+
+
+@dataclass(frozen=True, eq=False)
+class Attached:
+    """A splat with classes, and how it came to them."""
+
+    splats: SplatFile
+    """The splat in its own frame, with `labels`, the extra column `score`, class names and `info["labels"]`."""
+    transfer: Transfer
+    """What distance decided: every Gaussian (`by="distance"`), or those that the views left open (`by="views"`)."""
+    similarity: Similarity
+    """From the semantic field's frame to the splat's."""
+    alignment: Alignment | None
+    """How the similarity was found; None where the frames agreed or it was given."""
+    words: tuple[str, ...]
+    """What was done and found, a sentence each."""
+
+    @property
+    def labels(self) -> Tensor:  # [N] int64
+        """The class of each Gaussian, -1 = none."""
+        assert self.splats.gaussians.labels is not None
+        return self.splats.gaussians.labels
+
+
+def attach(
+    field: SemanticField,
+    splats: SplatFile,
+    classes: LabelSet,
+    *,
+    cameras: Sequence[Camera] | None = None,
+    splat_cameras: Sequence[Camera] | None = None,
+    similarity: Similarity | None = None,
+    distance: float | None = None,
+    by: By = "distance",
+) -> Attached:
+    """Give every Gaussian of a splat the class that the semantic field has at its place.
+
+    Frames: `similarity` is taken as it is given; else, with `splat_cameras`, it is fitted to the cameras of the same
+    names; else, where `frames_agree` says so, both share one frame; else the clouds themselves are aligned.
+
+    Classes, `by="distance"` (Sec. 3.4): the semantic Gaussians are classified, by votes of `cameras` or else by their
+    own latents, and each Gaussian of the splat takes the class of the nearest one within lambda. The score is
+    1 - d / lambda. `by="views"`: the semantic field segments `cameras`, and each Gaussian of the splat takes the class
+    of most of the pixels that it fills in them (the score is the winner's share of its votes); one that no view shows
+    takes the class of the nearest one that has a class, within lambda (score 1 - d / lambda).
+
+    Args:
+        field: a finished field.
+        splats: any splat of the same scene; labels that it has are replaced.
+        classes: names and embeddings in the teacher's space.
+        cameras: undistorted views in the field's frame, usually those it was trained on.
+        splat_cameras: views in the splat's frame, some of which share their names with `cameras`.
+        similarity: from the field's frame to the splat's; `Similarity.identity()` says that they are one.
+        distance: lambda in the splat's world units; None takes `default_distance`.
+        by: "distance" needs no cameras; "views" follows the borders of objects much better.
+
+    Raises:
+        ValueError: if `by` is unknown, cameras are missing, the splat is empty, or (SceneError) no similarity fits.
+    """
+    check_choice("by", by, WAYS)
+    if distance is not None:
+        check_range("distance", distance, 0, closed=(False, False))
+    if len(splats) == 0:
+        raise ValueError("splats: expected at least one Gaussian, got none; there is nothing to label")
+    for name, needed in (('by="views"', by == "views"), ("splat_cameras", splat_cameras is not None)):
+        if needed and not cameras:
+            raise ValueError(f"cameras: expected views in the field's frame (for {name}), got none; pass them as well")
+    similarity, alignment, said = _common_frame(field, splats, cameras, splat_cameras, similarity)
+    if by == "distance":
+        labels, scores, transfer, found = _by_distance(field, splats, classes, cameras, similarity, distance)
+    else:
+        assert cameras is not None
+        labels, scores, transfer, found = _by_views(field, splats, classes, cameras, similarity, distance)
+    counts = torch.bincount(labels + 1, minlength=len(classes) + 1).tolist()
+    facts = {
+        **found,
+        "lambda": transfer.distance,
+        "lambda from": transfer.how,
+        "frame": said,
+        "alignment": alignment.to_json() if alignment is not None else None,
+        "similarity": similarity.matrix().tolist(),
+        "counts": {"none": counts[0], **dict(zip(classes.names, counts[1:], strict=True))},
+    }
+    labelled = splats.replace(
+        gaussians=splats.gaussians.replace(labels=labels),
+        extra=splats.extra | {SCORE: scores.to(torch.float32).cpu().numpy()},
+        classes=classes.names,
+        info=splats.info | {"labels": facts},
+    )
+    words = (
+        said,
+        f"{facts['labelled by']}: {len(splats) - counts[0]} of {len(splats)} Gaussians have a class",
+        repr(transfer),
+    )
+    return Attached(labelled, transfer, similarity, alignment, words)
+
+
+def _common_frame(
+    field: SemanticField,
+    splats: SplatFile,
+    cameras: Sequence[Camera] | None,
+    splat_cameras: Sequence[Camera] | None,
+    similarity: Similarity | None,
+) -> tuple[Similarity, Alignment | None, str]:
+    """From the field's frame to the splat's, how it was found, and that in words."""
+    if similarity is not None:
+        return similarity, None, "the similarity between the frames was given"
+    if splat_cameras is not None:
+        assert cameras is not None
+        alignment = align_by_cameras(cameras, splat_cameras)
+        return alignment.similarity, alignment, f"aligned by {alignment.words}"
+    clouds = [_solid(gaussians.means, gaussians.opacities) for gaussians in (field.gaussians, splats.gaussians)]
+    check = frames_agree(*clouds)
+    if check.agree:
+        return Similarity.identity(), None, check.words
+    alignment = align_clouds(*clouds)
+    return alignment.similarity, alignment, f"{check.words}; aligned by {alignment.words}"
+
+
+def _solid(means: Tensor, opacities: Tensor) -> Tensor:  # [N, 3], [N] -> [n, 3]
+    """The places of Gaussians that are there to see; all of them where hardly any is."""
+    seen = (opacities > SOLID) & means.isfinite().all(1)
+    return means[seen] if int(seen.sum()) >= 100 else means
+
+
+def _by_distance(
+    field: SemanticField,
+    splats: SplatFile,
+    classes: LabelSet,
+    cameras: Sequence[Camera] | None,
+    similarity: Similarity,
+    distance: float | None,
+) -> tuple[Tensor, Tensor, Transfer, dict[str, Any]]:
+    """Labels [N], scores [N], the transfer and facts: the rule of Sec. 3.4."""
+    semantic, _ = label_field(field, classes, cameras)
+    assert semantic.labels is not None
+    transfer = transfer_labels(similarity.apply(semantic.means), semantic.labels, splats.gaussians.means, distance)
+    who = "own latents" if cameras is None else f"votes of {len(cameras)} views"
+    facts = {
+        "labelled by": f"distance to semantic Gaussians classified by {who}",
+        "score": "1 - distance / lambda",
+        "ambiguous": transfer.ambiguous,
+    }
+    return transfer.labels, _closeness(transfer), transfer, facts
+
+
+def _by_views(
+    field: SemanticField,
+    splats: SplatFile,
+    classes: LabelSet,
+    cameras: Sequence[Camera],
+    similarity: Similarity,
+    distance: float | None,
+) -> tuple[Tensor, Tensor, Transfer, dict[str, Any]]:
+    """Labels [N], scores [N], the transfer and facts: each Gaussian asks the pixels that it fills."""
+
+    def segmented() -> Iterator[tuple[Camera, Tensor]]:
+        for camera in cameras:
+            yield similarity.apply_to_camera(camera), field.segment(camera, classes.embeddings, decode="latent")
+
+    colour = splats.gaussians
+    votes = vote_labels(colour, segmented(), len(classes), min_share=0.0)
+    open_ = votes.labels < 0
+    carried = transfer_labels(colour.means, votes.labels, colour.means[open_], distance)
+    labels, scores = votes.labels.clone(), votes.shares.clone()
+    labels[open_], scores[open_] = carried.labels, _closeness(carried).to(scores)
+    facts = {
+        "labelled by": f"votes of {len(cameras)} segmented views",
+        "score": "share of the votes; where no view shows a Gaussian, 1 - distance / lambda to one that has a class",
+        "shown": int((~open_).sum()),
+        "not shown": int(open_.sum()),
+    }
+    return labels, scores, carried, facts
+
+
+def _closeness(transfer: Transfer) -> Tensor:  # [N] in [0, 1]
+    """1 - d / lambda where there is a label, 0 elsewhere."""
+    reach = max(transfer.distance, torch.finfo(transfer.distances.dtype).tiny)
+    return (1 - transfer.distances / reach).clamp_min(0.0)

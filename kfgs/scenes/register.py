@@ -1,0 +1,212 @@
+"""The similarity between two clouds of one scene that have nothing in common but their shape.
+
+Many starts, cheap first: a few thousand rotations and sizes are improved together on a lookup grid of nearest points
+(coarse), the best few basins by least squares on point-to-plane distances (fine), and the winner must leave the
+runner-up behind. Distances count both ways, so that neither shrinking one cloud into the other nor blowing it up pays.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from .._check import check_shapes
+from ..cameras.similarity import Similarity
+from .align import Alignment
+from .errors import SceneError
+from .frames import Array, bulk, median_spacing
+from .starts import Moves, improve_on_grid, principal_axes, spread_rotations, thin
+
+ROTATIONS = 720  # evenly over all rotations: about 15 degrees from any rotation to the next
+SIZES = (0.75, 0.87, 1.0, 1.15, 1.33)  # around the ratio of the clouds' radii, which partial overlap distorts
+BASINS = 8  # starts that are refined
+COARSE, FINE, FULL = 400, 3_000, 12_000  # points of each cloud
+NEAR = 3.0  # a point fits when closer than so many spacings of the sparser cloud
+MIN_FIT = 0.6  # of the points, both ways (harmonic mean)
+MARGIN = 0.6  # of what the best leaves unfit, the runner-up must leave more than 1 / MARGIN times as much
+
+
+class _Fit(NamedTuple):
+    similarity: Similarity
+    quality: float  # harmonic mean of the two shares that fit
+    shares: tuple[float, float]  # of src points near dst, and of dst points near src
+    rms: float  # of the points that fit, world units of dst
+    angle: float = 0.0
+
+
+def align_clouds(
+    src: Tensor,  # [N, 3]
+    dst: Tensor,  # [M, 3]
+    *,
+    generator: torch.Generator | None = None,
+) -> Alignment:
+    """Find rotation, translation and scale that lay one cloud onto another of the same scene, without any names.
+
+    The clouds may differ in density, noise and floaters, and overlap in part (about half of either should be in the
+    other). A point fits when it is closer to the other cloud than 3 spacings of the sparser one; `quality` is the
+    harmonic mean of the shares of points that fit, both ways.
+
+    Args:
+        src: points in the source frame, finite; leave out Gaussians too faint to see.
+        dst: points in the destination frame.
+        generator: draws the points that the search looks at; None stands for seed 0.
+
+    Returns:
+        The similarity from the source frame to the destination frame; `facts` holds both shares, the quality, and that
+        of the best other fit (another rotation, size or place).
+
+    Raises:
+        SceneError: if nothing fits well, or two different fits are about equally good (a symmetric scene).
+        ValueError: if shapes disagree, there are too few points, or a number is not finite.
+
+    Note:
+        About ten seconds on one core. The scene must have a shape: a bare box looks the same after half a turn.
+    """
+    check_shapes(("src", src, "N 3"), ("dst", dst, "M 3"))
+    seed = 0 if generator is None else int(torch.randint(2**31, (1,), generator=generator))
+    rng = np.random.default_rng(seed)
+    a, b = bulk("src", src, 60_000), bulk("dst", dst, 60_000)
+    for name, cloud in (("src", a), ("dst", b)):
+        if len(cloud) < 100 or np.linalg.svd(cloud - cloud.mean(0), compute_uv=False)[2] < 1e-6 * np.ptp(cloud):
+            raise SceneError(
+                f"{name}: expected at least 100 points that fill space, got {len(cloud)}; align by cameras instead"
+            )
+    fits = sorted((_refined(a, b, start, rng) for start in _starts(a, b, rng)), key=lambda fit: -fit.quality)
+    best = _fit_closely(_Cloud.of(a, FULL, rng), _Cloud.of(b, FULL, rng), fits[0].similarity, steps=12)
+    size = float(np.linalg.norm(np.ptp(b, axis=0)))
+    others = [fit for fit in fits[1:] if _differs(fit.similarity, best.similarity, size)]
+    runner_up = max((fit.quality for fit in others), default=0.0)
+    _check_fit(best, runner_up)
+    facts = {
+        "source points that fit": best.shares[0],
+        "destination points that fit": best.shares[1],
+        "quality": best.quality,
+        "best other fit": runner_up,
+    }
+    count = min(len(a), FULL) + min(len(b), FULL)
+    inliers = round(best.shares[0] * min(len(a), FULL) + best.shares[1] * min(len(b), FULL))
+    how = f"shape of the clouds (quality {best.quality:.2f}, next best {runner_up:.2f})"
+    return Alignment(best.similarity, best.rms, size, inliers, count, how, facts)
+
+
+def _check_fit(best: _Fit, runner_up: float) -> None:
+    """Refuse a bad or an ambiguous fit."""
+    if best.quality < MIN_FIT:
+        raise SceneError(
+            f"clouds: expected at least {MIN_FIT:.0%} of the points to fit, got {best.quality:.0%} "
+            f"({best.shares[0]:.0%} of the source, {best.shares[1]:.0%} of the destination) with the best similarity "
+            "found; are they of the same scene? Align by cameras of the same names, or pass the similarity"
+        )
+    if 1 - best.quality > MARGIN * (1 - runner_up):
+        raise SceneError(
+            f"clouds: expected one similarity to fit best, got two that fit alike (quality {best.quality:.3f} and "
+            f"{runner_up:.3f}): the scene's shape is symmetric. Align by cameras of the same names, or pass the similarity"
+        )
+
+
+def _starts(a: Array, b: Array, rng: np.random.Generator) -> list[Similarity]:
+    """The best basins of a search over all rotations and some sizes, most promising first."""
+    clouds = [thin(cloud, COARSE * 3, rng) for cloud in (a, b)]
+    centers = [cloud.mean(0) for cloud in clouds]
+    radii = [
+        float(np.sqrt(((cloud - center) ** 2).sum(1).mean())) for cloud, center in zip(clouds, centers, strict=True)
+    ]
+    x, y = ((cloud - center) / radius for cloud, center, radius in zip(clouds, centers, radii, strict=True))
+    rotations = np.concatenate([principal_axes(x, y), spread_rotations(ROTATIONS)])
+    moves = Moves.of(rotations, SIZES)
+    moves, scores = improve_on_grid(x, y, moves, COARSE, rng)
+    chosen: list[Similarity] = []
+    for i in np.argsort(-scores):
+        R, s = moves.rotations[i], float(moves.scales[i]) * radii[1] / radii[0]
+        t = centers[1] + radii[1] * moves.translations[i] - s * R @ centers[0]
+        start = Similarity(s, torch.from_numpy(_orthonormal(R)), torch.from_numpy(t))
+        if all(_differs(start, other, 2 * radii[1]) for other in chosen):
+            chosen.append(start)
+        if len(chosen) == BASINS:
+            break
+    return chosen
+
+
+def _refined(a: Array, b: Array, start: Similarity, rng: np.random.Generator) -> _Fit:
+    return _fit_closely(_Cloud.of(a, FINE, rng), _Cloud.of(b, FINE, rng), start, steps=20)
+
+
+class _Cloud(NamedTuple):
+    points: Array  # [n, 3]
+    normals: Array  # [n, 3]
+    tree: cKDTree
+    spacing: float
+
+    @staticmethod
+    def of(points: Array, count: int, rng: np.random.Generator) -> _Cloud:
+        points = thin(points, count, rng)
+        tree = cKDTree(points)
+        near = points[tree.query(points, k=min(12, len(points)), workers=1)[1]]  # [n, k, 3]
+        near = near - near.mean(1, keepdims=True)
+        normals = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, 0]
+        return _Cloud(points, normals, tree, median_spacing(tree))
+
+
+def _fit_closely(a: _Cloud, b: _Cloud, start: Similarity, *, steps: int) -> _Fit:
+    """Least squares on distances to the other cloud's tangent planes, both ways, with a reach that narrows."""
+    R, s, t = start.rotation.numpy(), start.scale, start.translation.numpy()
+    finest = NEAR * max(a.spacing * s, b.spacing)
+    for step in range(steps):
+        reach = finest * max(1.0, 4.0 * (1 - 1.5 * step / steps))
+        moved = s * a.points @ R.T + t
+        d, i = b.tree.query(moved, workers=1)
+        e, j = a.tree.query((b.points - t) @ R / s, workers=1)
+        P = np.concatenate([moved, moved[j]])
+        Q = np.concatenate([b.points[i], b.points])
+        n = np.concatenate([b.normals[i], a.normals[j] @ R.T])
+        w = np.concatenate([_weight(d, reach) / len(d), _weight(e * s, reach) / len(e)])
+        center = P.mean(0)
+        A = np.concatenate([np.cross(P - center, n), n, ((P - center) * n).sum(1)[:, None]], axis=1)  # [., 7]
+        system = (A * w[:, None]).T @ A
+        damping = 1e-4 * np.diag(np.maximum(np.diag(system), 1e-12 * np.trace(system)))
+        x = np.linalg.solve(system + damping, (A * w[:, None]).T @ ((Q - P) * n).sum(1))
+        turn, factor = _rotation_vector(x[:3]), float(np.exp(np.clip(x[6], -0.1, 0.1)))
+        t = factor * turn @ (t - center) + center + x[3:6]
+        R, s = _orthonormal(turn @ R), s * factor
+    similarity = Similarity(s, torch.from_numpy(R), torch.from_numpy(t))
+    return _judge(a, b, similarity)
+
+
+def _judge(a: _Cloud, b: _Cloud, similarity: Similarity) -> _Fit:
+    d = b.tree.query(similarity.apply(torch.from_numpy(a.points)).numpy(), workers=1)[0]
+    e = a.tree.query(similarity.inverse().apply(torch.from_numpy(b.points)).numpy(), workers=1)[0] * similarity.scale
+    reach = NEAR * max(a.spacing * similarity.scale, b.spacing)
+    shares = float((d < reach).mean()), float((e < reach).mean())
+    quality = 2 * shares[0] * shares[1] / max(sum(shares), 1e-12)
+    near = np.concatenate([d[d < reach], e[e < reach]])
+    return _Fit(similarity, quality, shares, float(np.sqrt((near**2).mean())) if len(near) else float("inf"))
+
+
+def _differs(one: Similarity, other: Similarity, size: float) -> bool:
+    """Whether two similarities are different answers: 10 degrees, 10 % in size, or a tenth of the scene apart."""
+    cosine = (float((one.rotation * other.rotation).sum()) - 1) / 2
+    shift = float((one.translation - other.translation).norm())
+    return cosine < np.cos(np.radians(10)) or abs(np.log(one.scale / other.scale)) > 0.1 or shift > 0.1 * size
+
+
+def _weight(distances: Array, reach: float) -> Array:
+    """Geman-McClure: 1 at 0, a quarter at `reach`, nothing far away."""
+    weight: Array = (reach**2 / (reach**2 + distances**2)) ** 2
+    return weight
+
+
+def _rotation_vector(vector: Array) -> Array:
+    from scipy.spatial.transform import Rotation
+
+    matrix: Array = Rotation.from_rotvec(vector).as_matrix()
+    return matrix
+
+
+def _orthonormal(matrix: Array) -> Array:
+    U, _, Vt = np.linalg.svd(matrix)
+    turned: Array = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    return turned
