@@ -1,6 +1,20 @@
 """Scores that carry the name of their protocol."""
 
+from .editing import RecolorReport, RemovalReport, score_recolor, score_removal
 from .label_set import LabelSet, load_label_set
 from .segmentation import PROTOCOL, SegmentationReport, evaluate_segmentation, load_label_map
+from .surface_density import surface_density
 
-__all__ = ["PROTOCOL", "LabelSet", "SegmentationReport", "evaluate_segmentation", "load_label_map", "load_label_set"]
+__all__ = [
+    "PROTOCOL",
+    "LabelSet",
+    "RecolorReport",
+    "RemovalReport",
+    "SegmentationReport",
+    "evaluate_segmentation",
+    "load_label_map",
+    "load_label_set",
+    "score_recolor",
+    "score_removal",
+    "surface_density",
+]

@@ -1,0 +1,314 @@
+"""Does an edit do what was asked, and nothing else? Measured in pictures and on surfaces whose truth is known.
+
+The toy room knows at every pixel what is seen there, and on every surface what it is (`make_toy_room`).
+So an edited cloud is compared with the cloud before the edit where the truth says "this is the object", and elsewhere.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import kornia.color
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from ..cameras.camera import Camera
+from ..gaussians import Gaussians
+from ..splat import rasterize
+from .scene_truth import SceneTruth
+from .surface_density import surface_density
+
+REMOVAL = (
+    "kfgs-removal/1: held-out views of a scene with exact labels and surfaces. A Gaussian shows the class if its centre is "
+    "nearest to the class's surface. Pixels of the class that such Gaussians gave at least 1/4 of their light: gone = less "
+    "than half of that light is left. Pixels of other classes: untouched = no channel moved by 8/255. Surface points whose "
+    "density (sum of o exp(-d^2 / 2)) was at least 0.05: of the class, gone = less than half is left; of others, kept = "
+    "at least half is left"
+)
+RECOLOR = (
+    "kfgs-recolor/1: test views of a scene with exact labels. Outside = PSNR of after against before over all pixels of "
+    "other classes and channels; inside = share of the class's coloured pixels whose hue is within 20 degrees of the target"
+)
+GONE, UNTOUCHED, OUTSIDE = 0.95, 0.98, 35.0  # shares and decibels that `passed` asks for
+HUE_INSIDE, MEASURED = 0.8, 0.5  # likewise, so that neither an edit that does nothing nor a void measurement passes
+STEP = 8 / 255  # a channel that moves less is untouched: twice what 8-bit rounding and a JPEG would do
+HUE = 20.0  # degrees
+LEAST_LIGHT = 0.25  # of a pixel that has to come from the object before the edit, else nothing can be said of it
+LEAST_DENSITY = 0.05  # at a surface point before the edit, likewise
+LEAST_CHROMA = 0.04  # ten 8-bit steps between the largest and the smallest channel: below, a hue is noise
+
+
+@dataclass(frozen=True)
+class RemovalReport:
+    """Shares in [0, 1] (NaN where nothing could be measured), and how much they were measured on."""
+
+    name: str
+    """The class that was to be removed."""
+    gone_pixels: float
+    """Of the class's pixels: those that no longer show it."""
+    untouched_pixels: float
+    """Of the pixels of other classes: those that did not change."""
+    untouched_off_border: float
+    """The same without the pixels within 2 of the class, where soft edges mix the two."""
+    gone_points: float
+    """Of the class's surface: where its density is gone."""
+    kept_points: float
+    """Of the other surfaces: where the density stayed."""
+    measured_pixels: float
+    """Of the class's pixels: those that the object's Gaussians showed before the edit."""
+    measured_points: float
+    """Of the class's surface points: those that the cloud covered before the edit."""
+    pixels: int
+    """Pixels of the class in the views."""
+    views: int
+    protocol: str = REMOVAL
+
+    @property
+    def passed(self) -> bool:
+        """Whether at least 0.95 of the class is gone and 0.98 of the rest is untouched, in pictures and on surfaces.
+
+        And whether that says something: at least half of the class's pixels and of its surface could be measured.
+        """
+        gone = self.gone_pixels >= GONE and self.gone_points >= GONE  # NaN passes nothing
+        kept = self.untouched_pixels >= UNTOUCHED and self.kept_points >= UNTOUCHED
+        return gone and kept and self.measured_pixels >= MEASURED and self.measured_points >= MEASURED
+
+    def __str__(self) -> str:
+        return (
+            f"{self.name} removed: {self.gone_pixels:.4f} of its pixels gone, {self.gone_points:.4f} of its surface; "
+            f"untouched elsewhere: {self.untouched_pixels:.4f} of the pixels ({self.untouched_off_border:.4f} off its "
+            f"border), {self.kept_points:.4f} of the surface ({self.protocol.split(':')[0]}, {self.views} views)"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """The report as plain values; what could not be measured is null."""
+        return _plain(self)
+
+
+@dataclass(frozen=True)
+class RecolorReport:
+    """How far a recolouring stayed inside its object, and whether it got its colour."""
+
+    name: str
+    """The class that was to be recoloured."""
+    rgb: tuple[float, float, float]
+    """The colour that was asked for, in [0, 1]."""
+    psnr_outside: float
+    """Decibels over all pixels of other classes; infinite if nothing changed there."""
+    psnr_off_border: float
+    """The same without the pixels within 2 of the class, where soft edges mix the two."""
+    hue_inside: float
+    """Of the class's coloured pixels: those with the target's hue."""
+    measured_pixels: float
+    """Of the class's pixels: those with enough colour after the edit to have a hue."""
+    pixels: int
+    """Pixels of the class in the views."""
+    views: int
+    protocol: str = RECOLOR
+
+    @property
+    def passed(self) -> bool:
+        """Whether no other object changed (at least 35 dB outside) and at least 0.8 of the class has the new hue."""
+        return self.psnr_outside >= OUTSIDE and self.hue_inside >= HUE_INSIDE and self.measured_pixels >= MEASURED
+
+    def __str__(self) -> str:
+        return (
+            f"{self.name} recoloured: PSNR outside {self.psnr_outside:.1f} dB ({self.psnr_off_border:.1f} off its "
+            f"border), {self.hue_inside:.4f} of its coloured pixels have the hue "
+            f"({self.protocol.split(':')[0]}, {self.views} views)"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """The report as plain values; what could not be measured, and an infinite PSNR, is null."""
+        return _plain(self)
+
+
+def score_removal(
+    before: Gaussians,
+    after: Gaussians,
+    scene: str | Path,
+    name: str,
+    *,
+    split: str = "test",
+    engine: str = "auto",
+) -> RemovalReport:
+    """Score the removal of a class (protocol `kfgs-removal/1`, see `REMOVAL`).
+
+    A Gaussian shows the object if its centre stands nearer to the class's true surface than to any other. Depth cannot
+    tell: a rug lies on its floor, and a picture hangs flat on its wall.
+
+    Args:
+        before: the colour field, with `sh`.
+        after: the same field without the class.
+        scene: a folder with exact labels and surfaces, as `make_toy_room` writes it, in whose frame both fields are.
+        name: the class.
+        split: which views are looked at.
+        engine: see `composite`.
+
+    Raises:
+        FileNotFoundError: if the scene lacks labels or `surface.npz`.
+        ValueError: if the scene has no such class, no view of the split shows it, or a field has no `sh`.
+    """
+    truth = SceneTruth.open(scene, name, split)
+    pixels = {key: _Share() for key in ("gone", "shown", "untouched", "off_border")}
+    points, of_class = truth.surface()
+    owned = [_is_nearest(cloud, points, of_class) for cloud in (before, after)]
+    for view in truth.views():
+        old, new = (_picture(cloud, view.camera, engine) for cloud in (before, after))
+        same = (new - old).abs().amax(-1) < STEP
+        light = _light(before, owned[0], view.camera, engine)
+        left = _light(after, owned[1], view.camera, engine)
+        shown = light >= LEAST_LIGHT
+        pixels["shown"].add(shown, among=view.inside)
+        pixels["gone"].add(left < 0.5 * light, among=view.inside & shown)
+        pixels["untouched"].add(same, among=~view.inside)
+        pixels["off_border"].add(same, among=view.far)
+    density, rest = (surface_density(cloud, points) for cloud in (before, after))
+    covered, lost = density >= LEAST_DENSITY, rest < 0.5 * density
+    return RemovalReport(
+        name=name,
+        gone_pixels=pixels["gone"].value,
+        untouched_pixels=pixels["untouched"].value,
+        untouched_off_border=pixels["off_border"].value,
+        gone_points=_share(lost, among=covered & of_class),
+        kept_points=_share(~lost, among=covered & ~of_class),
+        measured_pixels=pixels["shown"].value,
+        measured_points=_share(covered, among=of_class),
+        pixels=truth.pixels,
+        views=len(truth.indices),
+    )
+
+
+def score_recolor(
+    before: Gaussians,
+    after: Gaussians,
+    scene: str | Path,
+    name: str,
+    rgb: Sequence[float],
+    *,
+    split: str = "test",
+    engine: str = "auto",
+) -> RecolorReport:
+    """Score the recolouring of a class (protocol `kfgs-recolor/1`, see `RECOLOR`).
+
+    Args:
+        before: the colour field, with `sh`.
+        after: the same field, recoloured.
+        scene: a folder with labels of every view, as `make_toy_room` writes it, in whose frame both fields are.
+        name: the class.
+        rgb: the colour that was asked for, three numbers in [0, 1] that are not all alike: grey has no hue.
+        split: which views are looked at.
+        engine: see `composite`.
+
+    Raises:
+        FileNotFoundError: if the scene lacks labels.
+        ValueError: if the scene has no such class, no view of the split shows it, `rgb` is no colour, or a field has no
+            `sh`.
+    """
+    wanted = _check_color(rgb)
+    truth = SceneTruth.open(scene, name, split)
+    colored, right = _Share(), _Share()
+    outside, off_border = _MeanSquare(), _MeanSquare()
+    for view in truth.views():
+        old, new = (_picture(cloud, view.camera, engine) for cloud in (before, after))
+        outside.add((new - old)[~view.inside])
+        off_border.add((new - old)[view.far])
+        has_hue = new.amax(-1) - new.amin(-1) >= LEAST_CHROMA
+        turn = (_hue_degrees(new) - _hue_degrees(wanted[None, None])).remainder(360)
+        colored.add(has_hue, among=view.inside)
+        right.add(torch.minimum(turn, 360 - turn) <= HUE, among=view.inside & has_hue)
+    return RecolorReport(
+        name=name,
+        rgb=(float(wanted[0]), float(wanted[1]), float(wanted[2])),
+        psnr_outside=outside.psnr,
+        psnr_off_border=off_border.psnr,
+        hue_inside=right.value,
+        measured_pixels=colored.value,
+        pixels=truth.pixels,
+        views=len(truth.indices),
+    )
+
+
+class _Share:
+    """Of many, how many: counted over the views."""
+
+    def __init__(self) -> None:
+        self.hits, self.count = 0, 0
+
+    def add(self, which: Tensor, *, among: Tensor) -> None:
+        self.hits += int((which & among).sum())
+        self.count += int(among.sum())
+
+    @property
+    def value(self) -> float:
+        return self.hits / self.count if self.count else math.nan
+
+
+def _share(which: Tensor, *, among: Tensor) -> float:
+    share = _Share()
+    share.add(which, among=among)
+    return share.value
+
+
+class _MeanSquare:
+    """Mean of squared differences over all pixels of all views, for one PSNR."""
+
+    def __init__(self) -> None:
+        self.total, self.count = 0.0, 0
+
+    def add(self, difference: Tensor) -> None:
+        self.total += float(difference.double().square().sum())
+        self.count += difference.numel()
+
+    @property
+    def psnr(self) -> float:
+        if self.count == 0:
+            return math.nan
+        return -10 * math.log10(self.total / self.count) if self.total > 0 else math.inf
+
+
+def _picture(cloud: Gaussians, camera: Camera, engine: str) -> Tensor:  # [H, W, 3] in [0, 1]
+    if cloud.sh is None:
+        raise ValueError(
+            "before, after: expected colour fields with sh [N, K, 3], got None; pass the edited colour field"
+        )
+    return rasterize(cloud.detach().replace(features=None), camera, engine=engine).map.clamp(0, 1)
+
+
+def _is_nearest(
+    cloud: Gaussians,
+    points: Tensor,  # [P, 3]
+    of_class: Tensor,  # [P] bool
+) -> Tensor:  # [N] bool
+    """Which Gaussians stand nearer to the class's surface than to any other."""
+    nearest = cKDTree(points.numpy()).query(cloud.means.detach().cpu().numpy())[1]
+    return of_class[torch.from_numpy(nearest)]
+
+
+def _light(cloud: Gaussians, owned: Tensor, camera: Camera, engine: str) -> Tensor:  # [H, W] in [0, 1]
+    """How much of each pixel's light comes from some of the Gaussians."""
+    shares = owned.to(cloud.means)[:, None]
+    return rasterize(cloud.detach().replace(features=shares, sh=None), camera, engine=engine).map[..., 0]
+
+
+def _hue_degrees(rgb: Tensor) -> Tensor:  # [H, W, 3] -> [H, W]
+    return kornia.color.rgb_to_hsv(rgb.permute(2, 0, 1)[None])[0, 0].rad2deg()
+
+
+def _check_color(rgb: Sequence[float]) -> Tensor:  # [3]
+    color = torch.as_tensor(rgb, dtype=torch.float32)
+    if color.shape != (3,) or not bool(((color >= 0) & (color <= 1)).all()):
+        raise ValueError(f"rgb: expected three numbers in [0, 1], got {rgb!r}; divide 8-bit colours by 255")
+    if float(color.max() - color.min()) < LEAST_CHROMA:
+        raise ValueError(f"rgb: expected a colour with a hue, got the grey {rgb!r}; score another colour")
+    return color
+
+
+def _plain(report: RemovalReport | RecolorReport) -> dict[str, Any]:
+    values = asdict(report) | {"passed": report.passed}
+    return {key: None if isinstance(v, float) and not math.isfinite(v) else v for key, v in values.items()}
