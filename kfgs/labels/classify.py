@@ -7,11 +7,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._check import check_range, check_shapes
+from .._check import check_shapes, check_whole
 from ..quant.codebook import EPS, row_norms, unit_rows
 from ._rows import check_finite, unit_embeddings
+from .relevancy import select_by_similarity
 from .selection import Selection
-from .threshold import similarity_threshold
 
 CHUNK = 65_536  # rows per step: with 200 classes, 50 MB of similarities at a time
 
@@ -90,33 +90,89 @@ def select_by_query(
     features: Tensor,  # [N, D]
     query: Tensor,  # [D]
     threshold: float | None = None,
+    negatives: Tensor | None = None,  # [M, D]
 ) -> Selection:
     """Select the features whose cosine with one query is **above** a threshold (Sec. 3.4, single target).
 
     The paper publishes no value for its threshold gamma. Without one, it is taken from the scores: the gap below their
     highest mode (see `similarity_threshold`), and `how` says what was found. A scene that does not contain the target
-    has a highest mode as well, so look at `how` and at the scores before trusting an automatic gamma.
+    has a highest mode as well, so look at `how` and at the scores before trusting an automatic gamma. With negatives
+    (what the query is *not*: the other classes of the scene) none is needed: scores are relevancies, and gamma is 0.5.
 
     Args:
         features: decoded features; any scale. All-zero features score 0 and are never selected.
-        query: the target's embedding.
-        threshold: gamma, a cosine in [-1, 1]; None takes it from the scores.
+        query: the target's embedding, or a prototype.
+        threshold: gamma, a cosine in [-1, 1], or with negatives a relevancy in [0, 1]; None as above.
+        negatives: one row per thing to tell the target from.
 
     Raises:
-        ValueError: if shapes disagree, the query is all-zero, the threshold is no cosine, or a number is not finite.
+        ValueError: if shapes disagree, the query or a negative is all-zero, the threshold is out of range, or a number
+            is not finite.
     """
-    check_shapes(("features", features, "N D"), ("query", query, "D"))
-    target = unit_embeddings(query[None], "query")[0].to(features)
+    check_shapes(("features", features, "N D"), ("query", query, "D"), ("negatives", negatives, "M D"))
+    rows = unit_embeddings(query[None], "query").to(features)
+    if negatives is not None:
+        rows = torch.cat([rows, unit_embeddings(negatives, "negatives").to(features)])
     check_finite("features", features)
     with torch.no_grad():
-        scores = torch.cat([unit_rows(rows) @ target for rows in features.split(CHUNK)])
+        similarity = torch.cat([unit_rows(part) @ rows.T for part in features.split(CHUNK)])
         something = row_norms(features) > EPS
-    if threshold is None:
-        gamma, how = similarity_threshold(scores[something])
-    else:
-        check_range("threshold", threshold, -1, 1)
-        gamma, how = float(threshold), "given"
-    return Selection((scores > gamma) & something, scores, gamma, how)
+    against = None if negatives is None else similarity[:, 1:]
+    return select_by_similarity(similarity[:, 0], against, threshold, something)
+
+
+def select_by_category(
+    features: Tensor,  # [N, D]
+    embeddings: Tensor,  # [C, D]
+    category: int,
+) -> Selection:
+    """Select the features for which one class wins among all (Sec. 3.4, max-similarity): no threshold is needed.
+
+    Args:
+        features: decoded features; any scale.
+        embeddings: one row per class, in class order.
+        category: which class.
+
+    Returns:
+        The Gaussians that `classify` gives this class; scores are the winner's cosine where it won and 0 elsewhere.
+
+    Raises:
+        ValueError: as `classify`, or if there is no such class.
+    """
+    found = classify(features, embeddings)
+    check_whole("category", category, 0, len(embeddings) - 1)
+    mask = found.labels == category
+    return Selection(mask, found.scores * mask, None, f"class {category} wins among {len(embeddings)}")
+
+
+def select_like(
+    features: Tensor,  # [N, D]
+    like: int | Tensor,  # an index, indices [n] int64, or a mask [N] bool
+    threshold: float | None = None,
+    negatives: Tensor | None = None,  # [M, D]
+) -> Selection:
+    """Select the features like those of some examples: the query is the mean of their unit vectors (a prototype).
+
+    Args:
+        features: decoded features; any scale.
+        like: which Gaussians are the examples.
+        threshold: as in `select_by_query`.
+        negatives: as in `select_by_query`.
+
+    Raises:
+        ValueError: as `select_by_query`, or if there are no examples or an index is out of range.
+    """
+    check_shapes(("features", features, "N D"))
+    rows = torch.atleast_1d(torch.as_tensor(like, device=features.device))
+    rows = rows.nonzero()[:, 0] if rows.dtype == torch.bool and len(rows) == len(features) else rows
+    if rows.dtype.is_floating_point or rows.dtype == torch.bool or rows.ndim != 1 or len(rows) == 0:
+        raise ValueError(f"like: expected at least one index below {len(features)}, got {like!r}; name some examples")
+    if int(rows.min()) < 0 or int(rows.max()) >= len(features):
+        raise ValueError(
+            f"like: expected indices from 0 to {len(features) - 1}, got {int(rows.min())} to {int(rows.max())}; "
+            "take them from this cloud"
+        )
+    return select_by_query(features, unit_rows(features[rows]).mean(dim=0), threshold, negatives)
 
 
 def _best(features: Tensor, similarity: Tensor) -> Classification:

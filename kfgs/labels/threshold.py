@@ -10,6 +10,8 @@ BINS = 128
 SMOOTHING = 2.0  # standard deviation, in bins
 PER = 30_000  # counts are scaled to this many features, so that copying a cloud does not move its threshold
 CLEAR = 0.3  # a gap is clear when its floor is at least 2 x (10^0.3) sparser than the mode on either side
+MOST = 0.5  # a target is at most half of the scene: a gap with more above it lies between two parts of the rest
+TOP, WAY = 0.999, 0.7  # where no gap is clear: this far up from the median to this quantile
 
 
 def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]
@@ -17,8 +19,13 @@ def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]
 
     A target is often a hundredth of the scene, and the rest has several modes of its own. Otsu's threshold then cuts
     the rest in two (measured on mixtures with 1 % targets: IoU 0.02). So the smoothed histogram is read in log counts,
-    and the cut is at the floor of the highest-scoring gap at least half as deep as the deepest (same mixtures: 0.97 or
-    more where the modes are apart). Where no gap is clear (one mode, or modes that overlap), Otsu's threshold is taken.
+    and the cut is at the floor of the highest-scoring gap at least half as deep as the deepest, among the gaps that have
+    at most half of the scores above them. Where no gap is clear (one mode, or modes that overlap), the cut is 70 % of
+    the way from the median to the 99.9 % quantile.
+
+    Measured on room_0 (18 classes; IoU of the selected Gaussians with labels of the data set, mean over classes): 0.88
+    for scores averaged over views, where the best threshold in hindsight gives 0.90; without the bound of one half, 0.79;
+    with Otsu's threshold where no gap is clear, 0.80.
 
     Returns:
         The threshold and one line that says where it comes from. No scores give 1.0, all-equal scores their value; as
@@ -36,13 +43,13 @@ def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]
     highest_below = np.maximum.accumulate(density)
     highest_above = np.maximum.accumulate(density[::-1])[::-1]
     depth = np.minimum(highest_below, highest_above) - density
+    depth[1 - np.cumsum(counts) / values.size > MOST] = 0
     if depth.max() < CLEAR:
-        from skimage.filters import threshold_otsu
-
-        threshold = float(threshold_otsu(values, nbins=BINS))
-        return (
-            threshold,
-            f"Otsu at {threshold:.3f}: no clear gap between modes of {values.size} scores; check the scores",
+        median, top = np.quantile(values, (0.5, TOP))
+        threshold = float(median + WAY * (top - median))
+        return threshold, (
+            f"{WAY:.0%} of the way from the median {median:.3f} to the top {top:.3f}: no clear gap between modes of "
+            f"{values.size} scores; check the scores"
         )
     deep = np.flatnonzero(depth >= depth.max() / 2)
     breaks = np.flatnonzero(np.diff(deep) > 1)

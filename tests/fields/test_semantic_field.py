@@ -95,6 +95,29 @@ def test_query_with_and_without_threshold(mode):
 
 
 @pytest.mark.parametrize("mode", MODES)
+def test_query_by_views_and_with_negatives(mode):
+    made = field(mode)
+    by_views = made.query(embeddings()[0], 0.5, cameras=[camera()])
+    assert by_views.mask.tolist() == [True, False, False, False]
+    assert by_views.scores[0] > 0.99  # its own pixels all point at codeword 0; only those of its neighbour do not
+    assert by_views.scores[2:].abs().max() < 0.01
+    for cameras in (None, [camera()]):
+        against = made.query(embeddings()[2], negatives=embeddings()[:2], cameras=cameras)
+        assert against.mask.tolist() == [False, False, True, True]
+        assert against.threshold == 0.5
+    hidden = field(mode).gaussians
+    hidden = hidden.replace(
+        means=torch.cat([-hidden.means[:1], hidden.means[1:]])
+    )  # the first stands behind the camera
+    unseen = SemanticField(hidden, made.codebook, made.autoencoder).query(embeddings()[0], -1.0, cameras=[camera()])
+    assert unseen.mask.tolist() == [False, True, True, True]
+    with pytest.raises(ValueError, match="views: expected at least one camera, got none"):
+        made.query(embeddings()[0], cameras=[])
+    with pytest.raises(ValueError, match=r"negatives: expected \[M, 16\], got \(2, 5\)"):
+        made.query(embeddings()[0], negatives=torch.ones(2, 5))
+
+
+@pytest.mark.parametrize("mode", MODES)
 def test_feature_map_points_at_the_codewords(mode):
     features = field(mode).feature_map(camera())
     assert features.shape == (16, 40, DIM)

@@ -18,9 +18,21 @@ def test_gap_lies_below_the_highest_mode_however_rare_it_is(targets):
     assert how.startswith("gap at")
 
 
-def test_one_mode_falls_back_to_otsu_and_says_so():
+def test_one_mode_is_cut_in_its_upper_tail_and_says_so():
+    """A normal mode N(0.6, 0.05): its 99.9 % quantile is 0.6 + 3.0902 x 0.05, and 70 % of that way is 0.7082."""
     threshold, how = similarity_threshold(mixture([(0.6, 0.05, 20000)]))
-    assert threshold == pytest.approx(0.6, abs=0.02)  # Otsu cuts a symmetric mode in the middle
+    assert threshold == pytest.approx(0.6 + 0.7 * 3.0902 * 0.05, abs=0.004)
+    assert "no clear gap" in how
+
+
+def test_a_gap_within_the_rest_is_no_target():
+    """The deepest gap parts the rest in two; most of the scene lies above it, so the shallow gap above is taken."""
+    rest = [(0.25, 0.01, 6000), (0.55, 0.06, 12000)]
+    threshold, how = similarity_threshold(mixture([*rest, (0.85, 0.02, 400)]))
+    assert 0.7 < threshold < 0.82
+    assert how.startswith("gap at")
+    alone, how = similarity_threshold(mixture(rest))
+    assert alone > 0.6
     assert "no clear gap" in how
 
 
