@@ -27,6 +27,9 @@ from .splat_file import SplatFile
 
 MODULES = (  # asked in this order: compressed PLY before PLY, whose ending it shares
     "ply_3dgs",
+    "spz",
+    "ksplat",
+    "splat",
 )
 _HEAD_BYTES = 1 << 16
 

@@ -1,0 +1,91 @@
+"""The `.splat` file of antimatter15's viewer: 32 bytes a Gaussian, nothing else.
+
+A record is 3 float32 of position, 3 float32 of linear scale, red, green, blue and opacity as bytes, and the quaternion
+(w, x, y, z) as bytes q * 128 + 128. Axes are those of the 3DGS PLY. There is no header: a file is known by its name, and
+trusted if its size is a whole number of records and its floats can be a cloud. Order is kept as given; viewers that draw
+a file while it arrives like the large and opaque Gaussians first.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from .._files import atomic_path
+from ..gaussians import Gaussians
+from .splat_file import Precision, SplatFile
+from .values import SH_C0, byte_error, check_finite, colours_to_write, positive_scales, unit_quats, words_of_loss
+
+NAME = "splat"
+SUFFIXES = (".splat",)
+HOLDS_LABELS = False
+RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
+_ROTATION = 0.016  # radians: 2 * 4 components half of 1/128 off, the quaternion's length taken out
+
+
+def matches(head: bytes) -> bool:
+    """Never: the content has no mark, the name decides."""
+    return False
+
+
+def read(path: Path) -> SplatFile:
+    """Read a .splat file: colours of degree 0, opacities as stored (0 and 1 included).
+
+    Raises:
+        ValueError: if its size is no multiple of 32 bytes, or a float is not finite, or a scale negative.
+    """
+    size = path.stat().st_size
+    if size % RECORD.itemsize:
+        raise ValueError(
+            f"{path}: expected records of {RECORD.itemsize} bytes, got {size} bytes, {size % RECORD.itemsize} too many; the "
+            "file is truncated, or of another format"
+        )
+    rows = np.fromfile(path, dtype=RECORD)
+    check_finite(path, means=rows["means"], scales=rows["scales"])
+    rgba = torch.from_numpy(rows["rgba"].astype(np.float32)) / 255
+    quats = (torch.from_numpy(rows["quats"].astype(np.float32)) - 128) / 128
+    gaussians = Gaussians(
+        means=torch.from_numpy(rows["means"].copy()),
+        quats=unit_quats(quats),
+        scales=positive_scales(path, rows["scales"]),
+        opacities=rgba[:, 3].contiguous(),
+        sh=((rgba[:, :3] - 0.5) / SH_C0)[:, None],
+    )
+    return SplatFile(gaussians, info={"format": NAME})
+
+
+def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
+    """Write the base colours; a quaternion is stored with its largest component negative, since -1 fits and +1 does not.
+
+    Raises:
+        ValueError: if the cloud has no colours, or values that are not finite.
+    """
+    g = colours_to_write(splats.gaussians, ".splat")
+    assert g.sh is not None
+    quats = unit_quats(g.quats)
+    largest = quats.gather(1, quats.abs().argmax(1, keepdim=True))
+    quats = torch.where(largest > 0, -quats, quats)
+    rgba = torch.cat([0.5 + SH_C0 * g.sh[:, 0], g.opacities[:, None]], 1)
+    rows = np.zeros(len(g), RECORD)
+    rows["means"], rows["scales"] = g.means.numpy(), g.scales.numpy()
+    rows["rgba"] = (rgba.clamp(0, 1) * 255).round().numpy()
+    rows["quats"] = (quats * 128 + 128).round().clamp(0, 255).numpy()
+    with atomic_path(path) as temporary:
+        rows.tofile(temporary)
+    return words_of_loss(splats, ".splat", 0)
+
+
+def precision(gaussians: Gaussians) -> Precision:
+    """Positions and scales exactly; colour and opacity in 255 steps, colours beyond 0 to 1 cut off."""
+    sh = torch.zeros(0) if gaussians.sh is None else gaussians.sh[:, 0].double()
+    return Precision(
+        means=0.0,
+        scales=1e-6,
+        rotation=_ROTATION,
+        opacities=0.5 / 255 + 1e-6,
+        sh0=byte_error(sh, -0.5 / SH_C0, 0.5 / SH_C0),
+        sh_rest=0.0,
+        degree=0,
+    )

@@ -1,0 +1,172 @@
+"""SPZ, Niantic's compressed splat file: versions 1 to 4 read, 2 to 4 written; labels travel in an extension record."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from math import exp
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from .._check import check_choice, check_whole
+from ..gaussians import Gaussians
+from .splat_file import SCORE, Precision, SplatFile
+from .spz_codec import (
+    LOG_SCALES,
+    SPZ_AXES,
+    choose_fractional_bits,
+    most_fractional_bits,
+    pack,
+    precision_of,
+    unpack,
+)
+from .spz_labels import TYPE as LABELS
+from .spz_labels import LabelRecord, pack_labels, unpack_labels
+from .spz_streams import ANTIALIASED, GZIP, MAGIC, MAX_FRACTIONAL_BITS, Container, read_container, write_container
+from .values import colours_to_write, words_of_loss
+
+NAME = "spz"
+SUFFIXES = (".spz",)
+HOLDS_LABELS = True
+_COORDINATES = 0xADBE0003  # Adobe's record: u32, which axes the file has
+_SPARSE_BITS = 8  # fewer bits after the point than this are worth a word: steps of 1/256 unit
+
+
+def matches(head: bytes) -> bool:
+    """NGSP at the beginning, or at the beginning of a gzip stream."""
+    if head[:2] != GZIP:
+        return head.startswith(MAGIC)
+    try:
+        return zlib.decompressobj(wbits=31).decompress(head, len(MAGIC)) == MAGIC
+    except zlib.error:
+        return False
+
+
+def read(path: Path) -> SplatFile:
+    """Read an SPZ file of version 1, 2, 3 or 4, gzipped or plain, into the axes of the 3DGS PLY.
+
+    `info` has `version`, `antialiased`, `fractional_bits`, `extensions` (types of records that were not understood, in
+    hexadecimal) and `dropped` where the file has harmonics of degree 4.
+
+    Raises:
+        ValueError: if it is damaged, of another version, or in axes that no flip turns into those of the PLY.
+    """
+    c = read_container(path)
+    records: dict[int, bytes] = dict(c.extensions)
+    axes = _axes(path, records.pop(_COORDINATES, None))
+    label_record = records.pop(LABELS, None)
+    info: dict[str, Any] = {"format": NAME, "version": c.version, "antialiased": bool(c.flags & ANTIALIASED)}
+    info |= {"fractional_bits": c.fractional_bits, "extensions": [f"{kind:#010x}" for kind in records]}
+    if c.degree > 3:
+        info["dropped"] = f"spherical harmonics of degree {c.degree}: degree 3 was kept"
+    splats = SplatFile(unpack(path, c, axes), info=info)
+    if label_record is None:
+        return splats
+    labels = unpack_labels(path, label_record, c.count)
+    gaussians = splats.gaussians.replace(labels=torch.from_numpy(labels.class_id.astype(np.int64)))
+    extra = {} if labels.score is None else {SCORE: labels.score}
+    return splats.replace(gaussians=gaussians, extra=extra, classes=labels.classes)
+
+
+def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
+    """Write version 4 with positions as fine as their extent allows; see `write_spz`."""
+    return write_spz(path, splats)
+
+
+def write_spz(
+    path: str | Path,
+    splats: SplatFile,
+    *,
+    version: int = 4,
+    fractional_bits: int | None = None,
+    sh_bits: tuple[int, int] = (8, 8),
+) -> tuple[str, ...]:
+    """Write an SPZ file, labels, scores and class names included.
+
+    Args:
+        path: the file, whole or absent.
+        splats: a cloud with colours.
+        version: 4 (Zstandard streams), or 3 or 2 (gzip) for older readers; 2 keeps rotations as three bytes.
+        fractional_bits: bits after the point of positions, 0 to 24: a step is 2^-bits world units. By default 12, fewer
+            for a cloud that reaches beyond 2048 units, more for a small one.
+        sh_bits: bits kept of harmonics of degree 1, and of degrees 2 and 3, 1 to 8; (5, 4) is what Niantic's own
+            writer keeps, for a file of about half the size.
+
+    Returns:
+        What the file could not hold, in words.
+
+    Raises:
+        ValueError: if the cloud has no colours or values that are not finite, or reaches further than 24 bits hold.
+    """
+    check_choice("version", version, (2, 3, 4))
+    for bits in sh_bits:
+        check_whole("sh_bits", bits, 1, 8)
+    g = colours_to_write(splats.gaussians, ".spz")
+    if fractional_bits is None:
+        fractional_bits = max(choose_fractional_bits(g.means), 0)
+    else:
+        check_whole("fractional_bits", fractional_bits, 0, MAX_FRACTIONAL_BITS)
+    if fractional_bits > (most := most_fractional_bits(g.means)):
+        raise ValueError(
+            f"means: expected coordinates within {2.0 ** (23 - fractional_bits):g} units for {fractional_bits} fractional "
+            f"bits, got {g.means.abs().max().item():g}; "
+            + (f"choose {most} bits or fewer" if most >= 0 else "remove far Gaussians first")
+        )
+    assert g.sh is not None
+    degree = int(g.sh.shape[1] ** 0.5) - 1
+    flags = ANTIALIASED if splats.info.get("antialiased") else 0
+    records = [] if g.labels is None else [(LABELS, pack_labels(_record(splats)))]
+    streams = pack(g, version, fractional_bits, sh_bits)
+    write_container(Path(path), Container(version, len(g), degree, fractional_bits, flags, streams, records))
+    return _lost(splats, g, fractional_bits)
+
+
+def precision(gaussians: Gaussians) -> Precision:
+    """Of version 4 as `write` writes it; the cloud decides the bits of its positions."""
+    return precision_of(gaussians, choose_fractional_bits(gaussians.means))
+
+
+def _record(splats: SplatFile) -> LabelRecord:
+    labels = splats.gaussians.labels
+    assert labels is not None
+    class_id = labels.detach().cpu().numpy()
+    limits = np.iinfo(np.int32)
+    if len(class_id) and not -1 <= class_id.min() <= class_id.max() <= limits.max:
+        raise ValueError(
+            f"labels: expected -1 to {limits.max}, got {class_id.min()} to {class_id.max()}; -1 means none"
+        )
+    score = splats.extra.get(SCORE)
+    return LabelRecord(class_id.astype(np.int32), None if score is None else score.astype(np.float32), splats.classes)
+
+
+def _axes(path: Path, record: bytes | None) -> tuple[int, int, int]:
+    """Signs of a file's axes against those of the PLY: RUB, unless Adobe's record says otherwise."""
+    if record is None:
+        return SPZ_AXES
+    value = struct.unpack("<I", record)[0] if len(record) == 4 else -1
+    if value == 0:  # unspecified
+        return SPZ_AXES
+    if not 1 <= value <= 8:
+        raise ValueError(
+            f"{path}: expected a coordinate system of 1 to 8 (x, y, z with signs), got {value}; turn it to RUB with the program "
+            "that wrote it"
+        )
+    right, up, front = ((value - 1) >> bit & 1 for bit in range(3))  # LDB, RDB, LUB, RUB, LDF, RDF, LUF, RUF
+    return (1 if right else -1, -1 if up else 1, 1 if front else -1)
+
+
+def _lost(splats: SplatFile, g: Gaussians, fractional_bits: int) -> tuple[str, ...]:
+    lost = list(words_of_loss(splats, ".spz", 3))
+    if fractional_bits < _SPARSE_BITS:
+        lost.append(
+            f"positions finer than {2.0**-fractional_bits:g} units: the cloud reaches {g.means.abs().max().item():g} units "
+            "from the origin, and .spz has 24 bits a coordinate"
+        )
+    low, high = (exp(end) for end in LOG_SCALES)
+    cut = int(((g.scales < low / 1.032) | (g.scales > high * 1.032)).any(1).sum())
+    if cut:
+        lost.append(f"the extent of {cut} Gaussians: .spz holds {low:.1e} to {high:.0f} units along an axis")
+    return tuple(lost)

@@ -1,0 +1,238 @@
+"""The containers of SPZ files: one gzip stream (versions 1 to 3) or a header, records, a table and Zstandard streams (4).
+
+Both hold the same byte streams, one per attribute: positions, alphas, colors, scales, rotations, sh. Extension records
+`[u32 type][u32 length][payload]` lie between the header and the table (4) or after the last stream (1 to 3), announced by
+a flag; readers skip types that they do not know. All numbers are little-endian.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from .._files import atomic_path
+
+MAGIC = b"NGSP"
+GZIP = b"\x1f\x8b"
+ANTIALIASED, HAS_EXTENSIONS = 0x1, 0x2
+MAX_DEGREE = 4
+MAX_FRACTIONAL_BITS = 24
+_LEGACY = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fractional bits, flags, reserved
+_HEADER = struct.Struct("<4sIIBBBBI12x")  # the same, but the number of streams, and where the table begins
+_ENTRY = struct.Struct("<QQ")  # compressed and plain bytes of a stream
+_RECORD = struct.Struct("<II")
+_SLACK = 1 << 26  # bytes: promises up to here are cheap to keep, whatever the file's size
+_GZIP_RATIO, _ZSTD_RATIO = 1032, 4096  # deflate cannot do better; Zstandard can, on a cloud of equal Gaussians only
+_MAX_EXTENSIONS = 1 << 28  # bytes after the streams of a version 1 to 3 file
+
+
+@dataclass(frozen=True, eq=False)
+class Container:
+    """An SPZ file, its streams plain but still quantised."""
+
+    version: int
+    count: int
+    degree: int
+    """Of the spherical harmonics, 0 to 4."""
+    fractional_bits: int
+    flags: int
+    streams: dict[str, NDArray[np.uint8]]
+    """The bytes of each attribute, as many as `stream_sizes` says."""
+    extensions: list[tuple[int, bytes]] = field(default_factory=list)
+    """Records as (type, payload)."""
+
+
+def stream_sizes(version: int, count: int, degree: int) -> dict[str, int]:
+    """Plain bytes of each stream, in the order of the file."""
+    position, rotation = (6 if version == 1 else 9), (3 if version < 3 else 4)
+    each = {"positions": position, "alphas": 1, "colors": 3, "scales": 3, "rotations": rotation}
+    each["sh"] = 3 * ((degree + 1) ** 2 - 1)
+    return {name: size * count for name, size in each.items()}
+
+
+def read_container(path: Path) -> Container:
+    """Read an SPZ file of version 1 to 4; nothing is unpacked that its size could not hold.
+
+    Raises:
+        ValueError: if it is none, or damaged: truncated, promising more than it holds, or with bytes left over.
+    """
+    data = path.read_bytes()
+    if data[:2] == GZIP:
+        return _parse_legacy(path, _inflate(path, data))
+    if data[:4] != MAGIC or len(data) < _LEGACY.size:
+        raise ValueError(
+            f"{path}: expected an SPZ file (NGSP, or gzip around it), got {data[:4]!r}; is it another format?"
+        )
+    if struct.unpack_from("<I", data, 4)[0] < 4:
+        return _parse_legacy(path, data)
+    return _parse_streams(path, data)
+
+
+def write_container(path: Path, container: Container) -> None:
+    """Write a container in the layout of its version (2, 3 or 4), atomically."""
+    c = container
+    records = b"".join(_RECORD.pack(kind, len(payload)) + payload for kind, payload in c.extensions)
+    flags = c.flags | (HAS_EXTENSIONS if records else 0)
+    streams = [values.tobytes() for values in c.streams.values() if values.size]
+    if c.version < 4:
+        head = _LEGACY.pack(MAGIC, c.version, c.count, c.degree, c.fractional_bits, flags, 0)
+        deflate = zlib.compressobj(9, wbits=31)  # 31: gzip
+        parts = [deflate.compress(part) for part in (head, *streams, records)] + [deflate.flush()]
+    else:
+        packed = [zstandard.compress(stream, 12) for stream in streams]
+        table = [_ENTRY.pack(len(small), len(plain)) for small, plain in zip(packed, streams, strict=True)]
+        start = _HEADER.size + len(records)
+        head = _HEADER.pack(MAGIC, 4, c.count, c.degree, c.fractional_bits, flags, len(packed), start)
+        parts = [head, records, *table, *packed]
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.writelines(parts)
+
+
+def _check_header(
+    path: Path, data: bytes | bytearray, ratio: int, size: int
+) -> tuple[int, int, int, int, int, dict[str, int]]:
+    """The fields that all versions share, and the sizes of the streams; refused where `size` bytes cannot hold them."""
+    _, version, count, degree, bits, flags, _ = _LEGACY.unpack_from(data)
+    if not 1 <= version <= 4:
+        raise ValueError(
+            f"{path}: expected SPZ version 1 to 4, got {version}; ask for an update of kfgs, or convert it"
+        )
+    if degree > MAX_DEGREE:
+        raise ValueError(
+            f"{path}: expected spherical harmonics of degree 0 to {MAX_DEGREE}, got {degree}; the header is damaged"
+        )
+    if bits > MAX_FRACTIONAL_BITS:
+        raise ValueError(
+            f"{path}: expected 0 to {MAX_FRACTIONAL_BITS} fractional bits, got {bits}; the header is damaged"
+        )
+    sizes = stream_sizes(version, count, degree)
+    if sum(sizes.values()) > ratio * size + (_SLACK if ratio > 1 else 0):
+        raise ValueError(
+            f"{path}: the header promises {count} Gaussians ({sum(sizes.values())} bytes), which a file of {size} bytes "
+            "cannot hold; it is truncated, or damaged"
+        )
+    return version, count, degree, bits, flags, sizes
+
+
+def _inflate(path: Path, data: bytes) -> bytearray:
+    """The plain bytes of a gzip stream (one member or several), no more than its SPZ header accounts for."""
+    plain, rest, complete = bytearray(), data, False
+    try:
+        limit = _plain_limit(path, zlib.decompressobj(wbits=31).decompress(data, _LEGACY.size), len(data))
+        while rest[:2] == GZIP and len(plain) <= limit:
+            member = zlib.decompressobj(wbits=31)
+            plain += member.decompress(rest, limit + 1 - len(plain))  # never 0, which would mean no limit
+            while not member.eof and member.unconsumed_tail and len(plain) <= limit:
+                plain += member.decompress(member.unconsumed_tail, limit + 1 - len(plain))
+            complete, rest = member.eof, member.unused_data
+    except zlib.error as error:
+        raise ValueError(
+            f"{path}: expected a gzip stream, but it cannot be unpacked ({error}); it is damaged"
+        ) from error
+    if len(plain) > limit:
+        raise ValueError(f"{path}: expected {limit} plain bytes by its header, got more; the file is damaged")
+    if not complete:
+        raise ValueError(f"{path}: expected a whole gzip stream, got {len(plain)} plain bytes; the file is truncated")
+    if rest.strip(b"\0"):
+        raise ValueError(f"{path}: expected the end after the gzip stream, got {len(rest)} bytes more; it is damaged")
+    return plain
+
+
+def _plain_limit(path: Path, head: bytes, size: int) -> int:
+    """How many plain bytes a gzip file of `size` bytes may hold, by its first 16 plain ones."""
+    if head[:4] != MAGIC or len(head) < _LEGACY.size:
+        raise ValueError(
+            f"{path}: expected an SPZ header in the gzip stream (NGSP), got {bytes(head[:4])!r}; the file is truncated, or of "
+            "another format"
+        )
+    *_, flags, sizes = _check_header(path, head, _GZIP_RATIO, size)
+    more = min(_MAX_EXTENSIONS, _GZIP_RATIO * size) if flags & ~ANTIALIASED else 0
+    return _LEGACY.size + sum(sizes.values()) + more
+
+
+def _parse_legacy(path: Path, data: bytes | bytearray) -> Container:
+    if len(data) < _LEGACY.size:
+        raise ValueError(f"{path}: expected a header of {_LEGACY.size} bytes, got {len(data)}; the file is truncated")
+    version, count, degree, bits, flags, sizes = _check_header(path, data, 1, len(data) - _LEGACY.size)
+    if version == 4:
+        raise ValueError(f"{path}: expected version 1 to 3 in a gzip stream, got 4; the file is damaged")
+    streams, at = {}, _LEGACY.size
+    for name, size in sizes.items():
+        streams[name] = np.frombuffer(data, np.uint8, size, at)
+        at += size
+    rest = data[at:]
+    if rest and not flags & ~ANTIALIASED:  # other flags announce something after the streams
+        raise ValueError(
+            f"{path}: expected {at} bytes for {count} Gaussians, got {len(data)}; the file is damaged, or longer than it says"
+        )
+    records = _parse_records(path, rest) if flags & HAS_EXTENSIONS else []
+    return Container(version, count, degree, bits, flags, streams, records)
+
+
+def _parse_records(path: Path, data: bytes | bytearray) -> list[tuple[int, bytes]]:
+    records, at = [], 0
+    while at < len(data):
+        kind, length = _RECORD.unpack_from(data, at) if at + _RECORD.size <= len(data) else (0, len(data))
+        at += _RECORD.size
+        if at + length > len(data):
+            raise ValueError(
+                f"{path}: expected extension records of {len(data)} bytes, got one that ends after them; it is damaged"
+            )
+        records.append((kind, bytes(data[at : at + length])))
+        at += length
+    return records
+
+
+def _parse_streams(path: Path, data: bytes) -> Container:
+    """Version 4: 32 bytes of header, extension records, the table of contents, one Zstandard frame per stream."""
+    if len(data) < _HEADER.size:
+        raise ValueError(f"{path}: expected a header of {_HEADER.size} bytes, got {len(data)}; the file is truncated")
+    version, count, degree, bits, flags, sizes = _check_header(path, data, _ZSTD_RATIO, len(data))
+    *_, number, start = _HEADER.unpack_from(data)
+    names = [name for name, size in sizes.items() if size] if number < len(sizes) else list(sizes)
+    end = start + number * _ENTRY.size
+    if number != len(names) or start < _HEADER.size or end > len(data):
+        raise ValueError(
+            f"{path}: expected a table of {len(names)} streams within {len(data)} bytes, got {number} streams at byte "
+            f"{start}; the file is truncated, or damaged"
+        )
+    streams, at = {name: np.zeros(0, np.uint8) for name in sizes}, end
+    for name, (small, plain) in zip(names, _ENTRY.iter_unpack(data[start:end]), strict=True):
+        if plain != sizes[name] or at + small > len(data):
+            raise ValueError(
+                f"{path}: expected a stream of {sizes[name]} bytes of {name} within {len(data)} bytes, got {plain} bytes "
+                f"packed up to byte {at + small}; the file is truncated, or damaged"
+            )
+        streams[name] = np.frombuffer(_unpack_frame(path, name, data[at : at + small], plain), np.uint8)
+        at += small
+    if at != len(data):
+        raise ValueError(f"{path}: expected the end at byte {at}, got {len(data) - at} bytes more; the file is damaged")
+    records = _parse_records(path, data[_HEADER.size : start]) if flags & HAS_EXTENSIONS else []
+    return Container(version, count, degree, bits, flags, streams, records)
+
+
+def _unpack_frame(path: Path, name: str, data: bytes, size: int) -> bytes:
+    """One Zstandard frame of exactly `size` plain bytes."""
+    if not data and not size:
+        return b""
+    try:
+        promised = zstandard.get_frame_parameters(data).content_size
+        if promised not in (size, zstandard.CONTENTSIZE_UNKNOWN):  # else it alone would decide what is allocated
+            raise ValueError(
+                f"{path}: expected {size} bytes of {name}, got a frame of {promised} bytes; the file is damaged"
+            )
+        unpacker = zstandard.ZstdDecompressor()
+        plain = unpacker.decompress(data, max_output_size=size, allow_extra_data=False) if size else b""
+    except zstandard.ZstdError as error:
+        raise ValueError(
+            f"{path}: expected a Zstandard stream of {name}, but it cannot be unpacked ({error})"
+        ) from error
+    if len(plain) != size:
+        raise ValueError(f"{path}: expected {size} bytes of {name}, got {len(plain)}; the file is damaged")
+    return plain

@@ -1,0 +1,94 @@
+"""Values that quantised formats share: what they refuse, and what they say about a cloud that they hold only in part."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..gaussians import Gaussians
+from .splat_file import SCORE, SplatFile
+
+SH_C0 = 0.28209479177387814  # the constant harmonic: rgb = 0.5 + SH_C0 * coefficient
+_TINY_SCALE = 1e-10  # world units, of a Gaussian that a file gives no extent at all
+
+
+def check_finite(path: Path, **values: NDArray[np.float32]) -> None:
+    """Raise a ValueError that names the file, the kind of value and the first Gaussian with NaN or infinity."""
+    for name, array in values.items():
+        bad = ~np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
+        if bad.any():
+            raise ValueError(
+                f"{path}: expected finite {name}, got {array[bad][0].tolist()} at Gaussian {int(bad.argmax())} and at "
+                f"{int(bad.sum()) - 1} more; the file is damaged, write it again"
+            )
+
+
+def positive_scales(path: Path, scales: NDArray[np.float32]) -> Tensor:  # [N, 3] float32 > 0
+    """Linear scales as read, zeros raised to 1e-10; negative ones are damage (ValueError)."""
+    if (scales < 0).any():
+        row = int((scales < 0).any(1).argmax())
+        raise ValueError(
+            f"{path}: expected scales of 0 or more, got {scales[row].tolist()} at Gaussian {row}; the file is damaged, or "
+            "of another format"
+        )
+    return torch.from_numpy(np.maximum(scales, np.float32(_TINY_SCALE)))
+
+
+def unit_quats(quats: Tensor) -> Tensor:  # [N, 4] wxyz -> [N, 4] of length 1
+    """Quaternions of length 1; those of length 0 become the identity."""
+    length = quats.norm(dim=1, keepdim=True)
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype)
+    return torch.where(length > 1e-12, quats / length.clamp(min=1e-12), identity)
+
+
+def colours_to_write(gaussians: Gaussians, name: str) -> Gaussians:
+    """The cloud in float64 on the CPU without its history; refused unless it has colour and finite values.
+
+    Raises:
+        ValueError: if it has no spherical harmonics, or a value is NaN or infinite, or a scale is not positive.
+    """
+    if gaussians.sh is None:
+        raise ValueError(
+            f"splats: expected a cloud with colours (sh [N, K, 3]) for {name}, got {gaussians!r}; write a field without "
+            "colours as .ply"
+        )
+    g = gaussians.detach().to("cpu", torch.float64)
+    for key in ("means", "quats", "scales", "opacities", "sh"):
+        values: Tensor = getattr(g, key)
+        bad = ~values.isfinite() if key != "scales" else ~(values.isfinite() & (values > 0))
+        rows = bad.reshape(len(g), -1).any(1) if len(g) else bad.new_zeros(0)
+        if rows.any():
+            raise ValueError(
+                f"{key}: expected finite{' positive' if key == 'scales' else ''} values, got "
+                f"{values[rows][0].flatten()[:4].tolist()} at Gaussian {int(rows.nonzero()[0])}; remove such Gaussians "
+                "first"
+            )
+    return g
+
+
+def words_of_loss(splats: SplatFile, name: str, degree: int) -> tuple[str, ...]:
+    """What a format without room for features, extra columns and high degrees of harmonics leaves out, in words."""
+    g, lost = splats.gaussians, []
+    if g.sh is not None and (have := int(g.sh.shape[1] ** 0.5) - 1) > degree:
+        kept = "the base colour only" if degree == 0 else f"degree {degree}"
+        lost.append(f"spherical harmonics of degree {have}: {name} holds {kept}")
+    if g.features is not None:
+        lost.append(f"{g.features.shape[1]} features per Gaussian: {name} has no place for them")
+    columns = [key for key in splats.extra if not (key == SCORE and g.labels is not None)]
+    if columns:
+        lost.append(f"the columns {', '.join(columns)}: {name} has no place for them")
+    return tuple(lost)
+
+
+def byte_error(values: Tensor, low: float, high: float) -> float:
+    """Largest error of values kept in 256 even steps from `low` to `high`: half a step, or what is cut off beyond.
+
+    `values` may be empty. The ends belong to the range.
+    """
+    step = (high - low) / 255
+    beyond = (values - values.clamp(low, high)).abs().max().item() if values.numel() else 0.0
+    return max(step / 2, beyond) * (1 + 1e-4)  # float32 rounding on the way back
