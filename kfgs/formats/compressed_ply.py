@@ -1,0 +1,282 @@
+"""The compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian, quantised between the bounds of every 256.
+
+Three elements. `chunk`, one row for each 256 Gaussians: the least and largest position, natural logarithm of scale and
+base colour among them. `vertex`: position and log scale in 11, 10 and 11 bits between those bounds, the rotation's three
+smaller components in 10 bits each and 2 bits that say which is largest (w, x, y, z), colour and opacity in 8 bits each;
+fields begin at the high bit. `sh`, only where there are higher harmonics: a byte for each, channel by channel, 32 steps
+to 1 between -4 and 4. Axes are those of the 3DGS PLY. Files of SuperSplat before version 2 have no colour bounds: there
+bytes run from 0 to 1. What the viewers check of the elements leaves no room for labels, which go to a file beside it.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..gaussians import Gaussians
+from .order import morton_order
+from .ply import Columns, read_comments, read_ply_elements, write_ply_elements
+from .smallest_three import pack_smallest_three, rotation_error, unpack_smallest_three
+from .splat_file import Precision, SplatFile
+from .values import SH_C0, check_finite, colours_to_write, words_of_loss
+
+NAME = "compressed_ply"
+SUFFIXES = (".compressed.ply",)
+MAGIC = b"ply"
+HOLDS_LABELS = False
+CHUNK = 256  # Gaussians between shared bounds
+LOG_SCALE_LIMIT = 20.0  # e^-20 to e^20 world units: what common writers keep of a scale
+SH_LIMIT = 4.0  # of the higher coefficients
+_AXES = (  # (columns of the least value, of the largest) of positions, log scales and colours
+    (("min_x", "min_y", "min_z"), ("max_x", "max_y", "max_z")),
+    (("min_scale_x", "min_scale_y", "min_scale_z"), ("max_scale_x", "max_scale_y", "max_scale_z")),
+    (("min_r", "min_g", "min_b"), ("max_r", "max_g", "max_b")),
+)
+_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_FIELDS = (11, 10, 11)  # bits of x, y and z
+_STEPS = np.array([2047, 1023, 2047])
+_ROUNDING = 6 * 2.0**-24  # float32: of the bounds, their difference, the product and the sum
+
+
+class _Bounds(NamedTuple):
+    low: NDArray[np.float32]  # [C, 3]
+    high: NDArray[np.float32]  # [C, 3]
+
+
+def matches(head: bytes) -> bool:
+    """A PLY file whose header names chunks and packed positions."""
+    header = head[: head.find(b"end_header")]
+    return head.startswith(MAGIC) and b"element chunk" in header and b"packed_position" in header
+
+
+def read(path: Path) -> SplatFile:
+    """Read a compressed PLY file with harmonics of degree 0 to 3; opacities of 0 and 1 are read as such.
+
+    Raises:
+        ValueError: if it is truncated, elements or columns are missing or disagree, or bounds are not finite.
+    """
+    elements = read_ply_elements(path)
+    chunk, vertex = (elements.get(name, {}) for name in ("chunk", "vertex"))
+    n = _check_elements(path, chunk, vertex)
+    extents, sizes, colours = (_read_bounds(path, chunk, axes) for axes in _AXES)
+    assert extents is not None
+    assert sizes is not None
+    positions = _between(extents, _unpack_vectors(vertex["packed_position"]))
+    log_scales = _between(sizes, _unpack_vectors(vertex["packed_scale"]))
+    rgba = (vertex["packed_color"][:, None] >> np.array([24, 16, 8, 0], np.uint32) & 255).astype(np.float32) / 255
+    rgb = rgba[:, :3] if colours is None else _between(colours, rgba[:, :3])
+    sh0 = (rgb - 0.5) / np.float32(SH_C0)
+    sh = np.concatenate([sh0[:, None], _read_rest(path, elements.get("sh"), n)], 1)
+    with np.errstate(over="ignore"):  # refused below
+        scales = np.exp(log_scales)
+    check_finite(path, means=positions, scales=scales, sh=sh)
+    gaussians = Gaussians(
+        means=torch.from_numpy(positions),
+        quats=_unpack_rotations(vertex["packed_rotation"]),
+        scales=torch.from_numpy(scales),
+        opacities=torch.from_numpy(rgba[:, 3].copy()),
+        sh=torch.from_numpy(sh),
+    )
+    return SplatFile(gaussians, info={"format": NAME, "comments": read_comments(path)})
+
+
+def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
+    """Write a compressed PLY file, in Morton order.
+
+    A cloud with labels keeps its order, since its labels go to a file beside this one; sort it first
+    (`splats.select(morton_order(...))`) for tighter bounds.
+
+    Raises:
+        ValueError: if the cloud has no colours, or values that are not finite.
+    """
+    g = colours_to_write(splats.gaussians, ".compressed.ply")
+    g = g.select(_file_order(splats.gaussians))
+    assert g.sh is not None
+    values = _quantities(g)
+    bounds = [_chunk_bounds(value) for value in values]
+    chunk = {
+        name: column
+        for axes, bound in zip(_AXES, bounds, strict=True)
+        for names, table in zip(axes, bound, strict=True)
+        for name, column in zip(names, np.ascontiguousarray(table.T), strict=True)
+    }
+    steps = [
+        np.round(_position_between(bound, value) * count)
+        for bound, value, count in zip(bounds, values, (_STEPS, _STEPS, 255), strict=True)
+    ]
+    opacity = np.round(np.clip(g.opacities.numpy(), 0, 1) * 255)
+    rgba = np.concatenate([steps[2], opacity[:, None]], 1).astype(np.uint32)
+    rotations = np.concatenate(pack_smallest_three(g.quats, 1023), 1).astype(np.uint32)
+    vertex = {
+        "packed_position": _pack(steps[0].astype(np.uint32), _FIELDS),
+        "packed_rotation": _pack(rotations, (2, 10, 10, 10)),
+        "packed_scale": _pack(steps[1].astype(np.uint32), _FIELDS),
+        "packed_color": _pack(rgba, (8, 8, 8, 8)),
+    }
+    elements = {"chunk": chunk, "vertex": vertex}
+    if g.sh.shape[1] > 1:
+        rest = g.sh[:, 1:].transpose(1, 2).flatten(1).numpy()  # channel by channel
+        steps_of_rest = np.clip(np.floor((rest / (2 * SH_LIMIT) + 0.5) * 256), 0, 255).astype(np.uint8)
+        elements["sh"] = {f"f_rest_{i}": np.ascontiguousarray(column) for i, column in enumerate(steps_of_rest.T)}
+    write_ply_elements(path, elements, comments=("written by kfgs",))
+    return words_of_loss(splats, ".compressed.ply", 3) + _words_of_clipping(g)
+
+
+def precision(gaussians: Gaussians) -> Precision:
+    """Half a step between the bounds that this cloud's chunks get, and what the fixed ranges cut off.
+
+    `means` is [N, 3] in the order of `gaussians`; scales, colours and harmonics are those of the worst chunk.
+    """
+    order = _file_order(gaussians)
+    g = colours_to_write(gaussians, ".compressed.ply").select(order)
+    assert g.sh is not None
+    errors = [_half_steps(value, count) for value, count in zip(_quantities(g), (_STEPS, _STEPS, 255), strict=True)]
+    means = torch.empty(len(g), 3, dtype=torch.float64)
+    means[order] = torch.from_numpy(errors[0])
+    log_scales = g.scales.log().numpy()
+    clipped = np.abs(np.clip(log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT) - log_scales)
+    strongest = float(g.sh[:, 1:].abs().max()) if g.sh.shape[1] > 1 and len(g) else 0.0
+    ends = SH_LIMIT - 1 / 32  # the outermost steps are read as their far ends, the others as their middles
+    return Precision(
+        means=means,
+        scales=math.expm1(min(float((errors[1] + clipped).max(initial=0.0)), 700.0)) + 1e-6,
+        rotation=rotation_error(1023),
+        opacities=0.5 / 255 + 1e-6,
+        sh0=float(errors[2].max(initial=0.0)) / SH_C0 + 1e-6,
+        sh_rest=max(1 / 64 if strongest < ends else 1 / 32, strongest - SH_LIMIT) + 1e-6,
+    )
+
+
+def _file_order(gaussians: Gaussians) -> Tensor:  # [N] int64
+    if gaussians.labels is not None:
+        return torch.arange(len(gaussians))
+    return morton_order(gaussians.means).cpu()
+
+
+def _quantities(g: Gaussians) -> tuple[NDArray[np.float64], ...]:  # 3 x [N, 3]
+    """What lies between bounds: positions, logarithms of scales, base colours."""
+    assert g.sh is not None
+    log_scales = g.scales.log().clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
+    return g.means.numpy(), log_scales.numpy(), (g.sh[:, 0] * SH_C0 + 0.5).numpy()
+
+
+def _chunk_bounds(values: NDArray[np.float64]) -> _Bounds:  # [N, 3]
+    """The least and largest value of each 256, as float32 (rounded, so a value may lie half a bit outside)."""
+    starts = np.arange(0, len(values), CHUNK)
+    if not len(starts):
+        return _Bounds(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
+    least, largest = (extreme.reduceat(values, starts, axis=0) for extreme in (np.minimum, np.maximum))
+    return _Bounds(least.astype(np.float32), largest.astype(np.float32))
+
+
+def _position_between(bounds: _Bounds, values: NDArray[np.float64]) -> NDArray[np.float64]:  # [N, 3] in [0, 1]
+    chunk = np.arange(len(values)) // CHUNK
+    low, high = bounds.low.astype(np.float64), bounds.high.astype(np.float64)
+    size = np.where(high > low, high - low, 1.0)
+    return np.clip((values - low[chunk]) / size[chunk], 0, 1)
+
+
+def _between(bounds: _Bounds, fraction: NDArray[np.float32]) -> NDArray[np.float32]:  # [N, 3]
+    chunk = np.arange(len(fraction)) // CHUNK
+    with np.errstate(over="ignore", invalid="ignore"):  # refused by the caller
+        return bounds.low[chunk] + fraction * (bounds.high - bounds.low)[chunk]
+
+
+def _half_steps(values: NDArray[np.float64], steps: NDArray[np.int64] | int) -> NDArray[np.float64]:  # [N, 3]
+    bounds = _chunk_bounds(values)
+    chunk = np.arange(len(values)) // CHUNK
+    largest = np.maximum(np.abs(bounds.low), np.abs(bounds.high)).astype(np.float64)
+    half = (bounds.high.astype(np.float64) - bounds.low) / np.asarray(steps) / 2
+    return (half + largest * _ROUNDING)[chunk]
+
+
+def _pack(fields: NDArray[np.uint32], bits: tuple[int, ...]) -> NDArray[np.uint32]:  # [N, F] -> [N]
+    """Put whole numbers side by side, the first at the high end."""
+    packed = np.zeros(len(fields), np.uint32)
+    for i, width in enumerate(bits):
+        packed = packed << np.uint32(width) | fields[:, i]
+    return packed
+
+
+def _unpack_vectors(packed: NDArray[np.uint32]) -> NDArray[np.float32]:  # [N] -> [N, 3]
+    """Fractions of the way from the least value to the largest."""
+    whole = packed[:, None] >> np.array([21, 11, 0], np.uint32) & _STEPS.astype(np.uint32)
+    return whole.astype(np.float32) / _STEPS.astype(np.float32)
+
+
+def _unpack_rotations(packed: NDArray[np.uint32]) -> Tensor:  # [N] -> [N, 4] wxyz
+    small = (packed[:, None] >> np.array([20, 10, 0], np.uint32) & 1023).astype(np.float32)
+    return unpack_smallest_three((packed >> np.uint32(30)).astype(np.int64), small, 1023)
+
+
+def _read_rest(path: Path, columns: Columns | None, n: int) -> NDArray[np.float32]:  # [N, K - 1, 3]
+    """The higher harmonics; the outermost bytes stand for the ends of the range, the others for middles of steps."""
+    if columns is None:
+        return np.zeros((n, 0, 3), np.float32)
+    names = [f"f_rest_{i}" for i in range(len(columns))]
+    if (
+        len(names) not in (9, 24, 45)
+        or set(names) != set(columns)
+        or any(c.dtype != np.uint8 for c in columns.values())
+    ):
+        raise ValueError(
+            f"{path}: expected an 'sh' element of 9, 24 or 45 bytes f_rest_0, f_rest_1, ..., got {len(columns)} columns; "
+            "write the file again"
+        )
+    if len(columns["f_rest_0"]) != n:
+        raise ValueError(
+            f"{path}: expected 'sh' of {n} rows (from vertex), got {len(columns['f_rest_0'])}; write the file again"
+        )
+    table = ((np.arange(256, dtype=np.float32) + 0.5) / 256 - 0.5) * 2 * np.float32(SH_LIMIT)
+    table[0], table[255] = -SH_LIMIT, SH_LIMIT
+    return np.stack([table[columns[name]] for name in names], 1).reshape(n, 3, len(names) // 3).transpose(0, 2, 1)
+
+
+def _read_bounds(path: Path, chunk: Columns, axes: tuple[tuple[str, ...], tuple[str, ...]]) -> _Bounds | None:
+    """The bounds of one kind, or None where the file has none of them (colours in older files)."""
+    names = [name for side in axes for name in side]
+    if not any(name in chunk for name in names) and names[0] == "min_r":
+        return None
+    wrong = [name for name in names if name not in chunk or chunk[name].dtype != np.float32]
+    if wrong:
+        raise ValueError(
+            f"{path}: expected 'chunk' with float {', '.join(names)}, {', '.join(wrong)} missing; write the file again"
+        )
+    low, high = (np.stack([chunk[name] for name in side], 1) for side in axes)
+    check_finite(path, bounds=np.concatenate([low, high], 1))
+    return _Bounds(low, high)
+
+
+def _check_elements(path: Path, chunk: Columns, vertex: Columns) -> int:
+    """How many Gaussians there are, if the elements fit together."""
+    wrong = [name for name in _PACKED if name not in vertex or vertex[name].dtype != np.uint32]
+    if wrong:
+        raise ValueError(
+            f"{path}: expected 'vertex' with uint {', '.join(_PACKED)}, {', '.join(wrong)} missing; write the file again"
+        )
+    n = len(vertex[_PACKED[0]])
+    chunks = len(next(iter(chunk.values()), ()))
+    if chunks != -(-n // CHUNK):
+        raise ValueError(
+            f"{path}: expected {-(-n // CHUNK)} chunks for {n} Gaussians, {CHUNK} each, got {chunks}; the file is damaged"
+        )
+    return n
+
+
+def _words_of_clipping(g: Gaussians) -> tuple[str, ...]:
+    """What lies beyond the fixed ranges."""
+    assert g.sh is not None
+    lost = []
+    small = int((g.scales.log().abs() > LOG_SCALE_LIMIT).any(1).sum())
+    if small:
+        lost.append(f"scales of {small} Gaussians: .compressed.ply holds e^-20 to e^20")
+    large = int((g.sh[:, 1:].abs() > SH_LIMIT).any(2).any(1).sum())
+    if large:
+        lost.append(f"strong higher harmonics of {large} Gaussians: .compressed.ply holds -4 to 4")
+    return tuple(lost)

@@ -1,0 +1,56 @@
+"""Rotations by the three smaller components of a unit quaternion: the fourth follows from its length, and is positive."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .values import unit_quats
+
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # components beside the largest, in order
+
+
+def pack_smallest_three(
+    quats: Tensor,  # [N, 4] wxyz, of any length
+    steps: int,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:  # [N, 1] in 0..3, [N, 3] in 0..steps
+    """The index of the largest component in (w, x, y, z), and the other three in whole steps.
+
+    Each of the three lies between -1/sqrt(2) and 1/sqrt(2), which are steps 0 and `steps`. A quaternion of length 0 is
+    the identity; of equally large components the first counts as the largest.
+    """
+    unit = unit_quats(quats.detach().cpu().double()).numpy()
+    largest = np.abs(unit).argmax(1)
+    rows = np.arange(len(unit))
+    small = unit[rows[:, None], _OTHERS[largest]] * np.where(unit[rows, largest] < 0, -1.0, 1.0)[:, None]
+    whole = np.clip(np.round((small * math.sqrt(0.5) + 0.5) * steps), 0, steps).astype(np.int64)
+    return largest[:, None].astype(np.int64), whole
+
+
+def unpack_smallest_three(
+    largest: NDArray[np.int64],  # [N] in 0..3
+    small: NDArray[np.float32],  # [N, 3] in 0..steps
+    steps: int,
+) -> Tensor:  # [N, 4] wxyz float32, of length 1
+    """Quaternions from what `pack_smallest_three` gives; three components longer than 1 together are shortened to it."""
+    values = (small / np.float32(steps) - np.float32(0.5)) * np.float32(math.sqrt(2))
+    squares = (values**2).sum(1, keepdims=True)
+    values = values / np.sqrt(np.maximum(squares, 1))
+    quats = np.empty((len(values), 4), np.float32)
+    rows = np.arange(len(values))
+    quats[rows[:, None], _OTHERS[largest]] = values
+    quats[rows, largest] = np.sqrt(np.maximum(0, 1 - squares[:, 0]))
+    return torch.from_numpy(quats)
+
+
+def rotation_error(steps: int) -> float:
+    """Largest angle in radians between a rotation and what comes back.
+
+    Each stored component is off by d = sqrt(2) / steps / 2 at most. The largest, m >= 1/2, is off by (a . e) / m, which is
+    at most 3 d (all four components 1/2); the quaternion then by sqrt(12) d, the rotation by twice that.
+    """
+    return 2 * math.sqrt(12) * math.sqrt(2) / steps / 2 * 1.02 + 1e-5  # second order, and float32
