@@ -18,15 +18,17 @@ from .relevancy import relevancy, select_by_similarity
 from .segment import label_pixels, nearest_codeword
 from .selection import Selection, select_by_label, select_where
 from .threshold import similarity_threshold
-from .transfer import Transfer, default_distance, transfer_labels
+from .transfer import Transfer, transfer_labels
+from .transfer_distance import default_distance
 from .vote import Votes, vote_labels
-from .where import AboveScore, Both, Either, Everything, InBox, InSphere, Not, OfClass, OfIndex, Where
+from .where import AboveScore, Both, Component, Either, Everything, InBox, InSphere, Not, OfClass, OfIndex, Where
 
 __all__ = [
     "AboveScore",
     "Both",
     "Classification",
     "CodewordLabels",
+    "Component",
     "Duplicate",
     "Edit",
     "EditList",

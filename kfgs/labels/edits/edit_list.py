@@ -1,0 +1,195 @@
+"""Edits in order: applied together, undone one by one, saved as JSON and replayed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..._files import read_json, write_json
+from ...formats.splat_file import SplatFile
+from .._plain import checked_object
+from ..where import Where
+from .appearance import Opacity, Recolor
+from .base import Edit
+from .insert import Insert, read_similarity, read_source
+from .motion import Duplicate, Move, Turn
+from .presence import Extract, Remove
+
+FORMAT, VERSION = "kfgs.edits", 1
+OPS: dict[str, type[Edit]] = {op.op: op for op in (Remove, Extract, Recolor, Opacity, Move, Duplicate, Insert)}
+
+
+@dataclass(frozen=True)
+class EditList:
+    """Edits that are applied one after the other, each to what the one before left.
+
+    Nothing is changed in place: `then`, `undo` and `redo` give new lists, `apply` a new cloud. Classes are asked for anew
+    by every edit, so `Remove` after `Insert` sees what was inserted.
+
+    Example:
+        >>> edits = EditList().then(Recolor("plant", "#c04040")).then(Remove("chair"))
+        >>> len(edits), len(edits.undo()), edits.undo().redo() == edits
+        (2, 1, True)
+    """
+
+    edits: tuple[Edit, ...] = ()
+    """What `apply` does, in order."""
+    undone: tuple[Edit, ...] = ()
+    """What `redo` brings back, the last one first."""
+
+    def __post_init__(self) -> None:
+        for name in ("edits", "undone"):
+            given = getattr(self, name)
+            if isinstance(given, Edit) or not isinstance(given, Iterable):
+                raise TypeError(f"{name}: expected a list of edits, got {given!r:.80}; write it as [Remove('chair')]")
+            edits = tuple(given)
+            for i, edit in enumerate(edits):
+                if not isinstance(edit, Edit):
+                    raise TypeError(f"{name}[{i}]: expected an edit, got {edit!r:.80}; use one of {_names()}")
+            object.__setattr__(self, name, edits)
+
+    def __len__(self) -> int:
+        return len(self.edits)
+
+    def __iter__(self) -> Iterator[Edit]:
+        return iter(self.edits)
+
+    def then(self, edit: Edit) -> EditList:
+        """The list with one more edit; what was undone is forgotten."""
+        return EditList((*self.edits, edit))
+
+    def undo(self) -> EditList:
+        """The list without its last edit, which `redo` brings back.
+
+        Raises:
+            ValueError: if there is nothing to undo.
+        """
+        if not self.edits:
+            raise ValueError("edits: expected an edit to undo, got an empty list; add one with then()")
+        return EditList(self.edits[:-1], (*self.undone, self.edits[-1]))
+
+    def redo(self) -> EditList:
+        """The list with the edit that was undone last.
+
+        Raises:
+            ValueError: if nothing was undone since the last `then`.
+        """
+        if not self.undone:
+            raise ValueError("undone: expected an edit to redo, got none; undo() one first, and then() forgets them")
+        return EditList((*self.edits, self.undone[-1]), self.undone[:-1])
+
+    def apply(self, splats: SplatFile) -> SplatFile:
+        """The cloud after all edits.
+
+        Raises:
+            ValueError: if an edit cannot be done; the message says which.
+            FileNotFoundError: if a file to insert is not there.
+        """
+        for i, edit in enumerate(self.edits):
+            try:
+                splats = edit.apply(splats)
+            except ValueError as error:
+                raise ValueError(f"edits[{i}] ({edit.op}): {error}") from error
+        return splats
+
+    def save(self, path: str | Path) -> Path:
+        """Write the list as JSON, undone edits included.
+
+        Files to insert are named relative to the JSON file where they lie in its folder or below, else in full; the
+        latter are only read back with `load(path, anywhere=True)`.
+
+        Raises:
+            ValueError: if an insert holds a cloud in memory.
+        """
+        path = Path(path)
+        write_json(
+            path,
+            {"format": FORMAT, "version": VERSION}
+            | {
+                name: [_written(edit, f"{name}[{i}]", path.parent) for i, edit in enumerate(edits)]
+                for name, edits in (("edits", self.edits), ("undone", self.undone))
+            },
+        )
+        return path
+
+    @staticmethod
+    def load(path: str | Path, *, anywhere: bool = False) -> EditList:
+        """Read what `save` wrote.
+
+        Args:
+            path: the JSON file; files to insert are looked for beside it.
+            anywhere: also allow files to insert that lie outside its folder.
+
+        Raises:
+            FileNotFoundError: if there is no such file, or a file to insert is missing.
+            ValueError: if it is no such JSON, of another version, or an edit in it is not one that kfgs knows; the
+                message names the place in the file.
+        """
+        path = Path(path)
+        try:
+            content = read_json(path)
+        except RecursionError as error:
+            raise ValueError(f"{path}: expected saved edits, got JSON that nests too deep; write it again") from error
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise ValueError(f"{path}: expected edits that kfgs saved ('format': {FORMAT!r}), got something else")
+        if content.get("version") != VERSION:
+            raise ValueError(
+                f"{path}: expected version {VERSION} of {FORMAT}, got {content.get('version')!r:.80}; install the kfgs "
+                "that wrote it"
+            )
+        unknown = sorted(set(content) - {"format", "version", "edits", "undone"})
+        if unknown:
+            raise ValueError(f"{path}: expected 'edits' and 'undone', got {unknown[0]!r:.80}; correct or delete it")
+        lists = {}
+        for name in ("edits", "undone"):
+            values = content.get(name, [])
+            if not isinstance(values, list) or (name == "edits" and name not in content):
+                raise ValueError(f"{path}: {name}: expected a list of edits, got {values!r:.80}; write it as [...]")
+            try:
+                lists[name] = tuple(_read(v, f"{name}[{i}]", path.parent, anywhere) for i, v in enumerate(values))
+            except (ValueError, FileNotFoundError) as error:
+                raise type(error)(f"{path}: {error}") from error
+        return EditList(**lists)
+
+
+def _names() -> str:
+    return ", ".join(kind.__name__ for kind in OPS.values())
+
+
+def _written(edit: Edit, name: str, folder: Path) -> dict[str, Any]:
+    try:
+        return (edit.seen_from(folder) if isinstance(edit, Insert) else edit).to_json()
+    except ValueError as error:
+        raise ValueError(f"{name}.{error}") from error
+
+
+def _read(value: Any, name: str, folder: Path, anywhere: bool) -> Edit:
+    op = value.get("op") if isinstance(value, dict) else None
+    if not isinstance(op, str) or op not in OPS:
+        raise ValueError(
+            f"{name}: expected an edit whose 'op' is one of {', '.join(OPS)}, got {value!r:.80}; correct it"
+        )
+    members = checked_object(name, value, OPS[op], "op")
+    if isinstance(members.get("where"), dict):
+        members["where"] = Where.from_json(members["where"], f"{name}.where")
+    if isinstance(members.get("rotation"), dict):
+        members["rotation"] = _read_turn(members["rotation"], f"{name}.rotation")
+    if "source" in members:
+        members["source"] = read_source(members["source"], f"{name}.source", folder, anywhere)
+    if "similarity" in members:
+        members["similarity"] = read_similarity(members["similarity"], f"{name}.similarity")
+    try:
+        return OPS[op](**members)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}.{error}") from error
+
+
+def _read_turn(value: dict[str, Any], name: str) -> Turn:
+    if set(value) != {"axis", "degrees"}:
+        raise ValueError(f"{name}: expected axis and degrees, got {', '.join(value) or 'nothing'}; write both")
+    try:
+        return Turn(**value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}.{error}") from error

@@ -1,0 +1,139 @@
+"""The edit that brings in Gaussians from another file or scene."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any, ClassVar
+
+import torch
+
+from ...cameras.similarity import Similarity
+from ...formats.splat_file import SplatFile
+from ...formats.table import read_splats
+from ...splat.transform import transform_gaussians
+from .._plain import number_of, numbers_of
+from .base import Edit
+from .merge import join
+
+
+@dataclass(frozen=True, eq=False)
+class Insert(Edit):
+    """Add the Gaussians of another splat file behind those of the scene; see `join` for what happens where they differ.
+
+    The file is read when the edit is applied. Two inserts are equal when they name the same file and the same place.
+    """
+
+    op: ClassVar[str] = "insert"
+    source: str | Path | SplatFile
+    """A splat file of any known format, or a cloud in memory (which JSON cannot hold)."""
+    similarity: Similarity | None = None
+    """From the axes of the source to those of the scene; None leaves it where it is."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.source, str | Path | SplatFile) or self.source == "":
+            raise TypeError(
+                f"source: expected a path or a SplatFile, got {self.source!r:.80}; wrap Gaussians in SplatFile(...)"
+            )
+        if self.similarity is not None and not isinstance(self.similarity, Similarity):
+            raise TypeError(
+                f"similarity: expected a Similarity, got {type(self.similarity).__name__}; build one with "
+                "Similarity(scale, rotation, translation) or Similarity.from_matrix"
+            )
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Insert) and self._key() == other._key()
+
+    def __hash__(self) -> int:
+        return hash(self._key()[0])
+
+    def _key(self) -> tuple[Any, Any]:
+        source = id(self.source) if isinstance(self.source, SplatFile) else os.fspath(self.source)
+        return source, _similarity_json(self.similarity)
+
+    def apply(self, splats: SplatFile) -> SplatFile:
+        """See `Edit.apply`; reads the file if it is one."""
+        part = self.source if isinstance(self.source, SplatFile) else read_splats(self.source)
+        if self.similarity is not None:
+            part = part.replace(gaussians=transform_gaussians(part.gaussians, self.similarity))
+        return join(splats, part)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values that JSON can hold; see `Edit.to_json`.
+
+        Raises:
+            ValueError: if the source is a cloud in memory.
+        """
+        if isinstance(self.source, SplatFile):
+            raise ValueError(
+                "source: expected a path to save this edit, got a SplatFile in memory; write it with write_splats and "
+                "insert the file"
+            )
+        return {"op": self.op, "source": os.fspath(self.source), "similarity": _similarity_json(self.similarity)}
+
+    def seen_from(self, folder: Path) -> Insert:
+        """The same edit with its path as it is written in a file of that folder: relative if it lies in it."""
+        if isinstance(self.source, SplatFile):
+            return self
+        path, folder = Path(self.source).resolve(), folder.resolve()
+        inside = path.is_relative_to(folder)
+        return replace(self, source=path.relative_to(folder).as_posix() if inside else str(path))
+
+
+def read_similarity(value: Any, name: str) -> Similarity | None:
+    """What `Insert.to_json` wrote.
+
+    Raises:
+        ValueError: if it is no such object, or no similarity.
+    """
+    if value is None:
+        return None
+    needed = {"scale", "rotation", "translation"}
+    if not isinstance(value, Mapping) or set(value) != needed or not _is_matrix(value["rotation"]):
+        raise ValueError(
+            f"{name}: expected scale, rotation [[3], [3], [3]] and translation [3], got {value!r:.80}; write all three"
+        )
+    try:
+        rotation = torch.tensor([numbers_of("rotation", row, 3) for row in value["rotation"]], dtype=torch.float64)
+        translation = torch.tensor(numbers_of("translation", value["translation"], 3), dtype=torch.float64)
+        return Similarity(number_of("scale", value["scale"]), rotation, translation)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}.{error}") from error
+
+
+def read_source(value: Any, name: str, folder: Path, anywhere: bool) -> Path:
+    """The file that a saved edit names, which by default must lie in the folder of the edits or below it.
+
+    Raises:
+        ValueError: if it is no path, or leads out of the folder (an absolute path, `..`, a link).
+        FileNotFoundError: if there is no such file.
+    """
+    if not isinstance(value, str) or not value or "\0" in value:
+        raise ValueError(f"{name}: expected the path of a splat file, got {value!r:.80}; write it as a string")
+    parts = PurePosixPath(value).parts + PureWindowsPath(value).parts
+    rooted = PurePosixPath(value).is_absolute() or bool(PureWindowsPath(value).drive or PureWindowsPath(value).root)
+    path = folder / value
+    if not anywhere and (rooted or ".." in parts or not path.resolve().is_relative_to(folder.resolve())):
+        raise ValueError(
+            f"{name}: expected a file in {folder} or below, got {value!r:.200}; copy it there, or load with "
+            "anywhere=True if you trust these edits"
+        )
+    if not path.exists():
+        raise FileNotFoundError(f"{name}: expected a splat file at {path}, got none; put it there")
+    return path
+
+
+def _is_matrix(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 3
+
+
+def _similarity_json(similarity: Similarity | None) -> dict[str, Any] | None:
+    if similarity is None:
+        return None
+    return {
+        "scale": similarity.scale,
+        "rotation": similarity.rotation.tolist(),
+        "translation": similarity.translation.tolist(),
+    }

@@ -1,0 +1,140 @@
+"""Edits of where it stands: move, turn and resize Gaussians about a pivot, or a copy of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from ..._check import check_range
+from ...cameras.similarity import Similarity
+from ...formats.splat_file import SplatFile
+from ...gaussians import Gaussians
+from ...splat.transform import transform_gaussians
+from .._plain import number_of, numbers_of, quaternion_of, rotation_matrix
+from ..where import Where, as_where
+from .base import Edit, scatter, selected
+from .merge import join
+from .presence import check_flag
+
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A rotation by an angle about an axis, by the right hand: a positive turn about z takes x to y."""
+
+    axis: tuple[float, ...]
+    """A direction (x, y, z) of any length, or `"x"`, `"y"`, `"z"`."""
+    degrees: float
+
+    def __post_init__(self) -> None:
+        axis: Any = AXES.get(self.axis, self.axis) if isinstance(self.axis, str) else self.axis
+        object.__setattr__(self, "axis", numbers_of("axis", axis, 3))
+        object.__setattr__(self, "degrees", number_of("degrees", self.degrees))
+        if not any(self.axis):
+            raise ValueError("axis: expected a direction, got (0, 0, 0); name 'x', 'y', 'z' or a vector")
+
+    def matrix(self) -> Any:  # [3, 3]
+        """The rotation matrix."""
+        length = math.hypot(*self.axis)
+        return Rotation.from_rotvec([self.degrees * part / length for part in self.axis], degrees=True).as_matrix()
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values that JSON can hold."""
+        return {"axis": list(self.axis), "degrees": self.degrees}
+
+
+@dataclass(frozen=True)
+class _Motion(Edit):
+    """What `Move` and `Duplicate` share: x' = scale R (x - pivot) + pivot + translation."""
+
+    where: Where
+    translation: tuple[float, ...] = (0.0, 0.0, 0.0)
+    """World units."""
+    rotation: Turn | tuple[float, ...] | None = None
+    """A `Turn`, a pair such as `("z", 90)` (axis, degrees), or a quaternion (w, x, y, z)."""
+    scale: float = 1.0
+    """> 0"""
+    pivot: str | tuple[float, ...] = "centroid"
+    """The point that turning and resizing leave in place: `"centroid"` (the mean of the selected positions, weighted by
+    opacity) or (x, y, z)."""
+    allow_empty: bool = False
+    """False: an empty selection is an error."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "where", as_where(self.where))
+        object.__setattr__(self, "translation", numbers_of("translation", self.translation, 3))
+        object.__setattr__(self, "rotation", _rotation(self.rotation))
+        object.__setattr__(self, "scale", number_of("scale", self.scale))
+        check_range("scale", self.scale, 0, closed=(False, False))
+        if isinstance(self.pivot, str):
+            if self.pivot != "centroid":
+                raise ValueError(f"pivot: expected 'centroid' or [x, y, z], got {self.pivot!r:.80}; give the point")
+        else:
+            object.__setattr__(self, "pivot", numbers_of("pivot", self.pivot, 3))
+        check_flag("allow_empty", self.allow_empty)
+
+    def similarity(self, gaussians: Gaussians) -> Similarity:
+        """The motion of the selected Gaussians in world axes."""
+        R = _matrix(self.rotation)
+        if isinstance(self.pivot, str):
+            weights = gaussians.opacities.detach().double().cpu()
+            pivot = weights @ gaussians.means.detach().double().cpu() / weights.sum()
+        else:
+            pivot = torch.tensor(self.pivot, dtype=torch.float64)
+        shift = torch.tensor(self.translation, dtype=torch.float64)
+        return Similarity(self.scale, R, pivot + shift - self.scale * (R @ pivot))
+
+
+@dataclass(frozen=True)
+class Move(_Motion):
+    """Move, turn and resize Gaussians; their scales and the directions of their colours go along."""
+
+    op: ClassVar[str] = "move"
+
+    def apply(self, splats: SplatFile) -> SplatFile:
+        """See `Edit.apply`."""
+        mask = selected(self.where, splats, self.allow_empty)
+        if not bool(mask.any()):
+            return splats
+        part = splats.gaussians.select(mask)
+        moved = transform_gaussians(part, self.similarity(part))
+        return splats.replace(gaussians=scatter(splats.gaussians, mask, moved))
+
+
+@dataclass(frozen=True)
+class Duplicate(_Motion):
+    """Add a copy of Gaussians, moved as `Move` does; labels and other columns are copied. Copies follow the originals."""
+
+    op: ClassVar[str] = "duplicate"
+
+    def apply(self, splats: SplatFile) -> SplatFile:
+        """See `Edit.apply`."""
+        mask = selected(self.where, splats, self.allow_empty)
+        if not bool(mask.any()):
+            return splats
+        copy = splats.select(mask)
+        return join(
+            splats, copy.replace(gaussians=transform_gaussians(copy.gaussians, self.similarity(copy.gaussians)))
+        )
+
+
+def _rotation(value: Any) -> Turn | tuple[float, ...] | None:
+    if value is None or isinstance(value, Turn):
+        return value
+    if isinstance(value, Sequence) and not isinstance(value, str) and len(value) == 2:
+        return Turn(value[0], value[1])
+    return quaternion_of("rotation", value)
+
+
+def _matrix(rotation: Turn | tuple[float, ...] | None) -> Tensor:  # [3, 3] float64
+    if rotation is None:
+        return torch.eye(3, dtype=torch.float64)
+    matrix = rotation.matrix() if isinstance(rotation, Turn) else rotation_matrix(rotation)
+    return torch.tensor(matrix.tolist(), dtype=torch.float64)
