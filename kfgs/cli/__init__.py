@@ -12,9 +12,12 @@ from typing import Any
 
 import tyro
 
+from .color import attach, color, convert, edit
 from .semantic import demo, fit, info, label, segment, sfm
 
-COMMANDS: dict[str, Any] = {"demo": demo, "sfm": sfm, "fit": fit, "segment": segment, "label": label, "info": info}
+COMMANDS: dict[str, Any] = {
+    command.__name__: command for command in (demo, sfm, fit, segment, label, info, color, attach, edit, convert)
+}
 
 
 def main(arguments: list[str] | None = None) -> int:

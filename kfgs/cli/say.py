@@ -44,3 +44,29 @@ def load_classes(scene: Path | None, classes: Path | None, text: Path | None) ->
     if classes is None or text is None:
         raise ValueError("classes, text: expected class names (.json) and embeddings (.npy); pass --classes and --text")
     return load_label_set(classes, text)
+
+
+def training_cameras(field: Any, scene: Path | None, images: Path | None) -> list[Any]:
+    """The cameras that a field was trained with, found again in its scene by name."""
+    from ..scenes import load_scene
+
+    if scene is None:
+        raise ValueError("by: expected 'latents' without a scene, got 'views'; pass --scene, whose cameras vote")
+    cameras = load_scene(scene, images=images).undistorted().cameras
+    trained = set(field.info.get("views", ()))
+    voting = [camera for camera in cameras if camera.name in trained]
+    if not voting:
+        raise ValueError(
+            f"scene: expected the views that the field was trained on ({', '.join(sorted(trained)[:3])}, ...), got "
+            f"{len(cameras)} others in {scene}; pass the field's own scene, or --by latents"
+        )
+    return voting
+
+
+def size_of(path: Path) -> int:
+    """Bytes of a file, or of all files in a folder."""
+    return (
+        path.stat().st_size
+        if path.is_file()
+        else sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+    )

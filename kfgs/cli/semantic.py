@@ -5,32 +5,15 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
-from .say import Mode, Preset, fit_config, load_classes, say, wrote
+from .say import Mode, Preset, fit_config, load_classes, say, training_cameras, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
 SceneFolder = Annotated[Path, tyro.conf.Positional]
-
-
-def _training_cameras(field: Any, scene: Path | None, images: Path | None) -> list[Any]:
-    """The cameras that a field was trained with, found again in its scene by name."""
-    from ..scenes import load_scene
-
-    if scene is None:
-        raise ValueError("by: expected 'latents' without a scene, got 'views'; pass --scene, whose cameras vote")
-    cameras = load_scene(scene, images=images).undistorted().cameras
-    trained = set(field.info.get("views", ()))
-    voting = [camera for camera in cameras if camera.name in trained]
-    if not voting:
-        raise ValueError(
-            f"scene: expected the views that the field was trained on ({', '.join(sorted(trained)[:3])}, ...), got "
-            f"{len(cameras)} others in {scene}; pass the field's own scene, or --by latents"
-        )
-    return voting
 
 
 def demo(out: Path = Path("kfgs_demo"), seed: int = 0, steps: int | None = None) -> None:
@@ -226,7 +209,7 @@ def label(
         raise ValueError(f"out: expected another folder than that of --cloud, got {out}; {cloud} would be overwritten")
     if query is None:
         by = by or ("latents" if scene is None else "views")
-        cameras = _training_cameras(loaded, scene, images) if by == "views" else None
+        cameras = training_cameras(loaded, scene, images) if by == "views" else None
         gaussians, scores = label_field(loaded, label_set, cameras)
         rule = "votes of the training views; score = winner's share" if cameras else "own latents; score = cosine"
     else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -64,3 +65,20 @@ def write_comparison(
     path = Path(path)
     save_picture(path, picture_grid(rows, titles))
     return path
+
+
+class PhotoPictures:
+    """What `score_views` calls for each view: some of the renderings are drawn beside their photographs."""
+
+    def __init__(self, folder: Path, stems: Sequence[str], count: int) -> None:
+        """Draw `count` of the views, evenly spread, into `folder/<stem>.png`."""
+        self.folder, self.written = folder, list[Path]()
+        places = np.linspace(0, len(stems) - 1, min(count, len(stems))).round().astype(int)
+        self._chosen = {stems[i] for i in places}
+
+    def __call__(self, stem: str, rendered: Tensor, taken: Tensor) -> None:
+        """Draw the view if it was chosen."""
+        if stem in self._chosen:
+            path = self.folder / f"{stem}.png"
+            save_picture(path, picture_grid([[taken, rendered]], ("photograph", "colour field")))
+            self.written.append(path)

@@ -1,4 +1,4 @@
-"""What lies at a path, in words: a field, a run, a scene, a PLY file."""
+"""What lies at a path, in words: a field, a run, a scene, a splat file, a point cloud."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ from pathlib import Path
 
 from .._files import read_json
 from ..fields import SemanticField
+from ..formats import SplatFile, find_format, read_splats
 from ..formats.ply import read_ply
 from ..scenes import load_scene
 
 
 def describe(path: str | Path) -> str:
-    """Describe a field folder, a run folder, a scene folder or a PLY file.
+    """Describe a field folder, a run folder, a scene folder, a splat file of any format, or a PLY file of points.
 
     Raises:
         FileNotFoundError: if there is nothing there.
@@ -19,11 +20,14 @@ def describe(path: str | Path) -> str:
     """
     path = Path(path)
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file or folder; expected a field, a run, a scene or a PLY file")
+        raise FileNotFoundError(f"{path}: no such file or folder; expected a field, a run, a scene or a splat file")
     if path.is_file():
-        columns = read_ply(path)
-        count = len(next(iter(columns.values())))
-        return f"{path}: PLY with {count} vertices; columns {', '.join(columns)}"
+        if find_format(path).NAME == "ply":
+            columns = read_ply(path)
+            if "scale_0" not in columns:
+                count = len(next(iter(columns.values())))
+                return f"{path}: PLY with {count} vertices; columns {', '.join(columns)}"
+        return _describe_splats(path, read_splats(path))
     if (path / "field.json").is_file():
         return SemanticField.load(path).summary()
     if (path / "field" / "field.json").is_file():
@@ -43,4 +47,18 @@ def describe(path: str | Path) -> str:
         f"  extent: {scene.extent:.3f} world units",
         *(f"  note: {note}" for note in scene.notes),
     ]
+    return "\n".join(lines)
+
+
+def _describe_splats(path: Path, splats: SplatFile) -> str:
+    lines = [f"{path}: {splats!r}"]
+    if len(splats):
+        low, high = (values.tolist() for values in splats.gaussians.means.aminmax(dim=0))
+        lines += [f"  {axis}: {a:.4g} to {b:.4g}" for axis, a, b in zip("xyz", low, high, strict=True)]
+    lines += [f"  {name}: {value}" for name, value in splats.info.items() if not isinstance(value, dict | list)]
+    labels = splats.gaussians.labels
+    if labels is not None:
+        for i, name in enumerate(splats.classes):
+            lines.append(f"  {name:<16s} {int((labels == i).sum()):8d} Gaussians")
+        lines.append(f"  {'(none)':<16s} {int((labels < 0).sum()):8d} Gaussians")
     return "\n".join(lines)
