@@ -3,12 +3,13 @@
 from .config import FieldConfig
 from .densify import Densified, GradientStatistics, densify
 from .fit import FieldFit, fit_field
-from .loss import Loss, l1_loss
+from .loss import ColorLoss, Loss, l1_loss
 from .optimizer import FieldOptimizer
 from .params import GaussianParams
 from .semantic_field import SemanticField
 
 __all__ = [
+    "ColorLoss",
     "Densified",
     "FieldConfig",
     "FieldFit",

@@ -30,6 +30,15 @@ class FieldConfig:
     opacities_lr: float = 0.05
     """Learning rate of the opacity logits."""
     features_lr: float = 0.005
+    sh0_lr: float = 0.0025
+    """Learning rate of the colours (coefficients of degree 0)."""
+    sh_rest_lr: float = 0.0025 / 20
+    """Learning rate of the higher harmonics."""
+    sh_degree_every: int = 1_000
+    """Colours start at degree 0, and gain one each so many steps; 0 = all from the start."""
+    coarse: tuple[tuple[int, int], ...] = ()
+    """Pairs (last step, divisor): up to that step pictures are compared at size // divisor, each pixel the mean of divisor
+    x divisor ones; the last steps, and all when empty, at full size. For targets of the cameras' own size."""
     adam_eps: float = 1e-15
     """Adam's epsilon: tiny, since gradients of a mean over all pixels are tiny."""
     render_scale: float | None = None
@@ -65,13 +74,14 @@ class FieldConfig:
     def __post_init__(self) -> None:
         for name in ("steps", "densify_every", "report_every", "checkpoint_every"):
             _check_count(name, getattr(self, name), 1)
-        for name in ("densify_from", "densify_until", "reset_every"):
+        for name in ("densify_from", "densify_until", "reset_every", "sh_degree_every"):
             _check_count(name, getattr(self, name), 0)
         if self.max_gaussians is not None:
             _check_count("max_gaussians", self.max_gaussians, 1)
         for name in ("means_lr", "means_lr_final", "adam_eps"):
             check_range(name, getattr(self, name), 0, closed=_POSITIVE)
-        for name in ("quats_lr", "scales_lr", "opacities_lr", "features_lr", "densify_gradient", "percent_dense"):
+        rates = ("quats_lr", "scales_lr", "opacities_lr", "features_lr", "sh0_lr", "sh_rest_lr")
+        for name in (*rates, "densify_gradient", "percent_dense"):
             check_range(name, getattr(self, name), 0, closed=(True, False))
         check_range("prune_extent", self.prune_extent, 0, closed=_POSITIVE)
         check_range("prune_opacity", self.prune_opacity, 0, 1, closed=(True, False))
@@ -79,6 +89,20 @@ class FieldConfig:
         check_choice("densify_gradient_size", self.densify_gradient_size, ("render", "target"))
         if self.render_scale is not None:
             check_range("render_scale", self.render_scale, 0, closed=_POSITIVE)
+        object.__setattr__(self, "coarse", tuple(map(tuple, self.coarse)))  # JSON gives lists
+        _check_coarse(self.coarse)
+        if self.coarse and self.render_scale is not None:
+            raise ValueError(
+                f"coarse: expected () with render_scale = {self.render_scale}, got {self.coarse}; use one of the two"
+            )
+
+    def divisor(self, step: int) -> int:
+        """By how much pictures are shrunk at a step (`coarse`)."""
+        return next((divisor for last, divisor in self.coarse if step <= last), 1)
+
+    def sh_degree(self, step: int) -> int:
+        """Up to which degree colours are used at a step, if they have it."""
+        return step // self.sh_degree_every if self.sh_degree_every else 3
 
     @classmethod
     def paper(cls, **changes: Any) -> FieldConfig:
@@ -118,10 +142,22 @@ class FieldConfig:
     def with_steps(self, steps: int) -> FieldConfig:
         """The same schedule stretched or compressed to another number of steps; `densify_every` stays."""
         ratio = steps / self.steps
-        names = ("densify_from", "densify_until", "reset_every")
-        return replace(self, steps=steps, **{name: round(getattr(self, name) * ratio) for name in names})
+        names = ("densify_from", "densify_until", "reset_every", "sh_degree_every")
+        coarse = tuple((max(1, round(last * ratio)), divisor) for last, divisor in self.coarse)
+        scaled: dict[str, Any] = {name: round(getattr(self, name) * ratio) for name in names}
+        return replace(self, steps=steps, coarse=coarse, **scaled)
 
 
 def _check_count(name: str, value: object, low: int) -> None:
     if isinstance(value, bool) or not isinstance(value, int) or value < low:
         raise ValueError(f"{name}: expected a whole number of at least {low}, got {value!r}")
+
+
+def _check_coarse(coarse: tuple[tuple[int, int], ...]) -> None:
+    for pair in coarse:
+        if len(pair) != 2:
+            raise ValueError(f"coarse: expected pairs (last step, divisor), got {pair!r}; give two whole numbers each")
+        _check_count("coarse: last step", pair[0], 1)
+        _check_count("coarse: divisor", pair[1], 1)
+    if list(coarse) != sorted(set(coarse)):
+        raise ValueError(f"coarse: expected pairs in increasing order of their last step, got {coarse}; sort them")

@@ -59,7 +59,7 @@ def fit_field(
         config: the paper's values when not given.
         extent: size of the scene in world units (`Scene.extent`); scales the means' learning rate and what counts as a
             large Gaussian.
-        loss: compares a rendered map, its alpha and the target.
+        loss: compares a rendered map, its alpha and the target. For colours, `ColorLoss`.
         generator: draws the views' order and the places of split Gaussians; None stands for seed 0.
         progress: show a bar with loss, number of Gaussians and time left.
         callback: called with each new row of the history. To stop early, raise from it; a checkpoint stays behind.
@@ -81,7 +81,7 @@ def fit_field(
     trainer = Trainer(params, cameras, targets, config, extent, loss, generator)
     path, identity = (Path(checkpoint) if checkpoint is not None else None), {}
     if path is not None:
-        others = {"extent": float(extent), "loss": getattr(loss, "__qualname__", type(loss).__name__)}
+        others = {"extent": float(extent), "loss": getattr(loss, "__qualname__", None) or repr(loss)}
         identity = identify_fit(params, cameras, targets, config, generator=generator, others=others)
         saved = read_checkpoint(path, identity)
         if saved is not None:

@@ -28,6 +28,8 @@ class FieldOptimizer:
             "log_scales": config.scales_lr,
             "logit_opacities": config.opacities_lr,
             "features": config.features_lr,
+            "sh0": config.sh0_lr,
+            "sh_rest": config.sh_rest_lr,
         }
         groups = [
             {"params": [value], "lr": rates[name], "name": name} for name, value in self.params.to_tensors().items()

@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from math import isqrt
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from .._check import check_range, check_shapes
+from .._check import check_range, check_shapes, check_whole
 from ..gaussians import Gaussians
+from ..splat.sh import rgb_to_sh0
 
 # Spacing of a point is held within these bounds: near-duplicates would give specks, a loner a giant Gaussian.
 SMALLEST_SPACING = 0.01  # times the median spacing
@@ -24,14 +26,17 @@ class GaussianParams:
     """N Gaussians as the optimiser sees them: unbounded numbers. `activated()` gives what everyone else uses.
 
     **Convention**: scales are logarithms of world units, opacities are logits, quaternions are (w, x, y, z) of any
-    length; features are linear, without activation.
+    length; features and spherical harmonics are linear, without activation. A semantic field carries `features`, a colour
+    field `sh0` and, above degree 0, `sh_rest`: two tensors, since they learn at different rates.
     """
 
     means: Tensor  # [N, 3]
     quats: Tensor  # [N, 4] wxyz
     log_scales: Tensor  # [N, 3]
     logit_opacities: Tensor  # [N]
-    features: Tensor  # [N, D]
+    features: Tensor | None = None  # [N, D]
+    sh0: Tensor | None = None  # [N, 3], the coefficient of degree 0
+    sh_rest: Tensor | None = None  # [N, K - 1, 3], K = (degree + 1)^2; None at degree 0
 
     def __post_init__(self) -> None:
         check_shapes(
@@ -40,22 +45,39 @@ class GaussianParams:
             ("log_scales", self.log_scales, "N 3"),
             ("logit_opacities", self.logit_opacities, "N"),
             ("features", self.features, "N D"),
+            ("sh0", self.sh0, "N 3"),
+            ("sh_rest", self.sh_rest, "N R 3"),
         )
+        if (self.features is None) == (self.sh0 is None):
+            got = "neither" if self.features is None else "both"
+            raise ValueError(f"features, sh0: expected one of them, got {got}; a field has features or colours")
+        if self.sh_rest is not None and (self.sh0 is None or self.sh_rest.shape[1] not in (3, 8, 15)):
+            raise ValueError(
+                f"sh_rest: expected 3, 8 or 15 coefficients (degree 1 to 3) beside sh0, got {self.sh_rest.shape[1]}"
+                f"{' without sh0' if self.sh0 is None else ''}; leave it None at degree 0"
+            )
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
 
     def __repr__(self) -> str:
-        return f"GaussianParams({len(self)} Gaussians, {self.channels} channels, {self.means.dtype})"
+        kind = f"SH degree {self.sh_degree}" if self.sh0 is not None else f"{self.channels} channels"
+        return f"GaussianParams({len(self)} Gaussians, {kind}, {self.means.dtype})"
 
     @property
     def channels(self) -> int:
-        """D, the number of features per Gaussian."""
-        return int(self.features.shape[1])
+        """D, how many channels a rendered map has: the number of features per Gaussian, or 3 for colours."""
+        return 3 if self.features is None else int(self.features.shape[1])
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics; 0 where there are none."""
+        return 0 if self.sh_rest is None else isqrt(self.sh_rest.shape[1] + 1) - 1
 
     def to_tensors(self) -> dict[str, Tensor]:
-        """The raw tensors by name, in a fixed order."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        """The raw tensors that there are, by name, in a fixed order."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if value is not None}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> GaussianParams:
@@ -65,48 +87,67 @@ class GaussianParams:
             ValueError: if a name is missing.
         """
         names = [field.name for field in fields(cls)]
-        missing = [name for name in names if name not in tensors]
+        needed = [*names[:4], "sh0" if "features" not in tensors and "sh0" in tensors else "features"]
+        missing = [name for name in needed if name not in tensors]
         if missing:
             raise ValueError(
-                f"tensors: expected the names {names}, got {sorted(tensors)} without {missing}; "
+                f"tensors: expected the names {needed}, got {sorted(tensors)} without {missing}; "
                 "pass what GaussianParams.to_tensors gave"
             )
-        return cls(**{name: tensors[name] for name in names})
+        return cls(**{name: tensors[name] for name in names if name in tensors})
 
     def map(self, function: Callable[[Tensor], Tensor]) -> GaussianParams:
         """Apply one function to every raw tensor."""
         return GaussianParams(**{name: function(value) for name, value in self.to_tensors().items()})
 
-    def activated(self) -> Gaussians:
-        """The Gaussians these values stand for; differentiable."""
-        return Gaussians(
-            self.means, self.quats, self.log_scales.exp(), self.logit_opacities.sigmoid(), features=self.features
-        )
+    def activated(self, sh_degree: int | None = None) -> Gaussians:
+        """The Gaussians these values stand for; differentiable.
+
+        Args:
+            sh_degree: of colours, use the harmonics up to this degree only; None: all.
+        """
+        sh = None
+        if self.sh0 is not None:
+            degree = self.sh_degree if sh_degree is None else min(sh_degree, self.sh_degree)
+            rest = [] if degree == 0 or self.sh_rest is None else [self.sh_rest[:, : (degree + 1) ** 2 - 1]]
+            sh = torch.cat([self.sh0[:, None], *rest], dim=1)
+        scales, opacities = self.log_scales.exp(), self.logit_opacities.sigmoid()
+        return Gaussians(self.means, self.quats, scales, opacities, features=self.features, sh=sh)
 
     @classmethod
     def from_gaussians(cls, gaussians: Gaussians) -> GaussianParams:
-        """The raw values of a cloud with features: the inverse of `activated`, to train on from there.
+        """The raw values of a cloud with features or colours: the inverse of `activated`, to train on from there.
+
+        Features are taken where a cloud has both.
 
         Raises:
-            ValueError: if the Gaussians carry no features.
+            ValueError: if the Gaussians carry neither.
         """
-        if gaussians.features is None:
-            raise ValueError("gaussians: expected features [N, D], got None; give them some with replace(features=...)")
+        if gaussians.features is None and gaussians.sh is None:
+            raise ValueError(
+                "gaussians: expected features [N, D] or sh [N, K, 3], got neither; give them some with replace()"
+            )
         tiny = torch.finfo(gaussians.opacities.dtype).eps  # a logit stays finite
+        sh = None if gaussians.features is not None else gaussians.sh
+        higher = sh is not None and sh.shape[1] > 1
         return cls(
             means=gaussians.means.detach().clone(),
             quats=gaussians.quats.detach().clone(),
             log_scales=gaussians.scales.detach().log(),
             logit_opacities=torch.logit(gaussians.opacities.detach(), eps=tiny),
-            features=gaussians.features.detach().clone(),
+            features=None if gaussians.features is None else gaussians.features.detach().clone(),
+            sh0=None if sh is None else sh[:, 0].detach().clone(),
+            sh_rest=sh[:, 1:].detach().clone() if sh is not None and higher else None,
         )
 
     @classmethod
     def from_points(
         cls,
         points: Tensor,  # [P, 3] world units
-        channels: int,
+        channels: int = 3,
         *,
+        colors: Tensor | None = None,  # [P, 3] in [0, 1], or uint8
+        sh_degree: int = 3,
         initial_opacity: float = 0.1,
         max_points: int | None = None,
         outlier_range: float = 4.0,
@@ -116,14 +157,17 @@ class GaussianParams:
 
         The standard deviation is the root mean square of the three distances, held between `SMALLEST_SPACING` times its
         median and its 0.99 quantile, so that near-duplicates and lonely points are harmless. Features start at 0 and
-        rotations at the identity.
+        rotations at the identity. With `colors` it is a colour field that starts: each Gaussian shows its point's colour
+        from everywhere.
 
         Structure from motion leaves points far outside a scene (30 times its size is common). A point is dropped when
         its distance from the coordinate-wise median exceeds `outlier_range` times the 0.95 quantile of these distances.
 
         Args:
             points: the cloud, usually `Scene.points`.
-            channels: D, the number of features per Gaussian.
+            channels: D, the number of features per Gaussian; not looked at where `colors` are given.
+            colors: of the points, usually `Scene.colors`; None starts a field of features.
+            sh_degree: highest degree of the spherical harmonics of a colour field, 0 to 3.
             initial_opacity: in (0, 1).
             max_points: keep a random subset of at most this many (after outliers are dropped).
             outlier_range: infinity keeps every point.
@@ -137,28 +181,41 @@ class GaussianParams:
             >>> GaussianParams.from_points(cube, 9).activated().scales[0]
             tensor([1., 1., 1.])
         """
-        check_shapes(("points", points, "P 3"))
         check_range("channels", channels, 1)
+        check_shapes(("points", points, "P 3"), ("colors", colors, "P 3"))
+        check_whole("sh_degree", sh_degree, 0, 3)
         check_range("initial_opacity", initial_opacity, 0, 1, closed=(False, False))
         if not outlier_range > 0:
             raise ValueError(f"outlier_range: expected a positive number (or infinity), got {outlier_range!r}")
         if not points.is_floating_point() or not bool(torch.isfinite(points).all()):
             raise ValueError("points: expected finite floating-point numbers, got others; drop those rows first")
-        points = points.detach()
-        points = points[_inliers(points, outlier_range)]
+        inliers = _inliers(points.detach(), outlier_range)
+        points, colors = points.detach()[inliers], None if colors is None else colors.to(points.device)[inliers]
         if max_points is not None and len(points) > max_points:
             check_range("max_points", max_points, 2)
             generator = generator or torch.Generator().manual_seed(0)
-            chosen = torch.randperm(len(points), generator=generator)[:max_points].sort().values
-            points = points[chosen.to(points.device)]
+            chosen = torch.randperm(len(points), generator=generator)[:max_points].sort().values.to(points.device)
+            points, colors = points[chosen], None if colors is None else colors[chosen]
         n = len(points)
         return cls(
             means=points.clone(),
             quats=points.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
             log_scales=point_spacing(points).log()[:, None].repeat(1, 3),
             logit_opacities=points.new_full((n,), math.log(initial_opacity / (1 - initial_opacity))),
-            features=points.new_zeros(n, channels),
+            features=points.new_zeros(n, channels) if colors is None else None,
+            sh0=None if colors is None else rgb_to_sh0(_unit_colors(colors).to(points)),
+            sh_rest=points.new_zeros(n, (sh_degree + 1) ** 2 - 1, 3) if colors is not None and sh_degree else None,
         )
+
+
+def _unit_colors(colors: Tensor) -> Tensor:  # [P, 3] -> [P, 3] in [0, 1]
+    if colors.dtype == torch.uint8:
+        return colors.double() / 255
+    if not colors.is_floating_point() or not bool(((colors >= 0) & (colors <= 1)).all()):
+        raise ValueError(
+            f"colors: expected uint8, or floating point in [0, 1], got {colors.dtype} with other values; divide by 255"
+        )
+    return colors
 
 
 def _inliers(points: Tensor, outlier_range: float) -> Tensor:  # [P, 3] -> [P] bool

@@ -13,6 +13,7 @@ from torch import Tensor
 from ..cameras import Camera
 from ..splat import rasterize
 from .checkpoint import Checkpoint
+from .coarse import shrink_camera, shrink_map
 from .config import FieldConfig
 from .densify import GradientStatistics, densify, lowered_opacities
 from .loss import Loss
@@ -36,7 +37,7 @@ class Trainer:
         """Prepare step 1; the arguments are those of `fit_field`, checked."""
         self._cameras, self._targets, self._loss = cameras, targets, loss
         self._config, self._extent, self._generator = config, extent, generator
-        self._render_cameras: dict[int, Camera] = {}
+        self._render_cameras: dict[tuple[int, int], Camera] = {}
         self.optimizer = FieldOptimizer(params, config, extent=extent)
         self.statistics = GradientStatistics.zeros(params)
         self.history: list[dict[str, Any]] = []
@@ -63,7 +64,8 @@ class Trainer:
         params = self.optimizer.params
         target = self._target(view)
         camera = self._camera(view, target)
-        rendering = rasterize(params.activated(), camera, engine=self._config.engine)
+        gaussians = params.activated(self._config.sh_degree(self.step))
+        rendering = rasterize(gaussians, camera, engine=self._config.engine)
         means2d = rendering.projected.means2d
         if means2d.requires_grad:
             means2d.retain_grad()
@@ -121,17 +123,27 @@ class Trainer:
                 f"targets[{view}]: expected [h, w, D] with D = {channels} (from params), got {tuple(target.shape)}; "
                 "start from GaussianParams.from_points(points, D)"
             )
-        return target.to(self.optimizer.params.means)
+        target = target.to(self.optimizer.params.means)
+        divisor = self._config.divisor(self.step)
+        if divisor > 1:
+            if tuple(target.shape[:2]) != self._cameras[view].size:
+                raise ValueError(
+                    f"targets[{view}]: expected {self._cameras[view].size} pixels as the camera has (config.coarse asks "
+                    f"for it), got {tuple(target.shape[:2])}; resize the camera, or leave coarse empty"
+                )
+            target = shrink_map(target, divisor)
+        return target
 
     def _camera(self, view: int, target: Tensor) -> Camera:
         """The camera to render with; each is made once, since checking a camera takes longer than using it."""
-        if view not in self._render_cameras:
+        divisor = self._config.divisor(self.step)
+        if (view, divisor) not in self._render_cameras:
             camera = self._cameras[view].to(self.optimizer.params.means)
             if self._config.render_scale is not None:
                 height, width = (max(1, round(n * self._config.render_scale)) for n in target.shape[:2])
                 camera = camera.resized(min(height, camera.height), min(width, camera.width))
-            self._render_cameras[view] = camera
-        return self._render_cameras[view]
+            self._render_cameras[view, divisor] = camera if divisor == 1 else shrink_camera(camera, divisor)
+        return self._render_cameras[view, divisor]
 
     def snapshot(self) -> Checkpoint:
         """All that `restore_` needs."""
