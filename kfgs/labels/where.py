@@ -17,6 +17,7 @@ from torch import Tensor
 from .._check import check_range, check_whole
 from ..gaussians import Gaussians
 from ._plain import NESTED, checked_object, members_of, number_of, numbers_of, quaternion_of, rotation_matrix
+from .components import components
 from .names import class_index
 from .selection import select_where
 
@@ -249,9 +250,7 @@ class Component(Where):
         mask = self.where._ask(cloud)
         if not bool(mask.any()):
             return mask
-        from .components import components
-
-        parts = components(cloud.gaussians.means, select_where(mask), self.distance)
+        parts = components(cloud.gaussians.means, select_where(mask), self.distance, most=self.rank + 1)
         return parts[self.rank].mask if self.rank < len(parts) else torch.zeros_like(mask)
 
 
