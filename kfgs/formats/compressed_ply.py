@@ -40,7 +40,9 @@ _AXES = (  # (columns of the least value, of the largest) of positions, log scal
 )
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _FIELDS = (11, 10, 11)  # bits of x, y and z
-_STEPS = np.array([2047, 1023, 2047])
+_STEPS = np.array([2047, 1023, 2047], np.float32)  # between the bounds of positions and log scales
+_COLOR_STEPS = np.array([255, 255, 255], np.float32)
+_ALL_STEPS = (_STEPS, _STEPS, _COLOR_STEPS)
 _ROUNDING = 6 * 2.0**-24  # float32: of the bounds, their difference, the product and the sum
 
 
@@ -69,7 +71,9 @@ def read(path: Path) -> SplatFile:
     assert sizes is not None
     positions = _between(extents, _unpack_vectors(vertex["packed_position"]))
     log_scales = _between(sizes, _unpack_vectors(vertex["packed_scale"]))
-    rgba = (vertex["packed_color"][:, None] >> np.array([24, 16, 8, 0], np.uint32) & 255).astype(np.float32) / 255
+    rgba = (vertex["packed_color"][:, None] >> np.array([24, 16, 8, 0], np.uint32) & 255).astype(
+        np.float32
+    ) / np.float32(255)
     rgb = rgba[:, :3] if colours is None else _between(colours, rgba[:, :3])
     sh0 = (rgb - 0.5) / np.float32(SH_C0)
     sh = np.concatenate([sh0[:, None], _read_rest(path, elements.get("sh"), n)], 1)
@@ -107,16 +111,16 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
         for name, column in zip(names, np.ascontiguousarray(table.T), strict=True)
     }
     steps = [
-        np.round(_position_between(bound, value) * count)
-        for bound, value, count in zip(bounds, values, (_STEPS, _STEPS, 255), strict=True)
+        np.round(_position_between(bound, value) * count).astype(np.uint32)
+        for bound, value, count in zip(bounds, values, _ALL_STEPS, strict=True)
     ]
     opacity = np.round(np.clip(g.opacities.numpy(), 0, 1) * 255)
-    rgba = np.concatenate([steps[2], opacity[:, None]], 1).astype(np.uint32)
+    rgba = np.concatenate([steps[2], opacity[:, None].astype(np.uint32)], 1)
     rotations = np.concatenate(pack_smallest_three(g.quats, 1023), 1).astype(np.uint32)
     vertex = {
-        "packed_position": _pack(steps[0].astype(np.uint32), _FIELDS),
+        "packed_position": _pack(steps[0], _FIELDS),
         "packed_rotation": _pack(rotations, (2, 10, 10, 10)),
-        "packed_scale": _pack(steps[1].astype(np.uint32), _FIELDS),
+        "packed_scale": _pack(steps[1], _FIELDS),
         "packed_color": _pack(rgba, (8, 8, 8, 8)),
     }
     elements = {"chunk": chunk, "vertex": vertex}
@@ -136,7 +140,7 @@ def precision(gaussians: Gaussians) -> Precision:
     order = _file_order(gaussians)
     g = colours_to_write(gaussians, ".compressed.ply").select(order)
     assert g.sh is not None
-    errors = [_half_steps(value, count) for value, count in zip(_quantities(g), (_STEPS, _STEPS, 255), strict=True)]
+    errors = [_half_steps(value, count) for value, count in zip(_quantities(g), _ALL_STEPS, strict=True)]
     means = torch.empty(len(g), 3, dtype=torch.float64)
     means[order] = torch.from_numpy(errors[0])
     log_scales = g.scales.log().numpy()
@@ -188,11 +192,11 @@ def _between(bounds: _Bounds, fraction: NDArray[np.float32]) -> NDArray[np.float
         return bounds.low[chunk] + fraction * (bounds.high - bounds.low)[chunk]
 
 
-def _half_steps(values: NDArray[np.float64], steps: NDArray[np.int64] | int) -> NDArray[np.float64]:  # [N, 3]
+def _half_steps(values: NDArray[np.float64], steps: NDArray[np.float32]) -> NDArray[np.float64]:  # [N, 3]
     bounds = _chunk_bounds(values)
     chunk = np.arange(len(values)) // CHUNK
     largest = np.maximum(np.abs(bounds.low), np.abs(bounds.high)).astype(np.float64)
-    half = (bounds.high.astype(np.float64) - bounds.low) / np.asarray(steps) / 2
+    half = (bounds.high.astype(np.float64) - bounds.low) / steps / 2
     return (half + largest * _ROUNDING)[chunk]
 
 
@@ -207,7 +211,7 @@ def _pack(fields: NDArray[np.uint32], bits: tuple[int, ...]) -> NDArray[np.uint3
 def _unpack_vectors(packed: NDArray[np.uint32]) -> NDArray[np.float32]:  # [N] -> [N, 3]
     """Fractions of the way from the least value to the largest."""
     whole = packed[:, None] >> np.array([21, 11, 0], np.uint32) & _STEPS.astype(np.uint32)
-    return whole.astype(np.float32) / _STEPS.astype(np.float32)
+    return whole.astype(np.float32) / _STEPS
 
 
 def _unpack_rotations(packed: NDArray[np.uint32]) -> Tensor:  # [N] -> [N, 4] wxyz
@@ -220,11 +224,8 @@ def _read_rest(path: Path, columns: Columns | None, n: int) -> NDArray[np.float3
     if columns is None:
         return np.zeros((n, 0, 3), np.float32)
     names = [f"f_rest_{i}" for i in range(len(columns))]
-    if (
-        len(names) not in (9, 24, 45)
-        or set(names) != set(columns)
-        or any(c.dtype != np.uint8 for c in columns.values())
-    ):
+    types = {column.dtype.name for column in columns.values()}
+    if len(names) not in (9, 24, 45) or set(names) != set(columns) or types != {"uint8"}:
         raise ValueError(
             f"{path}: expected an 'sh' element of 9, 24 or 45 bytes f_rest_0, f_rest_1, ..., got {len(columns)} columns; "
             "write the file again"
@@ -233,7 +234,7 @@ def _read_rest(path: Path, columns: Columns | None, n: int) -> NDArray[np.float3
         raise ValueError(
             f"{path}: expected 'sh' of {n} rows (from vertex), got {len(columns['f_rest_0'])}; write the file again"
         )
-    table = ((np.arange(256, dtype=np.float32) + 0.5) / 256 - 0.5) * 2 * np.float32(SH_LIMIT)
+    table = (((np.arange(256) + 0.5) / 256 - 0.5) * 2 * SH_LIMIT).astype(np.float32)
     table[0], table[255] = -SH_LIMIT, SH_LIMIT
     return np.stack([table[columns[name]] for name in names], 1).reshape(n, 3, len(names) // 3).transpose(0, 2, 1)
 

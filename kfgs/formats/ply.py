@@ -35,7 +35,7 @@ class _Element(NamedTuple):
     """A table that the header promises."""
 
     name: str
-    count: int  # rows
+    rows: int
     properties: list[tuple[str, str]]  # (name, numpy code)
     lists: list[str]  # header lines of the properties that this module does not read
 
@@ -102,15 +102,15 @@ def _check_scalars(path: Path, element: _Element) -> None:
 def _parse_rows(path: Path, file: BinaryIO, element: _Element) -> Columns:
     try:
         table = np.zeros((0, len(element.properties)))
-        if element.count:
-            table = np.loadtxt(file, dtype=np.float64, max_rows=element.count, ndmin=2)
+        if element.rows:
+            table = np.loadtxt(file, dtype=np.float64, max_rows=element.rows, ndmin=2)
     except ValueError as error:
         raise ValueError(
-            f"{path}: expected {element.count} rows of numbers, but they cannot be parsed ({error}); write the file again"
+            f"{path}: expected {element.rows} rows of numbers, but they cannot be parsed ({error}); write the file again"
         ) from error
-    if table.shape != (element.count, len(element.properties)):
+    if table.shape != (element.rows, len(element.properties)):
         raise ValueError(
-            f"{path}: expected {element.count} rows of {len(element.properties)} numbers, got {table.shape}"
+            f"{path}: expected {element.rows} rows of {len(element.properties)} numbers, got {table.shape}"
         )
     return {name: table[:, i].astype(code) for i, (name, code) in enumerate(element.properties)}
 
@@ -118,19 +118,19 @@ def _parse_rows(path: Path, file: BinaryIO, element: _Element) -> Columns:
 def _read_element(path: Path, file: BinaryIO, element: _Element, layout: str, left: int) -> Columns:
     """Read the rows of one element from where `file` stands, if the `left` bytes of the file can hold them."""
     if layout == "ascii":
-        if element.count * 2 * len(element.properties) > left + 1:  # a digit and a separator each, at the very least
+        if element.rows * 2 * len(element.properties) > left + 1:  # a digit and a separator each, at the very least
             raise ValueError(
-                f"{path}: the header promises {element.count} {_plural(element)}, but the file is too short; it is truncated"
+                f"{path}: the header promises {element.rows} {_plural(element)}, but the file is too short; it is truncated"
             )
         return _parse_rows(path, file, element)
     order = "<" if layout == "binary_little_endian" else ">"
     dtype = np.dtype([(name, order + code) for name, code in element.properties])
-    if element.count * dtype.itemsize > left:
+    if element.rows * dtype.itemsize > left:
         raise ValueError(
-            f"{path}: the header promises {element.count} {_plural(element)} of {dtype.itemsize} bytes, but only {left} bytes "
+            f"{path}: the header promises {element.rows} {_plural(element)} of {dtype.itemsize} bytes, but only {left} bytes "
             "follow; the file is truncated"
         )
-    rows = np.fromfile(file, dtype=dtype, count=element.count)
+    rows = np.fromfile(file, dtype=dtype, count=element.rows)
     return {name: np.ascontiguousarray(rows[name].astype(code)) for name, code in element.properties}
 
 
@@ -156,7 +156,7 @@ def other_elements(path: str | Path) -> list[str]:
     with path.open("rb") as file:
         header = _parse_header(path, file)
     _check_vertex(path, header)
-    return [element.name for element in header.elements[1:] if element.count]
+    return [element.name for element in header.elements[1:] if element.rows]
 
 
 def read_comments(path: str | Path) -> list[str]:

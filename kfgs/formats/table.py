@@ -26,8 +26,11 @@ from .sidecar import read_sidecar, write_sidecar
 from .splat_file import SplatFile
 
 MODULES = (  # asked in this order: compressed PLY before PLY, whose ending it shares
+    "compressed_ply",
     "ply_3dgs",
     "spz",
+    "sog",
+    "gltf",
     "ksplat",
     "splat",
 )

@@ -1,0 +1,108 @@
+"""Few values that stand for many: codebooks of 256 numbers and palettes of rows, by k-means without chance."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+CODES = 256  # numbers in a codebook: an index is one byte
+_PASSES = 30  # of Lloyd's algorithm on the line
+_ROW_PASSES = 4  # on rows; 10 lower the error by 1 % and take 3 times as long (100,000 rows of 45, palette 65,536)
+_BLOCK = 1 << 22  # distances at a time, 16 MiB
+
+
+def fit_codebook(
+    values: NDArray[np.float64],  # [N]
+) -> NDArray[np.float32]:  # [256], ascending
+    """256 numbers near which all values lie: Lloyd's algorithm on the line, exact in each pass.
+
+    Starts from quantiles, half of them by rank and half by value, so that outliers get numbers too. Up to 256 different
+    values are kept as they are.
+    """
+    ordered = np.sort(values.ravel())
+    different = np.unique(ordered.astype(np.float32))
+    if len(different) <= CODES:
+        different = different if len(different) else np.zeros(1, np.float32)
+        return np.concatenate([different, np.full(CODES - len(different), different[-1])]).astype(np.float32)
+    sums = np.concatenate([[0.0], np.cumsum(ordered)])
+    by_rank = np.quantile(ordered, (np.arange(CODES // 2) + 0.5) / (CODES // 2))
+    centers = np.sort(np.concatenate([by_rank, np.linspace(ordered[0], ordered[-1], CODES // 2)]))
+    for _ in range(_PASSES):
+        ends = np.concatenate([[0], np.searchsorted(ordered, (centers[1:] + centers[:-1]) / 2), [len(ordered)]])
+        counts = np.diff(ends)
+        means = np.diff(sums[ends]) / np.maximum(counts, 1)
+        centers = np.sort(np.where(counts > 0, means, centers))
+    return centers.astype(np.float32)
+
+
+def nearest_codes(
+    codebook: NDArray[np.float32],  # [256], ascending
+    values: NDArray[np.float64],  # [...]
+) -> NDArray[np.uint8]:  # [...]
+    """The index of the number nearest to each value; of two equally near ones the smaller."""
+    middles = (codebook[1:].astype(np.float64) + codebook[:-1]) / 2
+    return np.searchsorted(middles, values).astype(np.uint8)
+
+
+class Palette(NamedTuple):
+    """Rows that stand for many."""
+
+    rows: Tensor  # [K, D]
+    labels: Tensor  # [N] int64 into rows
+
+
+def fit_palette(
+    rows: Tensor,  # [N, D]
+    size: int,
+) -> Palette:
+    """At most `size` rows near which all rows lie, by k-means in two levels.
+
+    The rows are parted into about sqrt(size) groups, and each group gets a share of the palette in proportion to the rows
+    in it. That costs N 2 sqrt(size) distances a pass where one level costs N size. Starting rows are evenly spaced, so
+    give rows in an order where neighbours are alike. Nothing is lost where `size` is N or more.
+    """
+    if len(rows) <= size:
+        return Palette(rows, torch.arange(len(rows)))
+    groups = _fit_means(rows, max(1, round(math.sqrt(size)))).labels
+    order = torch.argsort(groups, stable=True)
+    counts = torch.bincount(groups)
+    shares = _share(counts, size)
+    labels = torch.empty(len(rows), dtype=torch.int64)
+    parts: list[Tensor] = []
+    for members, share in zip(order.split(counts.tolist()), shares, strict=True):
+        if len(members):
+            part = _fit_means(rows[members], share)
+            labels[members] = part.labels + sum(map(len, parts))
+            parts.append(part.rows)
+    return Palette(torch.cat(parts), labels)
+
+
+def _share(counts: Tensor, size: int) -> list[int]:
+    """Whole parts of `size` in proportion to the counts, at least 1 where there is something, never more than it."""
+    filled = int((counts > 0).sum())
+    parts = (counts * (size - filled) // int(counts.sum())) + (counts > 0).long()
+    return torch.minimum(parts, counts).tolist()
+
+
+def _fit_means(rows: Tensor, size: int) -> Palette:
+    """Lloyd's algorithm from evenly spaced rows; a mean that no row is nearest to stays where it is."""
+    if len(rows) <= size:
+        return Palette(rows, torch.arange(len(rows)))
+    means = rows[torch.arange(size) * len(rows) // size].clone()
+    for _ in range(_ROW_PASSES):
+        labels = _nearest_rows(rows, means)
+        counts = torch.bincount(labels, minlength=size)
+        sums = torch.zeros_like(means).index_add_(0, labels, rows)
+        means = torch.where(counts[:, None] > 0, sums / counts.clamp(min=1)[:, None], means)
+    return Palette(means, _nearest_rows(rows, means))
+
+
+def _nearest_rows(rows: Tensor, means: Tensor) -> Tensor:  # [N] int64
+    lengths = (means**2).sum(1)
+    blocks = rows.split(max(1, _BLOCK // len(means)))
+    return torch.cat([torch.addmm(lengths, block, means.T, alpha=-2).argmin(1) for block in blocks])
