@@ -1,6 +1,8 @@
 """Labels: classes of codewords, pixels and Gaussians, their transfer to the colour field, and edits (Sec. 3.4)."""
 
+from .answer import Answer, BestView, answer, answers, view_shares
 from .average import ViewAverage, average_views
+from .boxes import OrientedBox
 from .classify import (
     Classification,
     CodewordLabels,
@@ -11,12 +13,13 @@ from .classify import (
     select_like,
 )
 from .color import parse_color
+from .components import component_distance, component_numbers, components, select_near
 from .edit import extract, recolor, remove
 from .edits import Duplicate, Edit, EditList, Extract, Insert, Move, Opacity, Recolor, Remove, Turn, join
 from .names import class_index
 from .relevancy import relevancy, select_by_similarity
 from .segment import label_pixels, nearest_codeword
-from .selection import Selection, select_by_label, select_where
+from .selection import Selection, select_by_label, select_in_box, select_in_sphere, select_where
 from .threshold import similarity_threshold
 from .transfer import Transfer, transfer_labels
 from .transfer_distance import default_distance
@@ -25,6 +28,8 @@ from .where import AboveScore, Both, Component, Either, Everything, InBox, InSph
 
 __all__ = [
     "AboveScore",
+    "Answer",
+    "BestView",
     "Both",
     "Classification",
     "CodewordLabels",
@@ -43,6 +48,7 @@ __all__ = [
     "OfClass",
     "OfIndex",
     "Opacity",
+    "OrientedBox",
     "Recolor",
     "Remove",
     "Selection",
@@ -51,9 +57,14 @@ __all__ = [
     "ViewAverage",
     "Votes",
     "Where",
+    "answer",
+    "answers",
     "average_views",
     "class_index",
     "classify",
+    "component_distance",
+    "component_numbers",
+    "components",
     "default_distance",
     "extract",
     "join",
@@ -68,9 +79,13 @@ __all__ = [
     "select_by_label",
     "select_by_query",
     "select_by_similarity",
+    "select_in_box",
+    "select_in_sphere",
     "select_like",
+    "select_near",
     "select_where",
     "similarity_threshold",
     "transfer_labels",
+    "view_shares",
     "vote_labels",
 ]

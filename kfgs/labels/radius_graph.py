@@ -35,8 +35,9 @@ def radius_components(
         return np.zeros(0, dtype=np.int64)
     first, cell, keys, steps = _cells(points, distance)
     k = min(NEIGHBOURS + 1, n)
-    near, index = cKDTree(points).query(points, k=k, distance_upper_bound=distance * (1 + 1e-9), workers=-1)
-    near, index = near.reshape(n, k), index.reshape(n, k)
+    reach = distance * (1 + 1e-9)  # scipy's bound is strict, ours is not
+    found = cKDTree(points).query(points, k=k, distance_upper_bound=reach, workers=-1)
+    near, index = (np.reshape(part, (n, k)) for part in found)
     hit = near <= distance
     a, b = np.repeat(np.arange(n), k)[hit.ravel()], index.ravel()[hit.ravel()]
     part = _united(n, np.concatenate([a, np.arange(n)]), np.concatenate([b, first[cell]]))
@@ -92,7 +93,7 @@ def _compared(
     many = left[1] * right[1]
     for i in np.flatnonzero(many > BLOCK):
         a, b = (rows[side[0][i] : side[0][i] + side[1][i]] for side in (left, right))
-        near, index = cKDTree(points[b]).query(points[a], distance_upper_bound=distance * (1 + 1e-9))
+        near, index = (np.atleast_1d(part) for part in cKDTree(points[b]).query(points[a]))
         best = int(np.argmin(near))
         if near[best] <= distance:
             found.append((a[best : best + 1], b[index[best : best + 1]]))

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .._check import check_shapes
+from .._check import check_range, check_shapes
 from ..gaussians import Gaussians
 from ._rows import check_finite
+from .boxes import OrientedBox
 from .names import class_index
 
 
@@ -127,3 +128,48 @@ def select_by_label(
         return select_where(mask, how)
     check_shapes(("gaussians.labels", gaussians.labels, "N"), ("scores", scores, "N"))
     return Selection(mask, scores, None, how)
+
+
+def select_in_box(
+    means: Tensor,  # [N, 3]
+    box: OrientedBox | tuple[Sequence[float] | Tensor, Sequence[float] | Tensor],
+) -> Selection:
+    """Select the Gaussians whose means lie in a box, or on its faces.
+
+    Args:
+        means: positions, in world units.
+        box: an oriented box, or the lowest and the highest corner of an axis-aligned one.
+
+    Raises:
+        ValueError: if shapes disagree, a number is not finite, or the lowest corner is above the highest.
+    """
+    check_shapes(("means", means, "N 3"))
+    check_finite("means", means)
+    if not isinstance(box, OrientedBox):
+        box = OrientedBox.between(*box)
+    size = " x ".join(f"{2 * float(half):.4g}" for half in box.half)
+    return select_where(box.contains(means), f"in a box of {size}")
+
+
+def select_in_sphere(
+    means: Tensor,  # [N, 3]
+    center: Sequence[float] | Tensor,  # [3]
+    radius: float,
+) -> Selection:
+    """Select the Gaussians whose means are at most `radius` from a point.
+
+    Args:
+        means: positions, in world units.
+        center: the point.
+        radius: in world units.
+
+    Raises:
+        ValueError: if shapes disagree, a number is not finite, or the radius is negative.
+    """
+    place = torch.as_tensor(center, dtype=torch.float64, device=means.device)
+    check_shapes(("means", means, "N 3"), ("center", place, "3"))
+    check_finite("means", means)
+    check_finite("center", place)
+    check_range("radius", radius, 0)
+    inside = ((means.double() - place) ** 2).sum(dim=1) <= radius**2
+    return select_where(inside, f"within {radius:.4g} of ({', '.join(f'{x:.4g}' for x in place.tolist())})")

@@ -1,0 +1,216 @@
+"""The answer to "where is the chair?": how many Gaussians, where, how large, and from where it is best seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .._check import check_shapes, check_whole
+from ..cameras import Camera
+from ..gaussians import Gaussians
+from ..splat import rasterize
+from ._rows import check_finite
+from .boxes import OrientedBox
+from .components import component_numbers
+from .selection import Selection
+
+LONGEST = (
+    160  # pixels of the longer side of the views that are compared; shares change by less than 0.2 % of the picture
+)
+TOGETHER = 16  # answers drawn in one rendering, as channels
+SPECK = 0.05  # a part with less than this share of the largest is no answer of its own
+
+
+@dataclass(frozen=True)
+class BestView:
+    """The camera that shows a selection largest."""
+
+    camera: str  # its name
+    index: int  # its place among the cameras asked
+    share: float  # of the picture that the selection fills, in [0, 1): what hides it and what it lets through count
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What a selection is, as numbers. Positions are those of the Gaussians' centres, in world units."""
+
+    indices: Tensor  # [n] int64, ascending
+    score: float  # mean score of the selected
+    centroid: Tensor  # [3] mean position
+    box: OrientedBox  # a small box around the centres
+    extent: tuple[Tensor, Tensor]  # lowest and highest corner [3] along the world's axes
+    best_view: BestView | None  # None without cameras, or where no camera shows any of it
+    how: str  # how it was selected
+
+    @property
+    def count(self) -> int:
+        """How many Gaussians."""
+        return len(self.indices)
+
+    @property
+    def volume(self) -> float:
+        """Of the oriented box, in cubed world units."""
+        return self.box.volume
+
+    def __repr__(self) -> str:
+        place = ", ".join(f"{x:.3g}" for x in self.centroid.tolist())
+        size = " x ".join(f"{2 * x:.3g}" for x in self.box.half.tolist())
+        view = "" if self.best_view is None else f", {self.best_view.share:.1%} of {self.best_view.camera!r}"
+        return f"Answer({self.count} Gaussians at ({place}), {size}, score {self.score:.3f}{view})"
+
+    def to_json(self, indices: bool = True) -> dict[str, Any]:
+        """Plain numbers, lists and strings; the list of Gaussians can be left out, as it may be long."""
+        view = self.best_view
+        return {
+            "count": self.count,
+            "score": self.score,
+            "centroid": self.centroid.tolist(),
+            "box": self.box.to_json(),
+            "extent": [corner.tolist() for corner in self.extent],
+            "volume": self.volume,
+            "best_view": None if view is None else {"camera": view.camera, "index": view.index, "share": view.share},
+            "how": self.how,
+        } | ({"indices": self.indices.tolist()} if indices else {})
+
+
+def answer(
+    gaussians: Gaussians,
+    selection: Selection,
+    cameras: Sequence[Camera] | None = None,
+    *,
+    engine: str = "auto",
+) -> Answer:
+    """Describe a selection as a whole; `answers` describes each of its connected parts.
+
+    Args:
+        gaussians: the cloud that was selected in.
+        selection: at least one Gaussian.
+        cameras: views to choose the best one from, without distortion.
+        engine: compositing engine.
+
+    Raises:
+        ValueError: if nothing is selected, shapes disagree, or a selected position is not finite.
+    """
+    check_shapes(("gaussians.means", gaussians.means, "N 3"), ("selection.mask", selection.mask, "N"))
+    if not bool(selection.mask.any()):
+        raise ValueError(
+            f"selection: expected at least one Gaussian, got none ({selection.words}); lower the threshold, or ask for "
+            "something else"
+        )
+    return _described(gaussians, selection, [selection.indices], [selection.how], cameras, engine)[0]
+
+
+def answers(
+    gaussians: Gaussians,
+    selection: Selection,
+    cameras: Sequence[Camera] | None = None,
+    *,
+    distance: float | None = None,
+    smallest: int | None = None,
+    most: int = 100,
+    engine: str = "auto",
+) -> list[Answer]:
+    """One answer for each connected part of a selection ("the four chairs"), largest first.
+
+    Args:
+        gaussians: the cloud that was selected in.
+        selection: perhaps empty: then there is no answer, and the list is empty.
+        cameras: as in `answer`.
+        distance: how far apart connected Gaussians may be, in world units; see `component_numbers`.
+        smallest: parts of fewer Gaussians are left out; None leaves out those below 5 % of the largest.
+        most: how many answers at most.
+        engine: compositing engine.
+
+    Raises:
+        ValueError: if shapes disagree, a position is not finite, or a number is out of range.
+    """
+    check_shapes(("gaussians.means", gaussians.means, "N 3"), ("selection.mask", selection.mask, "N"))
+    check_whole("most", most, 1)
+    if smallest is not None:
+        check_whole("smallest", smallest, 1)
+    numbers = component_numbers(gaussians.means, selection.mask, distance)
+    sizes = torch.bincount(numbers[selection.mask])
+    if len(sizes) == 0:
+        return []
+    least = SPECK * int(sizes[0]) if smallest is None else smallest
+    kept = int((sizes[:most] >= least).sum())
+    order = torch.argsort(numbers, stable=True)[int((numbers < 0).sum()) :]  # part by part, ascending in each
+    parts = list(order.split(sizes.tolist())[:kept])
+    how = [f"{selection.how}; part {i + 1} of {len(sizes)}" for i in range(kept)]
+    return _described(gaussians, selection, parts, how, cameras, engine)
+
+
+def view_shares(
+    gaussians: Gaussians,
+    parts: Sequence[Tensor],  # P index tensors [n] int64
+    cameras: Sequence[Camera],
+    *,
+    engine: str = "auto",
+) -> Tensor:  # [C, P]
+    """The share of each camera's picture that each part fills: the mean over pixels of its rendering weights w = T alpha.
+
+    What lies in front hides a part, and a transparent part counts by its opacity. Pictures are drawn with at most 160
+    pixels a side, 16 parts at a time.
+
+    Args:
+        gaussians: the whole cloud.
+        parts: indices of the Gaussians of each part; parts may overlap.
+        cameras: views without distortion.
+        engine: compositing engine.
+    """
+    shares = torch.zeros(len(cameras), len(parts), dtype=gaussians.means.dtype, device=gaussians.means.device)
+    with torch.no_grad():
+        for start in range(0, len(parts), TOGETHER):
+            some = parts[start : start + TOGETHER]
+            member = torch.zeros(len(gaussians), len(some)).to(gaussians.means)
+            for i, part in enumerate(some):
+                member[part, i] = 1
+            marked = gaussians.replace(features=member, sh=None)
+            for c, camera in enumerate(cameras):
+                scale = min(1.0, LONGEST / max(camera.size))
+                small = camera.resized(*(max(1, round(side * scale)) for side in camera.size))
+                shares[c, start : start + len(some)] = rasterize(marked, small, engine=engine).map.mean(dim=(0, 1))
+    return shares
+
+
+def _described(
+    gaussians: Gaussians,
+    selection: Selection,
+    parts: list[Tensor],
+    how: list[str],
+    cameras: Sequence[Camera] | None,
+    engine: str,
+) -> list[Answer]:
+    views = [None] * len(parts) if not cameras else _best_views(gaussians, parts, cameras, engine)
+    return [
+        _answer(gaussians.means[part], selection.scores[part], part, view, why)
+        for part, view, why in zip(parts, views, how, strict=True)
+    ]
+
+
+def _best_views(
+    gaussians: Gaussians, parts: list[Tensor], cameras: Sequence[Camera], engine: str
+) -> list[BestView | None]:
+    shares = view_shares(gaussians, parts, cameras, engine=engine)
+    return [
+        BestView(cameras[c].name, c, share) if share > 0 else None
+        for share, c in ((float(column.max()), int(column.argmax())) for column in shares.T)
+    ]
+
+
+def _answer(means: Tensor, scores: Tensor, indices: Tensor, view: BestView | None, how: str) -> Answer:
+    check_finite("gaussians.means", means)
+    points = means.detach().double()
+    return Answer(
+        indices=indices,
+        score=float(scores.double().mean()),
+        centroid=points.mean(dim=0),
+        box=OrientedBox.around(points),
+        extent=(points.amin(dim=0), points.amax(dim=0)),
+        best_view=view,
+        how=how,
+    )
