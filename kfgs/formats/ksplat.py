@@ -132,8 +132,9 @@ def _read_section(
             raise ValueError(f"{path}: expected bucket centres of 12 bytes, got {s.bucket_bytes}; the file is damaged")
         centres = np.frombuffer(data, "<f4", 3 * s.buckets, centres_at).reshape(-1, 3)
         quantum = s.quantum or 32767
-        offsets = (means - quantum) * np.float32(s.block_size / 2 / quantum)
-        means = offsets + centres[_buckets(path, s, lengths)]
+        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused below
+            offsets = (means - quantum) * np.float32(s.block_size / 2 / quantum)
+            means = offsets + centres[_buckets(path, s, lengths)]
     scales, quats = rows["scales"].astype(np.float32), rows["quats"].astype(np.float32)
     sh = rows["sh"].astype(np.float32)
     if level == 2:
@@ -141,7 +142,8 @@ def _read_section(
     check_finite(path, positions=means, scales=scales, rotations=quats, harmonics=sh)
     rgba = torch.from_numpy(rows["rgba"].astype(np.float32)) / 255
     rest = torch.zeros(s.size, (degree + 1) ** 2 - 1, 3)
-    rest[:, : (s.degree + 1) ** 2 - 1] = torch.from_numpy(_by_coefficient(sh))
+    if s.size:  # the degree of an empty section says nothing
+        rest[:, : (s.degree + 1) ** 2 - 1] = torch.from_numpy(_by_coefficient(sh))
     gaussians = Gaussians(
         means=torch.from_numpy(means),
         quats=unit_quats(torch.from_numpy(quats)),

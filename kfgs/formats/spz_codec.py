@@ -61,10 +61,10 @@ def pack(g: Gaussians, version: int, fractional_bits: int, sh_bits: tuple[int, i
     fixed = (g.means * 2**fractional_bits).round().to(torch.int32).numpy()
     low, high = LOG_SCALES
     quats = unit_quats(g.quats).numpy()
-    rest = (g.sh[:, 1:] * 128 + 128).round().clamp(0, 255)
+    rest = g.sh[:, 1:] * 128 + 128
     for part, bits in ((rest[:, :3], sh_bits[0]), (rest[:, 3:], sh_bits[1])):
-        bucket = 1 << (8 - bits)
-        part.copy_(((part + bucket // 2) / bucket).floor().mul(bucket).clamp(0, 256 - bucket))
+        bucket = 2 ** (8 - bits)  # steps of a byte that become one
+        part.copy_((part / bucket + 0.5).floor().mul(bucket).clamp(0, 256 - bucket))
     return {
         "positions": np.ascontiguousarray(fixed.astype("<i4")[..., None].view(np.uint8)[..., :3]).reshape(-1),
         "alphas": _bytes(g.opacities * 255),

@@ -1,0 +1,116 @@
+import numpy as np
+import pytest
+import torch
+from oracles_precision import assert_within, rotation_angles
+
+from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs.formats.splat import precision, read, write
+from kfgs.gaussians import Gaussians
+
+
+def _cloud(n: int = 500, degree: int = 0) -> Gaussians:
+    g = torch.Generator().manual_seed(5)
+    return Gaussians(
+        means=torch.randn(n, 3, generator=g),
+        quats=torch.randn(n, 4, generator=g),
+        scales=torch.rand(n, 3, generator=g) + 1e-4,
+        opacities=torch.rand(n, generator=g) * 0.98 + 0.01,
+        sh=torch.rand(n, (degree + 1) ** 2, 3, generator=g) * 3 - 1.5,
+    )
+
+
+def test_a_record_by_hand(tmp_path):
+    bytes_ = np.float32([1.5, -2, 3, 0.1, 0.2, 0.4]).tobytes() + bytes([0, 255, 102, 51, 128, 192, 64, 0])
+    (tmp_path / "a.splat").write_bytes(bytes_)
+    g = read(tmp_path / "a.splat").gaussians
+    np.testing.assert_array_equal(g.means, np.float32([[1.5, -2, 3]]))
+    np.testing.assert_array_equal(g.scales, np.float32([[0.1, 0.2, 0.4]]))
+    np.testing.assert_allclose(0.5 + 0.28209479177387814 * g.sh[0, 0], [0, 1, 0.4], atol=1e-6)
+    np.testing.assert_allclose(g.opacities, [0.2])
+    quat = np.array([[0, 0.5, -0.5, -1]])  # w, x, y, z
+    assert rotation_angles(g.quats.numpy(), quat).max() < 1e-3
+    assert rotation_angles(g.quats.numpy(), quat[:, [3, 0, 1, 2]]).max() > 0.5  # read as x, y, z, w it is another
+
+
+def test_a_cloud_comes_back_as_exactly_as_stated(tmp_path):
+    cloud = _cloud()
+    assert write(tmp_path / "a.splat", SplatFile(cloud)) == ()
+    assert (tmp_path / "a.splat").stat().st_size == 500 * 32
+    back, stated = read(tmp_path / "a.splat").gaussians, precision(cloud)
+    assert_within(back, cloud, stated)
+    assert (back.sh - cloud.sh).abs().max() > 0.9 * stated.sh0
+    assert (back.opacities - cloud.opacities).abs().max() > 0.9 * stated.opacities
+    assert rotation_angles(back.quats.numpy(), cloud.quats.numpy()).max() > 0.5 * stated.rotation
+
+
+def test_rotations_about_an_axis_are_exact(tmp_path):
+    cloud = _cloud(8).replace(quats=torch.cat([torch.eye(4), -torch.eye(4)]) * 3)
+    write(tmp_path / "a.splat", SplatFile(cloud))
+    assert rotation_angles(read(tmp_path / "a.splat").gaussians.quats.numpy(), cloud.quats.numpy()).max() == 0
+    stored = np.fromfile(tmp_path / "a.splat", np.uint8).reshape(8, 32)[:, 28:]
+    assert set(stored.ravel()) == {0, 128}  # -1 has a byte, +1 has none: a viewer that does not normalise is right too
+
+
+@pytest.mark.parametrize("name", ["inria_9080.ply", "minimal.splat", "biker.spz"])
+def test_real_files_survive(tmp_path, shared_data, name):
+    cloud = read_splats(shared_data / "splats" / name).gaussians
+    written = write_splats(tmp_path / "a.splat", cloud)
+    back = read_splats(tmp_path / "a.splat").gaussians
+    assert_within(back, cloud, precision(cloud))
+    lost = {"inria_9080.ply": ("spherical harmonics of degree 3: .splat holds the base colour only",)}
+    assert written.lost == lost.get(name, ())
+
+
+def test_labels_go_beside(tmp_path):
+    splats = SplatFile(_cloud().replace(labels=torch.arange(500) % 3 - 1), {"score": np.ones(500)}, ("rug", "sofa"))
+    written = write_splats(tmp_path / "a.splat", splats)
+    assert len(written.paths) == 3
+    assert written.lost == ()
+    back = read_splats(tmp_path / "a.splat")
+    assert back.gaussians.labels.tolist() == splats.gaussians.labels.tolist()
+    assert back.classes == ("rug", "sofa")
+
+
+def test_what_is_cut_off_is_in_the_precision(tmp_path):
+    cloud = _cloud(3)
+    cloud.sh[1, 0, 2] = 4.0
+    write(tmp_path / "a.splat", SplatFile(cloud))
+    assert precision(cloud).sh0 == pytest.approx(4 - 0.5 / 0.28209479177387814, rel=1e-3)
+    assert_within(read(tmp_path / "a.splat").gaussians, cloud, precision(cloud))
+
+
+def test_an_empty_file_is_an_empty_cloud(tmp_path):
+    write(tmp_path / "a.splat", SplatFile(_cloud(0)))
+    assert (tmp_path / "a.splat").read_bytes() == b""
+    assert read(tmp_path / "a.splat").gaussians.sh.shape == (0, 1, 3)
+
+
+def test_degenerate_values_are_mended(tmp_path):
+    (tmp_path / "a.splat").write_bytes(bytes(24) + bytes([9, 9, 9, 9]) + b"\x80" * 4)
+    g = read(tmp_path / "a.splat").gaussians
+    assert g.quats.tolist() == [[1, 0, 0, 0]]
+    assert bool((g.scales == 1e-10).all())
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (bytes(63), "records of 32 bytes, got 63 bytes, 31 too many; the file is truncated"),
+        (np.float32([0, 0, np.nan, 1, 1, 1]).tobytes() + bytes(8), "finite means, got .*nan.* at Gaussian 0"),
+        (bytes(32) + np.float32([0, 0, 0, 1, np.inf, 1]).tobytes() + bytes(8), "finite scales, .* at Gaussian 1"),
+        (np.float32([0, 0, 0, 1, -1, 1]).tobytes() + bytes(8), "scales of 0 or more, got .* at Gaussian 0"),
+    ],
+)
+def test_damage_is_named(tmp_path, content, message):
+    (tmp_path / "bad.splat").write_bytes(content)
+    with pytest.raises(ValueError, match=f"bad.splat: expected {message}"):
+        read_splats(tmp_path / "bad.splat")
+
+
+def test_a_field_without_colours_is_refused(tmp_path):
+    cloud = _cloud().replace(sh=None, features=torch.zeros(500, 9))
+    with pytest.raises(ValueError, match=r"splats: expected a cloud with colours .* for .splat, got .*; write a field"):
+        write(tmp_path / "a.splat", SplatFile(cloud))
+    with pytest.raises(ValueError, match=r"opacities: expected finite values, got .*nan.* at Gaussian 0"):
+        write(tmp_path / "a.splat", SplatFile(_cloud().replace(opacities=torch.full((500,), float("nan")))))
+    assert list(tmp_path.iterdir()) == []

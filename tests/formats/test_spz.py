@@ -1,0 +1,481 @@
+import gzip
+import struct
+import tracemalloc
+
+import gsply
+import numpy as np
+import pytest
+import torch
+import zstandard
+from oracles_precision import assert_within, rotation_angles
+from oracles_spz import legacy_payload, smallest_three
+
+from kfgs.cameras import Camera
+from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs.formats import spz as module
+from kfgs.formats.spz import precision, read, write, write_spz
+from kfgs.formats.spz_codec import choose_fractional_bits, flip_axes
+from kfgs.formats.spz_labels import TYPE as LABELS
+from kfgs.formats.spz_streams import read_container
+from kfgs.gaussians import Gaussians
+from kfgs.splat import evaluate_sh, rasterize
+
+ROW = {"position": (256, -512, 768), "alpha": 51, "color": (0, 128, 255), "scale": (160, 128, 96)}
+# Odd in x, y or z, by degree: the harmonics of degree 1 are y, z, x; gsply leaves axes as they are, so a test turns them.
+TURN = torch.tensor([1.0, -1.0, -1.0])
+
+
+def _cloud(n: int = 40, degree: int = 3, seed: int = 3) -> Gaussians:
+    g = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        means=torch.randn(n, 3, generator=g) * torch.tensor([3.0, 1.0, 0.5]),
+        quats=torch.randn(n, 4, generator=g),
+        scales=torch.rand(n, 3, generator=g) * 0.4 + 0.01,
+        opacities=torch.rand(n, generator=g) * 0.9 + 0.05,
+        sh=torch.rand(n, (degree + 1) ** 2, 3, generator=g) * 1.6 - 0.8,
+    )
+
+
+def _labelled(n: int = 40) -> SplatFile:
+    score = np.linspace(0, 1, n, dtype=np.float32)
+    return SplatFile(_cloud(n).replace(labels=torch.arange(n) % 4 - 1), {"score": score}, ("rug", "sofa", "Tür"))
+
+
+def _legacy(path, rows, packed=True, **options):
+    data = legacy_payload(rows, **options)
+    path.write_bytes(gzip.compress(data) if packed else data)
+    return path
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("version", [3, 4])
+def test_a_cloud_comes_back_as_exactly_as_stated(tmp_path, degree, version):
+    cloud = _cloud(degree=degree)
+    assert write_spz(tmp_path / "a.spz", SplatFile(cloud), version=version) == ()
+    back = read(tmp_path / "a.spz")
+    assert back.info["version"] == version
+    assert_within(back.gaussians, cloud, precision(cloud))
+
+
+def test_the_stated_precision_is_not_idle(tmp_path):
+    cloud = _cloud(2000, 1)
+    write(tmp_path / "a.spz", SplatFile(cloud))
+    back, stated = read(tmp_path / "a.spz").gaussians, precision(cloud)
+    assert (back.means - cloud.means).abs().max() > 0.9 * stated.means
+    assert (back.scales / cloud.scales - 1).abs().max() > 0.9 * stated.scales
+    assert rotation_angles(back.quats.numpy(), cloud.quats.numpy()).max() > 0.5 * stated.rotation
+    assert (back.opacities - cloud.opacities).abs().max() > 0.9 * stated.opacities
+    assert (back.sh[:, 0] - cloud.sh[:, 0]).abs().max() > 0.9 * stated.sh0
+    assert (back.sh[:, 1:] - cloud.sh[:, 1:]).abs().max() > 0.9 * stated.sh_rest
+
+
+def test_version_2_keeps_rotations_as_three_bytes(tmp_path):
+    cloud = _cloud()
+    cloud = cloud.replace(quats=cloud.quats + torch.tensor([6.0, 0, 0, 0]))  # w well away from 0, where xyz say little
+    write_spz(tmp_path / "a.spz", SplatFile(cloud), version=2)
+    back = read(tmp_path / "a.spz")
+    assert back.info["version"] == 2
+    assert_within(back.gaussians, cloud, precision(cloud)._replace(rotation=0.02))
+
+
+@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_old_versions_by_hand(tmp_path, version, packed):
+    rotation = (191, 64, 200) if version < 3 else (2 << 30) | (100 << 20) | ((512 + 200) << 10) | 300
+    position = (1.5, -0.25, 1000.0) if version == 1 else ROW["position"]
+    sh = list(range(0, 72, 8))  # degree 1: y, z, x, each red, green, blue
+    rows = [ROW | {"position": position, "rotation": rotation, "sh": sh}] * 2
+    g = read(_legacy(tmp_path / "a.spz", rows, packed, version=version, degree=1, bits=8)).gaussians
+    raw = position if version == 1 else [value / 256 for value in position]
+    np.testing.assert_allclose(g.means[1], [raw[0], -raw[1], -raw[2]])
+    np.testing.assert_allclose(g.opacities[1], 0.2)
+    np.testing.assert_allclose(g.scales[1], np.exp([0.0, -2.0, -4.0]), rtol=1e-6)
+    np.testing.assert_allclose(g.sh[1, 0], [-0.5 / 0.15, (128 / 255 - 0.5) / 0.15, 0.5 / 0.15], atol=1e-6)
+    stored = (np.array(sh).reshape(3, 3) - 128) / 128
+    np.testing.assert_allclose(g.sh[1, 1:], stored * np.array([[-1], [-1], [1]]))  # y, z turn their signs, x does not
+    if version < 3:
+        x, y, z = (byte / 127.5 - 1 for byte in rotation)
+        quat = [max(0.0, 1 - x * x - y * y - z * z) ** 0.5, x, -y, -z]
+    else:
+        x, y, z, w = smallest_three(rotation)
+        quat = [w, x, -y, -z]
+    assert rotation_angles(g.quats[1:].numpy(), np.array([quat])).max() < 1e-3
+    assert abs(quat[3]) > 0.4  # a turned axis cannot hide
+
+
+@pytest.mark.parametrize("version", [3, 4])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_gsply_reads_what_is_written(tmp_path, version, degree):
+    cloud = _cloud(degree=degree)
+    write_spz(tmp_path / "a.spz", SplatFile(_labelled().gaussians.replace(sh=cloud.sh)), version=version)
+    other, ours = gsply.read_spz(str(tmp_path / "a.spz")), read(tmp_path / "a.spz").gaussians
+    np.testing.assert_allclose(other.means, ours.means * TURN, atol=1e-6)
+    np.testing.assert_allclose(np.exp(other.scales), ours.scales, rtol=1e-5)
+    quats = ours.quats * torch.tensor([1.0, 1, -1, -1])
+    assert rotation_angles(other.quats, quats.numpy()).max() < 1e-3
+    np.testing.assert_allclose(1 / (1 + np.exp(-other.opacities)), ours.opacities, atol=1e-5)
+    np.testing.assert_allclose(other.sh0, ours.sh[:, 0], atol=1e-5)
+    if degree:
+        turned = flip_axes(ours, (1, -1, -1)).sh[:, 1:]
+        np.testing.assert_allclose(other.shN, turned, atol=1e-5)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_what_gsply_writes_is_read(tmp_path, version):
+    cloud = _cloud()
+    turned = flip_axes(cloud, (1, -1, -1))
+    unit = turned.quats / turned.quats.norm(dim=1, keepdim=True)
+    data = gsply.GSData(
+        means=turned.means.numpy(),
+        scales=turned.scales.log().numpy(),
+        quats=unit.numpy(),
+        opacities=turned.opacities.logit().numpy(),
+        sh0=turned.sh[:, 0].numpy(),
+        shN=turned.sh[:, 1:].contiguous().numpy(),
+    )
+    gsply.write_spz(str(tmp_path / "a.spz"), data, version=version)
+    back = read(tmp_path / "a.spz")
+    assert back.info["fractional_bits"] == 12
+    assert_within(back.gaussians, cloud, precision(cloud)._replace(means=2.0**-13 + 1e-6))
+
+
+def test_turned_axes_show_the_same_colours():
+    cloud, directions = _cloud(), torch.nn.functional.normalize(_cloud(seed=9).means, dim=1)
+    for axes in ((1, -1, -1), (-1, 1, 1), (1, 1, -1)):
+        turned = flip_axes(cloud, axes)
+        sign = torch.tensor(axes, dtype=torch.float32)
+        seen = evaluate_sh(turned.sh, directions * sign)
+        torch.testing.assert_close(seen, evaluate_sh(cloud.sh, directions))
+        again = flip_axes(turned, axes)
+        torch.testing.assert_close(again.quats, cloud.quats)
+        torch.testing.assert_close(again.means, cloud.means)
+
+
+def test_biker_agrees_with_the_compressed_ply_of_the_same_scene(shared_data):
+    ours = read_splats(shared_data / "splats" / "biker.spz").gaussians
+    other = gsply.plyread(str(shared_data / "splats" / "biker.compressed.ply"))  # axes of the PLY
+    assert len(ours) == len(other.means) == 152746
+    assert np.abs(ours.means.numpy() - other.means).max() < 4e-3  # 11 bits over a chunk against 12 after the point
+    logs = other.scales.clip(-10, None)
+    assert np.abs(ours.scales.log().numpy() - logs).max() < 1 / 32 + 0.01
+    angles = rotation_angles(ours.quats.numpy(), other.quats)
+    assert np.quantile(angles, 0.999) < 0.01
+    assert np.abs(ours.opacities.numpy() - 1 / (1 + np.exp(-other.opacities))).max() < 0.005
+    assert np.abs(ours.sh[:, 0].numpy() - other.sh0).max() < 0.03
+
+
+def test_fixtures_hold_four_splats(shared_data):
+    expected = read_splats(shared_data / "splats" / "minimal.splat").gaussians
+    for name in ("minimal-v3.spz", "minimal-v4.spz"):
+        g = read_splats(shared_data / "splats" / name).gaussians
+        torch.testing.assert_close(g.means, expected.means)
+        torch.testing.assert_close(g.scales, expected.scales, rtol=0.02, atol=0)
+        torch.testing.assert_close(g.opacities, expected.opacities)
+        torch.testing.assert_close(g.sh, expected.sh, rtol=0, atol=0.02)
+    plain, packed = (read(shared_data / "splats" / name) for name in ("minimal-raw.spz", "minimal-v2.spz"))
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        torch.testing.assert_close(getattr(plain.gaussians, name), getattr(packed.gaussians, name), rtol=0, atol=0)
+    torch.testing.assert_close(packed.gaussians.means * TURN, expected.means)  # made without turning the axes
+
+
+@pytest.mark.parametrize("name", ["biker.spz", "inria_9080.ply", "minimal-v4.spz"])
+def test_real_files_survive(tmp_path, shared_data, name):
+    cloud = read_splats(shared_data / "splats" / name).gaussians
+    write_splats(tmp_path / "a.spz", cloud)
+    back = read_splats(tmp_path / "a.spz").gaussians
+    assert_within(back, cloud, precision(cloud))
+    write_splats(tmp_path / "b.spz", back)
+    once, twice = (read_container(tmp_path / f"{letter}.spz").streams for letter in "ab")
+    for stream in ("positions", "alphas", "colors", "scales", "sh"):
+        assert np.array_equal(once[stream], twice[stream]), stream  # rounding twice is rounding once
+    assert np.mean(once["rotations"] == twice["rotations"]) > 0.99  # which of two equal components is the largest
+
+
+@pytest.mark.parametrize(("sh_bits", "at_least"), [((8, 8), 45), ((5, 5), 40)])
+def test_a_picture_of_the_written_cloud_is_the_same(tmp_path, shared_data, sh_bits, at_least):
+    cloud = read_splats(shared_data / "splats" / "inria_9080.ply").gaussians
+    write_spz(tmp_path / "a.spz", SplatFile(cloud), sh_bits=sh_bits)
+    camera = Camera(torch.eye(4), torch.tensor([[90.0, 0, 64], [0, 90, 48], [0, 0, 1]]), 128, 96)
+    before = rasterize(cloud, camera).map.clamp(0, 1)
+    after = rasterize(read(tmp_path / "a.spz").gaussians, camera).map.clamp(0, 1)
+    assert before.std() > 0.1
+    assert -10 * (before - after).square().mean().log10() > at_least
+
+
+def test_fewer_bits_of_harmonics_make_a_smaller_file(tmp_path, shared_data):
+    splats = read_splats(shared_data / "splats" / "inria_9080.ply")
+    write_spz(tmp_path / "a.spz", splats)
+    write_spz(tmp_path / "b.spz", splats, sh_bits=(5, 4))
+    small, large = ((tmp_path / name).stat().st_size for name in ("b.spz", "a.spz"))
+    assert small < 0.75 * large
+    error = (read(tmp_path / "b.spz").gaussians.sh - splats.gaussians.sh).abs()
+    assert error[:, 1:4].max() <= 1 / 32 + 1e-5
+    assert 1 / 32 < error[:, 4:].max() <= 1 / 16 + 1e-5
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_labels_travel_inside(tmp_path, version):
+    splats = _labelled()
+    write_spz(tmp_path / "a.spz", splats, version=version)
+    back = read(tmp_path / "a.spz")
+    assert back.gaussians.labels.tolist() == splats.gaussians.labels.tolist()
+    np.testing.assert_array_equal(back.extra["score"], splats.extra["score"])
+    assert back.classes == ("rug", "sofa", "Tür")
+    assert back.info["extensions"] == []
+
+
+def test_labels_through_the_table_need_no_file_beside(tmp_path):
+    splats = _labelled()
+    written = write_splats(tmp_path / "a.spz", splats)
+    assert not (tmp_path / "a.spz.labels.npz").exists()
+    for path in written.paths[1:]:
+        path.unlink()  # a.classes.json
+    back = read_splats(tmp_path / "a.spz")
+    assert back.classes == splats.classes
+    assert back.gaussians.labels.tolist() == splats.gaussians.labels.tolist()
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_unknown_extensions_are_skipped_and_listed(tmp_path, version, monkeypatch):
+    monkeypatch.setattr(module, "LABELS", 0x12340007)  # written by a program that kfgs does not know
+    write_spz(tmp_path / "a.spz", _labelled(), version=version)
+    monkeypatch.undo()
+    back = read(tmp_path / "a.spz")
+    assert back.gaussians.labels is None
+    assert back.info["extensions"] == ["0x12340007"]
+
+
+@pytest.mark.parametrize(("value", "signs"), [(0, (1, -1, -1)), (4, (1, -1, -1)), (6, (1, 1, 1)), (7, (-1, -1, 1))])
+def test_the_axes_of_adobes_record_are_obeyed(tmp_path, value, signs):
+    record = struct.pack("<III", 0xADBE0003, 4, value)
+    rows = [ROW | {"rotation": 0xC0000000}]
+    path = _legacy(tmp_path / "a.spz", rows, version=3, bits=8, flags=2, extensions=record)
+    np.testing.assert_array_equal(read(path).gaussians.means[0], np.array([1, -2, 3]) * signs)
+
+
+def test_antialiasing_is_kept(tmp_path):
+    splats = SplatFile(_cloud(), info={"antialiased": True})
+    write_spz(tmp_path / "a.spz", splats, version=3)
+    again = read(tmp_path / "a.spz")
+    write(tmp_path / "b.spz", again)
+    assert read(tmp_path / "b.spz").info["antialiased"] is True
+    assert (tmp_path / "b.spz").read_bytes()[14] == 1
+
+
+def test_harmonics_of_degree_4_are_cut_and_told(tmp_path):
+    rows = [ROW | {"rotation": 0xC0000000, "sh": [128 + i for i in range(72)]}]
+    splats = read(_legacy(tmp_path / "a.spz", rows, version=3, degree=4))
+    assert splats.gaussians.sh.shape == (1, 16, 3)
+    assert splats.gaussians.sh[0, 15, 2] == 44 / 128  # x (x^2 - 3 y^2) keeps its sign
+    assert "degree 4" in splats.info["dropped"]
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_empty_clouds_survive(tmp_path, version):
+    for degree in (0, 3):
+        empty = _cloud(0, degree).replace(labels=torch.zeros(0, dtype=torch.int64))
+        write_spz(tmp_path / "a.spz", SplatFile(empty), version=version)
+        back = read(tmp_path / "a.spz").gaussians
+        assert back.sh.shape == (0, (degree + 1) ** 2, 3)
+        assert len(back.labels) == 0
+
+
+def test_several_gzip_members_are_one_stream(tmp_path):
+    data = legacy_payload([ROW | {"rotation": 0xC0000000}] * 5, version=3)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(data[:30]) + gzip.compress(data[30:]) + b"\0" * 7)
+    assert len(read(tmp_path / "a.spz")) == 5
+
+
+def test_positions_get_the_bits_that_their_extent_leaves():
+    for reach, bits in ((5.0, 12), (2047.9, 12), (2048.0, 11), (3e5, 4), (8e6, 0), (0.9, 15), (1e-9, 20), (0.0, 12)):
+        means = torch.tensor([[0.0, -reach, 0.0]], dtype=torch.float64)
+        assert choose_fractional_bits(means) == bits, reach
+        assert round(reach * 2**bits) < 2**23
+    assert choose_fractional_bits(torch.zeros(0, 3)) == 12
+
+
+def test_a_far_outlier_costs_precision_and_says_so(tmp_path):
+    cloud = _cloud()
+    cloud.means[7] = torch.tensor([3e5, 0, 0])
+    lost = write(tmp_path / "a.spz", SplatFile(cloud))
+    assert any("positions finer than 0.0625 units: the cloud reaches 300000 units" in words for words in lost)
+    assert_within(read(tmp_path / "a.spz").gaussians, cloud, precision(cloud))
+
+
+def test_what_is_lost_is_said(tmp_path):
+    cloud = _cloud().replace(features=torch.zeros(40, 9))
+    cloud.scales[3, 0] = 1e-7
+    cloud.sh[5, 0, 1] = 5.0
+    splats = SplatFile(cloud, {"height": np.zeros(40), "score": np.zeros(40)})
+    lost = write(tmp_path / "a.spz", splats)
+    assert any("9 features per Gaussian: .spz has no place" in words for words in lost)
+    assert any("the columns height, score" in words for words in lost)  # a score without labels is a column
+    assert any("the extent of 1 Gaussians: .spz holds 4.5e-05 to 379 units" in words for words in lost)
+    back, stated = read(tmp_path / "a.spz").gaussians, precision(cloud)
+    assert stated.scales > 400
+    assert stated.sh0 == pytest.approx(5 - 0.5 / 0.15, rel=1e-3)
+    assert_within(back, cloud, stated)
+
+
+def test_bad_requests_are_named(tmp_path):
+    cloud = _cloud()
+    path = tmp_path / "a.spz"
+    cases = [
+        ({"version": 1}, {}, r"version: expected one of 2, 3, 4, got 1"),
+        ({"fractional_bits": 25}, {}, r"fractional_bits: expected a number in \[0, 24\], got 25"),
+        ({"fractional_bits": 23}, {}, r"means: expected coordinates within 1 units .* choose 20 bits or fewer"),
+        ({"sh_bits": (8, 0)}, {}, r"sh_bits: expected a number in \[1, 8\], got 0"),
+        ({}, {"means": cloud.means * 1e9}, r"means: expected coordinates within 8.38861e\+06 .* remove far Gaussians"),
+        ({}, {"means": cloud.means * float("nan")}, r"means: expected finite values, got .* at Gaussian 0; remove"),
+        ({}, {"scales": cloud.scales - 0.2}, r"scales: expected finite positive values"),
+        ({}, {"sh": None}, r"splats: expected a cloud with colours .* got Gaussians\(40 .* as .ply"),
+        ({}, {"labels": torch.full((40,), -3)}, r"labels: expected -1 to 2147483647, got -3 to -3; -1 means none"),
+    ]
+    for options, changes, message in cases:
+        with pytest.raises(ValueError, match=message):
+            write_spz(path, SplatFile(cloud.replace(**changes)), **options)
+    names = SplatFile(cloud.replace(labels=torch.zeros(40, dtype=torch.int64)), classes=("a" * (1 << 20),))
+    with pytest.raises(ValueError, match="classes: expected names of at most 1048576 bytes, got .*; shorten"):
+        write(path, names)
+    assert list(tmp_path.iterdir()) == []
+
+
+def _v4(count=2, degree=0, bits=12, flags=0, streams=None, sizes=None, start=32, number=None, extensions=b""):
+    """A version 4 file of zeros, or with something wrong in it."""
+    plain = [9 * count, count, 3 * count, 3 * count, 4 * count]
+    packed = [zstandard.compress(b"\0" * size) for size in plain] if streams is None else streams
+    number = len(packed) if number is None else number
+    head = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, degree, bits, flags, number, start)
+    table = b"".join(struct.pack("<QQ", len(p), s) for p, s in zip(packed, sizes or plain, strict=False))
+    return head + extensions + table + b"".join(packed)
+
+
+def _ext(kind, payload, length=None):
+    return struct.pack("<II", kind, len(payload) if length is None else length) + payload
+
+
+_GOOD = legacy_payload([ROW | {"rotation": 0}] * 3, version=3)
+_HALF = legacy_payload([ROW | {"rotation": (0, 0, 0), "position": (float("inf"), 0, 0)}], version=1)
+_BOMB = struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 0, 12, 0, 0) + bytes(1 << 25)
+
+
+def _labels(n=1, names=b"", version=1, flags=0, rest=None):
+    rest = zstandard.compress(struct.pack("<i", 0) * n + names) if rest is None else rest
+    return struct.pack("<HHII", version, flags, n, len(names)) + rest
+
+
+def _with_labels(payload):
+    return legacy_payload([ROW | {"rotation": 0}], version=3, flags=2, extensions=_ext(LABELS, payload))
+
+
+BAD = {
+    "not spz": (b"hello", "expected an SPZ file"),
+    "only magic": (b"NGSP\x04", "expected an SPZ file"),
+    "other gzip": (gzip.compress(b"x" * 99), "expected an SPZ header in the gzip stream"),
+    "cut gzip": (gzip.compress(_GOOD)[:-9], "expected a whole gzip stream.*truncated"),
+    "very short gzip": (gzip.compress(_GOOD)[:14], "header in the gzip stream.*truncated"),
+    "damaged gzip": (gzip.compress(_GOOD)[:-8] + bytes(8), "gzip stream, but it cannot be unpacked"),
+    "bytes after gzip": (gzip.compress(_GOOD) + b"abc", "after the gzip stream, got 3 bytes more"),
+    "bytes in gzip": (gzip.compress(_GOOD + b"x"), "plain bytes by its header, got more"),
+    "bytes after raw": (_GOOD + b"x", "expected 76 bytes for 3 Gaussians, got 77"),
+    "cut raw": (_GOOD[:-1], "promises 3 Gaussians .60 bytes., which a file of 59 bytes cannot hold"),
+    "gzip bomb": (gzip.compress(_BOMB), "plain bytes by its header, got more"),
+    "4 billion in gzip": (gzip.compress(_GOOD[:8] + b"\xff\xff\xff\xff" + _GOOD[12:]), "promises 4294967295 Gaussians"),
+    "4 billion": (_v4()[:8] + b"\xff\xff\xff\xff" + _v4()[12:], "promises 4294967295 Gaussians"),
+    "short after promise": (gzip.compress(_GOOD[:8] + b"\x63" + _GOOD[9:]), "promises 99 Gaussians .* cannot hold"),
+    "degree 7": (gzip.compress(_GOOD[:12] + b"\x07" + _GOOD[13:]), "degree 0 to 4, got 7"),
+    "40 bits": (gzip.compress(_GOOD[:13] + b"\x28" + _GOOD[14:]), "0 to 24 fractional bits, got 40"),
+    "version 5": (_v4()[:4] + b"\x05" + _v4()[5:], "version 1 to 4, got 5"),
+    "version 0": (_GOOD[:4] + b"\x00" + _GOOD[5:], "version 1 to 4, got 0"),
+    "version 4 in gzip": (gzip.compress(_GOOD[:4] + b"\x04" + _GOOD[5:]), "version 1 to 3 in a gzip stream, got 4"),
+    "infinite half": (gzip.compress(_HALF), "finite positions, got .*inf.* at Gaussian 0"),
+    "short header": (_v4()[:30], "header of 32 bytes, got 30"),
+    "few streams": (_v4(number=3), "a table of 5 streams .* got 3 streams"),
+    "table outside": (_v4(start=4000), "a table of 5 streams .* at byte 4000"),
+    "table in header": (_v4(start=8), "a table of 5 streams .* at byte 8"),
+    "cut streams": (_v4()[:-1], "bytes of rotations within .* truncated"),
+    "garbage after": (_v4() + b"xyz", "3 bytes more"),
+    "size in table": (
+        _v4(sizes=[18, 2, 6, 6, 1 << 40]),
+        "expected a stream of 8 bytes of rotations .* got 1099511627776",
+    ),
+    "frame promises": (
+        _v4(streams=[zstandard.compress(bytes(1 << 26)), *[zstandard.compress(bytes(n)) for n in (2, 6, 6, 8)]]),
+        "expected 18 bytes of positions, got a frame of 67108864 bytes",
+    ),
+    "no zstd": (_v4(streams=[b"rubbish!"] * 5), "Zstandard stream of positions"),
+    "data after frame": (
+        _v4(streams=[zstandard.compress(bytes(n)) + b"more" * (n == 18) for n in (18, 2, 6, 6, 8)]),
+        "Zstandard stream of positions, but",
+    ),
+    "long record": (_v4(start=44, flags=2, extensions=_ext(7, b"abcd", 99)), "extension records .* ends after them"),
+    "cut record": (_v4(start=36, flags=2, extensions=b"abcd"), "extension records .* ends after them"),
+    "axes": (
+        _v4(start=44, flags=2, extensions=_ext(0xADBE0003, b"\x0c\0\0\0")),
+        "coordinate system of 1 to 8 .* got 12",
+    ),
+    "labels of 9": (_with_labels(_labels(9)), "labels of 1 Gaussians .* got 9"),
+    "labels layout 2": (_with_labels(_labels(version=2)), "labels of layout 1, got 2"),
+    "labels cut": (_with_labels(_labels()[:-3]), "labels, but they cannot be read"),
+    "short labels": (_with_labels(b"\x01"), "labels of layout 1, got 0"),
+    "labels bomb": (_with_labels(_labels(rest=zstandard.compress(bytes(1 << 26)))), "labels, but .*another size"),
+    "labels below": (_with_labels(_labels(rest=zstandard.compress(struct.pack("<i", -2)))), "class_id of -1 or more"),
+    "names no json": (_with_labels(_labels(names=b"[nope")), "labels, but they cannot be read"),
+    "names no list": (_with_labels(_labels(names=b'{"a": 1}')), "a list of names"),
+    "long names": (_with_labels(struct.pack("<HHII", 1, 0, 1, 1 << 30)), "at most 1048576 bytes of names"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_damage_is_named_and_costs_no_memory(tmp_path, case):
+    content, message = BAD[case]
+    (tmp_path / "bad.spz").write_bytes(content)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match=f"bad.spz.*{message}"):
+            read(tmp_path / "bad.spz")
+        assert tracemalloc.get_traced_memory()[1] < 1 << 22
+    finally:
+        tracemalloc.stop()
+
+
+def test_the_undamaged_files_of_these_tests_are_read(tmp_path):
+    for content in (_v4(), _v4(start=44, flags=2, extensions=_ext(7, b"abcd")), gzip.compress(_GOOD), _GOOD,
+                    _with_labels(_labels(names=b'["rug"]'))):  # fmt: skip
+        (tmp_path / "good.spz").write_bytes(content)
+        assert len(read(tmp_path / "good.spz")) in (1, 2, 3)
+
+
+def test_every_cut_of_a_file_is_refused(tmp_path):
+    write(tmp_path / "a.spz", _labelled(12))
+    write_spz(tmp_path / "b.spz", _labelled(12), version=3)
+    for name in ("a.spz", "b.spz"):
+        data = (tmp_path / name).read_bytes()
+        for end in range(0, len(data), 7):
+            (tmp_path / "cut.spz").write_bytes(data[:end])
+            with pytest.raises(ValueError, match="cut.spz"):
+                read(tmp_path / "cut.spz")
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_random_damage_is_a_value_error_or_nothing(tmp_path, version):
+    write_spz(tmp_path / "a.spz", _labelled(6), version=version)
+    whole, rng = (tmp_path / "a.spz").read_bytes(), np.random.default_rng(version)
+    data, refused = np.frombuffer(whole if version == 4 else gzip.decompress(whole), np.uint8), 0
+    for _ in range(300):
+        bad = data.copy()
+        bad[rng.integers(0, len(bad) if rng.random() < 0.5 else 40, 3)] = rng.integers(0, 256, 3)
+        (tmp_path / "bad.spz").write_bytes(bad.tobytes())
+        try:
+            read(tmp_path / "bad.spz")
+        except ValueError as error:
+            refused += "bad.spz" in str(error)
+    assert refused > 100
+
+
+def test_files_are_known_by_their_content(tmp_path):
+    write_spz(tmp_path / "a.spz", _labelled(), version=3)
+    (tmp_path / "a.spz").rename(tmp_path / "a.bin")
+    assert read_splats(tmp_path / "a.bin").info["format"] == "spz"
+    assert not module.matches(b"\x1f\x8b\x08\xff\xff\xff\xff\xff\xff\xff\xff\xff")
+    assert not module.matches(b"ply\n")
