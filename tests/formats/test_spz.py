@@ -294,6 +294,16 @@ def test_positions_get_the_bits_that_their_extent_leaves():
     assert choose_fractional_bits(torch.zeros(0, 3)) == 12
 
 
+@pytest.mark.parametrize(("bits", "step"), [(20, 2.0**-20), (2, 0.25)])
+def test_bits_of_positions_can_be_chosen(tmp_path, bits, step):
+    cloud = _cloud()
+    write_spz(tmp_path / "a.spz", SplatFile(cloud), fractional_bits=bits)
+    back = read(tmp_path / "a.spz")
+    assert back.info["fractional_bits"] == bits
+    error = (back.gaussians.means - cloud.means).abs().max()
+    assert 0.4 * step < error <= 0.5 * step + 1e-6
+
+
 def test_a_far_outlier_costs_precision_and_says_so(tmp_path):
     cloud = _cloud()
     cloud.means[7] = torch.tensor([3e5, 0, 0])
