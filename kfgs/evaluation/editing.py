@@ -104,6 +104,8 @@ class RecolorReport:
     """The same without the pixels within 2 of the class, where soft edges mix the two."""
     hue_inside: float
     """Of the class's coloured pixels: those with the target's hue."""
+    hue_before: float
+    """The same before the edit: a brown chair is hardly moved by red."""
     measured_pixels: float
     """Of the class's pixels: those with enough colour after the edit to have a hue."""
     pixels: int
@@ -119,7 +121,7 @@ class RecolorReport:
     def __str__(self) -> str:
         return (
             f"{self.name} recoloured: PSNR outside {self.psnr_outside:.1f} dB ({self.psnr_off_border:.1f} off its "
-            f"border), {self.hue_inside:.4f} of its coloured pixels have the hue "
+            f"border), {self.hue_inside:.4f} of its coloured pixels have the hue ({self.hue_before:.4f} before) "
             f"({self.protocol.split(':')[0]}, {self.views} views)"
         )
 
@@ -212,22 +214,24 @@ def score_recolor(
     """
     wanted = _check_color(rgb)
     truth = SceneTruth.open(scene, name, split)
-    colored, right = _Share(), _Share()
+    colored, right, right_before = _Share(), _Share(), _Share()
     outside, off_border = _MeanSquare(), _MeanSquare()
     for view in truth.views():
         old, new = (_picture(cloud, view.camera, engine) for cloud in (before, after))
         outside.add((new - old)[~view.inside])
         off_border.add((new - old)[view.far])
-        has_hue = new.amax(-1) - new.amin(-1) >= LEAST_CHROMA
-        turn = (_hue_degrees(new) - _hue_degrees(wanted[None, None])).remainder(360)
+        for picture, share in ((old, right_before), (new, right)):
+            has_hue = picture.amax(-1) - picture.amin(-1) >= LEAST_CHROMA
+            turn = (_hue_degrees(picture) - _hue_degrees(wanted[None, None])).remainder(360)
+            share.add(torch.minimum(turn, 360 - turn) <= HUE, among=view.inside & has_hue)
         colored.add(has_hue, among=view.inside)
-        right.add(torch.minimum(turn, 360 - turn) <= HUE, among=view.inside & has_hue)
     return RecolorReport(
         name=name,
-        rgb=(float(wanted[0]), float(wanted[1]), float(wanted[2])),
+        rgb=(float(rgb[0]), float(rgb[1]), float(rgb[2])),
         psnr_outside=outside.psnr,
         psnr_off_border=off_border.psnr,
         hue_inside=right.value,
+        hue_before=right_before.value,
         measured_pixels=colored.value,
         pixels=truth.pixels,
         views=len(truth.indices),

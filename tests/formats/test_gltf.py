@@ -227,7 +227,8 @@ def test_primitives_join(tmp_path):
     path.write_text(json.dumps(root))
     splats = read_splats(path)
     assert (splats.info["primitives"], splats.info["ignored"], len(splats)) == (2, 1, 10)
-    assert bool((splats.gaussians.sh[5:, 1:] == 0).all()) and bool((splats.gaussians.sh[:5, 1:] != 0).all())
+    assert bool((splats.gaussians.sh[5:, 1:] == 0).all())
+    assert bool((splats.gaussians.sh[:5, 1:] != 0).all())
 
 
 def test_drafts_are_read(tmp_path):
