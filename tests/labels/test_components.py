@@ -1,0 +1,130 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from oracles_selection import components as oracle
+
+from kfgs.labels import component_distance, component_numbers, components, select_near, select_where
+from kfgs.labels.radius_graph import radius_components
+
+
+def clumps(n, heaps, spread, seed):
+    """Heaps of points of very different density, as densification leaves them, some rounded onto each other."""
+    rng = np.random.default_rng(seed)
+    centres = rng.normal(size=(heaps, 3)) * 2
+    points = centres[rng.integers(0, heaps, n)] + rng.normal(size=(n, 3)) * rng.gamma(1, spread, n)[:, None]
+    return np.round(points, 2) if seed % 3 == 0 else points
+
+
+@pytest.mark.parametrize("distance", [0.02, 0.1, 0.3, 1.0])
+@pytest.mark.parametrize("seed", range(6))
+def test_the_same_parts_as_a_flood_fill(distance, seed, monkeypatch):
+    monkeypatch.setattr("kfgs.labels.radius_graph.BLOCK", (7, 4_000_000)[seed % 2])
+    points = clumps(160, 12, (0.02, 0.2)[seed % 2], seed)
+    expected = oracle(points, distance)
+    numbers = radius_components(points, distance)
+    assert [np.flatnonzero(numbers == i).tolist() for i in range(numbers.max() + 1)] == expected
+
+
+def test_two_dense_heaps_just_in_range_are_one():
+    """Each point's 8 nearest all lie in its own heap, so only the exact comparison finds the bridge."""
+    rng = np.random.default_rng(0)
+    heap = rng.uniform(0, 0.1, (50, 3))
+    gap = 0.9 - np.ptp(heap[:, 0])
+    heap[:, 0] -= heap[:, 0].min()
+    both = np.concatenate([heap, heap + np.array([0.9, 0, 0])])
+    nearest = min(np.linalg.norm(a - b) for a in both[:50] for b in both[50:])
+    assert gap <= nearest < 0.9
+    assert radius_components(both, nearest * 1.0001).max() == 0
+    assert np.bincount(radius_components(both, nearest * 0.9999)).tolist() == [50, 50]
+
+
+def test_far_outliers_do_not_overflow_the_grid():
+    points = np.array([[0, 0, 0], [0.5, 0, 0], [1e12, 0, 0], [-1e12, 1e12, 3e11], [-1e12, 1e12, 3e11]])
+    assert radius_components(points, 1e-3).tolist() == [1, 2, 3, 0, 0]
+    assert radius_components(points, 0.5).tolist() == [0, 0, 2, 1, 1]
+
+
+def test_order_and_motion_do_not_matter():
+    points = torch.from_numpy(clumps(300, 9, 0.05, 1))
+    mask = torch.ones(300, dtype=torch.bool)
+    numbers = component_numbers(points, mask, 0.2)
+    order = torch.randperm(300, generator=torch.Generator().manual_seed(0))
+    shuffled = component_numbers(points[order], mask, 0.2)
+    same = lambda labels: labels[:, None] == labels[None]  # noqa: E731
+    assert same(shuffled).equal(same(numbers[order]))
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64))[0]
+    assert component_numbers(points @ turn.T + 5, mask, 0.2).equal(numbers)
+
+
+def grid(origin, n=5, step=0.1):
+    x, y = torch.meshgrid(torch.arange(n) * step, torch.arange(n) * step, indexing="ij")
+    return torch.stack([x, y, torch.zeros_like(x)], dim=-1).reshape(-1, 3) + torch.tensor(origin)
+
+
+def test_parts_of_a_selection_largest_first():
+    means = torch.cat([grid([0.0, 0, 0], n=3), grid([2.0, 0, 0], n=5), grid([4.0, 0, 0], n=4)])
+    mask = torch.ones(9 + 25 + 16, dtype=torch.bool)
+    mask[-1] = False
+    chosen = select_where(mask, "all but one")
+    parts = components(means, chosen)
+    assert [len(part) for part in parts] == [25, 15, 9]
+    assert parts[0].indices.tolist() == list(range(9, 34))
+    assert parts[1].how == "all but one; part 2 of 3"
+    assert [len(part) for part in components(means, chosen, smallest=10)] == [25, 15]
+    assert [len(part) for part in components(means, chosen, most=1)] == [25]
+    assert [len(part) for part in components(means, chosen, distance=3.0)] == [49]
+    assert components(means, select_where(torch.zeros_like(mask))) == []
+
+
+def test_default_distance_follows_the_selection():
+    """On a grid, 90 % have their fourth neighbour within sqrt(2) steps: a corner's is (1, 1), an edge's (1, 1) too."""
+    dense, sparse = grid([0.0, 0, 0], n=20, step=0.1), grid([100.0, 0, 0], n=20, step=0.3)
+    means = torch.cat([dense, sparse])
+    first = torch.arange(800) < 400
+    step = component_distance(means, first)
+    assert 2 * 0.1 - 1e-6 <= step <= 2 * 0.1 * math.sqrt(2) + 1e-6
+    assert component_distance(means, ~first) == pytest.approx(3 * step, rel=1e-4)
+    assert component_distance(means * 7, first) == pytest.approx(7 * step, rel=1e-4)
+    specks = torch.zeros(800, dtype=torch.bool)
+    specks[[0, 399, 799]] = True
+    assert component_distance(means, specks) <= 4 * 0.3 * math.sqrt(2) + 1e-6  # not the hundred between the sheets
+    assert component_numbers(torch.ones(3, 3), torch.ones(3, dtype=torch.bool)).tolist() == [0, 0, 0]
+
+
+def test_a_click_takes_the_thing_under_it():
+    means = torch.cat([grid([0.0, 0, 0]), grid([2.0, 0, 0]), grid([2.0, 0.5, 0])])
+    labels = torch.tensor([3] * 25 + [3] * 25 + [4] * 25)
+    picked = select_near(means, [2.1, 0.0, 0.05], labels=labels)
+    assert picked.indices.tolist() == list(range(25, 50))  # not its like far away, not its neighbour of another class
+    features = torch.eye(2)[(labels == 4).long()] + 0.05
+    alike = select_near(means, [2.0, 0.9, 0.0], features=features)
+    assert alike.indices.tolist() == list(range(50, 75))
+    assert "connected with Gaussian 54" in alike.how
+    itself = select_near(means, [2.0, 0.9, 0.0], features=features, threshold=1.0)
+    assert bool(itself.mask[54])  # strictly above 1 there is nothing, not even itself
+
+
+def test_wrong_input_is_named():
+    means, mask = torch.rand(4, 3), torch.ones(4, dtype=torch.bool)
+    broken = means.clone()
+    broken[2, 1] = math.nan
+    with pytest.raises(ValueError, match="means: expected finite numbers, got NaN or infinity in row 2"):
+        component_numbers(broken, mask)
+    with pytest.raises(TypeError, match="mask: expected a boolean mask, got torch.int64"):
+        component_numbers(means, mask.long())
+    with pytest.raises(ValueError, match=r"distance: expected a number in \(0, inf\), got 0"):
+        component_numbers(means, mask, 0)
+    with pytest.raises(ValueError, match=r"selection.mask: expected \[N\] with N = 4 \(from means\), got \(3,\)"):
+        components(means, select_where(mask[:3]))
+    with pytest.raises(ValueError, match="smallest: expected a number in"):
+        components(means, select_where(mask), smallest=0)
+    with pytest.raises(ValueError, match="labels, features: expected one of them, got none or both"):
+        select_near(means, [0, 0, 0])
+    with pytest.raises(ValueError, match=r"labels: expected a label at the nearest Gaussian, got -1 \(none\) at"):
+        select_near(means, [0, 0, 0], labels=torch.full((4,), -1))
+    with pytest.raises(ValueError, match=r"point: expected \[3\], got \(2,\)"):
+        select_near(means, [0, 0], labels=torch.zeros(4).long())
+    with pytest.raises(ValueError, match="means: expected at least one Gaussian, got none"):
+        select_near(means[:0], [0, 0, 0], labels=torch.zeros(0).long())

@@ -1,0 +1,33 @@
+import pytest
+
+from kfgs.labels import class_index
+
+NAMES = ["wall", "Window blind", "chair", "armchair"]
+
+
+def test_a_name_is_its_place():
+    assert [class_index(name, NAMES) for name in NAMES] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("name", "near"),
+    [
+        ("chiar", "did you mean 'chair'"),
+        ("CHAIR", "did you mean 'chair' or 'armchair'"),
+        ("window blinds", "did you mean 'Window blind'"),
+        ("blind", "did you mean 'Window blind'"),
+        ("zebra", "add its embedding to the classes"),
+        ("", "add its embedding to the classes"),
+    ],
+)
+def test_an_unknown_name_meets_the_near_ones(name, near):
+    with pytest.raises(ValueError, match="class: expected one of wall, Window blind, chair, armchair, got") as caught:
+        class_index(name, NAMES)
+    assert near in str(caught.value)
+
+
+def test_a_long_list_is_cut_and_no_names_are_named():
+    with pytest.raises(ValueError, match="thing 19 and 80 more, got 'sky'"):
+        class_index("sky", [f"thing {i}" for i in range(100)])
+    with pytest.raises(ValueError, match="class: expected class names to look 'sky' up in, got none"):
+        class_index("sky", ())
