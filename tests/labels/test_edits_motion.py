@@ -1,0 +1,167 @@
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from kfgs.cameras import Camera
+from kfgs.formats import SplatFile
+from kfgs.gaussians import Gaussians
+from kfgs.labels import Duplicate, Everything, Move, OfClass, OfIndex, Turn
+from kfgs.splat import covariance_3d, evaluate_sh, rasterize
+
+MOTIONS = (
+    {"translation": (1.0, -2.0, 0.5)},
+    {"rotation": ("z", 90)},
+    {"rotation": Turn((1.0, 2.0, -1.0), 33.0), "scale": 0.5, "pivot": (1.0, 1.0, 0.0)},
+    {"rotation": (0.2, -0.4, 0.8, 0.4), "scale": 3.0, "translation": (0.1, 0.2, 0.3)},
+)
+
+
+def scene(n=10, seed=1):
+    rng = np.random.default_rng(seed)
+    draw = lambda *shape: torch.from_numpy(rng.uniform(0.1, 0.9, shape))  # noqa: E731
+    gaussians = Gaussians(
+        means=draw(n, 3) * 2,
+        quats=draw(n, 4) - 0.5,
+        scales=draw(n, 3) * 0.2,
+        opacities=draw(n),
+        sh=draw(n, 16, 3) - 0.5,
+        labels=torch.arange(n) % 2,
+    )
+    return SplatFile(gaussians, {"score": rng.uniform(size=n)}, ("wall", "chair"), {"format": "ply"})
+
+
+def oracle_matrix(motion):
+    """The 3 x 3 matrix of a motion's rotation, by Rodrigues' formula or from the quaternion, in plain numpy."""
+    rotation = motion.get("rotation")
+    if rotation is None:
+        return np.eye(3)
+    if isinstance(rotation, tuple) and len(rotation) == 4:
+        w, x, y, z = np.array(rotation) / np.linalg.norm(rotation)
+        return np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+    axis, degrees = ((0, 0, 1), 90) if rotation == ("z", 90) else (rotation.axis, rotation.degrees)
+    k, a = np.array(axis) / np.linalg.norm(axis), np.deg2rad(degrees)
+    K = np.array([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]])
+    return np.eye(3) + np.sin(a) * K + (1 - np.cos(a)) * K @ K
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_move_against_the_equation(motion):
+    splats = scene()
+    g, mask = splats.gaussians, splats.gaussians.labels == 1
+    moved = Move("chair", **motion).apply(splats).gaussians
+    R, s = oracle_matrix(motion), motion.get("scale", 1.0)
+    x, o = g.means[mask].numpy(), g.opacities[mask].numpy()
+    pivot = motion.get("pivot", (o[:, None] * x).sum(0) / o.sum())
+    expected = s * (x - pivot) @ R.T + pivot + np.array(motion.get("translation", (0, 0, 0)))
+    np.testing.assert_allclose(moved.means[mask].numpy(), expected, atol=1e-12)
+    before, after = (covariance_3d(c.quats[mask], c.scales[mask]).numpy() for c in (g, moved))
+    np.testing.assert_allclose(after, s * s * R @ before @ R.T, atol=1e-7)
+    directions = torch.from_numpy(np.random.default_rng(0).normal(size=(5, 3)))
+    turn = torch.from_numpy(R)
+    torch.testing.assert_close(
+        evaluate_sh(moved.sh[mask], directions @ turn.T), evaluate_sh(g.sh[mask], directions), atol=1e-6, rtol=0
+    )
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_move_leaves_the_rest_the_order_and_the_input(motion):
+    splats = scene()
+    copy = splats.gaussians.means.clone()
+    moved = Move("chair", **motion).apply(splats)
+    rest = splats.gaussians.labels == 0
+    for name in ("means", "quats", "scales", "sh", "opacities"):
+        assert getattr(moved.gaussians, name)[rest].equal(getattr(splats.gaussians, name)[rest])
+    assert moved.gaussians.labels.equal(splats.gaussians.labels)
+    assert moved.gaussians.opacities.equal(splats.gaussians.opacities)
+    assert splats.gaussians.means.equal(copy)
+
+
+def test_turning_about_the_centroid_keeps_it_and_going_back_undoes():
+    splats, turn = scene(), Turn("y", 70)
+    there = Move("chair", rotation=turn).apply(splats)
+    mask = splats.gaussians.labels == 1
+    o = splats.gaussians.opacities[mask]
+    torch.testing.assert_close(o @ there.gaussians.means[mask], o @ splats.gaussians.means[mask])
+    back = Move("chair", rotation=Turn("y", -70)).apply(there)
+    torch.testing.assert_close(back.gaussians.means, splats.gaussians.means)
+    torch.testing.assert_close(back.gaussians.sh, splats.gaussians.sh, atol=1e-6, rtol=0)
+
+
+def test_a_quarter_turn_about_z_takes_x_to_y():
+    splats = scene(1)
+    splats = splats.replace(gaussians=splats.gaussians.replace(means=torch.tensor([[1.0, 0, 0]]).double()))
+    moved = Move(Everything(), rotation=("z", 90), pivot=(0, 0, 0)).apply(splats)
+    torch.testing.assert_close(moved.gaussians.means, torch.tensor([[0.0, 1.0, 0.0]]).double())
+    xyzw = Rotation.from_euler("z", 90, degrees=True).as_quat()
+    same = Move(Everything(), rotation=tuple(xyzw[[3, 0, 1, 2]]), pivot=(0, 0, 0)).apply(splats)
+    torch.testing.assert_close(same.gaussians.means, moved.gaussians.means)
+
+
+def test_moved_object_is_drawn_where_it_stands():
+    """A shift by exactly 8 pixels at the object's depth shifts the picture by 8 columns."""
+    K = torch.tensor([[40.0, 0, 32], [0, 40, 16], [0, 0, 1]])
+    camera = Camera(torch.eye(4), K, 64, 32)
+    means = torch.tensor([[0.0, 0.1, 4.0], [0.1, -0.1, 4.0]])
+    gaussians = Gaussians(
+        means=means,
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1),
+        scales=torch.tensor([[0.1, 0.2, 1e-4]]).repeat(2, 1),
+        opacities=torch.tensor([0.8, 0.6]),
+        sh=torch.rand(2, 1, 3, generator=torch.Generator().manual_seed(0)),
+    )
+    moved = Move(Everything(), (8 * 4 / 40, 0.0, 0.0)).apply(SplatFile(gaussians)).gaussians
+    before, after = (rasterize(g, camera).map for g in (gaussians, moved))
+    assert before.max() > 0.3
+    torch.testing.assert_close(after[:, 8:], before[:, :-8], atol=5e-3, rtol=0)  # EWA's Jacobian differs off-axis
+
+
+def test_duplicates_follow_the_originals_with_their_labels_and_columns():
+    splats = scene()
+    doubled = Duplicate("chair", (0, 0, 5), ("x", 30), 0.5).apply(splats)
+    mask = splats.gaussians.labels == 1
+    assert len(doubled) == 15
+    for name in ("means", "quats", "scales", "sh", "opacities", "labels"):
+        assert getattr(doubled.gaussians, name)[:10].equal(getattr(splats.gaussians, name))
+    moved = Move("chair", (0, 0, 5), ("x", 30), 0.5).apply(splats).gaussians.select(mask)
+    for name in ("means", "quats", "scales", "sh", "opacities", "labels"):
+        torch.testing.assert_close(getattr(doubled.gaussians, name)[10:], getattr(moved, name))
+    assert doubled.extra["score"][10:].tolist() == splats.extra["score"][mask.numpy()].tolist()
+    assert doubled.classes == splats.classes
+    assert doubled.info == splats.info
+
+
+@pytest.mark.parametrize("edit", [Move, Duplicate])
+def test_nothing_selected(edit):
+    splats = scene()
+    with pytest.raises(ValueError, match="where: expected a selection of some of 10 Gaussians, got none"):
+        edit(OfClass(5)).apply(splats)
+    assert len(edit(OfIndex([]), allow_empty=True).apply(splats)) == 10
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: Move("a", (1, 2)), ValueError, "translation: expected 3 finite numbers"),
+        (lambda: Move("a", scale=0), ValueError, "scale: expected a number in"),
+        (lambda: Move("a", scale=-1), ValueError, "scale: expected a number in"),
+        (lambda: Move("a", rotation=(0, 0, 0, 0)), ValueError, "rotation: expected a quaternion .* got zeros"),
+        (lambda: Move("a", rotation=(1, 2, 3)), ValueError, "rotation: expected 4 finite numbers"),
+        (lambda: Move("a", rotation="z"), TypeError, "rotation: expected 4 numbers, got 'z'"),
+        (lambda: Move("a", rotation=("w", 90)), TypeError, "axis: expected 3 numbers, got 'w'"),
+        (lambda: Move("a", rotation=((0, 0, 0), 90)), ValueError, "axis: expected a direction, got"),
+        (lambda: Move("a", rotation=("z", "90")), TypeError, "degrees: expected a number, got '90'"),
+        (lambda: Move("a", pivot="corner"), ValueError, r"pivot: expected 'centroid' or \[x, y, z\], got 'corner'"),
+        (lambda: Duplicate("a", pivot=(0, 0)), ValueError, "pivot: expected 3 finite numbers"),
+        (lambda: Duplicate("a", allow_empty="no"), TypeError, "allow_empty: expected true or false, got 'no'"),
+    ],
+)
+def test_wrong_input_is_named(make, error, message):
+    with pytest.raises(error, match=message):
+        make()
