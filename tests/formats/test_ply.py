@@ -2,7 +2,15 @@ import numpy as np
 import pytest
 import torch
 
-from kfgs.formats.ply import other_elements, points_from_columns, read_ply, write_ply
+from kfgs.formats.ply import (
+    other_elements,
+    points_from_columns,
+    read_comments,
+    read_ply,
+    read_ply_elements,
+    write_ply,
+    write_ply_elements,
+)
 from kfgs.formats.ply_3dgs import columns_from_gaussians, gaussians_from_columns
 from kfgs.gaussians import Gaussians
 
@@ -164,3 +172,68 @@ def test_a_cloud_has_no_other_elements(tmp_path):
     assert other_elements(tmp_path / "a.ply") == []
     with pytest.raises(FileNotFoundError, match="none.ply: no such file; expected a PLY"):
         other_elements(tmp_path / "none.ply")
+
+
+TABLES = {
+    "chunk": {"low": np.float32([-1, 2.5]), "high": np.float64([3, 1e-9])},
+    "vertex": {"packed": np.uint32([0, 4294967295, 7]), "id": np.int16([-3, 2, 1])},
+    "sh": {"f_rest_0": np.uint8([0, 128, 255])},
+}
+
+
+def _assert_same(back, tables):
+    assert list(back) == list(tables)
+    for element, columns in tables.items():
+        assert list(back[element]) == list(columns)
+        for name, values in columns.items():
+            assert back[element][name].dtype == values.dtype
+            np.testing.assert_array_equal(back[element][name], values)
+
+
+def test_several_elements_survive_the_file(tmp_path):
+    write_ply_elements(tmp_path / "a.ply", TABLES, comments=("first", "and second"))
+    _assert_same(read_ply_elements(tmp_path / "a.ply"), TABLES)
+    assert read_comments(tmp_path / "a.ply") == ["first", "and second"]
+    with pytest.raises(ValueError, match="expected 'vertex' as the first element, got 'chunk'; re-export"):
+        read_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("layout", ["ascii", "binary_big_endian"])
+def test_several_elements_of_other_layouts(tmp_path, layout):
+    names = {"float32": "float", "float64": "double", "uint32": "uint", "int16": "short", "uint8": "uchar"}
+    head, body = f"ply\nformat {layout} 1.0\n", b""
+    for element, columns in TABLES.items():
+        head += f"element {element} {len(next(iter(columns.values())))}\n"
+        head += "".join(f"property {names[values.dtype.name]} {name}\n" for name, values in columns.items())
+        for row in zip(*columns.values(), strict=True):
+            if layout == "ascii":
+                body += (" ".join(repr(value.item()) for value in row) + "\n").encode()
+            else:
+                body += b"".join(np.array(value, value.dtype.newbyteorder(">")).tobytes() for value in row)
+    (tmp_path / "a.ply").write_bytes(head.encode() + b"end_header\n" + body)
+    _assert_same(read_ply_elements(tmp_path / "a.ply"), TABLES)
+
+
+def test_elements_that_cannot_be_read_are_named(tmp_path):
+    write_ply_elements(tmp_path / "a.ply", TABLES)
+    content = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "short.ply").write_bytes(content[:-1])
+    with pytest.raises(ValueError, match="promises 3 rows of 'sh' of 1 bytes, but only 2 bytes follow; .*truncated"):
+        read_ply_elements(tmp_path / "short.ply")
+    head = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\n"
+    (tmp_path / "face.ply").write_bytes(head + b"element face 1\nproperty list uchar int i\nend_header\n" + b"\0" * 9)
+    with pytest.raises(ValueError, match="face.ply: expected scalar face properties, got 'property list"):
+        read_ply_elements(tmp_path / "face.ply")
+    (tmp_path / "twice.ply").write_bytes(head + b"element vertex 1\nproperty float y\nend_header\n" + b"\0" * 8)
+    with pytest.raises(ValueError, match="elements of different names"):
+        read_ply_elements(tmp_path / "twice.ply")
+    (tmp_path / "empty.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
+    with pytest.raises(ValueError, match="expected one 'vertex' element, got none"):
+        read_ply(tmp_path / "empty.ply")
+    with pytest.raises(FileNotFoundError, match="none.ply: no such file"):
+        read_comments(tmp_path / "none.ply")
+
+
+def test_a_comment_may_speak_of_the_header(tmp_path):
+    write_ply(tmp_path / "a.ply", {"x": np.float32([1, 2])}, comments=("before end_header there is this",))
+    assert read_ply(tmp_path / "a.ply")["x"].tolist() == [1, 2]
