@@ -128,8 +128,6 @@ def _inflate(path: Path, data: bytes) -> bytearray:
         while rest[:2] == GZIP and len(plain) <= limit:
             member = zlib.decompressobj(wbits=31)
             plain += member.decompress(rest, limit + 1 - len(plain))  # never 0, which would mean no limit
-            while not member.eof and member.unconsumed_tail and len(plain) <= limit:
-                plain += member.decompress(member.unconsumed_tail, limit + 1 - len(plain))
             complete, rest = member.eof, member.unused_data
     except zlib.error as error:
         raise ValueError(
@@ -157,8 +155,6 @@ def _plain_limit(path: Path, head: bytes, size: int) -> int:
 
 
 def _parse_legacy(path: Path, data: bytes | bytearray) -> Container:
-    if len(data) < _LEGACY.size:
-        raise ValueError(f"{path}: expected a header of {_LEGACY.size} bytes, got {len(data)}; the file is truncated")
     version, count, degree, bits, flags, sizes = _check_header(path, data, 1, len(data) - _LEGACY.size)
     if version == 4:
         raise ValueError(f"{path}: expected version 1 to 3 in a gzip stream, got 4; the file is damaged")

@@ -364,6 +364,11 @@ def _ext(kind, payload, length=None):
     return struct.pack("<II", kind, len(payload) if length is None else length) + payload
 
 
+def _unsized(data):
+    """A Zstandard frame that does not say how long it is."""
+    return zstandard.ZstdCompressor(write_content_size=False).compress(data)
+
+
 _GOOD = legacy_payload([ROW | {"rotation": 0}] * 3, version=3)
 _HALF = legacy_payload([ROW | {"rotation": (0, 0, 0), "position": (float("inf"), 0, 0)}], version=1)
 _BOMB = struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 0, 12, 0, 0) + bytes(1 << 25)
@@ -418,6 +423,11 @@ BAD = {
         _v4(streams=[zstandard.compress(bytes(n)) + b"more" * (n == 18) for n in (18, 2, 6, 6, 8)]),
         "Zstandard stream of positions, but",
     ),
+    "unsized frame, short": (
+        _v4(streams=[_unsized(bytes(n - 1)) for n in (18, 2, 6, 6, 8)]),
+        "18 bytes of positions, got 17",
+    ),
+    "unsized frame, long": (_v4(streams=[_unsized(bytes(1 << 20))] * 5), "Zstandard stream of positions, but"),
     "long record": (_v4(start=44, flags=2, extensions=_ext(7, b"abcd", 99)), "extension records .* ends after them"),
     "cut record": (_v4(start=36, flags=2, extensions=b"abcd"), "extension records .* ends after them"),
     "axes": (
@@ -450,8 +460,18 @@ def test_damage_is_named_and_costs_no_memory(tmp_path, case):
 
 
 def test_the_undamaged_files_of_these_tests_are_read(tmp_path):
-    for content in (_v4(), _v4(start=44, flags=2, extensions=_ext(7, b"abcd")), gzip.compress(_GOOD), _GOOD,
-                    _with_labels(_labels(names=b'["rug"]'))):  # fmt: skip
+    unsized = [_unsized(bytes(n)) for n in (18, 2, 6, 6, 8)]
+    no_harmonics = [zstandard.compress(bytes(n)) for n in (18, 2, 6, 6, 8)] + [b""]  # six streams at degree 0
+    good = [
+        _v4(),
+        _v4(streams=unsized),
+        _v4(streams=no_harmonics, sizes=[18, 2, 6, 6, 8, 0]),
+        _v4(start=44, flags=2, extensions=_ext(7, b"abcd")),
+        gzip.compress(_GOOD),
+        _GOOD,
+        _with_labels(_labels(names=b'["rug"]')),
+    ]
+    for content in good:
         (tmp_path / "good.spz").write_bytes(content)
         assert len(read(tmp_path / "good.spz")) in (1, 2, 3)
 
