@@ -1,0 +1,121 @@
+import numpy as np
+import pytest
+import torch
+
+from kfgs.cameras import Similarity
+from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs.gaussians import Gaussians
+from kfgs.labels import Insert, join
+from kfgs.splat import evaluate_sh, transform_gaussians
+
+
+def splats(n, coefficients=1, labels=None, classes=(), extra=None, seed=0, features=None, dtype=torch.float32):
+    draw = np.random.default_rng(seed)
+    random = lambda *shape: torch.from_numpy(draw.uniform(0.1, 0.9, shape)).to(dtype)  # noqa: E731
+    gaussians = Gaussians(
+        means=random(n, 3),
+        quats=random(n, 4),
+        scales=random(n, 3),
+        opacities=random(n),
+        features=None if features is None else random(n, features),
+        sh=random(n, coefficients, 3) if coefficients else None,
+        labels=None if labels is None else torch.tensor(labels),
+    )
+    return SplatFile(gaussians, extra or {}, tuple(classes), {"seed": seed})
+
+
+@pytest.mark.parametrize(("first", "second"), [(16, 4), (1, 16), (4, 4)])
+def test_the_lower_degree_is_filled_up_and_looks_as_before(first, second):
+    a, b = splats(3, first), splats(2, second, seed=1)
+    both = join(a, b)
+    assert both.gaussians.sh.shape == (5, max(first, second), 3)
+    directions = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
+    shown = evaluate_sh(both.gaussians.sh, directions)
+    torch.testing.assert_close(shown[:3], evaluate_sh(a.gaussians.sh, directions[:3]))
+    torch.testing.assert_close(shown[3:], evaluate_sh(b.gaussians.sh, directions[3:]))
+    assert both.gaussians.means.equal(torch.cat([a.gaussians.means, b.gaussians.means]))
+    assert both.info == a.info
+
+
+def test_classes_are_the_same_when_their_names_are():
+    a = splats(3, labels=[0, 1, -1], classes=("wall", "chair"))
+    b = splats(4, labels=[2, 0, -1, 1], classes=("chair", "wall", "vase", "never used"), seed=1)
+    both = join(a, b)
+    assert both.classes == ("wall", "chair", "vase")
+    assert both.gaussians.labels.tolist() == [0, 1, -1, 2, 1, -1, 0]
+
+
+def test_classes_without_names():
+    named, bare = splats(2, labels=[0, 1], classes=("wall", "chair")), splats(2, labels=[3, 0], seed=1)
+    assert join(bare, bare).classes == ()
+    assert join(bare, bare).gaussians.labels.tolist() == [3, 0, 3, 0]
+    into_named, into_bare = join(named, bare), join(bare, named)
+    assert into_named.classes == ("wall", "chair", "class 0", "class 3")
+    assert into_named.gaussians.labels.tolist() == [0, 1, 3, 2]
+    assert into_bare.classes == ("class 0", "class 1", "class 2", "class 3", "wall", "chair")
+    assert into_bare.gaussians.labels.tolist() == [3, 0, 4, 5]
+
+
+def test_what_one_cloud_lacks_is_filled():
+    a = splats(2, extra={"score": np.array([0.5, 0.6], np.float32), "id": np.array([7, 8], np.int32)}, features=4)
+    b = splats(1, labels=[0], classes=("vase",), extra={"score": np.array([0.25]), "heat": np.array([3.0])}, seed=1)
+    both = join(a, b)
+    assert both.gaussians.labels.tolist() == [-1, -1, 0]
+    assert both.extra["score"].tolist() == [np.float32(0.5), np.float32(0.6), 0.25]
+    assert both.extra["id"].tolist() == [7, 8, 0]
+    assert both.extra["id"].dtype == np.int32
+    assert both.extra["heat"].tolist() == [0, 0, 3]
+    assert both.gaussians.features[2].tolist() == [0, 0, 0, 0]
+    assert join(splats(2), splats(1)).gaussians.labels is None
+    assert join(splats(2, dtype=torch.float64), splats(1)).gaussians.sh.dtype == torch.float64
+
+
+def test_clouds_that_cannot_be_joined_are_refused():
+    with pytest.raises(ValueError, match="sh: expected colours in both clouds, got none in what is inserted"):
+        join(splats(2), splats(1, coefficients=0))
+    with pytest.raises(ValueError, match="sh: expected colours in both clouds, got none in the scene"):
+        join(splats(2, coefficients=0), splats(1))
+    with pytest.raises(ValueError, match="features: expected as many channels in both clouds, got 3 and 4"):
+        join(splats(2, features=3), splats(1, features=4))
+
+
+def test_insert_reads_the_file_and_places_it(tmp_path):
+    scene, object_ = splats(4, 9, labels=[0, 0, 1, 1], classes=("wall", "chair")), splats(3, 4, seed=1)
+    object_ = object_.replace(gaussians=object_.gaussians.replace(labels=torch.tensor([0, 0, 0])), classes=("vase",))
+    write_splats(tmp_path / "vase.ply", object_)
+    quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    place = Similarity(2.0, quarter, torch.tensor([1.0, 2.0, 3.0]))
+    from_file = Insert(tmp_path / "vase.ply", place).apply(scene)
+    in_memory = Insert(read_splats(tmp_path / "vase.ply"), place).apply(scene)
+    assert from_file.classes == ("wall", "chair", "vase")
+    assert from_file.gaussians.labels.tolist() == [0, 0, 1, 1, 2, 2, 2]
+    x, y, z = object_.gaussians.means.unbind(1)
+    torch.testing.assert_close(from_file.gaussians.means[4:], torch.stack([1 - 2 * y, 2 + 2 * x, 3 + 2 * z], dim=1))
+    moved = transform_gaussians(object_.gaussians, place)
+    torch.testing.assert_close(from_file.gaussians.sh[4:, :4], moved.sh)
+    assert not from_file.gaussians.sh[4:, 4:].any()
+    torch.testing.assert_close(in_memory.gaussians.means, from_file.gaussians.means)
+    assert len(scene) == 4
+    stays = Insert(tmp_path / "vase.ply").apply(scene)
+    torch.testing.assert_close(stays.gaussians.means[4:], object_.gaussians.means)
+
+
+def test_inserts_are_equal_when_file_and_place_are():
+    place = Similarity.identity()
+    assert Insert("a.ply", place) == Insert("a.ply", Similarity.identity())
+    assert hash(Insert("a.ply", place)) == hash(Insert("a.ply"))
+    assert Insert("a.ply", place) != Insert("a.ply")
+    assert Insert("a.ply") != Insert("b.ply")
+    cloud = splats(1)
+    assert Insert(cloud) == Insert(cloud) != Insert(splats(1))
+
+
+def test_wrong_input_is_named(tmp_path):
+    with pytest.raises(TypeError, match="source: expected a path or a SplatFile, got Gaussians.*; wrap Gaussians in"):
+        Insert(splats(1).gaussians)
+    with pytest.raises(TypeError, match="source: expected a path or a SplatFile, got ''"):
+        Insert("")
+    with pytest.raises(TypeError, match="similarity: expected a Similarity, got Tensor; build one with"):
+        Insert("a.ply", torch.eye(4))
+    with pytest.raises(FileNotFoundError, match="missing.ply: no such file"):
+        Insert(tmp_path / "missing.ply").apply(splats(1))
