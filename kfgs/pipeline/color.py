@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from dataclasses import field as default
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from .._check import check_range, check_whole
 from .._files import write_json
 from ..cameras import Camera, resize_map
 from ..fields import ColorLoss, FieldConfig, GaussianParams, fit_field
-from ..formats import write_splats
+from ..formats import read_splats, write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene
 from .fit import _generator, _scene_digest, _tensor_digest
@@ -56,11 +56,22 @@ class ColorConfig:
 
     @staticmethod
     def cpu() -> ColorConfig:
-        """A schedule for two CPU cores: the same method, fewer steps."""
-        return ColorConfig(sh_degree=2, field=CPU_FIELD)
+        """A schedule for two CPU cores, minutes for a room: the method of 3DGS, a tenth of its steps at twice its rates.
+
+        Most steps compare pictures of half the size, which takes a quarter of the time; the last ones bring the detail.
+        Growing is over early, bounded, and asks for a higher threshold; opacities are not reset, since there are too few
+        steps to recover.
+        """
+        return ColorConfig(sh_degree=2, field=_CPU_FIELD)
+
+    @staticmethod
+    def quick() -> ColorConfig:
+        """A minute on two CPU cores for a small scene, such as the toy room (48 views of 192x256)."""
+        field = replace(_CPU_FIELD.with_steps(1_200), densify_every=50, coarse=((600, 2),), max_gaussians=40_000)
+        return ColorConfig(sh_degree=1, field=field)
 
 
-CPU_FIELD = FieldConfig(
+_CPU_FIELD = FieldConfig(
     steps=3_000,
     means_lr=3.2e-4,
     means_lr_final=3.2e-6,
@@ -76,7 +87,6 @@ CPU_FIELD = FieldConfig(
     densify_gradient=4e-4,
     reset_every=0,
     max_gaussians=120_000,
-    report_every=50,
     checkpoint_every=500,
 )
 
@@ -173,8 +183,22 @@ def fit_color(
     run.scratch("color", inputs).unlink(missing_ok=True)
     params = GaussianParams.from_tensors(load_file(stage.folder / "params.safetensors"))
     result = ColorResult(params.activated().detach(), Path(folder) / "color.ply", run.stages)
-    write_splats(result.path, result.gaussians)
+    if not _is_saved(result):
+        write_splats(result.path, result.gaussians)
     return result
+
+
+def _is_saved(result: ColorResult) -> bool:
+    """Whether this very cloud lies there already; a file that has since been given labels is left as it is."""
+    try:
+        saved = read_splats(result.path).gaussians
+    except (OSError, ValueError):
+        return False
+    assert result.gaussians.sh is not None
+    exact = saved.sh is not None and len(saved) == len(result.gaussians) and torch.equal(saved.sh, result.gaussians.sh)
+    return exact and all(
+        torch.equal(getattr(saved, name), getattr(result.gaussians, name)) for name in ("means", "quats")
+    )
 
 
 def _check_scene(scene: Scene) -> None:

@@ -80,5 +80,6 @@ def _seen(gaussians: Gaussians, camera: Camera, projected: Projected) -> tuple[T
     if gaussians.features is not None:
         return gaussians.features, projected.index
     assert gaussians.sh is not None
-    directions = gaussians.means[projected.index] - camera.center.to(gaussians.means)
-    return evaluate_sh(gaussians.sh[projected.index], directions), None
+    # index_select: its gradient takes half the time of that of an index in brackets
+    directions = gaussians.means.index_select(0, projected.index) - camera.center.to(gaussians.means)
+    return evaluate_sh(gaussians.sh.index_select(0, projected.index), directions), None

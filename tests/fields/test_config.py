@@ -42,3 +42,34 @@ def test_with_steps_keeps_the_schedule_in_proportion():
 def test_wrong_values(change, message):
     with pytest.raises(ValueError, match=message):
         FieldConfig(**change)
+
+
+def test_published_rates_of_colours():
+    config = FieldConfig()
+    assert (config.sh0_lr, config.sh_rest_lr, config.sh_degree_every) == (0.0025, 0.000125, 1_000)
+    assert [config.sh_degree(step) for step in (1, 999, 1_000, 2_999, 3_000)] == [0, 0, 1, 2, 3]
+    assert FieldConfig(sh_degree_every=0).sh_degree(1) == 3
+
+
+def test_pictures_start_small_on_schedule():
+    config = FieldConfig(steps=100, coarse=((30, 4), (60, 2)))
+    assert [config.divisor(step) for step in (1, 30, 31, 60, 61, 100)] == [4, 4, 2, 2, 1, 1]
+    assert FieldConfig().divisor(1) == 1
+    assert config.with_steps(1_000).coarse == ((300, 4), (600, 2))
+    assert FieldConfig(coarse=[[30, 4], [60, 2]]).coarse == config.coarse  # as JSON has it
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sh0_lr": -1.0}, "sh0_lr: expected a number in"),
+        ({"sh_degree_every": -1}, "sh_degree_every: expected a whole number of at least 0"),
+        ({"coarse": ((10, 0),)}, "coarse: divisor: expected a whole number of at least 1, got 0"),
+        ({"coarse": ((10, 2, 3),)}, r"coarse: expected pairs \(last step, divisor\), got \(10, 2, 3\); give two"),
+        ({"coarse": ((20, 2), (10, 1))}, "coarse: expected pairs in increasing order .* sort them"),
+        ({"coarse": ((10, 2),), "render_scale": 2.0}, r"coarse: expected \(\) with render_scale = 2.0"),
+    ],
+)
+def test_wrong_values_of_colours(change, message):
+    with pytest.raises(ValueError, match=message):
+        FieldConfig(**change)

@@ -138,3 +138,93 @@ def test_tensors_round_trip_and_missing_name():
     )
     with pytest.raises(ValueError, match=r"without \['quats'\]"):
         GaussianParams.from_tensors({k: v for k, v in params.to_tensors().items() if k != "quats"})
+
+
+def test_a_colour_field_shows_its_points_colours():
+    from kfgs.splat import evaluate_sh
+
+    colors = torch.randint(0, 256, (400, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    colors[0] = torch.tensor([0, 128, 255])
+    params = GaussianParams.from_points(cloud(), colors=colors, sh_degree=2)
+    assert (params.channels, params.sh_degree, params.features) == (3, 2, None)
+    assert list(params.to_tensors()) == ["means", "quats", "log_scales", "logit_opacities", "sh0", "sh_rest"]
+    gaussians = params.activated()
+    assert gaussians.sh.shape == (400, 9, 3)
+    shown = evaluate_sh(gaussians.sh, torch.randn(400, 3, generator=torch.Generator().manual_seed(1)))
+    torch.testing.assert_close(shown, colors / 255)
+    floats = GaussianParams.from_points(cloud(), colors=colors / 255, sh_degree=0)
+    assert torch.equal(floats.sh0, params.sh0)
+    assert floats.sh_rest is None
+    assert "SH degree 2" in repr(params)
+    torch.testing.assert_close(params.log_scales, GaussianParams.from_points(cloud(), 9).log_scales)
+
+
+def test_colours_stay_with_their_points_when_some_are_dropped():
+    inside = cloud()
+    far = torch.full((5, 3), 500.0) + torch.arange(15.0).view(5, 3)
+    points = torch.cat([far, inside])
+    colors = ((points - points.min(dim=0).values) / (points.max() - points.min())).clamp(0, 1)
+    params = GaussianParams.from_points(points, colors=colors, sh_degree=0, max_points=50)
+    rows = [int((points == mean).all(dim=1).nonzero()) for mean in params.means]
+    assert len(rows) == 50
+    assert min(rows) >= 5
+    torch.testing.assert_close(params.sh0 * 0.28209479 + 0.5, colors[rows])
+
+
+def test_fewer_degrees_on_request():
+    params = GaussianParams.from_points(cloud(10), colors=torch.rand(10, 3), sh_degree=3)
+    params.sh_rest.copy_(torch.randn(10, 15, 3, generator=torch.Generator().manual_seed(0)))
+    whole = params.activated().sh
+    assert [params.activated(degree).sh.shape[1] for degree in (0, 1, 2, 3, 7)] == [1, 4, 9, 16, 16]
+    assert torch.equal(params.activated(1).sh, whole[:, :4])
+
+
+@pytest.mark.parametrize("K", [1, 4, 9, 16])
+def test_a_colour_cloud_and_back(K):
+    generator = torch.Generator().manual_seed(3)
+    gaussians = Gaussians(
+        means=torch.randn(7, 3, generator=generator),
+        quats=torch.randn(7, 4, generator=generator),
+        scales=torch.rand(7, 3, generator=generator) + 0.1,
+        opacities=torch.rand(7, generator=generator) * 0.8 + 0.1,
+        sh=torch.randn(7, K, 3, generator=generator),
+    )
+    params = GaussianParams.from_gaussians(gaussians)
+    again = GaussianParams.from_tensors(params.to_tensors()).activated()
+    assert torch.equal(again.sh, gaussians.sh)
+    assert again.features is None
+    torch.testing.assert_close(again.scales, gaussians.scales)
+    assert params.map(torch.clone).sh_degree == int(K**0.5) - 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sh0": None}, "features, sh0: expected one of them, got neither"),
+        ({"features": torch.zeros(4, 2)}, "features, sh0: expected one of them, got both"),
+        ({"sh_rest": torch.zeros(4, 5, 3)}, r"sh_rest: expected 3, 8 or 15 coefficients .* got 5; leave it None"),
+        (
+            {"sh0": None, "features": torch.zeros(4, 2), "sh_rest": torch.zeros(4, 3, 3)},
+            "sh_rest: .* got 3 without sh0",
+        ),
+        ({"sh0": torch.zeros(5, 3)}, r"sh0: expected \[N, 3\] with N = 4 \(from means\), got \(5, 3\)"),
+    ],
+)
+def test_a_field_has_features_or_colours(change, message):
+    tensors = GaussianParams.from_points(cloud(4), colors=torch.zeros(4, 3), sh_degree=0).to_tensors()
+    with pytest.raises(ValueError, match=message):
+        GaussianParams(**(tensors | change))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"colors": torch.full((10, 3), 2.0)}, r"colors: expected uint8, or floating point in \[0, 1\]"),
+        ({"colors": torch.zeros(10, 3, dtype=torch.int64)}, "colors: expected uint8"),
+        ({"colors": torch.zeros(9, 3)}, r"colors: expected \[P, 3\] with P = 10 \(from points\), got \(9, 3\)"),
+        ({"sh_degree": 4}, r"sh_degree: expected a number in \[0, 3\], got 4"),
+    ],
+)
+def test_wrong_colours(change, message):
+    with pytest.raises(ValueError, match=message):
+        GaussianParams.from_points(cloud(10), **({"colors": torch.zeros(10, 3)} | change))

@@ -1,0 +1,189 @@
+"""Colours through the same `fit_field`: harmonics on schedule, small pictures first, checkpoints to the bit."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from kfgs import Camera, Gaussians, rasterize
+from kfgs.fields import ColorLoss, FieldConfig, GaussianParams, fit_field
+
+SHORT = FieldConfig(
+    steps=60,
+    sh0_lr=0.05,
+    sh_rest_lr=0.01,
+    sh_degree_every=20,
+    coarse=((25, 2),),
+    scales_lr=0.01,
+    means_lr=1e-3,
+    means_lr_final=1e-4,
+    densify_from=5,
+    densify_until=45,
+    densify_every=10,
+    densify_gradient=5e-4,
+    reset_every=30,
+    report_every=10,
+    checkpoint_every=20,
+)
+
+
+def look_at_origin(angle):
+    """A camera on a circle of radius 4 around the y axis, looking at the origin."""
+    c, s = torch.cos(torch.tensor(angle)), torch.sin(torch.tensor(angle))
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    viewmat[2, 3] = 4.0
+    return Camera(viewmat, torch.tensor([[30.0, 0, 16.3], [0, 31.0, 11.6], [0, 0, 1]]), 32, 24, name=f"view {angle}")
+
+
+def blobs(n=14, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        means=torch.rand(n, 3, generator=g) * 2 - 1,
+        quats=torch.randn(n, 4, generator=g),
+        scales=torch.rand(n, 3, generator=g) * 0.25 + 0.1,
+        opacities=torch.rand(n, generator=g) * 0.6 + 0.3,
+        sh=torch.randn(n, 4, 3, generator=g) * 0.4,
+    )
+
+
+def scene(views=5):
+    cameras = [look_at_origin(0.5 * i) for i in range(views)]
+    return cameras, [rasterize(blobs(), camera).map.clamp(0, 1) for camera in cameras]
+
+
+def start(n=60, sh_degree=2):
+    g = torch.Generator().manual_seed(7)
+    points = torch.rand(n, 3, generator=g) * 2.4 - 1.2
+    return GaussianParams.from_points(points, colors=torch.rand(n, 3, generator=g), sh_degree=sh_degree)
+
+
+def same(a, b):
+    return list(a.to_tensors()) == list(b.to_tensors()) and all(
+        torch.equal(x, y) for x, y in zip(a.to_tensors().values(), b.to_tensors().values(), strict=True)
+    )
+
+
+def test_colours_that_change_with_the_view_are_recovered():
+    cameras, targets = scene()
+    config = replace(
+        SHORT,
+        steps=200,
+        means_lr=5e-3,
+        quats_lr=0.01,
+        scales_lr=0.02,
+        sh0_lr=0.03,
+        densify_until=120,
+        densify_every=20,
+        densify_gradient=2e-3,
+        reset_every=0,
+        coarse=((40, 2),),
+        sh_degree_every=40,
+    )
+
+    def error(params):
+        gaussians, camera = params.activated(), look_at_origin(0.75)
+        return float((rasterize(gaussians, camera).map - rasterize(blobs(), camera).map.clamp(0, 1)).abs().mean())
+
+    fits = [
+        fit_field(start(sh_degree=degree), cameras, targets, config, extent=2.0, loss=ColorLoss()).params
+        for degree in (0, 2)
+    ]
+    level = sum(float(target.mean()) for target in targets) / len(targets)
+    assert error(fits[1]) < 0.15 * level
+    assert error(fits[1]) < 0.9 * error(fits[0])  # one colour per Gaussian is not enough
+    assert len(fits[1]) > 60
+
+
+def test_degrees_come_on_schedule():
+    cameras, targets = scene(3)
+    moved = []
+    for steps in (19, 20, 39, 40):
+        config = replace(SHORT, steps=steps, densify_from=100, coarse=())
+        rest = fit_field(start(), cameras, targets, config, extent=2.0).params.sh_rest
+        moved.append((bool(rest[:, :3].any()), bool(rest[:, 3:].any())))
+    assert moved == [(False, False), (True, False), (True, False), (True, True)]
+
+
+def test_pictures_are_small_at_first():
+    cameras, targets = scene(2)
+    sizes = []
+
+    def recorded(rendered, alpha, target):
+        sizes.append((tuple(rendered.shape), tuple(target.shape)))
+        return ColorLoss()(rendered, alpha, target)
+
+    config = replace(SHORT, steps=4, coarse=((1, 4), (3, 2)))
+    fit_field(start(), cameras, targets, config, extent=2.0, loss=recorded)
+    expected = [(6, 8, 3), (12, 16, 3), (12, 16, 3), (24, 32, 3)]
+    assert sizes == [(size, size) for size in expected]
+
+
+class StopHereError(Exception):
+    pass
+
+
+@pytest.mark.parametrize("stop_at", [10, 30, 50])  # before a checkpoint, within the degrees, after the reset
+def test_a_resumed_colour_fit_equals_an_undisturbed_one_bit_for_bit(tmp_path, stop_at):
+    cameras, targets = scene(3)
+    arguments = (cameras, targets, SHORT)
+    options = {"extent": 2.0, "loss": ColorLoss()}
+    whole = fit_field(start(), *arguments, **options)
+    path = tmp_path / "fit.safetensors"
+
+    def interrupt(row):
+        if row["step"] == stop_at:
+            raise StopHereError
+
+    with pytest.raises(StopHereError):
+        fit_field(start(), *arguments, **options, callback=interrupt, checkpoint=path)
+    resumed = fit_field(start(), *arguments, **options, checkpoint=path)
+    assert same(resumed.params, whole.params)
+    assert resumed.params.sh_rest.any()
+
+
+def test_a_checkpoint_knows_the_loss(tmp_path):
+    cameras, targets = scene(2)
+    path = tmp_path / "fit.safetensors"
+    config = replace(SHORT, steps=2)
+    fit_field(start(), cameras, targets, config, extent=2.0, loss=ColorLoss(0.2), checkpoint=path)
+    fit_field(start(), cameras, targets, config, extent=2.0, loss=ColorLoss(0.2), checkpoint=path)
+    with pytest.raises(ValueError, match="got one with other loss; delete it"):
+        fit_field(start(), cameras, targets, config, extent=2.0, loss=ColorLoss(0.5), checkpoint=path)
+
+
+def test_an_existing_splat_can_be_trained_on():
+    cameras, targets = scene(3)
+    begin = GaussianParams.from_gaussians(blobs())
+    config = replace(SHORT, steps=2, sh_degree_every=0)
+    fit = fit_field(begin, cameras, targets, config, extent=2.0)
+    scratch = fit_field(start(), cameras, targets, config, extent=2.0)
+    assert fit.history[0]["loss"] < 0.1 * scratch.history[0]["loss"]  # it was right already
+    assert fit.params.sh_degree == 1
+
+
+def test_unknown_pixels_teach_nothing():
+    """Half of each picture is unknown: what is rendered there keeps its colour."""
+    camera = look_at_origin(0.0)
+    right = Gaussians(
+        means=torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]),
+        quats=torch.tensor([[1.0, 0, 0, 0], [1.0, 0, 0, 0]]),
+        scales=torch.full((2, 3), 0.1),
+        opacities=torch.full((2,), 0.8),
+        sh=torch.zeros(2, 1, 3),
+    )
+    target = torch.ones(24, 32, 3)
+    target[:, 16:] = torch.nan
+    config = replace(SHORT, steps=5, densify_from=100, coarse=())
+    fit = fit_field(GaussianParams.from_gaussians(right), [camera], [target], config, extent=2.0, loss=ColorLoss())
+    before = GaussianParams.from_gaussians(right)
+    assert torch.equal(fit.params.sh0[0], before.sh0[0])
+    assert (fit.params.sh0[1] > before.sh0[1]).all()
+
+
+def test_coarse_pictures_must_have_the_cameras_size():
+    cameras, targets = scene(2)
+    with pytest.raises(
+        ValueError, match=r"targets\[\d\]: expected \(24, 32\) pixels as the camera has .*got \(12, 16\)"
+    ):
+        fit_field(start(), cameras, [target[::2, ::2] for target in targets], SHORT, extent=2.0)

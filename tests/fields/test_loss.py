@@ -1,0 +1,88 @@
+import numpy as np
+import pytest
+import torch
+from oracles_color import ssim_windows
+
+from kfgs.fields import ColorLoss, l1_loss, loss
+from kfgs.fields.loss import mean_similarity
+from kfgs.metrics import ssim
+
+
+def pictures(height=23, width=31, dtype=torch.float64, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    a = torch.rand(height, width, 3, generator=g, dtype=dtype)
+    return a, (0.6 * a + 0.4 * torch.rand(height, width, 3, generator=g, dtype=dtype)).clamp(0, 1)
+
+
+@pytest.fixture(params=["compiled", "kornia"])
+def path(request, monkeypatch):
+    """Both ways to SSIM: compiled code, and kornia's."""
+    if request.param == "compiled":
+        pytest.importorskip("numba")
+    else:
+        monkeypatch.setattr(loss, "choose", lambda *asked: "reference")
+    return request.param
+
+
+def test_similarity_is_the_mean_over_windows(path):
+    a, b = pictures()
+    assert float(mean_similarity(a, b)) == pytest.approx(ssim_windows(a, b).mean(), abs=1e-12)
+    assert float(mean_similarity(a, b)) == pytest.approx(float(ssim(a, b)), abs=1e-12)
+    assert float(mean_similarity(a, a)) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_windows_with_an_unknown_pixel_do_not_count(path):
+    a, b = pictures()
+    b[3, 4] = torch.nan
+    b[20:, 25:] = torch.nan
+    windows = ssim_windows(a, torch.where(b.isnan(), 0, b))
+    counted = np.array(
+        [
+            [not b[i : i + 11, j : j + 11].isnan().any() for j in range(windows.shape[1])]
+            for i in range(windows.shape[0])
+        ]
+    )
+    assert 0 < counted.sum() < counted.size
+    assert float(mean_similarity(a, b)) == pytest.approx(windows[counted].mean(), abs=1e-12)
+    wild = torch.where(b.isnan(), 1e3, a)  # what is rendered there does not matter
+    assert float(mean_similarity(wild, b)) == pytest.approx(windows[counted].mean(), abs=1e-12)
+
+
+def test_gradient_of_the_similarity_is_that_of_finite_differences(path):
+    a, b = pictures(13, 14)
+    assert torch.autograd.gradcheck(lambda x: mean_similarity(x, b), a.clone().requires_grad_())
+    b[0, 0] = torch.nan
+    assert torch.autograd.gradcheck(lambda x: mean_similarity(x, b), a.clone().requires_grad_())
+
+
+def test_compiled_and_kornias_gradients_agree_in_float32(monkeypatch):
+    pytest.importorskip("numba")
+    gradients = []
+    for choice in ("numba", "reference"):
+        monkeypatch.setattr(loss, "choose", lambda *asked, choice=choice: choice)
+        a, b = pictures(90, 75, torch.float32)
+        value = mean_similarity(a.requires_grad_(), b)
+        value.backward()
+        gradients.append((float(value.detach()), a.grad))
+    assert gradients[0][0] == pytest.approx(gradients[1][0], abs=1e-6)
+    torch.testing.assert_close(gradients[0][1], gradients[1][1], rtol=2e-4, atol=2e-8)
+
+
+def test_nothing_known_is_no_loss(path):
+    a, b = pictures()
+    assert float(mean_similarity(a, b * torch.nan)) == 1.0
+    assert float(ColorLoss()(a, a[..., 0], b * torch.nan)) == 0.0
+
+
+def test_color_loss_mixes_l1_and_dissimilarity():
+    a, b = pictures()
+    absolute, similar = float((a - b).abs().mean()), float(ssim_windows(a, b).mean())
+    assert float(ColorLoss(0.2)(a, a[..., 0], b)) == pytest.approx(0.8 * absolute + 0.2 * (1 - similar), abs=1e-12)
+    assert float(ColorLoss(1.0)(a, a[..., 0], b)) == pytest.approx(1 - similar, abs=1e-12)
+    assert float(ColorLoss(0.0)(a, a[..., 0], b)) == float(l1_loss(a, a[..., 0], b))
+    assert float(ColorLoss(0.2)(a[:10], a[:10, :, 0], b[:10])) == float(l1_loss(a[:10], a[:10, :, 0], b[:10]))
+
+
+def test_a_weight_outside_0_and_1_is_refused():
+    with pytest.raises(ValueError, match=r"ssim_weight: expected a number in \[0, 1\], got 1.5"):
+        ColorLoss(1.5)

@@ -1,0 +1,141 @@
+"""A colour field of a room of six small pictures, as a stage of a run folder."""
+
+import dataclasses
+
+import pytest
+import torch
+from small_room import make_room
+
+from kfgs.cameras import Distortion
+from kfgs.evaluation.color import score_views
+from kfgs.fields import FieldConfig
+from kfgs.formats import read_splats
+from kfgs.pipeline.color import ColorConfig, Pictures, fit_color
+from kfgs.scenes import load_scene
+
+FIELD = dataclasses.replace(
+    ColorConfig.quick().field.with_steps(120), densify_every=10, report_every=20, checkpoint_every=25
+)
+CONFIG = dataclasses.replace(ColorConfig.quick(), field=FIELD)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return load_scene(make_room(tmp_path_factory.mktemp("room") / "scene"))
+
+
+@pytest.fixture(scope="module")
+def fitted(scene, tmp_path_factory):
+    return fit_color(scene, tmp_path_factory.mktemp("run"), CONFIG)
+
+
+def same(a, b):
+    return all(
+        torch.equal(getattr(a, name), getattr(b, name)) for name in ("means", "quats", "scales", "opacities", "sh")
+    )
+
+
+def test_a_small_field_already_resembles_unseen_views(fitted, scene):
+    assert score_views(fitted.gaussians, scene, "train").psnr.value > 19
+    assert score_views(fitted.gaussians, scene).psnr.value > 14  # six postage stamps; a grey picture scores about 11
+    assert [stage.name for stage in fitted.stages] == ["color"]
+    assert not list((fitted.path.parent / "unfinished").glob("*"))
+
+
+def test_the_splat_file_holds_the_field(fitted):
+    read = read_splats(fitted.path).gaussians
+    for name in ("means", "quats", "sh"):
+        assert torch.equal(getattr(read, name), getattr(fitted.gaussians, name))
+    torch.testing.assert_close(read.scales, fitted.gaussians.scales)
+    torch.testing.assert_close(read.opacities, fitted.gaussians.opacities)
+
+
+def test_a_second_run_redoes_nothing(fitted, scene):
+    written = fitted.path.stat().st_mtime_ns
+    again = fit_color(scene, fitted.path.parent, CONFIG)
+    assert [stage.reused for stage in again.stages] == [True]
+    assert same(again.gaussians, fitted.gaussians)
+    assert again.seconds == fitted.seconds
+    assert again.path.stat().st_mtime_ns == written  # nor is the file touched
+
+
+def test_killed_in_the_middle_it_goes_on_and_ends_the_same(fitted, scene, tmp_path):
+    def kill(row):
+        if row["step"] == 60:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_color(scene, tmp_path, CONFIG, callback=kill)
+    assert not (tmp_path / "color.ply").exists()
+    steps = []
+    resumed = fit_color(scene, tmp_path, CONFIG, callback=lambda row: steps.append(row["step"]))
+    assert steps[0] == 60  # from the checkpoint at 50
+    assert same(resumed.gaussians, fitted.gaussians)
+
+
+def test_other_options_and_other_pictures_make_another_field(fitted, scene, tmp_path):
+    quick = dataclasses.replace(CONFIG, field=dataclasses.replace(FIELD, steps=2))
+    first = fit_color(scene, tmp_path, quick)
+    other = fit_color(scene, tmp_path, dataclasses.replace(quick, ssim_weight=0.0))
+    colours = fit_color(dataclasses.replace(scene, colors=255 - scene.colors), tmp_path, quick)
+    keys = {result.stages[0].key for result in (first, other, colours)}
+    assert len(keys) == 3
+    assert not same(first.gaussians, colours.gaussians)
+
+
+def test_pictures_are_kept_as_bytes_at_the_training_size(scene):
+    views = scene.views("train")
+    cameras = [scene.cameras[i].resized(30, 40) for i in views]
+    pictures = Pictures(scene, views, cameras)
+    assert len(pictures) == 6
+    picture = pictures[2]
+    blocks = scene.image(views[2]).view(30, 2, 40, 2, 3).mean(dim=(1, 3))
+    assert picture.shape == (30, 40, 3)
+    assert (picture - blocks).abs().mean() < 0.02
+    assert torch.equal((picture * 255).round() / 255, picture)
+    assert torch.equal(pictures[2], picture)
+
+
+def test_where_the_lens_saw_nothing_the_picture_is_unknown(scene):
+    lens = Distortion("brown_conrady", (0.3, 0.0, 0.0, 0.0))
+    bent = dataclasses.replace(scene, cameras=[dataclasses.replace(c, distortion=lens) for c in scene.cameras])
+    straight = bent.undistorted()
+    views = straight.views("train")
+    whole = Pictures(straight, views, [straight.cameras[i] for i in views])[0]
+    assert torch.equal(whole[..., 0].isnan(), ~straight.mask(views[0]))
+    half = Pictures(straight, views, [straight.cameras[i].resized(30, 40) for i in views])[0]
+    assert 0 < int(half[..., 0].isnan().sum()) < 600
+    assert half[15, 20].isfinite().all()
+
+
+def test_bad_input_is_refused_before_any_work(scene, tmp_path):
+    lens = Distortion("brown_conrady", (0.3, 0.0, 0.0, 0.0))
+    bent = dataclasses.replace(scene, cameras=[dataclasses.replace(c, distortion=lens) for c in scene.cameras])
+    with pytest.raises(ValueError, match="scene: expected cameras without distortion, got a lens; pass"):
+        fit_color(bent, tmp_path, CONFIG)
+    bare = dataclasses.replace(scene, points=scene.points[:0], colors=scene.colors[:0])
+    with pytest.raises(ValueError, match="scene: expected sparse points to start from, got 0"):
+        fit_color(bare, tmp_path, CONFIG)
+    with pytest.raises(ValueError, match="split: expected one of train, test, got 'val'"):
+        fit_color(scene, tmp_path, dataclasses.replace(CONFIG, split="val"))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sh_degree": 4}, r"sh_degree: expected a number in \[0, 3\], got 4"),
+        ({"picture_scale": 0.0}, r"picture_scale: expected a number in \(0, 1\], got 0"),
+        ({"ssim_weight": -0.1}, "ssim_weight: expected a number in"),
+        ({"max_points": 1}, "max_points: expected a number in"),
+    ],
+)
+def test_wrong_options(change, message):
+    with pytest.raises(ValueError, match=message):
+        ColorConfig(**change)
+
+
+def test_the_published_schedule_is_the_default():
+    assert ColorConfig.paper() == ColorConfig()
+    assert ColorConfig().field == FieldConfig()
+    assert (ColorConfig().sh_degree, ColorConfig().ssim_weight, ColorConfig().picture_scale) == (3, 0.2, 1.0)
