@@ -66,7 +66,7 @@ def component_numbers(
         TypeError: if the mask is not boolean.
 
     Note:
-        600,000 Gaussians take about ten seconds on one core, in memory that does not depend on how dense they lie.
+        600,000 Gaussians take about 13 seconds on one core and 1 GB, however dense they lie.
     """
     check_shapes(("means", means, "N 3"), ("mask", mask, "N"))
     if mask.dtype != torch.bool:

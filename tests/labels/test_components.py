@@ -40,6 +40,11 @@ def test_two_dense_heaps_just_in_range_are_one():
     assert np.bincount(radius_components(both, nearest * 0.9999)).tolist() == [50, 50]
 
 
+def test_two_dense_heaps_in_one_cell_are_one():
+    heap = np.random.default_rng(0).uniform(0, 1e-4, (30, 3))
+    assert radius_components(np.concatenate([heap, heap + np.array([0.1, 0, 0])]), 1.0).max() == 0
+
+
 def test_far_outliers_do_not_overflow_the_grid():
     points = np.array([[0, 0, 0], [0.5, 0, 0], [1e12, 0, 0], [-1e12, 1e12, 3e11], [-1e12, 1e12, 3e11]])
     assert radius_components(points, 1e-3).tolist() == [1, 2, 3, 0, 0]
