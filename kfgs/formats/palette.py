@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 CODES = 256  # numbers in a codebook: an index is one byte
-_PASSES = 30  # of Lloyd's algorithm on the line
+_PASSES = 10  # of Lloyd's algorithm on the line
+_EVEN = 64  # numbers that start evenly between the least and the largest value, so that outliers get some
+_BINS = 512  # of the density of values
 _ROW_PASSES = 4  # on rows; 10 lower the error by 1 % and take 3 times as long (100,000 rows of 45, palette 65,536)
 _BLOCK = 1 << 22  # distances at a time, 16 MiB
 
@@ -21,8 +23,8 @@ def fit_codebook(
 ) -> NDArray[np.float32]:  # [256], ascending
     """256 numbers near which all values lie: Lloyd's algorithm on the line, exact in each pass.
 
-    Starts from quantiles, half of them by rank and half by value, so that outliers get numbers too. Up to 256 different
-    values are kept as they are.
+    Three in four start with the spacing that is best for many numbers, in proportion to the cube root of the density
+    (Panter and Dite 1951), the others evenly. Up to 256 different values are kept as they are.
     """
     ordered = np.sort(values.ravel())
     different = np.unique(ordered.astype(np.float32))
@@ -30,14 +32,21 @@ def fit_codebook(
         different = different if len(different) else np.zeros(1, np.float32)
         return np.concatenate([different, np.full(CODES - len(different), different[-1])]).astype(np.float32)
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
-    by_rank = np.quantile(ordered, (np.arange(CODES // 2) + 0.5) / (CODES // 2))
-    centers = np.sort(np.concatenate([by_rank, np.linspace(ordered[0], ordered[-1], CODES // 2)]))
+    centers = _spread_by_density(ordered)
     for _ in range(_PASSES):
         ends = np.concatenate([[0], np.searchsorted(ordered, (centers[1:] + centers[:-1]) / 2), [len(ordered)]])
         counts = np.diff(ends)
         means = np.diff(sums[ends]) / np.maximum(counts, 1)
         centers = np.sort(np.where(counts > 0, means, centers))
     return centers.astype(np.float32)
+
+
+def _spread_by_density(ordered: NDArray[np.float64]) -> NDArray[np.float64]:  # [N] -> [256]
+    counts, edges = np.histogram(ordered, bins=_BINS)
+    filled = np.concatenate([[0.0], np.cumsum(np.cbrt(counts))])
+    n = CODES - _EVEN
+    dense = np.interp((np.arange(n) + 0.5) / n * filled[-1], filled, edges)
+    return np.sort(np.concatenate([dense, np.linspace(ordered[0], ordered[-1], _EVEN)]))
 
 
 def nearest_codes(

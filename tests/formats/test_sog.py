@@ -1,0 +1,301 @@
+import json
+import math
+import zipfile
+
+import gsply.sog_reader
+import numpy as np
+import pytest
+import torch
+from oracles_packed import smallest_three
+from oracles_precision import assert_within, rotation_angles
+from oracles_sog import decode, encode, pack, sog_gaussian, unpack, version_1
+
+from kfgs import rasterize
+from kfgs.cameras.camera import Camera
+from kfgs.formats import SplatFile, find_format, read_splats, write_splats
+from kfgs.formats.order import morton_order
+from kfgs.formats.smallest_three import pack_smallest_three, rotation_error, unpack_smallest_three
+from kfgs.formats.sog import precision, read, write
+from kfgs.gaussians import Gaussians
+
+
+def _cloud(n: int = 700, degree: int = 3) -> Gaussians:
+    g = torch.Generator().manual_seed(6)
+    return Gaussians(
+        means=torch.randn(n, 3, generator=g) * torch.tensor([1.0, 50.0, 0.2]) + 3,
+        quats=torch.randn(n, 4, generator=g) * 3,
+        scales=(torch.randn(n, 3, generator=g) - 3).exp(),
+        opacities=torch.rand(n, generator=g),
+        sh=torch.randn(n, (degree + 1) ** 2, 3, generator=g) * 0.3,
+    )
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A small scene of degree 1 as its files, to be damaged."""
+    path = tmp_path_factory.mktemp("scene") / "a.sog"
+    write(path, SplatFile(_cloud(70, 1)))
+    return unpack(path)
+
+
+def _gsply_reads(path, monkeypatch):
+    """gsply without its decoder of images, which is not a dependency here."""
+    monkeypatch.setattr(
+        gsply.sog_reader, "_load_webp_image", lambda data: ((a := decode(data)).ravel(), a.shape[1], a.shape[0])
+    )
+    return gsply.sog_reader.sogread(str(path))
+
+
+@pytest.mark.parametrize("name", ["guitar.compressed.ply", "inria_9080.ply"])
+def test_real_files_survive(tmp_path, shared_data, name):
+    cloud = read_splats(shared_data / "splats" / name).gaussians
+    assert write_splats(tmp_path / "a.sog", cloud).lost == ()
+    order, stated = morton_order(cloud.means), precision(cloud)
+    back = read_splats(tmp_path / "a.sog")
+    assert back.info == {"format": "sog", "version": 2, "generator": "kfgs"}
+    assert_within(back.gaussians, cloud.select(order), stated._replace(means=stated.means[order]))
+    assert stated.scales < 0.12
+    assert stated.sh0 < 0.06
+    assert stated.sh_rest < 0.03
+    assert (stated.means <= 4e-5 * (1 + cloud.means.abs()) * cloud.means.abs().max().log1p()).all()
+    assert (tmp_path / "a.sog").stat().st_size < (shared_data / "splats" / name).stat().st_size
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_made_clouds_survive_and_others_read_them(tmp_path, monkeypatch, degree):
+    cloud, path = _cloud(1500, degree), tmp_path / "a.sog"
+    assert write(path, SplatFile(cloud)) == ()
+    order, stated, back = morton_order(cloud.means), precision(cloud), read(path).gaussians
+    assert_within(back, cloud.select(order), stated._replace(means=stated.means[order]))
+    files = unpack(path)
+    for i in (0, 777, 1499):
+        for name, expected in sog_gaussian(files, i).items():
+            np.testing.assert_allclose(getattr(back, name)[i].numpy(), expected, rtol=2e-6, atol=1e-6, err_msg=name)
+    other = _gsply_reads(path, monkeypatch)
+    np.testing.assert_allclose(other.means, back.means.numpy(), rtol=2e-5, atol=1e-6)
+    np.testing.assert_allclose(np.exp(other.scales), back.scales.numpy(), rtol=1e-5)
+    assert rotation_angles(other.quats, back.quats.numpy()).max() < 1e-5
+    np.testing.assert_allclose(other.sh0, back.sh[:, 0].numpy(), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(other.shN, back.sh[:, 1:].numpy(), rtol=0, atol=1e-6)
+    inner = (back.opacities > 0) & (back.opacities < 1)
+    opacities = 1 / (1 + np.exp(-other.opacities))
+    np.testing.assert_allclose(opacities[inner], back.opacities[inner].numpy(), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_version_1_is_read_as_others_do(tmp_path, monkeypatch, degree):
+    write(tmp_path / "a.sog", SplatFile(_cloud(150, degree)))
+    old = version_1(unpack(tmp_path / "a.sog"), degree)
+    splats, other = read(pack(tmp_path / "old.sog", old)), _gsply_reads(tmp_path / "old.sog", monkeypatch)
+    cloud = splats.gaussians
+    assert splats.info == {"format": "sog", "version": 1}
+    assert cloud.sh.shape == (150, (degree + 1) ** 2, 3)
+    np.testing.assert_allclose(other.means, cloud.means.numpy(), rtol=2e-5, atol=1e-6)
+    np.testing.assert_allclose(np.exp(other.scales), cloud.scales.numpy(), rtol=1e-5)
+    assert rotation_angles(other.quats, cloud.quats.numpy()).max() < 1e-5
+    np.testing.assert_allclose(other.sh0, cloud.sh[:, 0].numpy(), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(other.shN, cloud.sh[:, 1:].numpy(), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(1 / (1 + np.exp(-other.opacities)), cloud.opacities.numpy(), rtol=0, atol=1e-5)
+    red, alpha = (int(decode(old["sh0.webp"])[0, 0, channel]) for channel in (0, 3))
+    assert cloud.sh[0, 0, 0] == pytest.approx(-2 + 4 * red / 255)
+    assert cloud.opacities[0] == pytest.approx(1 / (1 + math.exp(6 - 13.5 * alpha / 255)))
+
+
+def test_a_folder_and_its_meta_are_read_like_the_zip(tmp_path):
+    cloud = _cloud(100).replace(labels=torch.arange(100) % 3)
+    written = write_splats(tmp_path / "scene", SplatFile(cloud, {}, ("a", "b", "c")), format="sog")
+    assert [path.name for path in written.paths] == ["scene", "scene.labels.npz", "scene.classes.json"]
+    write_splats(tmp_path / "scene.sog", SplatFile(cloud))
+    zipped = read(tmp_path / "scene.sog").gaussians
+    for path in (tmp_path / "scene", tmp_path / "scene" / "meta.json"):
+        assert find_format(path).NAME == "sog"
+        back = read_splats(path)
+        assert back.gaussians.labels.tolist() == cloud.labels.tolist()
+        for name in ("means", "quats", "scales", "opacities", "sh"):
+            assert torch.equal(getattr(back.gaussians, name), getattr(zipped, name))
+        assert_within(back.gaussians, cloud, precision(cloud))  # labelled: the caller's order
+    write_splats(tmp_path / "scene", cloud, format="sog")  # over a scene, as a whole
+    (tmp_path / "scene" / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match=r"path: expected a new folder, .* with notes.txt; choose another name"):
+        write_splats(tmp_path / "scene", cloud, format="sog")
+    assert (tmp_path / "scene" / "notes.txt").read_text() == "mine"
+
+
+def test_equal_clouds_give_equal_files(tmp_path):
+    for name in "ab":
+        write(tmp_path / f"{name}.sog", SplatFile(_cloud(2100, 2)))
+    assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
+
+
+@pytest.mark.parametrize("n", [0, 1, 65])
+def test_few_gaussians_survive(tmp_path, n):
+    cloud = _cloud(n, 3)
+    write(tmp_path / "a.sog", SplatFile(cloud))
+    back = read(tmp_path / "a.sog").gaussians
+    if n:
+        order, stated = morton_order(cloud.means), precision(cloud)
+        assert_within(back, cloud.select(order), stated._replace(means=stated.means[order]))
+    else:
+        assert (len(back), precision(cloud).means.shape) == (0, (0, 3))
+
+
+def test_rotations_by_their_three_smaller_components():
+    quats = torch.randn(4000, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+    quats[:3] = torch.tensor([[1.0, 1, 1, 1], [-1, 1, -1, 1], [0, 0, 0, 0]])
+    for steps in (255, 1023):
+        largest, small = pack_smallest_three(quats, steps)
+        back = unpack_smallest_three(largest[:, 0], small.astype(np.float32), steps).double().numpy()
+        assert rotation_angles(back[3:], quats[3:].numpy()).max() < rotation_error(steps)
+        assert rotation_angles(back[3:], quats[3:].numpy()).max() > 0.6 * rotation_error(steps)  # the bound is near
+        np.testing.assert_allclose(np.linalg.norm(back, axis=1), 1, atol=1e-6)
+        assert rotation_angles(back[2:3], np.array([[1.0, 0, 0, 0]])) < rotation_error(steps)
+        for i in (0, 1, 5, 9):
+            np.testing.assert_allclose(back[i], smallest_three(int(largest[i, 0]), small[i].tolist(), steps), atol=1e-6)
+
+
+def test_the_picture_stays_the_same(tmp_path, shared_data):
+    cloud = read_splats(shared_data / "splats" / "inria_9080.ply").gaussians
+    write(tmp_path / "a.sog", SplatFile(cloud))
+    camera = Camera(torch.eye(4), torch.tensor([[90.0, 0, 64], [0, 90, 48], [0, 0, 1]]), 128, 96)
+    pictures = [rasterize(g, camera).map.clamp(0, 1) for g in (cloud, read(tmp_path / "a.sog").gaussians)]
+    assert pictures[0].std() > 0.1
+    assert -10 * (pictures[0] - pictures[1]).square().mean().log10() > 40
+
+
+def test_images_of_other_kinds_and_a_missing_first_code(tmp_path, scene):
+    meta = json.loads(scene["meta.json"])
+    book = meta["scales"]["codebook"]
+    lowest = book[1] + (book[1] - book[255]) / 255
+    meta["scales"] |= {"codebook": [None, *book[1:]], "files": ["size.png"]}
+    pixels = decode(scene["scales.webp"])
+    pixels[0, 0, :3] = 0
+    files = scene | {"meta.json": json.dumps(meta).encode(), "size.png": encode(pixels[..., :3], "PNG")}
+    back = read(pack(tmp_path / "a.sog", files)).gaussians
+    torch.testing.assert_close(back.scales[0], torch.full((3,), math.exp(lowest)))
+
+
+def test_what_is_lost_is_told(tmp_path):
+    splats = SplatFile(_cloud(10).replace(features=torch.zeros(10, 4)), {"id": np.arange(10)})
+    assert write(tmp_path / "a.sog", splats) == (
+        "4 features per Gaussian: .sog has no place for them",
+        "the columns id: .sog has no place for them",
+    )
+    with pytest.raises(ValueError, match="splats: expected a cloud with colours"):
+        write(tmp_path / "b.sog", SplatFile(_cloud(10).replace(sh=None)))
+    assert not (tmp_path / "b.sog").exists()
+
+
+def _changed(scene, *keys, to):
+    """The scene with one value of `meta.json` changed, or taken out where `to` is ..."""
+    meta = json.loads(scene["meta.json"])
+    inner = meta
+    for key in keys[:-1]:
+        inner = inner[key]
+    if to is ...:
+        del inner[keys[-1]]
+    else:
+        inner[keys[-1]] = to
+    return scene | {"meta.json": json.dumps(meta).encode()}
+
+
+@pytest.mark.parametrize(
+    ("keys", "to", "message"),
+    [
+        (("version",), 3, "expected SOG version 1 or 2, got 3; export it as version 2"),
+        (("count",), 10**12, "expected a count of Gaussians that .* bytes can hold, got 1000000000000"),
+        (("count",), -1, "expected a count of Gaussians"),
+        (("count",), 70.0, "expected a count of Gaussians"),
+        (("count",), 5000, "means_l.webp' to be a lossless image of 5000 values .*, got 12 x 8 pixels"),
+        (("version",), ..., r"expected 'means.shape' in meta.json"),
+        (("means", "mins"), [0.0, math.nan, 0.0], "expected 3 finite numbers in 'means.mins'"),
+        (("means", "maxs"), [0.0, 1.0], "expected 3 finite numbers in 'means.maxs'"),
+        (("means", "maxs"), [200.0, 1.0, 1.0], "expected finite means, got .*inf"),
+        (("means", "files"), ["means_l.webp"], "expected 2 names in 'means.files'"),
+        (("means", "files"), ["means_l.webp", "../means_u.webp"], "got '../means_u.webp'; paths are refused"),
+        (("quats", "files"), ["/etc/passwd"], "the name of a file beside meta.json, got '/etc/passwd'"),
+        (("quats", "files"), ["a\\b"], "paths are refused"),
+        (("quats", "files"), [7], "the name of a file beside meta.json, got 7"),
+        (("quats", "files"), ["none.webp"], "expected 'none.webp' in the zip file, got no such entry"),
+        (("quats",), ..., "expected 'quats.files' in meta.json, got None"),
+        (("scales", "codebook"), "abc", "expected 1 finite numbers in 'scales.codebook'"),
+        (("scales", "codebook"), [1.0], "expected finite scales, got .*nan"),
+        (("scales", "codebook"), [1000.0] * 256, "expected finite scales, got .*inf"),
+        (("sh0", "codebook"), [True] * 256, "finite numbers in 'sh0.codebook'"),
+        (("shN", "bands"), 4, "expected 'shN.bands' from 1 to 3 in meta.json, got 4"),
+        (("shN", "bands"), 2, "'shN_centroids.webp' to be a lossless image of 1024 values"),
+        (("shN", "count"), 10**6, "expected 'shN.count' from 1 to 65536"),
+        (("shN", "count"), 10, "expected labels below 10 in 'shN_labels.webp', got 69"),
+    ],
+)
+def test_a_damaged_meta_is_named(tmp_path, scene, keys, to, message):
+    path = pack(tmp_path / "bad.sog", _changed(scene, *keys, to=to))
+    with pytest.raises(ValueError, match=f"bad.sog: .*{message}"):
+        read_splats(path)
+
+
+def _one_image(scene, name, pixels):
+    return scene | {name: encode(pixels)}
+
+
+def test_damaged_images_are_named(tmp_path, scene):
+    quats = decode(scene["quats.webp"])
+    quats[0, 3, 3] = 200
+    cases = {
+        "expected rotations whose alpha is 252 to 255, got 200 at Gaussian 3; was the image saved with loss": scene
+        | {"quats.webp": encode(quats)},
+        "expected 'sh0.webp' to be a lossless image": scene | {"sh0.webp": scene["sh0.webp"][:-40]},
+        "expected 'scales.webp' to be a lossless image .*cannot identify": scene
+        | {"scales.webp": b"GIF89a" + bytes(99)},
+        "expected 'means_u.webp' to be .* got 2000 x 2000 pixels": scene
+        | {"means_u.webp": encode(np.zeros((2000, 2000, 3)))},
+        "expected 'sh0.webp' of at most .* bytes .from the count., got more": scene | {"sh0.webp": bytes(10**7)},
+        "expected '192' x|expected 'shN_centroids.webp' of 192 x 2 pixels, got 96 x 8": scene
+        | {"shN_centroids.webp": encode(np.zeros((8, 96, 3)))},
+    }
+    for i, (message, files) in enumerate(cases.items()):
+        path = pack(tmp_path / f"bad{i}.sog", files)
+        with pytest.raises(ValueError, match=f"bad{i}.sog: .*({message})"):
+            read_splats(path)
+
+
+def test_zip_files_that_are_none_or_hostile_are_named(tmp_path, scene):
+    path = tmp_path / "bad.sog"
+    path.write_bytes(b"PK\x03\x04 and then nothing of the kind")
+    with pytest.raises(ValueError, match="bad.sog: expected a zip file, but it cannot be opened"):
+        read_splats(path)
+    pack(path, {"other.txt": b"x"})
+    with pytest.raises(ValueError, match="bad.sog: expected 'meta.json' in the zip file, got no such entry"):
+        read_splats(path)
+    pack(path, {"meta.json": bytes(10**8)})  # 100 KB that would become 100 MB
+    with pytest.raises(ValueError, match="bad.sog: expected 'meta.json' of at most 4194304 bytes"):
+        read_splats(path)
+    for text, message in (
+        (b"{", "cannot be parsed"),
+        (b"[1]", "expected an object"),
+        (b"[" * 100000, "cannot be parsed"),
+    ):
+        with pytest.raises(ValueError, match=f"bad.sog: .*{message}"):
+            read_splats(pack(path, {"meta.json": text}))
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr("meta.json", scene["meta.json"])
+    with pytest.raises(ValueError, match="stored or deflated, got zip method 14"):
+        read_splats(path)
+    whole = pack(path, scene).read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match="bad.sog: expected a zip file"):
+        read_splats(path)
+    at = whole.index(b"meta.json") + 60
+    path.write_bytes(whole[:at] + bytes(20) + whole[at + 20 :])
+    with pytest.raises(ValueError, match="bad.sog: expected 'meta.json' in the zip file, but it is damaged"):
+        read_splats(path)
+
+
+def test_a_folder_without_all_files_is_named(tmp_path, scene):
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    for name, data in scene.items():
+        (folder / name).write_bytes(data)
+    assert len(read_splats(folder)) == 70
+    (folder / "sh0.webp").unlink()
+    with pytest.raises(ValueError, match="scene: expected 'sh0.webp' in the folder, got no such file; copy all"):
+        read_splats(folder)
