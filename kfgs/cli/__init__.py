@@ -12,11 +12,12 @@ from typing import Any
 
 import tyro
 
-from .color import attach, color, convert, edit
+from .color import attach, color, convert, edit, select
 from .semantic import demo, fit, info, label, segment, sfm
 
 COMMANDS: dict[str, Any] = {
-    command.__name__: command for command in (demo, sfm, fit, segment, label, info, color, attach, edit, convert)
+    command.__name__: command
+    for command in (demo, sfm, fit, segment, label, info, color, attach, select, edit, convert)
 }
 
 

@@ -1,4 +1,4 @@
-"""Commands of the colour field: color, attach, select, edit, convert."""
+"""Commands of colour scenes: color, attach, select, edit, convert."""
 
 from __future__ import annotations
 
@@ -133,6 +133,58 @@ def attach(
     for words in written.lost:
         say(f"note: {words}")
     wrote(written.paths)
+
+
+def select(
+    query: Annotated[str, tyro.conf.Positional],
+    source: Annotated[Path, tyro.conf.Positional],
+    out: Path | None = None,
+    scene: Path | None = None,
+    classes: Path | None = None,
+    text: Path | None = None,
+    threshold: float | None = None,
+    negatives: bool = True,
+    images: Path | None = None,
+) -> None:
+    """Which Gaussians are the chair? How many there are, where, how large, and the view that shows each best.
+
+    Args:
+        query: a class name, "chair".
+        source: a field folder (`RUN/field`), asked by text; or a splat with classes, asked by label.
+        out: folder for selection.json (with the indices) and selection.ply (the Gaussians), if wanted.
+        scene: scene folder: classes.json, text.npy, and the cameras that score and show.
+        classes: JSON list of class names; SCENE/classes.json when not given.
+        text: .npy of one embedding per class; SCENE/text.npy when not given.
+        threshold: of a field, the paper's gamma; from the scores' distribution when not given. Of a splat, the least score.
+        negatives: tell the class from all others (relevancy) instead of by its cosine alone; of a field.
+        images: folder of the scene's pictures, if it is not SCENE/images.
+    """
+    from .._files import write_json
+    from ..fields import SemanticField
+    from ..formats import SplatFile, read_splats, write_splats
+    from ..labels import answers
+    from ..pipeline import query_field
+    from ..pipeline.apply import select_labelled
+    from ..scenes import load_scene
+
+    if (source / "field.json").is_file():
+        label_set, field = load_classes(scene, classes, text), SemanticField.load(source)
+        cameras = None if scene is None else training_cameras(field, scene, images)
+        found = query_field(field, label_set, query, threshold, cameras=cameras, negatives=negatives)
+        cloud = SplatFile(field.gaussians, {"score": found.scores.numpy()})
+    else:
+        cloud = read_splats(source)
+        found = select_labelled(cloud, query, threshold)
+        cameras = None if scene is None else load_scene(scene, images=images).undistorted().cameras
+    say(f"{query}: {len(found)} of {len(cloud)} Gaussians, {found.words}")
+    things = answers(cloud.gaussians, found, cameras)
+    for thing in things:
+        say(f"  {thing!r}")
+    if out is not None:
+        parts = [thing.to_json() for thing in things]
+        facts = {"query": query, "threshold": found.threshold, "how": found.how, "count": len(found), "parts": parts}
+        write_json(out / "selection.json", facts)
+        wrote([out / "selection.json", *write_splats(out / "selection.ply", cloud.select(found.mask)).paths])
 
 
 def edit(

@@ -190,6 +190,8 @@ def label(
             in the paper. `views` when a scene is given.
         images: folder of the scene's pictures, if it is not SCENE/images.
     """
+    import torch
+
     from ..fields import SemanticField
     from ..pipeline import label_cloud, label_field, query_field, read_cloud, save_labelled
 
@@ -213,7 +215,9 @@ def label(
         gaussians, scores = label_field(loaded, label_set, cameras)
         rule = "votes of the training views; score = winner's share" if cameras else "own latents; score = cosine"
     else:
-        gaussians, scores, rule = query_field(loaded, label_set, query, threshold)
+        found = query_field(loaded, label_set, query, threshold)
+        gaussians = loaded.gaussians.replace(labels=torch.where(found.mask, label_set.index(query), -1))
+        scores, rule = found.scores, f"{query}: {len(found)} Gaussians above gamma = {found.threshold:.4f} ({found.how})"
     say(f"labelled by {rule}")
     assert gaussians.labels is not None
     written = save_labelled(targets[0], gaussians, scores, label_set, rule=rule)

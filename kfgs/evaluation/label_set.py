@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from .._files import read_json
+from ..labels.names import class_index
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +33,8 @@ class LabelSet:
         return len(self.names)
 
     def index(self, name: str) -> int:
-        """The label of a class; a ValueError lists the known names."""
-        if name not in self.names:
-            raise ValueError(f"class: expected one of {', '.join(self.names)}, got {name!r}")
-        return self.names.index(name)
+        """The label of a class; a ValueError offers names that are like an unknown one."""
+        return class_index(name, self.names)
 
 
 def load_label_set(classes: str | Path, embeddings: str | Path) -> LabelSet:

@@ -20,8 +20,9 @@ from ..evaluation.segmentation import VOID
 from ..fields import SemanticField
 from ..formats.ply import Columns, other_elements, points_from_columns, read_ply, write_ply
 from ..formats.ply_3dgs import columns_from_gaussians
+from ..formats.splat_file import SCORE, SplatFile
 from ..gaussians import Gaussians
-from ..labels import Transfer, classify, transfer_labels
+from ..labels import Selection, Transfer, classify, select_by_label, transfer_labels
 from ..scenes import Scene
 from ..viz import FeatureColors, overlay_labels, palette, save_picture
 
@@ -159,18 +160,49 @@ def label_field(
 
 
 def query_field(
-    field: SemanticField, classes: LabelSet, name: str, threshold: float | None = None
-) -> tuple[Gaussians, Tensor, str]:
-    """The field's Gaussians with one class labelled: those whose similarity to it exceeds gamma (Sec. 3.4).
+    field: SemanticField,
+    classes: LabelSet,
+    name: str,
+    threshold: float | None = None,
+    *,
+    cameras: Sequence[Camera] | None = None,
+    negatives: bool = False,
+) -> Selection:
+    """The field's Gaussians of one class: those more similar to it than gamma (Sec. 3.4).
 
-    Returns:
-        The labelled Gaussians, the similarities [N], and a sentence that names gamma and where it came from.
+    Args:
+        field: a finished field.
+        classes: names and embeddings.
+        name: the class asked for.
+        threshold: gamma; from the scores' distribution when not given.
+        cameras: views whose pixels score each Gaussian; without them its own latent does, as in the paper.
+        negatives: tell the class from all others by relevancy, instead of taking its cosine alone.
     """
     target = classes.index(name)
-    found = field.query(classes.embeddings[target], threshold)
-    labels = torch.where(found.mask, target, -1)
-    how = f"{name}: {int(found.mask.sum())} Gaussians above gamma = {found.threshold:.4f} ({found.how})"
-    return field.gaussians.replace(labels=labels), found.scores, how
+    others = classes.embeddings[torch.arange(len(classes)) != target] if negatives else None
+    return field.query(classes.embeddings[target], threshold, negatives=others, cameras=cameras)
+
+
+def select_labelled(splats: SplatFile, name: str, threshold: float | None = None) -> Selection:
+    """The Gaussians of a labelled splat that carry one class.
+
+    Args:
+        splats: with labels and class names.
+        name: the class asked for.
+        threshold: take only those whose `score` is above it.
+
+    Raises:
+        ValueError: if the splat has no labels or no such class, or there are no scores to compare with a threshold.
+    """
+    score = splats.extra.get(SCORE)
+    found = select_by_label(splats.gaussians, name, splats.classes)
+    if score is None:
+        if threshold is not None:
+            raise ValueError(f"threshold: expected a splat with the column {SCORE!r}, got none; leave it out")
+        return found
+    scores = torch.from_numpy(score).to(splats.gaussians.means)
+    mask = found.mask if threshold is None else found.mask & (scores > threshold)
+    return Selection(mask, scores, threshold, found.how)
 
 
 def save_labelled(
