@@ -38,12 +38,29 @@ def test_remove_and_extract_divide_the_cloud():
     assert places(splats) == list(range(9))
 
 
-def test_grow_takes_unlabelled_neighbours_and_nothing_else():
-    splats = scene()  # the chair at 3 and 4, a wall at 2 and 7, orphans at 5, 6 and 8
-    assert places(Remove("chair", grow=1.5).apply(splats)) == [0, 1, 2, 6, 7, 8]
-    assert places(Remove("chair", grow=2.5).apply(splats)) == [0, 1, 2, 7, 8]
+def test_grow_takes_unlabelled_neighbours_that_are_nearest_to_it():
+    splats = scene()  # the chair at 3 and 4, a wall at 0, 1, 2 and 7, orphans at 5, 6 and 8
     assert places(Remove("chair", grow=1.0).apply(splats)) == [0, 1, 2, 5, 6, 7, 8]  # strictly closer
-    assert places(Remove("chair", grow=100.0).apply(splats)) == [0, 1, 2, 7]
+    assert places(Remove("chair", grow=1.5).apply(splats)) == [0, 1, 2, 6, 7, 8]
+    assert places(Remove("chair", grow=100.0).apply(splats)) == [0, 1, 2, 6, 7, 8]  # 6 and 8 belong to the wall at 7
+    middle = scene((0, 1, 2, 3, 4, 5, 5.5, 7, 8))
+    assert places(Remove("chair", grow=100.0).apply(middle)) == [0, 1, 2, 7, 8]  # 5.5 lies half-way: taken
+
+
+def test_grow_against_loops():
+    rng = np.random.default_rng(0)
+    labels = rng.integers(-1, 2, 200)
+    splats = scene(range(200), labels)
+    points = rng.uniform(0, 1, (200, 3))
+    splats = splats.replace(gaussians=splats.gaussians.replace(means=torch.from_numpy(points)))
+    gone = []
+    for i in range(200):
+        to = {label: min(np.linalg.norm(points[i] - p) for p in points[labels == label]) for label in (0, 1)}
+        if labels[i] == 1 or (labels[i] == -1 and to[1] < 0.1 and to[1] <= to[0]):
+            gone.append(i)
+    assert (labels == 1).sum() < len(gone) < (labels != 0).sum()
+    left = Remove("chair", grow=0.1).apply(splats).extra["score"].astype(int).tolist()
+    assert left == sorted(set(range(200)) - set(gone))
 
 
 def test_grow_without_labels_takes_every_neighbour():

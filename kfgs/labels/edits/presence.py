@@ -20,9 +20,10 @@ from .base import Edit, selected
 class Remove(Edit):
     """Take Gaussians away ("delete the chair").
 
-    `grow` takes the **unlabelled** Gaussians (label -1; all others where the cloud has no labels) whose centres are
-    closer to a removed one than so many world units: the transfer of labels leaves such orphans around an object, and
-    they would stay behind as a halo. Labelled neighbours are never taken.
+    `grow` also takes the **unlabelled** Gaussians (label -1; all others where the cloud has no labels) whose centres are
+    closer than so many world units to a removed one, and no farther from it than from any labelled one that stays: the
+    transfer of labels leaves such orphans around an object, and they would stay behind as a halo. Labelled neighbours
+    are never taken.
     """
 
     op: ClassVar[str] = "remove"
@@ -69,13 +70,18 @@ def check_flag(name: str, value: object) -> None:
 
 
 def _orphans_near(splats: SplatFile, mask: Tensor, distance: float) -> Tensor:  # [N] bool -> [N] bool
+    """The unlabelled Gaussians closer than `distance` to the mask, and no farther from it than from other labels."""
     labels = splats.gaussians.labels
     free = ~mask if labels is None else ~mask & (labels < 0)
     if distance == 0 or not bool(mask.any()) or not bool(free.any()):
         return torch.zeros_like(mask)
-    means = splats.gaussians.means.detach().double().cpu()
-    taken, candidates = means[mask.cpu()].numpy(), means[free.cpu()].numpy()
-    nearest, _ = cKDTree(taken).query(candidates, distance_upper_bound=distance)  # infinite beyond
-    near = torch.zeros_like(mask)
-    near[free] = torch.from_numpy(nearest < distance).to(mask.device)
-    return near
+    means = splats.gaussians.means.detach().double().cpu().numpy()
+    taken, candidates, rivals = (means[rows.cpu().numpy()] for rows in (mask, free, ~(mask | free)))
+    to_taken, _ = cKDTree(taken).query(candidates, distance_upper_bound=distance)  # infinite beyond
+    near = to_taken < distance
+    if len(rivals) and near.any():
+        to_rival, _ = cKDTree(rivals).query(candidates[near], distance_upper_bound=distance)
+        near[near] = to_taken[near] <= to_rival
+    out = torch.zeros_like(mask)
+    out[free] = torch.from_numpy(near).to(mask.device)
+    return out
