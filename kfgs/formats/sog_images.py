@@ -103,9 +103,10 @@ class SogFiles:
 
     def read_meta(self) -> dict[str, Any]:
         """What `meta.json` says."""
+        data = self.read(META, _META_BYTES)
         try:
-            meta = json.loads(self.read(META, _META_BYTES).decode("utf-8"))
-        except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+            meta = json.loads(data.decode("utf-8"))
+        except (ValueError, RecursionError) as error:  # not UTF-8, not JSON, or an integer of thousands of digits
             raise ValueError(f"{self.path}: expected JSON in {META}, but it cannot be parsed ({error})") from error
         if not isinstance(meta, dict):
             raise ValueError(f"{self.path}: expected an object in {META}, got {type(meta).__name__}; export it again")

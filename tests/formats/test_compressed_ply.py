@@ -67,6 +67,22 @@ def test_real_files_survive(tmp_path, shared_data, name):
     assert stated.means.median() < 0.1  # the tolerance says something
 
 
+@pytest.mark.parametrize("name", ["biker", "guitar"])
+def test_a_file_of_supersplat_is_written_as_it_was(tmp_path, shared_data, name):
+    path = shared_data / "splats" / f"{name}.compressed.ply"
+    cloud = read(path).gaussians
+    kept = cloud.replace(labels=torch.zeros(len(cloud), dtype=torch.int64))  # labels keep the order
+    write(tmp_path / "a.compressed.ply", SplatFile(kept))
+    before, after = (read_ply_elements(file) for file in (path, tmp_path / "a.compressed.ply"))
+    for word in ("packed_position", "packed_scale", "packed_color"):
+        np.testing.assert_array_equal(after["vertex"][word], before["vertex"][word])
+    same = after["vertex"]["packed_rotation"] == before["vertex"]["packed_rotation"]
+    assert same.mean() > 0.997  # which of two equal components is the largest
+    assert list(after["chunk"]) == list(before["chunk"])
+    for bound, column in before["chunk"].items():
+        np.testing.assert_allclose(after["chunk"][bound], column, rtol=0, atol=2e-6)
+
+
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_made_clouds_survive_and_others_read_them(tmp_path, degree):
     cloud = _cloud(degree=degree)
