@@ -11,16 +11,16 @@ from typing import Any
 
 import torch
 from safetensors.torch import load_file, save_file
-from torch import Tensor
 
 from .._check import check_range, check_whole
 from .._files import write_json
-from ..cameras import Camera, resize_map
+from ..cameras import Camera
 from ..fields import ColorLoss, FieldConfig, GaussianParams, fit_field
 from ..formats import read_splats, write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene
 from .fit import _generator, _scene_digest, _tensor_digest
+from .photos import Photos
 from .stages import Run, Stage
 
 
@@ -51,7 +51,7 @@ class ColorConfig:
 
     @staticmethod
     def paper() -> ColorConfig:
-        """The schedule of 3DGS: 30,000 steps at full size. For a workstation with a GPU."""
+        """The schedule of 3DGS: 30,000 steps at full size; hours on a CPU."""
         return ColorConfig()
 
     @staticmethod
@@ -67,26 +67,32 @@ class ColorConfig:
     @staticmethod
     def quick() -> ColorConfig:
         """A minute on two CPU cores for a small scene, such as the toy room (48 views of 192x256)."""
-        field = replace(_CPU_FIELD.with_steps(1_200), densify_every=50, coarse=((600, 2),), max_gaussians=40_000)
+        schedule: dict[str, Any] = {
+            "densify_from": 80,
+            "densify_until": 800,
+            "densify_every": 50,
+            "sh_degree_every": 320,
+        }
+        field = replace(_CPU_FIELD, steps=1_200, coarse=((600, 2),), max_gaussians=40_000, **schedule)
         return ColorConfig(sh_degree=1, field=field)
 
 
 _CPU_FIELD = FieldConfig(
-    steps=3_000,
+    steps=5_000,
     means_lr=3.2e-4,
     means_lr_final=3.2e-6,
     quats_lr=0.002,
     scales_lr=0.01,
     sh0_lr=0.005,
     sh_rest_lr=0.005 / 20,
-    sh_degree_every=800,
-    coarse=((2_000, 2),),
+    sh_degree_every=1_000,
+    coarse=((3_000, 2),),
     densify_from=200,
-    densify_until=2_000,
+    densify_until=2_500,
     densify_every=100,
     densify_gradient=4e-4,
     reset_every=0,
-    max_gaussians=120_000,
+    max_gaussians=150_000,
     checkpoint_every=500,
 )
 
@@ -104,36 +110,6 @@ class ColorResult:
     def seconds(self) -> float:
         """Time spent on it, also by earlier processes."""
         return sum(stage.seconds for stage in self.stages)
-
-
-class Pictures(Sequence[Tensor]):
-    """The training pictures at their training size: read when first asked for, then kept as bytes.
-
-    A picture is [h, w, 3] float32 in [0, 1], NaN where nothing was recorded (the border of an undistorted one).
-    """
-
-    def __init__(self, scene: Scene, views: Sequence[int], cameras: Sequence[Camera]) -> None:
-        self._scene, self._views, self._sizes = scene, list(views), [camera.size for camera in cameras]
-        self._kept: dict[int, tuple[Tensor, Tensor | None]] = {}
-
-    def __len__(self) -> int:
-        return len(self._views)
-
-    def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [h, w, 3], one picture at a time
-        if i not in self._kept:
-            self._kept[i] = self._read(i)
-        bytes_, known = self._kept[i]
-        picture = bytes_.float() / 255
-        return picture if known is None else picture.masked_fill(~known[..., None], torch.nan)
-
-    def _read(self, i: int) -> tuple[Tensor, Tensor | None]:  # [h, w, 3] uint8, [h, w] bool
-        view, size = self._views[i], self._sizes[i]
-        picture, known = self._scene.image(view), self._scene.mask(view)
-        inside = known.float()[..., None]
-        picture = resize_map(picture, size, antialias=True)
-        inside = resize_map(inside, size, antialias=True)[..., 0]
-        bytes_ = (picture.clamp(0, 1) * 255).round().to(torch.uint8)
-        return bytes_, None if bool(known.all()) else inside > 1 - 1e-4
 
 
 def fit_color(
@@ -163,8 +139,17 @@ def fit_color(
     config = config or ColorConfig.paper()
     views = scene.views(config.split)
     _check_scene(scene)
-    cameras = [_training_camera(scene.cameras[i], config.picture_scale) for i in views]
     run = Run(Path(folder), report)
+    params = _color_stage(run, scene, views, config, {"progress": progress, "callback": callback})
+    result = ColorResult(params.activated().detach(), Path(folder) / "color.ply", run.stages)
+    if not _is_saved(result):
+        write_splats(result.path, result.gaussians)
+    return result
+
+
+def _color_stage(
+    run: Run, scene: Scene, views: Sequence[int], config: ColorConfig, options: dict[str, Any]
+) -> GaussianParams:
     inputs = {
         "pictures": run.digests([scene.image_paths[i] for i in views]),
         "lenses": None if scene.lenses is None else [_describe_lens(scene.lenses[i]) for i in views],
@@ -173,19 +158,38 @@ def fit_color(
         "extent": float(scene.extent),
         "config": asdict(config),
     }
-    stage = run.stage(
-        "color",
-        inputs,
-        lambda made: _make(
-            made, scene, views, cameras, config, run, inputs, {"progress": progress, "callback": callback}
-        ),
-    )
-    run.scratch("color", inputs).unlink(missing_ok=True)
-    params = GaussianParams.from_tensors(load_file(stage.folder / "params.safetensors"))
-    result = ColorResult(params.activated().detach(), Path(folder) / "color.ply", run.stages)
-    if not _is_saved(result):
-        write_splats(result.path, result.gaussians)
-    return result
+    scratch = run.scratch("color", inputs)
+
+    def make(folder: Path) -> float:
+        started = time.perf_counter()
+        generator = _generator(config.seed, "color")
+        start = GaussianParams.from_points(
+            scene.points,
+            colors=scene.colors,
+            sh_degree=config.sh_degree,
+            max_points=config.max_points,
+            generator=generator,
+        )
+        cameras = [_training_camera(scene.cameras[i], config.picture_scale) for i in views]
+        fit = fit_field(
+            start,
+            cameras,
+            Photos(scene, views, cameras),
+            config.field,
+            extent=scene.extent,
+            loss=ColorLoss(config.ssim_weight),
+            generator=generator,
+            checkpoint=scratch,
+            **options,
+        )
+        tensors = {name: value.contiguous() for name, value in fit.params.to_tensors().items()}
+        save_file(tensors, folder / "params.safetensors")
+        write_json(folder / "history.json", fit.history)
+        return max(0.0, fit.history[-1]["seconds"] - (time.perf_counter() - started))  # before it was killed
+
+    stage = run.stage("color", inputs, make)
+    scratch.unlink(missing_ok=True)
+    return GaussianParams.from_tensors(load_file(stage.folder / "params.safetensors"))
 
 
 def _is_saved(result: ColorResult) -> bool:
@@ -194,11 +198,11 @@ def _is_saved(result: ColorResult) -> bool:
         saved = read_splats(result.path).gaussians
     except (OSError, ValueError):
         return False
-    assert result.gaussians.sh is not None
-    exact = saved.sh is not None and len(saved) == len(result.gaussians) and torch.equal(saved.sh, result.gaussians.sh)
-    return exact and all(
-        torch.equal(getattr(saved, name), getattr(result.gaussians, name)) for name in ("means", "quats")
-    )
+    ours = result.gaussians
+    if saved.sh is None or len(saved) != len(ours):
+        return False
+    same = all(torch.equal(getattr(saved, name), getattr(ours, name)) for name in ("means", "quats", "sh"))
+    return same and all(torch.allclose(getattr(saved, name), getattr(ours, name)) for name in ("scales", "opacities"))
 
 
 def _check_scene(scene: Scene) -> None:
@@ -217,39 +221,3 @@ def _describe_lens(lens: Camera) -> list[Any]:
 
 def _training_camera(camera: Camera, scale: float) -> Camera:
     return camera.resized(*(max(1, round(n * scale)) for n in camera.size)) if scale != 1 else camera
-
-
-def _make(
-    folder: Path,
-    scene: Scene,
-    views: Sequence[int],
-    cameras: Sequence[Camera],
-    config: ColorConfig,
-    run: Run,
-    inputs: dict[str, Any],
-    options: dict[str, Any],
-) -> float:
-    started = time.perf_counter()
-    generator = _generator(config.seed, "color")
-    start = GaussianParams.from_points(
-        scene.points,
-        colors=scene.colors,
-        sh_degree=config.sh_degree,
-        max_points=config.max_points,
-        generator=generator,
-    )
-    fit = fit_field(
-        start,
-        cameras,
-        Pictures(scene, views, cameras),
-        config.field,
-        extent=scene.extent,
-        loss=ColorLoss(config.ssim_weight),
-        generator=generator,
-        checkpoint=run.scratch("color", inputs),
-        **options,
-    )
-    tensors = {name: value.contiguous() for name, value in fit.params.to_tensors().items()}
-    save_file(tensors, folder / "params.safetensors")
-    write_json(folder / "history.json", fit.history)
-    return max(0.0, fit.history[-1]["seconds"] - (time.perf_counter() - started))  # before it was killed

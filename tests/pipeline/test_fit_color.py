@@ -9,12 +9,17 @@ from small_room import make_room
 from kfgs.cameras import Distortion
 from kfgs.evaluation.color import score_views
 from kfgs.fields import FieldConfig
-from kfgs.formats import read_splats
-from kfgs.pipeline.color import ColorConfig, Pictures, fit_color
+from kfgs.formats import read_splats, write_splats
+from kfgs.pipeline.color import ColorConfig, fit_color
+from kfgs.pipeline.photos import Photos
 from kfgs.scenes import load_scene
 
 FIELD = dataclasses.replace(
-    ColorConfig.quick().field.with_steps(120), densify_every=10, report_every=20, checkpoint_every=25
+    ColorConfig.quick().field.with_steps(120),
+    densify_every=10,
+    max_gaussians=3_000,
+    report_every=20,
+    checkpoint_every=25,
 )
 CONFIG = dataclasses.replace(ColorConfig.quick(), field=FIELD)
 
@@ -36,8 +41,8 @@ def same(a, b):
 
 
 def test_a_small_field_already_resembles_unseen_views(fitted, scene):
-    assert score_views(fitted.gaussians, scene, "train").psnr.value > 19
-    assert score_views(fitted.gaussians, scene).psnr.value > 14  # six postage stamps; a grey picture scores about 11
+    assert score_views(fitted.gaussians, scene, "train").psnr.value > 20
+    assert score_views(fitted.gaussians, scene).psnr.value > 15.5  # of six stamps; the mean colour scores 13.3
     assert [stage.name for stage in fitted.stages] == ["color"]
     assert not list((fitted.path.parent / "unfinished").glob("*"))
 
@@ -51,12 +56,14 @@ def test_the_splat_file_holds_the_field(fitted):
 
 
 def test_a_second_run_redoes_nothing(fitted, scene):
+    labels = torch.arange(len(fitted.gaussians)) % 3
+    write_splats(fitted.path, fitted.gaussians.replace(labels=labels))
     written = fitted.path.stat().st_mtime_ns
     again = fit_color(scene, fitted.path.parent, CONFIG)
     assert [stage.reused for stage in again.stages] == [True]
     assert same(again.gaussians, fitted.gaussians)
     assert again.seconds == fitted.seconds
-    assert again.path.stat().st_mtime_ns == written  # nor is the file touched
+    assert again.path.stat().st_mtime_ns == written  # labels given since are kept
 
 
 def test_killed_in_the_middle_it_goes_on_and_ends_the_same(fitted, scene, tmp_path):
@@ -86,7 +93,7 @@ def test_other_options_and_other_pictures_make_another_field(fitted, scene, tmp_
 def test_pictures_are_kept_as_bytes_at_the_training_size(scene):
     views = scene.views("train")
     cameras = [scene.cameras[i].resized(30, 40) for i in views]
-    pictures = Pictures(scene, views, cameras)
+    pictures = Photos(scene, views, cameras)
     assert len(pictures) == 6
     picture = pictures[2]
     blocks = scene.image(views[2]).view(30, 2, 40, 2, 3).mean(dim=(1, 3))
@@ -101,9 +108,9 @@ def test_where_the_lens_saw_nothing_the_picture_is_unknown(scene):
     bent = dataclasses.replace(scene, cameras=[dataclasses.replace(c, distortion=lens) for c in scene.cameras])
     straight = bent.undistorted()
     views = straight.views("train")
-    whole = Pictures(straight, views, [straight.cameras[i] for i in views])[0]
+    whole = Photos(straight, views, [straight.cameras[i] for i in views])[0]
     assert torch.equal(whole[..., 0].isnan(), ~straight.mask(views[0]))
-    half = Pictures(straight, views, [straight.cameras[i].resized(30, 40) for i in views])[0]
+    half = Photos(straight, views, [straight.cameras[i].resized(30, 40) for i in views])[0]
     assert 0 < int(half[..., 0].isnan().sum()) < 600
     assert half[15, 20].isfinite().all()
 

@@ -1,0 +1,79 @@
+"""Fit a colour field to a scene and score it on the views that were held out.
+
+    python benchmarks/color_field.py SCENE OUT [--preset cpu|quick|paper] [--steps N] [--pictures 4]
+
+Writes OUT/color.ply (a 3DGS PLY), OUT/scores.json (`kfgs-color/1`) and OUT/views/*.png: the rendering beside the picture.
+Compare the published 3DGS with `--preset paper`, on a GPU.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from kfgs._files import write_json
+from kfgs.evaluation.color import score_views
+from kfgs.pipeline.color import ColorConfig, fit_color
+from kfgs.scenes import load_scene
+
+
+def main() -> None:
+    """Fit, score, and say what it took."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scene")
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--preset", choices=("cpu", "quick", "paper"), default="cpu")
+    parser.add_argument("--steps", type=int, help="the preset's schedule compressed or stretched to so many steps")
+    parser.add_argument("--pictures", type=int, default=4, help="how many test views to draw")
+    args = parser.parse_args()
+    scene = load_scene(args.scene).undistorted()
+    config: ColorConfig = getattr(ColorConfig, args.preset)()
+    if args.steps:
+        config = replace(config, field=config.field.with_steps(args.steps))
+    loads: list[float] = []
+
+    def tell(row: dict[str, float]) -> None:
+        loads.append(os.getloadavg()[0])
+        if row["step"] % 250 == 0:
+            print(f"{row}, load {loads[-1]:.1f}", flush=True)
+
+    result = fit_color(scene, args.out, config, report=print, callback=tell)
+    chosen = [scene.stem(i) for i in scene.views("test")]
+    chosen = chosen[:: max(1, len(chosen) // max(1, args.pictures))][: args.pictures]
+
+    def draw(stem: str, rendered: Tensor, taken: Tensor) -> None:
+        if stem in chosen:
+            path = args.out / "views" / f"{stem}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray((torch.cat([rendered, taken], dim=1) * 255).round().byte().numpy()).save(path)
+
+    started = time.perf_counter()
+    report = score_views(result.gaussians, scene, show=draw)
+    per_view = (time.perf_counter() - started) / len(report.views)
+    load = sum(loads) / len(loads) if loads else None
+    facts = {
+        "preset": args.preset,
+        "steps": config.field.steps,
+        "gaussians": len(result.gaussians),
+        "seconds": result.seconds,
+        "threads": torch.get_num_threads(),
+        "mean load of the machine": load,
+        "seconds per scored view": per_view,
+        "scores": report.to_json(),
+    }
+    write_json(args.out / "scores.json", facts)
+    print(report)
+    print(
+        f"{len(result.gaussians)} Gaussians, {result.seconds / 60:.1f} minutes, {config.field.steps} steps, load {load}"
+    )
+
+
+if __name__ == "__main__":
+    main()
