@@ -24,7 +24,7 @@ from .order import morton_order
 from .ply import Columns, read_comments, read_ply_elements, write_ply_elements
 from .smallest_three import pack_smallest_three, rotation_error, unpack_smallest_three
 from .splat_file import Precision, SplatFile
-from .values import SH_C0, check_finite, colours_to_write, words_of_loss
+from .values import SH_C0, check_finite, colours_to_write, positive_scales, words_of_loss
 
 NAME = "compressed_ply"
 SUFFIXES = (".compressed.ply",)
@@ -83,7 +83,7 @@ def read(path: Path) -> SplatFile:
     gaussians = Gaussians(
         means=torch.from_numpy(positions),
         quats=_unpack_rotations(vertex["packed_rotation"]),
-        scales=torch.from_numpy(scales),
+        scales=positive_scales(path, scales),
         opacities=torch.from_numpy(rgba[:, 3].copy()),
         sh=torch.from_numpy(sh),
     )

@@ -15,6 +15,7 @@ from torch import Tensor
 from ..gaussians import Gaussians
 from .ply import points_from_columns, read_ply, stack_columns, write_ply
 from .splat_file import Columns, Precision, SplatFile
+from .values import check_finite, positive_scales
 
 NAME = "ply"
 SUFFIXES = (".ply",)
@@ -32,13 +33,16 @@ def read(path: Path) -> SplatFile:
     """Read a 3DGS PLY with any degree of spherical harmonics; unknown columns go to `extra`.
 
     Raises:
-        ValueError: if it is damaged, or no 3DGS file.
+        ValueError: if it is damaged, no 3DGS file, or a value is not a finite number; opacities of 0 and 1, whose logits
+            are infinite, are read as such.
     """
     columns = read_ply(path)
     try:
         gaussians = gaussians_from_columns(columns)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+    _check_values(path, gaussians)
+    gaussians = gaussians.replace(scales=positive_scales(path, gaussians.scales.numpy()))
     extra = {name: values for name, values in columns.items() if not _is_ours(name)}
     return SplatFile(gaussians, extra, info={"format": NAME})
 
@@ -52,6 +56,12 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
 def precision(gaussians: Gaussians) -> Precision:
     """float32 of logarithms and logits."""
     return Precision(means=0.0, scales=1e-5, rotation=1e-3, opacities=1e-5, sh0=0.0, sh_rest=0.0)
+
+
+def _check_values(path: Path, g: Gaussians) -> None:
+    values = {"means": g.means, "rotations": g.quats, "scales": g.scales, "opacities": g.opacities}
+    values |= {name: v for name, v in (("colours", g.sh), ("features", g.features)) if v is not None}
+    check_finite(path, **{name: value.numpy() for name, value in values.items()})
 
 
 def _is_ours(name: str) -> bool:

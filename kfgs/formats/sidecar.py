@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from .._files import atomic_path, digest_file, read_json, write_json
 from .splat_file import SCORE, SplatFile
+
+_NPZ_HEADERS = 1 << 16  # bytes: what an .npz file of three arrays has beside their values
 
 
 def names_path(path: str | Path) -> Path:
@@ -31,7 +36,7 @@ def write_names(path: str | Path, classes: tuple[str, ...], **facts: Any) -> Pat
 
 
 def write_sidecar(path: Path, splats: SplatFile, *, holds_labels: bool) -> list[Path]:
-    """Write what the format itself could not hold, and take away labels that belonged to an older file of that name."""
+    """Write what the format itself could not hold, and take away labels and names that belonged to an older file."""
     labels, written = splats.gaussians.labels, []
     beside = labels_path(path)
     if labels is not None and not holds_labels:
@@ -43,6 +48,8 @@ def write_sidecar(path: Path, splats: SplatFile, *, holds_labels: bool) -> list[
         written.append(beside)
     else:
         beside.unlink(missing_ok=True)
+    if labels is not None and not splats.classes:
+        names_path(path).unlink(missing_ok=True)  # else the older file's names would be read as this one's
     if labels is not None and splats.classes:
         facts = splats.info.get("labels", {})
         written.append(write_names(path, splats.classes, **facts))
@@ -80,22 +87,36 @@ def read_names(path: Path) -> tuple[str, ...]:
 
 
 def _with_labels(beside: Path, path: Path, splats: SplatFile) -> SplatFile:
-    try:
-        with np.load(beside, allow_pickle=False) as file:
-            labels, of = file["class_id"], str(file["of"])
-            score = file.get(SCORE)
-    except (ValueError, KeyError, OSError, EOFError) as error:
-        raise ValueError(
-            f"{beside}: expected labels of {path.name}, but it cannot be read ({error}); delete it"
-        ) from error
+    labels, score, of = _load_labels(beside, path, len(splats))
     if of != _digest(path) or labels.shape != (len(splats),):
         raise ValueError(
             f"{beside}: expected the labels of {path.name} as it is, got those of another version; delete it, or write "
             "both again"
         )
+    if (labels < -1).any() or (score is not None and (score.shape != labels.shape or not np.isfinite(score).all())):
+        raise ValueError(f"{beside}: expected class_id of -1 or more and finite scores of as many Gaussians; delete it")
     extra = splats.extra if score is None else splats.extra | {SCORE: score}
     gaussians = splats.gaussians.replace(labels=torch.from_numpy(labels.astype(np.int64)))
     return splats.replace(gaussians=gaussians, extra=extra)
+
+
+def _load_labels(beside: Path, path: Path, count: int) -> tuple[NDArray[Any], NDArray[Any] | None, str]:
+    """`class_id`, `score` and the digest of the file they belong to; nothing is unpacked that is larger than it can be."""
+    try:
+        with zipfile.ZipFile(beside) as archive:
+            sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
+        if sum(sizes.values()) > 16 * count + _NPZ_HEADERS:
+            raise ValueError(f"{sum(sizes.values())} bytes for {count} Gaussians")
+        with np.load(beside, allow_pickle=False) as file:
+            labels, of = file["class_id"], str(file["of"])
+            score = file.get(SCORE)
+    except (ValueError, KeyError, OSError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(
+            f"{beside}: expected labels of {path.name}, but it cannot be read ({error}); delete it"
+        ) from error
+    if labels.dtype.kind not in "iu" or (score is not None and score.dtype.kind != "f"):
+        raise ValueError(f"{beside}: expected whole numbers as class_id, got {labels.dtype}; delete it")
+    return labels, score, of
 
 
 def _digest(path: Path) -> str:

@@ -29,7 +29,7 @@ from .smallest_three import pack_smallest_three, rotation_error, unpack_smallest
 from .sog_images import META, SogFiles, encode_image, write_zip
 from .sog_meta import SogMeta, parse_meta
 from .splat_file import Precision, SplatFile
-from .values import check_finite, colours_to_write, words_of_loss
+from .values import check_finite, colours_to_write, positive_scales, words_of_loss
 
 NAME = "sog"
 SUFFIXES = (".sog",)
@@ -76,7 +76,7 @@ def read(path: Path) -> SplatFile:
     gaussians = Gaussians(
         means=torch.from_numpy(means),
         quats=quats,
-        scales=torch.from_numpy(linear),
+        scales=positive_scales(path, linear),
         opacities=_opacities(meta, rgba[:, 3]),
         sh=torch.from_numpy(sh),
     )

@@ -22,7 +22,7 @@ from types import ModuleType
 from typing import NamedTuple
 
 from ..gaussians import Gaussians
-from .sidecar import read_sidecar, write_sidecar
+from .sidecar import names_path, read_sidecar, write_sidecar
 from .splat_file import SplatFile
 
 MODULES = (  # asked in this order: compressed PLY before PLY, whose ending it shares
@@ -79,13 +79,21 @@ def read_splats(path: str | Path) -> SplatFile:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is of no known format, or damaged: truncated, with counts that disagree or numbers that are not
-            finite.
+        ValueError: if it is of no known format, or damaged: truncated, with counts that disagree, numbers that are not
+            finite, or labels that are none of the named classes.
     """
     path = Path(path)
     module = find_format(path)
-    splats: SplatFile = module.read(path)
-    return read_sidecar(path, splats)
+    splats: SplatFile = read_sidecar(path, module.read(path))
+    labels = splats.gaussians.labels
+    if labels is not None and len(labels):
+        low, high = int(labels.min()), int(labels.max())
+        if low < -1 or (splats.classes and high >= len(splats.classes)):
+            raise ValueError(
+                f"{path}: expected labels from -1 to {len(splats.classes) - 1} (the named classes), got {low} to {high}; "
+                f"correct the labels, or the names in {names_path(path).name}"
+            )
+    return splats
 
 
 def write_splats(path: str | Path, splats: SplatFile | Gaussians, *, format: str | None = None) -> Written:

@@ -168,7 +168,7 @@ def test_a_file_that_pygltflib_wrote_opens(tmp_path):
 
 
 def test_labels_names_and_columns_travel(tmp_path):
-    cloud = _cloud().replace(labels=torch.tensor([-1, 0, 1, 2, 0, 300, 70000]))
+    cloud = _cloud().replace(labels=torch.tensor([-1, 0, 1, 2, 0, 2, 1]))
     extra = {"score": np.linspace(0, 1, 7, dtype=np.float32), "filter 3D": np.arange(7, dtype=np.uint8)}
     extra["huge"] = np.full(7, 2**31 - 1, np.int64)
     classes = ("wall", "Stuhl ä", "plant")
@@ -183,6 +183,12 @@ def test_labels_names_and_columns_travel(tmp_path):
     assert {"_CLASS_ID", "_SCORE", "_FILTER_3D"} < set(
         _json(tmp_path / "a.glb")["meshes"][0]["primitives"][0]["attributes"]
     )
+
+
+def test_labels_without_names_may_be_large(tmp_path):
+    cloud = _cloud(2).replace(labels=torch.tensor([300, 1 << 24]))
+    write_splats(tmp_path / "a.glb", cloud)
+    assert read_splats(tmp_path / "a.glb").gaussians.labels.tolist() == [300, 1 << 24]
 
 
 def test_a_node_moves_resizes_and_turns(tmp_path):

@@ -1,0 +1,149 @@
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+
+from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs.formats.sidecar import labels_path, names_path, read_names, write_names
+from kfgs.gaussians import Gaussians
+
+CLASSES = ("wall", "Stuhl ä", "plant")
+
+
+def _splats(n: int = 6) -> SplatFile:
+    g = torch.Generator().manual_seed(1)
+    cloud = Gaussians(
+        means=torch.randn(n, 3, generator=g),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        scales=torch.ones(n, 3),
+        opacities=torch.full((n,), 0.5),
+        sh=torch.randn(n, 1, 3, generator=g),
+        labels=torch.arange(n) % 4 - 1,
+    )
+    return SplatFile(cloud, {"score": np.linspace(0, 1, n)}, CLASSES)
+
+
+@pytest.fixture
+def path(tmp_path):
+    """A .splat file, which has no place for labels, with its labels beside it."""
+    assert write_splats(tmp_path / "a.splat", _splats()).paths == [
+        tmp_path / "a.splat", tmp_path / "a.splat.labels.npz", tmp_path / "a.classes.json"
+    ]  # fmt: skip
+    return tmp_path / "a.splat"
+
+
+def _bend(path, **changes):
+    with np.load(labels_path(path)) as file:
+        arrays = dict(file) | changes
+    np.savez(labels_path(path), **{name: value for name, value in arrays.items() if value is not None})
+
+
+def test_labels_scores_and_names_come_back(path):
+    back = read_splats(path)
+    assert back.gaussians.labels.tolist() == [-1, 0, 1, 2, -1, 0]
+    assert back.gaussians.labels.dtype == torch.int64
+    np.testing.assert_allclose(back.extra["score"], np.linspace(0, 1, 6), atol=1e-7)
+    assert back.classes == CLASSES
+
+
+def test_without_them_the_file_still_opens(path):
+    labels_path(path).unlink()
+    names_path(path).unlink()
+    back = read_splats(path)
+    assert back.gaussians.labels is None
+    assert (back.classes, back.extra) == ((), {})
+
+
+def test_labels_without_names_and_scores(path):
+    names_path(path).unlink()
+    _bend(path, score=None)
+    back = read_splats(path)
+    assert back.gaussians.labels.tolist() == [-1, 0, 1, 2, -1, 0]
+    assert (back.classes, back.extra) == ((), {})
+
+
+def test_labels_of_another_version_are_refused(path):
+    content = path.read_bytes()
+    path.write_bytes(content[32:] + content[:32])  # the same Gaussians in another order
+    with pytest.raises(ValueError, match=r"labels.npz: expected the labels of a.splat as it is, got those of another"):
+        read_splats(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"class_id": np.zeros(5, np.int32)}, "got those of another version"),
+        ({"class_id": np.zeros(6, np.float32)}, "expected whole numbers as class_id, got float32; delete it"),
+        ({"class_id": np.full(6, "a")}, "expected whole numbers as class_id"),
+        ({"class_id": np.full(6, -2)}, "expected class_id of -1 or more"),
+        ({"class_id": None}, "it cannot be read .*class_id.*; delete it"),
+        ({"of": None}, "it cannot be read .*of.*; delete it"),
+        ({"of": np.array("other")}, "got those of another version"),
+        ({"score": np.full(6, np.nan)}, "finite scores"),
+        ({"score": np.zeros(7)}, "finite scores of as many Gaussians"),
+        ({"score": np.zeros(100_000)}, "it cannot be read .800.* bytes for 6 Gaussians"),
+        ({"class_id": np.array([None] * 6)}, "it cannot be read"),  # pickled objects are never loaded
+    ],
+)
+def test_damaged_labels_are_named(path, changes, message):
+    _bend(path, **changes)
+    with pytest.raises(ValueError, match=f"a.splat.labels.npz: .*{message}"):
+        read_splats(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"hello" * 100, np.arange(6).tobytes()])
+def test_what_is_no_archive_is_named(path, content):
+    labels_path(path).write_bytes(content)
+    with pytest.raises(
+        ValueError, match=r"a.splat.labels.npz: expected labels of a.splat, but it cannot be read .* delete"
+    ):
+        read_splats(path)
+
+
+def test_a_single_array_is_no_archive(path):
+    buffer = io.BytesIO()
+    np.save(buffer, np.zeros(6, np.int32))
+    labels_path(path).write_bytes(buffer.getvalue())
+    with pytest.raises(ValueError, match="cannot be read"):
+        read_splats(path)
+
+
+def test_an_archive_that_unpacks_to_gigabytes_is_not_unpacked(path):
+    with zipfile.ZipFile(labels_path(path), "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("class_id.npy", b"\0" * (64 << 20))
+    assert labels_path(path).stat().st_size < 100_000
+    with pytest.raises(ValueError, match=r"67108864 bytes for 6 Gaussians"):
+        read_splats(path)
+
+
+def test_every_cut_of_the_labels_is_refused(path):
+    content = labels_path(path).read_bytes()
+    for cut in range(0, len(content), 13):
+        labels_path(path).write_bytes(content[:cut])
+        with pytest.raises(ValueError, match=r"labels.npz"):
+            read_splats(path)
+
+
+def test_names_survive(tmp_path):
+    target = write_names(tmp_path / "a.ply", CLASSES, distance=0.1)
+    assert target == tmp_path / "a.classes.json"
+    assert read_names(target) == CLASSES
+    assert json.loads(target.read_text())["distance"] == 0.1
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("[]", "expected 'class_id' with the names of classes 0, 1, ..., got NoneType"),
+        ('{"class_id": {"0": "a", "2": "b"}}', "expected 'class_id' with the names"),
+        ('{"class_id": {"0": 5}}', r"expected names, got \(5,\); write each class as a string"),
+        ("{", "cannot be parsed"),
+    ],
+)
+def test_damaged_names_are_named(path, content, message):
+    names_path(path).write_text(content)
+    with pytest.raises(ValueError, match=f"a.classes.json: .*{message}"):
+        read_splats(path)

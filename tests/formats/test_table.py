@@ -1,0 +1,116 @@
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from kfgs.formats import SplatFile, find_format, formats, read_splats, write_splats
+from kfgs.formats import table as module_table
+from kfgs.formats.sidecar import labels_path, names_path
+from kfgs.gaussians import Gaussians
+
+
+def _cloud(n: int = 9, labels: bool = True) -> Gaussians:
+    g = torch.Generator().manual_seed(1)
+    return Gaussians(
+        means=torch.randn(n, 3, generator=g),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        scales=torch.ones(n, 3),
+        opacities=torch.full((n,), 0.5),
+        sh=torch.randn(n, 1, 3, generator=g),
+        labels=torch.arange(n) % 3 - 1 if labels else None,
+    )
+
+
+def test_every_format_keeps_the_contract():
+    for name, module in formats().items():
+        assert name == module.NAME
+        assert isinstance(module.HOLDS_LABELS, bool)
+        assert all(suffix.startswith(".") and suffix == suffix.lower() for suffix in module.SUFFIXES)
+        assert module.matches(b"") is False
+        assert callable(module.read)
+        assert hasattr(module, "write") == hasattr(module, "precision") or name == "ksplat"
+        assert module.__doc__
+    assert {"ply", "compressed_ply", "spz", "sog", "gltf", "ksplat", "splat"} == set(formats())
+
+
+def test_every_module_of_a_format_is_listed():
+    found = {name.rpartition(".")[2] for name, module in sys.modules.items()
+             if name.startswith("kfgs.formats.") and hasattr(module, "SUFFIXES")}  # fmt: skip
+    assert found == set(module_table.MODULES)
+
+
+@pytest.mark.parametrize("name", ["ply", "compressed_ply", "spz", "sog", "gltf"])
+def test_content_goes_before_the_name(tmp_path, name):
+    module = formats()[name]
+    write_splats(tmp_path / f"a{module.SUFFIXES[0]}", _cloud(labels=False))
+    (tmp_path / f"a{module.SUFFIXES[0]}").rename(tmp_path / "renamed.splat")
+    assert find_format(tmp_path / "renamed.splat") is module
+    assert len(read_splats(tmp_path / "renamed.splat")) == 9
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [("a.ply", "ply"), ("a.compressed.ply", "compressed_ply"), ("A.PLY", "ply"), ("a.b.SPZ", "spz"), ("a.glb", "gltf"),
+     ("a.gltf", "gltf"), ("a.splat", "splat"), ("a.sog", "sog")],
+)  # fmt: skip
+def test_the_ending_chooses_the_format(tmp_path, file, name):
+    written = write_splats(tmp_path / file, _cloud(labels=False))
+    assert written.paths == [tmp_path / file]
+    assert read_splats(tmp_path / file).info["format"] == name
+
+
+def test_a_format_can_be_named(tmp_path):
+    write_splats(tmp_path / "noending", _cloud(labels=False), format="spz")
+    assert read_splats(tmp_path / "noending").info["format"] == "spz"
+
+
+def test_what_is_lost_is_said(tmp_path):
+    cloud = _cloud().replace(sh=torch.zeros(9, 16, 3), features=torch.zeros(9, 4))
+    lost = write_splats(tmp_path / "a.splat", SplatFile(cloud, {"id": np.arange(9)})).lost
+    assert any("degree 3" in word for word in lost)
+    assert any("4 features" in word for word in lost)
+    assert any("id" in word for word in lost)
+
+
+def test_bad_requests_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none.ply: no such file; expected a splat file there"):
+        read_splats(tmp_path / "none.ply")
+    (tmp_path / "a.txt").write_text("hello")
+    with pytest.raises(
+        ValueError, match=r"a.txt: expected a splat file of a known format, got something else; known are "
+    ):
+        read_splats(tmp_path / "a.txt")
+    with pytest.raises(ValueError, match=r"expected a splat file of a known format"):
+        read_splats(tmp_path)
+    with pytest.raises(
+        ValueError, match=r"path: expected a name that ends in one of .*, got 'a.obj'; rename it or pass"
+    ):
+        write_splats(tmp_path / "a.obj", _cloud())
+    with pytest.raises(ValueError, match=r"format: expected one of .*, got 'obj'; leave it out"):
+        write_splats(tmp_path / "a.ply", _cloud(), format="obj")
+    with pytest.raises(ValueError, match=r"expected a name that ends in"):  # read only
+        write_splats(tmp_path / "a.ksplat", _cloud())
+    assert [file.name for file in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_labels_beyond_the_names_are_refused(tmp_path):
+    path = tmp_path / "a.ply"
+    write_splats(path, SplatFile(_cloud(), classes=("a", "b")))
+    assert read_splats(path).classes == ("a", "b")
+    names_path(path).write_text('{"class_id": {"0": "a"}}')
+    with pytest.raises(
+        ValueError, match=r"a.ply: expected labels from -1 to 0 \(the named classes\), got -1 to 1; .* in a.classes"
+    ):
+        read_splats(path)
+
+
+def test_labels_of_an_older_file_do_not_stay(tmp_path):
+    path = tmp_path / "a.splat"
+    write_splats(path, SplatFile(_cloud(), classes=("a", "b")))
+    assert labels_path(path).is_file()
+    write_splats(path, _cloud(5, labels=False))
+    assert read_splats(path).gaussians.labels is None
+    assert not labels_path(path).is_file()
+    write_splats(path, _cloud())  # labels without names
+    assert read_splats(path).classes == ()
