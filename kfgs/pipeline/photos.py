@@ -1,4 +1,4 @@
-"""The photographs that a colour field is trained on: read when first asked for, shrunk to the training size, then kept as bytes."""
+"""The photographs that a colour field learns from: read when first asked for, shrunk to the training size, kept as bytes."""
 
 from __future__ import annotations
 
