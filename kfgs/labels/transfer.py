@@ -7,19 +7,21 @@ from typing import Literal, get_args
 
 import numpy as np
 import torch
-from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 
 from .._check import check_choice, check_range, check_shapes, check_whole
 from ..gaussians import Gaussians
+from ..splat.covariance import covariance_3d
 from .transfer_distance import explained_distance, positions
-from .transfer_rules import Density, Nearest, Rule, Vote
-from .transfer_sources import Array, Sources, neighbours_together
+from .transfer_rules import Density, Nearest, Rule, Verdict, Vote, upper_triangle
+from .transfer_sources import Array, Near, Sources, neighbours_together
 
 Method = Literal["nearest", "vote", "mahalanobis"]
 
 NEIGHBOURS = 4  # looked at by "nearest", for ambiguity alone; 8 cost half as much again
-CHUNK = 32_768  # destinations at a time: with 16 neighbours and their axes, 38 MB
+CHUNK = 16_384  # destinations at a time: with 16 neighbours and their covariances, 25 MB
+THIN = 1e-3  # of a Gaussian's length is the least thickness that "mahalanobis" sees
+TINY = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,50 +49,58 @@ class Transfer:
 def transfer_labels(
     src: Tensor | Gaussians,  # [S, 3] means, or the Gaussians
     src_labels: Tensor,  # [S] int64, -1 = none
-    dst_means: Tensor,  # [N, 3]
+    dst: Tensor | Gaussians,  # [N, 3] means, or the Gaussians
     distance: float | None = None,
     *,
     method: Method = "nearest",
     neighbours: int = 16,
-    deviations: float = 3.0,
+    deviations: float = 5.0,
 ) -> Transfer:
     """Give each destination a label from the labelled sources **strictly** closer than `distance`.
 
     The rule of Sec. 3.4, where `distance` is lambda. The paper does not say which label wins when several lie in range.
-    Three answers, of the same sources, those with label -1 left out (they do not hide a labelled one behind them):
+    Three answers; sources with label -1 take no part and do not hide a labelled one behind them:
 
     - "nearest": the nearest source decides. Its share is that of its label among the 4 nearest in range, each counting 1.
-    - "vote": the `neighbours` nearest in range vote, each with its opacity (1 if `src` is positions alone), however far
-      they are. Among tied labels, the one with the nearest voter.
-    - "mahalanobis": the density of the semantic field at the destination decides: of the `neighbours` nearest in range,
-      each weighs o exp(-m^2 / 2), where m is the distance in standard deviations of that source; from `deviations` on,
-      none takes part. Among tied labels, the one with the source of least m. Needs Gaussians as `src`.
+    - "vote": the `neighbours` nearest in range vote with weight o / d, opacity (1 for positions) over distance. Among
+      tied labels, the one with the nearest voter.
+    - "mahalanobis": shapes decide. Of the `neighbours` nearest in range, those less than `deviations` standard deviations
+      away vote with weight o exp(-m^2 / 2), m^2 = d^T (Sigma_src + Sigma_dst)^-1 d: how much source and destination
+      overlap. Among tied labels, the one with the source of least m. `src` must be Gaussians; a `dst` of positions has
+      Sigma_dst = 0.
 
     Of equally near sources (as float64 distances) the lowest indices come first; of several at one position only the
-    lowest index speaks.
+    lowest index speaks. A Gaussian thinner than a thousandth of its length counts as that thick.
 
     Args:
         src: the semantic field, as positions or as Gaussians.
         src_labels: their labels.
-        dst_means: positions of the Gaussians to label (the colour field).
+        dst: what to label (the colour field), as positions or as Gaussians.
         distance: lambda in world units; None takes `default_distance`.
         method: which label wins.
         neighbours: how many sources "vote" and "mahalanobis" look at, at most.
-        deviations: the reach of "mahalanobis" in standard deviations of a source.
+        deviations: the reach of "mahalanobis", besides `distance`.
 
     Returns:
         Labels, shares, distances and sources on the destinations' device, with counts. Without any labelled source
         everything is orphaned.
 
     Raises:
-        ValueError: if shapes disagree, a position is not finite, a label is below -1, a number is out of range, or
-            "mahalanobis" gets no Gaussians.
+        ValueError: if shapes disagree, a position, shape or opacity is not finite, a label is below -1, a number is out of
+            range, or "mahalanobis" gets no Gaussians.
         TypeError: if the labels are not integers.
+
+    Note:
+        Measured on the colour Gaussians of the toy room (true classes of its surface) and of Replica's room_0 (classes of
+        the labelled pixels that they fill), mIoU in per cent over nearest / vote / mahalanobis of Gaussians: 88.6 / 89.6 /
+        90.9 and 74.7 / 75.4 / 78.7 from `SemanticField.classify_by_views`; 50.1 / 70.1 / 74.4 and 30.7 / 51.1 / 48.9 from
+        `SemanticField.classify`, whose labels are noisy. Times: benchmarks/transfer.py.
     """
     check_choice("method", method, get_args(Method))
     check_whole("neighbours", neighbours, 1)
     check_range("deviations", deviations, 0, closed=(False, False))
     src_means = src.means if isinstance(src, Gaussians) else src
+    dst_means = dst.means if isinstance(dst, Gaussians) else dst
     check_shapes(("src_means", src_means, "S 3"), ("src_labels", src_labels, "S"), ("dst_means", dst_means, "N 3"))
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
@@ -98,21 +108,28 @@ def transfer_labels(
         raise ValueError(
             "src: expected Gaussians for method 'mahalanobis', got positions; pass the Gaussians themselves"
         )
-    points, dst = positions("src_means", src_means), positions("dst_means", dst_means)
     labels = _labels(src_labels)
+    points, targets = positions("src_means", src_means), positions("dst_means", dst_means)
     kept = np.flatnonzero(labels >= 0)
-    found = _Found(len(dst))
+    found = _Found(len(targets))
     if kept.size == 0:
         chosen, how = (0.0, "no labelled source") if distance is None else (float(distance), "given")
         return found.report(dst_means, chosen, how, method)
     sources = Sources(points[kept], labels[kept])
-    chosen, how = explained_distance(sources.tree, dst) if distance is None else (float(distance), "given")
     kept = kept[sources.first]
-    rule = _rule(method, sources, src, kept, deviations)
-    order = neighbours_together(dst) if len(dst) else np.empty(0, dtype=np.int64)
-    for start in range(0, len(dst), CHUNK):
+    chosen, how = explained_distance(sources.tree, targets) if distance is None else (float(distance), "given")
+    k = NEIGHBOURS if method == "nearest" else neighbours
+    rule: Rule = Nearest(sources)
+    if method == "vote":
+        rule = Vote(sources, _opacities(src)[kept], 1e-9 * chosen)
+    elif method == "mahalanobis":
+        shapes = _covariances("src", src)[:, kept], targets, _covariances("dst", dst)
+        rule = Density(sources, _opacities(src)[kept], *shapes, deviations)
+    order = neighbours_together(targets)
+    for start in range(0, len(targets), CHUNK):
         rows = order[start : start + CHUNK]
-        found.fill(sources, kept, rule, dst, rows, NEIGHBOURS if method == "nearest" else neighbours, chosen)
+        near = sources.near(targets[rows], k, chosen)
+        found.fill(rows, sources, kept, near, rule(rows, near))
     return found.report(dst_means, chosen, how, method)
 
 
@@ -126,18 +143,14 @@ class _Found:
         self.shares = np.zeros(n)
         self.ambiguous = 0
 
-    def fill(self, sources: Sources, kept: Array, rule: Rule, dst: Array, rows: Array, k: int, distance: float) -> None:
-        """Ask `rule` about some rows of `dst`; `kept` says which of the caller's sources each source is."""
-        points = dst[rows]
-        near = sources.near(points, k, distance)
-        verdict = rule(points, near)
-        self.ambiguous += int(verdict.ambiguous.sum())
+    def fill(self, rows: Array, sources: Sources, kept: Array, near: Near, verdict: Verdict) -> None:
+        """Note a verdict on some rows; `kept` says which of the caller's sources each source is."""
         some = np.flatnonzero(verdict.column >= 0)
         column = verdict.column[some]
-        source = near.source[some, column]
-        rows = rows[some]
+        source, rows = near.source[some, column], rows[some]
         self.labels[rows], self.sources[rows] = sources.labels[source], kept[source]
         self.distances[rows], self.shares[rows] = near.distance[some, column], verdict.share[some]
+        self.ambiguous += int(verdict.ambiguous.sum())
 
     def report(self, dst_means: Tensor, distance: float, how: str, method: Method) -> Transfer:
         device = dst_means.device
@@ -156,20 +169,32 @@ class _Found:
         )
 
 
-def _rule(method: Method, sources: Sources, src: Tensor | Gaussians, kept: Array, deviations: float) -> Rule:
-    """The rule of a method for the sources `kept` of `src`."""
-    if method == "nearest":
-        return Nearest(sources)
-    if not isinstance(src, Gaussians):
-        return Vote(sources, np.ones(len(kept)))
-    which = torch.from_numpy(kept).to(src.means.device)
-    tiny = np.finfo(np.float64).tiny
-    opacities = np.maximum(src.opacities[which].detach().cpu().double().numpy(), tiny)
-    if method == "vote":
-        return Vote(sources, opacities)
-    axes = quaternion_to_rotation_matrix(src.quats[which].detach().cpu().double()).numpy()
-    scales = src.scales[which].detach().cpu().double().clamp_min(1e-12).numpy()
-    return Density(sources, opacities, axes.transpose(0, 2, 1) / scales[:, :, None], deviations)
+def _opacities(cloud: Tensor | Gaussians) -> Array:  # [N] float64, > 0
+    """What each source has to say: its opacity, or 1 where there are only positions."""
+    if not isinstance(cloud, Gaussians):
+        return np.ones(len(cloud))
+    values = cloud.opacities.detach().cpu().double()
+    _check_finite("src.opacities", values[:, None])
+    return values.clamp_min(TINY).numpy()
+
+
+def _covariances(name: str, cloud: Tensor | Gaussians) -> Array:  # [6, N]
+    """Covariances in float64, none so thin that its inverse is lost in rounding; zeros for positions."""
+    if not isinstance(cloud, Gaussians):
+        return np.zeros((6, len(cloud)))
+    scales, quats = cloud.scales.detach().cpu().double(), cloud.quats.detach().cpu().double()
+    _check_finite(f"{name}.scales, {name}.quats", torch.cat([scales, quats], dim=1))
+    scales = torch.maximum(scales, (THIN * scales.amax(dim=1, keepdim=True)).clamp_min(1e-30))
+    return upper_triangle(covariance_3d(quats, scales).numpy())
+
+
+def _check_finite(name: str, values: Tensor) -> None:  # [N, n]
+    finite = torch.isfinite(values).all(dim=1)
+    if not finite.all():
+        row = int((~finite).nonzero()[0])
+        raise ValueError(
+            f"{name}: expected finite numbers, got NaN or infinity in row {row}; remove such Gaussians first"
+        )
 
 
 def _labels(labels: Tensor) -> Array:  # [S] int64

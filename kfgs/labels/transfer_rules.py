@@ -20,7 +20,7 @@ class Verdict(NamedTuple):
 
 
 Rule = Callable[[Array, Near], Verdict]
-"""Takes the destinations [n, 3] and what is near them."""
+"""Takes rows of the destinations [n] and what is near them."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Nearest:
 
     sources: Sources
 
-    def __call__(self, points: Array, near: Near) -> Verdict:
+    def __call__(self, rows: Array, near: Near) -> Verdict:
         """Column 0, where it holds a source."""
         weight = near.hit.astype(np.float64)
         label = self.sources.labels[near.source]
@@ -40,41 +40,74 @@ class Nearest:
 
 @dataclass(frozen=True, eq=False)
 class Vote:
-    """The label with the most weight among the sources in range."""
+    """The label with the most weight among the sources in range, each weighing its opacity over its distance."""
 
     sources: Sources
-    weights: Array  # [S] > 0
+    opacities: Array  # [S] > 0
+    least: float  # distances below this count as this: a source at the very place outweighs all others
 
-    def __call__(self, points: Array, near: Near) -> Verdict:
+    def __call__(self, rows: Array, near: Near) -> Verdict:
         """Tied labels: the one with the nearest voter."""
-        weight = np.where(near.hit, self.weights[near.source], 0)
+        weight = np.where(near.hit, self.opacities[near.source] / np.maximum(near.distance, self.least), 0)
         return _tally(self.sources, near, weight, near.distance)
 
 
 @dataclass(frozen=True, eq=False)
 class Density:
-    """The label whose Gaussians are densest at the destination: the sum of o exp(-m^2 / 2), m in standard deviations."""
+    """The label whose Gaussians overlap the destination most: the sum of o exp(-m^2 / 2).
+
+    m^2 = d^T (Sigma_src + Sigma_dst)^-1 d is the squared Mahalanobis distance, the exponent of the overlap integral of
+    two Gaussians; with a point for a destination, Sigma_dst = 0, it is the source's own density.
+    """
 
     sources: Sources
-    weights: Array  # [S] > 0, opacities
-    whitening: Array  # [S, 3, 3], S^-1 R^T: takes an offset to standard deviations along the Gaussian's axes
-    deviations: float  # sources further away than this take no part
+    opacities: Array  # [S] > 0
+    src_covariances: Array  # [6, S], see `upper_triangle`
+    dst_means: Array  # [N, 3]
+    dst_covariances: Array  # [6, N], zeros for points
+    deviations: float  # sources from here on take no part
 
-    def __call__(self, points: Array, near: Near) -> Verdict:
-        """Tied labels: the one with the Gaussian that is nearest in standard deviations."""
-        offset = points[:, None] - self.sources.points[near.source]  # [n, k, 3]
-        m = np.linalg.norm((self.whitening[near.source] @ offset[..., None])[..., 0], axis=-1)
-        m[~near.hit | (m >= self.deviations)] = np.inf
-        return _tally(self.sources, near, self.weights[near.source] * np.exp(-0.5 * m**2), m)
+    def __call__(self, rows: Array, near: Near) -> Verdict:
+        """Tied labels: the one with the Gaussian of least m."""
+        hit = near.hit
+        source, row = near.source[hit], np.broadcast_to(rows[:, None], hit.shape)[hit]
+        covariances = self.src_covariances[:, source] + self.dst_covariances[:, row]
+        squares = _mahalanobis_squares(self.dst_means[row] - self.sources.points[source], covariances)
+        m = np.full(hit.shape, np.inf)
+        m[hit] = np.where(squares < self.deviations**2, squares, np.inf)
+        least = m.min(axis=1, keepdims=True)
+        least[np.isinf(least)] = 0
+        weight = self.opacities[near.source] * np.exp(-0.5 * (m - least))  # relative to the best: nothing underflows
+        return _tally(self.sources, near, weight, m)
+
+
+def upper_triangle(covariances: Array) -> Array:  # [N, 3, 3] -> [6, N], xx xy xz yy yz zz
+    """The six numbers of symmetric matrices, each in a row of its own."""
+    return np.ascontiguousarray(covariances[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].T)
+
+
+def _mahalanobis_squares(offset: Array, covariances: Array) -> Array:  # [n, 3], [6, n] -> [n]
+    """d^T Sigma^-1 d by Cramer's rule, ten times faster than a solver on so many small matrices."""
+    x, y, z = offset.T
+    xx, xy, xz, yy, yz, zz = covariances
+    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy  # the first row of the adjugate
+    determinant = xx * a + xy * b + xz * c
+    squares: Array = (
+        x * (x * a + 2 * (y * b + z * c))
+        + y * (y * (xx * zz - xz * xz) + 2 * z * (xy * xz - xx * yz))
+        + z * z * (xx * yy - xy * xy)
+    ) / determinant
+    return np.maximum(squares, 0)
 
 
 def _tally(sources: Sources, near: Near, weight: Array, far: Array) -> Verdict:
     """Add up `weight` [n, k] per label; of the winner's sources the one that is least `far` [n, k] is named."""
     part = np.isfinite(far)
-    found = part.any(axis=1)
+    found: Array = np.asarray(part.any(axis=1))
     ambiguous = _disagree(sources, near, part)
-    column = np.asarray(np.where(found, far.argmin(axis=1), -1))
-    share: Array = found.astype(np.float64)
+    column = np.full(len(found), -1)
+    column[found] = np.argmin(far[found], axis=1)
+    share = np.where(found, 1.0, 0.0)
     rows = np.flatnonzero(ambiguous)
     if rows.size:  # elsewhere all agree, which is most of the cloud
         label, weight = np.where(part[rows], sources.labels[near.source[rows]], -1), weight[rows]

@@ -74,6 +74,8 @@ def distinct(points: Array) -> tuple[Array, Array]:
 
 def neighbours_together(points: Array) -> Array:  # [N, 3] -> [N] int64
     """An order of points in which neighbours ask one after another: the tree answers twice as fast."""
+    if len(points) == 0:
+        return np.empty(0, dtype=np.int64)
     cell = max(float(np.ptp(points, axis=0).max()) / 64, np.finfo(np.float64).tiny)
     order: Array = np.lexsort(np.floor((points - points.min(axis=0)) / cell).T)
     return order

@@ -1,0 +1,76 @@
+"""How long does it take to carry labels to another cloud, and which method takes what?
+
+    python benchmarks/transfer.py [--sources 100000] [--destinations 600000] [--repeats 3]
+
+Two clouds along the walls of a room of 6 x 4 x 3, 1 cm thick, with labels in patches of half a unit. The least of some
+repeats, beside scipy's bare k-d tree (no order, no ties, no counts) on the same points.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from kfgs.gaussians import Gaussians
+from kfgs.labels import default_distance, transfer_labels
+
+SIZE = np.array([6.0, 4.0, 3.0])
+
+
+def room(N: int, sigma: float, seed: int) -> Gaussians:
+    """N flat-ish Gaussians along the walls."""
+    rng = np.random.default_rng(seed)
+    means, axis = rng.random((N, 3)) * SIZE, rng.integers(0, 3, N)
+    means[np.arange(N), axis] = rng.integers(0, 2, N) * SIZE[axis]
+    means += 0.01 * rng.standard_normal((N, 3))
+    values = means, rng.standard_normal((N, 4)), sigma * (0.3 + rng.random((N, 3))), 0.05 + 0.9 * rng.random(N)
+    return Gaussians(*(torch.from_numpy(value).float() for value in values))
+
+
+def least(repeats: int, call: Callable[[], object]) -> float:
+    """Seconds of the quickest of some calls."""
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sources", type=int, default=100_000)
+    parser.add_argument("--destinations", type=int, default=600_000)
+    parser.add_argument("--repeats", type=int, default=3)
+    args = parser.parse_args()
+    src, dst = room(args.sources, 0.04, 0), room(args.destinations, 0.015, 1)
+    patches = (src.means * 2).floor().long()
+    labels = (patches @ torch.tensor([1, 5, 7])) % 13
+    distance = default_distance(src.means, dst.means)
+    points, targets = src.means.double().numpy(), dst.means.double().numpy()
+    print(
+        f"{args.sources:,} sources, {args.destinations:,} destinations, lambda {distance:.3g}; load {os.getloadavg()[0]:.1f}"
+    )
+    print(f"{'':34} {'seconds':>8} {'labelled':>9} {'ambiguous':>10}")
+    for k in (1, 16):
+        seconds = least(args.repeats, lambda k=k: cKDTree(points).query(targets, k=k, workers=-1))  # type: ignore[misc]
+        print(f"{f'scipy alone, {k} neighbours':34} {seconds:8.2f}")
+    rows = [("nearest, lambda chosen", {"distance": None}), ("nearest", {})]
+    rows += [(f"{m}, {k} neighbours", {"method": m, "neighbours": k}) for m in ("vote", "mahalanobis") for k in (8, 16)]
+    for name, options in rows:
+        call = partial(transfer_labels, src, labels, dst, **{"distance": distance, **options})
+        result = call()
+        shares = result.labelled / len(dst), result.ambiguous / len(dst)
+        print(f"{name:34} {least(args.repeats, call):8.2f} {shares[0]:9.1%} {shares[1]:10.1%}")
+
+
+if __name__ == "__main__":
+    main()
