@@ -27,13 +27,22 @@ def test_one_mode_is_cut_in_its_upper_tail_and_says_so():
 
 def test_a_gap_within_the_rest_is_no_target():
     """The deepest gap parts the rest in two; most of the scene lies above it, so the shallow gap above is taken."""
-    rest = [(0.25, 0.01, 6000), (0.55, 0.06, 12000)]
+    rest = [(0.25, 0.01, 4000), (0.55, 0.06, 14000)]
     threshold, how = similarity_threshold(mixture([*rest, (0.85, 0.02, 400)]))
     assert 0.7 < threshold < 0.82
     assert how.startswith("gap at")
     alone, how = similarity_threshold(mixture(rest))
     assert alone > 0.6
     assert "no clear gap" in how
+
+
+def test_most_of_the_scene_can_be_the_target_if_it_stands_apart():
+    rest = [(0.45, 0.03, 4000), (0.55, 0.03, 4000)]
+    threshold, how = similarity_threshold(mixture([*rest, (0.85, 0.02, 12000)]))
+    assert 0.64 < threshold < 0.8
+    assert how.startswith("gap at")
+    too_much = similarity_threshold(mixture([*rest, (0.85, 0.02, 40000)]))[0]
+    assert too_much > 0.85  # 83 % are no target, but what the rest is to
 
 
 def test_two_values_are_cut_in_the_middle():
