@@ -63,7 +63,7 @@ class Shades(NamedTuple):
         """The colour of each luminance, and by how much it changes per unit of luminance."""
         bent = luminance > self.bend
         straight = (1 - self.gain * self.bend) / (1 - self.bend) if bool(bent.any()) else self.gain
-        tone = torch.where(bent, self.gain * self.bend + straight * (luminance - self.bend), self.gain * luminance)
+        tone = self.gain * luminance.clamp(max=self.bend) + straight * (luminance - self.bend).clamp(min=0)
         rate = torch.where(bent, straight, self.gain)
         above = (tone > self.knee)[:, None]
         rest = 1 - self.knee

@@ -72,7 +72,7 @@ def recolor(
     sh = gaussians.sh[mask]
     weights = sh.new_tensor(LUMINANCE)
     luminance = sh0_to_rgb(sh[:, 0]) @ weights  # [n], may be slightly negative: 3DGS clamps after summing
-    middle = _middle(luminance, gaussians.opacities[mask], gaussians.scales[mask])
+    middle = _middle(luminance.detach(), gaussians.opacities[mask].detach(), gaussians.scales[mask].detach())
     painted = torch.zeros_like(sh)
     if mode == "tint" and float(middle) < DARK:
         painted[:, 0] = rgb_to_sh0(target)

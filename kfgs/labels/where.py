@@ -269,28 +269,32 @@ class Not(Where):
 
 
 @dataclass(frozen=True)
-class Both(Where):
-    """The Gaussians that all of several questions select."""
-
-    kind: ClassVar[str] = "both"
+class _Several(Where):
     parts: tuple[Where, ...]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "parts", _checked_parts(self.parts))
+        if not isinstance(self.parts, Sequence) or not self.parts:
+            raise ValueError(f"parts: expected at least one Where, got {self.parts!r:.80}; use Everything() for all")
+        for part in self.parts:
+            _check_where("parts", part)
+        object.__setattr__(self, "parts", tuple(self.parts))
+
+
+@dataclass(frozen=True)
+class Both(_Several):
+    """The Gaussians that all of several questions select."""
+
+    kind: ClassVar[str] = "both"
 
     def _ask(self, cloud: _Cloud) -> Tensor:  # [N] bool
         return reduce(torch.logical_and, (part._ask(cloud) for part in self.parts))
 
 
 @dataclass(frozen=True)
-class Either(Where):
+class Either(_Several):
     """The Gaussians that at least one of several questions selects."""
 
     kind: ClassVar[str] = "either"
-    parts: tuple[Where, ...]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "parts", _checked_parts(self.parts))
 
     def _ask(self, cloud: _Cloud) -> Tensor:  # [N] bool
         return reduce(torch.logical_or, (part._ask(cloud) for part in self.parts))
@@ -316,14 +320,6 @@ def as_where(value: Any) -> Where:
 def _check_where(name: str, value: Any) -> None:
     if not isinstance(value, Where):
         raise TypeError(f"{name}: expected a Where, such as OfClass('chair'), got {value!r:.80}; build one")
-
-
-def _checked_parts(parts: Any) -> tuple[Where, ...]:
-    if not isinstance(parts, Sequence) or not parts:
-        raise ValueError(f"parts: expected at least one Where, got {parts!r:.80}; use Everything() for all")
-    for part in parts:
-        _check_where("parts", part)
-    return tuple(parts)
 
 
 def _parts(kind: type[Both] | type[Either], where: Where) -> tuple[Where, ...]:

@@ -139,6 +139,18 @@ def test_tint_of_a_dark_paint_scales_all_directions_alike():
     torch.testing.assert_close(ratio[0][0] / ratio[0][0].sum(), rgb / rgb.sum())
 
 
+@pytest.mark.parametrize(
+    ("rgb", "mode"), [("#c04040", "tint"), ("#000000", "tint"), ("#ffffff", "hue"), ("teal", "hue")]
+)
+def test_gradients_pass_through_unbroken(rgb, mode):
+    gaussians = field(coefficients=9)
+    gaussians.sh.requires_grad_()
+    painted = recolor(gaussians, gaussians.labels == 0, rgb, mode)
+    painted.sh.square().sum().backward()
+    assert torch.isfinite(painted.sh).all()
+    assert torch.isfinite(gaussians.sh.grad).all()
+
+
 def test_recolour_leaves_all_else_alone():
     gaussians = field()
     before = gaussians.sh.clone()

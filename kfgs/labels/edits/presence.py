@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -77,10 +78,10 @@ def _orphans_near(splats: SplatFile, mask: Tensor, distance: float) -> Tensor:  
         return torch.zeros_like(mask)
     means = splats.gaussians.means.detach().double().cpu().numpy()
     taken, candidates, rivals = (means[rows.cpu().numpy()] for rows in (mask, free, ~(mask | free)))
-    to_taken, _ = cKDTree(taken).query(candidates, distance_upper_bound=distance)  # infinite beyond
+    to_taken = np.asarray(cKDTree(taken).query(candidates, distance_upper_bound=distance)[0])  # infinite beyond
     near = to_taken < distance
     if len(rivals) and near.any():
-        to_rival, _ = cKDTree(rivals).query(candidates[near], distance_upper_bound=distance)
+        to_rival = np.asarray(cKDTree(rivals).query(candidates[near], distance_upper_bound=distance)[0])
         near[near] = to_taken[near] <= to_rival
     out = torch.zeros_like(mask)
     out[free] = torch.from_numpy(near).to(mask.device)
