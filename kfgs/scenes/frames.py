@@ -15,10 +15,13 @@ Array = np.ndarray[Any, Any]
 
 SAMPLE = 20_000  # points of each cloud that are measured
 REACH_SPACINGS = 2.0  # near = closer than so many spacings of the sparser cloud ...
-REACH_SIZE = 0.005  # ... or than this share of the scene's size, whichever is more
+REACH_SIZE = 0.01  # ... or than this share of the scene's size, whichever is more
 NEAR_SHARE = 0.8
 """Two clouds agree when four points in five of the one that fits better are near the other. (A semantic and a colour
 field of the toy room: 0.99; the same with one turned by half a turn about the vertical: 0.77; 5 % larger: 0.52.)"""
+
+LEAST_SHARE = 0.3
+"""And this many of the other: one cloud may be a part of the other, but all of a room lies near a fog that fills it."""
 
 
 class FrameCheck(NamedTuple):
@@ -26,8 +29,8 @@ class FrameCheck(NamedTuple):
 
     agree: bool
     words: str
-    near: float  # share of the one cloud's points near the other, of whichever cloud has more
-    distance: float  # median distance to the other cloud, of that cloud, world units
+    near: tuple[float, float]  # share of src's points near dst, and of dst's near src
+    distance: float  # median distance to the other cloud, of the nearer one, world units
     reach: float  # what counted as near, world units
 
 
@@ -38,8 +41,9 @@ def frames_agree(
     """Say whether two clouds of one scene lie in the same frame.
 
     A point is near when it is closer to the other cloud than 2 spacings (median distance to the next point) of the
-    sparser cloud, or 0.5 % of the scene's size (diagonal of the `robust_bounds` of the smaller cloud). The clouds agree
-    when 80 % of either one's points within its robust bounds are near. One cloud may be a part of the other.
+    sparser cloud, or 1 % of the scene's size (diagonal of the `robust_bounds` of the smaller cloud). The clouds agree
+    when 80 % of one's and 30 % of the other's points (within their robust bounds) are near: one may be a part of the
+    other.
 
     Args:
         src: one cloud, finite.
@@ -61,12 +65,13 @@ def frames_agree(
     trees = cKDTree(a), cKDTree(b)
     spacing = max(median_spacing(tree) for tree in trees)
     reach = max(REACH_SPACINGS * spacing, REACH_SIZE * size)
-    distances = [tree.query(cloud, workers=1)[0] for tree, cloud in ((trees[1], a), (trees[0], b))]
-    near, distance = max((float((d < reach).mean()), float(np.median(d))) for d in distances)
-    agree = near >= NEAR_SHARE
+    distances = [nearest(tree, cloud)[0] for tree, cloud in ((trees[1], a), (trees[0], b))]
+    near = float((distances[0] < reach).mean()), float((distances[1] < reach).mean())
+    distance = min(float(np.median(d)) for d in distances)
+    agree = max(near) >= NEAR_SHARE and min(near) >= LEAST_SHARE
     words = (
-        f"the frames {'agree' if agree else 'disagree'}: {near:.0%} of the points lie within {reach:.3g} of the other "
-        f"cloud (median distance {distance:.3g}, spacing {spacing:.3g}, size {size:.3g})"
+        f"the frames {'agree' if agree else 'disagree'}: {near[0]:.0%} and {near[1]:.0%} of the points lie within "
+        f"{reach:.3g} of the other cloud (median distance {distance:.3g}, spacing {spacing:.3g}, size {size:.3g})"
     )
     return FrameCheck(agree, words, near, distance, reach)
 
@@ -88,5 +93,10 @@ def bulk(name: str, points: Tensor, sample: int = SAMPLE) -> Array:
 
 def median_spacing(tree: cKDTree) -> float:
     """Median distance from a point to the next at another place."""
-    near = np.asarray(tree.query(np.asarray(tree.data)[:: max(1, tree.n // 5_000)], k=2, workers=1)[0])[:, 1]
-    return float(np.median(near))
+    return float(np.median(nearest(tree, np.asarray(tree.data)[:: max(1, tree.n // 5_000)], k=2)[0][:, 1]))
+
+
+def nearest(tree: cKDTree, places: Array, k: int = 1) -> tuple[Array, Array]:
+    """Distances and indices of the k nearest points, [N] each, or [N, k] for more than one."""
+    distances, indices = tree.query(places, k=k, workers=1)
+    return np.asarray(distances), np.asarray(indices)

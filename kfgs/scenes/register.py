@@ -12,20 +12,21 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from .._check import check_shapes
 from ..cameras.similarity import Similarity
 from .align import Alignment
 from .errors import SceneError
-from .frames import Array, bulk, median_spacing
+from .frames import Array, bulk, median_spacing, nearest
 from .starts import Moves, improve_on_grid, principal_axes, spread_rotations, thin
 
-ROTATIONS = 720  # evenly over all rotations: about 15 degrees from any rotation to the next
+ROTATIONS = 576  # evenly over all rotations: about 16 degrees from any rotation to the nearest, in the middle
 SIZES = (0.75, 0.87, 1.0, 1.15, 1.33)  # around the ratio of the clouds' radii, which partial overlap distorts
-BASINS = 8  # starts that are refined
-COARSE, FINE, FULL = 400, 3_000, 12_000  # points of each cloud
-NEAR = 3.0  # a point fits when closer than so many spacings of the sparser cloud
+BASINS, FINALISTS = 8, 3  # starts that are refined, and those that are refined on all points
+COARSE, FINE, FULL = 300, 3_000, 10_000  # points of each cloud
+NEAR = 2.0  # a point fits when closer than so many spacings of the sparser cloud (thinned to FULL points)
 MIN_FIT = 0.6  # of the points, both ways (harmonic mean)
 MARGIN = 0.6  # of what the best leaves unfit, the runner-up must leave more than 1 / MARGIN times as much
 
@@ -35,7 +36,6 @@ class _Fit(NamedTuple):
     quality: float  # harmonic mean of the two shares that fit
     shares: tuple[float, float]  # of src points near dst, and of dst points near src
     rms: float  # of the points that fit, world units of dst
-    angle: float = 0.0
 
 
 def align_clouds(
@@ -46,8 +46,8 @@ def align_clouds(
 ) -> Alignment:
     """Find rotation, translation and scale that lay one cloud onto another of the same scene, without any names.
 
-    The clouds may differ in density, noise and floaters, and overlap in part (about half of either should be in the
-    other). A point fits when it is closer to the other cloud than 3 spacings of the sparser one; `quality` is the
+    The clouds may differ in density, noise and floaters, and overlap in part (about three quarters of each in the
+    other). A point fits when it is closer to the other cloud than 2 spacings of the sparser one; `quality` is the
     harmonic mean of the shares of points that fit, both ways.
 
     Args:
@@ -64,7 +64,7 @@ def align_clouds(
         ValueError: if shapes disagree, there are too few points, or a number is not finite.
 
     Note:
-        About ten seconds on one core. The scene must have a shape: a bare box looks the same after half a turn.
+        Five to ten seconds on one core. The scene must have a shape: a bare box looks the same after half a turn.
     """
     check_shapes(("src", src, "N 3"), ("dst", dst, "M 3"))
     seed = 0 if generator is None else int(torch.randint(2**31, (1,), generator=generator))
@@ -75,11 +75,14 @@ def align_clouds(
             raise SceneError(
                 f"{name}: expected at least 100 points that fill space, got {len(cloud)}; align by cameras instead"
             )
-    fits = sorted((_refined(a, b, start, rng) for start in _starts(a, b, rng)), key=lambda fit: -fit.quality)
-    best = _fit_closely(_Cloud.of(a, FULL, rng), _Cloud.of(b, FULL, rng), fits[0].similarity, steps=12)
     size = float(np.linalg.norm(np.ptp(b, axis=0)))
-    others = [fit for fit in fits[1:] if _differs(fit.similarity, best.similarity, size)]
-    runner_up = max((fit.quality for fit in others), default=0.0)
+    starts, fits = _starts(a, b, rng), []
+    for count, steps, kept in ((FINE, 20, FINALISTS), (FULL, 10, 2)):
+        x, y = _Cloud.of(a, count, rng), _Cloud.of(b, count, rng)
+        fits = sorted((_fit_closely(x, y, start, steps=steps) for start in starts), key=lambda fit: -fit.quality)
+        starts = _different([fit.similarity for fit in fits], a.mean(0), size, kept)
+    best = fits[0]
+    runner_up = max((fit.quality for fit in fits if fit.similarity in starts[1:]), default=0.0)
     _check_fit(best, runner_up)
     facts = {
         "source points that fit": best.shares[0],
@@ -87,10 +90,9 @@ def align_clouds(
         "quality": best.quality,
         "best other fit": runner_up,
     }
-    count = min(len(a), FULL) + min(len(b), FULL)
-    inliers = round(best.shares[0] * min(len(a), FULL) + best.shares[1] * min(len(b), FULL))
+    inliers = round(best.shares[0] * len(x.points) + best.shares[1] * len(y.points))
     how = f"shape of the clouds (quality {best.quality:.2f}, next best {runner_up:.2f})"
-    return Alignment(best.similarity, best.rms, size, inliers, count, how, facts)
+    return Alignment(best.similarity, best.rms, size, inliers, len(x.points) + len(y.points), how, facts)
 
 
 def _check_fit(best: _Fit, runner_up: float) -> None:
@@ -104,7 +106,7 @@ def _check_fit(best: _Fit, runner_up: float) -> None:
     if 1 - best.quality > MARGIN * (1 - runner_up):
         raise SceneError(
             f"clouds: expected one similarity to fit best, got two that fit alike (quality {best.quality:.3f} and "
-            f"{runner_up:.3f}): the scene's shape is symmetric. Align by cameras of the same names, or pass the similarity"
+            f"{runner_up:.3f}): a symmetric shape, or not of the same scene. Align by cameras of the same names, or pass the similarity"
         )
 
 
@@ -119,20 +121,22 @@ def _starts(a: Array, b: Array, rng: np.random.Generator) -> list[Similarity]:
     rotations = np.concatenate([principal_axes(x, y), spread_rotations(ROTATIONS)])
     moves = Moves.of(rotations, SIZES)
     moves, scores = improve_on_grid(x, y, moves, COARSE, rng)
-    chosen: list[Similarity] = []
-    for i in np.argsort(-scores):
-        R, s = moves.rotations[i], float(moves.scales[i]) * radii[1] / radii[0]
+    order = np.argsort(-scores)[: 50 * BASINS]
+    found = []
+    for i in order:
+        R, s = _orthonormal(moves.rotations[i]), float(moves.scales[i]) * radii[1] / radii[0]
         t = centers[1] + radii[1] * moves.translations[i] - s * R @ centers[0]
-        start = Similarity(s, torch.from_numpy(_orthonormal(R)), torch.from_numpy(t))
-        if all(_differs(start, other, 2 * radii[1]) for other in chosen):
-            chosen.append(start)
-        if len(chosen) == BASINS:
-            break
+        found.append(Similarity(s, torch.from_numpy(R), torch.from_numpy(t)))
+    return _different(found, centers[0], 2 * radii[1], BASINS)
+
+
+def _different(similarities: list[Similarity], center: Array, size: float, count: int) -> list[Similarity]:
+    """The first `count` that are different answers: 10 degrees, 10 % in size, or a tenth of the scene apart."""
+    chosen: list[Similarity] = []
+    for one in similarities:
+        if len(chosen) < count and all(_differs(one, other, center, size) for other in chosen):
+            chosen.append(one)
     return chosen
-
-
-def _refined(a: Array, b: Array, start: Similarity, rng: np.random.Generator) -> _Fit:
-    return _fit_closely(_Cloud.of(a, FINE, rng), _Cloud.of(b, FINE, rng), start, steps=20)
 
 
 class _Cloud(NamedTuple):
@@ -145,7 +149,7 @@ class _Cloud(NamedTuple):
     def of(points: Array, count: int, rng: np.random.Generator) -> _Cloud:
         points = thin(points, count, rng)
         tree = cKDTree(points)
-        near = points[tree.query(points, k=min(12, len(points)), workers=1)[1]]  # [n, k, 3]
+        near = points[nearest(tree, points, k=min(12, len(points)))[1]]  # [n, k, 3]
         near = near - near.mean(1, keepdims=True)
         normals = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, 0]
         return _Cloud(points, normals, tree, median_spacing(tree))
@@ -158,8 +162,8 @@ def _fit_closely(a: _Cloud, b: _Cloud, start: Similarity, *, steps: int) -> _Fit
     for step in range(steps):
         reach = finest * max(1.0, 4.0 * (1 - 1.5 * step / steps))
         moved = s * a.points @ R.T + t
-        d, i = b.tree.query(moved, workers=1)
-        e, j = a.tree.query((b.points - t) @ R / s, workers=1)
+        d, i = nearest(b.tree, moved)
+        e, j = nearest(a.tree, (b.points - t) @ R / s)
         P = np.concatenate([moved, moved[j]])
         Q = np.concatenate([b.points[i], b.points])
         n = np.concatenate([b.normals[i], a.normals[j] @ R.T])
@@ -177,8 +181,8 @@ def _fit_closely(a: _Cloud, b: _Cloud, start: Similarity, *, steps: int) -> _Fit
 
 
 def _judge(a: _Cloud, b: _Cloud, similarity: Similarity) -> _Fit:
-    d = b.tree.query(similarity.apply(torch.from_numpy(a.points)).numpy(), workers=1)[0]
-    e = a.tree.query(similarity.inverse().apply(torch.from_numpy(b.points)).numpy(), workers=1)[0] * similarity.scale
+    d = nearest(b.tree, similarity.apply(torch.from_numpy(a.points)).numpy())[0]
+    e = nearest(a.tree, similarity.inverse().apply(torch.from_numpy(b.points)).numpy())[0] * similarity.scale
     reach = NEAR * max(a.spacing * similarity.scale, b.spacing)
     shares = float((d < reach).mean()), float((e < reach).mean())
     quality = 2 * shares[0] * shares[1] / max(sum(shares), 1e-12)
@@ -186,10 +190,10 @@ def _judge(a: _Cloud, b: _Cloud, similarity: Similarity) -> _Fit:
     return _Fit(similarity, quality, shares, float(np.sqrt((near**2).mean())) if len(near) else float("inf"))
 
 
-def _differs(one: Similarity, other: Similarity, size: float) -> bool:
-    """Whether two similarities are different answers: 10 degrees, 10 % in size, or a tenth of the scene apart."""
+def _differs(one: Similarity, other: Similarity, center: Array, size: float) -> bool:
     cosine = (float((one.rotation * other.rotation).sum()) - 1) / 2
-    shift = float((one.translation - other.translation).norm())
+    places = [similarity.apply(torch.from_numpy(center)[None])[0] for similarity in (one, other)]
+    shift = float((places[0] - places[1]).norm())
     return cosine < np.cos(np.radians(10)) or abs(np.log(one.scale / other.scale)) > 0.1 or shift > 0.1 * size
 
 
@@ -200,8 +204,6 @@ def _weight(distances: Array, reach: float) -> Array:
 
 
 def _rotation_vector(vector: Array) -> Array:
-    from scipy.spatial.transform import Rotation
-
     matrix: Array = Rotation.from_rotvec(vector).as_matrix()
     return matrix
 

@@ -9,11 +9,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from .frames import Array
+from .frames import Array, nearest
 
 GRID = 40  # cells a side of the lookup grid: 64,000 nearest points are found once, in a tenth of a second
 REACH = 2.6  # half a side of the grid, in radii of the cloud
-STEPS = 14  # of the improvement
+STEPS, FIRST, KEPT = 14, 7, 4  # of the improvement; after the first seven only the best quarter goes on
 WIDE, NARROW = 0.5, 0.08  # the distances, in radii, at which a pair counts a quarter: first and last step
 BLOCK = 200  # starts at a time
 
@@ -78,7 +78,7 @@ class _Lookup:
         self.points = points
         axis = (np.arange(GRID) + 0.5) / GRID * 2 * REACH - REACH
         places = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-        self.nearest = cKDTree(points).query(places, workers=1)[1].astype(np.int32)
+        self.nearest = nearest(cKDTree(points), places)[1].astype(np.int32)
 
     def __call__(self, places: Array) -> Array:  # [..., 3] -> [..., 3]
         cell = np.clip(((places + REACH) * (GRID / (2 * REACH))).astype(np.int32), 0, GRID - 1)
@@ -100,25 +100,31 @@ def improve_on_grid(
     """
     to_x, to_y = _Lookup(x.astype(np.float32)), _Lookup(y.astype(np.float32))
     p, q = (cloud[rng.permutation(len(cloud))[:count]].astype(np.float32) for cloud in (x, y))
-    results = [
-        _improve(Moves(*(part[i : i + BLOCK].astype(np.float32) for part in moves)), p, q, to_x, to_y)
-        for i in range(0, len(moves.scales), BLOCK)
-    ]
-    improved = (np.concatenate([np.asarray(result[0][k]) for result in results]).astype(np.float64) for k in range(3))
-    return Moves(*improved), np.concatenate([result[1] for result in results])
+    scores = np.zeros(0)
+    for widths in np.split(np.geomspace(WIDE, NARROW, STEPS), [FIRST]):
+        if len(scores):  # the second half of the steps is for the better part of the starts
+            moves = Moves(*(part[np.argsort(-scores)[: max(1, len(scores) // KEPT)]] for part in moves))
+        blocks = [Moves(*(part[i : i + BLOCK] for part in moves)) for i in range(0, len(moves.scales), BLOCK)]
+        results = [
+            _improve(Moves(*(part.astype(np.float32) for part in some)), p, q, to_x, to_y, widths) for some in blocks
+        ]
+        moves = Moves(*(np.concatenate([result[0][k] for result in results]).astype(np.float64) for k in range(3)))
+        scores = np.concatenate([result[1] for result in results])
+    return moves, scores
 
 
-def _improve(moves: Moves, p: Array, q: Array, to_x: _Lookup, to_y: _Lookup) -> tuple[Moves, Array]:
+def _improve(moves: Moves, p: Array, q: Array, to_x: _Lookup, to_y: _Lookup, widths: Array) -> tuple[Moves, Array]:
+    """One step per width, and the scores at the last width after the last step."""
     scores = np.zeros(len(moves.scales))
-    for step in range(STEPS + 1):
-        width = WIDE * (NARROW / WIDE) ** (min(step, STEPS - 1) / (STEPS - 1))
+    for width in [*widths, None]:
         R, s, t = moves
         moved = s[:, None, None] * (p @ R.transpose(0, 2, 1)) + t[:, None]  # [S, n, 3]
         back = (q - t[:, None]) @ R / s[:, None, None]  # [S, m, 3]
         onto, origin = to_y(moved), to_x(back)
-        ahead = _weights(((moved - onto) ** 2).sum(-1), width)
-        behind = _weights(((back - origin) ** 2).sum(-1) * s[:, None] ** 2, width)
-        if step == STEPS:
+        reach = float(widths[-1] if width is None else width)
+        ahead = _weights(_squares(moved - onto), reach)
+        behind = _weights(_squares(back - origin) * s[:, None] ** 2, reach)
+        if width is None:
             one, other = ahead.mean(1), behind.mean(1)
             scores = 2 * one * other / np.maximum(one + other, 1e-12)
             break
@@ -128,20 +134,26 @@ def _improve(moves: Moves, p: Array, q: Array, to_x: _Lookup, to_y: _Lookup) -> 
     return moves, scores
 
 
+def _squares(vectors: Array) -> Array:
+    squares: Array = np.einsum("snk,snk->sn", vectors, vectors)
+    return squares
+
+
 def _weights(squares: Array, width: float) -> Array:
+    """Geman-McClure: 1 at 0, a quarter at `width`, nothing far away."""
     weights: Array = (width**2 / (width**2 + squares)) ** 2
     return weights
 
 
 def _fit(source: Array, target: Array, weights: Array) -> Moves:
     """Umeyama's similarity for every row, but with the scale as the ratio of spreads: noise in either cloud is alike."""
-    w = weights / np.maximum(weights.sum(1, keepdims=True), 1e-12)
-    a, b = ((w[..., None] * points).sum(1) for points in (source, target))
-    x, y = source - a[:, None], target - b[:, None]
-    U, _, Vt = np.linalg.svd(y.transpose(0, 2, 1) @ (w[..., None] * x))
+    w = (weights / np.maximum(weights.sum(1, keepdims=True), 1e-12))[:, None]  # [S, 1, n]
+    a, b = (w @ source)[:, 0], (w @ target)[:, 0]  # [S, 3]
+    cross = (target * w.transpose(0, 2, 1)).transpose(0, 2, 1) @ source - b[:, :, None] * a[:, None]
+    U, _, Vt = np.linalg.svd(cross)
     Vt = Vt.copy()
     Vt[:, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
     R = U @ Vt
-    spread = [(w * (points**2).sum(-1)).sum(1) for points in (x, y)]
-    s = np.clip(np.sqrt(spread[1] / np.maximum(spread[0], 1e-12)), 0.3, 3.0)
+    spread = [(w[:, 0] * _squares(x)).sum(1) - (c * c).sum(1) for x, c in ((source, a), (target, b))]
+    s = np.clip(np.sqrt(np.maximum(spread[1], 0) / np.maximum(spread[0], 1e-12)), 0.3, 3.0)
     return Moves(R, s, b - s[:, None] * np.einsum("sij,sj->si", R, a))

@@ -1,0 +1,200 @@
+"""A semantic field attached to a splat of the same scene, in its frame or another."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from cases_clouds import room
+from scipy.spatial.transform import Rotation
+
+from kfgs.cameras import Camera
+from kfgs.cameras.similarity import Similarity
+from kfgs.evaluation import LabelSet
+from kfgs.fields import SemanticField
+from kfgs.formats.splat_file import SplatFile
+from kfgs.formats.table import read_splats, write_splats
+from kfgs.gaussians import Gaussians
+from kfgs.pipeline.attach import attach
+from kfgs.scenes import SceneError, register
+
+CLASSES = LabelSet(("wall", "box", "table"), torch.eye(4)[:3])
+
+
+def true_labels(points):
+    """Which of wall (0), box (1) and table (2) a point of `room` lies on."""
+    x, y, z = points.T
+    box = (x - 2.9).abs().lt(0.42) & (y - 0.65).abs().lt(0.27) & z.gt(0.88) & z.lt(0.93)
+    table = ((x - 1.2) ** 2 + (y - 1.8) ** 2).sqrt().lt(0.63) & (z - 0.7).abs().lt(0.03)
+    return torch.where(box, 1, torch.where(table, 2, 0))
+
+
+def cloud(count, seed, **others):
+    points = room(count, seed).float()
+    quats = torch.tensor([1.0, 0, 0, 0]).expand(len(points), 4)
+    return Gaussians(points, quats, torch.full((len(points), 3), 0.03), torch.full((len(points),), 0.8), **others)
+
+
+def a_field(count=4_000):
+    gaussians = cloud(count, 0)
+    return SemanticField(gaussians.replace(features=CLASSES.embeddings[true_labels(gaussians.means)]))
+
+
+def a_splat(count=6_000):
+    gaussians = cloud(count, 1)
+    sh = torch.rand(len(gaussians), 1, 3, generator=torch.Generator().manual_seed(0))
+    return SplatFile(
+        gaussians.replace(sh=sh), {"temperature": np.arange(len(gaussians), dtype=np.float32)}, (), {"format": "test"}
+    )
+
+
+def look(place, name, target=(1.6, 1.2, 0.6)):
+    """A camera at `place` that looks at `target` with z up."""
+    ahead = torch.tensor(target) - torch.tensor(place)
+    ahead = ahead / ahead.norm()
+    right = torch.linalg.cross(ahead, torch.tensor([0.0, 0.0, 1.0]))
+    right = right / right.norm()
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(ahead, right), ahead])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ torch.tensor(place)
+    return Camera(viewmat, torch.tensor([[90.0, 0, 63], [0, 92, 49], [0, 0, 1]]), 128, 96, name)
+
+
+CAMERAS = [
+    look((3.2 + math.cos(a), 2.6 + math.sin(a), 2.0 + 0.4 * math.sin(3 * a)), f"view_{a:.1f}.png")
+    for a in (0.0, 0.5, 1.0, 1.6, 2.4, -0.7)
+]
+
+
+def a_similarity(seed=3):
+    rng = np.random.default_rng(seed)
+    rotation = torch.from_numpy(Rotation.random(random_state=rng).as_matrix())
+    return Similarity(2.5, rotation, torch.from_numpy(5 * rng.normal(size=3)))
+
+
+def moved(splats, similarity):
+    gaussians = splats.gaussians
+    turned = gaussians.replace(means=similarity.apply(gaussians.means), scales=gaussians.scales * similarity.scale)
+    return splats.replace(gaussians=turned)  # the Gaussians are round: no rotation to turn
+
+
+def accuracy(labels, splats):
+    return float((labels == true_labels(splats.gaussians.means)).float().mean())
+
+
+def test_distance_in_one_frame():
+    splats = a_splat()
+    attached = attach(a_field(), splats, CLASSES)
+    assert accuracy(attached.labels, splats) > 0.97
+    assert attached.alignment is None
+    assert "the frames agree" in attached.words[0]
+    labelled = attached.labels >= 0
+    score = torch.from_numpy(attached.splats.extra["score"])
+    expected = 1 - attached.transfer.distances / attached.transfer.distance
+    torch.testing.assert_close(score[labelled], expected[labelled].float())
+    assert (score[~labelled] == 0).all()
+
+
+def test_nothing_else_of_the_splat_changes():
+    splats = a_splat(1_500)
+    attached = attach(a_field(1_500), splats, CLASSES).splats
+    assert attached.classes == CLASSES.names
+    assert set(attached.extra) == {"warmth", "score"}
+    assert attached.info["format"] == "test"
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        assert torch.equal(getattr(attached.gaussians, name), getattr(splats.gaussians, name))
+    assert splats.gaussians.labels is None
+
+
+def test_views_label_what_they_show_and_their_neighbours():
+    splats = a_splat()
+    hidden = torch.tensor([[1.2, 1.8, 0.62], [50.0, 50.0, 50.0]])  # below the table's top; out of every view and reach
+    gaussians = Gaussians.cat([splats.gaussians, splats.gaussians.select(torch.tensor([0, 1])).replace(means=hidden)])
+    splats = SplatFile(gaussians)
+    attached = attach(a_field(), splats, CLASSES, cameras=CAMERAS, by="views")
+    assert accuracy(attached.labels, splats) > 0.95
+    assert attached.labels[-2] == 2
+    assert attached.labels[-1] == -1
+    assert attached.splats.extra["score"][-1] == 0
+    facts = attached.splats.info["labels"]
+    assert facts["shown"] + facts["not shown"] == len(splats)
+    assert 0 < facts["not shown"] < 0.2 * len(splats)
+
+
+@pytest.mark.parametrize("by", ["distance", "views"])
+def test_cameras_of_the_same_names_find_the_frame(by):
+    similarity = a_similarity()
+    here, there = a_splat(), moved(a_splat(), similarity)
+    splat_cameras = [similarity.apply_to_camera(camera) for camera in CAMERAS]
+    expected = attach(a_field(), here, CLASSES, cameras=CAMERAS, by=by)
+    found = attach(a_field(), there, CLASSES, cameras=CAMERAS, splat_cameras=splat_cameras, by=by)
+    assert float((found.labels == expected.labels).float().mean()) > 0.999  # ties and borders round differently
+    torch.testing.assert_close(found.similarity.matrix(), similarity.matrix(), atol=1e-3, rtol=1e-4)
+    assert found.alignment.inliers == len(CAMERAS)
+    assert found.transfer.distance == pytest.approx(similarity.scale * expected.transfer.distance, rel=1e-2)
+
+
+def test_the_clouds_find_the_frame(monkeypatch):
+    monkeypatch.setattr(register, "ROTATIONS", 200)
+    splats = moved(a_splat(), a_similarity())
+    attached = attach(a_field(), splats, CLASSES)
+    assert "disagree" in attached.words[0]
+    assert "shape of the clouds" in attached.words[0]
+    assert accuracy(attached.labels, a_splat()) > 0.95
+    assert attached.alignment.facts["quality"] > 0.7
+
+
+def test_a_given_similarity_is_taken_as_it_is():
+    similarity = a_similarity()
+    attached = attach(a_field(2_000), moved(a_splat(2_000), similarity), CLASSES, similarity=similarity)
+    assert accuracy(attached.labels, a_splat(2_000)) > 0.95
+    assert attached.similarity is similarity
+
+
+def test_a_given_distance_is_lambda():
+    attached = attach(a_field(1_500), a_splat(1_500), CLASSES, distance=0.02)
+    assert attached.transfer.distance == 0.02
+    assert attached.splats.info["labels"]["lambda"] == 0.02
+    assert 0 < attached.transfer.orphaned == int((attached.labels == -1).sum())
+
+
+def test_the_facts_survive_a_file(tmp_path):
+    attached = attach(a_field(1_500), a_splat(1_500), CLASSES, cameras=CAMERAS, by="views")
+    facts = json.loads(json.dumps(attached.splats.info["labels"], allow_nan=False))
+    assert sum(facts["counts"].values()) == len(attached.splats)
+    write_splats(tmp_path / "a.ply", attached.splats)
+    back = read_splats(tmp_path / "a.ply")
+    assert torch.equal(back.gaussians.labels, attached.labels)
+    assert back.classes == CLASSES.names
+    written = json.loads((tmp_path / "a.classes.json").read_text())
+    assert written["labelled by"] == "votes of 6 segmented views"
+
+
+def test_an_unrelated_splat_is_refused(monkeypatch):
+    monkeypatch.setattr(register, "ROTATIONS", 50)
+    splats = a_splat(2_000)
+    generator = torch.Generator().manual_seed(1)
+    blob = 3 * torch.randn(2_000, 3, generator=generator) * torch.tensor([1.0, 2.0, 0.7])
+    other = SplatFile(splats.gaussians.replace(means=blob))
+    with pytest.raises(SceneError, match="of the same scene"):
+        attach(a_field(2_000), other, CLASSES)
+
+
+def test_what_cannot_be_done_is_refused():
+    field, splats = a_field(200), a_splat(200)
+    with pytest.raises(ValueError, match="by: expected one of 'distance', 'views', got 'magic'"):
+        attach(field, splats, CLASSES, by="magic")
+    with pytest.raises(ValueError, match=r'cameras: expected views in the field\'s frame \(for by="views"\), got none'):
+        attach(field, splats, CLASSES, by="views")
+    with pytest.raises(ValueError, match=r"cameras: expected views in the field's frame \(for splat_cameras\)"):
+        attach(field, splats, CLASSES, splat_cameras=CAMERAS)
+    with pytest.raises(ValueError, match="distance: expected a number"):
+        attach(field, splats, CLASSES, distance=0.0)
+    nothing = splats.select(torch.zeros(len(splats), dtype=torch.bool))
+    with pytest.raises(ValueError, match="splats: expected at least one Gaussian, got none"):
+        attach(field, nothing, CLASSES)
+    strangers = [replace(camera, name=f"other_{i}.png") for i, camera in enumerate(CAMERAS)]
+    with pytest.raises(SceneError, match="at least two names that both have"):
+        attach(field, splats, CLASSES, cameras=CAMERAS, splat_cameras=strangers)
