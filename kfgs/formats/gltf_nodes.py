@@ -36,7 +36,7 @@ def placed_meshes(document: Document) -> Iterator[tuple[str, int, Tensor]]:  # n
         scene = document.item("scenes", document.root.get("scene", 0))
         roots = document.list_of(scene, "nodes", "scenes.nodes")
     else:
-        below = [child for i in range(len(nodes)) for child in _children(document, i)]
+        below = {child for i in range(len(nodes)) for child in _children(document, i) if isinstance(child, int)}
         roots = [i for i in range(len(nodes)) if i not in below]
     waiting = [(root, torch.eye(4, dtype=torch.float64), 0) for root in reversed(roots)]
     seen: set[int] = set()

@@ -1,10 +1,13 @@
 """Damaged and hostile files of every format: a ValueError that names the file, in bounded memory, or a sound cloud."""
 
 import gc
+import io
+import json
 import re
 import struct
 import time
 import tracemalloc
+import zipfile
 
 import numpy as np
 import pytest
@@ -129,6 +132,59 @@ def test_numbers_in_a_text_made_huge(tmp_path, sound, kind):
         for other in (b"1000000000", b"-1", b"99999999999999999999", b"x"):
             bent = content[: match.start()] + other + content[match.end() :]
             _read(tmp_path / f"bad{suffix}", bent)
+
+
+def _places(value, path=()):
+    """Every place in a JSON document, as the keys that lead there."""
+    yield path
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, child in items:
+        if not (isinstance(key, int) and key > 3):  # long lists repeat themselves
+            yield from _places(child, (*path, key))
+
+
+def _documents(root):
+    """The document with one place after the other exchanged for what should not be there."""
+    for path in _places(root):
+        for odd in (None, True, -1, 3, 1e300, "x", [], [[]], {}, {"a": {}}):
+            if not path:
+                yield odd
+                continue
+            bent = json.loads(json.dumps(root))
+            holder = bent
+            for key in path[:-1]:
+                holder = holder[key]
+            holder[path[-1]] = odd
+            yield bent
+
+
+def test_any_value_in_the_json_of_gltf(tmp_path, sound):
+    suffix, content = sound("gltf-text")
+    root = json.loads(content)
+    root["extensionsRequired"] = ["KHR_gaussian_splatting"]
+    root["nodes"] = [
+        {"children": [1], "scale": [2, 2, 2]},
+        {"mesh": 0, "rotation": [0, 0, 1, 0], "translation": [1, 2, 3]},
+    ]
+    root["bufferViews"][0]["byteStride"] = 12
+    root["accessors"][0]["normalized"] = False
+    outcomes = [_read(tmp_path / f"bad{suffix}", json.dumps(bent).encode()) for bent in _documents(root)]
+    assert outcomes.count("refused") > 200
+
+
+def test_any_value_in_the_json_of_sog(tmp_path, sound):
+    suffix, content = sound("sog")
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    root = json.loads(files["meta.json"])
+    outcomes = []
+    for bent in _documents(root):
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(buffer, "w") as archive:
+            for name, data in (files | {"meta.json": json.dumps(bent).encode()}).items():
+                archive.writestr(name, data)
+        outcomes.append(_read(tmp_path / f"bad{suffix}", buffer.getvalue()))
+    assert outcomes.count("refused") > 200
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog", ".glb", ".gltf", ".ksplat", ".splat"])
