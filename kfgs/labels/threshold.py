@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
@@ -46,7 +48,8 @@ def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]
     highest_above = np.maximum.accumulate(density[::-1])[::-1]
     depth = np.minimum(highest_below, highest_above) - density
     above = 1 - np.cumsum(counts) / values.size
-    candidates = [np.where(above <= share, depth, 0) for share, clear in SHARES if depth[above <= share].max() >= clear]
+    parts = ((np.arange(BINS) >= _past_flank(density, above, share), clear) for share, clear in SHARES)
+    candidates = [depth * part for part, clear in parts if (depth * part).max() >= clear]
     if not candidates:
         median, top = np.quantile(values, (0.5, TOP))
         threshold = float(median + WAY * (top - median))
@@ -62,3 +65,11 @@ def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]
     threshold = float(centres[floor].mean())
     sparser = 10 ** depth[gap].max()
     return threshold, f"gap at {threshold:.3f}: {sparser:.0f} x sparser than the modes beside it ({values.size} scores)"
+
+
+def _past_flank(density: np.ndarray[Any, Any], above: np.ndarray[Any, Any], share: float) -> int:
+    """The first bin with at most a share of the scores above it that does not still rise from a gap before it."""
+    start = int(np.argmax(above <= share))
+    while 0 < start < BINS and density[start] > density[start - 1]:
+        start += 1
+    return start
