@@ -306,17 +306,6 @@ KINDS: dict[str, type[Where]] = {
 }
 
 
-def as_where(value: Any) -> Where:
-    """A question as it is; a name stands for the class of that name.
-
-    Raises:
-        TypeError: if it is neither.
-    """
-    where = OfClass(value) if isinstance(value, str) else value
-    _check_where("where", where)
-    return where
-
-
 def _check_where(name: str, value: Any) -> None:
     if not isinstance(value, Where):
         raise TypeError(f"{name}: expected a Where, such as OfClass('chair'), got {value!r:.80}; build one")

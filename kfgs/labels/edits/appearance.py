@@ -10,8 +10,8 @@ from ...formats.splat_file import SplatFile
 from .._plain import number_of
 from ..color import parse_color
 from ..edit import Mode, recolor
-from ..where import Where, as_where
-from .base import Edit, selected
+from ..where import Where
+from .base import Edit, as_where, selected
 from .presence import check_flag
 
 HIDDEN = 1e-6  # an opacity that every renderer skips (alpha < 1/255) and every file can hold

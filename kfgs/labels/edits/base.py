@@ -11,7 +11,7 @@ from torch import Tensor
 from ...formats.splat_file import SplatFile
 from ...gaussians import Gaussians
 from .._plain import members_of
-from ..where import Where
+from ..where import OfClass, Where
 
 SHOWN = 12  # classes listed in a message
 
@@ -35,6 +35,19 @@ class Edit(ABC):
     def to_json(self) -> dict[str, Any]:
         """Plain values that JSON can hold: `op`, and the fields."""
         return {"op": self.op} | {name: _plain(value) for name, value in members_of(self).items()}
+
+
+def as_where(value: Any) -> Where:
+    """A selection as it is; a name stands for the class of that name.
+
+    Raises:
+        TypeError: if it is neither.
+    """
+    if not isinstance(value, str | Where):
+        raise TypeError(
+            f"where: expected a Where, such as OfClass('chair'), or a class name, got {value!r:.80}; build one"
+        )
+    return OfClass(value) if isinstance(value, str) else value
 
 
 def selected(where: Where, splats: SplatFile, allow_empty: bool) -> Tensor:  # [N] bool

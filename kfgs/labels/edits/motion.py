@@ -17,8 +17,8 @@ from ...formats.splat_file import SplatFile
 from ...gaussians import Gaussians
 from ...splat.transform import transform_gaussians
 from .._plain import number_of, numbers_of, quaternion_of, rotation_matrix
-from ..where import Where, as_where
-from .base import Edit, scatter, selected
+from ..where import Where
+from .base import Edit, as_where, scatter, selected
 from .merge import join
 from .presence import check_flag
 

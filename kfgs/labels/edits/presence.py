@@ -13,8 +13,8 @@ from torch import Tensor
 from ..._check import check_range
 from ...formats.splat_file import SplatFile
 from .._plain import number_of
-from ..where import Where, as_where
-from .base import Edit, selected
+from ..where import Where
+from .base import Edit, as_where, selected
 
 
 @dataclass(frozen=True)
