@@ -144,7 +144,7 @@ class GaussianParams:
     def from_points(
         cls,
         points: Tensor,  # [P, 3] world units
-        channels: int = 3,
+        channels: int | None = None,
         *,
         colors: Tensor | None = None,  # [P, 3] in [0, 1], or uint8
         sh_degree: int = 3,
@@ -165,7 +165,7 @@ class GaussianParams:
 
         Args:
             points: the cloud, usually `Scene.points`.
-            channels: D, the number of features per Gaussian; not looked at where `colors` are given.
+            channels: D, the number of features per Gaussian; leave it out where `colors` are given.
             colors: of the points, usually `Scene.colors`; None starts a field of features.
             sh_degree: highest degree of the spherical harmonics of a colour field, 0 to 3.
             initial_opacity: in (0, 1).
@@ -181,7 +181,13 @@ class GaussianParams:
             >>> GaussianParams.from_points(cube, 9).activated().scales[0]
             tensor([1., 1., 1.])
         """
-        check_range("channels", channels, 1)
+        if (channels is None) == (colors is None):
+            raise ValueError(
+                f"channels, colors: expected one of them, got {'neither' if channels is None else 'both'}; a field has "
+                "so many features per Gaussian, or colours"
+            )
+        if channels is not None:
+            check_range("channels", channels, 1)
         check_shapes(("points", points, "P 3"), ("colors", colors, "P 3"))
         check_whole("sh_degree", sh_degree, 0, 3)
         check_range("initial_opacity", initial_opacity, 0, 1, closed=(False, False))
@@ -202,7 +208,7 @@ class GaussianParams:
             quats=points.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
             log_scales=point_spacing(points).log()[:, None].repeat(1, 3),
             logit_opacities=points.new_full((n,), math.log(initial_opacity / (1 - initial_opacity))),
-            features=points.new_zeros(n, channels) if colors is None else None,
+            features=None if channels is None else points.new_zeros(n, channels),
             sh0=None if colors is None else rgb_to_sh0(_unit_colors(colors).to(points)),
             sh_rest=points.new_zeros(n, (sh_degree + 1) ** 2 - 1, 3) if colors is not None and sh_degree else None,
         )

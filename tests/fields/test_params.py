@@ -222,6 +222,8 @@ def test_a_field_has_features_or_colours(change, message):
         ({"colors": torch.full((10, 3), 2.0)}, r"colors: expected uint8, or floating point in \[0, 1\]"),
         ({"colors": torch.zeros(10, 3, dtype=torch.int64)}, "colors: expected uint8"),
         ({"colors": torch.zeros(9, 3)}, r"colors: expected \[P, 3\] with P = 10 \(from points\), got \(9, 3\)"),
+        ({"colors": None}, "channels, colors: expected one of them, got neither"),
+        ({"channels": 3}, "channels, colors: expected one of them, got both"),
         ({"sh_degree": 4}, r"sh_degree: expected a number in \[0, 3\], got 4"),
     ],
 )
