@@ -20,6 +20,7 @@ _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _HEAD, _CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
 _MOST_JSON = 1 << 24  # bytes of a .glb's JSON: sixty thousand accessors take less
 _MOST_TEXT = 1 << 32  # bytes of a .gltf, whose buffers may be inside as text
+_MOST_VALUES = 1 << 20  # in the JSON; buffers as text have none of the marks that are counted
 _WHOLE = 2**53  # a JSON number beyond is no exact integer
 
 
@@ -153,6 +154,9 @@ def open_document(path: Path) -> Document:
             )
         else:
             text, binary = head + file.read(), None
+    values = sum(text.count(mark) for mark in (b",", b"[", b"{"))
+    if values > _MOST_VALUES:  # each becomes an object of Python's, tens of times larger than its text
+        raise ValueError(f"{path}: expected at most {_MOST_VALUES} values in its JSON, got {values}; split the scene")
     try:
         root = json.loads(text)
     except (ValueError, RecursionError) as error:

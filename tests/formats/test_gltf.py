@@ -3,6 +3,7 @@
 import base64
 import json
 import struct
+import tracemalloc
 
 import numpy as np
 import pygltflib
@@ -356,6 +357,19 @@ def test_one_buffer_shown_a_thousand_times_is_refused(tmp_path):
     path.write_text(json.dumps(root))
     with pytest.raises(ValueError, match="one buffer is shown too many times"):
         read_splats(path)
+
+
+def test_json_of_millions_of_values_is_not_parsed(tmp_path):
+    text = b'{"asset": {"version": "2.0"}, "accessors": [' + b"[]," * (1 << 20) + b"0]}"
+    (tmp_path / "a.gltf").write_bytes(text)
+    tracemalloc.start()
+    with pytest.raises(
+        ValueError, match="a.gltf: expected at most 1048576 values in its JSON, got 20971.*split the scene"
+    ):
+        read_splats(tmp_path / "a.gltf")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * len(text)
 
 
 @pytest.mark.parametrize(
