@@ -171,7 +171,7 @@ def test_any_value_in_the_json_of_gltf(tmp_path, sound):
     root["bufferViews"][0]["byteStride"] = 12
     root["accessors"][0]["normalized"] = False
     outcomes = [_read(tmp_path / f"bad{suffix}", json.dumps(bent).encode()) for bent in _documents(root)]
-    assert outcomes.count("refused") > 200
+    assert outcomes.count("refused") > 100
 
 
 def test_any_value_in_the_json_of_sog(tmp_path, sound):
@@ -186,7 +186,7 @@ def test_any_value_in_the_json_of_sog(tmp_path, sound):
             for name, data in (files | {"meta.json": json.dumps(bent).encode()}).items():
                 archive.writestr(name, data)
         outcomes.append(_read(tmp_path / f"bad{suffix}", buffer.getvalue()))
-    assert outcomes.count("refused") > 200
+    assert outcomes.count("refused") > 100
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog", ".glb", ".gltf", ".ksplat", ".splat"])
