@@ -77,7 +77,7 @@ def frames_agree(
 
 
 def bulk(name: str, points: Tensor, sample: int = SAMPLE) -> Array:
-    """The points inside the cloud's robust bounds, float64, evenly thinned; refuses NaN and fewer than two points."""
+    """The points inside the cloud's robust bounds, float64, evenly thinned, each place once; refuses NaN and fewer than two points."""
     values = points.detach().double().cpu()
     finite = values.isfinite().all(1)
     if not bool(finite.all()):
@@ -88,7 +88,7 @@ def bulk(name: str, points: Tensor, sample: int = SAMPLE) -> Array:
     if len(values) < 2:
         raise ValueError(f"{name}: expected at least two points, got {len(values)}; there is nothing to compare")
     kept: Array = values[robust_bounds(values, margin=0.0).inside].numpy() if len(values) > 100 else values.numpy()
-    return kept[:: max(1, len(kept) // sample)]
+    return np.unique(kept[:: max(1, len(kept) // sample)], axis=0)  # no two at one place: the spacing is not 0
 
 
 def median_spacing(tree: cKDTree) -> float:

@@ -77,9 +77,9 @@ def align_clouds(
             )
     size = float(np.linalg.norm(np.ptp(b, axis=0)))
     starts, fits = _starts(a, b, rng), []
-    for count, steps, kept in ((FINE, 20, FINALISTS), (FULL, 10, 2)):
+    for count, reaches, kept in ((FINE, np.geomspace(4, 1, 20), FINALISTS), (FULL, np.geomspace(1, 0.5, 10), 2)):
         x, y = _Cloud.of(a, count, rng), _Cloud.of(b, count, rng)
-        fits = sorted((_fit_closely(x, y, start, steps=steps) for start in starts), key=lambda fit: -fit.quality)
+        fits = sorted((_fit_closely(x, y, start, reaches) for start in starts), key=lambda fit: -fit.quality)
         starts = _different([fit.similarity for fit in fits], a.mean(0), size, kept)
     best = fits[0]
     runner_up = max((fit.quality for fit in fits if fit.similarity in starts[1:]), default=0.0)
@@ -106,7 +106,8 @@ def _check_fit(best: _Fit, runner_up: float) -> None:
     if 1 - best.quality > MARGIN * (1 - runner_up):
         raise SceneError(
             f"clouds: expected one similarity to fit best, got two that fit alike (quality {best.quality:.3f} and "
-            f"{runner_up:.3f}): a symmetric shape, or not of the same scene. Align by cameras of the same names, or pass the similarity"
+            f"{runner_up:.3f}): a symmetric shape, or not of the same scene. Align by cameras of the same names, or pass "
+            "the similarity"
         )
 
 
@@ -155,12 +156,14 @@ class _Cloud(NamedTuple):
         return _Cloud(points, normals, tree, median_spacing(tree))
 
 
-def _fit_closely(a: _Cloud, b: _Cloud, start: Similarity, *, steps: int) -> _Fit:
-    """Least squares on distances to the other cloud's tangent planes, both ways, with a reach that narrows."""
+def _fit_closely(a: _Cloud, b: _Cloud, start: Similarity, reaches: Array) -> _Fit:
+    """Least squares on distances to the other cloud's tangent planes, both ways, one step per reach.
+
+    Reaches are multiples of the distance within which a point fits.
+    """
     R, s, t = start.rotation.numpy(), start.scale, start.translation.numpy()
-    finest = NEAR * max(a.spacing * s, b.spacing)
-    for step in range(steps):
-        reach = finest * max(1.0, 4.0 * (1 - 1.5 * step / steps))
+    fits = NEAR * max(a.spacing * s, b.spacing)
+    for reach in reaches * fits:
         moved = s * a.points @ R.T + t
         d, i = nearest(b.tree, moved)
         e, j = nearest(a.tree, (b.points - t) @ R / s)

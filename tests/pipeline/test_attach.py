@@ -46,7 +46,7 @@ def a_splat(count=6_000):
     gaussians = cloud(count, 1)
     sh = torch.rand(len(gaussians), 1, 3, generator=torch.Generator().manual_seed(0))
     return SplatFile(
-        gaussians.replace(sh=sh), {"temperature": np.arange(len(gaussians), dtype=np.float32)}, (), {"format": "test"}
+        gaussians.replace(sh=sh), {"warmth": np.arange(len(gaussians), dtype=np.float32)}, (), {"format": "test"}
     )
 
 

@@ -58,6 +58,13 @@ def test_a_fog_around_a_scene_is_another_scene():
     assert not check.agree
 
 
+def test_points_at_one_place_count_once():
+    once = surface(2_000, 0)
+    check = frames_agree(once.repeat(3, 1), surface(2_000, 1))
+    assert check.agree
+    assert check.reach == pytest.approx(frames_agree(once, surface(2_000, 1)).reach, rel=0.05)
+
+
 def test_far_outliers_do_not_matter():
     far = torch.cat([surface(4_000, 1), 50 * torch.randn(30, 3, generator=torch.Generator().manual_seed(2))])
     assert frames_agree(surface(4_000, 0), far).agree
