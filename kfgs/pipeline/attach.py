@@ -82,6 +82,13 @@ def attach(
 
     Raises:
         ValueError: if `by` is unknown, cameras are missing, the splat is empty, or (SceneError) no similarity fits.
+
+    Note:
+        Toy room, colour field of 40,000 Gaussians, protocol `kfgs-removal/1`, the chairs: by distance 0.979 of their
+        pixels are gone and 0.969 of the others untouched, by views 0.995 and 0.970 (true label maps instead of
+        segmented ones give the same). Gaussians across a border cost the rest: with a score of at least 0.6 alone,
+        0.969 are gone and 0.976 untouched. A vote of neighbours for such Gaussians, or the class of the nearest
+        rendered surface, made it worse.
     """
     check_choice("by", by, WAYS)
     if distance is not None:

@@ -77,7 +77,7 @@ def frames_agree(
 
 
 def bulk(name: str, points: Tensor, sample: int = SAMPLE) -> Array:
-    """The points inside the cloud's robust bounds, float64, evenly thinned, each place once; refuses NaN and fewer than two points."""
+    """The points within robust bounds, float64, evenly thinned, each place once; refuses NaN and fewer than two."""
     values = points.detach().double().cpu()
     finite = values.isfinite().all(1)
     if not bool(finite.all()):
