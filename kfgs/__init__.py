@@ -27,6 +27,20 @@ _WHERE = {
     "SceneError": ".scenes",
     "load_scene": ".scenes",
     "run_sfm": ".scenes",
+    "Similarity": ".cameras",
+    "SplatFile": ".formats",
+    "read_splats": ".formats",
+    "write_splats": ".formats",
+    "EditList": ".labels",
+    "Recolor": ".labels",
+    "Remove": ".labels",
+    "Selection": ".labels",
+    "answers": ".labels",
+    "transform_gaussians": ".splat",
+    "ColorConfig": ".pipeline",
+    "attach": ".pipeline",
+    "fit_color": ".pipeline",
+    "score_views": ".evaluation",
     "transfer_labels": ".labels",
     "FeatureFolder": ".teachers",
     "FieldConfig": ".fields",
@@ -47,17 +61,30 @@ __all__ = sorted(_WHERE)
 if TYPE_CHECKING:
     from .cameras import Camera as Camera
     from .cameras import Distortion as Distortion
+    from .cameras import Similarity as Similarity
     from .cameras import resize_map as resize_map
     from .evaluation import LabelSet as LabelSet
     from .evaluation import evaluate_segmentation as evaluate_segmentation
     from .evaluation import load_label_set as load_label_set
+    from .evaluation import score_views as score_views
     from .fields import FieldConfig as FieldConfig
     from .fields import GaussianParams as GaussianParams
     from .fields import SemanticField as SemanticField
     from .fields import fit_field as fit_field
+    from .formats import SplatFile as SplatFile
+    from .formats import read_splats as read_splats
+    from .formats import write_splats as write_splats
     from .gaussians import Gaussians as Gaussians
+    from .labels import EditList as EditList
+    from .labels import Recolor as Recolor
+    from .labels import Remove as Remove
+    from .labels import Selection as Selection
+    from .labels import answers as answers
     from .labels import transfer_labels as transfer_labels
+    from .pipeline import ColorConfig as ColorConfig
     from .pipeline import FitConfig as FitConfig
+    from .pipeline import attach as attach
+    from .pipeline import fit_color as fit_color
     from .pipeline import fit_scene as fit_scene
     from .pipeline import score_scene as score_scene
     from .pipeline import segment_scene as segment_scene
@@ -75,6 +102,7 @@ if TYPE_CHECKING:
     from .splat import Rendering as Rendering
     from .splat import available_engines as available_engines
     from .splat import rasterize as rasterize
+    from .splat import transform_gaussians as transform_gaussians
     from .teachers import FeatureFolder as FeatureFolder
 
 

@@ -1,5 +1,6 @@
 """Scores that carry the name of their protocol."""
 
+from .color import ColorReport, score_views
 from .editing import RecolorReport, RemovalReport, score_recolor, score_removal
 from .label_set import LabelSet, load_label_set
 from .segmentation import PROTOCOL, SegmentationReport, evaluate_segmentation, load_label_map
@@ -7,6 +8,7 @@ from .surface_density import surface_density
 
 __all__ = [
     "PROTOCOL",
+    "ColorReport",
     "LabelSet",
     "RecolorReport",
     "RemovalReport",
@@ -16,5 +18,6 @@ __all__ = [
     "load_label_set",
     "score_recolor",
     "score_removal",
+    "score_views",
     "surface_density",
 ]

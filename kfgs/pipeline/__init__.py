@@ -9,31 +9,44 @@ from .apply import (
     score_scene,
     score_teacher,
     segment_scene,
+    select_labelled,
     true_labels,
     write_report,
 )
+from .attach import Attached, attach
+from .color import ColorConfig, ColorResult, fit_color
+from .compare import render_color, views_of_change, write_comparison
 from .describe import describe
 from .fit import FitConfig, FitResult, fit_scene, load_history
 from .pictures import write_training_pictures
 from .stages import Run, Stage
 
 __all__ = [
+    "Attached",
+    "ColorConfig",
+    "ColorResult",
     "FitConfig",
     "FitResult",
     "Run",
     "Stage",
+    "attach",
     "describe",
+    "fit_color",
     "fit_scene",
     "label_cloud",
     "label_field",
     "load_history",
     "query_field",
     "read_cloud",
+    "render_color",
     "save_labelled",
     "score_scene",
     "score_teacher",
     "segment_scene",
+    "select_labelled",
     "true_labels",
+    "views_of_change",
+    "write_comparison",
     "write_report",
     "write_training_pictures",
 ]

@@ -1,4 +1,4 @@
-"""The whole main job on a room that the package makes itself, with exact ground truth to score against."""
+"""The whole job on a room that the package makes itself, colours and edits too, with exact truth to score against."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..evaluation import load_label_set
+from ..evaluation import LabelSet, load_label_set, score_recolor, score_removal, score_views
+from ..formats import SplatFile, write_splats
 from ..formats.ply import write_ply
 from ..gaussians import Gaussians
-from ..labels import transfer_labels
-from ..scenes import load_scene
+from ..labels import EditList, OfClass, Recolor, Remove, answers, parse_color, select_by_label, transfer_labels
+from ..scenes import Scene, load_scene
 from ..scenes.toy import ToyConfig, make_toy_room
 from ..teachers import FeatureFolder
 from .apply import (
@@ -26,9 +27,14 @@ from .apply import (
     true_labels,
     write_report,
 )
-from .fit import FitConfig, fit_scene
+from .attach import attach
+from .color import ColorConfig, fit_color
+from .compare import views_of_change, write_comparison
+from .fit import FitConfig, FitResult, fit_scene
 from .pictures import write_training_pictures
 
+REMOVED, PAINTED, PAINT = "chair", "plant", "#c04040"  # the edits of the paper's Figures 5 and 4
+TITLES = ("before", "after")
 SURFACE_PROTOCOL = (
     "kfgs-surface/1: share of the ground-truth surface points, each seen by some training view, that receive their true "
     "class from the nearest labelled Gaussian within lambda; points out of reach count as wrong"
@@ -43,10 +49,10 @@ def run(
     report: Callable[[str], None] | None = None,
     progress: bool = False,
 ) -> list[Path]:
-    """Make the room, fit it, segment its unseen views, label its surface; return the files written.
+    """Make the room, fit it, segment its unseen views, label its surface, edit its colours; return the files written.
 
     Args:
-        out: receives `scene/`, `run/`, `segmentation/` and `scores.json`.
+        out: receives `scene/`, `run/`, `segmentation/`, labelled and edited clouds, pictures and `scores.json`.
         config: how to fit; the CPU preset when not given.
         room: what to build; the default room when not given.
         report: receives one line per step.
@@ -78,7 +84,15 @@ def run(
     surface["own latents (Sec. 3.4)"] = _label_surface(label_field(fitted.field, classes)[0], folder, None)
     for rule, facts in surface.items():
         say(f"surface points, Gaussians labelled by {rule}: {facts['agreement']:.4f} agree ({SURFACE_PROTOCOL})")
-    write_report(out / "scores.json", unseen_views=scores, teacher=teacher, surface=surface, seconds=fitted.seconds)
+    edited, edit_scores = _edit_colors(out, scene, folder, fitted, classes, say, progress)
+    write_report(
+        out / "scores.json",
+        unseen_views=scores,
+        teacher=teacher,
+        surface=surface,
+        **edit_scores,
+        seconds=fitted.seconds,
+    )
     segmentation = out / "segmentation"
     return [
         fitted.field_path,
@@ -88,8 +102,44 @@ def run(
         *written,
         out / "surface.ply",
         *write_training_pictures(fitted),
+        *edited,
         out / "scores.json",
     ]
+
+
+def _edit_colors(
+    out: Path,
+    scene: Scene,
+    folder: Path,
+    fitted: FitResult,
+    classes: LabelSet,
+    say: Callable[[str], None],
+    progress: bool,
+) -> tuple[list[Path], dict[str, Any]]:
+    """Fit the colours, attach the classes, remove the chairs and recolour the plants; the files and the scores."""
+    colored = fit_color(scene, out / "run", ColorConfig.quick(), report=say, progress=progress)
+    quality = score_views(colored.gaussians, scene)
+    say(f"colours of unseen views: {quality}")
+    cameras = [scene.cameras[i] for i in scene.views("train")]
+    splats = attach(fitted.field, SplatFile(colored.gaussians), classes, cameras=cameras, by="views").splats
+    written = write_splats(out / "color.ply", splats).paths
+    for thing in answers(splats.gaussians, select_by_label(splats.gaussians, REMOVED, classes.names), cameras):
+        say(f"  {REMOVED}: {thing!r}")
+    rgb = parse_color(PAINT)
+    edits = {"removed": EditList((Remove(OfClass(REMOVED)),)), "recolored": EditList((Recolor(OfClass(PAINTED), rgb),))}
+    after = {name: edit.apply(splats) for name, edit in edits.items()}
+    for name, edit in edits.items():
+        written += [*write_splats(out / f"{name}.ply", after[name]).paths, edit.save(out / f"{name}.edits.json")]
+        before_after = splats.gaussians, after[name].gaussians
+        views = views_of_change(*before_after, scene.cameras)
+        picture = out / f"{name}.png"
+        written.append(write_comparison(picture, *before_after, [scene.cameras[i] for i in views], titles=TITLES))
+    before = splats.gaussians
+    removal = score_removal(before, after["removed"].gaussians, folder, REMOVED)
+    recolored = score_recolor(before, after["recolored"].gaussians, folder, PAINTED, rgb)
+    say(str(removal))
+    say(str(recolored))
+    return written, {"color": quality, "removal": removal, "recolor": recolored}
 
 
 def _label_surface(gaussians: Gaussians, folder: Path, out: Path | None) -> dict[str, Any]:
