@@ -1,7 +1,7 @@
 """The command line: `kfgs demo | sfm | fit | segment | label | info | color | attach | select | edit | convert`.
 
 Every command names the files it wrote, shows progress on long work, and ends with 0 (done), 1 (bad input, with one
-message that says what to do), 2 (wrong usage) or 130 (interrupted; the same command goes on where it stopped).
+message that says what to do), 2 (wrong usage), 130 (interrupted; the same command goes on where it stopped) or 141 (nobody reads its lines any more).
 """
 
 from __future__ import annotations
@@ -36,6 +36,9 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("interrupted; the same command goes on where it stopped", file=sys.stderr)  # noqa: T201
         return 130
+    except BrokenPipeError:  # whoever read our lines has gone, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter complains when it ends
+        return 141
     except (ValueError, TypeError, OSError, ImportError, ArithmeticError) as error:
         print(f"error: {error}", file=sys.stderr)  # noqa: T201
         return 1
