@@ -1,7 +1,8 @@
 """The command line: `kfgs demo | sfm | fit | segment | label | info | color | attach | select | edit | convert`.
 
 Every command names the files it wrote, shows progress on long work, and ends with 0 (done), 1 (bad input, with one
-message that says what to do), 2 (wrong usage), 130 (interrupted; the same command goes on where it stopped) or 141 (nobody reads its lines any more).
+message that says what to do), 2 (wrong usage), 130 (interrupted; the same command goes on where it stopped) or 141
+(nobody reads its lines any more).
 """
 
 from __future__ import annotations
