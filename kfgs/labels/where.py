@@ -17,9 +17,8 @@ from torch import Tensor
 from .._check import check_range, check_whole
 from ..gaussians import Gaussians
 from ._plain import NESTED, checked_object, members_of, number_of, numbers_of, quaternion_of, rotation_matrix
-from .components import components
+from .components import component_numbers
 from .names import class_index
-from .selection import select_where
 
 
 class _Cloud(NamedTuple):
@@ -250,8 +249,7 @@ class Component(Where):
         mask = self.where._ask(cloud)
         if not bool(mask.any()):
             return mask
-        parts = components(cloud.gaussians.means, select_where(mask), self.distance, most=self.rank + 1)
-        return parts[self.rank].mask if self.rank < len(parts) else torch.zeros_like(mask)
+        return component_numbers(cloud.gaussians.means, mask, self.distance) == self.rank
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from functools import partial
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -15,10 +16,13 @@ from ..cameras.similarity import Similarity
 from ..evaluation import LabelSet
 from ..fields import SemanticField
 from ..formats.splat_file import SCORE, SplatFile
+from ..gaussians import Gaussians
 from ..labels import Transfer, transfer_labels, vote_labels
+from ..labels.transfer import Method
 from ..scenes.align import Alignment, align_by_cameras
 from ..scenes.frames import frames_agree
 from ..scenes.register import align_clouds
+from ..splat.transform import transform_gaussians
 from .apply import label_field
 
 By = Literal["distance", "views"]
@@ -58,6 +62,7 @@ def attach(
     similarity: Similarity | None = None,
     distance: float | None = None,
     by: By = "distance",
+    method: Method = "nearest",
 ) -> Attached:
     """Give every Gaussian of a splat the class that the semantic field has at its place.
 
@@ -65,10 +70,11 @@ def attach(
     names; else, where `frames_agree` says so, both share one frame; else the clouds themselves are aligned.
 
     Classes, `by="distance"` (Sec. 3.4): the semantic Gaussians are classified, by votes of `cameras` or else by their
-    own latents, and each Gaussian of the splat takes the class of the nearest one within lambda. The score is
-    1 - d / lambda. `by="views"`: the semantic field segments `cameras`, and each Gaussian of the splat takes the class
-    of most of the pixels that it fills in them (the score is the winner's share of its votes); one that no view shows
-    takes the class of the nearest one that has a class, within lambda (score 1 - d / lambda).
+    own latents, and those within lambda decide on each Gaussian of the splat. `by="views"`: the semantic field segments
+    `cameras`, and each Gaussian of the splat takes the class of most of the pixels that it fills in them (the score is
+    the winner's share of its votes); on one that no view shows, those of the splat that have a class decide, within
+    lambda. How distance decides is `method`'s: "nearest" gives a score of 1 - d / lambda, "vote" and "mahalanobis" the
+    winner's share of the weights.
 
     Args:
         field: a finished field.
@@ -79,9 +85,10 @@ def attach(
         similarity: from the field's frame to the splat's; `Similarity.identity()` says that they are one.
         distance: lambda in the splat's world units; None takes `default_distance`.
         by: "distance" needs no cameras; "views" follows the borders of objects much better.
+        method: which label wins where distance decides, see `transfer_labels`; "nearest" is the paper's.
 
     Raises:
-        ValueError: if `by` is unknown, cameras are missing, the splat is empty, or (SceneError) no similarity fits.
+        ValueError: if `by` or `method` is unknown, cameras are missing, the splat is empty, or (SceneError) no similarity fits.
 
     Note:
         Toy room, colour field of 40,000 Gaussians, protocol `kfgs-removal/1`, the chairs: by distance 0.979 of their
@@ -91,6 +98,7 @@ def attach(
         rendered surface, made it worse.
     """
     check_choice("by", by, WAYS)
+    check_choice("method", method, get_args(Method))
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
     if len(splats) == 0:
@@ -99,11 +107,12 @@ def attach(
         if needed and not cameras:
             raise ValueError(f"cameras: expected views in the field's frame (for {name}), got none; pass them as well")
     similarity, alignment, said = _common_frame(field, splats, cameras, splat_cameras, similarity)
+    carry = partial(transfer_labels, distance=distance, method=method)
     if by == "distance":
-        labels, scores, transfer, found = _by_distance(field, splats, classes, cameras, similarity, distance)
+        labels, scores, transfer, found = _by_distance(field, splats, classes, cameras, similarity, carry)
     else:
         assert cameras is not None
-        labels, scores, transfer, found = _by_views(field, splats, classes, cameras, similarity, distance)
+        labels, scores, transfer, found = _by_views(field, splats, classes, cameras, similarity, carry)
     counts = torch.bincount(labels + 1, minlength=len(classes) + 1).tolist()
     facts = {
         **found,
@@ -162,19 +171,20 @@ def _by_distance(
     classes: LabelSet,
     cameras: Sequence[Camera] | None,
     similarity: Similarity,
-    distance: float | None,
+    carry: Callable[[Gaussians, Tensor, Gaussians], Transfer],
 ) -> tuple[Tensor, Tensor, Transfer, dict[str, Any]]:
     """Labels [N], scores [N], the transfer and facts: the rule of Sec. 3.4."""
     semantic, _ = label_field(field, classes, cameras)
     assert semantic.labels is not None
-    transfer = transfer_labels(similarity.apply(semantic.means), semantic.labels, splats.gaussians.means, distance)
+    transfer = carry(transform_gaussians(semantic, similarity), semantic.labels, splats.gaussians)
     who = "own latents" if cameras is None else f"votes of {len(cameras)} views"
     facts = {
         "labelled by": f"distance to semantic Gaussians classified by {who}",
-        "score": "1 - distance / lambda",
+        "method": transfer.method,
+        "score": _meaning(transfer),
         "ambiguous": transfer.ambiguous,
     }
-    return transfer.labels, _closeness(transfer), transfer, facts
+    return transfer.labels, _sureness(transfer), transfer, facts
 
 
 def _by_views(
@@ -183,7 +193,7 @@ def _by_views(
     classes: LabelSet,
     cameras: Sequence[Camera],
     similarity: Similarity,
-    distance: float | None,
+    carry: Callable[[Gaussians, Tensor, Gaussians], Transfer],
 ) -> tuple[Tensor, Tensor, Transfer, dict[str, Any]]:
     """Labels [N], scores [N], the transfer and facts: each Gaussian asks the pixels that it fills."""
 
@@ -194,19 +204,27 @@ def _by_views(
     colour = splats.gaussians
     votes = vote_labels(colour, segmented(), len(classes), min_share=0.0)
     open_ = votes.labels < 0
-    carried = transfer_labels(colour.means, votes.labels, colour.means[open_], distance)
+    carried = carry(colour, votes.labels, colour.select(open_))
     labels, scores = votes.labels.clone(), votes.shares.clone()
-    labels[open_], scores[open_] = carried.labels, _closeness(carried).to(scores)
+    labels[open_], scores[open_] = carried.labels, _sureness(carried).to(scores)
     facts = {
         "labelled by": f"votes of {len(cameras)} segmented views",
-        "score": "share of the votes; where no view shows a Gaussian, 1 - distance / lambda to one that has a class",
+        "method": carried.method,
+        "score": f"share of the votes; where no view shows a Gaussian, {_meaning(carried)}, to those that have a class",
         "shown": int((~open_).sum()),
         "not shown": int(open_.sum()),
     }
     return labels, scores, carried, facts
 
 
-def _closeness(transfer: Transfer) -> Tensor:  # [N] in [0, 1]
-    """1 - d / lambda where there is a label, 0 elsewhere."""
+def _sureness(transfer: Transfer) -> Tensor:  # [N] in [0, 1]
+    """The score of labels that distance carried; 0 where there is none."""
+    if transfer.method != "nearest":
+        return transfer.shares
     reach = max(transfer.distance, torch.finfo(transfer.distances.dtype).tiny)
     return (1 - transfer.distances / reach).clamp_min(0.0)
+
+
+def _meaning(transfer: Transfer) -> str:
+    """What `_sureness` gives, in words."""
+    return "1 - distance / lambda" if transfer.method == "nearest" else "the label's share of the weights in range"

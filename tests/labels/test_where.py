@@ -119,6 +119,18 @@ def test_component_is_the_largest_connected_part_or_the_next():
     assert not any(ask(Component(OfClass(9), 0.5), g))
 
 
+def test_a_part_far_down_the_list_is_found():
+    n = 250  # parts of one Gaussian each, more than `components` returns
+    g = Gaussians(
+        means=torch.arange(n, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0, 0]),
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        scales=torch.full((n, 3), 0.1),
+        opacities=torch.full((n,), 0.5),
+        labels=torch.ones(n, dtype=torch.int64),
+    )
+    assert Component(OfClass(1), 0.5, 200).mask(g).nonzero().tolist() == [[200]]  # equally large: by index
+
+
 EVERY_KIND = (
     (OfClass("plant") | OfClass(-1)) - InBox((0, 0, 0), (1, 1, 1), (1, 0, 0, 0.5)),
     Component(~InSphere((1, 2, 3), 0.25), 0.1, 1),

@@ -14,11 +14,14 @@ from kfgs.cameras import Camera
 from kfgs.cameras.similarity import Similarity
 from kfgs.evaluation import LabelSet
 from kfgs.fields import SemanticField
+from kfgs.formats.sidecar import names_path
 from kfgs.formats.splat_file import SplatFile
 from kfgs.formats.table import read_splats, write_splats
 from kfgs.gaussians import Gaussians
+from kfgs.labels import transfer_labels
 from kfgs.pipeline.attach import attach
 from kfgs.scenes import SceneError, register
+from kfgs.splat.transform import transform_gaussians
 
 CLASSES = LabelSet(("wall", "box", "table"), torch.eye(4)[:3])
 
@@ -97,6 +100,42 @@ def test_distance_in_one_frame():
     assert (score[~labelled] == 0).all()
 
 
+@pytest.mark.parametrize("method", ["vote", "mahalanobis"])
+def test_other_rules_of_distance_outvote_mistakes_and_score_by_the_share_of_weights(method):
+    semantic, splats, similarity = a_field(2_000).gaussians, a_splat(2_000), a_similarity()
+    said = true_labels(semantic.means)
+    said[::8] = (said[::8] + 1) % 3  # an eighth is wrong
+    semantic = semantic.replace(
+        scales=semantic.scales * torch.tensor([2.0, 1.0, 0.2]),  # long ones, so that a turn shows
+        opacities=torch.linspace(0.2, 0.9, len(semantic)),
+        features=CLASSES.embeddings[said],
+    )
+    there = splats.replace(gaussians=transform_gaussians(splats.gaussians, similarity))
+    given = {"distance": 0.5, "method": method}
+    attached = attach(SemanticField(semantic), there, CLASSES, similarity=similarity, **given)
+    expected = transfer_labels(transform_gaussians(semantic, similarity), said, there.gaussians, **given)
+    assert attached.transfer.method == method
+    assert torch.equal(attached.labels, expected.labels)
+    torch.testing.assert_close(torch.from_numpy(attached.splats.extra["score"]), expected.shares.float())
+    assert float(expected.shares[expected.labels >= 0].min()) < 0.6  # some are not sure
+    nearest = attach(SemanticField(semantic), there, CLASSES, similarity=similarity, distance=0.5)
+    assert accuracy(attached.labels, splats) > accuracy(nearest.labels, splats) + 0.02
+    assert "share of the weights" in attached.splats.info["labels"]["score"]
+    assert attached.splats.info["labels"]["method"] == method
+
+
+def test_the_rule_of_distance_also_decides_on_what_no_view_shows():
+    splats = a_splat(2_000)
+    facts = {}
+    for method in ("nearest", "mahalanobis"):
+        attached = attach(a_field(2_000), splats, CLASSES, cameras=CAMERAS, by="views", method=method)
+        assert attached.transfer.method == method
+        assert len(attached.transfer.labels) == attached.splats.info["labels"]["not shown"] > 0
+        facts[method] = attached
+    shown = facts["nearest"].splats.extra["score"] != facts["mahalanobis"].splats.extra["score"]
+    assert 0 < shown.sum() <= facts["nearest"].splats.info["labels"]["not shown"]
+
+
 def test_nothing_else_of_the_splat_changes():
     splats = a_splat(1_500)
     attached = attach(a_field(1_500), splats, CLASSES).splats
@@ -168,7 +207,7 @@ def test_the_facts_survive_a_file(tmp_path):
     back = read_splats(tmp_path / "a.ply")
     assert torch.equal(back.gaussians.labels, attached.labels)
     assert back.classes == CLASSES.names
-    written = json.loads((tmp_path / "a.classes.json").read_text())
+    written = json.loads(names_path(tmp_path / "a.ply").read_text())
     assert written["labelled by"] == "votes of 6 segmented views"
 
 
@@ -190,6 +229,8 @@ def test_what_cannot_be_done_is_refused():
         attach(field, splats, CLASSES, by="views")
     with pytest.raises(ValueError, match=r"cameras: expected views in the field's frame \(for splat_cameras\)"):
         attach(field, splats, CLASSES, splat_cameras=CAMERAS)
+    with pytest.raises(ValueError, match="method: expected one of 'nearest', 'vote', 'mahalanobis', got 'guess'"):
+        attach(field, splats, CLASSES, method="guess")
     with pytest.raises(ValueError, match="distance: expected a number"):
         attach(field, splats, CLASSES, distance=0.0)
     nothing = splats.select(torch.zeros(len(splats), dtype=torch.bool))
