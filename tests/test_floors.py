@@ -18,7 +18,8 @@ ROOT = Path(kfgs.__file__).parent
 FLOORS = (
     {"_check", "_files"},
     {"gaussians", "cameras"},
-    {"splat", "quant", "metrics", "formats"},
+    {"splat", "quant", "metrics"},
+    {"formats"},
     {"scenes", "labels"},
     {"teachers", "fields", "viz"},
     {"evaluation"},

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from ..cameras.similarity import Similarity
 from ..gaussians import Gaussians
+from ..splat.transform import transform_gaussians
 from .gltf_container import Document
-from .spz_codec import flip_axes
+from .values import check_finite
 
 _DEEPEST = 256  # nodes below nodes
-_SAME = 1e-6  # an entry of a rotation matrix this near to -1, 0 or 1 is that
 
 
 def placed_meshes(document: Document) -> Iterator[tuple[str, int, Tensor]]:  # name of the node, mesh, [4, 4] float64
@@ -53,11 +53,11 @@ def placed_meshes(document: Document) -> Iterator[tuple[str, int, Tensor]]:  # n
 
 
 def place(document: Document, where: str, gaussians: Gaussians, matrix: Tensor) -> Gaussians:  # matrix: [4, 4]
-    """The Gaussians of a mesh moved to where its node puts them.
+    """The Gaussians of a mesh moved to where its node puts them, their colours turned along.
 
     Raises:
-        ValueError: if the node mirrors, shears or scales the axes differently, or turns colours that depend on the
-            direction by anything else than half turns around the axes.
+        ValueError: if the node mirrors, shears or scales the axes differently, or moves Gaussians out of the range of
+            float32.
     """
     if torch.equal(matrix, torch.eye(4, dtype=torch.float64)):
         return gaussians
@@ -68,25 +68,9 @@ def place(document: Document, where: str, gaussians: Gaussians, matrix: Tensor) 
             f"{document.path}: {where}: expected a rotation, one scale for all axes and a translation ({error}); apply "
             "the node's transform in the program that wrote it"
         ) from error
-    R = similarity.rotation
-    if (R - R.round()).abs().max() < _SAME and bool((R.round().diagonal().abs() == 1).all()):
-        x, y, z = (int(v) for v in R.round().diagonal().tolist())
-        turned = flip_axes(gaussians, (x, y, z)).replace(means=similarity.apply(gaussians.means))
-    elif gaussians.sh is not None and gaussians.sh.shape[1] > 1:
-        raise ValueError(
-            f"{document.path}: {where}: expected colours of degree 0 under a node that turns them, or half turns, got "
-            f"degree {math.isqrt(gaussians.sh.shape[1]) - 1}; apply the node's transform in the program that wrote it"
-        )
-    else:
-        turned = gaussians.replace(means=similarity.apply(gaussians.means), quats=_turn(gaussians.quats, R))
-    return turned.replace(scales=gaussians.scales * similarity.scale)
-
-
-def _turn(quats: Tensor, rotation: Tensor) -> Tensor:  # [N, 4] wxyz, [3, 3] -> [N, 4]
-    """Hamilton's product q_R q."""
-    x, y, z, w = Rotation.from_matrix(rotation.numpy()).as_quat().tolist()
-    left = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64)
-    return (quats.double() @ left.T).to(quats)
+    moved = transform_gaussians(gaussians, similarity)
+    check_finite(document.path, positions=moved.means.numpy(), scales=moved.scales.numpy())
+    return moved
 
 
 def _children(document: Document, index: int) -> list[Any]:
