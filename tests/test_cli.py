@@ -77,7 +77,7 @@ def test_label_carries_classes_to_another_cloud_and_keeps_its_columns(run, room,
     columns = read_ply(out / "cloud.ply")
     np.testing.assert_array_equal(columns["mass"], np.arange(len(surface)))
     assert (columns["class_id"] >= 0).mean() > 0.8
-    names = json.loads((out / "cloud.classes.json").read_text())
+    names = json.loads((out / "cloud.ply.classes.json").read_text())
     assert names["class_id"]["1"] == "floor"
     assert names["distance"] > 0
     assert {"class_id", "score", "red"} <= set(read_ply(out / "gaussians.ply"))
@@ -124,7 +124,7 @@ def test_a_single_query_reports_its_threshold(run, room, tmp_path, capsys):
     assert main(["label", str(run / "field"), "--scene", str(room), "--out", str(tmp_path), "--query", "chair"]) == 0
     assert "above gamma = " in capsys.readouterr().out
     labels = read_ply(tmp_path / "gaussians.ply")["class_id"]
-    names = json.loads((tmp_path / "gaussians.classes.json").read_text())["class_id"]
+    names = json.loads((tmp_path / "gaussians.ply.classes.json").read_text())["class_id"]
     assert {names[str(label)] for label in labels if label >= 0} == {"chair"}
     assert (labels == -1).any()
 

@@ -30,6 +30,7 @@ NAME = "compressed_ply"
 SUFFIXES = (".compressed.ply",)
 MAGIC = b"ply"
 HOLDS_LABELS = False
+SORTS = True
 CHUNK = 256  # Gaussians between shared bounds
 LOG_SCALE_LIMIT = 20.0  # e^-20 to e^20 world units: what common writers keep of a scale
 SH_LIMIT = 4.0  # of the higher coefficients
@@ -91,16 +92,12 @@ def read(path: Path) -> SplatFile:
 
 
 def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
-    """Write a compressed PLY file, in Morton order.
-
-    A cloud with labels keeps its order, since its labels go to a file beside this one; sort it first
-    (`splats.select(morton_order(...))`) for tighter bounds.
+    """Write a compressed PLY file in the order given; the nearer each 256 lie together, the tighter their bounds.
 
     Raises:
-        ValueError: if the cloud has no colours, or values that are not finite.
+        ValueError: if the cloud has no colours.
     """
     g = colours_to_write(splats.gaussians, ".compressed.ply")
-    g = g.select(_file_order(splats.gaussians))
     assert g.sh is not None
     values = _quantities(g)
     bounds = [_chunk_bounds(value) for value in values]
@@ -133,11 +130,11 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
 
 
 def precision(gaussians: Gaussians) -> Precision:
-    """Half a step between the bounds that this cloud's chunks get, and what the fixed ranges cut off.
+    """Half a step between the bounds that this cloud's chunks get in Morton order, and what the fixed ranges cut off.
 
     `means` is [N, 3] in the order of `gaussians`; scales, colours and harmonics are those of the worst chunk.
     """
-    order = _file_order(gaussians)
+    order = morton_order(gaussians.means).cpu()
     g = colours_to_write(gaussians, ".compressed.ply").select(order)
     assert g.sh is not None
     errors = [_half_steps(value, count) for value, count in zip(_quantities(g), _ALL_STEPS, strict=True)]
@@ -155,12 +152,6 @@ def precision(gaussians: Gaussians) -> Precision:
         sh0=float(errors[2].max(initial=0.0)) / SH_C0 + 1e-6,
         sh_rest=max(1 / 64 if strongest < ends else 1 / 32, strongest - SH_LIMIT) + 1e-6,
     )
-
-
-def _file_order(gaussians: Gaussians) -> Tensor:  # [N] int64
-    if gaussians.labels is not None:
-        return torch.arange(len(gaussians))
-    return morton_order(gaussians.means).cpu()
 
 
 def _quantities(g: Gaussians) -> tuple[NDArray[np.float64], ...]:  # 3 x [N, 3]

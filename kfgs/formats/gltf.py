@@ -110,7 +110,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     """Write one primitive with float32 values; labels, score, class names and extra columns go along.
 
     Raises:
-        ValueError: if the cloud is empty, has no colours or values that are not finite, or is too large for a .glb.
+        ValueError: if the cloud is empty, has no colours or labels beyond 2^24, or is too large for a .glb.
     """
     g = flip_axes(colours_to_write(splats.gaussians, ".glb"), AXES)
     if len(g) == 0:
@@ -292,9 +292,8 @@ def _write_columns(
     labels = splats.gaussians.labels
     if labels is not None:
         columns["class_id"] = labels.detach().cpu().numpy()
-        low, high = int(columns["class_id"].min()), int(columns["class_id"].max())
-        if low < -1 or high > _EXACT:
-            raise ValueError(f"labels: expected -1 to {_EXACT}, got {low} to {high}; -1 means none")
+        if (high := int(columns["class_id"].max())) > _EXACT:
+            raise ValueError(f"labels: expected -1 to {_EXACT} for glTF, got {high}; number the classes from 0")
     for name, values in splats.extra.items():
         as_written = values.astype(np.float32)
         if name == SCORE or np.array_equal(as_written.astype(values.dtype), values):  # float32 holds them

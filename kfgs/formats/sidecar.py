@@ -18,7 +18,16 @@ _NPZ_HEADERS = 1 << 16  # bytes: what an .npz file of three arrays has beside th
 
 
 def names_path(path: str | Path) -> Path:
-    """`scene.ply` -> `scene.classes.json`: the names of the classes in a splat file."""
+    """`scene.ply` -> `scene.ply.classes.json`: the names of the classes in a splat file, and in that one alone."""
+    path = Path(path)
+    return path.with_name(path.name + ".classes.json")
+
+
+def shared_names_path(path: str | Path) -> Path:
+    """`scene.ply` -> `scene.classes.json`: where names lay once; read where a file has none of its own.
+
+    It may belong to `scene.spz` as well, so it is never written or deleted.
+    """
     return Path(path).with_suffix(".classes.json")
 
 
@@ -36,7 +45,11 @@ def write_names(path: str | Path, classes: tuple[str, ...], **facts: Any) -> Pat
 
 
 def write_sidecar(path: Path, splats: SplatFile, *, holds_labels: bool) -> list[Path]:
-    """Write what the format itself could not hold, and take away labels and names that belonged to an older file."""
+    """Write what the format itself could not hold, and take away labels and names that belonged to an older `path`.
+
+    Names always lie beside a labelled file, whether or not the format holds them: people read them there, with the facts
+    of how the labels came about.
+    """
     labels, written = splats.gaussians.labels, []
     beside = labels_path(path)
     if labels is not None and not holds_labels:
@@ -48,11 +61,12 @@ def write_sidecar(path: Path, splats: SplatFile, *, holds_labels: bool) -> list[
         written.append(beside)
     else:
         beside.unlink(missing_ok=True)
-    if labels is not None and not splats.classes:
-        names_path(path).unlink(missing_ok=True)  # else the older file's names would be read as this one's
-    if labels is not None and splats.classes:
+    # Where another file's names would be read as this one's, that it has none is written too.
+    if labels is not None and (splats.classes or shared_names_path(path).is_file()):
         facts = splats.info.get("labels", {})
         written.append(write_names(path, splats.classes, **facts))
+    else:
+        names_path(path).unlink(missing_ok=True)
     return written
 
 
@@ -65,9 +79,15 @@ def read_sidecar(path: Path, splats: SplatFile) -> SplatFile:
     beside = labels_path(path)
     if splats.gaussians.labels is None and beside.is_file():
         splats = _with_labels(beside, path, splats)
-    if splats.gaussians.labels is not None and not splats.classes and names_path(path).is_file():
-        splats = splats.replace(classes=read_names(names_path(path)))
+    names = find_names(path)
+    if splats.gaussians.labels is not None and not splats.classes and names is not None:
+        splats = splats.replace(classes=read_names(names))
     return splats
+
+
+def find_names(path: str | Path) -> Path | None:
+    """The file with the names of a splat file's classes: its own, or the one that it may share; None where there is none."""
+    return next((found for found in (names_path(path), shared_names_path(path)) if found.is_file()), None)
 
 
 def read_names(path: Path) -> tuple[str, ...]:

@@ -35,6 +35,7 @@ NAME = "sog"
 SUFFIXES = (".sog",)
 MAGIC = b"PK\x03\x04"
 HOLDS_LABELS = False
+SORTS = True
 _LARGEST_FIRST = 252  # alpha of a rotation whose largest component is w
 _PER_LINE = 64  # rows of the palette in a line of its image
 _LEVELS = 65535
@@ -85,17 +86,12 @@ def read(path: Path) -> SplatFile:
 
 
 def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
-    """Write version 2 in Morton order: a zip file where the name ends in .sog, else a folder.
-
-    A cloud with labels keeps its order, since its labels go to a file beside this one; sort it first
-    (`splats.select(morton_order(...))`) for smaller images.
+    """Write version 2 in the order given: a zip file where the name ends in .sog, else a folder.
 
     Raises:
-        ValueError: if the cloud has no colours, or values that are not finite, or a folder of that name holds files that
-            are not of such a scene.
+        ValueError: if the cloud has no colours, or a folder of that name holds files that are not of such a scene.
     """
-    g = colours_to_write(splats.gaussians, ".sog").select(_file_order(splats.gaussians))
-    files = _encode(g)
+    files = _encode(colours_to_write(splats.gaussians, ".sog"))
     if path.name.lower().endswith(SUFFIXES):
         with atomic_path(path) as temporary:
             write_zip(temporary, files)
@@ -112,7 +108,7 @@ def precision(gaussians: Gaussians) -> Precision:
 
     Costs as much as writing: codebooks and palette are fitted.
     """
-    g = colours_to_write(gaussians, ".sog").select(_file_order(gaussians))
+    g = colours_to_write(gaussians, ".sog").select(morton_order(gaussians.means).cpu())
     assert g.sh is not None
     logs = _log_positions(gaussians.means.detach().cpu().double().numpy())
     half_step = (logs.max(0) - logs.min(0)) / _LEVELS / 2 if len(g) else np.zeros(3)
@@ -126,12 +122,6 @@ def precision(gaussians: Gaussians) -> Precision:
         sh0=_code_error(g.sh[:, 0].numpy()) + 1e-6,
         sh_rest=_rest_error(g.sh, rest) + 1e-6,
     )
-
-
-def _file_order(gaussians: Gaussians) -> Tensor:  # [N] int64
-    if gaussians.labels is not None:
-        return torch.arange(len(gaussians))
-    return morton_order(gaussians.means).cpu()
 
 
 # Reading

@@ -60,7 +60,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     """Write the base colours; a quaternion is stored with its largest component negative, since -1 fits and +1 does not.
 
     Raises:
-        ValueError: if the cloud has no colours, or values that are not finite.
+        ValueError: if the cloud has no colours.
     """
     g = colours_to_write(splats.gaussians, ".splat")
     assert g.sh is not None

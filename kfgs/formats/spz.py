@@ -26,7 +26,7 @@ from .spz_codec import (
 from .spz_labels import TYPE as LABELS
 from .spz_labels import LabelRecord, pack_labels, unpack_labels
 from .spz_streams import ANTIALIASED, GZIP, MAGIC, MAX_FRACTIONAL_BITS, Container, read_container, write_container
-from .values import colours_to_write, words_of_loss
+from .values import check_splats, colours_to_write, words_of_loss
 
 NAME = "spz"
 SUFFIXES = (".spz",)
@@ -99,11 +99,13 @@ def write_spz(
         What the file could not hold, in words.
 
     Raises:
-        ValueError: if the cloud has no colours or values that are not finite, or reaches further than 24 bits hold.
+        ValueError: if the cloud has no colours, values that `write_splats` refuses, or reaches further than 24 bits hold, or
+            an option is out of its range.
     """
     check_choice("version", version, (2, 3, 4))
     for bits in sh_bits:
         check_whole("sh_bits", bits, 1, 8)
+    check_splats(splats)
     g = colours_to_write(splats.gaussians, ".spz")
     if fractional_bits is None:
         fractional_bits = max(choose_fractional_bits(g.means), 0)
@@ -133,11 +135,6 @@ def _record(splats: SplatFile) -> LabelRecord:
     labels = splats.gaussians.labels
     assert labels is not None
     class_id = labels.detach().cpu().numpy()
-    limits = np.iinfo(np.int32)
-    if len(class_id) and not -1 <= class_id.min() <= class_id.max() <= limits.max:
-        raise ValueError(
-            f"labels: expected -1 to {limits.max}, got {class_id.min()} to {class_id.max()}; -1 means none"
-        )
     score = splats.extra.get(SCORE)
     return LabelRecord(class_id.astype(np.int32), None if score is None else score.astype(np.float32), splats.classes)
 

@@ -8,7 +8,10 @@ A format is one module of this package with
 - `write(path, splats) -> tuple[str, ...]`: write the file, whole or not at all, and say in words what it could not hold
   (formats that are only read have no `write`);
 - `precision(gaussians) -> Precision`: how exactly a written cloud comes back;
-- `HOLDS_LABELS`: whether `class_id`, `score` and names travel inside; else they go to files beside it (`sidecar`).
+- `HOLDS_LABELS`: whether `class_id` and `score` travel inside; else they go to a file beside it (`sidecar`, which writes
+  the names of classes beside every labelled file);
+- `SORTS = True`, where the format packs neighbours together: `write` keeps the order that it is given, and `write_splats`
+  gives it Morton order;
 
 and a line in `MODULES`.
 """
@@ -21,9 +24,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
+from torch import Tensor
+
 from ..gaussians import Gaussians
-from .sidecar import names_path, read_sidecar, write_sidecar
+from .order import morton_order
+from .sidecar import find_names, names_path, read_sidecar, write_sidecar
 from .splat_file import SplatFile
+from .values import check_splats
 
 MODULES = (  # asked in this order: compressed PLY before PLY, whose ending it shares
     "compressed_ply",
@@ -42,6 +49,7 @@ class Written(NamedTuple):
 
     paths: list[Path]  # the file, and those beside it
     lost: tuple[str, ...]  # what the format could not hold, in words
+    order: Tensor | None  # [N] int64: row i of the file is Gaussian order[i] of the cloud; None: the cloud's own order
 
 
 def formats() -> dict[str, ModuleType]:
@@ -91,7 +99,7 @@ def read_splats(path: str | Path) -> SplatFile:
         if low < -1 or (splats.classes and high >= len(splats.classes)):
             raise ValueError(
                 f"{path}: expected labels from -1 to {len(splats.classes) - 1} (the named classes), got {low} to {high}; "
-                f"correct the labels, or the names in {names_path(path).name}"
+                f"correct the labels, or the names in {(find_names(path) or names_path(path)).name}"
             )
     return splats
 
@@ -99,24 +107,34 @@ def read_splats(path: str | Path) -> SplatFile:
 def write_splats(path: str | Path, splats: SplatFile | Gaussians, *, format: str | None = None) -> Written:
     """Write a cloud in the format that the file's name asks for.
 
+    **Convention**: formats that pack neighbours together (compressed PLY, SOG) get the Gaussians in Morton order, labels
+    and scores along; `Written.order` says which went where. Whoever keeps indices (an edit of `OfIndex`) applies it to
+    them, or works on the cloud as read back. All other formats keep the order.
+
     Args:
         path: the file; it is whole or absent. Its ending chooses the format.
         splats: a cloud with colours; `labels`, `score` and class names travel with it.
         format: a format's name, where the ending does not say it.
 
     Returns:
-        The files written, and what the format could not hold.
+        The files written, what the format could not hold, and the order.
 
     Raises:
-        ValueError: if no format has such an ending, or the format cannot be written or cannot hold such a cloud.
+        ValueError: if no format has such an ending, or the format cannot be written or cannot hold such a cloud, or a value
+            is NaN or infinite, a scale not positive, an opacity outside [0, 1] (its ends are fine), or a label none of the
+            named classes. Nothing is written then.
     """
     path = Path(path)
     if isinstance(splats, Gaussians):
         splats = SplatFile(splats)
     module = _format_to_write(path, format)
+    check_splats(splats)
+    order = morton_order(splats.gaussians.means) if getattr(module, "SORTS", False) else None
+    if order is not None:
+        splats = splats.select(order)
     lost = module.write(path, splats)
     beside = write_sidecar(path, splats, holds_labels=module.HOLDS_LABELS)
-    return Written([path, *beside], tuple(lost))
+    return Written([path, *beside], tuple(lost), order)
 
 
 def _format_to_write(path: Path, name: str | None) -> ModuleType:

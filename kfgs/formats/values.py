@@ -14,6 +14,15 @@ from .splat_file import SCORE, SplatFile
 
 SH_C0 = 0.28209479177387814  # the constant harmonic: rgb = 0.5 + SH_C0 * coefficient
 _TINY_SCALE = 1e-10  # world units, of a Gaussian that a file gives no extent at all
+_LABELS = 2**31 - 1  # the largest int32
+_EXPECTED = {
+    "means": "finite numbers",
+    "quats": "finite numbers",
+    "scales": "finite numbers above 0",
+    "opacities": "numbers from 0 to 1",
+    "sh": "finite numbers",
+    "features": "finite numbers",
+}
 
 
 def check_finite(path: Path, **values: NDArray[np.float32]) -> None:
@@ -45,29 +54,60 @@ def unit_quats(quats: Tensor) -> Tensor:  # [N, 4] wxyz -> [N, 4] of length 1
     return torch.where(length > 1e-12, quats / length.clamp(min=1e-12), identity)
 
 
-def colours_to_write(gaussians: Gaussians, name: str) -> Gaussians:
-    """The cloud in float64 on the CPU without its history; refused unless it has colour and finite values.
+def check_splats(splats: SplatFile) -> None:
+    """Refuse what readers of any format refuse, before anything is written; values count as float32, which files hold.
+
+    Opacities of exactly 0 and 1 are fine: the PLY, which stores logits, keeps them within 1e-7 of these ends.
 
     Raises:
-        ValueError: if it has no spherical harmonics, or a value is NaN or infinite, or a scale is not positive.
+        ValueError: if a value is NaN or infinite, a scale is not positive, an opacity lies outside [0, 1], a label is below
+            -1 or none of the named classes, or a labelled Gaussian's score is not finite.
+    """
+    g = splats.gaussians.detach()
+    for name, expected in _EXPECTED.items():
+        values = getattr(g, name)
+        if values is None:
+            continue
+        values = values.float()
+        good = values.isfinite()
+        if name == "scales":
+            good &= values > 0
+        elif name == "opacities":
+            good &= (values >= 0) & (values <= 1)
+        _check_rows(name, expected, values, good)
+    if g.labels is None:
+        return
+    most = len(splats.classes) - 1 if splats.classes else _LABELS
+    expected = f"-1 (none) to {most}" + (" (the named classes)" if splats.classes else "")
+    _check_rows("labels", expected, g.labels, (g.labels >= -1) & (g.labels <= most))
+    if SCORE in splats.extra:
+        score = torch.from_numpy(np.asarray(splats.extra[SCORE], np.float32))
+        _check_rows(SCORE, "finite numbers", score, score.isfinite())
+
+
+def _check_rows(name: str, expected: str, values: Tensor, good: Tensor) -> None:  # [N, ...] twice
+    if good.all():
+        return
+    bad = ~good.reshape(len(good), -1).all(1)
+    row = int(bad.nonzero()[0])
+    raise ValueError(
+        f"{name}: expected {expected} in every Gaussian, got {values[row].flatten()[:4].tolist()} at {row} and others at "
+        f"{int(bad.sum()) - 1} more of {len(bad)}; correct them, or leave these Gaussians out with select"
+    )
+
+
+def colours_to_write(gaussians: Gaussians, name: str) -> Gaussians:
+    """The cloud in float64 on the CPU without its history.
+
+    Raises:
+        ValueError: if it has no spherical harmonics.
     """
     if gaussians.sh is None:
         raise ValueError(
             f"splats: expected a cloud with colours (sh [N, K, 3]) for {name}, got {gaussians!r}; write a field without "
             "colours as .ply"
         )
-    g = gaussians.detach().to("cpu", torch.float64)
-    for key in ("means", "quats", "scales", "opacities", "sh"):
-        values: Tensor = getattr(g, key)
-        bad = ~values.isfinite() if key != "scales" else ~(values.isfinite() & (values > 0))
-        rows = bad.reshape(len(g), -1).any(1) if len(g) else bad.new_zeros(0)
-        if rows.any():
-            raise ValueError(
-                f"{key}: expected finite{' positive' if key == 'scales' else ''} values, got "
-                f"{values[rows][0].flatten()[:4].tolist()} at Gaussian {int(rows.nonzero()[0])}; remove such Gaussians "
-                "first"
-            )
-    return g
+    return gaussians.detach().to("cpu", torch.float64)
 
 
 def words_of_loss(splats: SplatFile, name: str, degree: int) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from ..evaluation.segmentation import VOID
 from ..fields import SemanticField
 from ..formats.ply import Columns, other_elements, points_from_columns, read_ply, write_ply
 from ..formats.ply_3dgs import columns_from_gaussians
+from ..formats.sidecar import write_names
 from ..formats.splat_file import SCORE, SplatFile
 from ..gaussians import Gaussians
 from ..labels import Selection, Transfer, classify, select_by_label, transfer_labels
@@ -225,9 +226,7 @@ def save_labelled(
 
 
 def _write_names(path: Path, classes: LabelSet, facts: dict[str, Any]) -> Path:
-    names = path.with_suffix(".classes.json")
-    write_json(names, {"class_id": dict(enumerate(classes.names)), "none": -1, **facts})
-    return names
+    return write_names(path, classes.names, **facts)
 
 
 def label_columns(labels: Tensor, scores: Tensor | None = None) -> Columns:  # labels [N], scores [N]

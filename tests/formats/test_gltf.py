@@ -11,10 +11,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from kfgs.cameras import Camera, Similarity
 from kfgs.formats import SplatFile, read_splats, write_splats
 from kfgs.formats import gltf as format_gltf
 from kfgs.gaussians import Gaussians
-from kfgs.splat import evaluate_sh
+from kfgs.splat import evaluate_sh, rasterize
 
 KHR = "KHR_gaussian_splatting"
 
@@ -210,6 +211,38 @@ def test_a_node_moves_resizes_and_turns(tmp_path):
         np.testing.assert_allclose(np.abs(np.sum(axes * expected_axes, 0)), 1, atol=1e-5)  # same axes up to sign
 
 
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_turned_node_looks_the_same_from_a_moved_camera(tmp_path, degree):
+    cloud = _cloud(30, degree)
+    R = Rotation.from_euler("xyz", [25, -65, 110], degrees=True).as_matrix()
+    node = {
+        "mesh": 0,
+        "translation": [1, 2, 3],
+        "scale": [1.5] * 3,
+        "rotation": Rotation.from_matrix(R).as_quat().tolist(),
+    }
+    moved = read_splats(_gltf(tmp_path, cloud, **{"nodes": [node]})).gaussians
+    S = np.diag([1.0, -1.0, -1.0])  # glTF's axes against ours
+    motion = Similarity(1.5, torch.from_numpy(S @ R @ S), torch.tensor([1.0, -2.0, -3.0]))
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 6.0
+    camera = Camera(viewmat, torch.tensor([[40.0, 0, 20], [0, 44, 14], [0, 0, 1]]), 36, 30)
+    before, after = rasterize(cloud, camera).map, rasterize(moved, motion.apply_to_camera(camera)).map
+    assert before.std() > 0.1
+    torch.testing.assert_close(after, before, rtol=0, atol=2e-4)  # float32 all the way, up to 30 Gaussians a pixel
+
+
+def test_a_node_that_moves_beyond_float32_is_named(tmp_path):
+    path = _gltf(tmp_path, _cloud(5, 0), **{"nodes/0/scale": [1e25] * 3, "nodes/0/translation": [1e29, 0, 0]})
+    assert read_splats(path).gaussians.means.isfinite().all()
+    root = json.loads(path.read_text())
+    root["nodes"] = [{"children": [1], "scale": [1e25] * 3}, root["nodes"][0]]
+    root["scenes"][0]["nodes"] = [0]
+    path.write_text(json.dumps(root))
+    with pytest.raises(ValueError, match=r"bent.gltf: expected finite positions, got .*inf"):
+        read_splats(path)
+
+
 def test_half_turns_take_all_degrees_along(tmp_path):
     cloud = _cloud(5, 3)
     matrix = np.diag([-1.0, 1.0, -1.0, 1.0])
@@ -338,7 +371,7 @@ A = "meshes/0/primitives/0/attributes"
         ({"nodes/0/scale": [1, 2, 1]}, "one scale for all axes and a translation"),
         ({"nodes/0/scale": [0, 0, 0]}, "one scale for all axes and a translation"),
         ({"nodes/0/scale": [-1, 1, 1]}, "one scale for all axes and a translation"),
-        ({"nodes/0/rotation": [0.5, 0, 0, 0.8660254]}, "expected colours of degree 0 under a node .* got degree 1"),
+        ({"nodes/0/matrix": [1, 0, 0, 0, 0.5, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, "one scale for all axes .* apply the node"),
         ({"nodes/0/rotation": [0, 0, 0, 0]}, "expected a unit quaternion x, y, z, w"),
         ({"nodes/0/matrix": [1] * 15}, "matrix: expected 16 finite numbers"),
         ({"nodes/0/translation": ["a", 0, 0]}, "translation: expected 3 finite numbers"),
@@ -418,7 +451,7 @@ def test_what_cannot_be_written_is_named(tmp_path):
         write_splats(tmp_path / "a.glb", _cloud().replace(sh=None))
     with pytest.raises(ValueError, match="expected at least one Gaussian, got none; .* write .ply"):
         write_splats(tmp_path / "a.glb", _cloud(0))
-    with pytest.raises(ValueError, match="labels: expected -1 to 16777216, got 0 to 99999999"):
+    with pytest.raises(ValueError, match="labels: expected -1 to 16777216 for glTF, got 99999999; number"):
         write_splats(tmp_path / "a.glb", _cloud(2).replace(labels=torch.tensor([0, 99_999_999])))
     assert list(tmp_path.iterdir()) == []
 

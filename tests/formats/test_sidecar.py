@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from kfgs.formats import SplatFile, read_splats, write_splats
-from kfgs.formats.sidecar import labels_path, names_path, read_names, write_names
+from kfgs.formats.sidecar import labels_path, names_path, read_names, shared_names_path, write_names
 from kfgs.gaussians import Gaussians
 
 CLASSES = ("wall", "Stuhl ä", "plant")
@@ -30,7 +30,7 @@ def _splats(n: int = 6) -> SplatFile:
 def path(tmp_path):
     """A .splat file, which has no place for labels, with its labels beside it."""
     assert write_splats(tmp_path / "a.splat", _splats()).paths == [
-        tmp_path / "a.splat", tmp_path / "a.splat.labels.npz", tmp_path / "a.classes.json"
+        tmp_path / "a.splat", tmp_path / "a.splat.labels.npz", tmp_path / "a.splat.classes.json"
     ]  # fmt: skip
     return tmp_path / "a.splat"
 
@@ -129,7 +129,7 @@ def test_every_cut_of_the_labels_is_refused(path):
 
 def test_names_survive(tmp_path):
     target = write_names(tmp_path / "a.ply", CLASSES, distance=0.1)
-    assert target == tmp_path / "a.classes.json"
+    assert target == tmp_path / "a.ply.classes.json"
     assert read_names(target) == CLASSES
     assert json.loads(target.read_text())["distance"] == 0.1
 
@@ -145,5 +145,31 @@ def test_names_survive(tmp_path):
 )
 def test_damaged_names_are_named(path, content, message):
     names_path(path).write_text(content)
-    with pytest.raises(ValueError, match=f"a.classes.json: .*{message}"):
+    with pytest.raises(ValueError, match=f"a.splat.classes.json: .*{message}"):
         read_splats(path)
+
+
+def test_names_of_files_that_share_a_stem_stay_apart(tmp_path):
+    write_splats(tmp_path / "scene.ply", _splats())
+    write_splats(tmp_path / "scene.spz", _splats().replace(classes=("a", "b", "c", "d")))
+    write_splats(tmp_path / "scene.splat", _splats().replace(classes=()))
+    write_splats(tmp_path / "scene.compressed.ply", _splats().gaussians.replace(labels=None))
+    assert read_splats(tmp_path / "scene.ply").classes == CLASSES
+    assert read_splats(tmp_path / "scene.spz").classes == ("a", "b", "c", "d")
+    assert read_splats(tmp_path / "scene.splat").classes == ()
+
+
+def test_names_named_after_the_stem_are_read_and_left_alone(tmp_path):
+    path, shared = tmp_path / "scene.ply", tmp_path / "scene.classes.json"
+    write_splats(path, _splats())
+    names_path(path).rename(shared)
+    assert shared == shared_names_path(path)
+    assert read_splats(path).classes == CLASSES
+    content = shared.read_bytes()
+    write_splats(path, _splats().replace(classes=("x", "y", "z")))  # its own go first
+    assert read_splats(path).classes == ("x", "y", "z")
+    write_splats(path, _splats().replace(classes=()))  # without names: not those beside it either
+    assert read_splats(path).classes == ()
+    write_splats(path, _splats().gaussians.replace(labels=None))
+    assert not names_path(path).exists()
+    assert shared.read_bytes() == content

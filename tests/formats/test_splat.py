@@ -111,6 +111,4 @@ def test_a_field_without_colours_is_refused(tmp_path):
     cloud = _cloud().replace(sh=None, features=torch.zeros(500, 9))
     with pytest.raises(ValueError, match=r"splats: expected a cloud with colours .* for .splat, got .*; write a field"):
         write(tmp_path / "a.splat", SplatFile(cloud))
-    with pytest.raises(ValueError, match=r"opacities: expected finite values, got .*nan.* at Gaussian 0"):
-        write(tmp_path / "a.splat", SplatFile(_cloud().replace(opacities=torch.full((500,), float("nan")))))
     assert list(tmp_path.iterdir()) == []

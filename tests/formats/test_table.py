@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from kfgs.formats import SplatFile, find_format, formats, read_splats, write_splats
+from kfgs.formats import SplatFile, find_format, formats, morton_order, read_splats, write_splats
 from kfgs.formats import table as module_table
 from kfgs.formats.sidecar import labels_path, names_path
 from kfgs.gaussians import Gaussians
@@ -100,7 +100,7 @@ def test_labels_beyond_the_names_are_refused(tmp_path):
     assert read_splats(path).classes == ("a", "b")
     names_path(path).write_text('{"class_id": {"0": "a"}}')
     with pytest.raises(
-        ValueError, match=r"a.ply: expected labels from -1 to 0 \(the named classes\), got -1 to 1; .* in a.classes"
+        ValueError, match=r"a.ply: expected labels from -1 to 0 \(the named classes\), got -1 to 1; .* in a.ply.classes"
     ):
         read_splats(path)
 
@@ -114,3 +114,99 @@ def test_labels_of_an_older_file_do_not_stay(tmp_path):
     assert not labels_path(path).is_file()
     write_splats(path, _cloud())  # labels without names
     assert read_splats(path).classes == ()
+
+
+@pytest.mark.parametrize("labels", [True, False])
+@pytest.mark.parametrize("file", ["a.compressed.ply", "a.sog", "a.ply", "a.spz", "a.splat", "a.glb"])
+def test_the_order_of_a_file_is_told(tmp_path, file, labels):
+    g = torch.Generator().manual_seed(2)
+    cloud = _cloud(40, labels).replace(means=torch.randn(40, 3, generator=g))
+    order = write_splats(tmp_path / file, cloud).order
+    back = read_splats(tmp_path / file).gaussians
+    assert (order is not None) == (file in ("a.compressed.ply", "a.sog"))
+    if order is None:
+        order = torch.arange(40)
+    else:
+        assert torch.equal(order, morton_order(cloud.means))
+        assert not torch.equal(order, torch.arange(40))
+    assert torch.equal(torch.cdist(back.means, cloud.means).argmin(1), order)
+    if labels:
+        assert torch.equal(back.labels, cloud.labels[order])
+
+
+def _with(name, row, value):
+    """A cloud with one value exchanged."""
+    cloud = _cloud()
+    values = getattr(cloud, name).clone()
+    values[row] = value
+    return cloud.replace(**{name: values})
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        (
+            "means",
+            float("nan"),
+            r"means: expected finite numbers in every Gaussian, got \[nan, nan, nan\] at 3 and others",
+        ),
+        ("means", float("inf"), "means: expected finite"),
+        ("quats", float("-inf"), "quats: expected finite"),
+        ("scales", 0.0, r"scales: expected finite numbers above 0 in every Gaussian, got \[0.0, 0.0, 0.0\] at 3"),
+        ("scales", -1.0, "scales: expected finite numbers above 0"),
+        ("scales", float("inf"), "scales: expected finite numbers above 0"),
+        (
+            "opacities",
+            1.01,
+            "opacities: expected numbers from 0 to 1 in every Gaussian, got .*1.0099.* at 3 and others at 0",
+        ),
+        ("opacities", -0.01, "opacities: expected numbers from 0 to 1"),
+        ("opacities", float("nan"), "opacities: expected numbers from 0 to 1"),
+        (
+            "sh",
+            float("nan"),
+            "sh: expected finite .* more of 9; correct them, or leave these Gaussians out with select",
+        ),
+        ("labels", -2, r"labels: expected -1 \(none\) to 2147483647 in every Gaussian, got \[-2\] at 3"),
+    ],
+)
+@pytest.mark.parametrize("file", ["a.ply", "a.compressed.ply", "a.sog", "a.spz", "a.splat", "a.glb", "a.gltf"])
+def test_what_readers_refuse_is_not_written(tmp_path, file, name, value, message):
+    with pytest.raises(ValueError, match=message):
+        write_splats(tmp_path / file, _with(name, 3, value))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_double_that_float32_cannot_hold_is_refused(tmp_path):
+    wide = _cloud().to(torch.float64)
+    with pytest.raises(ValueError, match="means: expected finite numbers"):
+        write_splats(tmp_path / "a.ply", wide.replace(means=wide.means * 1e300))
+    with pytest.raises(ValueError, match="scales: expected finite numbers above 0"):
+        write_splats(tmp_path / "a.ply", wide.replace(scales=wide.scales * 1e-60))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_features_scores_and_labels_beyond_the_names_are_checked(tmp_path):
+    path, cloud = tmp_path / "a.ply", _cloud()
+    with pytest.raises(ValueError, match="features: expected finite numbers"):
+        write_splats(path, cloud.replace(features=torch.full((9, 2), torch.inf)))
+    with pytest.raises(
+        ValueError, match=r"labels: expected -1 \(none\) to 0 \(the named classes\) .* at 2 and others at 2 more"
+    ):
+        write_splats(path, SplatFile(cloud, classes=("a",)))
+    with pytest.raises(
+        ValueError, match=r"score: expected finite numbers in every Gaussian, got \[nan\] at 0 .* 8 more of 9"
+    ):
+        write_splats(path, SplatFile(cloud, {"score": np.full(9, np.nan)}))
+    assert list(tmp_path.iterdir()) == []
+    write_splats(path, SplatFile(_cloud(labels=False), {"score": np.full(9, np.nan)}))  # a column like any other
+    assert np.isnan(read_splats(path).extra["score"]).all()
+
+
+@pytest.mark.parametrize("file", ["a.ply", "a.compressed.ply", "a.sog", "a.spz", "a.splat", "a.glb"])
+def test_opacities_of_0_and_1_are_written(tmp_path, file):
+    cloud = _cloud(2, labels=False).replace(opacities=torch.tensor([0.0, 1.0]))
+    order = write_splats(tmp_path / file, cloud).order
+    back = read_splats(tmp_path / file).gaussians.opacities
+    expected = cloud.opacities if order is None else cloud.opacities[order]
+    torch.testing.assert_close(back, expected, rtol=0, atol=2e-7)
