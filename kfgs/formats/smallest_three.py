@@ -23,12 +23,9 @@ def pack_smallest_three(
     Each of the three lies between -1/sqrt(2) and 1/sqrt(2), which are steps 0 and `steps`. A quaternion of length 0 is
     the identity; of equally large components the first counts as the largest.
     """
-    unit = unit_quats(quats.detach().cpu().double()).numpy()
-    largest = np.abs(unit).argmax(1)
-    rows = np.arange(len(unit))
-    small = unit[rows[:, None], _OTHERS[largest]] * np.where(unit[rows, largest] < 0, -1.0, 1.0)[:, None]
+    largest, small = split_largest(unit_quats(quats.detach().cpu().double()).numpy())
     whole = np.clip(np.round((small * math.sqrt(0.5) + 0.5) * steps), 0, steps).astype(np.int64)
-    return largest[:, None].astype(np.int64), whole
+    return largest[:, None], whole
 
 
 def unpack_smallest_three(
@@ -37,14 +34,31 @@ def unpack_smallest_three(
     steps: int,
 ) -> Tensor:  # [N, 4] wxyz float32, of length 1
     """Quaternions from what `pack_smallest_three` gives; three components longer than 1 together are shortened to it."""
-    values = (small / np.float32(steps) - np.float32(0.5)) * np.float32(math.sqrt(2))
-    squares = (values**2).sum(1, keepdims=True)
-    values = values / np.sqrt(np.maximum(squares, 1))
-    quats = np.empty((len(values), 4), np.float32)
-    rows = np.arange(len(values))
-    quats[rows[:, None], _OTHERS[largest]] = values
+    return torch.from_numpy(
+        join_largest(largest, (small / np.float32(steps) - np.float32(0.5)) * np.float32(math.sqrt(2)))
+    )
+
+
+def split_largest(
+    quats: NDArray[np.float64],  # [N, 4] of length 1, in any order of components
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:  # [N] in 0..3, [N, 3]
+    """The place of the largest component, and the other three in order, signs turned so that the largest is positive."""
+    largest = np.abs(quats).argmax(1).astype(np.int64)
+    rows = np.arange(len(quats))
+    return largest, quats[rows[:, None], _OTHERS[largest]] * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]
+
+
+def join_largest(
+    largest: NDArray[np.int64],  # [N] in 0..3
+    small: NDArray[np.float32],  # [N, 3]
+) -> NDArray[np.float32]:  # [N, 4]
+    """Quaternions of length 1 from what `split_largest` gives; three components longer than 1 are shortened to it."""
+    squares = (small**2).sum(1, keepdims=True)
+    quats = np.empty((len(small), 4), np.float32)
+    rows = np.arange(len(small))
+    quats[rows[:, None], _OTHERS[largest]] = small / np.sqrt(np.maximum(squares, 1))
     quats[rows, largest] = np.sqrt(np.maximum(0, 1 - squares[:, 0]))
-    return torch.from_numpy(quats)
+    return quats
 
 
 def rotation_error(steps: int) -> float:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..gaussians import Gaussians
+from .smallest_three import join_largest, split_largest
 from .splat_file import Precision
 from .spz_streams import MAX_FRACTIONAL_BITS, Container
 from .values import byte_error, check_finite, unit_quats
@@ -156,24 +157,12 @@ def _unpack_smallest_three(stream: Bytes) -> NDArray[np.float32]:  # [N, 4] wxyz
     values = np.stack([(word >> shift) & 0x3FF for shift in (20, 10, 0)], 1)  # [N, 3]
     small = (values & 0x1FF).astype(np.float32) * np.float32(sqrt(0.5) / 511)
     small = np.where(values & 0x200, -small, small)
-    xyzw = np.empty((len(word), 4), np.float32)
-    others = _others()[largest]  # [N, 3]
-    np.put_along_axis(xyzw, others, small, 1)
-    rest = np.sqrt(np.maximum(0, 1 - (small**2).sum(1, keepdims=True)))
-    np.put_along_axis(xyzw, largest[:, None], rest, 1)
-    return xyzw[:, [3, 0, 1, 2]]
+    return join_largest(largest, small)[:, [3, 0, 1, 2]]
 
 
 def _pack_smallest_three(quats: NDArray[np.float64]) -> Bytes:  # quats: [N, 4] wxyz, unit
-    xyzw = quats[:, [1, 2, 3, 0]]
-    largest = np.abs(xyzw).argmax(1)
-    flip = np.take_along_axis(xyzw, largest[:, None], 1) < 0
-    small = np.take_along_axis(np.where(flip, -xyzw, xyzw), _others()[largest], 1)
+    largest, small = split_largest(quats[:, [1, 2, 3, 0]])
     sizes = np.minimum(np.round(np.abs(small) * (511 / sqrt(0.5))), 511).astype(np.uint32)
     values = sizes | np.where(small < 0, 0x200, 0).astype(np.uint32)
     word = (largest.astype(np.uint32) << 30) | (values[:, 0] << 20) | (values[:, 1] << 10) | values[:, 2]
     return word.astype("<u4").view(np.uint8)
-
-
-def _others() -> NDArray[np.int64]:  # [4, 3]: the components besides each
-    return np.array([[j for j in range(4) if j != i] for i in range(4)])
