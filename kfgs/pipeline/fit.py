@@ -6,7 +6,6 @@ Each call is a stage of a run folder: finished stages are found again by the has
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Callable, Sequence
@@ -35,6 +34,7 @@ from ..quant import (
     quantize_maps,
 )
 from ..scenes import Scene
+from .digests import digest_scene, stage_generator
 from .maps import KnownFeatures, Maps, UndistortedMaps
 from .stages import Run, Stage
 
@@ -91,28 +91,6 @@ class FitResult:
         return sum(stage.seconds for stage in self.stages)
 
 
-def _generator(seed: int, purpose: str) -> torch.Generator:
-    """A generator of its own for each stage, so that skipping a finished stage changes nothing downstream."""
-    digest = hashlib.sha256(f"{purpose}:{seed}".encode()).digest()
-    return torch.Generator().manual_seed(int.from_bytes(digest[:7], "little"))
-
-
-def _tensor_digest(*tensors: Tensor) -> str:
-    digest = hashlib.sha256()
-    for tensor in tensors:
-        digest.update(f"{tuple(tensor.shape)}{tensor.dtype}".encode())
-        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
-
-
-def _scene_digest(scene: Scene, views: Sequence[int]) -> str:
-    cameras = [scene.cameras[i] for i in views]
-    poses = torch.stack([camera.viewmat for camera in cameras])
-    intrinsics = torch.stack([camera.K for camera in cameras])
-    sizes = torch.tensor([camera.size for camera in cameras])
-    return _tensor_digest(poses, intrinsics, sizes, scene.points)
-
-
 def _lens_digest(maps: Maps) -> str | None:
     if not isinstance(maps, UndistortedMaps):
         return None
@@ -127,7 +105,7 @@ def _codebook_stage(
     """Adaptive Data Compression, Sec. 3.3.1: the codebook S."""
 
     def make(folder: Path) -> None:
-        fit = fit_codebook(maps, config.codebook, generator=_generator(config.seed, "codebook"), **options)
+        fit = fit_codebook(maps, config.codebook, generator=stage_generator(config.seed, "codebook"), **options)
         fit.codebook.save(folder / "codebook.safetensors")
         write_json(folder / "history.json", fit.history)
 
@@ -154,7 +132,9 @@ def _autoencoder_stage(
     """Semantic Compression, Sec. 3.3.2: encoder E and decoder Psi."""
 
     def make(folder: Path) -> None:
-        fit = fit_autoencoder(codebook, config.autoencoder, generator=_generator(config.seed, "autoencoder"), **options)
+        fit = fit_autoencoder(
+            codebook, config.autoencoder, generator=stage_generator(config.seed, "autoencoder"), **options
+        )
         fit.autoencoder.save(folder / "autoencoder.safetensors")
         write_json(folder / "history.json", fit.history)
 
@@ -174,7 +154,7 @@ def _field_stage(
 ) -> tuple[GaussianParams, Stage]:
     """The decoupled field, Sec. 3.2: Gaussians whose rendered latents follow the targets (Eq. 4)."""
     inputs = inputs | {
-        "scene": _scene_digest(scene, views),
+        "scene": digest_scene(scene, views),
         "extent": float(scene.extent),
         "config": asdict(config.field),
         "seed": config.seed,
@@ -183,7 +163,7 @@ def _field_stage(
 
     def make(folder: Path) -> float:
         started = time.perf_counter()
-        generator = _generator(config.seed, "field")
+        generator = stage_generator(config.seed, "field")
         start = GaussianParams.from_points(scene.points, int(targets[0].shape[-1]), generator=generator)
         cameras = [scene.cameras[i] for i in views]
         fit = fit_field(
