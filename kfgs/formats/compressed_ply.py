@@ -146,7 +146,7 @@ def precision(gaussians: Gaussians) -> Precision:
     ends = SH_LIMIT - 1 / 32  # the outermost steps are read as their far ends, the others as their middles
     return Precision(
         means=means,
-        scales=math.expm1(min(float((errors[1] + clipped).max(initial=0.0)), 700.0)) + 1e-6,
+        scales=math.expm1(min(float((errors[1] + clipped).max(initial=0.0)), 700.0)) * (1 + 1e-5) + 1e-6,
         rotation=rotation_error(1023),
         opacities=0.5 / 255 + 1e-6,
         sh0=float(errors[2].max(initial=0.0)) / SH_C0 + 1e-6,

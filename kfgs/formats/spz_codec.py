@@ -113,7 +113,7 @@ def precision_of(g: Gaussians, fractional_bits: int) -> Precision:
     sh = torch.zeros(0, 1, 3) if g.sh is None else g.sh.double()
     return Precision(
         means=0.5 * 2.0**-fractional_bits * (1 + 1e-4) + 1e-6 * (g.means.abs().max().item() if len(g) else 0.0),
-        scales=exp(max(1 / 32, cut)) - 1 + 1e-4,
+        scales=(exp(max(1 / 32, cut)) - 1) * (1 + 1e-5) + 1e-4,  # float32, of what is cut off far too
         rotation=0.005,  # 2 x sqrt(3 + 3^2) half steps of sqrt(0.5) / 511: the largest component makes up for the others
         opacities=0.5 / 255 + 1e-6,
         sh0=byte_error(sh[:, :1], -_DC, _DC),

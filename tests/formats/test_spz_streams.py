@@ -1,0 +1,199 @@
+"""SPZ containers by hand: versions 1 to 4, damaged in every way that has a name; whatever they promise costs no memory."""
+
+import gzip
+import struct
+import tracemalloc
+
+import numpy as np
+import pytest
+import torch
+import zstandard
+from oracles_spz import legacy_payload
+
+from kfgs.formats import SplatFile, read_splats, write_spz
+from kfgs.formats import spz as module
+from kfgs.formats.spz import read
+from kfgs.formats.spz_labels import TYPE as LABELS
+from kfgs.gaussians import Gaussians
+
+ROW = {"position": (256, -512, 768), "alpha": 51, "color": (0, 128, 255), "scale": (160, 128, 96)}
+
+
+def _labelled(n: int) -> SplatFile:
+    g = torch.Generator().manual_seed(3)
+    cloud = Gaussians(
+        means=torch.randn(n, 3, generator=g),
+        quats=torch.randn(n, 4, generator=g),
+        scales=torch.rand(n, 3, generator=g) * 0.4 + 0.01,
+        opacities=torch.rand(n, generator=g) * 0.9 + 0.05,
+        sh=torch.rand(n, 16, 3, generator=g) * 1.6 - 0.8,
+        labels=torch.arange(n) % 4 - 1,
+    )
+    return SplatFile(cloud, {"score": np.linspace(0, 1, n, dtype=np.float32)}, ("rug", "sofa", "Tür"))
+
+
+def _v4(count=2, degree=0, bits=12, flags=0, streams=None, sizes=None, start=32, number=None, extensions=b""):
+    """A version 4 file of zeros, or with something wrong in it."""
+    plain = [9 * count, count, 3 * count, 3 * count, 4 * count]
+    packed = [zstandard.compress(b"\0" * size) for size in plain] if streams is None else streams
+    number = len(packed) if number is None else number
+    head = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, degree, bits, flags, number, start)
+    table = b"".join(struct.pack("<QQ", len(p), s) for p, s in zip(packed, sizes or plain, strict=False))
+    return head + extensions + table + b"".join(packed)
+
+
+def _ext(kind, payload, length=None):
+    return struct.pack("<II", kind, len(payload) if length is None else length) + payload
+
+
+def _unsized(data):
+    """A Zstandard frame that does not say how long it is."""
+    return zstandard.ZstdCompressor(write_content_size=False).compress(data)
+
+
+_GOOD = legacy_payload([ROW | {"rotation": 0}] * 3, version=3)
+_HALF = legacy_payload([ROW | {"rotation": (0, 0, 0), "position": (float("inf"), 0, 0)}], version=1)
+_BOMB = struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 0, 12, 0, 0) + bytes(1 << 25)
+
+
+def _labels(n=1, names=b"", version=1, flags=0, rest=None):
+    rest = zstandard.compress(struct.pack("<i", 0) * n + names) if rest is None else rest
+    return struct.pack("<HHII", version, flags, n, len(names)) + rest
+
+
+def _with_labels(payload):
+    return legacy_payload([ROW | {"rotation": 0}], version=3, flags=2, extensions=_ext(LABELS, payload))
+
+
+BAD = {
+    "not spz": (b"hello", "expected an SPZ file"),
+    "only magic": (b"NGSP\x04", "expected an SPZ file"),
+    "other gzip": (gzip.compress(b"x" * 99), "expected an SPZ header in the gzip stream"),
+    "cut gzip": (gzip.compress(_GOOD)[:-9], "expected a whole gzip stream.*truncated"),
+    "very short gzip": (gzip.compress(_GOOD)[:14], "header in the gzip stream.*truncated"),
+    "damaged gzip": (gzip.compress(_GOOD)[:-8] + bytes(8), "gzip stream, but it cannot be unpacked"),
+    "bytes after gzip": (gzip.compress(_GOOD) + b"abc", "after the gzip stream, got 3 bytes more"),
+    "bytes in gzip": (gzip.compress(_GOOD + b"x"), "plain bytes by its header, got more"),
+    "bytes after raw": (_GOOD + b"x", "expected 76 bytes for 3 Gaussians, got 77"),
+    "cut raw": (_GOOD[:-1], "promises 3 Gaussians .60 bytes., which a file of 59 bytes cannot hold"),
+    "gzip bomb": (gzip.compress(_BOMB), "plain bytes by its header, got more"),
+    "4 billion in gzip": (gzip.compress(_GOOD[:8] + b"\xff\xff\xff\xff" + _GOOD[12:]), "promises 4294967295 Gaussians"),
+    "4 billion": (_v4()[:8] + b"\xff\xff\xff\xff" + _v4()[12:], "promises 4294967295 Gaussians"),
+    "short after promise": (gzip.compress(_GOOD[:8] + b"\x63" + _GOOD[9:]), "promises 99 Gaussians .* cannot hold"),
+    "degree 7": (gzip.compress(_GOOD[:12] + b"\x07" + _GOOD[13:]), "degree 0 to 4, got 7"),
+    "40 bits": (gzip.compress(_GOOD[:13] + b"\x28" + _GOOD[14:]), "0 to 24 fractional bits, got 40"),
+    "version 5": (_v4()[:4] + b"\x05" + _v4()[5:], "version 1 to 4, got 5"),
+    "version 0": (_GOOD[:4] + b"\x00" + _GOOD[5:], "version 1 to 4, got 0"),
+    "version 4 in gzip": (gzip.compress(_GOOD[:4] + b"\x04" + _GOOD[5:]), "version 1 to 3 in a gzip stream, got 4"),
+    "infinite half": (gzip.compress(_HALF), "finite positions, got .*inf.* at Gaussian 0"),
+    "short header": (_v4()[:30], "header of 32 bytes, got 30"),
+    "few streams": (_v4(number=3), "a table of 5 streams .* got 3 streams"),
+    "table outside": (_v4(start=4000), "a table of 5 streams .* at byte 4000"),
+    "table in header": (_v4(start=8), "a table of 5 streams .* at byte 8"),
+    "cut streams": (_v4()[:-1], "bytes of rotations within .* truncated"),
+    "garbage after": (_v4() + b"xyz", "3 bytes more"),
+    "size in table": (
+        _v4(sizes=[18, 2, 6, 6, 1 << 40]),
+        "expected a stream of 8 bytes of rotations .* got 1099511627776",
+    ),
+    "frame promises": (
+        _v4(streams=[zstandard.compress(bytes(1 << 26)), *[zstandard.compress(bytes(n)) for n in (2, 6, 6, 8)]]),
+        "expected 18 bytes of positions, got a frame of 67108864 bytes",
+    ),
+    "no zstd": (_v4(streams=[b"rubbish!"] * 5), "Zstandard stream of positions"),
+    "data after frame": (
+        _v4(streams=[zstandard.compress(bytes(n)) + b"more" * (n == 18) for n in (18, 2, 6, 6, 8)]),
+        "Zstandard stream of positions, but",
+    ),
+    "unsized frame, short": (
+        _v4(streams=[_unsized(bytes(n - 1)) for n in (18, 2, 6, 6, 8)]),
+        "18 bytes of positions, got 17",
+    ),
+    "unsized frame, long": (_v4(streams=[_unsized(bytes(1 << 20))] * 5), "Zstandard stream of positions, but"),
+    "long record": (_v4(start=44, flags=2, extensions=_ext(7, b"abcd", 99)), "extension records .* ends after them"),
+    "cut record": (_v4(start=36, flags=2, extensions=b"abcd"), "extension records .* ends after them"),
+    "axes": (
+        _v4(start=44, flags=2, extensions=_ext(0xADBE0003, b"\x0c\0\0\0")),
+        "coordinate system of 1 to 8 .* got 12",
+    ),
+    "labels of 9": (_with_labels(_labels(9)), "labels of 1 Gaussians .* got 9"),
+    "labels layout 2": (_with_labels(_labels(version=2)), "labels of layout 1, got 2"),
+    "labels cut": (_with_labels(_labels()[:-3]), "labels, but they cannot be read"),
+    "short labels": (_with_labels(b"\x01"), "labels of layout 1, got 0"),
+    "labels bomb": (_with_labels(_labels(rest=zstandard.compress(bytes(1 << 26)))), "labels, but .*another size"),
+    "labels below": (_with_labels(_labels(rest=zstandard.compress(struct.pack("<i", -2)))), "class_id of -1 or more"),
+    "names no json": (_with_labels(_labels(names=b"[nope")), "labels, but they cannot be read"),
+    "names no list": (_with_labels(_labels(names=b'{"a": 1}')), "a list of names"),
+    "long names": (_with_labels(struct.pack("<HHII", 1, 0, 1, 1 << 30)), "at most 1048576 bytes of names"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_damage_is_named_and_costs_no_memory(tmp_path, case):
+    content, message = BAD[case]
+    (tmp_path / "bad.spz").write_bytes(content)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match=f"bad.spz.*{message}"):
+            read(tmp_path / "bad.spz")
+        assert tracemalloc.get_traced_memory()[1] < 1 << 22
+    finally:
+        tracemalloc.stop()
+
+
+def test_the_undamaged_files_of_these_tests_are_read(tmp_path):
+    unsized = [_unsized(bytes(n)) for n in (18, 2, 6, 6, 8)]
+    no_harmonics = [zstandard.compress(bytes(n)) for n in (18, 2, 6, 6, 8)] + [b""]  # six streams at degree 0
+    good = [
+        _v4(),
+        _v4(streams=unsized),
+        _v4(streams=no_harmonics, sizes=[18, 2, 6, 6, 8, 0]),
+        _v4(start=44, flags=2, extensions=_ext(7, b"abcd")),
+        gzip.compress(_GOOD),
+        _GOOD,
+        _with_labels(_labels(names=b'["rug"]')),
+    ]
+    for content in good:
+        (tmp_path / "good.spz").write_bytes(content)
+        assert len(read(tmp_path / "good.spz")) in (1, 2, 3)
+
+
+def test_every_cut_of_a_file_is_refused(tmp_path):
+    write_spz(tmp_path / "a.spz", _labelled(12))
+    write_spz(tmp_path / "b.spz", _labelled(12), version=3)
+    for name in ("a.spz", "b.spz"):
+        data = (tmp_path / name).read_bytes()
+        for end in range(0, len(data), 7):
+            (tmp_path / "cut.spz").write_bytes(data[:end])
+            with pytest.raises(ValueError, match="cut.spz"):
+                read(tmp_path / "cut.spz")
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_random_damage_is_a_value_error_or_nothing(tmp_path, version):
+    write_spz(tmp_path / "a.spz", _labelled(6), version=version)
+    whole, rng = (tmp_path / "a.spz").read_bytes(), np.random.default_rng(version)
+    data, refused = np.frombuffer(whole if version == 4 else gzip.decompress(whole), np.uint8), 0
+    for _ in range(300):
+        bad = data.copy()
+        bad[rng.integers(0, len(bad) if rng.random() < 0.5 else 40, 3)] = rng.integers(0, 256, 3)
+        (tmp_path / "bad.spz").write_bytes(bad.tobytes())
+        try:
+            read(tmp_path / "bad.spz")
+        except ValueError as error:
+            refused += "bad.spz" in str(error)
+    assert refused > 100
+
+
+def test_several_gzip_members_are_one_stream(tmp_path):
+    data = legacy_payload([ROW | {"rotation": 0xC0000000}] * 5, version=3)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(data[:30]) + gzip.compress(data[30:]) + b"\0" * 7)
+    assert len(read(tmp_path / "a.spz")) == 5
+
+
+def test_files_are_known_by_their_content(tmp_path):
+    write_spz(tmp_path / "a.spz", _labelled(40), version=3)
+    (tmp_path / "a.spz").rename(tmp_path / "a.bin")
+    assert read_splats(tmp_path / "a.bin").info["format"] == "spz"
+    assert not module.matches(b"\x1f\x8b\x08\xff\xff\xff\xff\xff\xff\xff\xff\xff")
+    assert not module.matches(b"ply\n")
