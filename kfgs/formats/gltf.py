@@ -27,20 +27,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..gaussians import Gaussians
+from .axes import UP_AND_BACK, flip_axes
 from .gltf_accessors import AccessorWriter, read_accessor
 from .gltf_container import MAGIC as GLB
 from .gltf_container import Document, open_document, write_document
 from .gltf_nodes import place, placed_meshes
 from .ply import Columns
 from .splat_file import SCORE, Precision, SplatFile
-from .spz_codec import flip_axes
 from .values import SH_C0, check_finite, colours_to_write, positive_scales, unit_quats, words_of_loss
 
 NAME = "gltf"
 SUFFIXES = (".glb", ".gltf")
 HOLDS_LABELS = True
 EXTENSION = "KHR_gaussian_splatting"
-AXES = (1, -1, -1)  # right, up, back against right, down, forward
 KERNEL, COLOR_SPACE, PROJECTION, SORTING = "ellipse", "srgb_rec709_display", "perspective", "cameraDistance"
 _UNDERSTOOD = (EXTENSION, "KHR_mesh_quantization")
 _POINTS = 0
@@ -103,7 +102,7 @@ def read(path: Path) -> SplatFile:
         )
     info = {"format": NAME, "color_space": ", ".join(sorted(spaces)), "primitives": len(parts), "ignored": ignored}
     gaussians, extra, classes = _join(parts)
-    return SplatFile(flip_axes(gaussians, AXES), extra, classes, info)
+    return SplatFile(flip_axes(gaussians, UP_AND_BACK), extra, classes, info)
 
 
 def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
@@ -112,7 +111,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     Raises:
         ValueError: if the cloud is empty, has no colours or labels beyond 2^24, or is too large for a .glb.
     """
-    g = flip_axes(colours_to_write(splats.gaussians, ".glb"), AXES)
+    g = flip_axes(colours_to_write(splats.gaussians, ".glb"), UP_AND_BACK)
     if len(g) == 0:
         raise ValueError("splats: expected at least one Gaussian, got none; glTF has no empty accessors, write .ply")
     assert g.sh is not None

@@ -13,10 +13,10 @@ import torch
 
 from .._check import check_choice, check_whole
 from ..gaussians import Gaussians
+from .axes import UP_AND_BACK
 from .splat_file import SCORE, Precision, SplatFile
 from .spz_codec import (
     LOG_SCALES,
-    SPZ_AXES,
     choose_fractional_bits,
     most_fractional_bits,
     pack,
@@ -142,10 +142,10 @@ def _record(splats: SplatFile) -> LabelRecord:
 def _axes(path: Path, record: bytes | None) -> tuple[int, int, int]:
     """Signs of a file's axes against those of the PLY: RUB, unless Adobe's record says otherwise."""
     if record is None:
-        return SPZ_AXES
+        return UP_AND_BACK
     value = struct.unpack("<I", record)[0] if len(record) == 4 else -1
     if value == 0:  # unspecified
-        return SPZ_AXES
+        return UP_AND_BACK
     if not 1 <= value <= 8:
         raise ValueError(
             f"{path}: expected a coordinate system of 1 to 8 (x, y, z with signs), got {value}; turn it to RUB with the program "

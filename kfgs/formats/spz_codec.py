@@ -18,22 +18,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..gaussians import Gaussians
+from .axes import UP_AND_BACK, flip_axes
 from .smallest_three import join_largest, split_largest
 from .splat_file import Precision
 from .spz_streams import MAX_FRACTIONAL_BITS, Container
 from .values import byte_error, check_finite, unit_quats
 
 Bytes = NDArray[np.uint8]
-SPZ_AXES = (1, -1, -1)  # RUB against RDF
 _DC = 0.5 / 0.15  # the degree-0 coefficient of byte 255
 LOG_SCALES = (-10.0, 255 / 16 - 10)
 _MAX_FIXED = (1 << 23) - 1
 _COMMON_BITS, _STEPS = 12, 14  # bits that every writer uses; 2^14 steps across a cloud that is smaller
-# Signs of the coefficients under a flip of axes: which of x, y, z each harmonic is odd in, degrees 1 to 3.
-_ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 
 
-def unpack(path: Path, c: Container, axes: tuple[int, int, int] = SPZ_AXES) -> Gaussians:
+def unpack(path: Path, c: Container, axes: tuple[int, int, int] = UP_AND_BACK) -> Gaussians:
     """The Gaussians of a container, in the axes of the 3DGS PLY; harmonics of degree 4 are left out.
 
     Raises:
@@ -57,7 +55,7 @@ def unpack(path: Path, c: Container, axes: tuple[int, int, int] = SPZ_AXES) -> G
 
 def pack(g: Gaussians, version: int, fractional_bits: int, sh_bits: tuple[int, int]) -> dict[str, Bytes]:
     """The streams of a cloud (float64, axes of the PLY), for version 2, 3 or 4."""
-    g = flip_axes(g, SPZ_AXES)
+    g = flip_axes(g, UP_AND_BACK)
     assert g.sh is not None
     fixed = (g.means * 2**fractional_bits).round().to(torch.int32).numpy()
     low, high = LOG_SCALES
@@ -91,18 +89,6 @@ def most_fractional_bits(means: Tensor) -> int:  # means: [N, 3]
     """The most bits after the point that still hold every coordinate in 24; negative where none does."""
     reach = means.abs().max().item() if len(means) else 0.0
     return MAX_FRACTIONAL_BITS if reach == 0.0 else min(floor(log2(_MAX_FIXED / reach)), MAX_FRACTIONAL_BITS)
-
-
-def flip_axes(g: Gaussians, axes: tuple[int, int, int]) -> Gaussians:
-    """The same cloud with some axes turned around: means by their signs, quaternions as S R S, harmonics by parity."""
-    sign = dict(zip("xyz", axes, strict=True))
-    x, y, z = axes
-    means, quats = g.means.new_tensor([x, y, z]), g.quats.new_tensor([1, y * z, x * z, x * y])
-    sh = None
-    if g.sh is not None:
-        parity = [float(np.prod([sign[axis] for axis in odd])) for odd in ("", *_ODD)]
-        sh = g.sh * g.sh.new_tensor(parity[: g.sh.shape[1]])[:, None]
-    return g.replace(means=g.means * means + 0.0, quats=g.quats * quats + 0.0, sh=sh)  # + 0: no negative zeros
 
 
 def precision_of(g: Gaussians, fractional_bits: int) -> Precision:
