@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
-from .._check import check_whole
-from .edit_words import edits_from_words
+from .._check import check_range, check_whole
+from .checks import check_alone, check_folder, check_target, choose_views, open_field, open_splats
+from .edit_words import edits_from_words, inserted_files
 from .say import Preset, load_classes, say, size_of, training_cameras, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
+Method = Literal["nearest", "vote", "mahalanobis"]
 Several = tyro.conf.UseAppendAction[tuple[str, ...]]
 
 
@@ -48,6 +50,7 @@ def color(
     from ..scenes import load_scene
 
     check_whole("pictures", pictures, 0)
+    check_folder("out", out)
     config = ColorConfig.cpu() if preset == "cpu" else ColorConfig.paper()
     fields = config.field if steps is None else config.field.with_steps(steps)
     if max_gaussians is not None:
@@ -57,7 +60,8 @@ def color(
     for note in loaded.notes:
         say(f"note: {note}")
     result = fit_color(loaded, out, config, report=say, progress=True)
-    say(f"{result.gaussians!r} in {result.seconds / 60:.1f} min")
+    took = f"{result.seconds / 60:.1f} min" if result.seconds >= 60 else f"{result.seconds:.0f} s"
+    say(f"{result.gaussians!r} in {took}")
     written = [result.path]
     if loaded.splits.get("test"):
         beside = PhotoPictures(out / "views", [loaded.stem(i) for i in loaded.views("test")], pictures)
@@ -78,6 +82,7 @@ def attach(
     classes: Path | None = None,
     text: Path | None = None,
     by: Literal["views", "distance"] | None = None,
+    method: Method = "nearest",
     distance: float | None = None,
     splat_scene: Path | None = None,
     same_frame: bool = False,
@@ -93,8 +98,9 @@ def attach(
         classes: JSON list of class names; SCENE/classes.json when not given.
         text: .npy of one embedding per class; SCENE/text.npy when not given.
         by: `views`: the field segments its training views and each Gaussian takes the class of the pixels that it fills;
-            `distance`: the class of the nearest labelled Gaussian within lambda, as in the paper. `views` when a scene is
-            given.
+            `distance`: the labelled Gaussians within lambda decide, as in the paper. `views` when a scene is given.
+        method: where distance decides: the `nearest` labelled Gaussian (as in the paper), a `vote` of those around, or their
+            overlap (`mahalanobis`), which is the best of the three where the field's labels are noisy.
         distance: the paper's lambda in the splat's world units; from the clouds' spacing when not given.
         splat_scene: scene folder of the splat's own cameras, where its frame is another: cameras of the same names align
             the two. Without it the clouds themselves are compared, and aligned where they disagree.
@@ -102,33 +108,45 @@ def attach(
         images: folder of the scene's pictures, if it is not SCENE/images.
     """
     from ..cameras.similarity import Similarity
-    from ..fields import SemanticField
-    from ..formats import read_splats, write_splats
+    from ..formats import write_splats
     from ..pipeline.attach import attach as attach_field
-    from ..scenes import load_scene
+    from ..scenes import SceneError, load_scene
 
-    if out.resolve() == splats.resolve():
-        raise ValueError(f"out: expected another file than the splat, got {out} twice; give another name")
+    check_target("out", out, splats)
+    if scene is None:
+        check_alone("images", images, "without --scene, whose pictures they are")
+        for name, asked in (("by", by == "views"), ("splat_scene", splat_scene is not None)):
+            if asked:
+                raise ValueError(f"{name}: expected --scene beside it, whose cameras it needs, got none; pass --scene")
     if same_frame and splat_scene is not None:
         raise ValueError("same_frame: expected it alone, got --splat-scene too, whose cameras find the frame; drop one")
     by = by or ("distance" if scene is None else "views")
-    label_set, loaded, cloud = load_classes(scene, classes, text), SemanticField.load(field), read_splats(splats)
+    loaded, cloud, label_set = open_field(field), open_splats("splats", splats), load_classes(scene, classes, text)
     cameras = None if scene is None else training_cameras(loaded, scene, images)
     others = None if splat_scene is None else load_scene(splat_scene).undistorted().cameras
-    found = attach_field(
-        loaded,
-        cloud,
-        label_set,
-        cameras=cameras,
-        splat_cameras=others,
-        similarity=Similarity.identity() if same_frame else None,
-        distance=distance,
-        by=by,
-    )
+    try:
+        found = attach_field(
+            loaded,
+            cloud,
+            label_set,
+            cameras=cameras,
+            splat_cameras=others,
+            similarity=Similarity.identity() if same_frame else None,
+            distance=distance,
+            by=by,
+            method=method,
+        )
+    except SceneError as error:
+        raise SceneError(
+            f"splats: no frame found in which field and splat agree: {error} (--splat-scene gives the splat's cameras, "
+            "--same-frame says that there is nothing to find)"
+        ) from error
     for words in found.words:
         say(words)
     for i, name in enumerate(label_set.names):
         say(f"  {name:<16s} {int((found.labels == i).sum()):8d} Gaussians")
+    if bool((found.labels < 0).any()):
+        say(f"  {'(none)':<16s} {int((found.labels < 0).sum()):8d} Gaussians")
     written = write_splats(out, found.splats)
     for words in written.lost:
         say(f"note: {words}")
@@ -160,20 +178,29 @@ def select(
         images: folder of the scene's pictures, if it is not SCENE/images.
     """
     from .._files import write_json
-    from ..fields import SemanticField
-    from ..formats import SplatFile, read_splats, write_splats
+    from ..formats import SplatFile, write_splats
     from ..labels import answers
     from ..pipeline import query_field
     from ..pipeline.apply import select_labelled
     from ..scenes import load_scene
 
+    if not source.exists() and Path(query).exists():
+        raise ValueError(f"query, source: expected a class, then a file, got {query!r}, {str(source)!r}; swap them")
+    if out is not None:
+        check_folder("out", out)
+    if threshold is not None:
+        check_range("threshold", threshold, 0, 1)
+    if scene is None:
+        check_alone("images", images, "without --scene, whose pictures they are")
     if (source / "field.json").is_file():
-        label_set, field = load_classes(scene, classes, text), SemanticField.load(source)
+        field, label_set = open_field(source), load_classes(scene, classes, text)
         cameras = None if scene is None else training_cameras(field, scene, images)
         found = query_field(field, label_set, query, threshold, cameras=cameras, negatives=negatives)
         cloud = SplatFile(field.gaussians, {"score": found.scores.numpy()})
     else:
-        cloud = read_splats(source)
+        for name, given in (("classes", classes), ("text", text), ("negatives", negatives)):
+            check_alone(name, given, "beside a splat, which has its own classes")
+        cloud = open_splats("source", source, labelled=True)
         found = select_labelled(cloud, query, threshold)
         cameras = None if scene is None else load_scene(scene, images=images).undistorted().cameras
     say(f"{query}: {len(found)} of {len(cloud)} Gaussians, {found.words}")
@@ -181,6 +208,10 @@ def select(
     for thing in things:
         say(f"  {thing!r}")
     if out is not None:
+        if len(found) == 0:
+            raise ValueError(
+                f"query: expected Gaussians to save, got none of {query!r}; lower the threshold or drop --out"
+            )
         parts = [thing.to_json() for thing in things]
         facts = {"query": query, "threshold": found.threshold, "how": found.how, "count": len(found), "parts": parts}
         write_json(out / "selection.json", facts)
@@ -190,68 +221,92 @@ def select(
 def edit(
     splats: Annotated[Path, tyro.conf.Positional],
     out: Path,
-    remove: Several = (),
     recolor: Several = (),
+    mode: Literal["tint", "hue"] = "tint",
     opacity: Several = (),
+    scale: Several = (),
+    rotate: Several = (),
     move: Several = (),
+    duplicate: Several = (),
+    remove: Several = (),
     extract: Several = (),
+    insert: Several = (),
     replay: Path | None = None,
     scene: Path | None = None,
     views: Several = (),
     pictures: int = 2,
     images: Path | None = None,
 ) -> None:
-    """Edit a labelled splat by class: remove, recolour, fade, move, extract; the edits are saved and can be replayed.
+    """Edit a labelled splat by class; the edits are saved beside it and can be replayed.
+
+    Whatever their order on the line, edits are done in the order below, each on what those before left: --remove takes the
+    copies of --duplicate too, and --insert is touched by no other. Another order: several calls, or --replay.
 
     Args:
         splats: a splat with classes, as `kfgs attach` writes it.
-        out: the edited splat; its ending chooses the format. The edits go to a .edits.json beside it.
-        remove: a class to remove ("chair"); may be given several times, as all of these.
-        recolor: a class and a colour, "plant:#c04040".
+        out: the edited splat; its ending chooses the format. The edits go to OUT.edits.json (as --replay reads them) and
+            the views to OUT.png, with OUT less its ending.
+        recolor: a class and a colour, "plant:#c04040"; this and the others may be given several times.
+        mode: of --recolor: `tint` gives the colour itself and keeps the shading, `hue` keeps every lightness.
         opacity: a class and a factor in [0, 1], "lamp:0.3".
+        scale: a class and a factor, "lamp:1.5", about the centre of all that is of the class.
+        rotate: a class, an axis of the world and degrees, "table:z,90", by the right hand about the same centre.
         move: a class and a translation in world units, "table:0.5,0,0".
+        duplicate: a class and where its copy goes, seen from it, "chair:1,0,0".
+        remove: a class, "chair".
         extract: keep only these classes.
+        insert: a splat file to add, "lamp.ply", or that moved by a translation, "lamp.ply:1,0,0".
         replay: edits saved before, which come first.
         scene: scene folder in the splat's frame, whose cameras show the splat before and after.
         views: names of the views to show; those in which most changes when not given.
-        pictures: how many views to show.
+        pictures: how many views to show, where their names are not given.
         images: folder of the scene's pictures, if it is not SCENE/images.
     """
-    from ..formats import read_splats, write_splats
+    from ..formats import write_splats
     from ..labels.edits import EditList
     from ..pipeline.compare import views_of_change, write_comparison
-    from ..scenes import load_scene
 
-    if out.resolve() == splats.resolve():
-        raise ValueError(f"out: expected another file than the splat, got {out} twice; edits never touch their source")
-    if views and scene is None:
-        raise ValueError("views: expected --scene beside it, whose views these are, got none")
-    edits = EditList() if replay is None else EditList.load(replay)
-    for one in edits_from_words(recolor=recolor, opacity=opacity, move=move, remove=remove, extract=extract):
+    check_target("out", out, splats)
+    check_whole("pictures", pictures, 0)
+    if scene is None:
+        check_alone("views", ", ".join(views) or None, "without --scene, whose views they are")
+        check_alone("images", images, "without --scene, whose pictures they are")
+    edits = EditList() if replay is None else EditList.load(replay, anywhere=True)  # the user's own file
+    by_class = {"recolor": recolor, "opacity": opacity, "scale": scale, "rotate": rotate, "move": move}
+    by_class |= {"duplicate": duplicate, "remove": remove, "extract": extract}
+    for one in edits_from_words(**by_class, mode=mode, insert=insert):
         edits = edits.then(one)
     if len(edits) == 0:
-        raise ValueError(
-            "edits: expected at least one, got none; give --remove, --recolor, --opacity, --move, --extract"
-        )
-    before = read_splats(splats)
-    cameras = []
-    if scene is not None:
-        loaded = load_scene(scene, images=images).undistorted()
-        cameras = (loaded.select(views) if views else loaded).cameras
+        raise ValueError("edits: expected at least one, got none; give --remove, --recolor, --move or another")
+    check_target("out", out, *inserted_files(edits))
+    before = open_splats("splats", splats, labelled=any(by_class.values()))
+    cameras = [] if scene is None else _cameras_to_show(before, scene, images, views)
     after = edits.apply(before)
     say(f"{len(before)} Gaussians before, {len(after)} after {len(edits)} edit(s)")
+    if len(after) == 0:
+        say("note: nothing is left")
+    clouds = before.gaussians, after.gaussians
+    shown = cameras if views else [cameras[i] for i in views_of_change(*clouds, cameras, pictures)]
     written = write_splats(out, after)
     for words in written.lost:
         say(f"note: {words}")
     paths = [*written.paths, edits.save(out.with_suffix(".edits.json"))]
-    if cameras:
-        clouds = before.gaussians, after.gaussians
-        chosen = range(len(cameras)) if views else views_of_change(*clouds, cameras, pictures)
-        shown = [cameras[i] for i in chosen]
-        if shown:
-            paths.append(write_comparison(out.with_suffix(".png"), *clouds, shown, titles=("before", "after")))
-            say("before and after from " + ", ".join(camera.name for camera in shown))
+    if cameras and pictures and not shown:
+        say("note: no view of the scene shows a change")
+    if shown:
+        paths.append(write_comparison(out.with_suffix(".png"), *clouds, shown, titles=("before", "after")))
+        say("before and after from " + ", ".join(camera.name for camera in shown))
     wrote(paths)
+
+
+def _cameras_to_show(splats: Any, scene: Path, images: Path | None, views: tuple[str, ...]) -> list[Any]:
+    """The undistorted cameras of a scene, or of some of its views."""
+    from ..scenes import load_scene
+
+    if splats.gaussians.sh is None:
+        raise ValueError(f"scene: expected a splat with colours to show in it, got {splats!r}; leave --scene out")
+    loaded = load_scene(scene, images=images)
+    return list((choose_views(loaded, views) if views else loaded).undistorted().cameras)
 
 
 def convert(
@@ -264,14 +319,13 @@ def convert(
         source: .ply (3DGS or SuperSplat's compressed), .splat, .ksplat, .spz, .sog, .glb or .gltf.
         target: the file to write; its ending chooses the format (.ply, .compressed.ply, .splat, .spz, .sog, .glb, .gltf).
     """
-    from ..formats import read_splats, write_splats
+    from ..formats import write_splats
 
-    if source.resolve() == target.resolve():
-        raise ValueError(f"target: expected another file than source, got {target} twice; give another name")
-    splats = read_splats(source)
+    check_target("target", target, source)
+    splats = open_splats("source", source)
     say(repr(splats))
     written = write_splats(target, splats)
     for words in written.lost:
         say(f"note: {words}")
-    say(f"{size_of(source) / 2**20:.2f} MiB -> {size_of(target) / 2**20:.2f} MiB")
+    say(f"{size_of(source) / 2**10:,.1f} KiB -> {size_of(target) / 2**10:,.1f} KiB")
     wrote(written.paths)

@@ -42,7 +42,9 @@ def load_classes(scene: Path | None, classes: Path | None, text: Path | None) ->
     if text is None and scene is not None:
         text = scene / "text.npy"
     if classes is None or text is None:
-        raise ValueError("classes, text: expected class names (.json) and embeddings (.npy); pass --classes and --text")
+        raise ValueError(
+            "classes, text: expected class names (.json) and embeddings (.npy), got none; pass --classes and --text, or --scene"
+        )
     return load_label_set(classes, text)
 
 
@@ -58,7 +60,7 @@ def training_cameras(field: Any, scene: Path | None, images: Path | None) -> lis
     if not voting:
         raise ValueError(
             f"scene: expected the views that the field was trained on ({', '.join(sorted(trained)[:3])}, ...), got "
-            f"{len(cameras)} others in {scene}; pass the field's own scene, or --by latents"
+            f"{len(cameras)} others in {scene}; pass the field's own scene, or --classes and --text instead of a scene"
         )
     return voting
 

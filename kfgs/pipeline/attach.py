@@ -132,7 +132,7 @@ def attach(
     words = (
         said,
         f"{facts['labelled by']}: {len(splats) - counts[0]} of {len(splats)} Gaussians have a class",
-        repr(transfer),
+        repr(transfer) if by == "distance" else f"of {len(transfer.labels)} that no view shows: {transfer!r}",
     )
     return Attached(labelled, transfer, similarity, alignment, words)
 

@@ -44,6 +44,8 @@ def views_of_change(before: Gaussians, after: Gaussians, cameras: Sequence[Camer
         count: how many to choose at most; those in which nothing changes are never chosen.
     """
     check_whole("count", count, 0)
+    if count == 0:
+        return []
     shares = [changed_share(before, after, camera) for camera in cameras]
     ranked = [i for i in sorted(range(len(cameras)), key=lambda i: -shares[i]) if shares[i] > 0]
     forward = {i: cameras[i].viewmat[2, :3].double() for i in ranked}
@@ -60,11 +62,22 @@ def views_of_change(before: Gaussians, after: Gaussians, cameras: Sequence[Camer
 def write_comparison(
     path: str | Path, before: Gaussians, after: Gaussians, cameras: Sequence[Camera], *, titles: tuple[str, str]
 ) -> Path:
-    """Draw the scene before and after from each viewpoint, one row each, into one PNG file."""
-    rows = [[render_color(before, camera), render_color(after, camera)] for camera in cameras]
+    """Draw the scene before and after from each viewpoint, one row each, into one PNG file.
+
+    Pictures smaller than the largest get a white border.
+    """
+    height, width = (max(camera.size[i] for camera in cameras) for i in (0, 1))
+    rows = [[_padded(render_color(cloud, camera), height, width) for cloud in (before, after)] for camera in cameras]
     path = Path(path)
     save_picture(path, picture_grid(rows, titles))
     return path
+
+
+def _padded(picture: Tensor, height: int, width: int) -> Tensor:  # [h, w, 3] -> [H, W, 3]
+    top, left = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
+    sheet = picture.new_ones(height, width, 3)
+    sheet[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
+    return sheet
 
 
 class PhotoPictures:
