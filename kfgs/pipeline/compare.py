@@ -18,6 +18,7 @@ from ..viz.pairs import picture_grid
 
 PREVIEW = 96  # pixels: width of the renderings that choose the viewpoints
 VISIBLE = 8 / 255  # a pixel has changed when some channel did by more than this
+MOST = 0.5  # a picture of which more has changed is taken from inside the change: it comes after all others
 APART = 30.0  # degrees between the viewing directions of chosen viewpoints, where there are such
 
 
@@ -41,13 +42,15 @@ def views_of_change(before: Gaussians, after: Gaussians, cameras: Sequence[Camer
         before: the scene.
         after: the edited scene.
         cameras: viewpoints to choose from.
-        count: how many to choose at most; those in which nothing changes are never chosen.
+        count: how many to choose at most; those in which nothing changes are never chosen, those of which more than half
+            changes only when there are too few others.
     """
     check_whole("count", count, 0)
     if count == 0:
         return []
     shares = [changed_share(before, after, camera) for camera in cameras]
-    ranked = [i for i in sorted(range(len(cameras)), key=lambda i: -shares[i]) if shares[i] > 0]
+    order = sorted(range(len(cameras)), key=lambda i: (shares[i] > MOST, -shares[i]))
+    ranked = [i for i in order if shares[i] > 0]
     forward = {i: cameras[i].viewmat[2, :3].double() for i in ranked}
     chosen: list[int] = []
     limit = torch.cos(torch.deg2rad(torch.tensor(APART, dtype=torch.float64)))
