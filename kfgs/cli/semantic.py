@@ -75,6 +75,7 @@ def fit(
     max_gaussians: int | None = None,
     images: Path | None = None,
     undistorted_features: bool = False,
+    device: str = "auto",
 ) -> None:
     """Fit a semantic field to a posed scene and its teacher features.
 
@@ -90,6 +91,7 @@ def fit(
         max_gaussians: stop densifying at this many Gaussians.
         images: folder of the pictures, if it is not SCENE/images.
         undistorted_features: the teacher saw undistorted pictures already, so its maps need no lens removed.
+        device: where the field is trained: `auto` (a GPU if there is one), `cpu` or `cuda`.
     """
     from ..pipeline import fit_scene, write_training_pictures
     from ..scenes import load_scene
@@ -101,7 +103,7 @@ def fit(
     for note in loaded.notes:
         say(f"note: {note}")
     maps = FeatureFolder(features, [loaded.stem(i) for i in loaded.views(split)])
-    result = fit_scene(loaded, maps, out, config, report=say, progress=True)
+    result = fit_scene(loaded, maps, out, config, report=say, progress=True, device=device)
     say(result.field.summary())
     wrote([result.field_path, *write_training_pictures(result)])
 
@@ -217,7 +219,10 @@ def label(
     else:
         found = query_field(loaded, label_set, query, threshold)
         gaussians = loaded.gaussians.replace(labels=torch.where(found.mask, label_set.index(query), -1))
-        scores, rule = found.scores, f"{query}: {len(found)} Gaussians above gamma = {found.threshold:.4f} ({found.how})"
+        scores, rule = (
+            found.scores,
+            f"{query}: {len(found)} Gaussians above gamma = {found.threshold:.4f} ({found.how})",
+        )
     say(f"labelled by {rule}")
     assert gaussians.labels is not None
     written = save_labelled(targets[0], gaussians, scores, label_set, rule=rule)

@@ -19,6 +19,7 @@ from ..fields import ColorLoss, FieldConfig, GaussianParams, fit_field
 from ..formats import read_splats, write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene
+from .device import training_device
 from .digests import digest_scene, digest_tensors, stage_generator
 from .photos import Photos
 from .stages import Run, Stage
@@ -125,6 +126,7 @@ def fit_color(
     report: Callable[[str], None] | None = None,
     progress: bool = False,
     callback: Callable[[dict[str, Any]], None] | None = None,
+    device: str | torch.device = "auto",
 ) -> ColorResult:
     """Fit an ordinary 3DGS colour field to a scene's pictures, resuming what a run folder already holds.
 
@@ -137,15 +139,18 @@ def fit_color(
         report: receives one line per stage.
         progress: show a bar.
         callback: receives the rows of the history as they appear.
+        device: where to train, see `training_device`; the result lies on the CPU.
 
     Raises:
-        ValueError: if a camera has distortion, the scene has no points to start from, or no view is in the split.
+        ValueError: if a camera has distortion, there is no such device, the scene has no points to start from, or no
+            view is in the split.
     """
     config = config or ColorConfig.paper()
     views = scene.views(config.split)
     _check_scene(scene)
     run = Run(Path(folder), report)
-    params = _color_stage(run, scene, views, config, {"progress": progress, "callback": callback})
+    options = {"progress": progress, "callback": callback}
+    params = _color_stage(run, scene, views, config, training_device(device), options)
     result = ColorResult(params.activated().detach(), Path(folder) / "color.ply", run.stages)
     if not _is_saved(result):
         write_splats(result.path, result.gaussians)
@@ -153,7 +158,12 @@ def fit_color(
 
 
 def _color_stage(
-    run: Run, scene: Scene, views: Sequence[int], config: ColorConfig, options: dict[str, Any]
+    run: Run,
+    scene: Scene,
+    views: Sequence[int],
+    config: ColorConfig,
+    device: torch.device,
+    options: dict[str, Any],
 ) -> GaussianParams:
     inputs = {
         "pictures": run.digests([scene.image_paths[i] for i in views]),
@@ -177,7 +187,7 @@ def _color_stage(
         )
         cameras = [_training_camera(scene.cameras[i], config.picture_scale) for i in views]
         fit = fit_field(
-            start,
+            start.map(lambda value: value.to(device)),
             cameras,
             Photos(scene, views, cameras),
             config.field,
@@ -187,7 +197,7 @@ def _color_stage(
             checkpoint=scratch,
             **options,
         )
-        tensors = {name: value.contiguous() for name, value in fit.params.to_tensors().items()}
+        tensors = {name: value.cpu().contiguous() for name, value in fit.params.to_tensors().items()}
         save_file(tensors, folder / "params.safetensors")
         write_json(folder / "history.json", fit.history)
         return max(0.0, fit.history[-1]["seconds"] - (time.perf_counter() - started))  # before it was killed

@@ -34,6 +34,7 @@ from ..quant import (
     quantize_maps,
 )
 from ..scenes import Scene
+from .device import training_device
 from .digests import digest_scene, stage_generator
 from .maps import KnownFeatures, Maps, UndistortedMaps
 from .stages import Run, Stage
@@ -150,6 +151,7 @@ def _field_stage(
     targets: Sequence[Tensor],
     inputs: dict[str, Any],
     config: FitConfig,
+    device: torch.device,
     options: dict[str, Any],
 ) -> tuple[GaussianParams, Stage]:
     """The decoupled field, Sec. 3.2: Gaussians whose rendered latents follow the targets (Eq. 4)."""
@@ -167,7 +169,7 @@ def _field_stage(
         start = GaussianParams.from_points(scene.points, int(targets[0].shape[-1]), generator=generator)
         cameras = [scene.cameras[i] for i in views]
         fit = fit_field(
-            start,
+            start.map(lambda value: value.to(device)),
             cameras,
             targets,
             config.field,
@@ -177,7 +179,8 @@ def _field_stage(
             **options,
         )
         save_file(
-            {name: value.contiguous() for name, value in fit.params.to_tensors().items()}, folder / "params.safetensors"
+            {name: value.cpu().contiguous() for name, value in fit.params.to_tensors().items()},
+            folder / "params.safetensors",
         )
         write_json(folder / "history.json", fit.history)
         return max(0.0, fit.history[-1]["seconds"] - (time.perf_counter() - started))  # before it was killed
@@ -218,6 +221,7 @@ def fit_scene(
     report: Callable[[str], None] | None = None,
     progress: bool = False,
     callback: Callable[[dict[str, Any]], None] | None = None,
+    device: str | torch.device = "auto",
 ) -> FitResult:
     """Fit a decoupled semantic field to a scene (Figure 2), resuming whatever a run folder already holds.
 
@@ -229,11 +233,13 @@ def fit_scene(
         report: receives one line per stage.
         progress: show progress bars.
         callback: receives the history rows of every stage as they appear.
+        device: where to train the field, see `training_device`; the other stages and the result stay on the CPU.
 
     Raises:
-        ValueError: if the counts of views and maps differ, or a camera has distortion.
+        ValueError: if the counts of views and maps differ, a camera has distortion, or there is no such device.
     """
     config = config or FitConfig.paper()
+    target_device = training_device(device)
     views = scene.views(config.split)
     _check_inputs(scene, views, maps, config.split)
     run = Run(Path(folder), report)
@@ -256,7 +262,7 @@ def fit_scene(
             inputs["autoencoder"] = compressed.key
             with torch.no_grad():
                 targets = LatentMaps(index_maps, autoencoder.encode(codebook.codewords))
-    params, _ = _field_stage(run, scene, views, targets, inputs, config, options)
+    params, _ = _field_stage(run, scene, views, targets, inputs, config, target_device, options)
     info = {
         "mode": config.mode,
         "seed": config.seed,
