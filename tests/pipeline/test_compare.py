@@ -1,0 +1,124 @@
+"""Which viewpoints show an edit, and the pictures of it."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from kfgs.cameras import Camera
+from kfgs.gaussians import Gaussians
+from kfgs.pipeline.compare import (
+    PhotoPictures,
+    changed_share,
+    render_color,
+    views_of_change,
+    write_comparison,
+)
+
+
+def ball(*places, color=(1.0, 0.0, 0.0), scale=0.3):
+    n = len(places)
+    sh = ((torch.tensor(color) - 0.5) / 0.28209479177387814).expand(n, 1, 3).clone()
+    means = torch.tensor(places, dtype=torch.float32)
+    return Gaussians(
+        means, torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1), torch.full((n, 3), scale), torch.ones(n), sh=sh
+    )
+
+
+def camera(degrees, name="a.png", size=(48, 64)):
+    """At the origin, looking in the plane y = 0 at `degrees` from +z towards +x."""
+    a = math.radians(degrees)
+    viewmat = torch.eye(4)
+    viewmat[0, :3] = torch.tensor([math.cos(a), 0.0, -math.sin(a)])
+    viewmat[2, :3] = torch.tensor([math.sin(a), 0.0, math.cos(a)])
+    height, width = size
+    return Camera(viewmat, torch.tensor([[60.0, 0, width / 2], [0, 60, height / 2], [0, 0, 1]]), width, height, name)
+
+
+AHEAD, RIGHT = (0.0, 0.0, 5.0), (5.0, 0.0, 0.0)
+
+
+def test_the_share_counts_the_pixels_that_changed():
+    before, after = ball(AHEAD), ball(AHEAD, color=(0.0, 1.0, 0.0))
+    assert changed_share(before, before, camera(0)) == 0
+    assert changed_share(before, after, camera(180)) == 0
+    small = camera(0).resized(72, 96)
+    shown = (render_color(before, small) - render_color(after, small)).abs().amax(-1) > 8 / 255
+    assert changed_share(before, after, camera(0)) == pytest.approx(shown.float().mean().item())
+    # A round Gaussian of standard deviation 0.3 * 90 / 5 = 5.4 pixels; 0.99 exp(-r^2 / 2 s^2) > 8/255 within r = 2.6 s.
+    expected = math.pi * (0.3 * 90 / 5) ** 2 * 2 * math.log(0.99 * 255 / 8) / (72 * 96)
+    assert changed_share(before, after, camera(0)) == pytest.approx(expected, rel=0.05)
+
+
+def test_views_that_show_more_come_first_and_others_never():
+    before, after = ball(AHEAD, RIGHT), ball(RIGHT)
+    cameras = [camera(180), camera(28), camera(0), camera(20)]
+    shares = [changed_share(before, after, one) for one in cameras]
+    assert shares[3] > shares[2] > shares[1] > shares[0] == 0  # off the middle a ball looks larger, till it is cut off
+    assert views_of_change(before, after, cameras, 1) == [3]
+    assert views_of_change(before, after, cameras, 9) == [3, 2, 1]
+    assert views_of_change(before, before, cameras, 9) == []
+    assert views_of_change(before, after, cameras, 0) == []
+    assert views_of_change(before, after, [], 3) == []
+
+
+def test_the_second_view_looks_another_way():
+    before, after = ball(AHEAD, RIGHT), ball((0.0, 0.0, 50.0))
+    cameras = [camera(0), camera(2), camera(75), camera(90)]
+    chosen = views_of_change(before, after, cameras, 2)
+    assert len({min(i, 2) // 2 for i in chosen}) == 2  # one of the first two, one of the last two
+
+
+def test_a_view_from_inside_the_change_comes_last():
+    before, after = Gaussians.cat([ball(AHEAD, scale=1.5), ball(RIGHT)]), ball((0.0, 0.0, -50.0))
+    cameras = [camera(0), camera(90)]
+    assert changed_share(before, after, cameras[0]) > 0.5 > changed_share(before, after, cameras[1]) > 0
+    assert views_of_change(before, after, cameras, 1) == [1]
+    assert views_of_change(before, after, cameras, 2) == [1, 0]
+
+
+def test_a_negative_count_is_refused():
+    with pytest.raises(ValueError, match="count: expected a number in"):
+        views_of_change(ball(AHEAD), ball(RIGHT), [camera(0)], -1)
+
+
+def test_the_comparison_holds_both_renderings(tmp_path):
+    before, after = ball(AHEAD), ball(AHEAD, color=(0.0, 1.0, 0.0))
+    path = write_comparison(tmp_path / "new" / "a.png", before, after, [camera(0)], titles=("x", "y"))
+    picture = np.asarray(Image.open(path))
+    assert path == tmp_path / "new" / "a.png"
+    left, right = ((render_color(cloud, camera(0)) * 255).round().numpy() for cloud in (before, after))
+    bottom = picture.shape[0] - 6
+    np.testing.assert_allclose(picture[bottom - 48 : bottom, 6:70], left, atol=1)
+    np.testing.assert_allclose(picture[bottom - 48 : bottom, 76:140], right, atol=1)
+    assert picture.shape == (bottom + 6, 146, 3)
+
+
+def test_views_of_different_sizes_stand_on_white(tmp_path):
+    cameras = [camera(0), camera(0, size=(64, 32))]
+    path = write_comparison(tmp_path / "a.png", ball(AHEAD), ball(RIGHT), cameras, titles=("x", "y"))
+    picture = np.asarray(Image.open(path))
+    assert picture.shape[1] == 3 * 6 + 2 * 64
+    bottom = picture.shape[0] - 6
+    tall = picture[bottom - 64 : bottom, 6:70]
+    assert (tall[:, :16] == 255).all()
+    assert (tall[:, 48:] == 255).all()
+    expected = (render_color(ball(AHEAD), cameras[1]) * 255).round().numpy()
+    np.testing.assert_allclose(tall[:, 16:48], expected, atol=1)
+
+
+def test_pictures_beside_photographs_are_evenly_spread(tmp_path):
+    stems = [f"v{i}" for i in range(9)]
+    taken, rendered = torch.zeros(20, 30, 3), torch.ones(20, 30, 3)
+    for count, expected in ((0, []), (1, ["v0"]), (3, ["v0", "v4", "v8"]), (99, stems)):
+        show = PhotoPictures(tmp_path / str(count), stems, count)
+        for stem in stems:
+            show(stem, rendered, taken)
+        assert [path.stem for path in show.written] == expected
+        assert sorted(path.stem for path in (tmp_path / str(count)).glob("*.png")) == expected
+    picture = np.asarray(Image.open(tmp_path / "1" / "v0.png"))
+    assert (picture[-26:-6, 6:36] == 0).all()  # the photograph is left
+    assert (picture[-26:-6, 42:72] == 255).all()
+    assert PhotoPictures(tmp_path, [], 4).written == []

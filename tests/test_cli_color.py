@@ -1,0 +1,504 @@
+"""The commands of colour scenes, as a person runs them: color, attach, select, edit, convert."""
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from small_room import make_room
+
+import kfgs.pipeline.color as color_module
+from kfgs.cli import main
+from kfgs.evaluation import load_label_set
+from kfgs.fields import SemanticField
+from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs.formats.sidecar import names_path
+from kfgs.gaussians import Gaussians
+from kfgs.pipeline.photos import Photos
+from kfgs.scenes import load_scene
+from kfgs.splat import rasterize
+from kfgs.viz import palette
+
+COLOR = ["--steps", "30", "--max-gaussians", "2000"]
+
+
+def surface(room):
+    """Gaussians on the toy room's surface, and the true class of each."""
+    data = np.load(room / "surface.npz")
+    n = len(data["points"])
+    flat = torch.tensor([1.0, 0, 0, 0]).repeat(n, 1)
+    cloud = Gaussians(torch.from_numpy(data["points"]), flat, torch.full((n, 3), 0.06), torch.full((n,), 0.95))
+    return cloud, torch.from_numpy(data["labels"].astype(np.int64))
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    return make_room(tmp_path_factory.mktemp("cli") / "scene")
+
+
+@pytest.fixture(scope="module")
+def truth(room):
+    return surface(room)[1]
+
+
+@pytest.fixture(scope="module")
+def field(room, tmp_path_factory):
+    """A semantic field that knows the truth: the class embeddings on the room's surface."""
+    folder = tmp_path_factory.mktemp("run") / "run" / "field"
+    cloud, labels = surface(room)
+    classes = load_label_set(room / "classes.json", room / "text.npy")
+    scene = load_scene(room)
+    views = [scene.cameras[i].name for i in scene.views("train")]
+    SemanticField(cloud.replace(features=classes.embeddings[labels].float()), info={"views": views}).save(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def splat(room, tmp_path_factory):
+    """A colour splat without classes."""
+    path = tmp_path_factory.mktemp("splat") / "room.ply"
+    cloud, labels = surface(room)
+    shade = 1 - 0.3 * torch.rand(len(labels), 1, generator=torch.Generator().manual_seed(0))
+    rgb = torch.from_numpy(palette(labels)).float() / 255 * shade
+    write_splats(path, cloud.replace(sh=((rgb - 0.5) / 0.28209479177387814)[:, None]))
+    return path
+
+
+@pytest.fixture(scope="module")
+def labelled(room, field, splat, tmp_path_factory):
+    """The splat with classes, through the command line."""
+    out = tmp_path_factory.mktemp("labelled") / "room.ply"
+    assert main(["attach", str(field), str(splat), "--scene", str(room), "--by", "distance", "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def colored(room, tmp_path_factory):
+    """A run of `kfgs color`."""
+    out = tmp_path_factory.mktemp("color")
+    assert main(["color", str(room), "--out", str(out), *COLOR, "--pictures", "2"]) == 0
+    return out
+
+
+def test_color_scores_the_views_held_out(colored, room):
+    gaussians = read_splats(colored / "color.ply").gaussians
+    assert 500 < len(gaussians) <= 2000
+    assert gaussians.sh.shape[1:] == (9, 3)
+    scores = json.loads((colored / "scores.json").read_text())["color"]
+    scene = load_scene(room)
+    psnr = {}
+    for i in scene.views("test"):
+        rendered = rasterize(gaussians, scene.cameras[i]).map.clamp(0, 1).double()
+        taken = np.asarray(Image.open(scene.image_paths[i]).convert("RGB")) / 255
+        psnr[scene.stem(i)] = -10 * np.log10(((rendered.numpy() - taken) ** 2).mean())
+    assert {stem: row["psnr"] for stem, row in scores["views"].items()} == pytest.approx(psnr, abs=1e-3)
+    assert scores["psnr"] == pytest.approx(np.mean(list(psnr.values())), abs=1e-3)
+    assert sorted(path.name for path in (colored / "views").iterdir()) == ["view_001.png", "view_007.png"]
+
+
+def test_color_run_again_does_nothing_and_says_so(colored, room, capsys):
+    before = (colored / "color.ply").stat().st_mtime_ns
+    assert main(["color", str(room), "--out", str(colored), *COLOR, "--pictures", "0"]) == 0
+    said = capsys.readouterr().out
+    assert (colored / "color.ply").stat().st_mtime_ns == before
+    assert "PSNR" in said
+    assert "views" not in said.split("wrote:")[1]
+
+
+def test_color_interrupted_goes_on_to_the_same_field(colored, room, tmp_path, monkeypatch, capsys):
+    fit, look, looks = color_module.fit_field, Photos.__getitem__, []
+
+    def often(start, cameras, photos, config, **options):
+        return fit(start, cameras, photos, dataclasses.replace(config, checkpoint_every=10), **options)
+
+    def stopping(photos, i):
+        looks.append(i)
+        if len(looks) == 25:
+            raise KeyboardInterrupt
+        return look(photos, i)
+
+    monkeypatch.setattr(color_module, "fit_field", often)
+    monkeypatch.setattr(Photos, "__getitem__", stopping)
+    arguments = ["color", str(room), "--out", str(tmp_path), *COLOR, "--pictures", "0"]
+    assert main(arguments) == 130
+    assert "goes on where it stopped" in capsys.readouterr().err
+    assert not (tmp_path / "color.ply").exists()
+    assert main(arguments) == 0
+    assert len(looks) == 25 + 1 + 10  # once for the size, then steps 21 to 30
+    assert (tmp_path / "color.ply").read_bytes() == (colored / "color.ply").read_bytes()
+
+
+def test_color_of_a_scene_without_held_out_views_says_that_there_is_no_score(room, tmp_path, capsys):
+    scene = tmp_path / "scene"
+    shutil.copytree(room, scene)
+    names = json.loads((scene / "split.json").read_text())
+    (scene / "split.json").write_text(json.dumps({"train": names["train"]}))
+    assert main(["color", str(scene), "--out", str(tmp_path / "o"), "--steps", "2"]) == 0
+    assert "nothing to score against" in capsys.readouterr().out
+    assert (tmp_path / "o" / "color.ply").is_file()
+    assert not (tmp_path / "o" / "scores.json").exists()
+
+
+def test_attach_by_distance_gives_each_gaussian_the_class_at_its_place(labelled, field, splat, truth, room):
+    found, before = read_splats(labelled), read_splats(splat)
+    # The field's Gaussians lie at the same places; a vote of few, small views leaves some with another class.
+    assert (found.gaussians.labels == truth).float().mean() > 0.9
+    scene = load_scene(room).select("train")
+    embeddings = load_label_set(room / "classes.json", room / "text.npy").embeddings
+    semantic, _, _ = SemanticField.load(field).classify_by_views(embeddings, scene.cameras)
+    assert torch.equal(torch.from_numpy(found.extra["score"] == 1), semantic >= 0)  # the same place: no distance
+    assert torch.equal(found.gaussians.labels[semantic >= 0], semantic[semantic >= 0])
+    assert found.classes == tuple(json.loads((room / "classes.json").read_text()))
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        assert torch.equal(getattr(found.gaussians, name), getattr(before.gaussians, name))
+
+
+def test_attach_by_views_is_what_a_scene_does(field, splat, truth, room, tmp_path, capsys):
+    out = tmp_path / "new" / "a.compressed.ply"
+    assert main(["attach", str(field), str(splat), "--scene", str(room), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "the frames agree" in said
+    assert "votes of 6 segmented views" in said
+    assert "that no view shows" in said
+    found = read_splats(out).gaussians.labels
+    counts = [
+        f"  {name:<16s} {int((found == i).sum()):8d} Gaussians" for i, name in enumerate(read_splats(out).classes)
+    ]
+    assert "\n".join(counts) in said
+    assert f"{'(none)':<16s} {int((found < 0).sum()):8d}" in said or bool((found >= 0).all())
+    assert torch.bincount(found + 1, minlength=14)[1:].sum() > 0.9 * len(truth)
+
+
+def test_attach_by_files_and_another_rule(field, splat, truth, room, tmp_path):
+    files = ["--classes", str(room / "classes.json"), "--text", str(room / "text.npy")]
+    out = tmp_path / "a.ply"
+    for method in ("nearest", "vote", "mahalanobis"):
+        arguments = ["attach", str(field), str(splat), *files, "--out", str(out), "--method", method]
+        assert main([*arguments, "--distance", "0.3", "--same-frame"]) == 0
+        found = read_splats(out)
+        assert (found.gaussians.labels == truth).float().mean() > (0.999 if method == "nearest" else 0.85)
+        facts = json.loads(names_path(out).read_text())
+        assert (facts["method"], facts["lambda"]) == (method, 0.3)
+        assert ("share" in facts["score"]) == (method != "nearest")
+
+
+def test_select_counts_places_and_saves(labelled, room, tmp_path, capsys):
+    out = tmp_path / "o"
+    assert main(["select", "sofa", str(labelled), "--scene", str(room), "--out", str(out)]) == 0
+    cloud = read_splats(labelled)
+    index = cloud.classes.index("sofa")
+    mask = cloud.gaussians.labels == index
+    said = capsys.readouterr().out
+    assert f"sofa: {int(mask.sum())} of 4000 Gaussians, label sofa" in said
+    facts = json.loads((out / "selection.json").read_text())
+    assert facts["count"] == int(mask.sum())
+    largest = facts["parts"][0]
+    assert largest["count"] == len(largest["indices"]) <= facts["count"]
+    assert mask[largest["indices"]].all()
+    np.testing.assert_allclose(largest["extent"][0], cloud.gaussians.means[largest["indices"]].amin(0), atol=1e-6)
+    assert largest["best_view"]["camera"] in {camera.name for camera in load_scene(room).cameras}
+    assert largest["best_view"]["camera"] in said
+    saved = read_splats(out / "selection.ply")
+    assert torch.equal(saved.gaussians.means, cloud.gaussians.means[mask])
+    assert set(saved.gaussians.labels.tolist()) == {index}
+
+
+def test_select_asks_a_field_by_text(field, truth, room, capsys):
+    names = json.loads((room / "classes.json").read_text())
+    arguments = ["select", "lamp", str(field), "--classes", str(room / "classes.json")]
+    assert main([*arguments, "--text", str(room / "text.npy")]) == 0
+    said = capsys.readouterr().out
+    # Each Gaussian carries its class's own embedding.
+    assert f"lamp: {int((truth == names.index('lamp')).sum())} of 4000 Gaussians" in said
+    assert "12 negatives" in said
+
+
+def test_select_by_score(labelled, tmp_path, capsys):
+    cloud = read_splats(labelled)
+    score = np.linspace(0, 1, len(cloud), dtype=np.float32)
+    write_splats(tmp_path / "a.ply", cloud.replace(extra={"score": score}))
+    assert main(["select", "floor", str(tmp_path / "a.ply"), "--threshold", "0.5"]) == 0
+    expected = (cloud.gaussians.labels.numpy() == cloud.classes.index("floor")) & (score > 0.5)
+    assert f"floor: {expected.sum()} of 4000 Gaussians" in capsys.readouterr().out
+
+
+def by_name(path):
+    """The cloud, and a mask for each class."""
+    cloud = read_splats(path)
+    return cloud, {name: cloud.gaussians.labels == i for i, name in enumerate(cloud.classes)}
+
+
+def test_edit_does_each_of_its_options(labelled, tmp_path, capsys):
+    out = tmp_path / "new" / "e.ply"
+    options = ["--remove", "chair", "--remove", "rug", "--move", "sofa:0.5,0,-0.25", "--opacity", "lamp:0.5"]
+    options += [
+        "--recolor",
+        "plant:#0000ff",
+        "--rotate",
+        "table:z,90",
+        "--scale",
+        "door:2",
+        "--duplicate",
+        "lamp:0,1,0",
+    ]
+    assert main(["edit", str(labelled), "--out", str(out), *options]) == 0
+    (before, old), (after, new) = by_name(labelled), by_name(out)
+    a, b = before.gaussians, after.gaussians
+    lamps = int(old["lamp"].sum())
+    assert f"4000 Gaussians before, {len(b)} after 8 edit(s)" in capsys.readouterr().out
+    assert len(b) == 4000 - int(old["chair"].sum()) - int(old["rug"].sum()) + lamps
+    assert not new["chair"].any()
+    assert not new["rug"].any()
+    torch.testing.assert_close(b.means[new["sofa"]], a.means[old["sofa"]] + torch.tensor([0.5, 0.0, -0.25]))
+    torch.testing.assert_close(b.opacities[new["lamp"]], torch.full((2 * lamps,), 0.475))
+    shift = b.means[new["lamp"]][lamps:] - a.means[old["lamp"]]
+    torch.testing.assert_close(shift, torch.tensor([0.0, 1.0, 0.0]).expand(lamps, 3))
+    rgb = b.sh[new["plant"]][:, 0] * 0.28209479177387814 + 0.5
+    assert (rgb[:, 2] > rgb[:, 0] + 0.1).all()
+    centred = [x.means[m["table"]] - x.means[m["table"]].mean(0) for x, m in ((a, old), (b, new))]
+    torch.testing.assert_close(centred[1][:, :2], centred[0][:, :2].flip(1) * torch.tensor([-1.0, 1.0]))
+    centred = [x.means[m["door"]] - x.means[m["door"]].mean(0) for x, m in ((a, old), (b, new))]
+    torch.testing.assert_close(centred[1], 2 * centred[0])
+    torch.testing.assert_close(b.scales[new["door"]], 2 * a.scales[old["door"]])
+    torch.testing.assert_close(b.means[new["wall"]], a.means[old["wall"]], rtol=0, atol=0)
+
+
+def test_hue_keeps_luminance_and_tint_does_not(labelled, tmp_path):
+    luminance = torch.tensor([0.2126, 0.7152, 0.0722])
+    changes = {}
+    for mode in ("hue", "tint"):
+        out = tmp_path / f"{mode}.ply"
+        assert main(["edit", str(labelled), "--out", str(out), "--recolor", "sofa:#101030", "--mode", mode]) == 0
+        (before, mask), (after, _) = by_name(labelled), by_name(out)
+        rgb = [(c.gaussians.sh[mask["sofa"]][:, 0] * 0.28209479177387814 + 0.5) @ luminance for c in (before, after)]
+        changes[mode] = float((rgb[1] - rgb[0]).abs().max())
+    assert changes["hue"] < 1e-5
+    assert changes["tint"] > 0.1
+
+
+def test_edits_are_replayed_to_the_same_bytes_from_anywhere(labelled, tmp_path, capsys):
+    part, whole, again = tmp_path / "a" / "lamp.ply", tmp_path / "b" / "e.ply", tmp_path / "c" / "e.ply"
+    assert main(["edit", str(labelled), "--out", str(part), "--extract", "lamp"]) == 0
+    (before, old), (lamp, _) = by_name(labelled), by_name(part)
+    assert torch.equal(lamp.gaussians.means, before.gaussians.means[old["lamp"]])
+    options = ["--remove", "lamp", "--insert", f"{part}:0,0,0.5"]
+    assert main(["edit", str(labelled), "--out", str(whole), *options]) == 0
+    found, masks = by_name(whole)
+    moved = before.gaussians.means[old["lamp"]] + torch.tensor([0.0, 0.0, 0.5])
+    torch.testing.assert_close(found.gaussians.means[masks["lamp"]], moved)
+    # The inserted file lies in another folder than the saved edits: they are the user's own, and trusted.
+    arguments = ["edit", str(labelled), "--out", str(again), "--replay", str(tmp_path / "b" / "e.edits.json")]
+    assert main(arguments) == 0
+    assert again.read_bytes() == whole.read_bytes()
+    assert main([*arguments, "--remove", "chair"]) == 0
+    assert [one["op"] for one in json.loads((tmp_path / "c" / "e.edits.json").read_text())["edits"]] == [
+        "remove",
+        "insert",
+        "remove",
+    ]
+
+
+def test_edit_shows_before_and_after(labelled, room, tmp_path, capsys):
+    out = tmp_path / "e.spz"
+    arguments = ["edit", str(labelled), "--out", str(out), "--remove", "table", "--scene", str(room)]
+    assert main([*arguments, "--pictures", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "before and after from view_" in said
+    picture = np.asarray(Image.open(tmp_path / "e.png")).astype(int)
+    left, right = picture[-66:-6, 6:86], picture[-66:-6, 92:172]
+    assert (np.abs(left - right).max(-1) > 8).mean() > 0.02
+    assert main([*arguments, "--views", "view_003", "--views", "view_001.png"]) == 0
+    assert "from view_003.png, view_001.png" in capsys.readouterr().out
+    with Image.open(tmp_path / "e.png") as both:
+        assert both.height == picture.shape[0] + 66
+    (tmp_path / "e.png").unlink()
+    assert main([*arguments, "--pictures", "0"]) == 0
+    assert not (tmp_path / "e.png").exists()
+
+
+def test_an_edit_that_no_view_shows_gets_no_picture(labelled, room, tmp_path, capsys):
+    arguments = ["edit", str(labelled), "--out", str(tmp_path / "e.ply"), "--move", "table:0,0,0"]
+    assert main([*arguments, "--scene", str(room)]) == 0
+    assert "no view of the scene shows a change" in capsys.readouterr().out
+    assert not (tmp_path / "e.png").exists()
+
+
+def test_everything_may_be_removed(labelled, room, tmp_path, capsys):
+    cloud = read_splats(labelled)
+    few = cloud.select(cloud.gaussians.labels == 5)
+    write_splats(tmp_path / "chairs.ply", few)
+    arguments = ["edit", str(tmp_path / "chairs.ply"), "--out", str(tmp_path / "e.ply"), "--remove", "chair"]
+    assert main([*arguments, "--scene", str(room), "--pictures", "1"]) == 0
+    assert "nothing is left" in capsys.readouterr().out
+    assert len(read_splats(tmp_path / "e.ply")) == 0
+
+
+@pytest.mark.parametrize("name", ["a.spz", "a.splat", "a.sog", "a.glb"])
+def test_convert_keeps_classes(labelled, tmp_path, name, capsys):
+    assert main(["convert", str(labelled), str(tmp_path / "new" / name)]) == 0
+    said = capsys.readouterr().out
+    assert "KiB -> " in said
+    before, after = read_splats(labelled), read_splats(tmp_path / "new" / name)
+    assert after.classes == before.classes
+    counts = [torch.bincount(one.gaussians.labels + 1, minlength=14).tolist() for one in (before, after)]
+    assert counts[0] == counts[1]
+    for path in (tmp_path / "new").iterdir():
+        assert str(path) in said
+
+
+ERRORS = {
+    "attach": [
+        (["{splat}", "{field}", "--scene", "{room}", "--out", "{o}.ply"], "field: expected the folder that `kfgs fit`"),
+        (["{run}", "{splat}", "--scene", "{room}", "--out", "{o}.ply"], "a folder without one; pass {field}"),
+        (["{tmp}/no", "{splat}", "--scene", "{room}", "--out", "{o}.ply"], "no such folder; fit one with `kfgs fit`"),
+        (
+            ["{field}", "{field}", "--scene", "{room}", "--out", "{o}.ply"],
+            "splats: expected a splat file, got {field}, a",
+        ),
+        (["{field}", "{run}", "--scene", "{room}", "--out", "{o}.ply"], "{run}, a semantic field; pass a colour splat"),
+        (["{field}", "{tmp}/no.ply", "--scene", "{room}", "--out", "{o}.ply"], "{tmp}/no.ply: no such file"),
+        (["{field}", "{splat}", "--out", "{o}.ply"], "pass --classes and --text, or --scene"),
+        (
+            ["{field}", "{splat}", "--scene", "{room}", "--out", "{o}.ksplat"],
+            "out: expected a file whose name ends in one",
+        ),
+        (["{field}", "{splat}", "--scene", "{room}", "--out", "{splat}"], "out: expected another file than {splat}"),
+        (["{field}", "{splat}", "--scene", "{room}", "--out", "{splat}/a.ply"], "below the file {splat}; give another"),
+        (
+            ["{field}", "{splat}", "--out", "{o}.ply", "--by", "views", *["--classes", "a", "--text", "b"]],
+            "by: expected --scene",
+        ),
+        (
+            ["{field}", "{splat}", "--out", "{o}.ply", "--splat-scene", "{room}"],
+            "splat_scene: expected --scene beside it",
+        ),
+        (
+            ["{field}", "{splat}", "--out", "{o}.ply", "--images", "{room}/images"],
+            "images: expected none without --scene",
+        ),
+        (
+            ["{field}", "{splat}", "--out", "{o}.ply", "--scene", "{room}", "--splat-scene", "{room}", "--same-frame"],
+            "same_frame: expected it alone",
+        ),
+        (
+            ["{field}", "{splat}", "--scene", "{room}", "--out", "{o}.ply", "--distance", "-1"],
+            "distance: expected a number",
+        ),
+        (
+            ["{field}", "{four}", "--scene", "{room}", "--out", "{o}.ply"],
+            "splats: no frame found in which field and splat",
+        ),
+    ],
+    "select": [
+        (["{labelled}", "chair"], "query, source: expected a class, then a file"),
+        (["chiar", "{labelled}", "--out", "{o}"], "did you mean 'chair'?"),
+        (
+            ["chair", "{splat}"],
+            "source: expected a splat with classes, got {splat} without; `kfgs attach` gives it some",
+        ),
+        (["chair", "{tmp}/no.ply"], "{tmp}/no.ply: no such file"),
+        (["chair", "{field}"], "pass --classes and --text, or --scene"),
+        (["chair", "{run}"], "source: expected a splat file, got {run}, a semantic field"),
+        (["chair", "{labelled}", "--threshold", "2"], "threshold: expected a number in [0, 1], got 2"),
+        (["chair", "{labelled}", "--threshold", "1", "--out", "{o}"], "query: expected Gaussians to save, got none"),
+        (["chair", "{labelled}", "--text", "x.npy"], "text: expected none beside a splat, which has its own classes"),
+        (["chair", "{labelled}", "--no-negatives"], "negatives: expected none beside a splat"),
+        (["chair", "{labelled}", "--images", "{room}"], "images: expected none without --scene"),
+        (["chair", "{labelled}", "--out", "{splat}"], "out: expected a folder or nothing at {splat}, got a file"),
+    ],
+    "edit": [
+        (["{labelled}", "--out", "{o}.ply"], "edits: expected at least one, got none; give --remove"),
+        (["{labelled}", "--out", "{o}.ply", "--remove", "chiar"], "edits[0] (remove): class: expected one of wall"),
+        (["{labelled}", "--out", "{o}.ply", "--recolor", "chair:rde"], "recolor: expected a colour such as"),
+        (["{labelled}", "--out", "{o}.ply", "--move", "chair:1,2"], "move: expected 3 numbers between commas"),
+        (["{labelled}", "--out", "{o}.ply", "--insert", "{tmp}/no.ply"], "insert: expected a splat file"),
+        (
+            ["{labelled}", "--out", "{o}.ply", "--insert", "{room}/text.npy"],
+            "edits[0] (insert): {room}/text.npy: expected",
+        ),
+        (["{labelled}", "--out", "{splat}", "--insert", "{splat}"], "out: expected another file than {splat}"),
+        (["{labelled}", "--out", "{labelled}", "--remove", "chair"], "out: expected another file than {labelled}"),
+        (["{labelled}", "--out", "{o}.ksplat", "--remove", "chair"], "out: expected a file whose name ends in one of"),
+        (["{labelled}", "--out", "{o}", "--remove", "chair"], "got {o}; the ending chooses the format"),
+        (["{splat}", "--out", "{o}.ply", "--remove", "chair"], "splats: expected a splat with classes, got {splat}"),
+        (
+            ["{field}", "--out", "{o}.ply", "--remove", "chair"],
+            "splats: expected a splat file, got {field}, a semantic",
+        ),
+        (
+            ["{labelled}", "--out", "{o}.ply", "--remove", "chair", "--views", "view_001"],
+            "views: expected none without",
+        ),
+        (
+            ["{labelled}", "--out", "{o}.ply", "--remove", "chair", "--scene", "{room}", "--views", "view_01"],
+            "views: expected names of the scene's 9 views, got 'view_01'; did you mean 'view_001.png' or",
+        ),
+        (["{labelled}", "--out", "{o}.ply", "--remove", "chair", "--pictures", "-1"], "pictures: expected a number in"),
+        (["{labelled}", "--out", "{o}.ply", "--replay", "{tmp}/no.json"], "{tmp}/no.json: no such file"),
+        (["{labelled}", "--out", "{o}.ply", "--replay", "{room}/classes.json"], "expected edits that kfgs saved"),
+        (
+            ["{plain}", "--out", "{o}.ply", "--remove", "chair", "--scene", "{room}"],
+            "scene: expected a splat with colours",
+        ),
+    ],
+    "color": [
+        (["{room}", "--out", "{splat}"], "out: expected a folder or nothing at {splat}, got a file"),
+        (["{room}", "--out", "{o}", "--pictures", "-1"], "pictures: expected a number in"),
+        (["{room}", "--out", "{o}", "--steps", "0"], "steps: expected a whole number of at least 1, got 0"),
+        (["{room}", "--out", "{o}", "--split", "val"], "split: expected one of train, test, got 'val'"),
+        (["{tmp}", "--out", "{o}"], "expected a COLMAP model"),
+    ],
+    "convert": [
+        (["{splat}", "{splat}"], "target: expected another file than {splat}, got the same"),
+        (
+            ["{splat}", "{o}.ksplat"],
+            "target: expected a file whose name ends in one of .compressed.ply, .ply, .spz, .sog",
+        ),
+        (["{field}", "{o}.ply"], "source: expected a splat file, got {field}, a semantic field"),
+        (["{room}/text.npy", "{o}.ply"], "expected a splat file of a known format, got something else"),
+        (["{tmp}", "{o}.ply"], "expected a splat file of a known format"),
+    ],
+}
+
+
+@pytest.fixture(scope="module")
+def places(room, field, splat, labelled, tmp_path_factory):
+    """What the errors speak of; `plain` has classes but no colours, `four` has four Gaussians far away."""
+    folder = tmp_path_factory.mktemp("errors")
+    cloud = read_splats(labelled)
+    write_splats(folder / "plain.ply", SplatFile(cloud.gaussians.replace(sh=None), {}, cloud.classes))
+    four = read_splats(splat).gaussians.select(torch.arange(4))
+    write_splats(folder / "four.ply", four.replace(means=four.means + 100))
+    paths = {"room": room, "field": field, "run": field.parent, "splat": splat, "labelled": labelled}
+    return {name: str(path) for name, path in paths.items()} | {n: str(folder / f"{n}.ply") for n in ("plain", "four")}
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "message"),
+    [
+        pytest.param(command, arguments, message, id=f"{command}-{i}")
+        for command, cases in ERRORS.items()
+        for i, (arguments, message) in enumerate(cases)
+    ],
+)
+def test_bad_input_ends_with_1_one_line_and_no_files(command, arguments, message, places, tmp_path, capsys):
+    places = places | {"tmp": str(tmp_path), "o": str(tmp_path / "o" / "new")}
+    sources = {name: places[name] for name in ("splat", "labelled")}
+    before = {name: Path(path).read_bytes() for name, path in sources.items()}
+    assert main([command, *(one.format(**places) for one in arguments)]) == 1
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert said.startswith("error: ")
+    assert message.format(**places) in said
+    assert list(tmp_path.iterdir()) == []
+    assert before == {name: Path(path).read_bytes() for name, path in sources.items()}
+
+
+@pytest.mark.parametrize("arguments", [["edit", "a.ply"], ["attach", "a", "b", "--out", "c.ply", "--by", "magic"]])
+def test_wrong_usage_of_color_commands_ends_with_2(arguments):
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 2

@@ -1,0 +1,115 @@
+from pathlib import Path
+
+import pytest
+import torch
+
+from kfgs.cli.edit_words import edits_from_words, inserted_files
+from kfgs.gaussians import Gaussians
+from kfgs.labels.edits import Duplicate, Extract, Insert, Move, Opacity, Recolor, Remove, Turn
+from kfgs.labels.where import Either, OfClass
+
+
+def read(**words):
+    return list(edits_from_words(**words))
+
+
+def test_each_option_is_the_edit_it_says():
+    assert read(recolor=["plant:#ff0080"]) == [Recolor(OfClass("plant"), (1.0, 0.0, 128 / 255), "tint")]
+    assert read(recolor=["plant:teal"], mode="hue") == [Recolor(OfClass("plant"), (0.0, 128 / 255, 128 / 255), "hue")]
+    assert read(opacity=["lamp:0.3"]) == [Opacity(OfClass("lamp"), 0.3)]
+    assert read(scale=["lamp:1.5"]) == [Move(OfClass("lamp"), scale=1.5)]
+    assert read(rotate=["table:y,-90"]) == [Move(OfClass("table"), rotation=Turn((0, 1, 0), -90))]
+    assert read(move=["table:0.5,0,-2e-1"]) == [Move(OfClass("table"), (0.5, 0.0, -0.2))]
+    assert read(duplicate=["chair:1,0,0"]) == [Duplicate(OfClass("chair"), (1.0, 0.0, 0.0))]
+    assert read(remove=["window blind", "chair"]) == [Remove(OfClass("window blind")), Remove(OfClass("chair"))]
+    assert read(extract=["rug", "sofa"]) == [Extract(Either((OfClass("rug"), OfClass("sofa"))))]
+
+
+def test_nothing_asked_is_no_edit():
+    assert read() == []
+
+
+def test_the_order_does_not_depend_on_the_line(tmp_path):
+    (tmp_path / "a.ply").write_bytes(b"")
+    words = {
+        "insert": [str(tmp_path / "a.ply")],
+        "extract": ["a"],
+        "remove": ["b"],
+        "duplicate": ["c:0,0,1"],
+        "move": ["d:1,2,3"],
+        "rotate": ["e:z,5"],
+        "scale": ["f:2"],
+        "opacity": ["g:0.5"],
+        "recolor": ["h:red", "i:blue"],
+    }
+    expected = ["recolor", "recolor", "opacity", "move", "move", "move", "duplicate", "remove", "extract", "insert"]
+    edits = read(**words)
+    assert [edit.op for edit in edits] == expected
+    assert [edit.where.name for edit in edits[:8]] == ["h", "i", "g", "f", "e", "d", "c", "b"]
+
+
+def test_a_class_asked_twice_is_removed_once():
+    assert read(remove=["chair", "chair"]) == [Remove(OfClass("chair"))]
+
+
+def test_a_class_name_may_hold_a_colon():
+    assert read(opacity=["a:b:0.5"]) == [Opacity(OfClass("a:b"), 0.5)]
+
+
+def test_a_turn_about_z_takes_x_to_y():
+    (edit,) = read(rotate=["chair:z,90"])
+    one = Gaussians(torch.eye(3)[:1], torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3), torch.ones(1))
+    pivot = Move(edit.where, rotation=edit.rotation, pivot=(0, 0, 0))
+    torch.testing.assert_close(pivot.similarity(one).apply(one.means), torch.tensor([[0.0, 1.0, 0.0]]))
+
+
+def test_a_file_is_inserted_where_it_is_or_moved(tmp_path):
+    path = tmp_path / "lamp.ply"
+    path.write_bytes(b"")
+    (there,) = read(insert=[str(path)])
+    assert there == Insert(path)
+    (moved,) = read(insert=[f"{path}:1,0,-2"])
+    point = torch.tensor([[0.5, 0.5, 0.5]], dtype=torch.float64)
+    assert moved.similarity.apply(point).tolist() == [[1.5, 0.5, -1.5]]
+    assert inserted_files([there, Remove("a"), moved]) == [path, path]
+
+
+def test_a_file_whose_name_holds_a_colon_is_itself(tmp_path):
+    path = tmp_path / "lamp:1,0,0"
+    path.write_bytes(b"")
+    assert read(insert=[str(path)]) == [Insert(Path(path))]
+
+
+@pytest.mark.parametrize(
+    ("option", "words", "message"),
+    [
+        ("recolor", "plant", r"recolor: expected a class and a value, as in 'plant:#c04040', got 'plant'; put a colon"),
+        ("recolor", ":red", r"recolor: expected a class and a value.*got ':red'"),
+        ("recolor", "plant:", r"recolor: expected a class and a value.*got 'plant:'"),
+        ("recolor", "plant:rde", r"recolor: expected a colour such as .*, got 'rde'; write"),
+        ("recolor", "plant:#ff000080", r"recolor: expected a colour without alpha, got '#ff000080'; use the Opacity"),
+        ("opacity", "lamp:3", r"opacity: expected a factor from 0 to 1 after the colon, got 'lamp:3'; 0 hides"),
+        ("opacity", "lamp:x", r"opacity: expected a factor from 0 to 1 after the colon, got 'lamp:x'; write"),
+        ("opacity", "lamp:nan", r"opacity: expected a factor from 0 to 1 after the colon, got 'lamp:nan'"),
+        ("scale", "lamp:0", r"scale: expected a factor above 0 after the colon, got 'lamp:0'; 0.5 halves"),
+        ("scale", "lamp:1,2", r"scale: expected a factor above 0 after the colon, got 'lamp:1,2'"),
+        ("rotate", "table:90", r"rotate: expected an axis \(x, y or z\) and degrees, got 'table:90'; write it as"),
+        ("rotate", "table:z", r"rotate: expected an axis \(x, y or z\) and degrees after the colon, got 'table:z'"),
+        ("rotate", "table:z,inf", r"rotate: expected an axis .* got 'table:z,inf'"),
+        ("move", "table:1,2", r"move: expected 3 numbers between commas after the colon, got 'table:1,2'; write it so"),
+        ("move", "table:1,2,inf", r"move: expected 3 numbers between commas after the colon, got 'table:1,2,inf'"),
+        ("duplicate", "chair:1 0 0", r"duplicate: expected 3 numbers between commas .* got 'chair:1 0 0'"),
+        ("insert", "no.ply:1,0,0", r"insert: expected a splat file, .* got 'no.ply:1,0,0'; no file 'no.ply'"),
+        ("insert", "no.ply", r"insert: expected a splat file, .* got 'no.ply'; no file 'no.ply'"),
+    ],
+)
+def test_other_words_are_refused_and_quoted(option, words, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        read(**{option: [words]})
+
+
+def test_an_insertion_with_part_of_a_translation_is_refused(tmp_path):
+    (tmp_path / "a.ply").write_bytes(b"")
+    with pytest.raises(ValueError, match="insert: expected 3 numbers between commas after the colon, got .*a.ply:1,2'"):
+        read(insert=[f"{tmp_path}/a.ply:1,2"])
