@@ -3,11 +3,11 @@
 import dataclasses
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from cases_color import SH0, make_field, make_splat, surface
 from PIL import Image
 from small_room import make_room
 
@@ -15,24 +15,13 @@ import kfgs.pipeline.color as color_module
 from kfgs.cli import main
 from kfgs.evaluation import load_label_set
 from kfgs.fields import SemanticField
-from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs.formats import read_splats, write_splats
 from kfgs.formats.sidecar import names_path
-from kfgs.gaussians import Gaussians
 from kfgs.pipeline.photos import Photos
 from kfgs.scenes import load_scene
 from kfgs.splat import rasterize
-from kfgs.viz import palette
 
 COLOR = ["--steps", "30", "--max-gaussians", "2000"]
-
-
-def surface(room):
-    """Gaussians on the toy room's surface, and the true class of each."""
-    data = np.load(room / "surface.npz")
-    n = len(data["points"])
-    flat = torch.tensor([1.0, 0, 0, 0]).repeat(n, 1)
-    cloud = Gaussians(torch.from_numpy(data["points"]), flat, torch.full((n, 3), 0.06), torch.full((n,), 0.95))
-    return cloud, torch.from_numpy(data["labels"].astype(np.int64))
 
 
 @pytest.fixture(scope="module")
@@ -47,25 +36,12 @@ def truth(room):
 
 @pytest.fixture(scope="module")
 def field(room, tmp_path_factory):
-    """A semantic field that knows the truth: the class embeddings on the room's surface."""
-    folder = tmp_path_factory.mktemp("run") / "run" / "field"
-    cloud, labels = surface(room)
-    classes = load_label_set(room / "classes.json", room / "text.npy")
-    scene = load_scene(room)
-    views = [scene.cameras[i].name for i in scene.views("train")]
-    SemanticField(cloud.replace(features=classes.embeddings[labels].float()), info={"views": views}).save(folder)
-    return folder
+    return make_field(room, tmp_path_factory.mktemp("run") / "run" / "field")
 
 
 @pytest.fixture(scope="module")
 def splat(room, tmp_path_factory):
-    """A colour splat without classes."""
-    path = tmp_path_factory.mktemp("splat") / "room.ply"
-    cloud, labels = surface(room)
-    shade = 1 - 0.3 * torch.rand(len(labels), 1, generator=torch.Generator().manual_seed(0))
-    rgb = torch.from_numpy(palette(labels)).float() / 255 * shade
-    write_splats(path, cloud.replace(sh=((rgb - 0.5) / 0.28209479177387814)[:, None]))
-    return path
+    return make_splat(room, tmp_path_factory.mktemp("splat") / "room.ply")
 
 
 @pytest.fixture(scope="module")
@@ -257,7 +233,7 @@ def test_edit_does_each_of_its_options(labelled, tmp_path, capsys):
     torch.testing.assert_close(b.opacities[new["lamp"]], torch.full((2 * lamps,), 0.475))
     shift = b.means[new["lamp"]][lamps:] - a.means[old["lamp"]]
     torch.testing.assert_close(shift, torch.tensor([0.0, 1.0, 0.0]).expand(lamps, 3))
-    rgb = b.sh[new["plant"]][:, 0] * 0.28209479177387814 + 0.5
+    rgb = b.sh[new["plant"]][:, 0] * SH0 + 0.5
     assert (rgb[:, 2] > rgb[:, 0] + 0.1).all()
     centred = [x.means[m["table"]] - x.means[m["table"]].mean(0) for x, m in ((a, old), (b, new))]
     torch.testing.assert_close(centred[1][:, :2], centred[0][:, :2].flip(1) * torch.tensor([-1.0, 1.0]))
@@ -274,7 +250,7 @@ def test_hue_keeps_luminance_and_tint_does_not(labelled, tmp_path):
         out = tmp_path / f"{mode}.ply"
         assert main(["edit", str(labelled), "--out", str(out), "--recolor", "sofa:#101030", "--mode", mode]) == 0
         (before, mask), (after, _) = by_name(labelled), by_name(out)
-        rgb = [(c.gaussians.sh[mask["sofa"]][:, 0] * 0.28209479177387814 + 0.5) @ luminance for c in (before, after)]
+        rgb = [(c.gaussians.sh[mask["sofa"]][:, 0] * SH0 + 0.5) @ luminance for c in (before, after)]
         changes[mode] = float((rgb[1] - rgb[0]).abs().max())
     assert changes["hue"] < 1e-5
     assert changes["tint"] > 0.1
@@ -348,157 +324,3 @@ def test_convert_keeps_classes(labelled, tmp_path, name, capsys):
     assert counts[0] == counts[1]
     for path in (tmp_path / "new").iterdir():
         assert str(path) in said
-
-
-ERRORS = {
-    "attach": [
-        (["{splat}", "{field}", "--scene", "{room}", "--out", "{o}.ply"], "field: expected the folder that `kfgs fit`"),
-        (["{run}", "{splat}", "--scene", "{room}", "--out", "{o}.ply"], "a folder without one; pass {field}"),
-        (["{tmp}/no", "{splat}", "--scene", "{room}", "--out", "{o}.ply"], "no such folder; fit one with `kfgs fit`"),
-        (
-            ["{field}", "{field}", "--scene", "{room}", "--out", "{o}.ply"],
-            "splats: expected a splat file, got {field}, a",
-        ),
-        (["{field}", "{run}", "--scene", "{room}", "--out", "{o}.ply"], "{run}, a semantic field; pass a colour splat"),
-        (["{field}", "{tmp}/no.ply", "--scene", "{room}", "--out", "{o}.ply"], "{tmp}/no.ply: no such file"),
-        (["{field}", "{splat}", "--out", "{o}.ply"], "pass --classes and --text, or --scene"),
-        (
-            ["{field}", "{splat}", "--scene", "{room}", "--out", "{o}.ksplat"],
-            "out: expected a file whose name ends in one",
-        ),
-        (["{field}", "{splat}", "--scene", "{room}", "--out", "{splat}"], "out: expected another file than {splat}"),
-        (["{field}", "{splat}", "--scene", "{room}", "--out", "{splat}/a.ply"], "below the file {splat}; give another"),
-        (
-            ["{field}", "{splat}", "--out", "{o}.ply", "--by", "views", *["--classes", "a", "--text", "b"]],
-            "by: expected --scene",
-        ),
-        (
-            ["{field}", "{splat}", "--out", "{o}.ply", "--splat-scene", "{room}"],
-            "splat_scene: expected --scene beside it",
-        ),
-        (
-            ["{field}", "{splat}", "--out", "{o}.ply", "--images", "{room}/images"],
-            "images: expected none without --scene",
-        ),
-        (
-            ["{field}", "{splat}", "--out", "{o}.ply", "--scene", "{room}", "--splat-scene", "{room}", "--same-frame"],
-            "same_frame: expected it alone",
-        ),
-        (
-            ["{field}", "{splat}", "--scene", "{room}", "--out", "{o}.ply", "--distance", "-1"],
-            "distance: expected a number",
-        ),
-        (
-            ["{field}", "{four}", "--scene", "{room}", "--out", "{o}.ply"],
-            "splats: no frame found in which field and splat",
-        ),
-    ],
-    "select": [
-        (["{labelled}", "chair"], "query, source: expected a class, then a file"),
-        (["chiar", "{labelled}", "--out", "{o}"], "did you mean 'chair'?"),
-        (
-            ["chair", "{splat}"],
-            "source: expected a splat with classes, got {splat} without; `kfgs attach` gives it some",
-        ),
-        (["chair", "{tmp}/no.ply"], "{tmp}/no.ply: no such file"),
-        (["chair", "{field}"], "pass --classes and --text, or --scene"),
-        (["chair", "{run}"], "source: expected a splat file, got {run}, a semantic field"),
-        (["chair", "{labelled}", "--threshold", "2"], "threshold: expected a number in [0, 1], got 2"),
-        (["chair", "{labelled}", "--threshold", "1", "--out", "{o}"], "query: expected Gaussians to save, got none"),
-        (["chair", "{labelled}", "--text", "x.npy"], "text: expected none beside a splat, which has its own classes"),
-        (["chair", "{labelled}", "--no-negatives"], "negatives: expected none beside a splat"),
-        (["chair", "{labelled}", "--images", "{room}"], "images: expected none without --scene"),
-        (["chair", "{labelled}", "--out", "{splat}"], "out: expected a folder or nothing at {splat}, got a file"),
-    ],
-    "edit": [
-        (["{labelled}", "--out", "{o}.ply"], "edits: expected at least one, got none; give --remove"),
-        (["{labelled}", "--out", "{o}.ply", "--remove", "chiar"], "edits[0] (remove): class: expected one of wall"),
-        (["{labelled}", "--out", "{o}.ply", "--recolor", "chair:rde"], "recolor: expected a colour such as"),
-        (["{labelled}", "--out", "{o}.ply", "--move", "chair:1,2"], "move: expected 3 numbers between commas"),
-        (["{labelled}", "--out", "{o}.ply", "--insert", "{tmp}/no.ply"], "insert: expected a splat file"),
-        (
-            ["{labelled}", "--out", "{o}.ply", "--insert", "{room}/text.npy"],
-            "edits[0] (insert): {room}/text.npy: expected",
-        ),
-        (["{labelled}", "--out", "{splat}", "--insert", "{splat}"], "out: expected another file than {splat}"),
-        (["{labelled}", "--out", "{labelled}", "--remove", "chair"], "out: expected another file than {labelled}"),
-        (["{labelled}", "--out", "{o}.ksplat", "--remove", "chair"], "out: expected a file whose name ends in one of"),
-        (["{labelled}", "--out", "{o}", "--remove", "chair"], "got {o}; the ending chooses the format"),
-        (["{splat}", "--out", "{o}.ply", "--remove", "chair"], "splats: expected a splat with classes, got {splat}"),
-        (
-            ["{field}", "--out", "{o}.ply", "--remove", "chair"],
-            "splats: expected a splat file, got {field}, a semantic",
-        ),
-        (
-            ["{labelled}", "--out", "{o}.ply", "--remove", "chair", "--views", "view_001"],
-            "views: expected none without",
-        ),
-        (
-            ["{labelled}", "--out", "{o}.ply", "--remove", "chair", "--scene", "{room}", "--views", "view_01"],
-            "views: expected names of the scene's 9 views, got 'view_01'; did you mean 'view_001.png' or",
-        ),
-        (["{labelled}", "--out", "{o}.ply", "--remove", "chair", "--pictures", "-1"], "pictures: expected a number in"),
-        (["{labelled}", "--out", "{o}.ply", "--replay", "{tmp}/no.json"], "{tmp}/no.json: no such file"),
-        (["{labelled}", "--out", "{o}.ply", "--replay", "{room}/classes.json"], "expected edits that kfgs saved"),
-        (
-            ["{plain}", "--out", "{o}.ply", "--remove", "chair", "--scene", "{room}"],
-            "scene: expected a splat with colours",
-        ),
-    ],
-    "color": [
-        (["{room}", "--out", "{splat}"], "out: expected a folder or nothing at {splat}, got a file"),
-        (["{room}", "--out", "{o}", "--pictures", "-1"], "pictures: expected a number in"),
-        (["{room}", "--out", "{o}", "--steps", "0"], "steps: expected a whole number of at least 1, got 0"),
-        (["{room}", "--out", "{o}", "--split", "val"], "split: expected one of train, test, got 'val'"),
-        (["{tmp}", "--out", "{o}"], "expected a COLMAP model"),
-    ],
-    "convert": [
-        (["{splat}", "{splat}"], "target: expected another file than {splat}, got the same"),
-        (
-            ["{splat}", "{o}.ksplat"],
-            "target: expected a file whose name ends in one of .compressed.ply, .ply, .spz, .sog",
-        ),
-        (["{field}", "{o}.ply"], "source: expected a splat file, got {field}, a semantic field"),
-        (["{room}/text.npy", "{o}.ply"], "expected a splat file of a known format, got something else"),
-        (["{tmp}", "{o}.ply"], "expected a splat file of a known format"),
-    ],
-}
-
-
-@pytest.fixture(scope="module")
-def places(room, field, splat, labelled, tmp_path_factory):
-    """What the errors speak of; `plain` has classes but no colours, `four` has four Gaussians far away."""
-    folder = tmp_path_factory.mktemp("errors")
-    cloud = read_splats(labelled)
-    write_splats(folder / "plain.ply", SplatFile(cloud.gaussians.replace(sh=None), {}, cloud.classes))
-    four = read_splats(splat).gaussians.select(torch.arange(4))
-    write_splats(folder / "four.ply", four.replace(means=four.means + 100))
-    paths = {"room": room, "field": field, "run": field.parent, "splat": splat, "labelled": labelled}
-    return {name: str(path) for name, path in paths.items()} | {n: str(folder / f"{n}.ply") for n in ("plain", "four")}
-
-
-@pytest.mark.parametrize(
-    ("command", "arguments", "message"),
-    [
-        pytest.param(command, arguments, message, id=f"{command}-{i}")
-        for command, cases in ERRORS.items()
-        for i, (arguments, message) in enumerate(cases)
-    ],
-)
-def test_bad_input_ends_with_1_one_line_and_no_files(command, arguments, message, places, tmp_path, capsys):
-    places = places | {"tmp": str(tmp_path), "o": str(tmp_path / "o" / "new")}
-    sources = {name: places[name] for name in ("splat", "labelled")}
-    before = {name: Path(path).read_bytes() for name, path in sources.items()}
-    assert main([command, *(one.format(**places) for one in arguments)]) == 1
-    said = capsys.readouterr().err.strip().splitlines()[-1]
-    assert said.startswith("error: ")
-    assert message.format(**places) in said
-    assert list(tmp_path.iterdir()) == []
-    assert before == {name: Path(path).read_bytes() for name, path in sources.items()}
-
-
-@pytest.mark.parametrize("arguments", [["edit", "a.ply"], ["attach", "a", "b", "--out", "c.ply", "--by", "magic"]])
-def test_wrong_usage_of_color_commands_ends_with_2(arguments):
-    with pytest.raises(SystemExit) as stop:
-        main(arguments)
-    assert stop.value.code == 2
