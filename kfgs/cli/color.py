@@ -11,10 +11,11 @@ import tyro
 from .._check import check_range, check_whole
 from .checks import check_alone, check_folder, check_target, choose_views, open_field, open_splats
 from .edit_words import edits_from_words, inserted_files
-from .say import Preset, load_classes, say, size_of, training_cameras, wrote
+from .say import load_classes, say, say_lost, size_of, training_cameras, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
+ColorPreset = Literal["quick", "cpu", "paper"]
 Method = Literal["nearest", "vote", "mahalanobis"]
 Several = tyro.conf.UseAppendAction[tuple[str, ...]]
 
@@ -22,26 +23,29 @@ Several = tyro.conf.UseAppendAction[tuple[str, ...]]
 def color(
     scene: Annotated[Path, tyro.conf.Positional],
     out: Path,
-    preset: Preset = "cpu",
+    preset: ColorPreset = "cpu",
     split: str = "train",
     seed: int = 0,
     steps: int | None = None,
     max_gaussians: int | None = None,
     pictures: int = 4,
     images: Path | None = None,
+    device: str = "auto",
 ) -> None:
     """Fit a colour field (3-D Gaussian Splatting) to a posed scene, and score it on the views held out.
 
     Args:
         scene: folder with images and a COLMAP model or transforms.json.
         out: run folder; running again goes on where it stopped. `out/color.ply` receives the field.
-        preset: `cpu` (minutes on two cores) or `paper` (30,000 steps, full size, degree 3: for a GPU).
+        preset: `quick` (a minute, for small scenes), `cpu` (minutes on two cores) or `paper` (30,000 steps, full size,
+            degree 3: for a GPU).
         split: views to learn from.
         seed: every random choice follows from it.
         steps: training steps, instead of the preset's.
         max_gaussians: stop densifying at this many Gaussians.
         pictures: how many of the views held out are drawn beside their photographs.
         images: folder of the pictures, if it is not SCENE/images.
+        device: where the field is trained: `auto` (a GPU if there is one), `cpu` or `cuda`.
     """
     from ..evaluation.color import score_views
     from ..pipeline import write_report
@@ -51,7 +55,7 @@ def color(
 
     check_whole("pictures", pictures, 0)
     check_folder("out", out)
-    config = ColorConfig.cpu() if preset == "cpu" else ColorConfig.paper()
+    config = {"quick": ColorConfig.quick, "cpu": ColorConfig.cpu, "paper": ColorConfig.paper}[preset]()
     fields = config.field if steps is None else config.field.with_steps(steps)
     if max_gaussians is not None:
         fields = dataclasses.replace(fields, max_gaussians=max_gaussians)
@@ -59,7 +63,7 @@ def color(
     loaded = load_scene(scene, images=images).undistorted()
     for note in loaded.notes:
         say(f"note: {note}")
-    result = fit_color(loaded, out, config, report=say, progress=True)
+    result = fit_color(loaded, out, config, report=say, progress=True, device=device)
     took = f"{result.seconds / 60:.1f} min" if result.seconds >= 60 else f"{result.seconds:.0f} s"
     say(f"{result.gaussians!r} in {took}")
     written = [result.path]
@@ -148,8 +152,7 @@ def attach(
     if bool((found.labels < 0).any()):
         say(f"  {'(none)':<16s} {int((found.labels < 0).sum()):8d} Gaussians")
     written = write_splats(out, found.splats)
-    for words in written.lost:
-        say(f"note: {words}")
+    say_lost(written)
     wrote(written.paths)
 
 
@@ -288,8 +291,7 @@ def edit(
     clouds = before.gaussians, after.gaussians
     shown = cameras if views else [cameras[i] for i in views_of_change(*clouds, cameras, pictures)]
     written = write_splats(out, after)
-    for words in written.lost:
-        say(f"note: {words}")
+    say_lost(written)
     paths = [*written.paths, edits.save(out.with_suffix(".edits.json"))]
     if cameras and pictures and not shown:
         say("note: no view of the scene shows a change")
@@ -325,7 +327,6 @@ def convert(
     splats = open_splats("source", source)
     say(repr(splats))
     written = write_splats(target, splats)
-    for words in written.lost:
-        say(f"note: {words}")
+    say_lost(written)
     say(f"{size_of(source) / 2**10:,.1f} KiB -> {size_of(target) / 2**10:,.1f} KiB")
     wrote(written.paths)

@@ -22,6 +22,14 @@ def wrote(paths: list[Path]) -> None:
         say(f"  {path}" + (f"  ({sum(1 for p in path.iterdir())} files)" if path.is_dir() else ""))
 
 
+def say_lost(written: Any) -> None:
+    """Tell what the format of a splat file (`Written`) could not hold, and whether it has put the Gaussians in order."""
+    for words in written.lost:
+        say(f"note: {words}")
+    if written.order is not None:
+        say("note: neighbours now lie side by side (Morton order), so indices into the old file do not fit the new one")
+
+
 def fit_config(preset: Preset, mode: Mode, seed: int, steps: int | None, max_gaussians: int | None, split: str) -> Any:
     """The options of a fit, from a preset and what was given beside it."""
     from ..pipeline import FitConfig
