@@ -15,6 +15,9 @@ from .._check import check_choice, check_range, check_shapes
 DistortionModel = Literal["brown_conrady", "kannala_brandt"]
 COEFFICIENTS = {"brown_conrady": (4, 5, 8), "kannala_brandt": (4,)}
 
+NEAR = 0.2
+"""World units: the smallest depth that 3DGS draws, meant for scenes of metres."""
+
 
 @dataclass(frozen=True)
 class Distortion:
@@ -44,6 +47,8 @@ class Camera:
     **Convention** (COLMAP's): `viewmat` maps world to camera, x right, y down, z forward; the centre of the first pixel
     is (0.5, 0.5), so a centred principal point is (width / 2, height / 2). K is in pixels, without skew.
     A camera with distortion must be undistorted (`undistort`) before anything is rasterised through it.
+    What is not deeper than `near` is not drawn. It is a length of the scene, so it scales with it
+    (`Similarity.apply_to_camera`, `load_scene`); 0.2 of a unit is most of a room whose frame is small.
     """
 
     viewmat: Tensor  # [4, 4] world to camera
@@ -52,6 +57,7 @@ class Camera:
     height: int
     name: str = ""
     distortion: Distortion | None = None
+    near: float = NEAR  # > 0, world units: the smallest depth that is drawn
 
     def __post_init__(self) -> None:
         check_shapes(("viewmat", self.viewmat, "4 4"), ("K", self.K, "3 3"))
@@ -66,6 +72,10 @@ class Camera:
             self._check_values()
 
     def _check_values(self) -> None:
+        if not isinstance(self.near, numbers.Real):
+            raise TypeError(f"near: expected a number in world units, got {type(self.near).__name__}; pass a float")
+        check_range("near", float(self.near), 0, closed=(False, False))
+        object.__setattr__(self, "near", float(self.near))
         K, E = self.K.detach().double().cpu(), self.viewmat.detach().double().cpu()  # cameras are tiny
         if not (torch.isfinite(K).all() and torch.isfinite(E).all()):
             raise ValueError(

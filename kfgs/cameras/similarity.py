@@ -98,14 +98,14 @@ class Similarity:
     def apply_to_camera(self, camera: Camera) -> Camera:
         """The camera that takes the same picture of the moved scene.
 
-        Its viewmat stays a rigid motion, [R_c R^T, s t_c - R_c R^T t], so depths come out `scale` times as large (which
-        `rasterize`'s `near` must follow); K, the size and the lens stay.
+        Its viewmat stays a rigid motion, [R_c R^T, s t_c - R_c R^T t], so depths come out `scale` times as large, and
+        `near` with them; K, the size and the lens stay.
         """
         view = camera.viewmat.detach().double().cpu()
         moved = torch.eye(4, dtype=torch.float64)
         moved[:3, :3] = view[:3, :3] @ self.rotation.T
         moved[:3, 3] = self.scale * view[:3, 3] - moved[:3, :3] @ self.translation
-        return replace(camera, viewmat=moved.to(camera.viewmat))
+        return replace(camera, viewmat=moved.to(camera.viewmat), near=self.scale * camera.near)
 
 
 def fit_similarity(

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from .._files import atomic_path, digest_value
 from ..cameras import Camera
+from ..cameras.camera import NEAR
 from .config import FieldConfig
 from .params import GaussianParams
 
@@ -39,9 +40,14 @@ def identify_fit(
     generator: torch.Generator,
     others: dict[str, Any],
 ) -> dict[str, str]:
-    """A digest of each thing a fit depends on. Of the targets their number and the first one are looked at."""
+    """A digest of each thing a fit depends on. Of the targets their number and the first one are looked at.
+
+    Near planes count where one is not at 0.2: checkpoints from before cameras had one stay valid.
+    """
     options = {name: value for name, value in asdict(config).items() if name != "checkpoint_every"}
     views = [tensor for camera in cameras for tensor in (camera.viewmat, camera.K, torch.tensor(camera.size))]
+    near = torch.tensor([camera.near for camera in cameras], dtype=torch.float64)
+    views += [near] if (near != NEAR).any() else []
     return {
         "params": _digest_tensors(list(params.to_tensors().values())),
         "cameras": _digest_tensors(views),

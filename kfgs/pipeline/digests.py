@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from ..cameras.camera import NEAR
 from ..scenes import Scene
 
 
@@ -27,9 +28,13 @@ def digest_tensors(*tensors: Tensor) -> str:
 
 
 def digest_scene(scene: Scene, views: Sequence[int]) -> str:
-    """SHA-256 of some views' poses, intrinsics and sizes, and of the sparse points."""
+    """SHA-256 of some views' poses, intrinsics, sizes and near planes, and of the sparse points.
+
+    Where all near planes are at 0.2 they are left out: runs from before cameras had one stay valid.
+    """
     cameras = [scene.cameras[i] for i in views]
     poses = torch.stack([camera.viewmat for camera in cameras])
     intrinsics = torch.stack([camera.K for camera in cameras])
     sizes = torch.tensor([camera.size for camera in cameras])
-    return digest_tensors(poses, intrinsics, sizes, scene.points)
+    near = torch.tensor([camera.near for camera in cameras], dtype=torch.float64)
+    return digest_tensors(poses, intrinsics, sizes, scene.points, *([near] if (near != NEAR).any() else []))

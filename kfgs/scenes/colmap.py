@@ -130,7 +130,7 @@ def load_colmap(path: str | Path, images: str | Path) -> Scene:
     if len(points) == 0:
         notes.append("the model has no points: give the field points of your own to start from")
     splits = {"train": list(range(len(found))), "test": []}
-    return Scene(matched, [paths[i] for i in found], points, colors, splits, tuple(notes))
+    return Scene(matched, [paths[i] for i in found], points, colors, splits, tuple(notes)).with_near()
 
 
 def _intrinsics(path: Path, camera_id: int, camera: Any) -> tuple[torch.Tensor, Distortion | None, int, int]:

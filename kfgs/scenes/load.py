@@ -35,7 +35,8 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
             `"file"`: split.json; or a rule of `make_split`.
 
     Returns:
-        The scene, views in natural order of names; read its `notes`.
+        The scene, views in natural order of names, cameras with `near` in proportion to a small frame (`Scene.with_near`);
+        read its `notes`.
 
     Raises:
         FileNotFoundError: if there is no such folder, no image folder, or (`split="file"`) no split.json.

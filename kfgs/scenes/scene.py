@@ -11,11 +11,12 @@ from kornia.io import ImageLoadType, load_image
 from torch import Tensor
 
 from .._check import check_shapes
-from ..cameras.camera import Camera
+from ..cameras.camera import NEAR, Camera
 from ..cameras.undistort import undistort
 from .errors import SceneError
 from .names import file_stem
 
+NEAR_SHARE = 0.1  # of the extent: 3DGS's 0.2 is that of cameras 2 m about; in smaller frames the near plane follows
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")  # what kornia decodes
 
 
@@ -154,6 +155,17 @@ class Scene:
         if radius > 1e-6 * (1 + float(mean.norm())):
             return radius
         return float((self.points.double() - mean).norm(dim=-1).median()) if len(self.points) else 1.0
+
+    def with_near(self) -> Scene:
+        """The same scene with every camera's `near` at 0.2 world units or, if that is less, a tenth of the extent.
+
+        The extent of all views is taken, so that the split does not matter. Loaders do this; who makes a scene by hand in
+        a small frame (or one of kilometres, where another near plane may be wanted) chooses.
+        """
+        if len(self) == 0:
+            return self
+        near = min(NEAR, NEAR_SHARE * replace(self, splits={}).extent) or NEAR  # 0: all in one point, no length
+        return replace(self, cameras=[replace(camera, near=near) for camera in self.cameras])
 
     def select(self, which: str | Sequence[str] | Sequence[int]) -> Scene:
         """The scene with some of its views; points stay, splits keep their names.

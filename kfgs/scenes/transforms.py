@@ -95,7 +95,7 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
     if any(reader.masked for reader, _ in readers.values()):
         notes.append(f"{sum(reader.masked for reader, _ in readers.values())} frames have a mask_path; it is not used")
     cameras, paths = [view[0] for view in views], [view[1] for view in views]
-    return Scene(cameras, paths, points, colors, _splits(views, first.root, top), tuple(notes))
+    return Scene(cameras, paths, points, colors, _splits(views, first.root, top), tuple(notes)).with_near()
 
 
 def _files(path: Path) -> dict[str, Path]:

@@ -36,7 +36,7 @@ def project(
     gaussians: Gaussians,
     camera: Camera,
     *,
-    near: float = 0.2,
+    near: float | None = None,
     low_pass: float = 0.3,
     engine: str = "auto",
 ) -> Projected:
@@ -50,7 +50,7 @@ def project(
     Args:
         gaussians: the N Gaussians; `means`, `quats`, `scales` and `opacities` are differentiable.
         camera: without distortion; cast to the Gaussians' dtype and device.
-        near: smallest depth that is drawn, world units.
+        near: smallest depth that is drawn, world units; None: the camera's.
         low_pass: variance in pixels^2 added on both axes, so that nothing is smaller than a pixel.
         engine: as in `composite`. "numba", which "auto" takes on the CPU, computes the same with compiled code; all
             others are kornia's functions under autograd.
@@ -70,6 +70,7 @@ def project(
         The compiled code has no gradients of gradients. Nor has it any in the camera: where `camera.viewmat` or
         `camera.K` requires one, kornia's functions are used whatever the engine.
     """
+    near = camera.near if near is None else near
     check_range("near", near, 0, closed=(False, False))
     check_range("low_pass", low_pass, 0, closed=(True, False))
     if camera.distortion is not None:

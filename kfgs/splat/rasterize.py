@@ -28,7 +28,7 @@ def rasterize(
     *,
     background: Tensor | None = None,  # [D]
     engine: str = "auto",
-    near: float = 0.2,
+    near: float | None = None,
 ) -> Rendering:
     """Render the Gaussians' features, or their colour where they have no features.
 
@@ -40,7 +40,7 @@ def rasterize(
         camera: a pinhole; undistort a picture from a distorting lens first.
         background: what shows through, zeros if None; one value per channel.
         engine: see `composite`.
-        near: smallest depth that is drawn, world units.
+        near: smallest depth that is drawn, world units; None: the camera's.
 
     Returns:
         The map, its opacity, and the projected Gaussians; differentiable in all tensors of `gaussians` and in
