@@ -1,9 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pycolmap
 import pytest
 import torch
 
-from kfgs.cameras import Camera, Distortion
+from kfgs.cameras import Camera, Distortion, undistort
 
 K = torch.tensor([[70.0, 0.0, 50.0], [0.0, 66.0, 30.5], [0.0, 0.0, 1.0]])
 
@@ -42,6 +44,15 @@ def test_resized_agrees_with_colmap_and_not_with_integer_centers():
 def test_resized_keeps_the_lens():
     lens = Distortion("brown_conrady", (-0.1, 0, 0, 0))
     assert Camera(torch.eye(4), K, 96, 64, distortion=lens).resized(32, 48).distortion == lens
+
+
+def test_the_near_plane_stays_with_the_camera():
+    lens = Distortion("brown_conrady", (-0.1, 0, 0, 0))
+    camera = Camera(torch.eye(4), K, 96, 64, distortion=lens, near=np.float32(0.5))
+    assert type(camera.near) is float
+    others = camera.resized(32, 48), camera.to(torch.float64), undistort(torch.ones(64, 96, 1), camera)[1]
+    assert [other.near for other in (*others, replace(camera, name="b.png"))] == [0.5] * 4
+    assert Camera(torch.eye(4), K, 96, 64).near == 0.2
 
 
 def test_intrinsics_at_integer_centers_move_only_the_principal_point():
@@ -83,6 +94,10 @@ def test_gradient_reaches_pose_and_intrinsics():
         ({"viewmat": torch.diag(torch.tensor([2.0, 2, 2, 1]))}, ValueError, "rigid motion.*remove any scale"),
         ({"viewmat": torch.diag(torch.tensor([1.0, 1, -1, 1]))}, ValueError, "reflection.*handedness"),
         ({"viewmat": changed(torch.eye(4), 3, 0, 1.0)}, ValueError, "last row 0 0 0 1"),
+        ({"near": 0.0}, ValueError, r"near: expected a number in \(0, inf\), got 0.0"),
+        ({"near": float("nan")}, ValueError, r"near: expected a number in \(0, inf\), got nan"),
+        ({"near": float("inf")}, ValueError, r"near: expected a number in \(0, inf\), got inf"),
+        ({"near": "0.2"}, TypeError, "near: expected a number in world units, got str; pass a float"),
     ],
 )
 def test_refuses(change, error, match):

@@ -212,6 +212,9 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
         fit_field(start(), cameras, targets, replace(short, features_lr=0.1), extent=2.0, checkpoint=path)
     with pytest.raises(ValueError, match="other cameras, targets;"):
         fit_field(start(), cameras[:2], targets[:2], short, extent=2.0, checkpoint=path)
+    nearer = [replace(camera, near=0.1) for camera in cameras]
+    with pytest.raises(ValueError, match="other cameras;"):
+        fit_field(start(), nearer, targets, short, extent=2.0, checkpoint=path)
     with pytest.raises(ValueError, match="other extent, generator, params"):
         fit_field(
             start(61), cameras, targets, short, extent=3.0, checkpoint=path, generator=torch.Generator().manual_seed(9)

@@ -4,10 +4,10 @@ import math
 import pytest
 import torch
 
-from kfgs.cameras import Camera
+from kfgs.cameras import Camera, Similarity
 from kfgs.gaussians import Gaussians
 from kfgs.labels import Selection, answer, answers, select_where, view_shares
-from kfgs.splat import rasterize
+from kfgs.splat import rasterize, transform_gaussians
 
 
 def camera(z=0.0, name="", turned=False, width=40, height=32):
@@ -104,6 +104,17 @@ def test_the_nearer_camera_sees_it_best_and_the_one_behind_not_at_all():
     seen = view_shares(gaussians, [torch.arange(9)], views)
     assert seen[2:, 0].tolist() == [0, 0]
     assert 1.5 < seen[1, 0] / seen[0, 0] < 16 / 9  # (4 / 3)^2, less the low-pass filter
+
+
+@pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
+def test_the_best_view_is_the_same_in_every_frame(scale):
+    gaussians, views = scene(), [camera(0, "far"), camera(1, "near")]
+    moved = Similarity(scale, torch.eye(3), torch.tensor([1.0, -2.0, 3.0]))
+    there = transform_gaussians(gaussians, moved)
+    expected = answer(gaussians, chosen(gaussians), views).best_view
+    found = answer(there, chosen(there), [moved.apply_to_camera(view) for view in views]).best_view
+    assert (found.camera, found.index) == ("near", 1)
+    assert found.share == pytest.approx(expected.share, rel=1e-3)
 
 
 def test_shares_add_up_to_the_picture_and_know_what_hides():

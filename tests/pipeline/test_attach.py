@@ -185,6 +185,18 @@ def test_the_clouds_find_the_frame(monkeypatch):
     assert attached.alignment.facts["quality"] > 0.7
 
 
+def test_views_label_as_well_where_the_splats_frame_is_small():
+    turn = a_similarity()
+    shares = {}
+    for scale in (1.0, 0.01):
+        similarity = replace(turn, scale=scale)
+        there = moved(a_splat(3_000), similarity)
+        found = attach(a_field(), there, CLASSES, cameras=CAMERAS, similarity=similarity, by="views")
+        shares[scale] = accuracy(found.labels, a_splat(3_000)), found.splats.info["labels"]["shown"]
+    assert shares[1.0][0] > 0.95
+    assert shares[0.01] == pytest.approx(shares[1.0], rel=2e-3)  # borders round differently
+
+
 def test_a_given_similarity_is_taken_as_it_is():
     similarity = a_similarity()
     attached = attach(a_field(2_000), moved(a_splat(2_000), similarity), CLASSES, similarity=similarity)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from small_room import make_room
 
-from kfgs.cameras import Distortion
+from kfgs.cameras import Distortion, Similarity
 from kfgs.evaluation.color import score_views
 from kfgs.fields import FieldConfig
 from kfgs.formats import read_splats, write_splats
@@ -45,6 +45,21 @@ def test_a_small_field_already_resembles_unseen_views(fitted, scene):
     assert score_views(fitted.gaussians, scene).psnr.value > 15.5  # of six stamps; the mean colour scores 13.3
     assert [stage.name for stage in fitted.stages] == ["color"]
     assert not list((fitted.path.parent / "unfinished").glob("*"))
+
+
+def test_the_unit_of_the_world_does_not_matter(fitted, scene, tmp_path):
+    smaller = Similarity(0.05, torch.eye(3), torch.zeros(3))
+    small = dataclasses.replace(
+        scene,
+        cameras=[smaller.apply_to_camera(camera) for camera in scene.cameras],
+        points=smaller.apply(scene.points),
+    )
+    found = score_views(fit_color(small, tmp_path, CONFIG).gaussians, small, "train").psnr.value
+    assert found == pytest.approx(score_views(fitted.gaussians, scene, "train").psnr.value, abs=0.5)
+    cut = dataclasses.replace(small, cameras=[dataclasses.replace(c, near=0.2) for c in small.cameras])
+    quick = dataclasses.replace(CONFIG, field=dataclasses.replace(FIELD, steps=2))
+    keys = {fit_color(one, tmp_path, quick).stages[0].key for one in (small, cut)}
+    assert len(keys) == 2  # the near plane decides what is learned
 
 
 def test_the_splat_file_holds_the_field(fitted):

@@ -42,6 +42,28 @@ def test_a_second_model_is_mentioned(tmp_path: Path) -> None:
     assert any("holds other models too (1)" in note for note in load_scene(tmp_path).notes)
 
 
+def test_every_loader_gives_a_near_plane_to_suit_a_small_frame(tmp_path: Path) -> None:
+    write_model(tmp_path / "colmap/sparse/0", ["a.png", "b.png"])
+    _pictures(tmp_path / "colmap/images", ["a.png", "b.png"])
+    frames = []
+    for name, x in (("a.png", 0.0), ("b.png", 0.6)):
+        pose = [[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+        frames.append({"file_path": f"images/{name}", "transform_matrix": pose})
+    _pictures(tmp_path / "nerf/images", ["a.png", "b.png"])
+    lens = {"w": 64, "h": 48, "fl_x": 50, "fl_y": 50}
+    (tmp_path / "nerf/transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    for folder in ("colmap", "nerf"):
+        scene = load_scene(tmp_path / folder)
+        assert {camera.near for camera in scene.cameras} == {0.1 * scene.extent}
+        assert 0 < scene.extent < 1
+    assert load_scene(tmp_path / "nerf").cameras[0].near == pytest.approx(0.1 * 1.1 * 0.3)
+
+
+def test_real_rooms_keep_the_usual_near_plane(shared_data: Path) -> None:
+    for name in ("room_0", "fox"):
+        assert {camera.near for camera in load_scene(shared_data / name).cameras} == {0.2}
+
+
 def test_the_split_file_wins(tmp_path: Path) -> None:
     names = [f"rgb_{i}.png" for i in range(24)]
     write_model(tmp_path / "sparse/0", names)

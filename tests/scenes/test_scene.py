@@ -82,6 +82,22 @@ def test_a_pinhole_scene_is_undistorted_already(tmp_path: Path) -> None:
     assert scene.mask(0).shape == (48, 64)
 
 
+@pytest.mark.parametrize(("scale", "near"), [(1.0, 0.2), (0.1, 0.1 * 1.1 * 0.4), (1e-3, 0.1 * 1.1 * 4e-3)])
+def test_the_near_plane_follows_a_small_frame_whatever_the_split(tmp_path: Path, scale: float, near: float) -> None:
+    scene = _scene(tmp_path, positions=(0, 2 * scale, 7 * scale))  # all views: mean 3, farthest 7
+    assert {camera.near for camera in scene.cameras} == {0.2}  # a scene made by hand is left as it is
+    assert [camera.near for camera in scene.with_near().cameras] == pytest.approx([near] * 3)
+    if scale == 1:
+        assert scene.with_near().cameras[0].near == 0.2  # not a rounding away
+
+
+def test_the_near_plane_of_cameras_in_one_place(tmp_path: Path) -> None:
+    alone = _scene(tmp_path).select([0])  # the points' median distance is 3
+    scenes = [replace(alone, points=factor * alone.points) for factor in (10, 0.1, 0)]  # 0: every point in the camera
+    assert [scene.with_near().cameras[0].near for scene in scenes] == pytest.approx([0.2, 0.03, 0.2])
+    assert len(alone.select([]).with_near()) == 0
+
+
 def test_extent_is_of_the_training_cameras(tmp_path: Path) -> None:
     scene = _scene(tmp_path)  # training cameras at x = 0 and 2
     assert scene.extent == pytest.approx(1.1)

@@ -214,6 +214,19 @@ def _counting(function, **options):
     return torch.compile(function, fullgraph=True, backend=backend, **options), graphs
 
 
+def test_compiled_renderer_follows_the_near_plane_of_a_camera():
+    gaussians, camera = _scene()
+    depths = project(gaussians, camera).depths.sort().values
+    compiled, _ = _counting(lambda gaussians, camera: rasterize(gaussians, camera).map)
+    pictures = []
+    for k in (0, 10, 20):
+        there = replace(camera, near=0.2 if k == 0 else float((depths[k] + depths[k + 1]) / 2))
+        pictures.append(rasterize(gaussians, there).map)
+        torch.testing.assert_close(compiled(gaussians, there), pictures[-1], rtol=1e-6, atol=1e-7)
+    assert (pictures[0] - pictures[1]).abs().max() > 0.05
+    assert (pictures[1] - pictures[2]).abs().max() > 0.05
+
+
 def test_compiled_renderer_survives_a_growing_field():
     gaussians, camera = _scene()
     compiled, graphs = _counting(_loss)

@@ -131,6 +131,8 @@ def test_culled_at_and_before_the_near_plane(project):
     projected = project(_balls([[0.0, 0.0, z] for z in depths], scale=0.01), _straight())
     assert projected.index.tolist() == [4, 5]
     assert project(_balls([[0.0, 0.0, 0.3]]), _straight(), near=0.5).index.tolist() == []
+    assert project(_balls([[0.0, 0.0, 0.3]]), replace(_straight(), near=0.5)).index.tolist() == []
+    assert project(_balls([[0.0, 0.0, 0.3]]), replace(_straight(), near=0.5), near=0.1).index.tolist() == [0]
 
 
 def test_culled_where_too_transparent_to_show(project):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
@@ -35,14 +37,25 @@ def test_moved_scene_from_moved_camera_is_the_same_picture(seed):
     cloud, camera, similarity = a_cloud(), a_camera(), a_similarity(seed)
     before = rasterize(cloud, camera, engine="reference")
     moved = transform_gaussians(cloud, similarity)
-    near = 0.2 * similarity.scale  # world units, so it grows with the scene
-    after = rasterize(moved, similarity.apply_to_camera(camera), engine="reference", near=near)
+    after = rasterize(moved, similarity.apply_to_camera(camera), engine="reference")
     torch.testing.assert_close(after.map, before.map, atol=1e-9, rtol=0)
     torch.testing.assert_close(after.alpha, before.alpha, atol=1e-9, rtol=0)
     assert before.alpha.mean() > 0.3
     assert before.map.std() > 0.1
     stale = moved.replace(sh=cloud.sh)  # colours that did not turn are another picture
-    assert (rasterize(stale, similarity.apply_to_camera(camera), near=near).map - before.map).abs().max() > 0.05
+    assert (rasterize(stale, similarity.apply_to_camera(camera)).map - before.map).abs().max() > 0.05
+
+
+@pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
+def test_the_near_plane_cuts_the_same_gaussians_at_every_scale(scale):
+    cloud, camera = a_cloud(), replace(a_camera(), near=3.0)  # in the middle of the cloud
+    similarity = replace(a_similarity(), scale=scale)
+    moved = transform_gaussians(cloud, similarity)
+    before = rasterize(cloud, camera, engine="reference")
+    after = rasterize(moved, similarity.apply_to_camera(camera), engine="reference")
+    assert 0 < len(before.projected.index) < len(rasterize(cloud, a_camera()).projected.index)
+    assert after.projected.index.equal(before.projected.index)
+    torch.testing.assert_close(after.map, before.map, atol=1e-9, rtol=0)
 
 
 def test_covariances_turn_and_grow():
