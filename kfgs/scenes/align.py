@@ -13,13 +13,14 @@ import torch
 from ..cameras import Camera
 from ..cameras.similarity import Similarity, fit_similarity
 from ._pycolmap import quiet_pycolmap
+from .clouds import Array
 from .errors import SceneError
-from .frames import Array
 from .names import file_stem, some
 
 MAX_ERROR = 0.03  # of the cameras' extent: two SfM runs of one scene differ by well below a hundredth
 MAX_ANGLE = 15.0  # degrees between a camera's two orientations, after alignment
 MIN_INLIERS = 0.5  # share of the common cameras that must fit
+TRIPOD = 0.01  # cameras closer together than this share of the extent stand at one place
 SIGMAS = 4.0  # at the end, cameras farther off than this (by the median) are left out
 PAIRS = 5_000  # pairs of cameras tried when their centres alone say too little
 
@@ -94,15 +95,14 @@ def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
     names = [file_stem(a.name) for a, _ in pairs]
     A, B = (np.stack([_center(pair[k]) for pair in pairs]) for k in (0, 1))  # [V, 3]
     turns = np.stack([_rotation(b).T @ _rotation(a) for a, b in pairs])  # [V, 3, 3] source world to destination world
-    size = _extent(B)
-    if min(size / max(1.0, np.abs(B).max()), _extent(A) / max(1.0, np.abs(A).max())) < 1e-9:
+    sizes = _extents(B)
+    if min(sizes[0] / max(1.0, np.abs(B).max()), _extents(A)[0] / max(1.0, np.abs(A).max())) < 1e-9:
         raise SceneError(
             f"cameras: expected common cameras at different places, got {len(pairs)} at one ({some(names)}), from which "
             "no scale follows; give more views, or pass the similarity"
         )
-    found = [s for s in (_by_centers(A, B, size), *_by_orientations(A, B, turns, size)) if s is not None]
-    similarity, good = max((_refine(s, A, B, turns, size) for s in found), key=lambda result: int(result[1].sum()))
-    if good.sum() < max(2, MIN_INLIERS * len(pairs)):
+    similarity, good, size = _best_fit(A, B, turns, sizes)
+    if similarity is None or good.sum() < _least(A):
         raise SceneError(
             f"cameras: expected at least half of the {len(pairs)} common cameras to fit one similarity, got "
             f"{int(good.sum())}; check that the names mean the same pictures in both, or pass the similarity"
@@ -135,6 +135,24 @@ def common_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> list[tuple[C
 def _keys(src: Sequence[Camera], dst: Sequence[Camera], key: Any) -> tuple[dict[str, Camera], dict[str, Camera]] | None:
     tables = {key(camera): camera for camera in src}, {key(camera): camera for camera in dst}
     return tables if len(tables[0]) == len(src) and len(tables[1]) == len(dst) else None
+
+
+def _best_fit(A: Array, B: Array, turns: Array, sizes: list[float]) -> tuple[Similarity | None, Array, float]:
+    """The similarity that most cameras agree with, those cameras, and the first of the sizes with which half of them do."""
+    best: tuple[Similarity | None, Array, float] = (None, np.zeros(len(A), dtype=bool), sizes[0])
+    for size in sizes:
+        for start in (_by_centers(A, B, size), *_by_orientations(A, B, turns, size)):
+            if start is not None:
+                similarity, good = _refine(start, A, B, turns, size)
+                if best[0] is None or good.sum() > best[1].sum():
+                    best = similarity, good, size
+        if best[1].sum() >= _least(A):
+            break
+    return best
+
+
+def _least(A: Array) -> float:
+    return max(2, MIN_INLIERS * len(A))
 
 
 def _by_centers(A: Array, B: Array, size: float) -> Similarity | None:
@@ -229,9 +247,17 @@ def _similarity(scale: float, rotation: Array, translation: Array) -> Similarity
     return Similarity(float(scale), torch.from_numpy(np.array(rotation)), torch.from_numpy(np.array(translation)))
 
 
-def _extent(centers: Array) -> float:
-    """Twice the median distance from the median centre: wrong poses do not move it."""
-    return 2 * float(np.median(np.linalg.norm(centers - np.median(centers, axis=0), axis=1)))
+def _extents(centers: Array) -> list[float]:
+    """How large the cameras' place may be, likeliest first.
+
+    Twice the median distance from the median centre: wrong poses do not move it. Twice the upper quartile: it holds where
+    half of the cameras stand on one tripod, and comes first where the median says so. Twice the largest where all do.
+    """
+    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    median, upper, largest = (2 * float(np.quantile(distances, q)) for q in (0.5, 0.75, 1.0))
+    if upper <= TRIPOD * largest and median <= TRIPOD * largest:
+        return [largest]
+    return [upper, median] if median <= TRIPOD * upper else [median, upper]
 
 
 def _center(camera: Camera) -> Array:

@@ -7,35 +7,24 @@ runner-up behind. Distances count both ways, so that neither shrinking one cloud
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from .._check import check_shapes
 from ..cameras.similarity import Similarity
 from .align import Alignment
+from .close_fit import Cloud, Fit, fit_closely, orthonormal
+from .clouds import Array, bulk
 from .errors import SceneError
-from .frames import Array, bulk, median_spacing, nearest
 from .starts import Moves, improve_on_grid, principal_axes, spread_rotations, thin
 
 ROTATIONS = 576  # evenly over all rotations: about 16 degrees from any rotation to the nearest, in the middle
 SIZES = (0.75, 0.87, 1.0, 1.15, 1.33)  # around the ratio of the clouds' radii, which partial overlap distorts
 BASINS, FINALISTS = 8, 3  # starts that are refined, and those that are refined on all points
 COARSE, FINE, FULL = 300, 3_000, 10_000  # points of each cloud
-NEAR = 2.0  # a point fits when closer than so many spacings of the sparser cloud (thinned to FULL points)
 MIN_FIT = 0.6  # of the points, both ways (harmonic mean)
 MARGIN = 0.6  # of what the best leaves unfit, the runner-up must leave more than 1 / MARGIN times as much
-
-
-class _Fit(NamedTuple):
-    similarity: Similarity
-    quality: float  # harmonic mean of the two shares that fit
-    shares: tuple[float, float]  # of src points near dst, and of dst points near src
-    rms: float  # of the points that fit, world units of dst
 
 
 def align_clouds(
@@ -78,8 +67,8 @@ def align_clouds(
     size = float(np.linalg.norm(np.ptp(b, axis=0)))
     starts, fits = _starts(a, b, rng), []
     for count, reaches, kept in ((FINE, np.geomspace(4, 1, 20), FINALISTS), (FULL, np.geomspace(1, 0.5, 10), 2)):
-        x, y = _Cloud.of(a, count, rng), _Cloud.of(b, count, rng)
-        fits = sorted((_fit_closely(x, y, start, reaches) for start in starts), key=lambda fit: -fit.quality)
+        x, y = Cloud.of(a, count, rng), Cloud.of(b, count, rng)
+        fits = sorted((fit_closely(x, y, start, reaches) for start in starts), key=lambda fit: -fit.quality)
         starts = _different([fit.similarity for fit in fits], a.mean(0), size, kept)
     best = fits[0]
     runner_up = max((fit.quality for fit in fits if fit.similarity in starts[1:]), default=0.0)
@@ -95,7 +84,7 @@ def align_clouds(
     return Alignment(best.similarity, best.rms, size, inliers, len(x.points) + len(y.points), how, facts)
 
 
-def _check_fit(best: _Fit, runner_up: float) -> None:
+def _check_fit(best: Fit, runner_up: float) -> None:
     """Refuse a bad or an ambiguous fit."""
     if best.quality < MIN_FIT:
         raise SceneError(
@@ -125,7 +114,7 @@ def _starts(a: Array, b: Array, rng: np.random.Generator) -> list[Similarity]:
     order = np.argsort(-scores)[: 50 * BASINS]
     found = []
     for i in order:
-        R, s = _orthonormal(moves.rotations[i]), float(moves.scales[i]) * radii[1] / radii[0]
+        R, s = orthonormal(moves.rotations[i]), float(moves.scales[i]) * radii[1] / radii[0]
         t = centers[1] + radii[1] * moves.translations[i] - s * R @ centers[0]
         found.append(Similarity(s, torch.from_numpy(R), torch.from_numpy(t)))
     return _different(found, centers[0], 2 * radii[1], BASINS)
@@ -140,78 +129,8 @@ def _different(similarities: list[Similarity], center: Array, size: float, count
     return chosen
 
 
-class _Cloud(NamedTuple):
-    points: Array  # [n, 3]
-    normals: Array  # [n, 3]
-    tree: cKDTree
-    spacing: float
-
-    @staticmethod
-    def of(points: Array, count: int, rng: np.random.Generator) -> _Cloud:
-        points = thin(points, count, rng)
-        tree = cKDTree(points)
-        near = points[nearest(tree, points, k=min(12, len(points)))[1]]  # [n, k, 3]
-        near = near - near.mean(1, keepdims=True)
-        normals = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, 0]
-        return _Cloud(points, normals, tree, median_spacing(tree))
-
-
-def _fit_closely(a: _Cloud, b: _Cloud, start: Similarity, reaches: Array) -> _Fit:
-    """Least squares on distances to the other cloud's tangent planes, both ways, one step per reach.
-
-    Reaches are multiples of the distance within which a point fits.
-    """
-    R, s, t = start.rotation.numpy(), start.scale, start.translation.numpy()
-    fits = NEAR * max(a.spacing * s, b.spacing)
-    for reach in reaches * fits:
-        moved = s * a.points @ R.T + t
-        d, i = nearest(b.tree, moved)
-        e, j = nearest(a.tree, (b.points - t) @ R / s)
-        P = np.concatenate([moved, moved[j]])
-        Q = np.concatenate([b.points[i], b.points])
-        n = np.concatenate([b.normals[i], a.normals[j] @ R.T])
-        w = np.concatenate([_weight(d, reach) / len(d), _weight(e * s, reach) / len(e)])
-        center = P.mean(0)
-        A = np.concatenate([np.cross(P - center, n), n, ((P - center) * n).sum(1)[:, None]], axis=1)  # [., 7]
-        system = (A * w[:, None]).T @ A
-        damping = 1e-4 * np.diag(np.maximum(np.diag(system), 1e-12 * np.trace(system)))
-        x = np.linalg.solve(system + damping, (A * w[:, None]).T @ ((Q - P) * n).sum(1))
-        turn, factor = _rotation_vector(x[:3]), float(np.exp(np.clip(x[6], -0.1, 0.1)))
-        t = factor * turn @ (t - center) + center + x[3:6]
-        R, s = _orthonormal(turn @ R), s * factor
-    similarity = Similarity(s, torch.from_numpy(R), torch.from_numpy(t))
-    return _judge(a, b, similarity)
-
-
-def _judge(a: _Cloud, b: _Cloud, similarity: Similarity) -> _Fit:
-    d = nearest(b.tree, similarity.apply(torch.from_numpy(a.points)).numpy())[0]
-    e = nearest(a.tree, similarity.inverse().apply(torch.from_numpy(b.points)).numpy())[0] * similarity.scale
-    reach = NEAR * max(a.spacing * similarity.scale, b.spacing)
-    shares = float((d < reach).mean()), float((e < reach).mean())
-    quality = 2 * shares[0] * shares[1] / max(sum(shares), 1e-12)
-    near = np.concatenate([d[d < reach], e[e < reach]])
-    return _Fit(similarity, quality, shares, float(np.sqrt((near**2).mean())) if len(near) else float("inf"))
-
-
 def _differs(one: Similarity, other: Similarity, center: Array, size: float) -> bool:
     cosine = (float((one.rotation * other.rotation).sum()) - 1) / 2
     places = [similarity.apply(torch.from_numpy(center)[None])[0] for similarity in (one, other)]
     shift = float((places[0] - places[1]).norm())
     return cosine < np.cos(np.radians(10)) or abs(np.log(one.scale / other.scale)) > 0.1 or shift > 0.1 * size
-
-
-def _weight(distances: Array, reach: float) -> Array:
-    """Geman-McClure: 1 at 0, a quarter at `reach`, nothing far away."""
-    weight: Array = (reach**2 / (reach**2 + distances**2)) ** 2
-    return weight
-
-
-def _rotation_vector(vector: Array) -> Array:
-    matrix: Array = Rotation.from_rotvec(vector).as_matrix()
-    return matrix
-
-
-def _orthonormal(matrix: Array) -> Array:
-    U, _, Vt = np.linalg.svd(matrix)
-    turned: Array = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    return turned

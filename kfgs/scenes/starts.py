@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from .frames import Array, nearest
+from .clouds import Array, nearest
 
 GRID = 40  # cells a side of the lookup grid: 64,000 nearest points are found once, in a tenth of a second
 REACH = 2.6  # half a side of the grid, in radii of the cloud

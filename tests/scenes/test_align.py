@@ -143,3 +143,35 @@ def test_unrelated_poses_are_refused():
     others = [replace(c, name=f"view_{i}.png") for i, c in enumerate(some_cameras(20, seed=1))]
     with pytest.raises(SceneError, match="at least half of the 20 common cameras"):
         align_by_cameras(cameras, others)
+
+
+def test_shuffled_names_are_refused():
+    """The poses are those of the scene, each under another's name: no two cameras agree in orientation."""
+    cameras = some_cameras(18)
+    others = [replace(c, name=f"view_{(7 * i + 3) % 18}.png") for i, c in enumerate(moved(cameras, a_similarity()))]
+    with pytest.raises(SceneError, match="at least half of the 18 common cameras to fit one similarity, got"):
+        align_by_cameras(cameras, others)
+
+
+def test_two_names_swapped_are_refused():
+    cameras = some_cameras(2)
+    others = [replace(c, name=f"view_{1 - i}.png") for i, c in enumerate(moved(cameras, a_similarity()))]
+    with pytest.raises(SceneError, match="at least half of the 2 common cameras to fit one similarity, got 0"):
+        align_by_cameras(cameras, others)
+
+
+@pytest.mark.parametrize(("tripod", "elsewhere"), [(2, 1), (10, 8), (16, 4)])
+@pytest.mark.parametrize("jitter", [0.0, 1e-3])
+def test_most_cameras_on_one_tripod_leave_a_scale(tripod, elsewhere, jitter):
+    rng = np.random.default_rng(0)
+    centers = np.concatenate([0.3 + jitter * rng.normal(size=(tripod, 3)), rng.normal(size=(elsewhere, 3))])
+    cameras, true = some_cameras(centers=centers), a_similarity(7)
+    others = moved(cameras, true)
+    for i, camera in enumerate(others):
+        viewmat = camera.viewmat.clone()
+        viewmat[:3, 3] += torch.from_numpy(jitter * true.scale * rng.normal(size=3))
+        others[i] = replace(camera, viewmat=viewmat)
+    found = align_by_cameras(cameras, others)
+    assert found.inliers == tripod + elsewhere
+    assert_same(found.similarity, true, 1e-6 + 8 * jitter)
+    assert found.size > 0.5 * true.scale  # of the cameras elsewhere, not of the tripod

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from cases_clouds import surface
+from cases_clouds import room, surface
 
 from kfgs.cameras.similarity import Similarity
 from kfgs.scenes import frames_agree
@@ -32,6 +32,7 @@ def test_the_verdict_does_not_depend_on_the_unit(factor):
     "change",
     [
         similarity(scale=1.2),
+        similarity(shift=(0.1, 0.1, 0.1)),  # 2 % of the size for each wall: the shares near hardly notice
         similarity(shift=(0.6, 0.4, 0.3)),
         similarity(rotation=torch.diag(torch.tensor([-1.0, -1.0, 1.0]))),
         similarity(rotation=torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), shift=(3.0, 0.0, 0.0)),
@@ -53,9 +54,44 @@ def test_a_part_agrees_with_the_whole():
 def test_a_fog_around_a_scene_is_another_scene():
     generator = torch.Generator().manual_seed(1)
     fog = 3 * torch.randn(4_000, 3, generator=generator)
-    check = frames_agree(surface(4_000, 0), fog)
-    assert check.near[0] > 0.9  # every wall has fog near it
+    assert not frames_agree(surface(4_000, 0), fog).agree
+
+
+@pytest.mark.parametrize("count", [100, 300, 2_000])
+def test_few_points_agree_in_their_frame_and_in_no_other(count):
+    scene, few = room(6_000, 0), room(8_000, 1)[:count]
+    middle = scene.mean(0)
+    assert frames_agree(scene, few).agree
+    assert frames_agree(few, scene).agree
+    assert not frames_agree(scene, few * torch.tensor([-1.0, -1.0, 1.0]) + middle * torch.tensor([2.0, 2.0, 0.0])).agree
+    assert not frames_agree(scene, 1.05 * few).agree
+
+
+def test_unrelated_points_in_the_same_box_disagree():
+    for count in (300, 4_000):
+        generator = torch.Generator().manual_seed(3)
+        others = torch.rand(count, 3, generator=generator).double() * torch.tensor([4.0, 3.0, 2.0])
+        assert not frames_agree(room(6_000, 0), others).agree
+
+
+def test_five_per_cent_larger_is_another_frame_though_walls_stay_near_walls():
+    """About the corner where three walls meet: only the things between them move."""
+    scene, other = room(6_000, 0), room(8_000, 1)
+    check = frames_agree(scene, 1.05 * other)
+    assert max(check.near) > 0.8
+    assert check.drift > 0.03
     assert not check.agree
+    assert frames_agree(scene, other).drift < 0.003
+
+
+def test_walls_that_slide_along_themselves_say_nothing():
+    """Three planes through the origin: 5 % larger, they are the same planes."""
+    generator = torch.Generator().manual_seed(0)
+    corner = torch.rand(6_000, 3, generator=generator).double()
+    corner[torch.arange(6_000), torch.arange(6_000) % 3] = 0.0
+    check = frames_agree(corner[::2], 1.03 * corner[1::2])
+    assert check.agree
+    assert check.drift < 0.002
 
 
 def test_points_at_one_place_count_once():
