@@ -35,10 +35,12 @@ class FieldConfig:
     sh_rest_lr: float = 0.0025 / 20
     """Learning rate of the higher harmonics."""
     sh_degree_every: int = 1_000
-    """Colours start at degree 0, and gain one each so many steps; 0 = all from the start."""
+    """Colours gain one degree each so many steps, from the highest one that the start makes use of: 0 for a cloud of points,
+    its own for a loaded splat, which training must not first strip of what it holds. 0 = all from the start."""
     coarse: tuple[tuple[int, int], ...] = ()
     """Pairs (last step, divisor): up to that step pictures are compared at size // divisor, each pixel the mean of divisor
-    x divisor ones; the last steps, and all when empty, at full size. For targets of the cameras' own size."""
+    x divisor ones; the last steps, and all when empty, at full size. A divisor beyond a picture's smaller side counts as that
+    side. For targets of the cameras' own size."""
     adam_eps: float = 1e-15
     """Adam's epsilon: tiny, since gradients of a mean over all pixels are tiny."""
     render_scale: float | None = None
@@ -100,9 +102,9 @@ class FieldConfig:
         """By how much pictures are shrunk at a step (`coarse`)."""
         return next((divisor for last, divisor in self.coarse if step <= last), 1)
 
-    def sh_degree(self, step: int) -> int:
-        """Up to which degree colours are used at a step, if they have it."""
-        return step // self.sh_degree_every if self.sh_degree_every else 3
+    def sh_degree(self, step: int, start: int = 0) -> int:
+        """Up to which degree colours are used at a step, if they have it; `start` is the degree in use at the start."""
+        return start + step // self.sh_degree_every if self.sh_degree_every else 3
 
     @classmethod
     def paper(cls, **changes: Any) -> FieldConfig:
@@ -140,10 +142,13 @@ class FieldConfig:
         return replace(preset, **changes)
 
     def with_steps(self, steps: int) -> FieldConfig:
-        """The same schedule stretched or compressed to another number of steps; `densify_every` stays."""
+        """The same schedule stretched or compressed to another number of steps; `densify_every` stays.
+
+        Where pairs of `coarse` come to end at the same step, the last of them is kept.
+        """
         ratio = steps / self.steps
         names = ("densify_from", "densify_until", "reset_every", "sh_degree_every")
-        coarse = tuple((max(1, round(last * ratio)), divisor) for last, divisor in self.coarse)
+        coarse = tuple({max(1, round(last * ratio)): divisor for last, divisor in self.coarse}.items())
         scaled: dict[str, Any] = {name: round(getattr(self, name) * ratio) for name in names}
         return replace(self, steps=steps, coarse=coarse, **scaled)
 
@@ -159,5 +164,6 @@ def _check_coarse(coarse: tuple[tuple[int, int], ...]) -> None:
             raise ValueError(f"coarse: expected pairs (last step, divisor), got {pair!r}; give two whole numbers each")
         _check_count("coarse: last step", pair[0], 1)
         _check_count("coarse: divisor", pair[1], 1)
-    if list(coarse) != sorted(set(coarse)):
+    lasts = [last for last, _ in coarse]
+    if lasts != sorted(set(lasts)):
         raise ValueError(f"coarse: expected pairs in increasing order of their last step, got {coarse}; sort them")

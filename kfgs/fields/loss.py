@@ -34,10 +34,10 @@ def l1_loss(
 
     The mean of the absolute differences over pixels and channels: the paper writes a norm, its released script takes
     the mean, and the learning rates and the densification threshold of 3DGS are made for a mean. Pixels whose target is
-    NaN are not known and count nowhere.
+    NaN in any channel are not known and count nowhere.
     """
     height, width, channels = target.shape
-    known = ~target[..., 0].isnan()
+    known = _known(target)
     difference = torch.where(known[..., None], resize_map(rendered, (height, width)) - target, 0)
     return difference.abs().sum() / (known.sum() * channels).clamp_min(1)
 
@@ -46,7 +46,7 @@ def l1_loss(
 class ColorLoss:
     """What 3DGS trains colours with: (1 - ssim_weight) L1 + ssim_weight (1 - SSIM).
 
-    Pixels whose target is NaN are not known: they count neither in L1, nor does any SSIM window that holds one.
+    Pixels whose target is NaN in any channel are not known: they count neither in L1, nor does any SSIM window that holds one.
 
     Note:
         3DGS pads pictures with zeros for SSIM; here only windows that lie inside the picture count, as in
@@ -84,7 +84,7 @@ def mean_similarity(
         kornia's, except on the CPU where numba is installed: there the value and the gradient come from compiled code, which
         takes 5 ms instead of 37 (240x320, two threads). The compiled code has no gradient of the gradient.
     """
-    known = ~target[..., 0].isnan()
+    known = _known(target)
     counted = None
     if not bool(known.all()):
         picture, target = (torch.where(known[..., None], value, 0) for value in (picture, target))
@@ -96,6 +96,10 @@ def mean_similarity(
         return _CompiledSimilarity.apply(picture, target, counted)
     similarity = from_bchw(ssim(to_bchw(picture), to_bchw(target), SSIM_WINDOW, eps=0.0, padding="valid"))
     return similarity.mean() if counted is None else similarity[counted].mean()
+
+
+def _known(target: Tensor) -> Tensor:  # [H, W, D] -> [H, W] bool
+    return ~target.amax(dim=2).isnan()  # a NaN is above all; 9 times faster than isnan().any(dim=2) of 64 channels
 
 
 class _CompiledSimilarity(torch.autograd.Function):

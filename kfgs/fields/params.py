@@ -74,6 +74,13 @@ class GaussianParams:
         """Degree of the spherical harmonics; 0 where there are none."""
         return 0 if self.sh_rest is None else isqrt(self.sh_rest.shape[1] + 1) - 1
 
+    def used_sh_degree(self) -> int:
+        """Highest degree with a coefficient other than 0; 0 where only `sh0` says something."""
+        if self.sh_rest is None:
+            return 0
+        filled = self.sh_rest.detach().ne(0).any(dim=2).any(dim=0)  # [K - 1]
+        return isqrt(int(filled.nonzero().max()) + 1) if bool(filled.any()) else 0
+
     def to_tensors(self) -> dict[str, Tensor]:
         """The raw tensors that there are, by name, in a fixed order."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
@@ -118,7 +125,9 @@ class GaussianParams:
     def from_gaussians(cls, gaussians: Gaussians) -> GaussianParams:
         """The raw values of a cloud with features or colours: the inverse of `activated`, to train on from there.
 
-        Features are taken where a cloud has both.
+        Features are taken where a cloud has both. Scales of 0 become the smallest normal number and opacities keep eps away
+        from 0 and 1, since logarithm and logit must be finite. `fit_field` goes on with the harmonics that the cloud makes
+        use of (`used_sh_degree`), not from degree 0 as for points; `FieldConfig` says how further ones come.
 
         Raises:
             ValueError: if the Gaussians carry neither.
@@ -127,14 +136,14 @@ class GaussianParams:
             raise ValueError(
                 "gaussians: expected features [N, D] or sh [N, K, 3], got neither; give them some with replace()"
             )
-        tiny = torch.finfo(gaussians.opacities.dtype).eps  # a logit stays finite
+        scales, opacities = gaussians.scales.detach(), gaussians.opacities.detach()
         sh = None if gaussians.features is not None else gaussians.sh
         higher = sh is not None and sh.shape[1] > 1
         return cls(
             means=gaussians.means.detach().clone(),
             quats=gaussians.quats.detach().clone(),
-            log_scales=gaussians.scales.detach().log(),
-            logit_opacities=torch.logit(gaussians.opacities.detach(), eps=tiny),
+            log_scales=scales.clamp_min(torch.finfo(scales.dtype).tiny).log(),
+            logit_opacities=torch.logit(opacities, eps=torch.finfo(opacities.dtype).eps),
             features=None if gaussians.features is None else gaussians.features.detach().clone(),
             sh0=None if sh is None else sh[:, 0].detach().clone(),
             sh_rest=sh[:, 1:].detach().clone() if sh is not None and higher else None,
@@ -200,7 +209,8 @@ class GaussianParams:
         if max_points is not None and len(points) > max_points:
             check_range("max_points", max_points, 2)
             generator = generator or torch.Generator().manual_seed(0)
-            chosen = torch.randperm(len(points), generator=generator)[:max_points].sort().values.to(points.device)
+            order = torch.randperm(len(points), generator=generator, device=generator.device)
+            chosen = order[:max_points].sort().values.to(points.device)
             points, colors = points[chosen], None if colors is None else colors[chosen]
         n = len(points)
         return cls(

@@ -38,6 +38,7 @@ class Trainer:
         self._cameras, self._targets, self._loss = cameras, targets, loss
         self._config, self._extent, self._generator = config, extent, generator
         self._render_cameras: dict[tuple[int, int], Camera] = {}
+        self._sh_start = params.used_sh_degree()  # of the start, so a resumed fit finds the same: no part of a snapshot
         self.optimizer = FieldOptimizer(params, config, extent=extent)
         self.statistics = GradientStatistics.zeros(params)
         self.history: list[dict[str, Any]] = []
@@ -64,7 +65,7 @@ class Trainer:
         params = self.optimizer.params
         target = self._target(view)
         camera = self._camera(view, target)
-        gaussians = params.activated(self._config.sh_degree(self.step))
+        gaussians = params.activated(self._config.sh_degree(self.step, self._sh_start))
         rendering = rasterize(gaussians, camera, engine=self._config.engine)
         means2d = rendering.projected.means2d
         if means2d.requires_grad:
@@ -124,7 +125,7 @@ class Trainer:
                 "start from GaussianParams.from_points(points, D)"
             )
         target = target.to(self.optimizer.params.means)
-        divisor = self._config.divisor(self.step)
+        divisor = self._divisor(view)
         if divisor > 1:
             if tuple(target.shape[:2]) != self._cameras[view].size:
                 raise ValueError(
@@ -134,9 +135,12 @@ class Trainer:
             target = shrink_map(target, divisor)
         return target
 
+    def _divisor(self, view: int) -> int:
+        return min(self._config.divisor(self.step), *self._cameras[view].size)
+
     def _camera(self, view: int, target: Tensor) -> Camera:
         """The camera to render with; each is made once, since checking a camera takes longer than using it."""
-        divisor = self._config.divisor(self.step)
+        divisor = self._divisor(view)
         if (view, divisor) not in self._render_cameras:
             camera = self._cameras[view].to(self.optimizer.params.means)
             if self._config.render_scale is not None:

@@ -27,6 +27,9 @@ SHORT = FieldConfig(
 )
 
 
+DEGREES = (slice(0, 3), slice(3, 8), slice(8, 15))  # of sh_rest
+
+
 def look_at_origin(angle):
     """A camera on a circle of radius 4 around the y axis, looking at the origin."""
     c, s = torch.cos(torch.tensor(angle)), torch.sin(torch.tensor(angle))
@@ -160,6 +163,65 @@ def test_an_existing_splat_can_be_trained_on():
     scratch = fit_field(start(), cameras, targets, config, extent=2.0)
     assert fit.history[0]["loss"] < 0.1 * scratch.history[0]["loss"]  # it was right already
     assert fit.params.sh_degree == 1
+
+
+def shiny(n=14, degree=3, filled=3):
+    """A splat of harmonics up to a degree, of which those above `filled` are 0."""
+    sh = torch.zeros(n, (degree + 1) ** 2, 3)
+    sh[:, : (filled + 1) ** 2] = torch.randn(n, (filled + 1) ** 2, 3, generator=torch.Generator().manual_seed(5)) * 0.3
+    return GaussianParams.from_gaussians(blobs(n).replace(sh=sh))
+
+
+def test_a_perfect_splat_stays_perfect():
+    """Its own renderings leave nothing to learn, as long as all its harmonics are used from the first step."""
+    begin, cameras = shiny(), [look_at_origin(0.5 * i) for i in range(3)]
+    targets = [rasterize(begin.activated(), camera).map for camera in cameras]
+    config = replace(SHORT, steps=30, sh_degree_every=1_000, coarse=(), densify_from=100, reset_every=0)
+    fit = fit_field(begin, cameras, targets, config, extent=2.0, loss=ColorLoss(0.0))
+    assert [row["loss"] for row in fit.history] == [0.0, 0.0, 0.0]
+    assert same(fit.params, begin)
+    without = [rasterize(begin.activated(0), camera).map for camera in cameras]
+    assert min(float((a - b).abs().mean()) for a, b in zip(targets, without, strict=True)) > 0.01
+
+
+def test_degrees_start_where_the_splat_is_and_go_on():
+    cameras, targets = scene(3)
+    begin, moved = shiny(filled=1), []
+    for steps in (19, 20, 39, 40):
+        config = replace(SHORT, steps=steps, densify_from=100, coarse=())
+        rest = fit_field(begin, cameras, targets, config, extent=2.0).params.sh_rest
+        moved.append([not torch.equal(rest[:, part], begin.sh_rest[:, part]) for part in DEGREES])
+    assert moved == [[True, False, False], [True, True, False], [True, True, False], [True, True, True]]
+
+
+@pytest.mark.parametrize("stop_at", [10, 30])
+def test_a_resumed_fit_of_a_splat_uses_the_same_degrees(tmp_path, stop_at):
+    """At step 20 training has filled degree 2, which must not count as the start's."""
+    cameras, targets = scene(3)
+    begin, path = shiny(filled=1), tmp_path / "fit.safetensors"
+    config = replace(SHORT, steps=40, checkpoint_every=5)
+    whole = fit_field(begin, cameras, targets, config, extent=2.0)
+
+    def interrupt(row):
+        if row["step"] == stop_at:
+            raise StopHereError
+
+    with pytest.raises(StopHereError):
+        fit_field(begin, cameras, targets, config, extent=2.0, callback=interrupt, checkpoint=path)
+    assert same(fit_field(begin, cameras, targets, config, extent=2.0, checkpoint=path).params, whole.params)
+
+
+def test_a_divisor_larger_than_the_picture_leaves_one_row():
+    cameras, targets = scene(2)
+    sizes = []
+
+    def recorded(rendered, alpha, target):
+        sizes.append((tuple(rendered.shape), tuple(target.shape)))
+        return ColorLoss()(rendered, alpha, target)
+
+    config = replace(SHORT, steps=2, coarse=((1, 100),))
+    fit_field(start(), cameras, targets, config, extent=2.0, loss=recorded)
+    assert sizes == [((1, 1, 3), (1, 1, 3)), ((24, 32, 3), (24, 32, 3))]
 
 
 def test_unknown_pixels_teach_nothing():

@@ -59,6 +59,17 @@ def test_pictures_start_small_on_schedule():
     assert FieldConfig(coarse=[[30, 4], [60, 2]]).coarse == config.coarse  # as JSON has it
 
 
+def test_degrees_go_on_from_that_of_the_start():
+    assert [FieldConfig().sh_degree(step, 2) for step in (1, 999, 1_000)] == [2, 2, 3]
+
+
+def test_a_very_short_schedule_keeps_one_pair_per_step():
+    config = FieldConfig(steps=100, coarse=((50, 4), (90, 2)))
+    assert config.with_steps(1).coarse == ((1, 2),)
+    assert config.with_steps(2).coarse == ((1, 4), (2, 2))
+    assert FieldConfig(steps=100, coarse=((10, 8), (20, 4), (90, 2))).with_steps(5).coarse == ((1, 4), (4, 2))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -67,6 +78,7 @@ def test_pictures_start_small_on_schedule():
         ({"coarse": ((10, 0),)}, "coarse: divisor: expected a whole number of at least 1, got 0"),
         ({"coarse": ((10, 2, 3),)}, r"coarse: expected pairs \(last step, divisor\), got \(10, 2, 3\); give two"),
         ({"coarse": ((20, 2), (10, 1))}, "coarse: expected pairs in increasing order .* sort them"),
+        ({"coarse": ((10, 2), (10, 4))}, "coarse: expected pairs in increasing order .* sort them"),
         ({"coarse": ((10, 2),), "render_scale": 2.0}, r"coarse: expected \(\) with render_scale = 2.0"),
     ],
 )

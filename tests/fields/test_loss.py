@@ -48,6 +48,15 @@ def test_windows_with_an_unknown_pixel_do_not_count(path):
     assert float(mean_similarity(wild, b)) == pytest.approx(windows[counted].mean(), abs=1e-12)
 
 
+@pytest.mark.parametrize("channel", [0, 1, 2])
+def test_a_pixel_unknown_in_one_channel_is_unknown(path, channel):
+    a, b = pictures()
+    b[3, 4, channel], b[20:, 25:, channel] = torch.nan, torch.nan
+    whole = torch.where(b.isnan().any(dim=2, keepdim=True), torch.nan, b)
+    for measure in (mean_similarity, lambda x, y: l1_loss(x, x[..., 0], y)):
+        assert 0 < float(measure(a, b)) == float(measure(a, whole))
+
+
 def test_gradient_of_the_similarity_is_that_of_finite_differences(path):
     a, b = pictures(13, 14)
     assert torch.autograd.gradcheck(lambda x: mean_similarity(x, b), a.clone().requires_grad_())

@@ -130,6 +130,27 @@ def test_activation_and_its_inverse():
         GaussianParams.from_gaussians(gaussians.replace(features=None))
 
 
+def test_flat_gaussians_have_finite_logarithms():
+    scales = torch.tensor([[0.1, 0.0, 0.2], [0.0, 0.0, 1e-20]])
+    gaussians = Gaussians(torch.zeros(2, 3), torch.ones(2, 4), scales, torch.full((2,), 0.5), sh=torch.zeros(2, 1, 3))
+    params = GaussianParams.from_gaussians(gaussians)
+    assert torch.isfinite(params.log_scales).all()
+    torch.testing.assert_close(params.activated().scales, scales, rtol=1e-5, atol=2e-38)
+
+
+def test_the_degree_in_use_is_the_highest_that_is_not_all_zero():
+    params = GaussianParams.from_points(cloud(10), colors=torch.rand(10, 3), sh_degree=3)
+    found = [params.used_sh_degree()]
+    for row in (0, 2, 3, 7, 8, 14):
+        params.sh_rest.zero_()
+        params.sh_rest[4, row, 1] = -1e-3
+        found.append(params.used_sh_degree())
+    assert found == [0, 1, 1, 2, 2, 3, 3]
+    assert GaussianParams.from_points(cloud(10), 3).used_sh_degree() == 0
+    empty = params.map(lambda value: value[:0])
+    assert empty.used_sh_degree() == 0
+
+
 def test_tensors_round_trip_and_missing_name():
     params = GaussianParams.from_points(cloud(10), 3)
     again = GaussianParams.from_tensors(params.to_tensors())

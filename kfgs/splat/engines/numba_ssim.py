@@ -90,13 +90,8 @@ def compare_band(
     rows, length = picture.shape[0] - 10, picture.shape[1]
     across = length - 10 * channels
     w = (window[0], window[1], window[2], window[3], window[4], window[5])
-    v_a, v_b, v_aa, v_bb, v_ab = (
-        np.empty(length, window.dtype),
-        np.empty(length, window.dtype),
-        np.empty(length, window.dtype),
-        np.empty(length, window.dtype),
-        np.empty(length, window.dtype),
-    )
+    v_a, v_b = np.empty(length, window.dtype), np.empty(length, window.dtype)
+    v_aa, v_bb, v_ab = np.empty(length, window.dtype), np.empty(length, window.dtype), np.empty(length, window.dtype)
     found = np.empty(across, window.dtype)
     one, two = window.dtype.type(1), window.dtype.type(2)
     total = 0.0
