@@ -11,6 +11,7 @@ from .._check import check_range, check_shapes
 from .camera import Camera
 
 ROTATION_TOLERANCE = 1e-3  # as Camera asks of its viewmat: matrices from text files carry few digits
+LAST_ROW_TOLERANCE = 1e-5  # a float32 matrix inverse leaves 1e-7 there
 STRAIGHT = 1e-6  # points whose second spread is below this share of the first lie on a line
 
 
@@ -19,7 +20,7 @@ class Similarity:
     """x' = scale * R x + t: a rotation, one factor for all axes, and a shift.
 
     **Convention**: points are columns; values are float64 on the CPU, whatever the points are. The rotation is stored as
-    the exact rotation nearest to the matrix given.
+    the exact rotation nearest to the matrix given. Both tensors are copies: changing what was passed changes nothing here.
 
     Raises:
         ValueError: if the scale is not positive, a number is not finite, or the matrix is not a rotation.
@@ -41,7 +42,7 @@ class Similarity:
             raise ValueError(f"translation: expected finite numbers, got {self.translation.tolist()}; check the fit")
         object.__setattr__(self, "scale", float(self.scale))
         object.__setattr__(self, "rotation", exact_rotation("rotation", self.rotation))
-        object.__setattr__(self, "translation", self.translation.detach().double().cpu())
+        object.__setattr__(self, "translation", self.translation.detach().double().cpu().clone())
 
     @staticmethod
     def identity() -> Similarity:
@@ -53,11 +54,12 @@ class Similarity:
         """Read scale, rotation and translation from [[s R, t], [0, 1]].
 
         Raises:
-            ValueError: if the last row is not 0 0 0 1, or the rest shears, mirrors or scales the axes differently.
+            ValueError: if the last row is not 0 0 0 1 up to the rounding of float32 (1e-5), or the rest shears, mirrors or
+                scales the axes differently.
         """
         check_shapes(("matrix", matrix, "4 4"))
         matrix = matrix.detach().double().cpu()
-        if matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
+        if not (matrix[3] - matrix.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().max() <= LAST_ROW_TOLERANCE:  # NaN fails
             raise ValueError(f"matrix: expected the last row 0 0 0 1, got {matrix[3].tolist()}; pass points as columns")
         determinant = float(torch.linalg.det(matrix[:3, :3]))
         if not determinant > 0:
@@ -181,4 +183,4 @@ def exact_rotation(name: str, matrix: Tensor) -> Tensor:  # [3, 3] -> [3, 3] flo
     if torch.linalg.det(M) < 0:
         raise ValueError(f"{name}: expected a rotation, got a reflection (determinant -1); check the axes' handedness")
     U, _, Vh = torch.linalg.svd(M)
-    return M if error < 1e-14 else U @ Vh
+    return M.clone() if error < 1e-14 else U @ Vh

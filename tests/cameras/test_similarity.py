@@ -143,3 +143,27 @@ def test_mirrored_points_get_the_best_rotation():
 def test_wrong_input_is_named(build, message):
     with pytest.raises(ValueError, match=message):
         build()
+
+
+def test_numbers_are_copies():
+    """float64 tensors on the CPU need no conversion, so nothing else would stop them from being shared."""
+    R, t = torch.eye(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
+    a = Similarity(1.0, R, t)
+    matrix = a.matrix()
+    t += 5
+    R[0, 0] = -1
+    assert a.matrix().equal(matrix)
+    b = Similarity.from_matrix(matrix)
+    matrix.zero_()
+    assert b.matrix().equal(a.matrix())
+
+
+def test_a_matrix_inverted_in_float32_is_read():
+    matrix = a_similarity(2).matrix()
+    rounded = matrix.clone()
+    rounded[3] = torch.tensor([1e-8, -2e-7, 0, 1.0000001])
+    close(Similarity.from_matrix(rounded), Similarity.from_matrix(matrix))
+    for row in ([0, 0, 0, 1.001], [0, 1e-3, 0, 1], [0, 0, torch.nan, 1]):
+        rounded[3] = torch.tensor(row)
+        with pytest.raises(ValueError, match="matrix: expected the last row 0 0 0 1"):
+            Similarity.from_matrix(rounded)
