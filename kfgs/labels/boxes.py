@@ -57,7 +57,8 @@ class OrientedBox:
 
         Each start is turned about one of its axes after another to the rectangle of least area around the points'
         shadow along that axis (an edge of the hull lies on it), until it turns no more. This finds no guaranteed least
-        volume, but never more than that of the start. The longest edge comes first.
+        volume, but never more than that of the start. The longest edge comes first. `contains` is true of every one of
+        the points.
 
         Raises:
             ValueError: if there is no point, or one is not finite.
@@ -74,9 +75,10 @@ class OrientedBox:
         axes = axes[np.argsort(-np.ptp(shell @ axes.T, axis=0), kind="stable")]
         axes[2] *= np.sign(np.linalg.det(axes))
         local = shell @ axes.T
-        low, high = local.min(axis=0), local.max(axis=0)
-        center = middle + (low + high) / 2 @ axes
-        return cls(*(torch.from_numpy(part) for part in (center, axes, (high - low) / 2)))
+        center = middle + (local.min(axis=0) + local.max(axis=0)) / 2 @ axes
+        place, rows = torch.from_numpy(center), torch.from_numpy(axes)
+        half = _local(points.detach().cpu().double(), place, rows).abs().amax(dim=0)  # so that `contains` says yes
+        return cls(place, rows, half)
 
     @property
     def volume(self) -> float:
@@ -93,11 +95,17 @@ class OrientedBox:
         """Which points lie inside or on the faces, in float64."""
         check_shapes(("points", points, "N 3"))
         center, axes, half = (part.to(points.device, torch.float64) for part in (self.center, self.axes, self.half))
-        return (((points.double() - center) @ axes.T).abs() <= half).all(dim=1)
+        return (_local(points.double(), center, axes).abs() <= half).all(dim=1)
 
     def to_json(self) -> dict[str, Any]:
         """Plain lists: center, axes (rows) and half edges."""
         return {name: getattr(self, name).tolist() for name in ("center", "axes", "half")}
+
+
+def _local(points: Tensor, center: Tensor, axes: Tensor) -> Tensor:  # [N, 3], [3], [3, 3] -> [N, 3]
+    """Coordinates along the axes, from the centre; a matrix product would round by the number of points and the device."""
+    x, y, z = (points - center).unbind(dim=1)
+    return torch.stack([x * axis[0] + y * axis[1] + z * axis[2] for axis in axes], dim=1)
 
 
 def _shell(cloud: Array) -> Array:
