@@ -16,7 +16,7 @@ from .color import parse_color
 from .components import component_distance, component_numbers, components, select_near
 from .edit import extract, recolor, remove
 from .edits import Duplicate, Edit, EditList, Extract, Insert, Move, Opacity, Recolor, Remove, Turn, join
-from .names import class_index
+from .names import class_index, class_indices
 from .relevancy import relevancy, select_by_similarity
 from .segment import label_pixels, nearest_codeword
 from .selection import Selection, select_by_label, select_in_box, select_in_sphere, select_where
@@ -61,6 +61,7 @@ __all__ = [
     "answers",
     "average_views",
     "class_index",
+    "class_indices",
     "classify",
     "component_distance",
     "component_numbers",

@@ -1,32 +1,89 @@
-"""From a class name to its label, with a helpful refusal."""
+"""From a class name to its labels, with a helpful refusal."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .._check import check_whole
 
 SHOWN = 20  # names listed in a message
 
 
 def class_index(name: str, names: Sequence[str]) -> int:
-    """The label of a class: its place in `names`.
+    """The label of a class: its place in `names`, found as `class_indices` does.
 
     Raises:
-        ValueError: if there is no such class; the message offers the nearest names, whatever their case.
+        ValueError: if there is no such class (the message offers the nearest names), or several labels have that name.
 
     Example:
         >>> class_index("chair", ["wall", "chair"])
         1
     """
-    if name in names:
-        return list(names).index(name)
+    found = class_indices(name, names)
+    if len(found) > 1:
+        raise ValueError(
+            f"class: expected one class called {name!r}, got {len(found)} (labels {', '.join(map(str, found))}); "
+            "rename all but one, or ask for one by its index"
+        )
+    return found[0]
+
+
+def class_indices(name: str, names: Sequence[str]) -> tuple[int, ...]:
+    """The labels of a class, ascending: classes are the same when their names are, so there may be several.
+
+    A name is looked up exactly, then whatever its case; it must then fit names of one spelling only.
+
+    Raises:
+        ValueError: if there is no such class; the message offers the nearest names.
+
+    Example:
+        >>> class_indices("chair", ["chair", "wall", "chair"]), class_indices("Wall", ["chair", "wall"])
+        ((0, 2), (1,))
+    """
+    folded = {one for one in names if one.casefold() == name.casefold()}
+    spelled = name if name in names else folded.pop() if len(folded) == 1 else None
+    if spelled is not None:
+        return tuple(index for index, one in enumerate(names) if one == spelled)
     if not names:
         raise ValueError(
             f"class: expected class names to look {name!r} up in, got none; pass the names or use an index"
         )
     lower = {one.lower(): one for one in names}
-    near = [lower[match] for match in difflib.get_close_matches(name.lower(), lower, n=3, cutoff=0.6)]
-    near += [one for one in names if name and name.lower() in one.lower() and one not in near][:3]
+    near = sorted(folded)
+    near += [lower[m] for m in difflib.get_close_matches(name.lower(), lower, 3) if lower[m] not in near]
+    near += [one for one in dict.fromkeys(names) if name and name.lower() in one.lower() and one not in near][:3]
     listed = ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
     hint = f"did you mean {' or '.join(map(repr, near))}?" if near else "add its embedding to the classes"
     raise ValueError(f"class: expected one of {listed}, got {name!r}; {hint}")
+
+
+def class_of(argument: str, value: Any) -> str | int:
+    """A class as it is asked for: a name, or an index, -1 for none; `argument` is what an error speaks of.
+
+    Raises:
+        ValueError: if it is neither, or less than -1.
+    """
+    plain = value.tolist() if hasattr(value, "tolist") else value  # numpy's and torch's own numbers and strings
+    if isinstance(plain, str):
+        return plain
+    check_whole(argument, plain, -1, 2**31 - 1)
+    return int(plain)
+
+
+def labelled(
+    labels: Tensor,  # [N] int64
+    asked: Sequence[str | int],
+    classes: Sequence[str],
+) -> Tensor:  # [N] bool
+    """Which labels are of one of the classes asked for, by index or by name (see `class_indices`).
+
+    Raises:
+        ValueError: if a name is unknown.
+    """
+    wanted = [index for one in asked for index in (class_indices(one, classes) if isinstance(one, str) else (one,))]
+    return torch.isin(labels, torch.tensor(wanted, dtype=torch.int64, device=labels.device))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,7 +13,7 @@ from .._check import check_range, check_shapes
 from ..gaussians import Gaussians
 from ._rows import check_finite
 from .boxes import OrientedBox
-from .names import class_index
+from .names import class_of, labelled
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,18 +112,21 @@ def select_by_label(
 
     Args:
         gaussians: with labels.
-        label: a class index, -1 (none), a class name, or several of them.
+        label: a class index, -1 (none), a class name, or several of them. A name is looked up exactly, then whatever its
+            case; where several classes have it, all of them are meant.
         classes: the names of the classes, in label order; needed for names.
         scores: what each label is worth; 1 where selected and 0 elsewhere when not given.
 
     Raises:
-        ValueError: if the Gaussians carry no labels, or a name is unknown (the message offers near ones).
+        ValueError: if the Gaussians carry no labels, a name is unknown (the message offers near ones), or a label is no
+            whole number from -1.
     """
     if gaussians.labels is None:
         raise ValueError("gaussians.labels: expected labels [N], got None; label them first, with classify or vote")
-    asked = [label] if isinstance(label, int | str) else list(label)
-    wanted = [class_index(one, classes) if isinstance(one, str) else int(one) for one in asked]
-    mask = torch.isin(gaussians.labels, torch.tensor(wanted, dtype=torch.int64, device=gaussians.labels.device))
+    plain: Any = label.tolist() if hasattr(label, "tolist") else label  # numpy's and torch's own numbers
+    several = isinstance(plain, Iterable) and not isinstance(plain, str)
+    asked = [class_of("label", one) for one in (plain if several else [plain])]
+    mask = labelled(gaussians.labels, asked, classes)
     how = "label " + ", ".join(str(one) for one in asked)
     if scores is None:
         return select_where(mask, how)

@@ -18,7 +18,7 @@ from .._check import check_range, check_whole
 from ..gaussians import Gaussians
 from ._plain import NESTED, checked_object, members_of, number_of, numbers_of, quaternion_of, rotation_matrix
 from .components import component_numbers
-from .names import class_index
+from .names import class_of, labelled
 
 
 class _Cloud(NamedTuple):
@@ -108,13 +108,12 @@ class OfClass(Where):
     name: str | int
     """A name, looked up exactly, then whatever its case; or an index, -1 for those without a label.
 
-    An unknown name is an error; an index that no Gaussian carries selects nothing.
+    Where several classes have that name, all of them are meant. An unknown name is an error; an index that no Gaussian
+    carries selects nothing.
     """
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str):
-            check_whole("name", self.name, -1, 2**31 - 1)
-            object.__setattr__(self, "name", int(self.name))
+        object.__setattr__(self, "name", class_of("name", self.name))
 
     def _ask(self, cloud: _Cloud) -> Tensor:  # [N] bool
         if cloud.gaussians.labels is None:
@@ -122,7 +121,7 @@ class OfClass(Where):
                 f"gaussians.labels: expected labels to find class {self.name!r} by, got None; attach a semantic field "
                 "first, or select by a box or a sphere"
             )
-        return cloud.gaussians.labels == (self.name if isinstance(self.name, int) else _index(self.name, cloud.classes))
+        return labelled(cloud.gaussians.labels, (self.name,), cloud.classes)
 
 
 @dataclass(frozen=True)
@@ -311,11 +310,6 @@ def _check_where(name: str, value: Any) -> None:
 
 def _parts(kind: type[Both] | type[Either], where: Where) -> tuple[Where, ...]:
     return where.parts if isinstance(where, kind) else (where,)  # a & b & c is one Both of three
-
-
-def _index(name: str, classes: Sequence[str]) -> int:
-    same = [i for i, one in enumerate(classes) if one.casefold() == name.casefold()]
-    return same[0] if name not in classes and len(same) == 1 else class_index(name, classes)
 
 
 def _plain(value: Any) -> Any:

@@ -1,19 +1,38 @@
 import pytest
 
-from kfgs.labels import class_index
+from kfgs.labels import class_index, class_indices
 
 NAMES = ["wall", "Window blind", "chair", "armchair"]
 
 
 def test_a_name_is_its_place():
     assert [class_index(name, NAMES) for name in NAMES] == [0, 1, 2, 3]
+    assert [class_indices(name, NAMES) for name in NAMES] == [(0,), (1,), (2,), (3,)]
+
+
+def test_a_name_in_another_case():
+    assert class_index("window BLIND", NAMES) == 1
+    assert class_indices("chair", ["Chair", "chair", "CHAIR"]) == (1,)  # its own case wins
+    with pytest.raises(ValueError, match="got 'chAir'; did you mean 'CHAIR' or 'Chair' or 'chair'"):
+        class_indices("chAir", ["Chair", "chair", "CHAIR"])
+
+
+def test_several_labels_of_one_name():
+    names = ["chair", "wall", "chair", "Chair"]
+    assert class_indices("chair", names) == (0, 2)
+    assert class_indices("WALL", names) == (1,)
+    assert class_indices("CHAIR", ["Chair", "wall", "Chair"]) == (0, 2)
+    with pytest.raises(
+        ValueError, match=r"class: expected one class called 'chair', got 2 \(labels 0, 2\); rename all"
+    ):
+        class_index("chair", names)
 
 
 @pytest.mark.parametrize(
     ("name", "near"),
     [
         ("chiar", "did you mean 'chair'"),
-        ("CHAIR", "did you mean 'chair' or 'armchair'"),
+        ("chairs", "did you mean 'chair' or 'armchair'"),
         ("window blinds", "did you mean 'Window blind'"),
         ("blind", "did you mean 'Window blind'"),
         ("zebra", "add its embedding to the classes"),

@@ -1,6 +1,7 @@
 import math
 import operator
 
+import numpy as np
 import pytest
 import torch
 
@@ -89,6 +90,10 @@ def test_by_label_index_name_or_several():
     assert select_by_label(gaussians, ["lamp", 0], names).indices.tolist() == [0, 3]
     assert select_by_label(gaussians, -1).indices.tolist() == [2]
     assert len(select_by_label(gaussians, [])) == 0
+    assert select_by_label(gaussians, "CHAIR", names).indices.tolist() == [1, 4]
+    assert select_by_label(gaussians, "chair", ("wall", "chair", "chair")).indices.tolist() == [1, 3, 4]
+    for one in (np.int64(1), torch.tensor(1), np.array([1]), [torch.tensor(1)], {1}):
+        assert select_by_label(gaussians, one).indices.tolist() == [1, 4]
     scores = torch.linspace(0, 1, 5)
     assert select_by_label(gaussians, 1, scores=scores).scores.equal(scores)
 
@@ -117,6 +122,11 @@ def test_wrong_input_is_named():
         Selection(torch.ones(2, dtype=torch.bool), torch.tensor([0.0, math.nan]))
     with pytest.raises(ValueError, match="class: expected one of wall, chair, got 'chiar'; did you mean 'chair'?"):
         select_by_label(gaussians, "chiar", ("wall", "chair"))
+    for wrong in (1.5, [1, 2.0], True, None):
+        with pytest.raises(ValueError, match="label: expected a whole number, got .*; pass an int"):
+            select_by_label(gaussians, wrong)
+    with pytest.raises(ValueError, match=r"label: expected a number in \[-1, .*got -2"):
+        select_by_label(gaussians, -2)
     with pytest.raises(ValueError, match="gaussians.labels: expected labels"):
         select_by_label(gaussians.replace(labels=None), 1)
     with pytest.raises(ValueError, match="half: expected half edges >= 0"):

@@ -44,6 +44,14 @@ def test_class_by_name_by_index_and_none():
     assert ask(OfClass("chair"), g) == ask(OfClass(1), g)  # whatever its case
     assert ask(OfClass(-1), g) == [label == -1 for label in g.labels.tolist()]
     assert not any(ask(OfClass(7), g))
+    assert OfClass(np.int64(2)) == OfClass(torch.tensor(2)) == OfClass(2)
+
+
+def test_all_classes_of_one_name_are_meant():
+    g = cloud()
+    expected = [label in (0, 2) for label in g.labels.tolist()]
+    assert OfClass("chair").mask(g, ("chair", "wall", "chair")).tolist() == expected
+    assert OfClass("Chair").mask(g, ("chair", "wall", "chair")).tolist() == expected
 
 
 def test_a_name_in_its_own_case_wins():
@@ -202,3 +210,11 @@ def test_what_the_cloud_lacks_is_named():
         Not("plant")
     with pytest.raises(TypeError, match="unsupported operand"):
         OfClass("plant") & "wall"
+
+
+def test_a_rotation_of_the_smallest_floats_is_one():
+    g = cloud(200)
+    for tiny in (1e-320, 1e308):
+        assert ask(InBox((-1, -1, -1), (1, 0, 1), (tiny, 0, 0, tiny)), g) == ask(
+            InBox((-1, -1, -1), (1, 0, 1), (1, 0, 0, 1)), g
+        )

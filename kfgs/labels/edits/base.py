@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from typing import Any, ClassVar
 
 import torch
@@ -79,8 +80,10 @@ def _present(splats: SplatFile) -> str:
     if labels is None:
         return "the cloud carries no labels: widen the box or sphere"
     found, counts = torch.unique(labels[labels >= 0], return_counts=True)
-    order = counts.argsort(descending=True).tolist()
-    named = [f"{class_name(splats.classes, int(found[i]))} ({int(counts[i])})" for i in order]
+    sizes: Counter[str] = Counter()
+    for label, count in zip(found.tolist(), counts.tolist(), strict=True):
+        sizes[class_name(splats.classes, label)] += count
+    named = [f"{name} ({count})" for name, count in sizes.most_common()]
     more = f" and {len(named) - SHOWN} more" if len(named) > SHOWN else ""
     return f"classes present are {', '.join(named[:SHOWN]) or 'none'}{more}: select one of them"
 

@@ -17,8 +17,9 @@ def join(first: SplatFile, second: SplatFile) -> SplatFile:
     """The Gaussians of two clouds, those of the first in front; the first gives dtype, device and `info`.
 
     - Spherical harmonics: the lower degree is filled up with zeros, which changes no colour.
-    - Labels: classes are the same when their names are; new names that occur are added behind those of the first. A class without
-      a name is called `class 7` as soon as the other cloud has names; when neither has names, indices are kept.
+    - Labels: classes are the same when their names are, so what the second calls by a name that the first has (twice,
+      maybe) gets its lowest label there; new names that occur are added behind those of the first. A class without a name
+      is called `class 7` as soon as the other cloud has names; when neither has names, indices are kept.
     - What one cloud lacks: labels are -1 (none), features 0 (like nothing), extra columns 0.
 
     Raises:
