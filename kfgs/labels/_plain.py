@@ -90,5 +90,13 @@ def quaternion_of(name: str, values: Any) -> tuple[float, ...]:
 
 def rotation_matrix(quaternion: Sequence[float]) -> Any:  # (w, x, y, z) -> [3, 3]
     """The rotation of a quaternion of any length; scipy wants (x, y, z, w)."""
-    w, x, y, z = quaternion
+    w, x, y, z = unit(quaternion)
     return Rotation.from_quat([x, y, z, w]).as_matrix()
+
+
+def unit(values: Sequence[float]) -> list[float]:
+    """Finite numbers that are not all zero, brought to length 1; neither the largest nor the smallest floats overflow."""
+    largest = max(abs(value) for value in values)
+    scaled = [value / largest for value in values]
+    length = math.hypot(*scaled)
+    return [value / length for value in scaled]

@@ -51,7 +51,8 @@ class Shades(NamedTuple):
 
     A tone t(L) comes first: `gain L` up to the bend, then straight on to white at L = 1. The colour of a tone is the one
     of that luminance and hue, as saturated as the display shows it: `peak t / knee` up to the knee, then straight on to
-    white. Both rise throughout, so what was darker stays darker, and from [0, 1] neither leaves the display's range.
+    white. Both rise, so what was darker stays darker, and from [0, 1] neither leaves the display's range; only a tone that
+    reaches white at its bend (`tint` to white) is flat from there on.
     """
 
     peak: Tensor  # [3] the brightest colour of the hue and saturation: its largest channel is 1
@@ -85,7 +86,8 @@ def tint(rgb: Tensor, middle: Tensor) -> Shades:  # [3], []
     """Shades that turn the luminance `middle` (> 0) into `rgb` and keep ratios, as a change of albedo does.
 
     A darker colour than before keeps all ratios. A brighter one could leave the display's range: there they hold until
-    `rgb` is at its most brilliant, or half-way to white, and what is brighter still goes straight on to white.
+    `rgb` is at its most brilliant, or half-way to white, and what is brighter still goes straight on to white. To white
+    itself they hold up to `middle`, and all above it is white.
     """
     shades = same_luminance(rgb)
     target = rgb @ rgb.new_tensor(LUMINANCE)

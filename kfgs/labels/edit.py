@@ -43,8 +43,10 @@ def recolor(
 
     - `"tint"` paints it: the object's middle luminance (the median by visible area) becomes `rgb`, and ratios of
       luminance stay, as when the albedo changes under the same light. Where the middle is below 1/255 there is no
-      shading to keep and the colour is flat.
-    - `"hue"` keeps every luminance from every direction and changes hue and saturation only: a dark plant stays dark.
+      shading to keep and the colour is flat. White leaves no room above it: what was brighter than the middle becomes
+      white as well.
+    - `"hue"` keeps luminance from every direction and changes hue and saturation only: a dark plant stays dark. Where a
+      channel lay outside [0, 1] before or does so after, the renderer's clamp changes what is seen, and luminance with it.
 
     Args:
         gaussians: a colour field (with `sh`).

@@ -102,6 +102,11 @@ def test_hue_keeps_every_luminance_from_every_direction(rgb):
         )
 
 
+def test_a_tint_to_white_is_white_from_the_middle_on():
+    shown = paint(greys([0.1, 0.2, 0.4, 0.6, 0.8]), "#ffffff")
+    torch.testing.assert_close(shown[:, 0], torch.tensor([0.25, 0.5, 1, 1, 1], dtype=torch.float64))
+
+
 def test_hue_gives_shades_below_the_pure_colour_and_tints_above():
     """Of luminance L the colour s * rgb, or between the brightest of its hue and white; worked by hand for (1, 0.5, 0)."""
     knee = 0.2126 + 0.5 * 0.7152

@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -5,7 +7,7 @@ import torch
 from kfgs.cameras import Similarity
 from kfgs.formats import SplatFile, read_splats, write_splats
 from kfgs.gaussians import Gaussians
-from kfgs.labels import Insert, join
+from kfgs.labels import Insert, join, select_by_label
 from kfgs.splat import evaluate_sh, transform_gaussians
 
 
@@ -43,6 +45,18 @@ def test_classes_are_the_same_when_their_names_are():
     both = join(a, b)
     assert both.classes == ("wall", "chair", "vase")
     assert both.gaussians.labels.tolist() == [0, 1, -1, 2, 1, -1, 0]
+
+
+def test_classes_of_one_name_become_one_where_they_are_joined():
+    twice = splats(3, labels=[0, 1, 2], classes=("chair", "wall", "chair"))
+    plain = splats(2, labels=[0, 1], classes=("wall", "chair"), seed=1)
+    into_plain, into_twice = join(plain, twice), join(twice, plain)
+    assert into_plain.classes == ("wall", "chair")
+    assert into_plain.gaussians.labels.tolist() == [0, 1, 1, 0, 1]
+    assert into_twice.classes == ("chair", "wall", "chair")  # labels of the first stay what they were
+    assert into_twice.gaussians.labels.tolist() == [0, 1, 2, 1, 0]
+    for both in (into_plain, into_twice):
+        assert len(select_by_label(both.gaussians, "chair", both.classes)) == 3
 
 
 def test_classes_without_names():
@@ -106,6 +120,8 @@ def test_inserts_are_equal_when_file_and_place_are():
     assert hash(Insert("a.ply", place)) == hash(Insert("a.ply"))
     assert Insert("a.ply", place) != Insert("a.ply")
     assert Insert("a.ply") != Insert("b.ply")
+    assert Insert("a.ply") == Insert(Path("a.ply")) == Insert(Path.cwd() / "sub" / ".." / "a.ply")
+    assert hash(Insert("a.ply")) == hash(Insert(Path.cwd() / "a.ply"))
     cloud = splats(1)
     assert Insert(cloud) == Insert(cloud) != Insert(splats(1))
 
@@ -115,6 +131,9 @@ def test_wrong_input_is_named(tmp_path):
         Insert(splats(1).gaussians)
     with pytest.raises(TypeError, match="source: expected a path or a SplatFile, got ''"):
         Insert("")
+    for impossible in ("a\0b", "\ud800"):
+        with pytest.raises(ValueError, match="source: expected the path of a splat file, got .*; rename the file"):
+            Insert(impossible)
     with pytest.raises(TypeError, match="similarity: expected a Similarity, got Tensor; build one with"):
         Insert("a.ply", torch.eye(4))
     with pytest.raises(FileNotFoundError, match="missing.ply: no such file"):

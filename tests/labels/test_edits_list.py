@@ -107,6 +107,16 @@ def test_saved_and_replayed(tmp_path):
     same(again.redo().apply(splats), edits.redo().apply(splats))
 
 
+def test_a_relative_path_comes_back_as_the_same_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_splats("sub.ply", scene(3))
+    edits = EditList([Insert("sub.ply"), Insert(tmp_path / "sub.ply", PLACE)])
+    for path in ("edits.json", tmp_path / "other.json"):
+        assert EditList.load(edits.save(path)) == edits
+    elsewhere = edits.save(tmp_path / "folder" / "edits.json")
+    assert EditList.load(elsewhere, anywhere=True) == edits
+
+
 def test_the_folder_can_be_carried_away(tmp_path):
     edits = every_edit(tmp_path / "old")
     edits.save(tmp_path / "old" / "edits.json")
@@ -147,6 +157,11 @@ def test_a_missing_file_is_named(tmp_path):
     path.write_text(json.dumps(content))
     with pytest.raises(FileNotFoundError, match=r"edits\[0\].source: expected a splat file at .*vase.ply, got none"):
         EditList.load(path)
+    content["edits"][0]["source"] = "a" * 5000  # longer than any file system takes
+    path.write_text(json.dumps(content))
+    for anywhere in (False, True):
+        with pytest.raises(FileNotFoundError, match=r"edits\[0\].source: expected a splat file at .*aaa, got none"):
+            EditList.load(path, anywhere=anywhere)
     with pytest.raises(FileNotFoundError, match="no such file; expected a JSON file"):
         EditList.load(tmp_path / "none.json")
 
@@ -166,6 +181,8 @@ def test_a_cloud_in_memory_cannot_be_saved(tmp_path):
             {"format": "kfgs.edits", "version": 2, "edits": []},
             "expected version 1 of kfgs.edits, got 2; install the kfgs",
         ),
+        ({"format": "kfgs.edits", "version": True, "edits": []}, "expected version 1 of kfgs.edits, got True"),
+        ({"format": "kfgs.edits", "version": 1.0, "edits": []}, "expected version 1 of kfgs.edits, got 1.0"),
         ({"format": "kfgs.edits", "version": 1}, r"edits: expected a list of edits, got \[\]"),
         ({"format": "kfgs.edits", "version": 1, "edits": {}}, r"edits: expected a list of edits, got \{\}"),
         ({"format": "kfgs.edits", "version": 1, "edits": [], "run": "x"}, "expected 'edits' and 'undone', got 'run'"),
@@ -204,6 +221,11 @@ PLAIN = {"scale": 1, "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "translation
         ({"op": "move", "where": "a", "rotation": 90}, r"edits\[0\].rotation: expected 4 numbers, got 90"),
         ({"op": "move", "where": "a", "pivot": None}, r"edits\[0\].pivot: expected 3 numbers, got None"),
         ({"op": "insert", "source": 3}, r"edits\[0\].source: expected the path of a splat file, got 3"),
+        ({"op": "insert", "source": "\ud800"}, r"edits\[0\].source: expected the path of a splat file, got '.*ud800'"),
+        (
+            {"op": "insert", "source": "."},
+            r"edits\[0\].source: expected a splat file at .*, got a folder; name the file",
+        ),
         ({"op": "insert", "source": "a\0b"}, r"edits\[0\].source: expected the path of a splat file"),
         ({"op": "insert", "source": "a.ply", "similarity": 1}, r"edits\[0\].similarity: expected scale, rotation"),
         ({"op": "insert", "source": "a.ply", "similarity": PLAIN | {"scale": -1}}, r"similarity.scale: expected"),

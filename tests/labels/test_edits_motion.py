@@ -165,3 +165,24 @@ def test_nothing_selected(edit):
 def test_wrong_input_is_named(make, error, message):
     with pytest.raises(error, match=message):
         make()
+
+
+@pytest.mark.parametrize("tiny", [1e-320, 5e-324, 1e308])
+def test_rotations_of_the_smallest_and_largest_floats(tiny):
+    splats = scene()
+    for small, plain in (
+        ((tiny, 0, 0, tiny), (1, 0, 0, 1)),
+        (Turn((tiny, tiny, 0), 90), Turn((1, 1, 0), 90)),
+        (Turn((tiny, 0, 0), 90), Turn("x", 90)),
+    ):
+        moved, expected = (Move("chair", rotation=r).apply(splats).gaussians for r in (small, plain))
+        torch.testing.assert_close(moved.means, expected.means)
+
+
+def test_the_centroid_of_what_is_invisible_is_the_plain_mean():
+    splats = scene()
+    for opacity in (0.0, 1e-320):  # 1e-320: as weights they would vanish beside the positions
+        faint = splats.replace(gaussians=splats.gaussians.replace(opacities=torch.full((10,), opacity).double()))
+        moved = Move("chair", rotation=("z", 90), scale=2.0).apply(faint).gaussians
+        chair = splats.gaussians.labels == 1
+        torch.testing.assert_close(moved.means[chair].mean(dim=0), splats.gaussians.means[chair].mean(dim=0))

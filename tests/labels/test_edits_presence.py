@@ -78,6 +78,10 @@ def test_opacity_multiplies_and_nought_hides():
     assert (hidden.gaussians.opacities[3:5] < 1 / 255).all()
     assert (hidden.gaussians.opacities > 0).all()
     assert len(hidden) == 9
+    faint = torch.tensor([0.5, 0.5, 0.5, 1e-9, 0.0, 0.5, 0.5, 0.5, 0.5])
+    faint = splats.replace(gaussians=splats.gaussians.replace(opacities=faint))
+    for factor in (1, 0.5, 0):  # what is fainter than hidden gets no stronger
+        assert Opacity("chair", factor).apply(faint).gaussians.opacities.equal(faint.gaussians.opacities)
     assert Opacity("chair", 1).apply(splats).gaussians.opacities.equal(before)
     assert splats.gaussians.opacities.equal(before)
 
@@ -135,3 +139,20 @@ def test_a_cloud_without_colours_cannot_be_painted():
     splats = scene()
     with pytest.raises(ValueError, match=r"gaussians.sh: expected spherical harmonics"):
         Recolor(Everything(), "red").apply(splats.replace(gaussians=splats.gaussians.replace(sh=None)))
+
+
+def test_grow_names_a_position_that_is_none():
+    splats = scene()
+    means = splats.gaussians.means.clone()
+    means[5] = torch.nan
+    broken = splats.replace(gaussians=splats.gaussians.replace(means=means))
+    with pytest.raises(ValueError, match="gaussians.means: expected finite numbers, got NaN or infinity in row 5"):
+        Remove("chair", grow=0.5).apply(broken)
+    assert len(Remove("chair").apply(broken)) == 7
+
+
+def test_classes_of_one_name_are_counted_together():
+    splats = scene().replace(classes=("wall", "wall", "plant"))
+    assert len(Remove("wall").apply(splats)) == 3
+    with pytest.raises(ValueError, match=r"classes present are wall \(6\): select one of them"):
+        Remove("plant").apply(splats)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+import torch
+
 from ..._check import check_choice, check_range
 from ...formats.splat_file import SplatFile
 from .._plain import number_of
@@ -26,7 +28,7 @@ class Recolor(Edit):
     rgb: tuple[float, float, float]
     """Red, green, blue in [0, 1]; text such as `"#c04040"` or `"teal"` will do."""
     mode: Mode = "tint"
-    """`"tint"`: the object's middle luminance becomes `rgb`. `"hue"`: every luminance stays."""
+    """`"tint"`: the object's middle luminance becomes `rgb`. `"hue"`: every luminance stays that the display can show."""
     allow_empty: bool = False
     """False: an empty selection is an error."""
 
@@ -46,8 +48,8 @@ class Recolor(Edit):
 class Opacity(Edit):
     """Multiply opacities: 1 changes nothing, 0 hides.
 
-    Hidden Gaussians stay in the cloud, with opacity 1e-6: no renderer draws them, no index shifts, and files that hold
-    logits can hold them. `Remove` takes them out.
+    Hidden Gaussians stay in the cloud, with opacity 1e-6 (or what they had, if that was less): no renderer draws them, no
+    index shifts, and files that hold logits can hold them. `Remove` takes them out.
     """
 
     op: ClassVar[str] = "opacity"
@@ -67,5 +69,6 @@ class Opacity(Edit):
         """See `Edit.apply`."""
         mask = selected(self.where, splats, self.allow_empty)
         opacities = splats.gaussians.opacities.clone()
-        opacities[mask] = (opacities[mask] * self.factor).clamp(min=HIDDEN)
+        old = opacities[mask]
+        opacities[mask] = torch.maximum(old * self.factor, old.clamp(max=HIDDEN))
         return splats.replace(gaussians=splats.gaussians.replace(opacities=opacities))

@@ -134,7 +134,7 @@ class EditList:
             raise ValueError(f"{path}: expected saved edits, got JSON that nests too deep; write it again") from error
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise ValueError(f"{path}: expected edits that kfgs saved ('format': {FORMAT!r}), got something else")
-        if content.get("version") != VERSION:
+        if type(content.get("version")) is not int or content["version"] != VERSION:  # True and 1.0 equal 1
             raise ValueError(
                 f"{path}: expected version {VERSION} of {FORMAT}, got {content.get('version')!r:.80}; install the kfgs "
                 "that wrote it"
@@ -149,8 +149,10 @@ class EditList:
                 raise ValueError(f"{path}: {name}: expected a list of edits, got {values!r:.80}; write it as [...]")
             try:
                 lists[name] = tuple(_read(v, f"{name}[{i}]", path.parent, anywhere) for i, v in enumerate(values))
-            except (ValueError, FileNotFoundError) as error:
-                raise type(error)(f"{path}: {error}") from error
+            except FileNotFoundError as error:
+                raise FileNotFoundError(f"{path}: {error}") from error
+            except ValueError as error:
+                raise ValueError(f"{path}: {error}") from error
         return EditList(**lists)
 
 

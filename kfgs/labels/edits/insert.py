@@ -23,7 +23,8 @@ from .merge import join
 class Insert(Edit):
     """Add the Gaussians of another splat file behind those of the scene; see `join` for what happens where they differ.
 
-    The file is read when the edit is applied. Two inserts are equal when they name the same file and the same place.
+    The file is read when the edit is applied. Two inserts are equal when they name the same file, relative to the working
+    folder or in full, and the same place.
     """
 
     op: ClassVar[str] = "insert"
@@ -37,6 +38,8 @@ class Insert(Edit):
             raise TypeError(
                 f"source: expected a path or a SplatFile, got {self.source!r:.80}; wrap Gaussians in SplatFile(...)"
             )
+        if not isinstance(self.source, SplatFile):
+            _check_path("source", os.fspath(self.source))
         if self.similarity is not None and not isinstance(self.similarity, Similarity):
             raise TypeError(
                 f"similarity: expected a Similarity, got {type(self.similarity).__name__}; build one with "
@@ -50,7 +53,7 @@ class Insert(Edit):
         return hash(self._key()[0])
 
     def _key(self) -> tuple[Any, Any]:
-        source = id(self.source) if isinstance(self.source, SplatFile) else os.fspath(self.source)
+        source = id(self.source) if isinstance(self.source, SplatFile) else os.path.realpath(self.source)
         return source, _similarity_json(self.similarity)
 
     def apply(self, splats: SplatFile) -> SplatFile:
@@ -107,22 +110,37 @@ def read_source(value: Any, name: str, folder: Path, anywhere: bool) -> Path:
     """The file that a saved edit names, which by default must lie in the folder of the edits or below it.
 
     Raises:
-        ValueError: if it is no path, or leads out of the folder (an absolute path, `..`, a link).
+        ValueError: if it is no path, leads out of the folder (an absolute path, `..`, a link), or is a folder without a
+            `meta.json` (an unpacked SOG).
         FileNotFoundError: if there is no such file.
     """
-    if not isinstance(value, str) or not value or "\0" in value:
+    if not isinstance(value, str) or not value:
         raise ValueError(f"{name}: expected the path of a splat file, got {value!r:.80}; write it as a string")
+    _check_path(name, value)
     parts = PurePosixPath(value).parts + PureWindowsPath(value).parts
     rooted = PurePosixPath(value).is_absolute() or bool(PureWindowsPath(value).drive or PureWindowsPath(value).root)
     path = folder / value
-    if not anywhere and (rooted or ".." in parts or not path.resolve().is_relative_to(folder.resolve())):
+    real = Path(os.path.realpath(path))  # unlike resolve(), also of a name that no file system takes
+    if not anywhere and (rooted or ".." in parts or not real.is_relative_to(folder.resolve())):
         raise ValueError(
             f"{name}: expected a file in {folder} or below, got {value!r:.200}; copy it there, or load with "
             "anywhere=True if you trust these edits"
         )
-    if not path.exists():
-        raise FileNotFoundError(f"{name}: expected a splat file at {path}, got none; put it there")
+    if not os.path.exists(path):
+        raise FileNotFoundError(f"{name}: expected a splat file at {path!s:.400}, got none; put it there")
+    if path.is_dir() and not (path / "meta.json").is_file():
+        raise ValueError(f"{name}: expected a splat file at {path!s:.400}, got a folder; name the file in it")
     return path
+
+
+def _check_path(name: str, value: str) -> None:
+    """Raise a ValueError if no file system could hold a file of that name."""
+    try:
+        usable = b"\0" not in os.fsencode(value)
+    except UnicodeEncodeError:  # half a surrogate pair, which JSON can write
+        usable = False
+    if not usable:
+        raise ValueError(f"{name}: expected the path of a splat file, got {value!r:.80}; rename the file")
 
 
 def _is_matrix(value: Any) -> bool:

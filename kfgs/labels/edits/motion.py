@@ -16,7 +16,7 @@ from ...cameras.similarity import Similarity
 from ...formats.splat_file import SplatFile
 from ...gaussians import Gaussians
 from ...splat.transform import transform_gaussians
-from .._plain import number_of, numbers_of, quaternion_of, rotation_matrix
+from .._plain import number_of, numbers_of, quaternion_of, rotation_matrix, unit
 from ..where import Where
 from .base import Edit, as_where, scatter, selected
 from .merge import join
@@ -42,8 +42,8 @@ class Turn:
 
     def matrix(self) -> Any:  # [3, 3]
         """The rotation matrix."""
-        length = math.hypot(*self.axis)
-        return Rotation.from_rotvec([self.degrees * part / length for part in self.axis], degrees=True).as_matrix()
+        turns = math.fmod(self.degrees, 360)
+        return Rotation.from_rotvec([turns * part for part in unit(self.axis)], degrees=True).as_matrix()
 
     def to_json(self) -> dict[str, Any]:
         """Plain values that JSON can hold."""
@@ -63,7 +63,7 @@ class _Motion(Edit):
     """> 0"""
     pivot: str | tuple[float, ...] = "centroid"
     """The point that turning and resizing leave in place: `"centroid"` (the mean of the selected positions, weighted by
-    opacity) or (x, y, z)."""
+    opacity; the plain mean where every opacity is 0) or (x, y, z)."""
     allow_empty: bool = False
     """False: an empty selection is an error."""
 
@@ -85,6 +85,7 @@ class _Motion(Edit):
         R = _matrix(self.rotation)
         if isinstance(self.pivot, str):
             weights = gaussians.opacities.detach().double().cpu()
+            weights = weights / weights.max() if bool(weights.any()) else torch.ones_like(weights)
             pivot = weights @ gaussians.means.detach().double().cpu() / weights.sum()
         else:
             pivot = torch.tensor(self.pivot, dtype=torch.float64)

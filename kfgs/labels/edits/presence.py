@@ -13,6 +13,7 @@ from torch import Tensor
 from ..._check import check_range
 from ...formats.splat_file import SplatFile
 from .._plain import number_of
+from .._rows import check_finite
 from ..where import Where
 from .base import Edit, as_where, selected
 
@@ -76,6 +77,7 @@ def _orphans_near(splats: SplatFile, mask: Tensor, distance: float) -> Tensor:  
     free = ~mask if labels is None else ~mask & (labels < 0)
     if distance == 0 or not bool(mask.any()) or not bool(free.any()):
         return torch.zeros_like(mask)
+    check_finite("gaussians.means", splats.gaussians.means)
     means = splats.gaussians.means.detach().double().cpu().numpy()
     taken, candidates, rivals = (means[rows.cpu().numpy()] for rows in (mask, free, ~(mask | free)))
     to_taken = np.asarray(cKDTree(taken).query(candidates, distance_upper_bound=distance)[0])  # infinite beyond
