@@ -64,7 +64,8 @@ def fit_field(
         progress: show a bar with loss, number of Gaussians and time left.
         callback: called with each new row of the history. To stop early, raise from it; a checkpoint stays behind.
         checkpoint: a file that is written every `checkpoint_every` steps and at the end. If it exists, the fit
-            continues from it, and its result is bit for bit that of an undisturbed run (on one machine).
+            continues from it, and its result is bit for bit that of an undisturbed run (on one machine's CPU; a GPU adds
+            gradients up in no fixed order).
 
     Returns:
         The fitted params, and the history.
