@@ -127,15 +127,15 @@ def attach(
     by = by or ("distance" if scene is None else "views")
     loaded, cloud, label_set = open_field(field), open_splats("splats", splats), load_classes(scene, classes, text)
     cameras = None if scene is None else training_cameras(loaded, scene, images)
-    others = None if splat_scene is None else load_scene(splat_scene).undistorted().cameras
+    same = Similarity.identity() if same_frame else None
+    frame = same if splat_scene is None else load_scene(splat_scene).undistorted().cameras
     try:
         found = attach_field(
             loaded,
             cloud,
             label_set,
             cameras=cameras,
-            splat_cameras=others,
-            similarity=Similarity.identity() if same_frame else None,
+            frame=frame,
             distance=distance,
             by=by,
             method=method,

@@ -28,6 +28,7 @@ from .apply import label_field
 By = Literal["distance", "views"]
 WAYS: tuple[By, ...] = ("distance", "views")
 SOLID = 0.05  # opacity from which a Gaussian takes part in finding the frame: fainter ones float anywhere
+STAYS = 0.005  # of the scene's size: an alignment that moves half of the points by less moves nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,16 +59,15 @@ def attach(
     classes: LabelSet,
     *,
     cameras: Sequence[Camera] | None = None,
-    splat_cameras: Sequence[Camera] | None = None,
-    similarity: Similarity | None = None,
+    frame: Similarity | Sequence[Camera] | None = None,
     distance: float | None = None,
     by: By = "distance",
     method: Method = "nearest",
 ) -> Attached:
     """Give every Gaussian of a splat the class that the semantic field has at its place.
 
-    Frames: `similarity` is taken as it is given; else, with `splat_cameras`, it is fitted to the cameras of the same
-    names; else, where `frames_agree` says so, both share one frame; else the clouds themselves are aligned.
+    Frames: a similarity is taken as it is given; to cameras of the splat's own, one is fitted by their names; without
+    either, both share one frame where `frames_agree` says so, and else the clouds themselves are aligned.
 
     Classes, `by="distance"` (Sec. 3.4): the semantic Gaussians are classified, by votes of `cameras` or else by their
     own latents, and those within lambda decide on each Gaussian of the splat. `by="views"`: the semantic field segments
@@ -81,14 +81,15 @@ def attach(
         splats: any splat of the same scene; labels that it has are replaced.
         classes: names and embeddings in the teacher's space.
         cameras: undistorted views in the field's frame, usually those it was trained on.
-        splat_cameras: views in the splat's frame, some of which share their names with `cameras`.
-        similarity: from the field's frame to the splat's; `Similarity.identity()` says that they are one.
+        frame: what tells the splat's frame: the similarity from the field's to it (`Similarity.identity()` says that they
+            are one), or views in it, some of which share their names with `cameras`. None compares the clouds.
         distance: lambda in the splat's world units; None takes `default_distance`.
         by: "distance" needs no cameras; "views" follows the borders of objects much better.
         method: which label wins where distance decides, see `transfer_labels`; "nearest" is the paper's.
 
     Raises:
         ValueError: if `by` or `method` is unknown, cameras are missing, the splat is empty, or (SceneError) no similarity fits.
+        TypeError: if `frame` is neither.
 
     Note:
         Toy room, colour field of 40,000 Gaussians, protocol `kfgs-removal/1`, the chairs: by distance 0.979 of their
@@ -98,26 +99,28 @@ def attach(
         rendered surface, made it worse.
     """
     check_choice("by", by, WAYS)
+    _check_frame(frame)
     check_choice("method", method, get_args(Method))
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
     if len(splats) == 0:
         raise ValueError("splats: expected at least one Gaussian, got none; there is nothing to label")
-    for name, needed in (('by="views"', by == "views"), ("splat_cameras", splat_cameras is not None)):
+    for name, needed in (('by="views"', by == "views"), ("frame", not isinstance(frame, Similarity | None))):
         if needed and not cameras:
             raise ValueError(f"cameras: expected views in the field's frame (for {name}), got none; pass them as well")
-    similarity, alignment, said = _common_frame(field, splats, cameras, splat_cameras, similarity)
+    similarity, alignment, said = _common_frame(field, splats, cameras, frame)
     carry = partial(transfer_labels, distance=distance, method=method)
     if by == "distance":
         labels, scores, transfer, found = _by_distance(field, splats, classes, cameras, similarity, carry)
     else:
         assert cameras is not None
         labels, scores, transfer, found = _by_views(field, splats, classes, cameras, similarity, carry)
+    nothing_open = len(transfer.labels) == 0
     counts = torch.bincount(labels + 1, minlength=len(classes) + 1).tolist()
     facts = {
         **found,
-        "lambda": transfer.distance,
-        "lambda from": transfer.how,
+        "lambda": None if nothing_open else transfer.distance,
+        "lambda from": None if nothing_open else transfer.how,
         "frame": said,
         "alignment": alignment.to_json() if alignment is not None else None,
         "similarity": similarity.matrix().tolist(),
@@ -129,34 +132,50 @@ def attach(
         classes=classes.names,
         info=splats.info | {"labels": facts},
     )
-    words = (
-        said,
-        f"{facts['labelled by']}: {len(splats) - counts[0]} of {len(splats)} Gaussians have a class",
-        repr(transfer) if by == "distance" else f"of {len(transfer.labels)} that no view shows: {transfer!r}",
-    )
+    labelled_by = f"{facts['labelled by']}: {len(splats) - counts[0]} of {len(splats)} Gaussians have a class"
+    words = said, labelled_by, _about(transfer, by)
     return Attached(labelled, transfer, similarity, alignment, words)
+
+
+def _check_frame(frame: Any) -> None:
+    if isinstance(frame, Similarity | None):
+        return
+    if not isinstance(frame, Sequence) or not all(isinstance(camera, Camera) for camera in frame):
+        raise TypeError(
+            f"frame: expected a Similarity, views in the splat's frame, or None, got {type(frame).__name__}; a matrix "
+            "becomes one by Similarity.from_matrix"
+        )
 
 
 def _common_frame(
     field: SemanticField,
     splats: SplatFile,
     cameras: Sequence[Camera] | None,
-    splat_cameras: Sequence[Camera] | None,
-    similarity: Similarity | None,
+    frame: Similarity | Sequence[Camera] | None,
 ) -> tuple[Similarity, Alignment | None, str]:
     """From the field's frame to the splat's, how it was found, and that in words."""
-    if similarity is not None:
-        return similarity, None, "the similarity between the frames was given"
-    if splat_cameras is not None:
+    if isinstance(frame, Similarity):
+        return frame, None, "the similarity between the frames was given"
+    if frame is not None:
         assert cameras is not None
-        alignment = align_by_cameras(cameras, splat_cameras)
+        alignment = align_by_cameras(cameras, frame)
         return alignment.similarity, alignment, f"aligned by {alignment.words}"
     clouds = [_solid(gaussians.means, gaussians.opacities) for gaussians in (field.gaussians, splats.gaussians)]
     check = frames_agree(*clouds)
     if check.agree:
         return Similarity.identity(), None, check.words
     alignment = align_clouds(*clouds)
+    if _stays(clouds[0], alignment):
+        words = f"at first {check.words}; but of all frames their own fits best, by the {alignment.how}: they share it"
+        return Similarity.identity(), None, words
     return alignment.similarity, alignment, f"{check.words}; aligned by {alignment.words}"
+
+
+def _stays(means: Tensor, alignment: Alignment) -> bool:  # [N, 3]
+    """Whether an alignment leaves the points where they are, but for what sparse clouds are uncertain about."""
+    places = means.detach().double().cpu()
+    shifts = (alignment.similarity.apply(places) - places).norm(dim=1)
+    return float(shifts.median()) < STAYS * alignment.size
 
 
 def _solid(means: Tensor, opacities: Tensor) -> Tensor:  # [N, 3], [N] -> [n, 3]
@@ -223,6 +242,14 @@ def _sureness(transfer: Transfer) -> Tensor:  # [N] in [0, 1]
         return transfer.shares
     reach = max(transfer.distance, torch.finfo(transfer.distances.dtype).tiny)
     return (1 - transfer.distances / reach).clamp_min(0.0)
+
+
+def _about(transfer: Transfer, by: By) -> str:
+    """What distance decided, in words."""
+    if by == "distance":
+        return repr(transfer)
+    count = len(transfer.labels)
+    return f"of {count} that no view shows: {transfer!r}" if count else "some view shows every Gaussian"
 
 
 def _meaning(transfer: Transfer) -> str:

@@ -112,13 +112,13 @@ def test_other_rules_of_distance_outvote_mistakes_and_score_by_the_share_of_weig
     )
     there = splats.replace(gaussians=transform_gaussians(splats.gaussians, similarity))
     given = {"distance": 0.5, "method": method}
-    attached = attach(SemanticField(semantic), there, CLASSES, similarity=similarity, **given)
+    attached = attach(SemanticField(semantic), there, CLASSES, frame=similarity, **given)
     expected = transfer_labels(transform_gaussians(semantic, similarity), said, there.gaussians, **given)
     assert attached.transfer.method == method
     assert torch.equal(attached.labels, expected.labels)
     torch.testing.assert_close(torch.from_numpy(attached.splats.extra["score"]), expected.shares.float())
     assert float(expected.shares[expected.labels >= 0].min()) < 0.6  # some are not sure
-    nearest = attach(SemanticField(semantic), there, CLASSES, similarity=similarity, distance=0.5)
+    nearest = attach(SemanticField(semantic), there, CLASSES, frame=similarity, distance=0.5)
     assert accuracy(attached.labels, splats) > accuracy(nearest.labels, splats) + 0.02
     assert "share of the weights" in attached.splats.info["labels"]["score"]
     assert attached.splats.info["labels"]["method"] == method
@@ -168,7 +168,7 @@ def test_cameras_of_the_same_names_find_the_frame(by):
     here, there = a_splat(), moved(a_splat(), similarity)
     splat_cameras = [similarity.apply_to_camera(camera) for camera in CAMERAS]
     expected = attach(a_field(), here, CLASSES, cameras=CAMERAS, by=by)
-    found = attach(a_field(), there, CLASSES, cameras=CAMERAS, splat_cameras=splat_cameras, by=by)
+    found = attach(a_field(), there, CLASSES, cameras=CAMERAS, frame=splat_cameras, by=by)
     assert float((found.labels == expected.labels).float().mean()) > 0.999  # ties and borders round differently
     torch.testing.assert_close(found.similarity.matrix(), similarity.matrix(), atol=1e-3, rtol=1e-4)
     assert found.alignment.inliers == len(CAMERAS)
@@ -191,15 +191,58 @@ def test_views_label_as_well_where_the_splats_frame_is_small():
     for scale in (1.0, 0.01):
         similarity = replace(turn, scale=scale)
         there = moved(a_splat(3_000), similarity)
-        found = attach(a_field(), there, CLASSES, cameras=CAMERAS, similarity=similarity, by="views")
+        found = attach(a_field(), there, CLASSES, cameras=CAMERAS, frame=similarity, by="views")
         shares[scale] = accuracy(found.labels, a_splat(3_000)), found.splats.info["labels"]["shown"]
     assert shares[1.0][0] > 0.95
     assert shares[0.01] == pytest.approx(shares[1.0], rel=2e-3)  # borders round differently
 
 
+def test_a_sparse_splat_turned_by_half_a_turn_is_found_out(monkeypatch):
+    """Its walls lie near walls: the clouds are not taken for one frame, whatever their spacing."""
+    monkeypatch.setattr(register, "ROTATIONS", 200)
+    few = a_splat(6_000).select(torch.arange(0, 6_000, 12))
+    middle = few.gaussians.means.median(0).values
+    turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+    there = moved(few, Similarity(1.0, turn, middle - turn @ middle))
+    attached = attach(a_field(), there, CLASSES)
+    assert accuracy(attached.labels, few) > 0.95
+    assert attached.alignment is not None
+
+
+def test_clouds_that_fit_best_where_they_are_share_a_frame(monkeypatch):
+    """A third of the splat floats about, and of the field: too little is near to say so at once."""
+    monkeypatch.setattr(register, "ROTATIONS", 200)
+    splats = a_splat()
+    generator = torch.Generator().manual_seed(5)
+    means = splats.gaussians.means.clone()
+    means[::3] += 0.7 * torch.randn(means[::3].shape, generator=generator)
+    noisy = splats.replace(gaussians=splats.gaussians.replace(means=means))
+    field = a_field()
+    spread = field.gaussians.means.clone()
+    spread[::3] += 0.7 * torch.randn(spread[::3].shape, generator=generator)
+    attached = attach(SemanticField(field.gaussians.replace(means=spread)), noisy, CLASSES)
+    assert "the frames disagree" in attached.words[0]
+    assert "of all frames their own fits best" in attached.words[0]
+    assert torch.equal(attached.similarity.matrix(), Similarity.identity().matrix())
+    assert attached.alignment is None
+
+
+def test_where_the_views_show_everything_distance_has_no_lambda():
+    splats = a_splat(1_500)
+    top = splats.gaussians.select(torch.arange(3))
+    table = torch.tensor([[1.2, 1.8, 0.72], [1.4, 1.7, 0.72], [1.0, 1.9, 0.72]])
+    seen = SplatFile(top.replace(means=table))
+    attached = attach(a_field(1_500), seen, CLASSES, cameras=CAMERAS, frame=Similarity.identity(), by="views")
+    facts = attached.splats.info["labels"]
+    assert facts["not shown"] == 0
+    assert facts["lambda"] is None
+    assert facts["lambda from"] is None
+    assert attached.words[2] == "some view shows every Gaussian"
+
+
 def test_a_given_similarity_is_taken_as_it_is():
     similarity = a_similarity()
-    attached = attach(a_field(2_000), moved(a_splat(2_000), similarity), CLASSES, similarity=similarity)
+    attached = attach(a_field(2_000), moved(a_splat(2_000), similarity), CLASSES, frame=similarity)
     assert accuracy(attached.labels, a_splat(2_000)) > 0.95
     assert attached.similarity is similarity
 
@@ -239,8 +282,8 @@ def test_what_cannot_be_done_is_refused():
         attach(field, splats, CLASSES, by="magic")
     with pytest.raises(ValueError, match=r'cameras: expected views in the field\'s frame \(for by="views"\), got none'):
         attach(field, splats, CLASSES, by="views")
-    with pytest.raises(ValueError, match=r"cameras: expected views in the field's frame \(for splat_cameras\)"):
-        attach(field, splats, CLASSES, splat_cameras=CAMERAS)
+    with pytest.raises(ValueError, match=r"cameras: expected views in the field's frame \(for frame\)"):
+        attach(field, splats, CLASSES, frame=CAMERAS)
     with pytest.raises(ValueError, match="method: expected one of 'nearest', 'vote', 'mahalanobis', got 'guess'"):
         attach(field, splats, CLASSES, method="guess")
     with pytest.raises(ValueError, match="distance: expected a number"):
@@ -250,4 +293,4 @@ def test_what_cannot_be_done_is_refused():
         attach(field, nothing, CLASSES)
     strangers = [replace(camera, name=f"other_{i}.png") for i, camera in enumerate(CAMERAS)]
     with pytest.raises(SceneError, match="at least two names that both have"):
-        attach(field, splats, CLASSES, cameras=CAMERAS, splat_cameras=strangers)
+        attach(field, splats, CLASSES, cameras=CAMERAS, frame=strangers)
