@@ -51,6 +51,8 @@ class RemovalReport:
     """The class that was to be removed."""
     gone_pixels: float
     """Of the class's pixels: those that no longer show it."""
+    changed_pixels: float
+    """Of the same pixels: those that look different, by at least 8/255 in some channel."""
     untouched_pixels: float
     """Of the pixels of other classes: those that did not change."""
     untouched_off_border: float
@@ -157,17 +159,18 @@ def score_removal(
         ValueError: if the scene has no such class, no view of the split shows it, or a field has no `sh`.
     """
     truth = SceneTruth.open(scene, name, split)
-    pixels = {key: _Share() for key in ("gone", "shown", "untouched", "off_border")}
+    pixels = {key: _Share() for key in ("gone", "changed", "shown", "untouched", "off_border")}
     points, of_class = truth.surface()
     owned = [_is_nearest(cloud, points, of_class) for cloud in (before, after)]
     for view in truth.views():
-        old, new = (_picture(cloud, view.camera, engine) for cloud in (before, after))
+        old, new = (_picture(cloud, view.camera, engine).cpu() for cloud in (before, after))
         same = (new - old).abs().amax(-1) < STEP
         light = _light(before, owned[0], view.camera, engine)
         left = _light(after, owned[1], view.camera, engine)
         shown = light >= LEAST_LIGHT
         pixels["shown"].add(shown, among=view.inside)
         pixels["gone"].add(left < 0.5 * light, among=view.inside & shown)
+        pixels["changed"].add(~same, among=view.inside & shown)
         pixels["untouched"].add(same, among=~view.inside)
         pixels["off_border"].add(same, among=view.far)
     density, rest = (surface_density(cloud, points) for cloud in (before, after))
@@ -175,6 +178,7 @@ def score_removal(
     return RemovalReport(
         name=name,
         gone_pixels=pixels["gone"].value,
+        changed_pixels=pixels["changed"].value,
         untouched_pixels=pixels["untouched"].value,
         untouched_off_border=pixels["off_border"].value,
         gone_points=_share(lost, among=covered & of_class),
@@ -217,7 +221,7 @@ def score_recolor(
     colored, right, right_before = _Share(), _Share(), _Share()
     outside, off_border = _MeanSquare(), _MeanSquare()
     for view in truth.views():
-        old, new = (_picture(cloud, view.camera, engine) for cloud in (before, after))
+        old, new = (_picture(cloud, view.camera, engine).cpu() for cloud in (before, after))
         outside.add((new - old)[~view.inside])
         off_border.add((new - old)[view.far])
         for picture, share in ((old, right_before), (new, right)):
@@ -297,7 +301,7 @@ def _is_nearest(
 def _light(cloud: Gaussians, owned: Tensor, camera: Camera, engine: str) -> Tensor:  # [H, W] in [0, 1]
     """How much of each pixel's light comes from some of the Gaussians."""
     shares = owned.to(cloud.means)[:, None]
-    return rasterize(cloud.detach().replace(features=shares, sh=None), camera, engine=engine).map[..., 0]
+    return rasterize(cloud.detach().replace(features=shares, sh=None), camera, engine=engine).map[..., 0].cpu()
 
 
 def _hue_degrees(rgb: Tensor) -> Tensor:  # [H, W, 3] -> [H, W]
