@@ -1,4 +1,4 @@
-"""The state of an unfinished fit in one file, so that a killed run continues bit for bit."""
+"""The state of an unfinished fit in one file, so that a killed run continues: on a CPU bit for bit."""
 
 from __future__ import annotations
 
