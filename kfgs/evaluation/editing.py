@@ -26,15 +26,18 @@ from .surface_density import surface_density
 REMOVAL = (
     "kfgs-removal/1: held-out views of a scene with exact labels and surfaces. A Gaussian shows the class if its centre is "
     "nearest to the class's surface. Pixels of the class that such Gaussians gave at least 1/4 of their light: gone = less "
-    "than half of that light is left. Pixels of other classes: untouched = no channel moved by 8/255. Surface points whose "
-    "density (sum of o exp(-d^2 / 2)) was at least 0.05: of the class, gone = less than half is left; of others, kept = "
-    "at least half is left"
+    "than half of that light is left; changed = some channel moved by 8/255. Pixels of other classes: untouched = no "
+    "channel moved by 8/255. Surface points whose density (sum of o exp(-d^2 / 2)) was at least 0.05: of the class, gone = "
+    "less than half is left; of others, kept = at least half is left"
 )
 RECOLOR = (
     "kfgs-recolor/1: test views of a scene with exact labels. Outside = PSNR of after against before over all pixels of "
     "other classes and channels; inside = share of the class's coloured pixels whose hue is within 20 degrees of the target"
 )
 GONE, UNTOUCHED, OUTSIDE = 0.95, 0.98, 35.0  # shares and decibels that `passed` asks for
+CHANGED = (
+    0.8  # likewise: what looks as before is not gone, wherever its Gaussians went; some things match their background
+)
 HUE_INSIDE, MEASURED = 0.8, 0.5  # likewise, so that neither an edit that does nothing nor a void measurement passes
 STEP = 8 / 255  # a channel that moves less is untouched: twice what 8-bit rounding and a JPEG would do
 HUE = 20.0  # degrees
@@ -74,15 +77,19 @@ class RemovalReport:
     def passed(self) -> bool:
         """Whether at least 0.95 of the class is gone and 0.98 of the rest is untouched, in pictures and on surfaces.
 
-        And whether that says something: at least half of the class's pixels and of its surface could be measured.
+        And whether it can be seen (0.8 of the class's pixels changed) and says something: at least half of the class's
+        pixels and of its surface could be measured.
         """
-        gone = self.gone_pixels >= GONE and self.gone_points >= GONE  # NaN passes nothing
+        gone = (
+            self.gone_pixels >= GONE and self.gone_points >= GONE and self.changed_pixels >= CHANGED
+        )  # NaN passes nothing
         kept = self.untouched_pixels >= UNTOUCHED and self.kept_points >= UNTOUCHED
         return gone and kept and self.measured_pixels >= MEASURED and self.measured_points >= MEASURED
 
     def __str__(self) -> str:
         return (
-            f"{self.name} removed: {self.gone_pixels:.4f} of its pixels gone, {self.gone_points:.4f} of its surface; "
+            f"{self.name} removed: {self.gone_pixels:.4f} of its pixels gone ({self.changed_pixels:.4f} changed), "
+            f"{self.gone_points:.4f} of its surface; "
             f"untouched elsewhere: {self.untouched_pixels:.4f} of the pixels ({self.untouched_off_border:.4f} off its "
             f"border), {self.kept_points:.4f} of the surface ({self.protocol.split(':')[0]}, {self.views} views)"
         )
@@ -144,7 +151,8 @@ def score_removal(
     """Score the removal of a class (protocol `kfgs-removal/1`, see `REMOVAL`).
 
     A Gaussian shows the object if its centre stands nearer to the class's true surface than to any other. Depth cannot
-    tell: a rug lies on its floor, and a picture hangs flat on its wall.
+    tell: a rug lies on its floor, and a picture hangs flat on its wall. So Gaussians that only moved to where another
+    surface is nearest count as gone; how few of the class's pixels changed gives that away, unless it has a texture.
 
     Args:
         before: the colour field, with `sh`.

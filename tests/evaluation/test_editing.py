@@ -48,13 +48,14 @@ def test_removal_by_true_labels_is_near_one(room, cloud, mask, name):
     assert report.gone_points > 0.97
     assert report.untouched_off_border > 0.97
     assert report.kept_points > 0.99
+    assert report.changed_pixels > 0.97
     assert report.measured_pixels > 0.9
     assert report.views == 2
 
 
 def test_removing_nothing_leaves_everything(room, cloud):
     report = score_removal(cloud, cloud, room, "chair")
-    assert (report.gone_pixels, report.gone_points) == (0, 0)
+    assert (report.gone_pixels, report.changed_pixels, report.gone_points) == (0, 0, 0)
     assert (report.untouched_pixels, report.untouched_off_border, report.kept_points) == (1, 1, 1)
     assert not report.passed
 
@@ -85,6 +86,25 @@ def test_removing_half_scores_half(room, cloud, mask):
     assert abs(report.gone_points - share) < 0.03
     assert 0.1 < report.gone_pixels < 0.9
     assert not report.passed
+
+
+def test_a_class_that_looks_as_before_is_not_removed(room, cloud, mask):
+    report = score_removal(cloud, remove(cloud, mask["rug"]), room, "rug")
+    perfect = {"gone_pixels": 1.0, "gone_points": 1.0, "untouched_pixels": 1.0, "kept_points": 1.0}
+    assert dataclasses.replace(report, **perfect).passed
+    assert not dataclasses.replace(report, **perfect, changed_pixels=0.5).passed
+    assert not dataclasses.replace(report, **perfect, changed_pixels=math.nan).passed
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_fields_on_a_gpu_score_the_same(room, cloud, mask):
+    after = remove(cloud, mask["chair"])
+    here, there = (score_removal(cloud.to(d), after.to(d), room, "chair").to_json() for d in ("cpu", "cuda"))
+    assert there == pytest.approx(here, abs=0.01)
+    after = recolor(cloud, mask["chair"], BLUE)
+    here, there = (score_recolor(cloud.to(d), after.to(d), room, "chair", BLUE) for d in ("cpu", "cuda"))
+    assert there.hue_inside == pytest.approx(here.hue_inside, abs=0.01)
+    assert there.psnr_outside == pytest.approx(here.psnr_outside, abs=0.5)
 
 
 def test_an_object_that_was_not_there_is_no_success(room, cloud, mask):
