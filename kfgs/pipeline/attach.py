@@ -249,7 +249,7 @@ def _about(transfer: Transfer, by: By) -> str:
     if by == "distance":
         return repr(transfer)
     count = len(transfer.labels)
-    return f"of {count} that no view shows: {transfer!r}" if count else "some view shows every Gaussian"
+    return f"of {count} that no view shows: {transfer!r}" if count else "there is none that no view shows"
 
 
 def _meaning(transfer: Transfer) -> str:

@@ -21,6 +21,7 @@ MAX_ERROR = 0.03  # of the cameras' extent: two SfM runs of one scene differ by 
 MAX_ANGLE = 15.0  # degrees between a camera's two orientations, after alignment
 MIN_INLIERS = 0.5  # share of the common cameras that must fit
 TRIPOD = 0.01  # cameras closer together than this share of the extent stand at one place
+ROUNDING = 1e-4  # of the extent: poses in float32 may be off by that, where the frame stands far from its origin
 SIGMAS = 4.0  # at the end, cameras farther off than this (by the median) are left out
 PAIRS = 5_000  # pairs of cameras tried when their centres alone say too little
 
@@ -144,7 +145,8 @@ def _best_fit(A: Array, B: Array, turns: Array, sizes: list[float]) -> tuple[Sim
         for start in (_by_centers(A, B, size), *_by_orientations(A, B, turns, size)):
             if start is not None:
                 similarity, good = _refine(start, A, B, turns, size)
-                if best[0] is None or good.sum() > best[1].sum():
+                spread = np.ptp(B[good], axis=0).max(initial=0.0) if good.any() else 0.0
+                if spread > TRIPOD * size and good.sum() > best[1].sum():  # at one place any scale fits
                     best = similarity, good, size
         if best[1].sum() >= _least(A):
             break
@@ -206,7 +208,7 @@ def _refine(start: Similarity, A: Array, B: Array, turns: Array, size: float) ->
         else:
             similarity = fit_similarity(torch.from_numpy(A[good]), torch.from_numpy(B[good]))
         typical = float(np.median(_distances(similarity, A, B)[good]))
-        limit = min(MAX_ERROR * size, SIGMAS * typical + 1e-9 * size)
+        limit = min(MAX_ERROR * size, SIGMAS * typical + ROUNDING * size)
         before, good = good, _good(similarity, A, B, turns, limit)
         if bool((good == before).all()):
             break

@@ -237,7 +237,7 @@ def test_where_the_views_show_everything_distance_has_no_lambda():
     assert facts["not shown"] == 0
     assert facts["lambda"] is None
     assert facts["lambda from"] is None
-    assert attached.words[2] == "some view shows every Gaussian"
+    assert attached.words[2] == "there is none that no view shows"
 
 
 def test_a_given_similarity_is_taken_as_it_is():

@@ -162,7 +162,8 @@ def test_two_names_swapped_are_refused():
 
 @pytest.mark.parametrize(("tripod", "elsewhere"), [(2, 1), (10, 8), (16, 4)])
 @pytest.mark.parametrize("jitter", [0.0, 1e-3])
-def test_most_cameras_on_one_tripod_leave_a_scale(tripod, elsewhere, jitter):
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_most_cameras_on_one_tripod_leave_a_scale(tripod, elsewhere, jitter, dtype):
     rng = np.random.default_rng(0)
     centers = np.concatenate([0.3 + jitter * rng.normal(size=(tripod, 3)), rng.normal(size=(elsewhere, 3))])
     cameras, true = some_cameras(centers=centers), a_similarity(7)
@@ -171,7 +172,7 @@ def test_most_cameras_on_one_tripod_leave_a_scale(tripod, elsewhere, jitter):
         viewmat = camera.viewmat.clone()
         viewmat[:3, 3] += torch.from_numpy(jitter * true.scale * rng.normal(size=3))
         others[i] = replace(camera, viewmat=viewmat)
-    found = align_by_cameras(cameras, others)
+    found = align_by_cameras(*([camera.to(dtype) for camera in side] for side in (cameras, others)))
     assert found.inliers == tripod + elsewhere
-    assert_same(found.similarity, true, 1e-6 + 8 * jitter)
+    assert_same(found.similarity, true, 1e-5 + 8 * jitter)
     assert found.size > 0.5 * true.scale  # of the cameras elsewhere, not of the tripod
