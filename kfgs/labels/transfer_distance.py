@@ -45,16 +45,21 @@ def explained_distance(tree: cKDTree, dst: Array) -> tuple[float, str]:
     tiny = 1e-6 * max(1.0, float(np.abs(tree.maxes).max()), float(np.abs(tree.mins).max()))
     if len(dst) == 0:
         return tiny, "no destinations"
+    needed = f"{100 * COVERAGE:g} % of the destinations"
     reach = float(np.quantile(tree.query(_sample(dst), workers=-1)[0], COVERAGE))
     if tree.n == 1:
-        return max(1.01 * reach, tiny), f"{COVERAGE:.1%} of destinations within {reach:.4g} of the one source position"
+        return max(1.01 * reach, tiny), f"{needed} lie within {reach:.3g} of the one source position"
     spacings = np.asarray(tree.query(_sample(np.asarray(tree.data)), k=2, workers=-1)[0])[:, 1]
     usual, wide = (float(spacing) for spacing in np.quantile(spacings, [0.5, WIDE]))
-    chosen = min(max(reach, NEAREST * usual), FARTHEST * wide)
-    return max(chosen, tiny), (
-        f"{COVERAGE:.1%} of destinations lie within {reach:.4g}, "
-        f"kept from {NEAREST:g} median to {FARTHEST:g} wide source spacings, {usual:.4g} and {wide:.4g}"
-    )
+    if reach > FARTHEST * wide:
+        return max(FARTHEST * wide, tiny), (
+            f"{FARTHEST:g} wide source spacings of {wide:.3g} ({needed} would need {reach:.3g})"
+        )
+    if reach < NEAREST * usual:
+        return max(NEAREST * usual, tiny), (
+            f"{NEAREST:g} median source spacings of {usual:.3g} ({needed} need only {reach:.3g})"
+        )
+    return max(reach, tiny), f"{needed} have a source so near (source spacings: {usual:.3g} median, {wide:.3g} wide)"
 
 
 def _sample(points: Array) -> Array:

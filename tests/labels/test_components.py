@@ -89,13 +89,21 @@ def test_default_distance_follows_the_selection():
     means = torch.cat([dense, sparse])
     first = torch.arange(800) < 400
     step = component_distance(means, first)
-    assert 2 * 0.1 - 1e-6 <= step <= 2 * 0.1 * math.sqrt(2) + 1e-6
+    assert step == pytest.approx(1.5 * 0.1 * math.sqrt(2), rel=1e-4)
     assert component_distance(means, ~first) == pytest.approx(3 * step, rel=1e-4)
     assert component_distance(means * 7, first) == pytest.approx(7 * step, rel=1e-4)
     specks = torch.zeros(800, dtype=torch.bool)
     specks[[0, 399, 799]] = True
     assert component_distance(means, specks) <= 4 * 0.3 * math.sqrt(2) + 1e-6  # not the hundred between the sheets
     assert component_numbers(torch.ones(3, 3), torch.ones(3, dtype=torch.bool)).tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(("gap", "parts"), [(0.2, [800]), (0.22, [400, 400])])
+def test_default_distance_parts_things_that_stand_close(gap, parts):
+    """1.5 spacings of 0.141 are 0.212; twice the spacing joined the two chairs of room_0."""
+    means = torch.cat([grid([0.0, 0, 0], n=20, step=0.1), grid([1.9 + gap, 0, 0], n=20, step=0.1)])
+    numbers = component_numbers(means, torch.ones(800, dtype=torch.bool))
+    assert numbers.bincount().tolist() == parts
 
 
 def test_a_click_takes_the_thing_under_it():

@@ -31,8 +31,23 @@ def test_default_distance_is_used_and_explained():
     result = transfer_labels(src, torch.zeros(400, dtype=torch.int64), dst)
     assert result.distance == default_distance(src, dst)
     assert result.labelled >= 0.9 * 300 - 1
-    assert "source spacings" in result.how
+    assert "source spacings: " in result.how
     assert "orphaned" in repr(result)
+
+
+@pytest.mark.parametrize(
+    ("height", "words"),
+    [
+        (4.0, "99.5 % of the destinations have a source so near (source spacings: 1 median, 1 wide)"),
+        (0.5, "2 median source spacings of 1 (99.5 % of the destinations need only 0.5)"),
+        (100.0, "10 wide source spacings of 1 (99.5 % of the destinations would need 100)"),
+    ],
+)
+def test_the_line_says_which_bound_decided(height, words):
+    axis = torch.arange(10.0)
+    grid = torch.cartesian_prod(axis, axis, torch.zeros(1))
+    result = transfer_labels(grid, torch.zeros(100, dtype=torch.int64), grid + torch.tensor([0.0, 0.0, height]))
+    assert words in result.how
 
 
 def test_one_source_position_has_a_default_distance():
