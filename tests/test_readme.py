@@ -1,0 +1,46 @@
+"""The Python examples of the README run as they are written, on a small room; only the schedule is shortened."""
+
+import re
+from pathlib import Path
+
+import pytest
+from cases_color import make_field, make_splat
+from small_room import CONFIG, make_room
+
+import kfgs
+from kfgs import read_splats
+
+README = Path(kfgs.__file__).parents[1] / "README.md"
+
+
+@pytest.fixture(scope="module")
+def examples():
+    if not README.is_file():
+        pytest.skip("kfgs is installed without its repository: no README.md beside it")
+    return re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory):
+    """A folder as the README's user has it: scene/, features/, my.spz."""
+    folder = tmp_path_factory.mktemp("desk")
+    room = make_room(folder / "scene")
+    (folder / "features").symlink_to(room / "features", target_is_directory=True)
+    make_splat(room, folder / "my.spz")
+    return folder
+
+
+def test_examples_run_one_after_the_other(examples, desk, monkeypatch):
+    monkeypatch.chdir(desk)
+    fitting, editing = examples
+    assert fitting.count("FitConfig.cpu()") == 1
+    known = {"SHORT": CONFIG, "other_points": read_splats("my.spz").gaussians.means}
+    exec(fitting.replace("FitConfig.cpu()", "SHORT"), known)
+    assert known["chair"].mask.shape == (len(known["field"]),)
+    assert len(known["carried"].labels) == len(known["other_points"])
+    make_field(Path("scene"), Path("run/field"))  # 120 steps know no plant: this one knows the truth
+    exec(editing, known)
+    before, after = known["found"].splats, read_splats("edited.ply")
+    chairs = before.gaussians.labels == before.classes.index("chair")
+    assert 0 < int(chairs.sum()) == len(before) - len(after)
+    assert len(kfgs.EditList.load("edits.json")) == 1
