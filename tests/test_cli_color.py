@@ -17,6 +17,8 @@ from kfgs.evaluation import load_label_set
 from kfgs.fields import SemanticField
 from kfgs.formats import read_splats, write_splats
 from kfgs.formats.sidecar import names_path
+from kfgs.labels.edits import EditList
+from kfgs.pipeline.compare import views_of_edits
 from kfgs.pipeline.photos import Photos
 from kfgs.scenes import load_scene
 from kfgs.splat import rasterize
@@ -191,6 +193,11 @@ def test_select_asks_a_field_by_text(field, truth, room, capsys):
     # Each Gaussian carries its class's own embedding.
     assert f"lamp: {int((truth == names.index('lamp')).sum())} of 4000 Gaussians" in said
     assert "12 negatives" in said
+    assert "note: each Gaussian's own latent decides, which is noisy; with --scene the field's views do" in said
+    assert main(["select", "lamp", str(field), "--scene", str(room)]) == 0
+    said = capsys.readouterr().out
+    assert "own latent" not in said
+    assert "lamp/1" not in said  # what `kfgs edit` calls so are parts of a label
 
 
 def test_select_by_score(labelled, tmp_path, capsys):
@@ -243,6 +250,23 @@ def test_edit_does_each_of_its_options(labelled, tmp_path, capsys):
     torch.testing.assert_close(b.means[new["wall"]], a.means[old["wall"]], rtol=0, atol=0)
 
 
+def test_edit_takes_the_parts_that_select_lists(labelled, tmp_path, capsys):
+    assert main(["select", "chair", str(labelled), "--out", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    parts = json.loads((tmp_path / "selection.json").read_text())["parts"]
+    assert len(parts) > 1
+    for number, part in enumerate(parts, start=1):
+        assert f"  chair/{number}: Answer({part['count']} Gaussians" in said
+    assert main(["edit", str(labelled), "--out", str(tmp_path / "e.ply"), "--extract", "chair/2"]) == 0
+    found, cloud = read_splats(tmp_path / "e.ply"), read_splats(labelled)
+    assert torch.equal(found.gaussians.means, cloud.gaussians.means[parts[1]["indices"]])
+    assert (
+        main(["edit", str(labelled), "--out", str(tmp_path / "again.ply"), "--replay", str(tmp_path / "e.edits.json")])
+        == 0
+    )
+    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "e.ply").read_bytes()
+
+
 def test_hue_keeps_luminance_and_tint_does_not(labelled, tmp_path):
     luminance = torch.tensor([0.2126, 0.7152, 0.0722])
     changes = {}
@@ -291,6 +315,14 @@ def test_edit_shows_before_and_after(labelled, room, tmp_path, capsys):
     assert "from view_003.png, view_001.png" in capsys.readouterr().out
     with Image.open(tmp_path / "e.png") as both:
         assert both.height == picture.shape[0] + 66
+    (tmp_path / "e.png").unlink()
+    assert main([*arguments, "--recolor", "lamp:#00ff00", "--pictures", "2"]) == 0
+    chosen = capsys.readouterr().out.split("before and after from ")[1].splitlines()[0].split(", ")
+    before, edits = read_splats(labelled), EditList.load(tmp_path / "e.edits.json")
+    cameras = load_scene(room).cameras
+    states = [before, *(EditList(edits.edits[: i + 1]).apply(before) for i in range(2))]
+    expected = views_of_edits([state.gaussians for state in states], cameras, 2)
+    assert chosen == [cameras[i].name for i in expected]
     (tmp_path / "e.png").unlink()
     assert main([*arguments, "--pictures", "0"]) == 0
     assert not (tmp_path / "e.png").exists()

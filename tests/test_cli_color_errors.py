@@ -9,7 +9,9 @@ from small_room import make_room
 
 from kfgs.cli import main
 from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs.labels.edits import EditList, Remove
 
+TWICE = ["--views", "view_001", "--views", "view_001.png"]
 ERRORS = {
     "attach": [
         (["{splat}", "{field}", "--scene", "{room}", "--out", "{o}.ply"], "field: expected the folder that `kfgs fit`"),
@@ -97,6 +99,26 @@ ERRORS = {
             ["{labelled}", "--out", "{o}.ply", "--remove", "chair", "--scene", "{room}", "--views", "view_01"],
             "views: expected names of the scene's 9 views, got 'view_01'; did you mean 'view_001.png' or",
         ),
+        (
+            ["{labelled}", "--out", "{o}.ply", "--remove", "rug", "--scene", "{room}", *TWICE],
+            "views: expected each view once, got 'view_001.png' twice; name it once",
+        ),
+        (
+            ["{labelled}", "--out", "{same}.ply", "--replay", "{same}.edits.json"],
+            "replay: expected another file than {same}.edits.json, where the edits behind {same}.ply are saved, got the same",
+        ),
+        (
+            ["{labelled}", "--out", "{taken}.ply", "--remove", "rug"],
+            "a file or nothing at {taken}.edits.json, got a folder",
+        ),
+        (
+            ["{labelled}", "--out", "{o}.ply", "--remove", "chair/0"],
+            "remove: expected parts counted from 1, got 'chair/0'",
+        ),
+        (
+            ["{labelled}", "--out", "{o}.ply", "--remove", "chair/99"],
+            "got none from Component(where=OfClass(name='chair')",
+        ),
         (["{labelled}", "--out", "{o}.ply", "--remove", "chair", "--pictures", "-1"], "pictures: expected a number in"),
         (["{labelled}", "--out", "{o}.ply", "--replay", "{tmp}/no.json"], "{tmp}/no.json: no such file"),
         (["{labelled}", "--out", "{o}.ply", "--replay", "{room}/classes.json"], "expected edits that kfgs saved"),
@@ -127,7 +149,10 @@ ERRORS = {
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory):
-    """What the errors speak of; `plain` has classes but no colours, `four` has four Gaussians far away."""
+    """What the errors speak of.
+
+    `plain` has classes but no colours, `four` has four Gaussians far away; edits lie beside `same`, a folder beside `taken`.
+    """
     folder = tmp_path_factory.mktemp("errors")
     room = make_room(folder / "scene")
     field, splat = make_field(room, folder / "run" / "field"), make_splat(room, folder / "splat.ply")
@@ -138,8 +163,12 @@ def places(tmp_path_factory):
     write_splats(folder / "plain.ply", SplatFile(cloud.gaussians.replace(sh=None), {}, cloud.classes))
     four = read_splats(splat).gaussians.select(torch.arange(4))
     write_splats(folder / "four.ply", four.replace(means=four.means + 100))
-    paths = {"room": room, "field": field, "run": field.parent, "splat": splat, "labelled": labelled}
-    return {name: str(path) for name, path in paths.items()} | {n: str(folder / f"{n}.ply") for n in ("plain", "four")}
+    same = EditList((Remove("rug"),)).save(folder / "same.edits.json")
+    (folder / "taken.edits.json").mkdir()
+    paths = {"room": room, "field": field, "run": field.parent, "splat": splat, "labelled": labelled, "saved": same}
+    paths |= {"same": folder / "same", "taken": folder / "taken"}
+    paths |= {name: folder / f"{name}.ply" for name in ("plain", "four")}
+    return {name: str(path) for name, path in paths.items()}
 
 
 @pytest.mark.parametrize(
@@ -152,7 +181,7 @@ def places(tmp_path_factory):
 )
 def test_bad_input_ends_with_1_one_line_and_no_files(command, arguments, message, places, tmp_path, capsys):
     places = places | {"tmp": str(tmp_path), "o": str(tmp_path / "o" / "new")}
-    sources = {name: places[name] for name in ("splat", "labelled")}
+    sources = {name: places[name] for name in ("splat", "labelled", "saved")}
     before = {name: Path(path).read_bytes() for name, path in sources.items()}
     assert main([command, *(one.format(**places) for one in arguments)]) == 1
     said = capsys.readouterr().err.strip().splitlines()[-1]

@@ -4,9 +4,11 @@ import pytest
 import torch
 
 from kfgs.cli.edit_words import edits_from_words, inserted_files
+from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
+from kfgs.labels import answers, select_by_label
 from kfgs.labels.edits import Duplicate, Extract, Insert, Move, Opacity, Recolor, Remove, Turn
-from kfgs.labels.where import Either, OfClass
+from kfgs.labels.where import Component, Either, OfClass
 
 
 def read(**words):
@@ -50,6 +52,57 @@ def test_the_order_does_not_depend_on_the_line(tmp_path):
 
 def test_a_class_asked_twice_is_removed_once():
     assert read(remove=["chair", "chair"]) == [Remove(OfClass("chair"))]
+
+
+def test_a_class_asked_in_other_case_is_removed_with_it():
+    # Asked one after the other, the second would find nothing where they are one class.
+    assert read(remove=["chair", "rug", "Chair"]) == [
+        Remove(Either((OfClass("chair"), OfClass("Chair")))),
+        Remove(OfClass("rug")),
+    ]
+
+
+def test_a_number_behind_a_class_is_a_part_of_it():
+    second = Component(OfClass("chair"), rank=1)
+    assert read(recolor=["chair/2:red"]) == [Recolor(second, (1.0, 0.0, 0.0), "tint")]
+    assert read(opacity=["chair/2:0.3"]) == [Opacity(second, 0.3)]
+    assert read(scale=["chair/2:1.5"]) == [Move(second, scale=1.5)]
+    assert read(rotate=["chair/2:y,-90"]) == [Move(second, rotation=Turn((0, 1, 0), -90))]
+    assert read(move=["chair/2:0.5,0,0"]) == [Move(second, (0.5, 0.0, 0.0))]
+    assert read(duplicate=["chair/2:1,0,0"]) == [Duplicate(second, (1.0, 0.0, 0.0))]
+    assert read(extract=["chair/2", "rug"]) == [Extract(Either((second, OfClass("rug"))))]
+    assert read(remove=["chair/2"]) == [Remove(second)]
+    for name in ("tv/monitor", "chair/", "/2", "chair/-1", "chair/1.5"):
+        assert read(remove=[name]) == [Remove(OfClass(name))]
+
+
+def rows(*sizes):
+    """A row of Gaussians of class 1 for each size, 0.1 apart; rows are 10 apart. Beside them a row of class 0."""
+    means = torch.tensor([(10.0 * i, 0.1 * j, 0.0) for i, n in enumerate((*sizes, 40)) for j in range(n)])
+    n = len(means)
+    labels = (torch.arange(n) < sum(sizes)).long()
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1)
+    return SplatFile(Gaussians(means, quats, torch.ones(n, 3), torch.ones(n), labels=labels), {}, ("wall", "chair"))
+
+
+def test_parts_are_numbered_as_select_lists_them():
+    cloud = rows(20, 60, 40, 60)
+    things = answers(cloud.gaussians, select_by_label(cloud.gaussians, "chair", cloud.classes))
+    assert [thing.count for thing in things] == [60, 60, 40, 20]
+    for number, thing in enumerate(things, start=1):
+        (edit,) = read(remove=[f"Chair/{number}"])
+        assert torch.equal(edit.where.mask(cloud.gaussians, cloud.classes).nonzero()[:, 0], thing.indices)
+
+
+def test_parts_that_are_removed_are_counted_together():
+    cloud = rows(20, 60, 40, 50)
+    (edit,) = read(remove=["chair/1", "chair/2"])
+    left = edit.apply(cloud).gaussians
+    assert torch.equal(
+        left.means, torch.cat([cloud.gaussians.means[:20], cloud.gaussians.means[80:120], left.means[-40:]])
+    )
+    (edit,) = read(remove=["chair/1", "chair"])
+    assert edit.apply(cloud).gaussians.labels.unique().tolist() == [0]
 
 
 def test_a_class_name_may_hold_a_colon():
@@ -99,6 +152,8 @@ def test_a_file_whose_name_holds_a_colon_is_itself(tmp_path):
         ("move", "table:1,2", r"move: expected 3 numbers between commas after the colon, got 'table:1,2'; write it so"),
         ("move", "table:1,2,inf", r"move: expected 3 numbers between commas after the colon, got 'table:1,2,inf'"),
         ("duplicate", "chair:1 0 0", r"duplicate: expected 3 numbers between commas .* got 'chair:1 0 0'"),
+        ("remove", "chair/0", r"remove: expected parts counted from 1, got 'chair/0'; 'chair/1' is the largest"),
+        ("move", "chair/00:1,0,0", r"move: expected parts counted from 1, got 'chair/00'; 'chair/1' is the largest"),
         ("insert", "no.ply:1,0,0", r"insert: expected a splat file, .* got 'no.ply:1,0,0'; no file 'no.ply'"),
         ("insert", "no.ply", r"insert: expected a splat file, .* got 'no.ply'; no file 'no.ply'"),
     ],

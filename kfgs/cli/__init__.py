@@ -13,7 +13,8 @@ from typing import Any
 
 import tyro
 
-from .color import attach, color, convert, edit, select
+from .color import attach, color, convert, edit
+from .query import select
 from .semantic import demo, fit, info, label, segment, sfm
 
 COMMANDS: dict[str, Any] = {

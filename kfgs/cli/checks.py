@@ -26,6 +26,22 @@ def check_target(name: str, target: Path, *sources: Path) -> None:
             raise ValueError(f"{name}: expected another file than {source}, got the same; give another name")
 
 
+def edits_beside(out: Path, replay: Path | None) -> Path:
+    """Where the edits behind a splat file are saved.
+
+    Raises:
+        ValueError: if the edits to replay would be overwritten, or no file can be there.
+    """
+    saved = out.with_suffix(".edits.json")
+    _check_place("out", saved, "a file")
+    if replay is not None and replay.resolve() == saved.resolve():
+        raise ValueError(
+            f"replay: expected another file than {saved}, where the edits behind {out} are saved, got the same; give --out "
+            "another name"
+        )
+    return saved
+
+
 def check_folder(name: str, target: Path) -> None:
     """Raise a ValueError unless `target` is a folder or can become one."""
     _check_place(name, target, "a folder")
@@ -73,17 +89,21 @@ def choose_views(scene: Any, names: Sequence[str]) -> Any:
     """The scene with the named views alone.
 
     Raises:
-        ValueError: if a name is none of the scene's views.
+        ValueError: if a name is none of the scene's views, or one view is named twice, with its ending and without.
     """
+    seen = set[str]()
     for name in names:
         try:
-            scene.select([name])
+            (view,) = (camera.name for camera in scene.select([name]).cameras)
         except ValueError as error:
             near = difflib.get_close_matches(name, [camera.name for camera in scene.cameras], n=3, cutoff=0)
             raise ValueError(
                 f"views: expected names of the scene's {len(scene)} views, got {name!r}; "
                 f"did you mean {' or '.join(map(repr, near))}?"
             ) from error
+        if view in seen:
+            raise ValueError(f"views: expected each view once, got {view!r} twice; name it once")
+        seen.add(view)
     return scene.select(names)
 
 

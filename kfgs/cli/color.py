@@ -1,15 +1,16 @@
-"""Commands of colour scenes: color, attach, select, edit, convert."""
+"""Commands of colour scenes: color, attach, edit, convert."""
 
 from __future__ import annotations
 
 import dataclasses
+from itertools import accumulate
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from .._check import check_range, check_whole
-from .checks import check_alone, check_folder, check_target, choose_views, open_field, open_splats
+from .._check import check_whole
+from .checks import check_alone, check_folder, check_target, choose_views, edits_beside, open_field, open_splats
 from .edit_words import edits_from_words, inserted_files
 from .say import load_classes, say, say_lost, size_of, training_cameras, wrote
 
@@ -17,6 +18,7 @@ from .say import load_classes, say, say_lost, size_of, training_cameras, wrote
 
 ColorPreset = Literal["quick", "cpu", "paper"]
 Method = Literal["nearest", "vote", "mahalanobis"]
+TITLES = ("before", "after")
 Several = tyro.conf.UseAppendAction[tuple[str, ...]]
 
 
@@ -102,7 +104,8 @@ def attach(
         classes: JSON list of class names; SCENE/classes.json when not given.
         text: .npy of one embedding per class; SCENE/text.npy when not given.
         by: `views`: the field segments its training views and each Gaussian takes the class of the pixels that it fills;
-            `distance`: the labelled Gaussians within lambda decide, as in the paper. `views` when a scene is given.
+            `distance`: the labelled Gaussians of the field within lambda decide, as in the paper; those are labelled by
+            their own latents, as in the paper, or with --scene by the votes of its views. `views` when a scene is given.
         method: where distance decides: the `nearest` labelled Gaussian (as in the paper), a `vote` of those around, or their
             overlap (`mahalanobis`), which is the best of the three where the field's labels are noisy.
         distance: the paper's lambda in the splat's world units; from the clouds' spacing when not given.
@@ -156,71 +159,6 @@ def attach(
     wrote(written.paths)
 
 
-def select(
-    query: Annotated[str, tyro.conf.Positional],
-    source: Annotated[Path, tyro.conf.Positional],
-    out: Path | None = None,
-    scene: Path | None = None,
-    classes: Path | None = None,
-    text: Path | None = None,
-    threshold: float | None = None,
-    negatives: bool = True,
-    images: Path | None = None,
-) -> None:
-    """Which Gaussians are the chair? How many there are, where, how large, and the view that shows each best.
-
-    Args:
-        query: a class name, "chair".
-        source: a field folder (`RUN/field`), asked by text; or a splat with classes, asked by label.
-        out: folder for selection.json (with the indices) and selection.ply (the Gaussians), if wanted.
-        scene: scene folder: classes.json, text.npy, and the cameras that score and show.
-        classes: JSON list of class names; SCENE/classes.json when not given.
-        text: .npy of one embedding per class; SCENE/text.npy when not given.
-        threshold: of a field, the paper's gamma; from the scores' distribution when not given. Of a splat, the least score.
-        negatives: tell the class from all others (relevancy) instead of by its cosine alone; of a field.
-        images: folder of the scene's pictures, if it is not SCENE/images.
-    """
-    from .._files import write_json
-    from ..formats import SplatFile, write_splats
-    from ..labels import answers
-    from ..pipeline import query_field
-    from ..pipeline.apply import select_labelled
-    from ..scenes import load_scene
-
-    if not source.exists() and Path(query).exists():
-        raise ValueError(f"query, source: expected a class, then a file, got {query!r}, {str(source)!r}; swap them")
-    if out is not None:
-        check_folder("out", out)
-    if threshold is not None:
-        check_range("threshold", threshold, 0, 1)
-    if scene is None:
-        check_alone("images", images, "without --scene, whose pictures they are")
-    if (source / "field.json").is_file():
-        field, label_set = open_field(source), load_classes(scene, classes, text)
-        cameras = None if scene is None else training_cameras(field, scene, images)
-        found = query_field(field, label_set, query, threshold, cameras=cameras, negatives=negatives)
-        cloud = SplatFile(field.gaussians, {"score": found.scores.numpy()})
-    else:
-        for name, given in (("classes", classes), ("text", text), ("negatives", negatives)):
-            check_alone(name, given, "beside a splat, which has its own classes")
-        cloud = open_splats("source", source, labelled=True)
-        found = select_labelled(cloud, query, threshold)
-        cameras = None if scene is None else load_scene(scene, images=images).undistorted().cameras
-    say(f"{query}: {len(found)} of {len(cloud)} Gaussians, {found.words}")
-    things = answers(cloud.gaussians, found, cameras)
-    for thing in things:
-        say(f"  {thing!r}")
-    if out is not None:
-        if len(found) == 0:
-            raise ValueError(
-                f"query: expected Gaussians to save, got none of {query!r}; lower the threshold or drop --out"
-            )
-        parts = [thing.to_json() for thing in things]
-        facts = {"query": query, "threshold": found.threshold, "how": found.how, "count": len(found), "parts": parts}
-        write_json(out / "selection.json", facts)
-        wrote([out / "selection.json", *write_splats(out / "selection.ply", cloud.select(found.mask)).paths])
-
-
 def edit(
     splats: Annotated[Path, tyro.conf.Positional],
     out: Path,
@@ -245,6 +183,9 @@ def edit(
     Whatever their order on the line, edits are done in the order below, each on what those before left: --remove takes the
     copies of --duplicate too, and --insert is touched by no other. Another order: several calls, or --replay.
 
+    A class stands for all that carries it; "chair/1" for the largest of its connected parts, "chair/2" for the next, as
+    `kfgs select chair` lists them. Each edit counts the parts that those before left; --remove takes its own together.
+
     Args:
         splats: a splat with classes, as `kfgs attach` writes it.
         out: the edited splat; its ending chooses the format. The edits go to OUT.edits.json (as --replay reads them) and
@@ -256,20 +197,21 @@ def edit(
         rotate: a class, an axis of the world and degrees, "table:z,90", by the right hand about the same centre.
         move: a class and a translation in world units, "table:0.5,0,0".
         duplicate: a class and where its copy goes, seen from it, "chair:1,0,0".
-        remove: a class, "chair".
+        remove: a class, "chair", or one part of it, "chair/2".
         extract: keep only these classes.
         insert: a splat file to add, "lamp.ply", or that moved by a translation, "lamp.ply:1,0,0".
-        replay: edits saved before, which come first.
+        replay: edits saved before, which come first; another file than OUT.edits.json.
         scene: scene folder in the splat's frame, whose cameras show the splat before and after.
-        views: names of the views to show; those in which most changes when not given.
+        views: names of the views to show; when not given one for each edit in turn, then those in which most changes.
         pictures: how many views to show, where their names are not given.
         images: folder of the scene's pictures, if it is not SCENE/images.
     """
     from ..formats import write_splats
     from ..labels.edits import EditList
-    from ..pipeline.compare import views_of_change, write_comparison
+    from ..pipeline.compare import views_of_edits, write_comparison
 
     check_target("out", out, splats)
+    saved = edits_beside(out, replay)
     check_whole("pictures", pictures, 0)
     if scene is None:
         check_alone("views", ", ".join(views) or None, "without --scene, whose views they are")
@@ -288,15 +230,15 @@ def edit(
     say(f"{len(before)} Gaussians before, {len(after)} after {len(edits)} edit(s)")
     if len(after) == 0:
         say("note: nothing is left")
-    clouds = before.gaussians, after.gaussians
-    shown = cameras if views else [cameras[i] for i in views_of_change(*clouds, cameras, pictures)]
+    states = (cloud.gaussians for cloud in accumulate(edits, lambda cloud, one: one.apply(cloud), initial=before))
+    shown = cameras if views or not cameras else [cameras[i] for i in views_of_edits(states, cameras, pictures)]
     written = write_splats(out, after)
     say_lost(written)
-    paths = [*written.paths, edits.save(out.with_suffix(".edits.json"))]
+    paths = [*written.paths, edits.save(saved)]
     if cameras and pictures and not shown:
         say("note: no view of the scene shows a change")
     if shown:
-        paths.append(write_comparison(out.with_suffix(".png"), *clouds, shown, titles=("before", "after")))
+        paths.append(write_comparison(out.with_suffix(".png"), before.gaussians, after.gaussians, shown, titles=TITLES))
         say("before and after from " + ", ".join(camera.name for camera in shown))
     wrote(paths)
 

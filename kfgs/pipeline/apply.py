@@ -175,7 +175,7 @@ def query_field(
         field: a finished field.
         classes: names and embeddings.
         name: the class asked for.
-        threshold: gamma; from the scores' distribution when not given.
+        threshold: gamma, which scores must exceed. When not given, 0.5 with negatives, else from the scores' distribution.
         cameras: views whose pixels score each Gaussian; without them its own latent does, as in the paper.
         negatives: tell the class from all others by relevancy, instead of taking its cosine alone.
     """

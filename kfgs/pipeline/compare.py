@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from ..viz.pairs import picture_grid
 PREVIEW = 96  # pixels: width of the renderings that choose the viewpoints
 VISIBLE = 8 / 255  # a pixel has changed when some channel did by more than this
 MOST = 0.5  # a picture of which more has changed is taken from inside the change: it comes after all others
+SHOWN = 0.5  # an edit is shown where a view shows this share of what its best view shows
 APART = 30.0  # degrees between the viewing directions of chosen viewpoints, where there are such
 
 
@@ -30,9 +31,7 @@ def render_color(gaussians: Gaussians, camera: Camera) -> Tensor:  # [H, W, 3] i
 
 def changed_share(before: Gaussians, after: Gaussians, camera: Camera) -> float:
     """The share of a (small) picture in which an edit shows."""
-    small = camera.resized(max(1, round(PREVIEW * camera.height / camera.width)), PREVIEW)
-    difference = (render_color(before, small) - render_color(after, small)).abs().amax(-1)
-    return float((difference > VISIBLE).float().mean())
+    return _share(*(render_color(cloud, _small(camera)) for cloud in (before, after)))
 
 
 def views_of_change(before: Gaussians, after: Gaussians, cameras: Sequence[Camera], count: int = 2) -> list[int]:
@@ -45,21 +44,63 @@ def views_of_change(before: Gaussians, after: Gaussians, cameras: Sequence[Camer
         count: how many to choose at most; those in which nothing changes are never chosen, those of which more than half
             changes only when there are too few others.
     """
+    return views_of_edits((before, after), cameras, count)
+
+
+def views_of_edits(states: Iterable[Gaussians], cameras: Sequence[Camera], count: int = 2) -> list[int]:
+    """The viewpoints that show several edits: for each in turn its best, then those that show most of all together.
+
+    An edit that a view chosen before shows half as well as its own best gets no other, nor does one that is undone later.
+
+    Args:
+        states: the scene before the first edit, and after each of them.
+        cameras: viewpoints to choose from.
+        count: how many to choose at most, by the rules of `views_of_change`.
+    """
     check_whole("count", count, 0)
     if count == 0:
         return []
-    shares = [changed_share(before, after, camera) for camera in cameras]
-    order = sorted(range(len(cameras)), key=lambda i: (shares[i] > MOST, -shares[i]))
-    ranked = [i for i in order if shares[i] > 0]
-    forward = {i: cameras[i].viewmat[2, :3].double() for i in ranked}
+    small = [_small(camera) for camera in cameras]
+    seen = ([render_color(state, camera) for camera in small] for state in states)
+    first = last = next(seen)
+    shares = []  # of every edit, C each
+    for pictures in seen:
+        shares.append([_share(*pair) for pair in zip(last, pictures, strict=True)])
+        last = pictures
+    total = [_share(*pair) for pair in zip(first, last, strict=True)]
     chosen: list[int] = []
+    for share in shares:
+        best = next((i for i in _ranked(share) if total[i] > 0), None)
+        if best is not None and max((share[i] for i in chosen), default=0.0) < SHOWN * share[best]:
+            chosen.append(best)
+    return _filled_up(chosen[:count], total, cameras, count)
+
+
+def _filled_up(chosen: list[int], shares: list[float], cameras: Sequence[Camera], count: int) -> list[int]:
+    """What is chosen and the best of the others: first those that look another way, then any."""
+    ranked = _ranked(shares)
+    forward = {i: cameras[i].viewmat[2, :3].double() for i in ranked}
     limit = torch.cos(torch.deg2rad(torch.tensor(APART, dtype=torch.float64)))
     for apart in (True, False):
         for i in ranked:
             far = all(float(forward[i] @ forward[j]) < float(limit) for j in chosen)
             if len(chosen) < count and i not in chosen and (far or not apart):
-                chosen.append(i)
+                chosen = [*chosen, i]
     return chosen
+
+
+def _ranked(shares: Sequence[float]) -> list[int]:
+    """The viewpoints in which something changes, the best first."""
+    order = sorted(range(len(shares)), key=lambda i: (shares[i] > MOST, -shares[i]))
+    return [i for i in order if shares[i] > 0]
+
+
+def _small(camera: Camera) -> Camera:
+    return camera.resized(max(1, round(PREVIEW * camera.height / camera.width)), PREVIEW)
+
+
+def _share(before: Tensor, after: Tensor) -> float:  # [H, W, 3] each
+    return float(((before - after).abs().amax(-1) > VISIBLE).float().mean())
 
 
 def write_comparison(

@@ -14,6 +14,7 @@ from kfgs.pipeline.compare import (
     changed_share,
     render_color,
     views_of_change,
+    views_of_edits,
     write_comparison,
 )
 
@@ -77,6 +78,36 @@ def test_a_view_from_inside_the_change_comes_last():
     assert changed_share(before, after, cameras[0]) > 0.5 > changed_share(before, after, cameras[1]) > 0
     assert views_of_change(before, after, cameras, 1) == [1]
     assert views_of_change(before, after, cameras, 2) == [1, 0]
+
+
+def test_each_edit_gets_a_view_before_any_gets_two():
+    large, plain = ball(AHEAD, (0.6, 0.0, 5.0)), ball(RIGHT, scale=0.1)
+    green = ball(RIGHT, scale=0.1, color=(0.0, 1.0, 0.0))
+    before, after = Gaussians.cat([large, plain]), green
+    cameras = [camera(0), camera(-31), camera(2), camera(90)]
+    assert views_of_change(before, after, cameras, 2) == [0, 1]  # both of the large change, before the small one
+    painted_first, removed_first = [before, Gaussians.cat([large, green]), after], [before, plain, after]
+    for count, expected in ((0, []), (1, [3]), (2, [3, 0]), (3, [3, 0, 1]), (9, [3, 0, 1, 2])):
+        assert views_of_edits(painted_first, cameras, count) == expected
+    assert views_of_edits(iter(removed_first), cameras, 2) == [0, 3]
+
+
+def test_an_edit_that_a_chosen_view_shows_gets_no_other():
+    left, right = (-0.5, 0.0, 5.0), (0.5, 0.0, 5.0)
+    states = [ball(left, right, RIGHT), ball(right, RIGHT), ball(RIGHT)]
+    cameras = [camera(-4), camera(4), camera(-31)]
+    shares = [[changed_share(*states[i : i + 2], one) for one in cameras] for i in (0, 1)]
+    assert shares[0][1] == max(shares[0])  # off the middle a ball looks larger
+    assert 2 * shares[1][1] > shares[1][0] == max(shares[1]) > shares[1][1]
+    assert views_of_edits(states, cameras, 2) == [1, 2]  # not [1, 0]: the third camera looks another way
+
+
+def test_an_edit_that_is_undone_gets_no_view():
+    before, away, red = ball(AHEAD, RIGHT), ball(AHEAD), ball(RIGHT, AHEAD, color=(0.0, 1.0, 0.0))
+    cameras = [camera(0), camera(90)]
+    assert views_of_edits([before, away, before], cameras) == []
+    assert views_of_edits([before, away, before, red], cameras[:1]) == [0]
+    assert views_of_edits([before], cameras) == []
 
 
 def test_a_negative_count_is_refused():

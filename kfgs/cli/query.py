@@ -1,0 +1,86 @@
+"""The command that asks: select."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from .._check import check_range
+from .checks import check_alone, check_folder, open_field, open_splats
+from .say import load_classes, say, training_cameras, wrote
+
+# Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
+
+
+def select(
+    query: Annotated[str, tyro.conf.Positional],
+    source: Annotated[Path, tyro.conf.Positional],
+    out: Path | None = None,
+    scene: Path | None = None,
+    classes: Path | None = None,
+    text: Path | None = None,
+    threshold: float | None = None,
+    negatives: bool = True,
+    images: Path | None = None,
+) -> None:
+    """Which Gaussians are the chair? How many there are, where, how large, and the view that shows each best.
+
+    Connected parts are listed one by one, the largest first. Those of a labelled splat have names, chair/1, chair/2, by
+    which `kfgs edit` takes them.
+
+    Args:
+        query: a class name, "chair".
+        source: a field folder (`RUN/field`), asked by text; or a splat with classes, asked by label.
+        out: folder for selection.json (with the indices) and selection.ply (the Gaussians), if wanted.
+        scene: scene folder: classes.json, text.npy, and the cameras that score and show.
+        classes: JSON list of class names; SCENE/classes.json when not given.
+        text: .npy of one embedding per class; SCENE/text.npy when not given.
+        threshold: scores must be above it. Of a field the paper's gamma: when not given 0.5, or with --no-negatives read off
+            the scores' distribution. Of a splat all of the class are taken when not given.
+        negatives: tell the class from all others (relevancy) instead of by its cosine alone; of a field.
+        images: folder of the scene's pictures, if it is not SCENE/images.
+    """
+    from .._files import write_json
+    from ..formats import SplatFile, write_splats
+    from ..labels import answers
+    from ..pipeline import query_field
+    from ..pipeline.apply import select_labelled
+    from ..scenes import load_scene
+
+    if not source.exists() and Path(query).exists():
+        raise ValueError(f"query, source: expected a class, then a file, got {query!r}, {str(source)!r}; swap them")
+    if out is not None:
+        check_folder("out", out)
+    if threshold is not None:
+        check_range("threshold", threshold, 0, 1)
+    if scene is None:
+        check_alone("images", images, "without --scene, whose pictures they are")
+    counted = not (source / "field.json").is_file() and threshold is None  # parts are numbered as `kfgs edit` does
+    if (source / "field.json").is_file():
+        field, label_set = open_field(source), load_classes(scene, classes, text)
+        cameras = None if scene is None else training_cameras(field, scene, images)
+        found = query_field(field, label_set, query, threshold, cameras=cameras, negatives=negatives)
+        cloud = SplatFile(field.gaussians, {"score": found.scores.numpy()})
+        if cameras is None:
+            say("note: each Gaussian's own latent decides, which is noisy; with --scene the field's views do")
+    else:
+        for name, given in (("classes", classes), ("text", text), ("negatives", negatives)):
+            check_alone(name, given, "beside a splat, which has its own classes")
+        cloud = open_splats("source", source, labelled=True)
+        found = select_labelled(cloud, query, threshold)
+        cameras = None if scene is None else load_scene(scene, images=images).undistorted().cameras
+    say(f"{query}: {len(found)} of {len(cloud)} Gaussians, {found.words}")
+    things = answers(cloud.gaussians, found, cameras)
+    for number, thing in enumerate(things, start=1):
+        say(f"  {query}/{number}: {thing!r}" if counted else f"  {thing!r}")
+    if out is not None:
+        if len(found) == 0:
+            raise ValueError(
+                f"query: expected Gaussians to save, got none of {query!r}; lower the threshold or drop --out"
+            )
+        parts = [thing.to_json() for thing in things]
+        facts = {"query": query, "threshold": found.threshold, "how": found.how, "count": len(found), "parts": parts}
+        write_json(out / "selection.json", facts)
+        wrote([out / "selection.json", *write_splats(out / "selection.ply", cloud.select(found.mask)).paths])
