@@ -6,6 +6,9 @@ smaller components in 10 bits each and 2 bits that say which is largest (w, x, y
 fields begin at the high bit. `sh`, only where there are higher harmonics: a byte for each, channel by channel, 32 steps
 to 1 between -4 and 4. Axes are those of the 3DGS PLY. Files of SuperSplat before version 2 have no colour bounds: there
 bytes run from 0 to 1. What the viewers check of the elements leaves no room for labels, which go to a file beside it.
+
+**Why not a library**: gsply 0.4.6 cuts values off where this module rounds them, which makes the errors twice as large,
+and brings opacities of 0 and 1 in as logits of -10 and 10; the tests have it as an independent reader and writer.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from torch import Tensor
 from ..gaussians import Gaussians
 from .order import morton_order
 from .ply import Columns, read_comments, read_ply_elements, write_ply_elements
+from .render_mode import comments_of_mode, mode_from_comments
 from .smallest_three import pack_smallest_three, rotation_error, unpack_smallest_three
 from .splat_file import Precision, SplatFile
 from .values import SH_C0, check_finite, colours_to_write, positive_scales, words_of_loss
@@ -88,7 +92,8 @@ def read(path: Path) -> SplatFile:
         opacities=torch.from_numpy(rgba[:, 3].copy()),
         sh=torch.from_numpy(sh),
     )
-    return SplatFile(gaussians, info={"format": NAME, "comments": read_comments(path)})
+    comments = read_comments(path)
+    return SplatFile(gaussians, info={"format": NAME, "comments": comments, **mode_from_comments(comments)})
 
 
 def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
@@ -125,7 +130,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
         rest = g.sh[:, 1:].transpose(1, 2).flatten(1).numpy()  # channel by channel
         steps_of_rest = np.clip(np.floor((rest / (2 * SH_LIMIT) + 0.5) * 256), 0, 255).astype(np.uint8)
         elements["sh"] = {f"f_rest_{i}": np.ascontiguousarray(column) for i, column in enumerate(steps_of_rest.T)}
-    write_ply_elements(path, elements, comments=("written by kfgs",))
+    write_ply_elements(path, elements, comments=("written by kfgs", *comments_of_mode(splats.info)))
     return words_of_loss(splats, ".compressed.ply", 3) + _words_of_clipping(g)
 
 

@@ -12,6 +12,9 @@
 
 **Convention**: glTF has x right, y up, z back; the 3DGS PLY has x right, y down, z forward. Values are turned by half a
 turn around x when reading and writing, harmonics with them, so a scene stands upright in any viewer.
+
+**Why not a library**: pygltflib 1.16.5 holds the JSON as objects, but leaves accessors, buffers and this extension to its
+caller, and takes a file whose accessors reach beyond its buffers; the tests have it as an independent reader and writer.
 """
 
 from __future__ import annotations
@@ -33,6 +36,7 @@ from .gltf_container import MAGIC as GLB
 from .gltf_container import Document, open_document, write_document
 from .gltf_nodes import place, placed_meshes
 from .ply import Columns
+from .render_mode import words_of_lost_mode
 from .splat_file import SCORE, Precision, SplatFile
 from .values import SH_C0, check_finite, colours_to_write, positive_scales, unit_quats, words_of_loss
 
@@ -146,7 +150,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     }
     write_document(path, root, writer.binary())
     left = {name: values for name, values in splats.extra.items() if name not in kept}
-    return words_of_loss(splats.replace(extra=left), path.suffix, 3)
+    return words_of_loss(splats.replace(extra=left), path.suffix, 3) + words_of_lost_mode(splats.info, path.suffix)
 
 
 def precision(gaussians: Gaussians) -> Precision:

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from ..gaussians import Gaussians
-from .ply import points_from_columns, read_ply, stack_columns, write_ply
+from .ply import points_from_columns, read_comments, read_ply, stack_columns, write_ply
+from .render_mode import comments_of_mode, mode_from_comments
 from .splat_file import Columns, Precision, SplatFile
 from .values import check_finite, positive_scales
 
@@ -32,6 +33,8 @@ def matches(head: bytes) -> bool:
 def read(path: Path) -> SplatFile:
     """Read a 3DGS PLY with any degree of spherical harmonics; unknown columns go to `extra`.
 
+    `info` has `antialiased` or `surfels` where a comment says so (`render_mode`).
+
     Raises:
         ValueError: if it is damaged, no 3DGS file, or a value is not a finite number; opacities of 0 and 1, whose logits
             are infinite, are read as such.
@@ -44,12 +47,13 @@ def read(path: Path) -> SplatFile:
     _check_values(path, gaussians)
     gaussians = gaussians.replace(scales=positive_scales(path, gaussians.scales.numpy()))
     extra = {name: values for name, values in columns.items() if not _is_ours(name)}
-    return SplatFile(gaussians, extra, info={"format": NAME})
+    return SplatFile(gaussians, extra, info={"format": NAME, **mode_from_comments(read_comments(path))})
 
 
 def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     """Write the 3DGS layout, labels and extra columns included; nothing is lost."""
-    write_ply(path, columns_from_gaussians(splats.gaussians) | splats.extra, comments=("written by kfgs",))
+    comments = ("written by kfgs", *comments_of_mode(splats.info))
+    write_ply(path, columns_from_gaussians(splats.gaussians) | splats.extra, comments=comments)
     return ()
 
 

@@ -6,6 +6,9 @@ alpha. `scales`: indices into a codebook of natural logarithms. `sh0`: indices i
 as alpha. `shN_labels`: which row of `shN_centroids`, 64 to a line, holds the higher harmonics, as indices into a third
 codebook. Version 1 has even steps between bounds instead of codebooks, and opacity as a logit; it is read, not written.
 Axes are those of the 3DGS PLY. There is no place for labels, which go to a file beside it.
+
+**Why not a library**: gsply 0.4.6 reads SOG but does not write it, and unpacks whatever a zip entry promises; the tests
+have it as an independent reader.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from .._files import atomic_folder, atomic_path
 from ..gaussians import Gaussians
 from .order import morton_order
 from .palette import Palette, fit_codebook, fit_palette, nearest_codes
+from .render_mode import meta_of_mode
 from .sidecar import read_sidecar
 from .smallest_three import pack_smallest_three, rotation_error, unpack_smallest_three
 from .sog_images import META, SogFiles, encode_image, write_zip
@@ -56,6 +60,8 @@ def matches(head: bytes) -> bool:
 
 def read(path: Path) -> SplatFile:
     """Read a .sog file, a folder with `meta.json`, or that `meta.json`; opacities of 0 and 1 are read as such.
+
+    `info` has `version`, and, where the scene says so, `generator`, and `antialiased` or `surfels` (`render_mode`).
 
     Raises:
         ValueError: if it is neither, a file is missing or damaged, or sizes and indices disagree.
@@ -91,7 +97,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     Raises:
         ValueError: if the cloud has no colours, or a folder of that name holds files that are not of such a scene.
     """
-    files = _encode(colours_to_write(splats.gaussians, ".sog"))
+    files = _encode(colours_to_write(splats.gaussians, ".sog"), meta_of_mode(splats.info))
     if path.name.lower().endswith(SUFFIXES):
         with atomic_path(path) as temporary:
             write_zip(temporary, files)
@@ -184,8 +190,8 @@ def _log_positions(means: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.sign(means) * np.log1p(np.abs(means))
 
 
-def _encode(g: Gaussians) -> dict[str, bytes]:
-    """The files of a scene."""
+def _encode(g: Gaussians, mode: dict[str, Any]) -> dict[str, bytes]:
+    """The files of a scene, with what `meta.json` says of how to draw it."""
     assert g.sh is not None
     logs = _log_positions(g.means.numpy())
     low, high = (logs.min(0), logs.max(0)) if len(g) else (np.zeros(3), np.zeros(3))
@@ -205,6 +211,7 @@ def _encode(g: Gaussians) -> dict[str, bytes]:
         "version": 2,
         "asset": {"generator": "kfgs"},
         "count": len(g),
+        **mode,
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": books["scales"].tolist(), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .render_mode import mode_from_meta
+
 _BYTES_TO_GAUSSIANS = 64  # no scene has more Gaussians to a byte: even equal ones cost a few bits each
 
 
@@ -61,8 +63,7 @@ def parse_meta(path: Path, meta: dict[str, Any], size: int) -> SogMeta:
     facts: dict[str, Any] = {"version": version}
     if isinstance(asset, dict) and isinstance(asset.get("generator"), str):
         facts["generator"] = asset["generator"]
-    if isinstance(meta.get("antialias"), bool):
-        facts["antialias"] = meta["antialias"]
+    facts |= mode_from_meta(meta)
     low, high = (_numbers(path, _get(path, meta, "means", key), f"means.{key}", 3) for key in ("mins", "maxs"))
     return SogMeta(count, (low, high), tables, files, logits, palette, degree, facts)
 

@@ -29,7 +29,8 @@ class SplatFile:
     classes: tuple[str, ...] = ()
     """The name of each class index in `labels`; empty where the file has no names."""
     info: dict[str, Any] = field(default_factory=dict)
-    """Facts about the file: `format`, and what its header says; anything that JSON can hold."""
+    """Facts about the file: `format`, and what its header says; anything that JSON can hold. `antialiased` and `surfels` say
+    how the cloud was trained to be drawn (`render_mode`): they travel to other formats, or are named among what is lost."""
 
     def __post_init__(self) -> None:
         for name, values in self.extra.items():

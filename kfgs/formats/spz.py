@@ -1,4 +1,10 @@
-"""SPZ, Niantic's compressed splat file: versions 1 to 4 read, 2 to 4 written; labels travel in an extension record."""
+"""SPZ, Niantic's compressed splat file: versions 1 to 4 read, 2 to 4 written; labels travel in an extension record.
+
+**Why not a library**: Niantic's own binding is not in the Python package index (in 2026 the `spz` there, 0.0.1, is another
+author's, with a wheel for Python 3.13 alone). gsply 0.4.6 leaves the axes as the file has them, keeps neither flags nor
+extension records, where the labels are, and unpacks a gzip stream to whatever size it has; the tests have it as an
+independent reader and writer.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +20,8 @@ import torch
 from .._check import check_choice, check_whole
 from ..gaussians import Gaussians
 from .axes import UP_AND_BACK
+from .render_mode import ANTIALIASED as ANTIALIASED_MODE
+from .render_mode import words_of_lost_mode
 from .splat_file import SCORE, Precision, SplatFile
 from .spz_codec import (
     LOG_SCALES,
@@ -58,7 +66,7 @@ def read(path: Path) -> SplatFile:
     records: dict[int, bytes] = dict(c.extensions)
     axes = _axes(path, records.pop(_COORDINATES, None))
     label_record = records.pop(LABELS, None)
-    info: dict[str, Any] = {"format": NAME, "version": c.version, "antialiased": bool(c.flags & ANTIALIASED)}
+    info: dict[str, Any] = {"format": NAME, "version": c.version, ANTIALIASED_MODE: bool(c.flags & ANTIALIASED)}
     info |= {"fractional_bits": c.fractional_bits, "extensions": [f"{kind:#010x}" for kind in records]}
     if c.degree > 3:
         info["dropped"] = f"spherical harmonics of degree {c.degree}: degree 3 was kept"
@@ -119,7 +127,7 @@ def write_spz(
         )
     assert g.sh is not None
     degree = int(g.sh.shape[1] ** 0.5) - 1
-    flags = ANTIALIASED if splats.info.get("antialiased") else 0
+    flags = ANTIALIASED if splats.info.get(ANTIALIASED_MODE) else 0
     records = [] if g.labels is None else [(LABELS, pack_labels(_record(splats)))]
     streams = pack(g, version, fractional_bits, sh_bits)
     write_container(Path(path), Container(version, len(g), degree, fractional_bits, flags, streams, records))
@@ -156,7 +164,7 @@ def _axes(path: Path, record: bytes | None) -> tuple[int, int, int]:
 
 
 def _lost(splats: SplatFile, g: Gaussians, fractional_bits: int) -> tuple[str, ...]:
-    lost = list(words_of_loss(splats, ".spz", 3))
+    lost = list(words_of_loss(splats, ".spz", 3) + words_of_lost_mode(splats.info, ".spz", (ANTIALIASED_MODE,)))
     if fractional_bits < _SPARSE_BITS:
         lost.append(
             f"positions finer than {2.0**-fractional_bits:g} units: the cloud reaches {g.means.abs().max().item():g} units "
