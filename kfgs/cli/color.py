@@ -193,12 +193,12 @@ def edit(
         recolor: a class and a colour, "plant:#c04040"; this and the others may be given several times.
         mode: of --recolor: `tint` gives the colour itself and keeps the shading, `hue` keeps every lightness.
         opacity: a class and a factor in [0, 1], "lamp:0.3".
-        scale: a class and a factor, "lamp:1.5", about the centre of all that is of the class.
+        scale: a class and a factor, "lamp:1.5", about the centre of what it moves: the class, or its part.
         rotate: a class, an axis of the world and degrees, "table:z,90", by the right hand about the same centre.
         move: a class and a translation in world units, "table:0.5,0,0".
         duplicate: a class and where its copy goes, seen from it, "chair:1,0,0".
         remove: a class, "chair", or one part of it, "chair/2".
-        extract: keep only these classes.
+        extract: keep only these classes, or parts of them.
         insert: a splat file to add, "lamp.ply", or that moved by a translation, "lamp.ply:1,0,0".
         replay: edits saved before, which come first; another file than OUT.edits.json.
         scene: scene folder in the splat's frame, whose cameras show the splat before and after.
