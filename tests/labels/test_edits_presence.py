@@ -104,7 +104,7 @@ def test_nothing_selected_is_an_error_unless_allowed(edit):
     with pytest.raises(
         ValueError,
         match=r"where: expected a selection of some of 9 Gaussians, got none from OfClass\(name='plant'\); "
-        r"classes present are wall \(4\), chair \(2\): select one of them, or pass allow_empty=True",
+        r"classes present are wall \(4\), chair \(2\): select one of them, or allow none",
     ):
         edit(OfClass("plant")).apply(splats)
     result = edit(OfClass("plant"), allow_empty=True).apply(splats)

@@ -61,7 +61,7 @@ def selected(where: Where, splats: SplatFile, allow_empty: bool) -> Tensor:  # [
     if not allow_empty and not bool(mask.any()):
         raise ValueError(
             f"where: expected a selection of some of {len(splats)} Gaussians, got none from {where!r:.120}; "
-            f"{_present(splats)}, or pass allow_empty=True"
+            f"{_present(splats)}, or allow none (in Python: allow_empty=True)"
         )
     return mask
 
