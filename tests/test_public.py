@@ -12,8 +12,8 @@ import kfgs
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = [
-    "kfgs.cameras", "kfgs.evaluation", "kfgs.fields", "kfgs.labels", "kfgs.pipeline", "kfgs.quant", "kfgs.scenes",
-    "kfgs.splat", "kfgs.teachers", "kfgs.viz",
+    "kfgs.cameras", "kfgs.evaluation", "kfgs.fields", "kfgs.formats", "kfgs.labels", "kfgs.labels.edits", "kfgs.pipeline",
+    "kfgs.quant", "kfgs.scenes", "kfgs.splat", "kfgs.teachers", "kfgs.viz",
 ]  # fmt: skip
 
 
