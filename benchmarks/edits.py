@@ -1,0 +1,128 @@
+"""What labels carried to a colour scene are worth, class by class.
+
+python benchmarks/edits.py toy DEMO                   # DEMO: what `kfgs demo --out DEMO` wrote
+python benchmarks/edits.py real ROOM_0 FIELD COLOR    # FIELD: RUN/field, COLOR: a splat in the same frame
+
+Prints which rule labels the colour cloud best (mIoU, and mIoU weighted by what each Gaussian shows), and, for the toy room,
+the removal and the recolouring of every class (`kfgs-removal/1`, `kfgs-recolor/1`).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from kfgs import SemanticField, attach, load_label_set, load_scene, read_splats
+from kfgs.cameras import Camera, undistort_labels
+from kfgs.evaluation import LabelSet, load_label_map, score_recolor, score_removal
+from kfgs.formats import SplatFile
+from kfgs.gaussians import Gaussians
+from kfgs.labels import EditList, Recolor, Remove, average_views, transfer_labels, vote_labels
+from kfgs.scenes import Scene
+
+REACH = 0.05  # metres: a Gaussian farther from every true surface point has no true class
+BLUE = (0.1, 0.3, 0.9)  # a hue that no class of the toy room has
+
+
+def miou(labels: Tensor, truth: Tensor, classes: int, weights: Tensor) -> float:
+    """Mean IoU over the classes that occur, in percent; Gaussians without a true class are left out."""
+    known = truth >= 0
+    labels, truth, weights = labels[known], truth[known], weights[known].double()
+    ious = []
+    for c in range(classes):
+        union = float(weights[(labels == c) | (truth == c)].sum())
+        if union > 0:
+            ious.append(float(weights[(labels == c) & (truth == c)].sum()) / union)
+    return 100 * sum(ious) / len(ious)
+
+
+def compare_rules(
+    field: SemanticField, cloud: Gaussians, truth: Tensor, weights: Tensor, classes: LabelSet, cameras: list[Camera]
+) -> None:
+    """Print how well each rule of `transfer_labels` carries the semantic Gaussians' classes."""
+    print(f"{'semantic Gaussians by':24s} {'rule':12s}  mIoU  weighted  without label")
+    sources = {
+        "votes of views": field.classify_by_views(classes.embeddings, cameras)[0],
+        "own latents (Sec. 3.4)": field.classify(classes.embeddings)[0],
+    }
+    for who, labels in sources.items():
+        for method in ("nearest", "vote", "mahalanobis"):
+            found = transfer_labels(field.gaussians, labels, cloud, method=method)
+            scores = [miou(found.labels, truth, len(classes), w) for w in (torch.ones_like(weights), weights)]
+            print(f"{who:24s} {method:12s} {scores[0]:5.1f}  {scores[1]:8.1f}  {found.orphaned / len(cloud):8.1%}")
+
+
+def compare_views(
+    field: SemanticField, splats: SplatFile, truth: Tensor, weights: Tensor, classes: LabelSet, cameras: list[Camera]
+) -> SplatFile:
+    """The same for `attach(by="views")`; the labelled splat."""
+    found = attach(field, splats, classes, cameras=cameras, by="views")
+    scores = [miou(found.labels, truth, len(classes), w) for w in (torch.ones_like(weights), weights)]
+    none = float((found.labels < 0).float().mean())
+    print(f"{'attach by views':24s} {'-':12s} {scores[0]:5.1f}  {scores[1]:8.1f}  {none:8.1%}")
+    return found.splats
+
+
+def edit_every_class(splats: SplatFile, folder: Path) -> None:
+    """Print the removal and the recolouring of each class of the toy room."""
+    print(
+        "\nclass      gone: pixels surface | kept: pixels (off border) surface | pass | recolour: dB outside, hue inside"
+    )
+    before = splats.gaussians
+    for name in splats.classes:
+        removed = score_removal(before, EditList().then(Remove(name)).apply(splats).gaussians, folder, name)
+        painted = EditList().then(Recolor(name, BLUE)).apply(splats).gaussians
+        colored = score_recolor(before, painted, folder, name, BLUE)
+        print(
+            f"{name:10s}       {removed.gone_pixels:.3f}   {removed.gone_points:.3f} |       {removed.untouched_pixels:.3f} "
+            f"({removed.untouched_off_border:.3f})    {removed.kept_points:.3f}   | {'yes' if removed.passed else 'no ':4s} | "
+            f"{colored.psnr_outside:.1f} {colored.hue_inside:.3f}{'' if colored.passed else ' (no pass)'}"
+        )
+
+
+def labelled_views(scene: Scene, folder: Path) -> Iterator[tuple[Camera, Tensor]]:
+    """The training views with their label pictures."""
+    for i in scene.views("train"):
+        labels = load_label_map(folder / f"{scene.stem(i)}.png")
+        yield scene.cameras[i], labels if scene.lenses is None else undistort_labels(labels, scene.lenses[i])
+
+
+def toy(demo: Path) -> None:
+    """The toy room that `kfgs demo` made: truth is the class of the nearest surface point."""
+    folder = demo / "scene"
+    scene, classes = load_scene(folder), load_label_set(folder / "classes.json", folder / "text.npy")
+    field, splats = SemanticField.load(demo / "run" / "field"), read_splats(demo / "run" / "color.ply")
+    cameras = [scene.cameras[i] for i in scene.views("train")]
+    with np.load(folder / "surface.npz") as surface:
+        distance, nearest = cKDTree(surface["points"]).query(splats.gaussians.means.numpy())
+        truth = torch.from_numpy(np.where(distance < REACH, surface["labels"][nearest].astype(np.int64), -1))
+    weights = splats.gaussians.opacities
+    compare_rules(field, splats.gaussians, truth, weights, classes, cameras)
+    edit_every_class(compare_views(field, splats, truth, weights, classes, cameras), folder)
+
+
+def real(folder: Path, field_path: Path, color: Path) -> None:
+    """A real scene: truth is a vote of the labelled pixels of its training views."""
+    scene = load_scene(folder).undistorted()
+    classes = load_label_set(folder / "classes.json", folder / "text.npy")
+    field, splats = SemanticField.load(field_path), read_splats(color)
+    cameras = [scene.cameras[i] for i in scene.views("train")]
+    truth = vote_labels(splats.gaussians, labelled_views(scene, folder / "labels"), len(classes), min_share=0.0).labels
+    shown = average_views(splats.gaussians, ((camera, torch.ones(*camera.size, 1)) for camera in cameras)).weights
+    compare_rules(field, splats.gaussians, truth, shown, classes, cameras)
+    compare_views(field, splats, truth, shown, classes, cameras)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["toy"] and len(sys.argv) == 3:
+        toy(Path(sys.argv[2]))
+    elif sys.argv[1:2] == ["real"] and len(sys.argv) == 5:
+        real(*map(Path, sys.argv[2:]))
+    else:
+        raise SystemExit(__doc__)
