@@ -267,6 +267,17 @@ def test_edit_takes_the_parts_that_select_lists(labelled, tmp_path, capsys):
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "e.ply").read_bytes()
 
 
+@pytest.mark.parametrize("option", ["--remove", "--extract"])
+def test_a_part_beyond_the_last_is_refused_even_beside_one_that_is_there(labelled, tmp_path, capsys, option):
+    assert main(["select", "chair", str(labelled), "--out", str(tmp_path)]) == 0
+    count = len(json.loads((tmp_path / "selection.json").read_text())["parts"])
+    out = tmp_path / "e.ply"
+    wrong = f"Chair/{count + 1}"
+    assert main(["edit", str(labelled), "--out", str(out), option, "chair/1", option, wrong]) == 1
+    assert f"{wrong}: expected a part from Chair/1 to Chair/{count}" in capsys.readouterr().err
+    assert not out.exists()
+
+
 def test_hue_keeps_luminance_and_tint_does_not(labelled, tmp_path):
     luminance = torch.tensor([0.2126, 0.7152, 0.0722])
     changes = {}

@@ -117,7 +117,7 @@ ERRORS = {
         ),
         (
             ["{labelled}", "--out", "{o}.ply", "--remove", "chair/99"],
-            "got none from Component(where=OfClass(name='chair')",
+            "chair/99: expected a part from chair/1 to chair/",
         ),
         (["{labelled}", "--out", "{o}.ply", "--remove", "chair", "--pictures", "-1"], "pictures: expected a number in"),
         (["{labelled}", "--out", "{o}.ply", "--replay", "{tmp}/no.json"], "{tmp}/no.json: no such file"),

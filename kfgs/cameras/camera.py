@@ -72,7 +72,7 @@ class Camera:
             self._check_values()
 
     def _check_values(self) -> None:
-        if not isinstance(self.near, numbers.Real):
+        if not isinstance(self.near, numbers.Real) or isinstance(self.near, bool):
             raise TypeError(f"near: expected a number in world units, got {type(self.near).__name__}; pass a float")
         check_range("near", float(self.near), 0, closed=(False, False))
         object.__setattr__(self, "near", float(self.near))

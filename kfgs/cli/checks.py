@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -120,3 +120,43 @@ def _check_place(name: str, target: Path, kind: str) -> None:
     above = next(place for place in (*target.parents, Path("/")) if place.exists())
     if not above.is_dir():
         raise ValueError(f"{name}: expected a folder to write to, got {target} below the file {above}; give another")
+
+
+def check_parts(splats: Any, edits: Iterable[Any]) -> None:
+    """Refuse a part of a class (`chair/6`) that `kfgs select` does not list: there is none, or it is a speck.
+
+    Args:
+        splats: what the edits begin with.
+        edits: edits as `edits_from_words` makes them.
+
+    Raises:
+        ValueError: if a class has fewer parts; the message says how many.
+    """
+    import torch
+
+    from ..labels import component_numbers
+    from ..labels.answer import SPECK
+
+    for part in (part for edit in edits for part in _parts(getattr(edit, "where", None))):
+        name = part.where.name
+        mask = part.where.mask(splats.gaussians, splats.classes, splats.extra)
+        numbers = component_numbers(splats.gaussians.means, mask, part.distance)
+        sizes = torch.bincount(numbers[mask])
+        count = int((sizes >= SPECK * sizes[0]).sum()) if len(sizes) else 0
+        if part.rank >= count:
+            raise ValueError(
+                f"{name}/{part.rank + 1}: expected a part from {name}/1 to {name}/{count}, got none such; "
+                f"`kfgs select {name} SPLAT` lists them"
+                if count
+                else f"{name}/{part.rank + 1}: expected Gaussians of class {name!r}, got none in this splat; "
+                "`kfgs info SPLAT` lists what it holds"
+            )
+
+
+def _parts(where: Any) -> list[Any]:
+    """The parts of classes that a selection made from words names."""
+    from ..labels.where import Component, Either
+
+    if isinstance(where, Either):
+        return [part for one in where.parts for part in _parts(one)]
+    return [where] if isinstance(where, Component) else []

@@ -10,7 +10,16 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from .._check import check_whole
-from .checks import check_alone, check_folder, check_target, choose_views, edits_beside, open_field, open_splats
+from .checks import (
+    check_alone,
+    check_folder,
+    check_parts,
+    check_target,
+    choose_views,
+    edits_beside,
+    open_field,
+    open_splats,
+)
 from .edit_words import edits_from_words, inserted_files
 from .say import load_classes, say, say_lost, size_of, training_cameras, wrote
 
@@ -219,12 +228,14 @@ def edit(
     edits = EditList() if replay is None else EditList.load(replay, anywhere=True)  # the user's own file
     by_class = {"recolor": recolor, "opacity": opacity, "scale": scale, "rotate": rotate, "move": move}
     by_class |= {"duplicate": duplicate, "remove": remove, "extract": extract}
-    for one in edits_from_words(**by_class, mode=mode, insert=insert):
+    replayed, asked = edits, tuple(edits_from_words(**by_class, mode=mode, insert=insert))
+    for one in asked:
         edits = edits.then(one)
     if len(edits) == 0:
         raise ValueError("edits: expected at least one, got none; give --remove, --recolor, --move or another")
     check_target("out", out, *inserted_files(edits))
     before = open_splats("splats", splats, labelled=any(by_class.values()))
+    check_parts(replayed.apply(before), asked)
     cameras = [] if scene is None else _cameras_to_show(before, scene, images, views)
     after = edits.apply(before)
     say(f"{len(before)} Gaussians before, {len(after)} after {len(edits)} edit(s)")

@@ -48,7 +48,7 @@ def comments_of_mode(info: Mapping[str, Any]) -> tuple[str, ...]:
     """Comments for a PLY header, in the words of Brush and of Postshot; none where `info` does not say."""
     if info.get(SURFELS):
         return ("SplatRenderMode: 2dgs",)
-    if ANTIALIASED not in info:
+    if info.get(ANTIALIASED) is None:
         return ()
     return (
         ("SplatRenderMode: mip", "antialiased 1")
@@ -70,7 +70,7 @@ def meta_of_mode(info: Mapping[str, Any]) -> dict[str, Any]:
     """Keys for the `meta.json` of a SOG scene; none where `info` does not say."""
     if info.get(SURFELS):
         return {"model": "2dgs"}
-    if ANTIALIASED not in info:
+    if info.get(ANTIALIASED) is None:
         return {}
     return {"antialias": True, "model": "antialiased"} if info[ANTIALIASED] else {"antialias": False}
 

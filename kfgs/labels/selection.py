@@ -124,7 +124,7 @@ def select_by_label(
     if gaussians.labels is None:
         raise ValueError("gaussians.labels: expected labels [N], got None; label them first, with classify or vote")
     plain: Any = label.tolist() if hasattr(label, "tolist") else label  # numpy's and torch's own numbers
-    several = isinstance(plain, Iterable) and not isinstance(plain, str)
+    several = isinstance(plain, Iterable) and not isinstance(plain, str | bytes)
     asked = [class_of("label", one) for one in (plain if several else [plain])]
     mask = labelled(gaussians.labels, asked, classes)
     how = "label " + ", ".join(str(one) for one in asked)

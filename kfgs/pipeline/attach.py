@@ -19,6 +19,7 @@ from ..formats.splat_file import SCORE, SplatFile
 from ..gaussians import Gaussians
 from ..labels import Transfer, transfer_labels, vote_labels
 from ..labels.transfer import Method
+from ..scenes import SceneError
 from ..scenes.align import Alignment, align_by_cameras
 from ..scenes.frames import frames_agree
 from ..scenes.register import align_clouds
@@ -164,7 +165,10 @@ def _common_frame(
     check = frames_agree(*clouds)
     if check.agree:
         return Similarity.identity(), None, check.words
-    alignment = align_clouds(*clouds)
+    try:
+        alignment = align_clouds(*clouds)
+    except SceneError as error:
+        raise SceneError(f"{error} (frame=Similarity.identity() says that both share one frame)") from error
     if _stays(clouds[0], alignment):
         words = f"at first {check.words}; but of all frames their own fits best, by the {alignment.how}: they share it"
         return Similarity.identity(), None, words

@@ -94,6 +94,7 @@ def test_gradient_reaches_pose_and_intrinsics():
         ({"viewmat": torch.diag(torch.tensor([2.0, 2, 2, 1]))}, ValueError, "rigid motion.*remove any scale"),
         ({"viewmat": torch.diag(torch.tensor([1.0, 1, -1, 1]))}, ValueError, "reflection.*handedness"),
         ({"viewmat": changed(torch.eye(4), 3, 0, 1.0)}, ValueError, "last row 0 0 0 1"),
+        ({"near": True}, TypeError, "near: expected a number in world units, got bool"),
         ({"near": 0.0}, ValueError, r"near: expected a number in \(0, inf\), got 0.0"),
         ({"near": float("nan")}, ValueError, r"near: expected a number in \(0, inf\), got nan"),
         ({"near": float("inf")}, ValueError, r"near: expected a number in \(0, inf\), got inf"),

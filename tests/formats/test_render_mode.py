@@ -8,7 +8,7 @@ import torch
 
 from kfgs.formats import SplatFile, formats, read_splats, write_splats
 from kfgs.formats.ply import read_comments
-from kfgs.formats.render_mode import mode_from_comments, mode_from_meta
+from kfgs.formats.render_mode import comments_of_mode, meta_of_mode, mode_from_comments, mode_from_meta
 from kfgs.gaussians import Gaussians
 
 WRITABLE = [name for name, module in formats().items() if hasattr(module, "write")]
@@ -138,3 +138,8 @@ def test_comments_of_brush_and_postshot(comments, mode):
 )
 def test_metas_of_both_spellings(meta, mode):
     assert mode_from_meta(meta) == mode
+
+
+def test_a_mode_that_is_not_known_is_not_claimed():
+    assert comments_of_mode({"antialiased": None}) == ()
+    assert meta_of_mode({"antialiased": None}) == {}

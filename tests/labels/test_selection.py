@@ -137,3 +137,8 @@ def test_wrong_input_is_named():
         select_in_sphere(torch.zeros(1, 3), [0, math.nan, 0], 1)
     with pytest.raises(ValueError, match="means: expected finite numbers, got NaN or infinity in row 1"):
         select_in_sphere(torch.tensor([[0.0, 0, 0], [math.nan, 0, 0]]), [0, 0, 0], 1)
+
+
+def test_a_name_in_bytes_is_refused():
+    with pytest.raises((TypeError, ValueError), match="label: expected"):
+        select_by_label(cloud([0, 1]), b"chair", ("wall", "chair"))
