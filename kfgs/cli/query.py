@@ -57,8 +57,9 @@ def select(
         check_range("threshold", threshold, 0, 1)
     if scene is None:
         check_alone("images", images, "without --scene, whose pictures they are")
-    counted = not (source / "field.json").is_file() and threshold is None  # parts are numbered as `kfgs edit` does
-    if (source / "field.json").is_file():
+    is_field = (source / "field.json").is_file()
+    counted = not is_field and threshold is None  # parts are numbered as `kfgs edit` does
+    if is_field:
         field, label_set = open_field(source), load_classes(scene, classes, text)
         cameras = None if scene is None else training_cameras(field, scene, images)
         found = query_field(field, label_set, query, threshold, cameras=cameras, negatives=negatives)

@@ -20,6 +20,20 @@ class ViewAverage(NamedTuple):
     weights: Tensor  # [N] the number of pixels, in all views, that the Gaussian fills
 
 
+def sum_pixels(
+    gaussians: Gaussians,
+    camera: Camera,
+    signal: Tensor,  # [H, W, C] of the camera's size
+    *,
+    engine: str = "auto",
+) -> tuple[Tensor, Tensor, Tensor]:  # [M] int64, [M, C], [M]
+    """The Gaussians that one view shows, and for each the signal's sum over its pixels and the sum of its weights."""
+    projected = project(gaussians, camera, engine=engine)
+    tiles = bin_tiles(projected, camera.width, camera.height, engine=engine)
+    shape = projected.means2d, projected.conics, projected.opacities
+    return projected.index, *accumulate_pixels(*shape, signal, tiles, engine=engine)
+
+
 def average_views(
     gaussians: Gaussians,
     views: Iterable[tuple[Camera, Tensor]],  # maps [H, W, C] of the cameras' sizes
@@ -49,12 +63,9 @@ def average_views(
                 )
             if sums is None:
                 sums = torch.zeros(len(gaussians), channels).to(gaussians.means)
-            projected = project(gaussians, camera, engine=engine)
-            tiles = bin_tiles(projected, camera.width, camera.height, engine=engine)
-            shape = projected.means2d, projected.conics, projected.opacities
-            total, weight = accumulate_pixels(*shape, signal.to(sums), tiles, engine=engine)
-            sums.index_add_(0, projected.index, total)
-            weights.index_add_(0, projected.index, weight)
+            index, total, weight = sum_pixels(gaussians, camera, signal.to(sums), engine=engine)
+            sums.index_add_(0, index, total)
+            weights.index_add_(0, index, weight)
     if sums is None:
         raise ValueError("views: expected at least one camera, got none; pass those that the field was trained on")
     return ViewAverage(sums / weights.clamp_min(torch.finfo(weights.dtype).tiny)[:, None], weights)

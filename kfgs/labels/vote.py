@@ -16,7 +16,7 @@ from torch import Tensor
 from .._check import check_range
 from ..cameras import Camera
 from ..gaussians import Gaussians
-from ..splat import accumulate_pixels, bin_tiles, project
+from .average import sum_pixels
 
 MIN_SHARE = 0.7
 """A class needs seven votes in ten. Gaussians with less lie across a border: in the toy room about 65 % of those with a
@@ -66,11 +66,9 @@ def vote_labels(
                 )
             if int(labels.max()) >= classes:
                 raise ValueError(f"views: expected labels below {classes} (classes), got {int(labels.max())}")
-            projected = project(gaussians, camera, engine=engine)
-            tiles = bin_tiles(projected, camera.width, camera.height, engine=engine)
             ballots = torch.nn.functional.one_hot(labels + 1, classes + 1)[..., 1:].to(votes)
-            shape = projected.means2d, projected.conics, projected.opacities
-            votes.index_add_(0, projected.index, accumulate_pixels(*shape, ballots, tiles, engine=engine)[0])
+            index, total, _ = sum_pixels(gaussians, camera, ballots, engine=engine)
+            votes.index_add_(0, index, total)
     weights = votes.sum(1)
     best, labels = votes.max(1)
     shares = best / weights.clamp_min(torch.finfo(weights.dtype).tiny)

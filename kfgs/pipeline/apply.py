@@ -222,11 +222,7 @@ def save_labelled(
     assert gaussians.labels is not None
     columns = columns_from_gaussians(gaussians) | label_columns(gaussians.labels, scores)
     write_ply(path, columns, comments=("kfgs labelled Gaussians",))
-    return [path, _write_names(path, classes, {"labelled by": rule})]
-
-
-def _write_names(path: Path, classes: LabelSet, facts: dict[str, Any]) -> Path:
-    return write_names(path, classes.names, **facts)
+    return [path, write_names(path, classes.names, **{"labelled by": rule})]
 
 
 def label_columns(labels: Tensor, scores: Tensor | None = None) -> Columns:  # labels [N], scores [N]
@@ -281,7 +277,7 @@ def label_cloud(
     write_ply(out, cloud | added, comments=("labels carried by kfgs",))
     return moved, [
         Path(out),
-        _write_names(Path(out), classes, {"distance": moved.distance, "distance from": moved.how}),
+        write_names(out, classes.names, **{"distance": moved.distance, "distance from": moved.how}),
     ]
 
 

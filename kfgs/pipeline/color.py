@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from dataclasses import field as default
@@ -10,19 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file, save_file
 
 from .._check import check_range, check_whole
-from .._files import write_json
 from ..cameras import Camera
-from ..fields import ColorLoss, FieldConfig, GaussianParams, fit_field
+from ..fields import ColorLoss, FieldConfig, FieldFit, GaussianParams, fit_field
 from ..formats import read_splats, write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene
 from .device import training_device
-from .digests import digest_scene, digest_tensors, stage_generator
+from .digests import describe_lens, digest_scene, digest_tensors, stage_generator
 from .photos import Photos
 from .stages import Run, Stage
+from .train import check_scene, field_stage
 
 
 @dataclass(frozen=True)
@@ -147,7 +145,7 @@ def fit_color(
     """
     config = config or ColorConfig.paper()
     views = scene.views(config.split)
-    _check_scene(scene)
+    check_scene(scene)
     run = Run(Path(folder), report)
     options = {"progress": progress, "callback": callback}
     params = _color_stage(run, scene, views, config, training_device(device), options)
@@ -167,16 +165,14 @@ def _color_stage(
 ) -> GaussianParams:
     inputs = {
         "pictures": run.digests([scene.image_paths[i] for i in views]),
-        "lenses": None if scene.lenses is None else [_describe_lens(scene.lenses[i]) for i in views],
+        "lenses": None if scene.lenses is None else [describe_lens(scene.lenses[i]) for i in views],
         "scene": digest_scene(scene, views),
         "colors": digest_tensors(scene.colors),
         "extent": float(scene.extent),
         "config": asdict(config),
     }
-    scratch = run.scratch("color", inputs)
 
-    def make(folder: Path) -> float:
-        started = time.perf_counter()
+    def train(checkpoint: Path) -> FieldFit:
         generator = stage_generator(config.seed, "color")
         start = GaussianParams.from_points(
             scene.points,
@@ -186,7 +182,7 @@ def _color_stage(
             generator=generator,
         )
         cameras = [_training_camera(scene.cameras[i], config.picture_scale) for i in views]
-        fit = fit_field(
+        return fit_field(
             start.map(lambda value: value.to(device)),
             cameras,
             Photos(scene, views, cameras),
@@ -194,17 +190,11 @@ def _color_stage(
             extent=scene.extent,
             loss=ColorLoss(config.ssim_weight),
             generator=generator,
-            checkpoint=scratch,
+            checkpoint=checkpoint,
             **options,
         )
-        tensors = {name: value.cpu().contiguous() for name, value in fit.params.to_tensors().items()}
-        save_file(tensors, folder / "params.safetensors")
-        write_json(folder / "history.json", fit.history)
-        return max(0.0, fit.history[-1]["seconds"] - (time.perf_counter() - started))  # before it was killed
 
-    stage = run.stage("color", inputs, make)
-    scratch.unlink(missing_ok=True)
-    return GaussianParams.from_tensors(load_file(stage.folder / "params.safetensors"))
+    return field_stage(run, "color", inputs, train)[0]
 
 
 def _is_saved(result: ColorResult) -> bool:
@@ -218,20 +208,6 @@ def _is_saved(result: ColorResult) -> bool:
         return False
     same = all(torch.equal(getattr(saved, name), getattr(ours, name)) for name in ("means", "quats", "sh"))
     return same and all(torch.allclose(getattr(saved, name), getattr(ours, name)) for name in ("scales", "opacities"))
-
-
-def _check_scene(scene: Scene) -> None:
-    if scene.distorted:
-        raise ValueError("scene: expected cameras without distortion, got a lens; pass scene.undistorted()")
-    if len(scene.points) < 2:
-        raise ValueError(
-            f"scene: expected sparse points to start from, got {len(scene.points)}; a transforms.json needs a "
-            "ply_file_path, or estimate the scene with `kfgs sfm`"
-        )
-
-
-def _describe_lens(lens: Camera) -> list[Any]:
-    return [lens.K.tolist(), lens.size, asdict(lens.distortion) if lens.distortion else None]
 
 
 def _training_camera(camera: Camera, scale: float) -> Camera:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from ..cameras import Camera
 from ..cameras.camera import NEAR
 from ..scenes import Scene
 
@@ -38,3 +41,8 @@ def digest_scene(scene: Scene, views: Sequence[int]) -> str:
     sizes = torch.tensor([camera.size for camera in cameras])
     near = torch.tensor([camera.near for camera in cameras], dtype=torch.float64)
     return digest_tensors(poses, intrinsics, sizes, scene.points, *([near] if (near != NEAR).any() else []))
+
+
+def describe_lens(lens: Camera) -> list[Any]:
+    """What decides how a lens is removed, as plain values."""
+    return [lens.K.tolist(), lens.size, asdict(lens.distortion) if lens.distortion else None]

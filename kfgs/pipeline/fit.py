@@ -7,7 +7,6 @@ Each call is a stage of a run folder: finished stages are found again by the has
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from dataclasses import field as default
@@ -16,12 +15,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from .._check import check_choice
 from .._files import digest_value, read_json, write_json
-from ..fields import FieldConfig, GaussianParams, SemanticField, fit_field
+from ..fields import FieldConfig, FieldFit, GaussianParams, SemanticField, fit_field
 from ..quant import (
     Autoencoder,
     AutoencoderConfig,
@@ -35,9 +33,10 @@ from ..quant import (
 )
 from ..scenes import Scene
 from .device import training_device
-from .digests import digest_scene, stage_generator
+from .digests import describe_lens, digest_scene, stage_generator
 from .maps import KnownFeatures, Maps, UndistortedMaps
 from .stages import Run, Stage
+from .train import check_scene, field_stage
 
 Mode = Literal["decouple", "adc", "adc+sc"]
 MODES: tuple[Mode, ...] = ("decouple", "adc", "adc+sc")
@@ -95,9 +94,7 @@ class FitResult:
 def _lens_digest(maps: Maps) -> str | None:
     if not isinstance(maps, UndistortedMaps):
         return None
-    return digest_value(
-        [[lens.K.tolist(), lens.size, asdict(lens.distortion) if lens.distortion else None] for lens in maps.lenses]
-    )
+    return digest_value([describe_lens(lens) for lens in maps.lenses])
 
 
 def _codebook_stage(
@@ -161,33 +158,22 @@ def _field_stage(
         "config": asdict(config.field),
         "seed": config.seed,
     }
-    scratch = run.scratch("field", inputs)
 
-    def make(folder: Path) -> float:
-        started = time.perf_counter()
+    def train(checkpoint: Path) -> FieldFit:
         generator = stage_generator(config.seed, "field")
         start = GaussianParams.from_points(scene.points, int(targets[0].shape[-1]), generator=generator)
-        cameras = [scene.cameras[i] for i in views]
-        fit = fit_field(
+        return fit_field(
             start.map(lambda value: value.to(device)),
-            cameras,
+            [scene.cameras[i] for i in views],
             targets,
             config.field,
             extent=scene.extent,
             generator=generator,
-            checkpoint=scratch,
+            checkpoint=checkpoint,
             **options,
         )
-        save_file(
-            {name: value.cpu().contiguous() for name, value in fit.params.to_tensors().items()},
-            folder / "params.safetensors",
-        )
-        write_json(folder / "history.json", fit.history)
-        return max(0.0, fit.history[-1]["seconds"] - (time.perf_counter() - started))  # before it was killed
 
-    stage = run.stage("field", inputs, make)
-    scratch.unlink(missing_ok=True)
-    return GaussianParams.from_tensors(load_file(stage.folder / "params.safetensors")), stage
+    return field_stage(run, "field", inputs, train)
 
 
 def _check_inputs(scene: Scene, views: Sequence[int], maps: Maps, split: str) -> None:
@@ -197,13 +183,7 @@ def _check_inputs(scene: Scene, views: Sequence[int], maps: Maps, split: str) ->
             f"maps: expected one teacher map per view of split {split!r} ({len(views)}), got {len(maps)}; "
             "read them with FeatureFolder(path, stems of that split)"
         )
-    if scene.distorted:
-        raise ValueError("scene: expected cameras without distortion, got a lens; pass scene.undistorted()")
-    if len(scene.points) < 2:
-        raise ValueError(
-            f"scene: expected sparse points to start from, got {len(scene.points)}; a transforms.json needs a "
-            "ply_file_path, or estimate the scene with `kfgs sfm`"
-        )
+    check_scene(scene)
     stems = getattr(maps, "stems", None)
     if stems is not None and [Path(stem).name for stem in stems] != [Path(scene.stem(i)).name for i in views]:
         raise ValueError(

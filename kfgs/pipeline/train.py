@@ -1,0 +1,55 @@
+"""What the semantic and the colour field's long stage share: what a scene must bring, and a fit that can be killed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from safetensors.torch import load_file, save_file
+
+from .._files import write_json
+from ..fields import FieldFit, GaussianParams
+from ..scenes import Scene
+from .stages import Run, Stage
+
+
+def check_scene(scene: Scene) -> None:
+    """Raise a ValueError if a scene cannot be trained on: it has a lens, or no points to start from."""
+    if scene.distorted:
+        raise ValueError("scene: expected cameras without distortion, got a lens; pass scene.undistorted()")
+    if len(scene.points) < 2:
+        raise ValueError(
+            f"scene: expected sparse points to start from, got {len(scene.points)}; a transforms.json needs a "
+            "ply_file_path, or estimate the scene with `kfgs sfm`"
+        )
+
+
+def field_stage(
+    run: Run,
+    name: str,
+    inputs: dict[str, Any],
+    train: Callable[[Path], FieldFit],
+) -> tuple[GaussianParams, Stage]:
+    """Train a field as a stage of a run: found again when finished, resumed when it was killed.
+
+    Args:
+        run: the run folder.
+        name: the stage's.
+        inputs: everything that decides the result.
+        train: fits the field, given the file for its checkpoint.
+    """
+    scratch = run.scratch(name, inputs)
+
+    def make(folder: Path) -> float:
+        started = time.perf_counter()
+        fit = train(scratch)
+        tensors = {key: value.cpu().contiguous() for key, value in fit.params.to_tensors().items()}
+        save_file(tensors, folder / "params.safetensors")
+        write_json(folder / "history.json", fit.history)
+        return max(0.0, fit.history[-1]["seconds"] - (time.perf_counter() - started))  # before it was killed
+
+    stage = run.stage(name, inputs, make)
+    scratch.unlink(missing_ok=True)
+    return GaussianParams.from_tensors(load_file(stage.folder / "params.safetensors")), stage
