@@ -1,8 +1,8 @@
 """Scores that carry the name of their protocol."""
 
+from ..labels.label_set import LabelSet, load_label_set
 from .color import ColorReport, score_views
 from .editing import RecolorReport, RemovalReport, score_recolor, score_removal
-from .label_set import LabelSet, load_label_set
 from .segmentation import PROTOCOL, SegmentationReport, evaluate_segmentation, load_label_map
 from .surface_density import surface_density
 

@@ -16,6 +16,7 @@ from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels import (
     CodewordLabels,
+    Score,
     Selection,
     Votes,
     average_views,
@@ -217,6 +218,8 @@ class SemanticField:
         *,
         negatives: Tensor | None = None,  # [M, D]
         cameras: Iterable[Camera] | None = None,
+        score: Score | None = None,
+        logit_scale: float | str = "lseg",
     ) -> Selection:
         """The Gaussians that are more similar to one target than a threshold (gamma of Sec. 3.4).
 
@@ -230,19 +233,24 @@ class SemanticField:
             negatives: what the target is to be told from, such as the scene's other classes (`labels.relevancy`).
             cameras: score each Gaussian by the mean of its pixels in these views, instead of by its own latent, which
                 training constrains only in blends; those that the field was trained on are the natural choice.
+            score: "cosine", "softmax" over the target and the negatives, or "relevancy" (`labels.text_scores`); when not
+                given the relevancy with negatives, the cosine without.
+            logit_scale: of the softmax: "raw", "lseg", "clip", or a number that multiplies the cosines.
 
         Raises:
-            ValueError: if shapes disagree, a row is all-zero, or `cameras` is empty.
+            ValueError: if shapes disagree, a row is all-zero, `cameras` is empty, or an option is unknown.
         """
-        check_shapes(("embedding", embedding, str(self.dim)), ("negatives", negatives, f"M {self.dim}"))
+        self._check_text("embedding", embedding, ())
+        self._check_text("negatives", negatives, ("M",))
         if cameras is None:
-            return select_by_query(self.quantized(), embedding, threshold, negatives)
+            features = self.quantized()
+            return select_by_query(features, embedding, threshold, negatives, score=score, logit_scale=logit_scale)
         targets = embedding[None] if negatives is None else torch.cat([embedding[None], negatives])
         rows = unit_embeddings(targets, "embedding, negatives").to(self.features)
         views = ((camera, self._similarity_map(camera, rows)) for camera in cameras)
         values, weights = average_views(self.gaussians, views)
         against = None if negatives is None else values[:, 1:]
-        return select_by_similarity(values[:, 0], against, threshold, weights > 0)
+        return select_by_similarity(values[:, 0], against, threshold, weights > 0, score=score, logit_scale=logit_scale)
 
     def storage(self) -> int:
         """Bytes as Table 1 counts them: every attribute of the Gaussians, the decoder and the codebook, in float32.
@@ -310,4 +318,15 @@ class SemanticField:
         return self.features.any(dim=1)
 
     def _check_embeddings(self, embeddings: Tensor) -> None:
-        check_shapes(("embeddings", embeddings, f"C {self.dim}"))
+        self._check_text("embeddings", embeddings, ("C",))
+
+    def _check_text(self, name: str, rows: Tensor | None, axes: tuple[str, ...]) -> None:
+        """Refuse rows of another shape; where only D differs, they are mostly text of another teacher."""
+        shape = tuple(getattr(rows, "shape", ()))
+        if len(shape) == len(axes) + 1 and shape[-1] != self.dim:
+            expected = ", ".join((*axes, str(self.dim)))
+            raise ValueError(
+                f"{name}: expected [{expected}], got {shape}: text of another teacher? Embed the words with the one whose "
+                "features this field was fitted to"
+            )
+        check_shapes((name, rows, (*axes, self.dim)))

@@ -16,10 +16,12 @@ from .color import parse_color
 from .components import component_distance, component_numbers, components, select_near
 from .edit import extract, recolor, remove
 from .edits import Duplicate, Edit, EditList, Extract, Insert, Move, Opacity, Recolor, Remove, Turn, join
+from .label_set import LabelSet, load_label_set, teacher_mismatch
 from .names import class_index, class_indices
-from .relevancy import relevancy, select_by_similarity
+from .relevancy import CANONICAL, relevancy
 from .segment import label_pixels, nearest_codeword
 from .selection import Selection, select_by_label, select_in_box, select_in_sphere, select_where
+from .text_scores import LOGIT_SCALES, Score, select_by_similarity, text_scores
 from .threshold import similarity_threshold
 from .transfer import Transfer, transfer_labels
 from .transfer_distance import default_distance
@@ -27,6 +29,8 @@ from .vote import Votes, vote_labels
 from .where import AboveScore, Both, Component, Either, Everything, InBox, InSphere, Not, OfClass, OfIndex, Where
 
 __all__ = [
+    "CANONICAL",
+    "LOGIT_SCALES",
     "AboveScore",
     "Answer",
     "BestView",
@@ -43,6 +47,7 @@ __all__ = [
     "InBox",
     "InSphere",
     "Insert",
+    "LabelSet",
     "Move",
     "Not",
     "OfClass",
@@ -51,6 +56,7 @@ __all__ = [
     "OrientedBox",
     "Recolor",
     "Remove",
+    "Score",
     "Selection",
     "Transfer",
     "Turn",
@@ -71,6 +77,7 @@ __all__ = [
     "join",
     "label_codewords",
     "label_pixels",
+    "load_label_set",
     "nearest_codeword",
     "parse_color",
     "recolor",
@@ -86,6 +93,8 @@ __all__ = [
     "select_near",
     "select_where",
     "similarity_threshold",
+    "teacher_mismatch",
+    "text_scores",
     "transfer_labels",
     "view_shares",
     "vote_labels",

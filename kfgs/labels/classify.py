@@ -10,8 +10,8 @@ from torch import Tensor
 from .._check import check_shapes, check_whole
 from ..quant.codebook import EPS, row_norms, unit_rows
 from ._rows import check_finite, unit_embeddings
-from .relevancy import select_by_similarity
 from .selection import Selection
+from .text_scores import Score, select_by_similarity
 
 CHUNK = 65_536  # rows per step: with 200 classes, 50 MB of similarities at a time
 
@@ -91,6 +91,9 @@ def select_by_query(
     query: Tensor,  # [D]
     threshold: float | None = None,
     negatives: Tensor | None = None,  # [M, D]
+    *,
+    score: Score | None = None,
+    logit_scale: float | str = "lseg",
 ) -> Selection:
     """Select the features whose cosine with one query is **above** a threshold (Sec. 3.4, single target).
 
@@ -104,6 +107,8 @@ def select_by_query(
         query: the target's embedding, or a prototype.
         threshold: gamma, a cosine in [-1, 1], or with negatives a relevancy in [0, 1]; None as above.
         negatives: one row per thing to tell the target from.
+        score: "cosine", "softmax" or "relevancy" (`text_scores`); when not given as above.
+        logit_scale: of the softmax, as in `text_scores`.
 
     Raises:
         ValueError: if shapes disagree, the query or a negative is all-zero, the threshold is out of range, or a number
@@ -118,7 +123,7 @@ def select_by_query(
         similarity = torch.cat([unit_rows(part) @ rows.T for part in features.split(CHUNK)])
         something = row_norms(features) > EPS
     against = None if negatives is None else similarity[:, 1:]
-    return select_by_similarity(similarity[:, 0], against, threshold, something)
+    return select_by_similarity(similarity[:, 0], against, threshold, something, score=score, logit_scale=logit_scale)
 
 
 def select_by_category(
