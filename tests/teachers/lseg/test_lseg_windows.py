@@ -1,0 +1,157 @@
+"""Sliding windows over several scales, against closed forms and the evaluation written step by step."""
+
+import numpy as np
+import pytest
+import torch
+from oracles_windows import evaluate
+from torch import Tensor
+from torch.nn import functional
+
+from kfgs.teachers.lseg.windows import count_forwards, multi_scale_features, scaled_size, window_starts
+
+PAPER = (0.75, 1.0, 1.25, 1.75)
+
+
+def network(window: int, dim: int, seed: int = 0):
+    """A random network [1, 3, S, S] -> [1, D, S/2, S/2] whose output depends on where in the window something lies."""
+    generator = torch.Generator().manual_seed(seed)
+    kernel = torch.randn(dim, 3, 5, 5, generator=generator, dtype=torch.float64) / 3
+    place = torch.randn(dim, window // 2, window // 2, generator=generator, dtype=torch.float64)
+
+    def head(x: Tensor) -> Tensor:
+        assert x.shape == (1, 3, window, window)
+        found = functional.conv2d(x, kernel.to(x.dtype), stride=2, padding=2)
+        return torch.tanh(found) * (2 + place.to(x.dtype)) + place.to(x.dtype)
+
+    return head
+
+
+def picture(height: int, width: int, dtype: torch.dtype = torch.float64) -> Tensor:
+    generator = torch.Generator().manual_seed(height * 1000 + width)
+    return (torch.rand(3, height, width, generator=generator, dtype=torch.float64) * 2 - 1).to(dtype)
+
+
+def oracle(image: Tensor, head, window: int, scales, flip: bool) -> Tensor:
+    found = evaluate(image.double().numpy(), lambda x: head(torch.from_numpy(x)[None])[0].numpy(), window, scales, flip)
+    return torch.from_numpy(np.ascontiguousarray(found))
+
+
+SIZES = {
+    "the window": (64, 64),
+    "landscape": (48, 64),
+    "portrait": (70, 40),
+    "narrow": (9, 120),
+    "narrow portrait": (90, 5),
+    "small": (7, 10),
+    "bigger": (101, 150),
+    "one pixel": (1, 1),
+}
+
+
+@pytest.mark.parametrize("size", SIZES.values(), ids=SIZES)
+def test_equals_the_evaluation_step_by_step(size: tuple[int, int]) -> None:
+    image, head = picture(*size), network(64, 3)
+    found = multi_scale_features(image, head, window=64, scales=PAPER, flip=True)
+    expected = oracle(image, head, 64, PAPER, True)
+    assert found.shape == (3, *size)
+    assert (found - expected).abs().max() < 1e-10 * expected.abs().max()
+
+
+@pytest.mark.parametrize(
+    ("size", "scales", "flip"), [((360, 480), (1.25,), False), ((480, 480), (1.0,), False), ((150, 480), (1.75,), True)]
+)
+def test_equals_it_at_the_released_size_in_single_precision(size, scales, flip: bool) -> None:
+    """A smooth picture: torch resizes with positions in float32, off by 3e-5 of a pixel, which noise would enlarge."""
+    noise = picture(size[0] // 10, size[1] // 10, dtype=torch.float32)
+    image = functional.interpolate(noise[None], size=size, mode="bicubic", align_corners=True)[0].clamp(-1, 1)
+    head = network(480, 2)
+    found = multi_scale_features(image, head, window=480, scales=scales, flip=flip)
+    expected = oracle(image, head, 480, scales, flip)
+    assert found.dtype == torch.float32
+    assert (found - expected).abs().max() < 1e-5 * expected.abs().max()
+
+
+def test_more_channels_than_are_finished_at_a_time() -> None:
+    image = picture(40, 60)
+    wide = multi_scale_features(image, network(64, 130), window=64, scales=(1.25,), flip=False)
+    expected = oracle(image, network(64, 130), 64, (1.25,), False)
+    torch.testing.assert_close(wide, expected, rtol=0, atol=1e-9)
+
+
+def test_a_constant_is_summed_over_scales_not_averaged() -> None:
+    def constant(x: Tensor) -> Tensor:
+        return torch.full((1, 2, 32, 32), 3.0, dtype=x.dtype)
+
+    found = multi_scale_features(picture(50, 90), constant, window=64, scales=PAPER, flip=True)
+    torch.testing.assert_close(found, torch.full((2, 50, 90), 12.0, dtype=torch.float64), rtol=0, atol=1e-12)
+
+
+def test_flips_make_the_features_of_a_mirrored_picture_the_mirrored_features() -> None:
+    """Where one window holds the whole width, so that padding and overlaps are the same on both sides."""
+    image, head = picture(64, 64), network(64, 3)
+    (scale,) = (480 / 520,)
+    found = multi_scale_features(image.flip(-1), head, window=64, scales=(scale,), flip=True)
+    straight = multi_scale_features(image, head, window=64, scales=(scale,), flip=True)
+    torch.testing.assert_close(found, straight.flip(-1), rtol=0, atol=1e-12)
+    unflipped = multi_scale_features(image, head, window=64, scales=(scale,), flip=False)
+    assert (unflipped - straight).abs().max() > 0.1
+
+
+def test_scale_480_over_520_is_one_window_and_only_the_last_enlargement() -> None:
+    image, head = picture(64, 64), network(64, 3)
+    found = multi_scale_features(image, head, window=64, scales=(480 / 520,), flip=False)
+    expected = functional.interpolate(head(image[None]), size=(64, 64), mode="bilinear", align_corners=True)[0]
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+
+
+def test_sizes_windows_and_forwards_of_the_released_script() -> None:
+    """360 x 480: 1 + 2 + 4 + 6 = 13 windows, and their mirrors."""
+    assert [scaled_size(360, 480, s, 480) for s in PAPER] == [(293, 390), (390, 520), (488, 650), (683, 910)]
+    assert scaled_size(480, 360, 1.25, 480) == (650, 488)
+    assert scaled_size(1, 1000, 1.0, 480) == (1, 520)
+    assert [window_starts(n, 480) for n in (390, 480, 481, 800, 801, 910)] == [
+        [0], [0], [0, 320], [0, 320], [0, 320, 640], [0, 320, 640],
+    ]  # fmt: skip
+    assert count_forwards(360, 480, window=480, scales=PAPER, flip=True) == 26
+    assert count_forwards(360, 480, window=480, scales=(480 / 520,), flip=False) == 1
+    assert count_forwards(480, 480, window=480, scales=(480 / 520,), flip=False) == 1
+
+
+@pytest.mark.parametrize("size", [(48, 64), (64, 30), (150, 20)])
+def test_the_network_runs_as_often_as_counted(size: tuple[int, int]) -> None:
+    calls, head = [], network(64, 1)
+
+    def counting(x: Tensor) -> Tensor:
+        calls.append(x)
+        return head(x)
+
+    multi_scale_features(picture(*size), counting, window=64, scales=PAPER, flip=True)
+    assert len(calls) == count_forwards(*size, window=64, scales=PAPER, flip=True)
+
+
+def test_windows_are_filled_up_with_black_not_moved() -> None:
+    """650 pixels of a wide picture: the second window begins at 320 and ends in black."""
+    seen = []
+
+    def head(x: Tensor) -> Tensor:
+        seen.append(x[0])
+        return x.new_zeros(1, 1, 240, 240)
+
+    multi_scale_features(torch.ones(3, 360, 480), head, window=480, scales=(1.25,), flip=False)
+    assert len(seen) == 4
+    expected = -torch.ones(480, 480)
+    expected[: 488 - 320, : 650 - 320] = 1.0
+    for channel in seen[3]:  # rows from 320, columns from 320
+        torch.testing.assert_close(channel, expected)
+
+
+def test_a_network_of_another_size_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"head's output: expected \[1, D, 32, 32\], got \(1, 2, 64, 64\)"):
+        multi_scale_features(picture(8, 8), lambda x: x[:, :2], window=64, scales=(1.0,), flip=False)
+
+
+def test_no_or_negative_scales_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"scales: expected at least one scale, got none; pass \(1.0,\)"):
+        multi_scale_features(picture(8, 8), network(64, 1), window=64, scales=(), flip=False)
+    with pytest.raises(ValueError, match="scales: expected a number in"):
+        multi_scale_features(picture(8, 8), network(64, 1), window=64, scales=(-1.0,), flip=False)
