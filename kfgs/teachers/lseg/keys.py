@@ -74,7 +74,7 @@ def network_from_state(state: Mapping[str, Tensor], config: LSegConfig, *, sourc
     with torch.device("meta"):
         network = LSegNetwork(config)
     names = _names(network, _IMAGE_NAMES)
-    shapes = {names[own]: tuple(tensor.shape) for own, tensor in network.state_dict().items()}
+    shapes = _shapes(network, names)
     shapes[names[_POSITIONS]] = (1, 1 + config.position_grid**2, config.width)
     _check({name: value for name, value in state.items() if not name.startswith(_TEXT)}, shapes, source)
     tensors = _as_float(state, names)
@@ -99,7 +99,7 @@ def text_from_state(state: Mapping[str, Tensor], config: LSegConfig, *, source: 
     with torch.device("meta"):
         tower = ClipText(config)
     names = _names(tower, _TEXT_NAMES)
-    shapes = {names[own]: tuple(tensor.shape) for own, tensor in tower.state_dict().items()}
+    shapes = _shapes(tower, names)
     _check(state, shapes, source)
     _fill(tower, _as_float(state, names))
     return tower
@@ -119,6 +119,11 @@ def _names(module: nn.Module, table: tuple[tuple[str, str], ...]) -> dict[str, s
         assert len(found) == 1, own
         names[own] = re.sub(r"\{(\d)\+\}", lambda match: str(int(match[1]) + 1), found[0])
     return names
+
+
+def _shapes(module: nn.Module, names: Mapping[str, str]) -> dict[str, tuple[int, ...]]:
+    own = module.state_dict()
+    return {theirs: tuple(own[name].shape) for name, theirs in names.items()}
 
 
 def _check(state: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]], source: str) -> None:

@@ -1,0 +1,182 @@
+import pytest
+import torch
+from torch.nn import functional
+
+from kfgs.teachers.lseg.keys import network_from_state, text_from_state
+from kfgs.teachers.lseg.layout import random_state
+from kfgs.teachers.lseg.network import LSegConfig
+
+TINY = LSegConfig(
+    width=32,
+    depth=4,
+    heads=4,
+    position_grid=3,
+    window=64,
+    hooks=(0, 1, 2, 3),
+    neck=(8, 12, 16, 20),
+    fusion=16,
+    dim=24,
+    text_width=32,
+    text_layers=2,
+    text_heads=4,
+    context=9,
+    vocabulary=60,
+)
+HEAD = "net.scratch.head1.weight"
+POSITIONS = "net.pretrained.model.pos_embed"
+IN_PROJECTION = "net.clip_pretrained.transformer.resblocks.1.attn.in_proj_weight"
+QKV = "net.pretrained.model.blocks.2.attn.qkv.weight"
+
+
+@pytest.fixture
+def state():
+    return random_state(TINY, torch.Generator().manual_seed(7))
+
+
+@pytest.fixture
+def x():
+    return 2 * torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(8)) - 1
+
+
+def test_single_precision_is_shared_and_half_is_cast(state):
+    network, tower = network_from_state(state, TINY, source="a"), text_from_state(state, TINY, source="a")
+    assert network.head.weight.data_ptr() == state[HEAD].data_ptr()
+    assert network.vit.encoder.blocks[2][0].fn[1].qkv.weight.data_ptr() == state[QKV].data_ptr()
+    assert state[IN_PROJECTION].dtype == torch.float16
+    assert torch.equal(tower.blocks[1].qkv.weight, state[IN_PROJECTION].float())
+
+
+def test_all_of_it_is_single_precision_for_evaluation_only(state):
+    for module in (network_from_state(state, TINY, source="a"), text_from_state(state, TINY, source="a")):
+        assert not module.training
+        assert not any(part.training for part in module.modules())
+        assert {value.dtype for value in module.parameters()} == {torch.float32}
+        assert not any(value.requires_grad or value.is_meta for value in module.parameters())
+        assert not any(value.is_meta for value in module.buffers())
+
+
+def test_a_memory_mapped_file_is_not_copied(state, tmp_path):
+    torch.save(state, tmp_path / "a.pt")
+    mapped = torch.load(tmp_path / "a.pt", mmap=True, weights_only=True)
+    network = network_from_state(mapped, TINY, source="a.pt")
+    assert network.head.weight.data_ptr() == mapped[HEAD].data_ptr()
+
+
+def test_prefix_and_unused_tensors_may_be_missing(state, x):
+    expected = network_from_state(state, TINY, source="a")(x)
+    unused = ("clip_pretrained.", "pretrained.model.norm", "pretrained.model.head", "scratch.refinenet4.resConfUnit1")
+    bare = {name.removeprefix("net."): value for name, value in state.items()}
+    bare = {n: v for n, v in bare.items() if not n.startswith(unused) and not n.endswith("num_batches_tracked")}
+    assert len(state) - len(bare) > 60
+    assert torch.equal(network_from_state(bare, TINY, source="a")(x), expected)
+
+
+def test_blocks_on_the_logits_are_tolerated(state, x):
+    expected = network_from_state(state, TINY, source="a")(x)
+    more = {**state, "net.scratch.head_block.depthwise.depthwise.weight": torch.ones(1, 1, 3, 3)}
+    assert torch.equal(network_from_state(more, TINY, source="a")(x), expected)
+
+
+def test_positions_are_resized_bilinearly_about_pixel_centres(state):
+    side, grid = 3, 4
+    table = state[POSITIONS][0, 1:].reshape(side, side, -1).double()
+    expected = torch.empty(grid, grid, table.shape[2], dtype=torch.float64)
+    for i in range(grid):
+        for j in range(grid):
+            total = 0.0
+            for a in range(side):
+                for b in range(side):  # a hat of width 1 about the clamped sample, centres at + 0.5
+                    y = min(max((i + 0.5) * side / grid - 0.5, 0), side - 1)
+                    u = min(max((j + 0.5) * side / grid - 0.5, 0), side - 1)
+                    total = total + max(0.0, 1 - abs(y - a)) * max(0.0, 1 - abs(u - b)) * table[a, b]
+            expected[i, j] = total
+    found = network_from_state(state, TINY, source="a").vit.patch_embedding.positions
+    torch.testing.assert_close(found[1:].double(), expected.reshape(grid * grid, -1), rtol=1e-5, atol=1e-6)
+    assert torch.equal(found[0], state[POSITIONS][0, 0])
+
+
+def test_positions_of_the_windows_grid_stay_as_they_are():
+    same = LSegConfig(**{**vars(TINY), "position_grid": 4})
+    state = random_state(same, torch.Generator().manual_seed(9))
+    network = network_from_state(state, same, source="a")
+    assert network.vit.patch_embedding.positions.data_ptr() == state[POSITIONS].data_ptr()
+
+
+def test_each_tensor_matters(state, x):
+    """Every tensor of the image network, moved a little, moves the features: none is taken for another."""
+    expected = network_from_state(state, TINY, source="a")(x)
+    generator = torch.Generator().manual_seed(10)
+    for name, value in state.items():
+        if "clip_pretrained" in name or "model.norm" in name or "model.head" in name or "num_batches" in name:
+            continue
+        changed = network_from_state(
+            {**state, name: value + 0.3 * torch.randn(value.shape, generator=generator)}, TINY, source="a"
+        )(x)
+        moved = float((changed - expected).abs().max())
+        assert (moved == 0) == ("refinenet4.resConfUnit1" in name), name
+
+
+def test_missing_unknown_and_misshapen_tensors_are_counted_and_named(state):
+    del state[HEAD], state[QKV]
+    state["net.scratch.extra"] = torch.zeros(2)
+    state[POSITIONS] = torch.zeros(1, 17, 32)
+    with pytest.raises(ValueError, match="my.ckpt: expected the LSeg checkpoint of backbone clip_vitl16_384") as caught:
+        network_from_state(state, TINY, source="my.ckpt")
+    message = str(caught.value)
+    assert (
+        "2 missing (pretrained.model.blocks.2.attn.qkv.weight (96, 32); scratch.head1.weight (24, 16, 1, 1))" in message
+    )
+    assert "1 unknown (scratch.extra (2,))" in message
+    assert "1 of another shape (pretrained.model.pos_embed: expected (1, 10, 32), got (1, 17, 32))" in message
+    assert message.endswith("use the file as its authors published it")
+    assert "\n" not in message
+
+
+def test_a_file_without_text_is_refused_only_for_text(state):
+    image = {name: value for name, value in state.items() if "clip_pretrained" not in name}
+    network_from_state(image, TINY, source="a")
+    with pytest.raises(
+        ValueError, match=r"a: expected CLIP's text tower in it \(clip_pretrained\.\*\), got \d+ tensors"
+    ):
+        text_from_state(image, TINY, source="a")
+
+
+def test_a_text_tower_of_other_sizes_is_refused(state):
+    del state[IN_PROJECTION]
+    with pytest.raises(ValueError, match=r"1 missing \(clip_pretrained.transformer.resblocks.1.attn.in_proj_weight"):
+        text_from_state(state, TINY, source="a")
+
+
+def named(*names, shape=(4,)):
+    return {name: torch.zeros(shape) for name in names}
+
+
+@pytest.mark.parametrize(
+    ("found", "what"),
+    [
+        ({}, "got no tensors"),
+        (named("net.pretrained.layer1.0.weight", "net.scratch.head1.weight"), "got LSeg of backbone clip_resnet101"),
+        (named("net.pretrained.model.pos_embed", shape=(1, 145, 768)), "got LSeg of backbone clip_vitb32_384"),
+        (named("scratch.head1.weight", shape=(768, 256, 1, 1)), "got LSeg of backbone clipRN50x16_vitl16_384"),
+        (named("pretrained.model.cls_token", "scratch.output_conv.0.weight"), "got a DPT for depth or closed classes"),
+        (named("visual.conv1.weight", "positional_embedding"), "got CLIP alone, without LSeg's decoder"),
+        (named("vision_model.embeddings.x", "text_model.x"), "got CLIP or SigLIP of transformers"),
+        (named("student.backbone.cls_token"), "got a self-supervised training checkpoint"),
+        (named("cls_token", "blocks.0.norm1.weight"), "got a ViT alone"),
+        (named("image_encoder.pos_embed"), "got a SAM checkpoint"),
+        (named("layer1.0.conv1.weight", "fc.weight"), "got a ResNet"),
+        (named("fc.weight"), r"got 1 tensors, \d+ missing \(pretrained.model.cls_token.*, 1 unknown \(fc.weight"),
+    ],
+)
+def test_the_file_of_another_network_is_recognised(found, what):
+    with pytest.raises(ValueError, match=f"other.pt: expected the LSeg checkpoint.*{what}"):
+        network_from_state(found, TINY, source="other.pt")
+
+
+def test_positions_by_another_rule_would_be_noticed(state, x, monkeypatch):
+    expected = network_from_state(state, TINY, source="a")(x)
+    original = functional.interpolate
+    with monkeypatch.context() as patch:
+        patch.setattr(functional, "interpolate", lambda x, **options: original(x, **{**options, "align_corners": True}))
+        network = network_from_state(state, TINY, source="a")
+    assert (network(x) - expected).abs().max() > 1e-3

@@ -1,0 +1,141 @@
+import dataclasses
+
+import oracles_lseg
+import pytest
+import torch
+from torch import nn
+from torch.nn import functional
+
+from kfgs.teachers.lseg.keys import network_from_state
+from kfgs.teachers.lseg.layout import random_state
+from kfgs.teachers.lseg.network import LSegConfig
+
+SIZES = {
+    "width": 32,
+    "depth": 5,
+    "heads": 4,
+    "position_grid": 3,
+    "window": 64,
+    "hooks": (0, 1, 3, 4),
+    "neck": (8, 12, 16, 20),
+    "fusion": 16,
+    "dim": 24,
+    "text_width": 16,
+    "text_layers": 2,
+    "text_heads": 2,
+    "context": 9,
+    "vocabulary": 60,
+}
+TINY = LSegConfig(**SIZES)
+
+
+@pytest.fixture(scope="module")
+def case():
+    """A checkpoint, two windows, and their features by transformers in float64."""
+    generator = torch.Generator().manual_seed(5)
+    state = random_state(TINY, generator)
+    x = 2 * torch.rand(2, 3, 64, 64, generator=generator, dtype=torch.float64) - 1
+    return state, x, oracles_lseg.features(state, TINY, x)
+
+
+def relative(ours, theirs):
+    return float(((ours - theirs).abs().max() / theirs.abs().max()).detach())
+
+
+def test_features_are_those_of_transformers_dpt(case):
+    state, x, expected = case
+    network = network_from_state(state, TINY, source="tiny")
+    assert expected.shape == (2, 24, 32, 32)
+    assert expected.std() > 0.1
+    assert relative(network.double()(x), expected) < 1e-12
+
+
+def test_features_in_float32(case):
+    state, x, expected = case
+    network = network_from_state(state, TINY, source="tiny")
+    assert relative(network(x.float()).double(), expected) < 1e-5
+    assert relative(network(x.float()), oracles_lseg.features(state, TINY, x.float(), "eager")) < 1e-5
+
+
+def test_windows_of_a_batch_do_not_see_each_other(case):
+    state, x, _ = case
+    network = network_from_state(state, TINY, source="tiny").double()
+    torch.testing.assert_close(network(x)[1:], network(x[1:]), rtol=1e-12, atol=1e-12)
+
+
+def set_epsilon(network, kind, value):
+    for module in network.modules():
+        if isinstance(module, kind):
+            module.eps = value
+
+
+def patch_interpolate(network, monkeypatch):
+    original = functional.interpolate
+    monkeypatch.setattr(
+        functional, "interpolate", lambda x, **options: original(x, **{**options, "align_corners": False})
+    )
+
+
+def swap_readout(network, monkeypatch):
+    weight = network.reassemble[1].project.weight.data
+    network.reassemble[1].project.weight.data = weight.roll(weight.shape[1] // 2, 1)
+
+
+def swap_query_and_value(network, monkeypatch):
+    qkv = network.vit.encoder.blocks[2][0].fn[1].qkv
+    qkv.weight.data = qkv.weight.data.unflatten(0, (3, -1)).flip(0).flatten(0, 1)
+
+
+MISTAKES = {
+    "tanh GELU": lambda n, m: n.vit.encoder.blocks[0][1].fn[1].__setitem__(1, nn.GELU("tanh")),
+    "hook off by one": lambda n, m: setattr(n, "config", dataclasses.replace(TINY, hooks=(0, 1, 2, 4))),
+    "LN eps 1e-5": lambda n, m: set_epsilon(n, nn.LayerNorm, 1e-5),
+    "BN eps 1e-3": lambda n, m: set_epsilon(n, nn.BatchNorm2d, 1e-3),
+    "BN of the batch": lambda n, m: n.fusion[0].train(),
+    "align_corners": patch_interpolate,
+    "bias where none": lambda n, m: setattr(
+        n.reassemble[0].narrow, "bias", nn.Parameter(torch.full((16,), 1e-3).double())
+    ),
+    "readout before patches": swap_readout,
+    "value before key before query": swap_query_and_value,
+    "scale of attention": lambda n, m: setattr(n.vit.encoder.blocks[1][0].fn[1], "num_heads", 2),
+    "levels swapped": lambda n, m: n.fusion.insert(0, n.fusion.pop(1)),
+    "last norm": lambda n, m: n.vit.encoder.blocks[4].append(nn.LayerNorm(32, dtype=torch.float64)),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_planted_mistake_is_noticed(case, mistake, monkeypatch):
+    state, x, expected = case
+    network = network_from_state(state, TINY, source="tiny").double()
+    MISTAKES[mistake](network, monkeypatch)
+    assert relative(network(x), expected) > 1e-9  # the right one stays below 1e-12
+
+
+def test_a_window_of_another_size_is_refused(case):
+    network = network_from_state(case[0], TINY, source="tiny")
+    with pytest.raises(ValueError, match=r"x: expected \[B, 3, 64, 64\], got \(1, 3, 64, 80\)"):
+        network(torch.zeros(1, 3, 64, 80))
+
+
+def test_the_defaults_are_those_of_the_released_checkpoint():
+    config = LSegConfig()
+    assert (config.grid, config.mlp, config.text_mlp) == (30, 4096, 2048)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"patch": 14}, "patch: expected 16, got 14"),
+        ({"window": 72}, "window: expected a multiple of 32 pixels, got 72"),
+        ({"hooks": (0, 1, 2)}, "hooks: expected four rising block numbers below depth = 5"),
+        ({"hooks": (0, 1, 2, 5)}, "hooks: expected four rising block numbers below depth = 5"),
+        ({"neck": (8, 8)}, "neck: expected four channel counts"),
+        ({"heads": 5}, "heads: expected a divisor of width = 32, got 5"),
+        ({"text_heads": 3}, "text_heads: expected a divisor of text_width = 16, got 3"),
+        ({"depth": 0}, r"depth: expected a number in \[1, inf\), got 0"),
+    ],
+)
+def test_sizes_that_contradict_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        LSegConfig(**{**SIZES, **change})

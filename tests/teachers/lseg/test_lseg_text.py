@@ -1,0 +1,80 @@
+import oracles_lseg
+import pytest
+import torch
+from torch.nn import functional
+
+from kfgs.teachers.lseg.keys import text_from_state
+from kfgs.teachers.lseg.layout import random_state
+from kfgs.teachers.lseg.network import LSegConfig
+
+TINY = LSegConfig(
+    width=32,
+    depth=4,
+    heads=4,
+    position_grid=3,
+    window=64,
+    hooks=(0, 1, 2, 3),
+    neck=(8, 12, 16, 20),
+    fusion=16,
+    dim=24,
+    text_width=32,
+    text_layers=3,
+    text_heads=4,
+    context=9,
+    vocabulary=60,
+)
+IDS = torch.tensor(
+    [[58, 3, 59, 0, 0, 0, 0, 0, 0], [58, 7, 41, 5, 20, 33, 2, 59, 0], [58, 59, 59, 59, 59, 59, 59, 59, 59]]
+)
+
+
+@pytest.fixture(scope="module")
+def state():
+    return random_state(TINY, torch.Generator().manual_seed(6))
+
+
+def relative(ours, theirs):
+    return float((ours - theirs).abs().max() / theirs.abs().max())
+
+
+def test_embeddings_are_those_of_transformers_clip(state):
+    expected = oracles_lseg.text(state, TINY, IDS)
+    tower = text_from_state(state, TINY, source="tiny")
+    assert relative(tower.double()(IDS), expected) < 1e-12
+
+
+def test_embeddings_in_float32(state):
+    tower = text_from_state(state, TINY, source="tiny")
+    assert relative(tower(IDS), oracles_lseg.text(state, TINY, IDS, torch.float32, "eager")) < 1e-5
+
+
+def test_what_follows_the_end_does_not_matter(state):
+    tower = text_from_state(state, TINY, source="tiny").double()
+    padded = IDS.clone()
+    padded[0, 3:] = torch.tensor([59, 1, 2, 3, 4, 5])
+    torch.testing.assert_close(tower(padded)[0], tower(IDS)[0], rtol=1e-12, atol=1e-12)
+    padded[0, 1] = 4
+    assert (tower(padded)[0] - tower(IDS)[0]).abs().max() > 1e-3
+
+
+def test_planted_mistakes_are_noticed(state, monkeypatch):
+    expected = oracles_lseg.text(state, TINY, IDS)
+    tower = text_from_state(state, TINY, source="tiny").double()
+    original = functional.scaled_dot_product_attention
+    with monkeypatch.context() as patch:
+        patch.setattr(functional, "scaled_dot_product_attention", lambda q, k, v, is_causal: original(q, k, v))
+        assert relative(tower(IDS), expected) > 1e-6
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "sigmoid", lambda x: 0.5 * (1 + torch.erf(x / (1.702 * 2**0.5))))  # the exact GELU
+        assert relative(tower(IDS), expected) > 1e-6
+    for block in tower.blocks:
+        block.norm1.eps = 1e-6
+    assert relative(tower(IDS), expected) > 1e-9
+
+
+def test_tokens_of_another_length_or_kind_are_refused(state):
+    tower = text_from_state(state, TINY, source="tiny")
+    with pytest.raises(ValueError, match=r"ids: expected \[n, 9\], got \(3, 8\)"):
+        tower(IDS[:, :8])
+    with pytest.raises(ValueError, match="ids: expected int64 token numbers, got torch.float32"):
+        tower(IDS.float())
