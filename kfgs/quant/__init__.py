@@ -7,7 +7,7 @@ from .fit_autoencoder import AutoencoderConfig, AutoencoderFit, fit_autoencoder
 from .fit_codebook import CodebookConfig, CodebookFit, fit_codebook
 from .loss import BalancedLoss, class_balanced_loss
 from .maps import FeatureMaps, IndexMaps, LatentMaps, quantize_maps
-from .sampling import choose_grid_step, farthest_points, sample_grid
+from .sampling import choose_grid_step, farthest_points, grid_slices, sample_grid
 
 __all__ = [
     "EPS",
@@ -28,6 +28,7 @@ __all__ = [
     "farthest_points",
     "fit_autoencoder",
     "fit_codebook",
+    "grid_slices",
     "prune",
     "quantize_maps",
     "row_norms",

@@ -113,7 +113,9 @@ def fit_codebook(
 
     Args:
         maps: one map per image; only `len(maps)` and `maps[i]` are used, and one map is in memory at a time. Sizes may
-            differ, D may not. All-zero features are left out everywhere; half precision is computed in float32.
+            differ, D may not. All-zero features are left out everywhere; half precision is computed in float32. Maps
+            that offer `grid(i, step, samples)`, equal to `sample_grid(maps[i], step, samples=samples)`, are asked for
+            that instead: maps on disk then read only what is looked at.
         config: see `CodebookConfig`.
         generator: draws the order of the images; None stands for a fresh one with seed 0. On a CPU the same generator
             state gives the same bits.
@@ -246,9 +248,14 @@ def _first_codewords(maps: FeatureMaps, config: CodebookConfig) -> Tensor:  # [K
 
 def _samples(maps: FeatureMaps, i: int, config: CodebookConfig, dim: int | None = None) -> Tensor:  # [n, D]
     """The nonzero features of map i that lie on the grid, in at least single precision."""
-    feature_map = maps[i]  # once: this may read a file
-    check_shapes((f"maps[{i}]", feature_map, f"h w {dim or 'D'}"))
-    features = sample_grid(feature_map, config.grid_step, samples=config.samples)
+    grid: Callable[..., Tensor] | None = getattr(maps, "grid", None)
+    if grid is not None:
+        features = grid(i, config.grid_step, config.samples)
+        check_shapes((f"maps.grid({i})", features, f"n {dim or 'D'}"))
+    else:
+        feature_map = maps[i]  # once: this may read a file
+        check_shapes((f"maps[{i}]", feature_map, f"h w {dim or 'D'}"))
+        features = sample_grid(feature_map, config.grid_step, samples=config.samples)
     features = features.to(torch.promote_types(features.dtype, torch.float32))
     norms = row_norms(features)
     if not bool(torch.isfinite(norms).all()):

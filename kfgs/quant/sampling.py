@@ -27,6 +27,25 @@ def choose_grid_step(height: int, width: int, samples: int = SAMPLES) -> tuple[i
     return rows, columns
 
 
+def grid_slices(
+    height: int, width: int, step: tuple[int, int] | None = None, *, samples: int = SAMPLES
+) -> tuple[slice, slice]:
+    """The rows and the columns of a map that `sample_grid` looks at, so that a map on disk need not be read whole.
+
+    Raises:
+        ValueError: if a step is not positive.
+
+    Example:
+        >>> grid_slices(360, 480)
+        (slice(1, 360, 2), slice(1, 480, 3))
+    """
+    rows, columns = choose_grid_step(height, width, samples) if step is None else step
+    check_range("step[0]", rows, 1)
+    check_range("step[1]", columns, 1)
+    i, j = _grid(height, rows), _grid(width, columns)
+    return slice(i.start, height, rows), slice(j.start, width, columns)
+
+
 def sample_grid(
     feature_map: Tensor,  # [h, w, D]
     step: tuple[int, int] | None = None,
@@ -46,11 +65,8 @@ def sample_grid(
     """
     check_shapes(("feature_map", feature_map, "h w D"))
     height, width, dim = feature_map.shape
-    rows, columns = choose_grid_step(height, width, samples) if step is None else step
-    check_range("step[0]", rows, 1)
-    check_range("step[1]", columns, 1)
-    i, j = _grid(height, rows), _grid(width, columns)
-    return feature_map[i.start :: rows, j.start :: columns].reshape(-1, dim)
+    rows, columns = grid_slices(height, width, step, samples=samples)
+    return feature_map[rows, columns].reshape(-1, dim)
 
 
 def farthest_points(

@@ -2,40 +2,59 @@
 
 from __future__ import annotations
 
-import warnings
-import zipfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, overload
+from typing import overload
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from .._check import check_shapes
-from .._files import atomic_path
-
-_SUFFIXES = ("_fmap_CxHxW.pt", ".npy")  # tried in this order
+from .._check import check_shapes, check_whole
+from .._files import atomic_path, digest_file
+from ..quant import grid_slices
+from .langsplat import parse_level
+from .layouts import (
+    FEATURE_3DGS,
+    LANGSPLAT,
+    ROW_BLOCK,
+    Reading,
+    StoredMap,
+    layout_of,
+    open_map,
+    partner_of,
+    read_block,
+)
+from .manifest import MapRecord, read_manifest
+from .stems import explain_missing, find_maps, list_maps
 
 
 class FeatureFolder(Sequence[Tensor]):
     """The teacher's feature maps of some views: item i is view i's map, [h, w, D] float32, read when asked for.
 
-    Two layouts are known, and may be mixed: `<stem>_fmap_CxHxW.pt` (Feature-3DGS: a tensor [D, h, w], half or single
-    precision) and `<stem>.npy` (an array [h, w, D]). No map is kept in memory, so the maps of a scene need not fit.
-    Every map must have the same size; all-zero features are allowed, and mean "nothing known here".
+    These layouts are known, and may be mixed: `<stem>_fmap_CxHxW.pt` (Feature 3DGS: a tensor [D, h, w]),
+    `<stem>_s.npy` beside `<stem>_f.npy` (LangSplat: mask numbers [4, H, W], and a feature per mask), and `<stem>.npy` or
+    `<stem>.safetensors` (an array [h, w, D]; one of [D, h, w] is recognised by `channels` or the picture's aspect). Half,
+    single or double precision. The stem may be followed by the picture's ending, and a picture in a subfolder has its
+    map in the same subfolder; if no view has a map there, the last part of its name is looked for in all subfolders.
+
+    No map is kept in memory, so the maps of a scene need not fit. Every map must have the same size; all-zero features
+    are allowed, and mean "nothing known here". Maps that kfgs wrote, and deleted once index maps had been made of them
+    (`features.json` says `discarded`), need not be there until one is read.
 
     Args:
         path: the folder.
         stems: image names without their ending, in the order wanted; all maps of the folder, sorted, if None.
         channels: D that is expected, for instance that of the text embeddings; taken from the first map if None.
+        sizes: (H, W) of each view's picture, which tells [h, w, D] from [D, h, w] where nothing else does.
+        level: of LangSplat's masks: 0 to 3, or `default`, `s`, `m`, `l`.
+        stride: of LangSplat's masks, which are as large as the pictures: one cell per so many pixels.
 
     Raises:
         NotADirectoryError: if `path` is no folder.
-        FileNotFoundError: if views have no map; the message names them.
-        ValueError: if `stems` is empty or repeats one. When a map is read: if it is not a finite map of floats of the
-            size of the first, or cannot be read at all; the message names the file.
+        FileNotFoundError: if views have no map; the message names them. When a map is read: if it was discarded.
+        ValueError: if `stems` is empty or repeats one, or several files may be meant. When a map is read: if it is not a
+            finite map of floats of the size of the first, or cannot be read at all; the message names the file.
         TypeError: when a map is read: if the file holds something else than one tensor.
 
     Example:
@@ -47,27 +66,31 @@ class FeatureFolder(Sequence[Tensor]):
         (1, (3, 4, 8), torch.float32)
     """
 
-    def __init__(self, path: str | Path, stems: Sequence[str] | None = None, *, channels: int | None = None) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        stems: Sequence[str] | None = None,
+        *,
+        channels: int | None = None,
+        sizes: Sequence[tuple[int, int]] | None = None,
+        level: int | str = 0,
+        stride: int = 1,
+    ) -> None:
         self.path = Path(path)
         if not self.path.is_dir():
             raise NotADirectoryError(f"path: expected a folder of feature maps, got {self.path}; check its name")
-        if isinstance(stems, str):
-            raise TypeError(f"stems: expected a list of image stems, got the text {stems!r}; put it into a list")
-        self.stems = _all_stems(self.path) if stems is None else list(stems)
-        if not self.stems:
-            raise ValueError(f"stems: expected at least one view, got none ({self.path}); name the views to read")
-        if len(set(self.stems)) != len(self.stems):
-            twice = sorted({stem for stem in self.stems if self.stems.count(stem) > 1})
-            raise ValueError(f"stems: expected each view once, got {', '.join(twice)} more than once; remove repeats")
-        self.files = [_find(self.path, stem) for stem in self.stems]
-        missing = [stem + _SUFFIXES[0] for stem, file in zip(self.stems, self.files, strict=True) if not file.is_file()]
-        if missing:
-            named = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
-            raise FileNotFoundError(
-                f"{self.path}: expected a feature map for each of {len(self.stems)} views, {len(missing)} missing: "
-                f"{named} (or .npy); encode these views or leave them out of `stems`"
-            )
+        check_whole("stride", stride, 1)
         self.channels = channels
+        self.reading = Reading(channels=channels, level=parse_level(level), stride=stride)
+        manifest = read_manifest(self.path)
+        records = manifest.maps if manifest else {}
+        gone = records if manifest and manifest.discarded else {}
+        self.stems = _check_stems(self.path, [*list_maps(self.path), *gone] if stems is None else stems, stems is None)
+        if sizes is not None and len(sizes) != len(self.stems):
+            raise ValueError(f"sizes: expected {len(self.stems)} (one per view), got {len(sizes)}; give one for each")
+        self.sizes = None if sizes is None else list(sizes)
+        self._records = [records.get(stem) for stem in self.stems]
+        self.files = _find_files(self.path, self.stems, gone)
         self._shape: tuple[int, int, int] | None = None
 
     def __len__(self) -> int:
@@ -80,7 +103,8 @@ class FeatureFolder(Sequence[Tensor]):
     def shape(self) -> tuple[int, int, int]:
         """(h, w, D) of every map; opens the first file, without reading its values."""
         if self._shape is None:
-            h, w, D = _open(self.files[0]).shape
+            record = self._record(0)
+            h, w, D = record.shape if record else self._open(0).shape
             if self.channels is not None and self.channels != D:
                 raise ValueError(
                     f"{self.files[0]}: expected {self.channels} channels, got {D} in a map of {h} x {w}; "
@@ -97,24 +121,93 @@ class FeatureFolder(Sequence[Tensor]):
 
     def __getitem__(self, index: int | slice) -> Tensor | FeatureFolder:
         if isinstance(index, slice):
-            return FeatureFolder(self.path, self.stems[index], channels=self.channels)
-        file = self.files[index]
-        found = _open(file)
-        if tuple(found.shape) != self.shape:
-            raise ValueError(
-                f"{file}: expected a map of (h, w, D) = {self.shape} as in {self.files[0].name}, got "
-                f"{tuple(found.shape)}; encode all views with the same settings"
+            return FeatureFolder(
+                self.path,
+                self.stems[index],
+                channels=self.channels,
+                sizes=None if self.sizes is None else self.sizes[index],
+                level=self.reading.level,
+                stride=self.reading.stride,
             )
-        values = torch.empty(self.shape)
-        values.copy_(found if isinstance(found, Tensor) else torch.from_numpy(np.array(found, np.float32)))
-        bad = int((~torch.isfinite(values)).sum())
-        if bad:
-            raise ValueError(f"{file}: expected finite features, got {bad} NaN or infinite values; encode it again")
+        stored = self._checked(index)
+        values, bad = torch.empty(self.shape, dtype=torch.float32), 0
+        for start in range(0, self.shape[0], ROW_BLOCK):  # by rows, so that the values are all that is in memory
+            rows = slice(start, start + ROW_BLOCK)
+            bad += _count_bad(read_block(stored, rows, out=values[rows]))
+        self._check_finite(index, bad)
         return values
+
+    def grid(self, i: int, step: tuple[int, int] | None, samples: int) -> Tensor:  # [n, D] float32
+        """`quant.sample_grid(maps[i], step, samples=samples)`, reading no more of the file than that.
+
+        Raises:
+            ValueError: as when the whole map is read; only the values that are taken are looked at.
+        """
+        stored = self._checked(i)
+        values = read_block(stored, *grid_slices(*self.shape[:2], step, samples=samples))
+        self._check_finite(i, _count_bad(values))
+        return values.reshape(-1, self.shape[2])
+
+    def digests(self) -> list[list[str]] | None:
+        """[file name, SHA-256] of each view's map as far as it is known without reading the maps, else None.
+
+        It is known where `features.json` tells of this very file, or of one that was discarded. LangSplat's maps are
+        digested here, both files together; the level and the stride are part of the name.
+        """
+        langsplat = [file.is_file() and layout_of(file) is LANGSPLAT for file in self.files]
+        result = []
+        for i, file in enumerate(self.files):
+            record = self._record(i)
+            if langsplat[i]:
+                both = digest_file(file) + digest_file(partner_of(file, LANGSPLAT))
+                result.append([f"{file.name} level {self.reading.level} stride {self.reading.stride}", both])
+            elif record is not None:
+                result.append([file.name, record.digest])
+            elif any(langsplat):
+                result.append([file.name, digest_file(file)])
+            else:
+                return None
+        return result
+
+    def _record(self, i: int) -> MapRecord | None:
+        """What the manifest says about this very file, or about one that was discarded."""
+        record, file = self._records[i], self.files[i]
+        if record is None or file != self.path / record.file:
+            return None
+        if not file.is_file():
+            return record
+        info = file.stat()
+        return record if (info.st_size, info.st_mtime_ns) == (record.bytes, record.mtime_ns) else None
+
+    def _open(self, i: int) -> StoredMap:
+        file, record = self.files[i], self._record(i)
+        if not file.is_file():
+            raise FileNotFoundError(
+                f"{file}: expected a feature map, but it was discarded once its index map had been made, or deleted "
+                "since; make it again with `kfgs features`"
+            )
+        reading = replace(self.reading, size=self.sizes[i] if self.sizes else None)
+        return open_map(file, reading if record is None else replace(reading, channels=record.shape[2]))
+
+    def _checked(self, i: int) -> StoredMap:
+        """View i's map, if it has the size of the first."""
+        stored = self._open(i)
+        if tuple(stored.shape) != self.shape:
+            raise ValueError(
+                f"{self.files[i]}: expected a map of (h, w, D) = {self.shape} as in {self.files[0].name}, got "
+                f"{tuple(stored.shape)}; encode all views with the same settings"
+            )
+        return stored
+
+    def _check_finite(self, i: int, bad: int) -> None:
+        if bad:
+            raise ValueError(
+                f"{self.files[i]}: expected finite features, got {bad} NaN or infinite values; encode it again"
+            )
 
 
 def save_feature_map(path: str | Path, stem: str, features: Tensor) -> Path:  # features: [h, w, D]
-    """Write one view's map in the layout of Feature-3DGS, `<stem>_fmap_CxHxW.pt`, float16 [D, h, w], atomically.
+    """Write one view's map in the layout of Feature 3DGS, `<stem>_fmap_CxHxW.pt`, float16 [D, h, w], atomically.
 
     Raises:
         ValueError: if `features` is not [h, w, D], or not finite once it is float16 (largest value 65504).
@@ -126,47 +219,40 @@ def save_feature_map(path: str | Path, stem: str, features: Tensor) -> Path:  # 
             f"features: expected finite values below 65504 (they are stored as float16), got others in {stem!r}; "
             "normalise the rows"
         )
-    target = Path(path) / f"{stem}{_SUFFIXES[0]}"
+    target = Path(path) / f"{stem}{FEATURE_3DGS.suffix}"
     with atomic_path(target) as temporary:
         torch.save(half, temporary)
     return target
 
 
-def _all_stems(folder: Path) -> list[str]:
-    names = sorted(file.name for file in folder.iterdir() if not file.name.startswith("."))
-    return sorted({name.removesuffix(suffix) for name in names for suffix in _SUFFIXES if name.endswith(suffix)})
+def _check_stems(folder: Path, stems: Sequence[str], listed: bool) -> list[str]:
+    if isinstance(stems, str):
+        raise TypeError(f"stems: expected a list of image stems, got the text {stems!r}; put it into a list")
+    found = sorted(set(stems)) if listed else list(stems)
+    if not found:
+        raise ValueError(f"stems: expected at least one view, got none ({folder}); name the views to read")
+    if len(set(found)) != len(found):
+        twice = sorted({stem for stem in found if found.count(stem) > 1})
+        raise ValueError(f"stems: expected each view once, got {', '.join(twice)} more than once; remove repeats")
+    return found
 
 
-def _find(folder: Path, stem: str) -> Path:
-    """The file of a view; if there is none, the name it should have."""
-    candidates = [folder / f"{stem}{suffix}" for suffix in _SUFFIXES]
-    return next((file for file in candidates if file.is_file()), candidates[0])
+def _find_files(folder: Path, stems: list[str], gone: dict[str, MapRecord]) -> list[Path]:
+    """Each view's file; the one it was, where the map has been discarded."""
+    found = find_maps(folder, stems)
+    for stem, files in zip(stems, found, strict=True):
+        if not files and stem in gone:
+            files.append(folder / gone[stem].file)
+        if len(files) > 1:
+            names = ", ".join(str(file.relative_to(folder)) for file in files[:3])
+            raise ValueError(
+                f"{folder}: expected one map for view {stem!r}, got {len(files)}: {names}; name the subfolder itself"
+            )
+    missing = [stem for stem, files in zip(stems, found, strict=True) if not files]
+    if missing:
+        raise FileNotFoundError(f"{folder}: {explain_missing(folder, stems, missing)}")
+    return [files[0] for files in found]
 
 
-def _open(file: Path) -> Tensor | NDArray[np.floating]:  # [h, w, D]
-    """A file's map, mapped into memory rather than read; its kind and number of axes are checked."""
-    found: Any
-    try:
-        if file.suffix == ".npy":
-            found = np.load(file, mmap_mode="r", allow_pickle=False)
-        else:
-            mapped = zipfile.is_zipfile(file)  # files of torch < 1.6 are not zip archives and cannot be mapped
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # about the pickle's protocol; what matters is raised
-                found = torch.load(file, map_location="cpu", mmap=mapped, weights_only=True)
-    except Exception as error:  # a damaged pickle raises almost anything: struct.error, KeyError, EOFError, ...
-        raise ValueError(
-            f"{file}: expected a feature map, but it cannot be read ({type(error).__name__}: {str(error)[:120]}); "
-            "encode it again"
-        ) from error
-    axes = "[h, w, D]" if file.suffix == ".npy" else "[D, h, w]"
-    if not isinstance(found, np.ndarray) and not (isinstance(found, Tensor) and found.layout == torch.strided):
-        raise TypeError(
-            f"{file}: expected one dense tensor {axes}, got a {type(found).__name__}; save the tensor alone"
-        )
-    floating = found.is_floating_point() if isinstance(found, Tensor) else found.dtype.kind == "f"
-    if not floating:
-        raise ValueError(f"{file}: expected floating-point features, got {found.dtype}; encode it again")
-    if found.ndim != 3 or 0 in found.shape:
-        raise ValueError(f"{file}: expected a map {axes}, got {tuple(found.shape)}; save one view per file")
-    return found.permute(1, 2, 0) if isinstance(found, Tensor) else found
+def _count_bad(values: Tensor) -> int:
+    return int((~torch.isfinite(values)).sum())

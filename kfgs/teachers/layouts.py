@@ -7,7 +7,7 @@ import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -17,18 +17,50 @@ from torch import Tensor
 
 from .._check import check_shapes
 from .._files import atomic_path
+from .langsplat import INDEX, ROWS, MaskFeatures
 
 Axes = Literal["h w D", "D h w"]
-Array = Tensor | NDArray[Any]
 
 WIDTHS = frozenset((128, 256, 384, 512, 768, 1024, 1152, 1280, 1536))
 """Channels of encoders: a first axis of such a size, and a last one that is none, hints at [D, h, w]."""
 ROW_BLOCK = 32  # rows of a map converted at a time: 30 MB in single precision at 480 x 512 channels
 
 
+class StoredMap(Protocol):
+    """A map [h, w, D] that lies on disk: a tensor or an array mapped into memory, or one put together when read."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(h, w, D)."""
+        ...
+
+    @property
+    def dtype(self) -> Any:
+        """The kind of floats on disk."""
+        ...
+
+    def __getitem__(self, key: tuple[slice, slice], /) -> Any:
+        """Some rows and columns."""
+        ...
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a map is to be read, where its file does not say it alone."""
+
+    channels: int | None = None
+    """D, if it is known: tells [h, w, D] from [D, h, w]."""
+    size: tuple[int, int] | None = None
+    """(H, W) of the view's picture, if it is known: the map has its aspect."""
+    level: int = 0
+    """Which of LangSplat's four sets of masks (`langsplat.LEVELS`)."""
+    stride: int = 1
+    """One cell per so many pixels of LangSplat's masks, which are as large as the picture."""
+
+
 @dataclass(frozen=True)
 class Layout:
-    """One way to keep a view's map in one file."""
+    """One way to keep a view's map on disk."""
 
     suffix: str
     """What follows the picture's stem in the file's name."""
@@ -36,32 +68,24 @@ class Layout:
     """The order of the axes."""
     certain: bool
     """Whether every writer of such files keeps that order."""
-    open: Callable[[Path], Any]
-    """Maps the file's array into memory."""
+    open: Callable[[Path, Reading], Any]
+    """Maps the file into memory."""
+    partner: str = ""
+    """The suffix of a second file that must lie beside the first."""
 
 
-@dataclass(frozen=True)
-class Known:
-    """What is known about a map before its file is opened, to tell [h, w, D] from [D, h, w]."""
-
-    channels: int | None = None
-    """D."""
-    size: tuple[int, int] | None = None
-    """(H, W) of the view's picture: the map has its aspect."""
-
-
-def _open_torch(file: Path) -> Any:
+def _open_torch(file: Path, _: Reading) -> Any:
     mapped = zipfile.is_zipfile(file)  # files of torch < 1.6 are not zip archives and cannot be mapped
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about the pickle's protocol; what matters is raised
         return torch.load(file, map_location="cpu", mmap=mapped, weights_only=True)
 
 
-def _open_numpy(file: Path) -> Any:
+def _open_numpy(file: Path, _: Reading) -> Any:
     return np.load(file, mmap_mode="r", allow_pickle=False)
 
 
-def _open_safetensors(file: Path) -> Any:
+def _open_safetensors(file: Path, _: Reading) -> Any:
     with safe_open(file, framework="pt") as tensors:
         names = list(tensors.keys())
         if len(names) != 1:
@@ -69,27 +93,34 @@ def _open_safetensors(file: Path) -> Any:
         return tensors.get_tensor(names[0])  # mapped, not read
 
 
-LAYOUTS = (  # the first whose file exists is read
-    Layout("_fmap_CxHxW.pt", "D h w", True, _open_torch),  # Feature 3DGS: LSeg's half, SAM's single precision
-    Layout(".npy", "h w D", False, _open_numpy),  # kfgs
+def _open_langsplat(file: Path, reading: Reading) -> Any:
+    return MaskFeatures(file, reading.level, reading.stride)
+
+
+FEATURE_3DGS = Layout("_fmap_CxHxW.pt", "D h w", True, _open_torch)  # LSeg's in half, SAM's in single precision
+LANGSPLAT = Layout(INDEX, "h w D", True, _open_langsplat, partner=ROWS)
+LAYOUTS = (  # the first that a view has is read
+    FEATURE_3DGS,
+    LANGSPLAT,
+    Layout(".npy", "h w D", False, _open_numpy),  # kfgs's own
     Layout(".safetensors", "h w D", False, _open_safetensors),
 )
 
 
-def layout_of(file: Path) -> Layout:
-    """The layout whose suffix the file's name ends in.
-
-    Raises:
-        ValueError: if there is none.
-    """
+def layout_of(file: Path) -> Layout | None:
+    """The first layout whose suffix the file's name ends in, and whose partner lies beside it; None if there is none."""
     for layout in LAYOUTS:
-        if file.name.endswith(layout.suffix):
+        if file.name.endswith(layout.suffix) and (not layout.partner or partner_of(file, layout).is_file()):
             return layout
-    endings = ", ".join(layout.suffix for layout in LAYOUTS)
-    raise ValueError(f"{file}: expected a name that ends in one of {endings}, got {file.name!r}; rename the map")
+    return None
 
 
-def open_map(file: Path, known: Known = Known()) -> Array:  # [h, w, D]
+def partner_of(file: Path, layout: Layout) -> Path:
+    """The second file of a map that is kept in two."""
+    return file.with_name(file.name.removesuffix(layout.suffix) + layout.partner)
+
+
+def open_map(file: Path, reading: Reading = Reading()) -> StoredMap:  # [h, w, D]
     """A file's map, mapped into memory rather than read; its kind, its number of axes and their order are checked.
 
     Raises:
@@ -97,13 +128,18 @@ def open_map(file: Path, known: Known = Known()) -> Array:  # [h, w, D]
         TypeError: if it holds something else than one tensor.
     """
     layout = layout_of(file)
+    if layout is None:
+        endings = ", ".join(layout.suffix for layout in LAYOUTS)
+        raise ValueError(f"{file}: expected a name that ends in one of {endings}, got {file.name!r}; rename the map")
     try:
-        found = layout.open(file)
+        found = layout.open(file, reading)
     except Exception as error:  # a damaged pickle raises almost anything: struct.error, KeyError, EOFError, ...
         raise ValueError(
             f"{file}: expected a feature map, but it cannot be read ({type(error).__name__}: {str(error)[:120]}); "
             "encode it again"
         ) from error
+    if isinstance(found, MaskFeatures):
+        return found
     axes = "[" + layout.axes.replace(" ", ", ") + "]"
     if not isinstance(found, np.ndarray) and not (isinstance(found, Tensor) and found.layout == torch.strided):
         raise TypeError(
@@ -113,13 +149,32 @@ def open_map(file: Path, known: Known = Known()) -> Array:  # [h, w, D]
         raise ValueError(f"{file}: expected floating-point features, got {found.dtype}; encode it again")
     if found.ndim != 3 or 0 in found.shape:
         raise ValueError(f"{file}: expected a map {axes}, got {tuple(found.shape)}; save one view per file")
-    order = layout.axes if layout.certain else find_axes(str(file), (*map(int, found.shape),), known)
-    if order == "h w D":
-        return found  # type: ignore[no-any-return]
-    return found.permute(1, 2, 0) if isinstance(found, Tensor) else found.transpose(1, 2, 0)
+    order = layout.axes if layout.certain else find_axes(str(file), tuple(map(int, found.shape)), reading)
+    if order == "D h w":
+        found = found.permute(1, 2, 0) if isinstance(found, Tensor) else found.transpose(1, 2, 0)
+    return found  # type: ignore[no-any-return]
 
 
-def find_axes(name: str, shape: tuple[int, ...], known: Known = Known()) -> Axes:
+def read_block(
+    stored: StoredMap,  # [h, w, D]
+    rows: slice = slice(None),
+    columns: slice = slice(None),
+    out: Tensor | None = None,  # [rows, columns, D] float32
+) -> Tensor:  # [rows, columns, D] float32
+    """Some rows and columns of a map in single precision, in memory of their own; only they are read from disk.
+
+    A value beyond the range of single precision becomes infinite.
+    """
+    block = stored[rows, columns]
+    out = torch.empty(tuple(block.shape), dtype=torch.float32) if out is None else out
+    if isinstance(block, Tensor):
+        return out.copy_(block)
+    with np.errstate(over="ignore"):
+        np.copyto(out.numpy(), block, casting="same_kind")
+    return out
+
+
+def find_axes(name: str, shape: tuple[int, ...], reading: Reading = Reading()) -> Axes:
     """The order of the axes of a map that may be [h, w, D], as kfgs writes it, or [D, h, w], as encoders give it.
 
     Known channels decide, then the picture's aspect; where both orders fit, or nothing is known, it is [h, w, D].
@@ -128,18 +183,18 @@ def find_axes(name: str, shape: tuple[int, ...], known: Known = Known()) -> Axes
         ValueError: if nothing is known, and the sizes look like [D, h, w].
 
     Example:
-        >>> find_axes("a.npy", (512, 90, 120), Known(channels=512)), find_axes("a.npy", (90, 120, 512))
+        >>> find_axes("a.npy", (512, 90, 120), Reading(channels=512)), find_axes("a.npy", (90, 120, 512))
         ('D h w', 'h w D')
     """
     first, middle, last = shape
-    if known.channels is not None and known.channels in (first, last) and first != last:
-        return "h w D" if last == known.channels else "D h w"
-    if known.size is not None:
-        hwd, dhw = fits_aspect((first, middle), known.size), fits_aspect((middle, last), known.size)
+    if reading.channels is not None and reading.channels in (first, last) and first != last:
+        return "h w D" if last == reading.channels else "D h w"
+    if reading.size is not None:
+        hwd, dhw = fits_aspect((first, middle), reading.size), fits_aspect((middle, last), reading.size)
         if hwd or dhw:
             return "h w D" if hwd else "D h w"
     stretched, plain = max(first / middle, middle / first) > 3, max(middle / last, last / middle) <= 3
-    if known.channels is None and first in WIDTHS and last not in WIDTHS and (last > 64 or (stretched and plain)):
+    if reading.channels is None and first in WIDTHS and last not in WIDTHS and (last > 64 or (stretched and plain)):
         raise ValueError(
             f"{name}: expected a map [h, w, D], got {shape}, which may also be [D, h, w], and nothing tells which; "
             "say the number of channels, or save it as [h, w, D]"
@@ -158,7 +213,10 @@ def fits_aspect(cells: tuple[int, int], size: tuple[int, int]) -> bool:
     return abs(h - H * w / W) <= 1 or abs(w - W * h / H) <= 1
 
 
-def write_npy_map(path: str | Path, features: Array) -> Path:  # features: [h, w, D]
+def write_npy_map(
+    path: str | Path,
+    features: Tensor | NDArray[Any],  # [h, w, D]
+) -> Path:
     """Write one view's map as kfgs keeps it: a `.npy` file, float16 [h, w, D], whole or absent.
 
     The map is converted a few rows at a time, so no copy of it is made in memory.
@@ -168,16 +226,20 @@ def write_npy_map(path: str | Path, features: Array) -> Path:  # features: [h, w
     """
     check_shapes(("features", features, "h w D"))
     target = Path(path)
-    values = features.detach() if isinstance(features, Tensor) else torch.from_numpy(features)
-    header = {"descr": "<f2", "fortran_order": False, "shape": tuple(map(int, values.shape))}
+    header = {"descr": "<f2", "fortran_order": False, "shape": tuple(map(int, features.shape))}
     with atomic_path(target) as temporary, temporary.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, header)
-        for start in range(0, values.shape[0], ROW_BLOCK):
-            rows = values[start : start + ROW_BLOCK].to(torch.float16).cpu().contiguous()
-            if not bool(torch.isfinite(rows).all()):
+        for start in range(0, features.shape[0], ROW_BLOCK):
+            rows = features[start : start + ROW_BLOCK]
+            if isinstance(rows, Tensor):
+                half = rows.detach().to(torch.float16).cpu().contiguous().numpy().astype("<f2", copy=False)
+            else:
+                with np.errstate(over="ignore"):
+                    half = np.ascontiguousarray(rows, "<f2")
+            if not np.isfinite(half).all():
                 raise ValueError(
                     f"features: expected finite values below 65504 (they are stored as float16), got others for "
                     f"{target.name!r}; normalise the rows"
                 )
-            file.write(rows.numpy().astype("<f2", copy=False).data)
+            file.write(half.data)
     return target

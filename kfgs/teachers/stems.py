@@ -1,0 +1,95 @@
+"""Which file of a folder is a view's map: found by the stem of its picture."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+from ..scenes.scene import IMAGE_SUFFIXES
+from .layouts import FEATURE_3DGS, LANGSPLAT, LAYOUTS, layout_of
+
+
+def list_maps(folder: Path, *, deep: bool = False) -> dict[str, list[Path]]:
+    """The maps of a folder by stem; of several files of one stem the one to be read comes first.
+
+    A file may also be named by the whole name of the picture (`rgb_1.png.npy`); the stem is `rgb_1` all the same.
+
+    Args:
+        folder: where to look; hidden files are left out.
+        deep: look into its subfolders too (hidden ones left out, links not followed); a stem then names the subfolder
+            as well.
+    """
+    found: dict[str, list[Path]] = {}
+    for here, folders, names in os.walk(folder):
+        folders[:] = sorted(name for name in folders if deep and not name.startswith("."))
+        for name in sorted(names):
+            file = Path(here) / name
+            layout = None if name.startswith(".") else layout_of(file)
+            if layout is None or _is_partner(file):
+                continue
+            stem = file.relative_to(folder).as_posix().removesuffix(layout.suffix)
+            ending = PurePosixPath(stem).suffix
+            if ending.lower() in IMAGE_SUFFIXES and PurePosixPath(stem).stem:
+                stem = stem.removesuffix(ending)
+            found.setdefault(stem, []).append(file)
+    for files in found.values():
+        files.sort(key=_rank)
+    return found
+
+
+def find_maps(folder: Path, stems: Sequence[str]) -> list[list[Path]]:
+    """Each view's map: no file where there is none, several where it cannot be told which one is meant.
+
+    A view's map lies in the folder under the picture's stem, in subfolders as the picture does. If no view has one
+    there, maps are looked for by the last part of the stem, in the folder and all its subfolders.
+    """
+    found = [_direct(folder, stem) for stem in stems]
+    if all(found):
+        return found
+    present = list_maps(folder, deep=True)
+    found = [files or present.get(stem, [])[:1] for files, stem in zip(found, stems, strict=True)]
+    if any(found):
+        return found
+    bases = Counter(PurePosixPath(stem).name for stem in stems)
+    by_base: dict[str, list[Path]] = {}
+    for stem, files in present.items():
+        by_base.setdefault(PurePosixPath(stem).name, []).append(files[0])
+    return [by_base.get(base, []) if bases[base] == 1 else [] for base in (PurePosixPath(stem).name for stem in stems)]
+
+
+def explain_missing(folder: Path, stems: Sequence[str], missing: Sequence[str]) -> str:
+    """What to say when views have no map: which, and how the maps that are there are called."""
+    named = ", ".join(stem + FEATURE_3DGS.suffix for stem in missing[:5]) + (", ..." if len(missing) > 5 else "")
+    text = f"expected a feature map for each of {len(stems)} views, {len(missing)} missing: {named} (or .npy)"
+    others = [stem for stem in list_maps(folder, deep=True) if stem not in set(stems)]
+    if len(missing) == len(stems) and others:
+        return (
+            f"{text}; its {len(others)} maps are called {_three(others)}, but the pictures {_three(list(stems))}: rename "
+            "the maps by their pictures"
+        )
+    return f"{text}; encode these views or leave them out of `stems`"
+
+
+def _direct(folder: Path, stem: str) -> list[Path]:
+    for layout in LAYOUTS:
+        file = folder / f"{stem}{layout.suffix}"
+        if file.is_file() and layout_of(file) is layout:
+            return [file]
+    return []
+
+
+def _is_partner(file: Path) -> bool:
+    """Whether it is the second file of a map that is kept in two."""
+    first = file.with_name(file.name.removesuffix(LANGSPLAT.partner) + LANGSPLAT.suffix)
+    return file.name.endswith(LANGSPLAT.partner) and first.is_file()
+
+
+def _rank(file: Path) -> tuple[int, str]:
+    layout = layout_of(file)
+    return (LAYOUTS.index(layout) if layout else len(LAYOUTS)), file.name
+
+
+def _three(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
