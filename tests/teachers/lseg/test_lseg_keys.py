@@ -109,9 +109,8 @@ def test_each_tensor_matters(state, x):
     for name, value in state.items():
         if "clip_pretrained" in name or "model.norm" in name or "model.head" in name or "num_batches" in name:
             continue
-        changed = network_from_state(
-            {**state, name: value + 0.3 * torch.randn(value.shape, generator=generator)}, TINY, source="a"
-        )(x)
+        other = value + 0.3 * torch.randn(value.shape, generator=generator)
+        changed = network_from_state({**state, name: other}, TINY, source="a")(x)
         moved = float((changed - expected).abs().max())
         assert (moved == 0) == ("refinenet4.resConfUnit1" in name), name
 
