@@ -7,6 +7,7 @@ Each call is a stage of a run folder: finished stages are found again by the has
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from dataclasses import field as default
@@ -34,7 +35,7 @@ from ..quant import (
 from ..scenes import Scene
 from .device import training_device
 from .digests import describe_lens, digest_scene, stage_generator
-from .maps import KnownFeatures, Maps, UndistortedMaps
+from .maps import KnownFeatures, Maps, UndistortedMaps, check_readable, map_digests, map_shape
 from .stages import Run, Stage
 from .train import check_scene, field_stage
 
@@ -103,6 +104,7 @@ def _codebook_stage(
     """Adaptive Data Compression, Sec. 3.3.1: the codebook S."""
 
     def make(folder: Path) -> None:
+        check_readable(maps, "the codebook")
         fit = fit_codebook(maps, config.codebook, generator=stage_generator(config.seed, "codebook"), **options)
         fit.codebook.save(folder / "codebook.safetensors")
         write_json(folder / "history.json", fit.history)
@@ -115,12 +117,16 @@ def _codebook_stage(
 def _index_stage(
     run: Run, maps: Maps, features: dict[str, Any], codebook: Codebook, upstream: Stage, progress: bool
 ) -> tuple[IndexMaps, Stage]:
-    """Quantisation, Eq. 5: the index map M of every view."""
-    stage = run.stage(
-        "index_maps",
-        {"features": features, "codebook": upstream.key},
-        lambda folder: quantize_maps(maps, codebook, progress=progress).save(folder / "index_maps.safetensors"),
-    )
+    """Quantisation, Eq. 5: the index map M of every view; a killed one goes on with the view it was at."""
+    inputs = {"features": features, "codebook": upstream.key}
+    scratch = run.scratch("index_maps", inputs)
+
+    def make(folder: Path) -> None:
+        check_readable(maps, "quantisation")
+        quantize_maps(maps, codebook, progress=progress, scratch=scratch).save(folder / "index_maps.safetensors")
+
+    stage = run.stage("index_maps", inputs, make)
+    shutil.rmtree(scratch, ignore_errors=True)
     return IndexMaps.load(stage.folder / "index_maps.safetensors"), stage
 
 
@@ -176,8 +182,15 @@ def _field_stage(
     return field_stage(run, "field", inputs, train)
 
 
-def _check_inputs(scene: Scene, views: Sequence[int], maps: Maps, split: str) -> None:
+def _check_inputs(scene: Scene, views: Sequence[int], maps: Maps, split: str, mode: Mode) -> None:
     """Refuse what would fail only after the first stages are done."""
+    if mode == "decouple":
+        if getattr(maps, "recomputed", False):
+            raise ValueError(
+                "maps: expected stored maps for mode 'decouple', which looks at one in every step, got maps that run the "
+                "teacher each time; store them with extract_features, or use another mode"
+            )
+        check_readable(maps, "mode 'decouple'")
     if len(views) != len(maps):
         raise ValueError(
             f"maps: expected one teacher map per view of split {split!r} ({len(views)}), got {len(maps)}; "
@@ -221,7 +234,7 @@ def fit_scene(
     config = config or FitConfig.paper()
     target_device = training_device(device)
     views = scene.views(config.split)
-    _check_inputs(scene, views, maps, config.split)
+    _check_inputs(scene, views, maps, config.split, config.mode)
     run = Run(Path(folder), report)
     options: dict[str, Any] = {"progress": progress, "callback": callback}
     codebook, autoencoder = None, None
@@ -229,7 +242,7 @@ def fit_scene(
     if lenses and not config.undistorted_features:
         maps = UndistortedMaps(maps, lenses)
     targets: Sequence[Tensor] = KnownFeatures(maps)
-    features = {"files": run.digests(maps.files), "lenses": _lens_digest(maps)}
+    features = {"files": map_digests(run, maps), "lenses": _lens_digest(maps)}
     if config.mode == "decouple":
         inputs: dict[str, Any] = {"mode": config.mode, "features": features}
     else:
@@ -247,7 +260,7 @@ def fit_scene(
         "mode": config.mode,
         "seed": config.seed,
         "views": [scene.cameras[i].name for i in views],
-        "teacher_map": list(maps[0].shape),
+        "teacher_map": list(map_shape(maps)),
         "seconds": {stage.name: round(stage.seconds, 3) for stage in run.stages},
         "kfgs": version("kfgs"),
     }

@@ -11,10 +11,18 @@ from torch import Tensor
 
 from ..cameras import Camera, undistort
 from ..quant import EPS, row_norms
+from ..quant.sampling import SAMPLES, sample_grid
+from .digests import describe_lens
+from .stages import Run
 
 
 class Maps(Protocol):
-    """Teacher maps on disk, one file per view, read when asked for; an all-zero feature says "nothing known"."""
+    """Teacher maps on disk, one file per view, read when asked for; an all-zero feature says "nothing known".
+
+    Three more members are used where they exist: `digests() -> list[list[str]] | None`, what decides each map, when that is
+    known without reading the files; `shape`, (h, w, D) without reading values; and `grid(i, step, samples)`, see
+    `fit_codebook`.
+    """
 
     @property
     def files(self) -> Sequence[Path]:
@@ -55,8 +63,33 @@ class UndistortedMaps:
     def __len__(self) -> int:
         return len(self.maps)
 
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(h, w, D) of every map, as the maps say it; a lens changes no size."""
+        return map_shape(self.maps)
+
+    def digests(self) -> list[list[str]] | None:
+        """What decides each map before the lens is removed; None if the maps cannot tell."""
+        return _own_digests(self.maps)
+
     def __getitem__(self, i: int, /) -> Tensor:  # [h, w, D]
-        features = self.maps[i]
+        return self._straighten(i, self.maps[i])
+
+    def grid(self, i: int, step: tuple[int, int] | None = None, samples: int = SAMPLES) -> Tensor:  # [n, D]
+        """`sample_grid(self[i], step, samples=samples)`, looking only at these pixels where the view has no lens."""
+        lens, has = self.lenses[i], {name for name in ("grid", "grid_after") if hasattr(self.maps, name)}
+        if lens.distortion is None and "grid" in has:
+            return self.maps.grid(i, step, samples)  # type: ignore[attr-defined, no-any-return]
+        if "grid_after" in has:  # maps that are made anew keep their samples
+
+            def change(features: Tensor) -> Tensor:
+                return self._straighten(i, features)
+
+            key = describe_lens(lens)
+            return self.maps.grid_after(i, step, samples, change=change, key=key)  # type: ignore[attr-defined, no-any-return]
+        return sample_grid(self[i], step, samples=samples)
+
+    def _straighten(self, i: int, features: Tensor) -> Tensor:  # [h, w, D] -> [h, w, D]
         lens = self.lenses[i].resized(int(features.shape[0]), int(features.shape[1]))
         if lens.distortion is None:
             return features
@@ -76,3 +109,33 @@ class KnownFeatures(Sequence[Tensor]):
     def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [h, w, D], one map at a time
         features = self.maps[i]
         return features.masked_fill(row_norms(features.float())[..., None] <= EPS, torch.nan)
+
+
+def map_digests(run: Run, maps: Maps) -> list[list[str]]:
+    """[file name, SHA-256] of each map: as the maps say, which may have been discarded since, or else of their files."""
+    known = _own_digests(maps)
+    return run.digests(maps.files) if known is None else known
+
+
+def map_shape(maps: Maps) -> tuple[int, int, int]:
+    """(h, w, D) of the first map, without reading it where the maps can tell."""
+    h, w, D = maps.shape if hasattr(maps, "shape") else maps[0].shape
+    return int(h), int(w), int(D)
+
+
+def check_readable(maps: Maps, stage: str) -> None:
+    """Refuse to begin a stage that looks at maps which have been discarded.
+
+    Raises:
+        FileNotFoundError: if a file is gone.
+    """
+    gone = [file for file in maps.files if not file.is_file()]
+    if gone:
+        raise FileNotFoundError(
+            f"maps: expected the maps of all views, which {stage} looks at, got {len(gone)} of {len(maps)} that are gone "
+            f"({gone[0]}, ...); make them again with `kfgs features` (extract_features)"
+        )
+
+
+def _own_digests(maps: Maps) -> list[list[str]] | None:
+    return maps.digests() if hasattr(maps, "digests") else None  # type: ignore[no-any-return]

@@ -13,6 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._check import check_shapes
+from .._files import atomic_path
 from ._store import read_tensors, write_tensors
 from .codebook import EPS, Codebook, row_norms
 
@@ -138,22 +139,41 @@ def quantize_maps(
     codebook: Codebook,
     *,
     progress: bool = False,
+    scratch: Path | None = None,
 ) -> IndexMaps:
     """Quantise every pixel of every map (Eq. 5), with one map in memory at a time.
 
     An all-zero feature (not longer than `EPS`, as in `fit_codebook`) says nothing about its pixel and becomes a hole,
     index K.
 
+    Args:
+        maps: see `fit_codebook`.
+        codebook: what the maps are quantised with.
+        progress: show a progress bar.
+        scratch: a folder of these maps and this codebook alone, where each index map is kept at once; those that a
+            killed process left there are not made again. The caller deletes it.
+
     Raises:
         ValueError: if a map is not [h, w, D] with the codebook's D, or holds NaN or infinity.
     """
     quantised = []
     for i in tqdm(range(len(maps)), desc="quantise", disable=not progress):
-        feature_map = maps[i]  # once: this may read a file
-        check_shapes((f"maps[{i}]", feature_map, f"h w {codebook.dim}"))
-        norms = row_norms(feature_map.to(torch.promote_types(feature_map.dtype, torch.float32)))
-        if not bool(torch.isfinite(norms).all()):
-            raise ValueError(f"maps[{i}]: expected finite features, got NaN or infinity; encode that image again")
-        index = codebook.quantize(feature_map).masked_fill(norms <= EPS, codebook.size)
-        quantised.append(index.cpu().numpy().astype(np.uint16))
+        kept = None if scratch is None else scratch / f"{i}.npy"
+        if kept is not None and kept.is_file():
+            quantised.append(np.load(kept, allow_pickle=False))
+            continue
+        quantised.append(_quantize_map(maps, i, codebook))
+        if kept is not None:
+            with atomic_path(kept) as temporary:
+                np.save(temporary, quantised[-1])
     return IndexMaps(quantised, codebook.size)
+
+
+def _quantize_map(maps: FeatureMaps, i: int, codebook: Codebook) -> NDArray[np.uint16]:  # [h, w]
+    feature_map = maps[i]  # once: this may read a file
+    check_shapes((f"maps[{i}]", feature_map, f"h w {codebook.dim}"))
+    norms = row_norms(feature_map.to(torch.promote_types(feature_map.dtype, torch.float32)))
+    if not bool(torch.isfinite(norms).all()):
+        raise ValueError(f"maps[{i}]: expected finite features, got NaN or infinity; encode that image again")
+    index = codebook.quantize(feature_map).masked_fill(norms <= EPS, codebook.size)
+    return index.cpu().numpy().astype(np.uint16)

@@ -1,0 +1,246 @@
+"""A teacher's maps written to a folder, one picture in memory at a time, so that a killed run goes on where it stopped."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+
+from torch import Tensor
+from tqdm import tqdm
+
+from .._files import digest_file
+from ..scenes import Scene, read_image
+from .layouts import LAYOUTS, write_npy_map
+from .manifest import Manifest, MapRecord, read_manifest
+from .map_store import MapStore, check_space, duration, encode_half, gigabytes, locked, map_file, plain_identity, sweep
+from .protocol import Teacher, identify
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture that a teacher is to see: where it lies, and what its map is to be called."""
+
+    stem: str
+    """The view's name without its suffix."""
+    path: Path
+
+    def read(self) -> Tensor:  # [H, W, 3] float32 RGB in [0, 1]
+        """Read the file; see `scenes.read_image` for what it raises."""
+        return read_image(self.path)
+
+
+def pictures_of(scene: Scene, views: Sequence[int] | None = None) -> list[Picture]:
+    """The pictures of some views of a scene (all if None), as they lie on disk.
+
+    A lens is not removed, also where the scene is undistorted: `fit_scene` removes it from the maps
+    (`FitConfig.undistorted_features` is False).
+    """
+    chosen = range(len(scene)) if views is None else views
+    return [Picture(scene.stem(i), scene.image_paths[i]) for i in chosen]
+
+
+def extract_features(
+    teacher: Teacher,
+    pictures: Sequence[Picture],
+    folder: str | Path,
+    *,
+    overwrite: bool = False,
+    progress: bool = False,
+    report: Callable[[str], None] | None = None,
+) -> Manifest:
+    """Write a teacher's map of each picture to a folder that `FeatureFolder` reads, and that a later call completes.
+
+    A map is `<stem>.npy`, float16 [h, w, D]. What was made of which picture by which teacher stands in `features.json`,
+    which is written after every picture. A map is made again if it is gone or damaged, or if its picture has changed.
+    One picture and its map are in memory at a time.
+
+    Args:
+        teacher: sees each picture, [3, H, W] RGB in [0, 1].
+        pictures: see `pictures_of`.
+        folder: for the maps; made if there is none.
+        overwrite: give up the maps of another teacher (or other weights, or options) that lie there, and maps of these
+            names that kfgs did not write. Maps of the same teacher are kept all the same.
+        progress: show a progress bar, with the time left.
+        report: receives a line about what is to be done, and one per map that is made again.
+
+    Returns:
+        The manifest: a record per map, also of pictures that this call was not asked for.
+
+    Raises:
+        TypeError: if the teacher returns no tensor, or its identity is no JSON.
+        ValueError: if there are no pictures, two have one stem, a map is not finite in float16 or has another number of
+            channels than the others, or another size than that of a picture of equal size; if the folder holds maps of
+            another teacher, or is being written to by another process.
+        OSError: if the folder cannot be written to, or the maps will not fit on the disk.
+    """
+    folder = Path(folder)
+    check_pictures(pictures, folder)
+    with locked(folder):
+        identity = plain_identity(identify(teacher))
+        _make_room(folder, pictures, identity, overwrite=overwrite)
+        store = MapStore.open(folder, identity)
+        sweep(folder, [map_file(folder, picture.stem) for picture in pictures])
+        digests = {picture.stem: digest_file(picture.path) for picture in pictures}
+        doubts = {picture.stem: store.doubt(picture.stem, digests[picture.stem]) for picture in pictures}
+        todo = [picture for picture in pictures if doubts[picture.stem] is not None]
+        maker = _Maker(teacher, store, digests, len(todo))
+        if todo:
+            maker.learn(pictures, todo)
+        if report is not None:
+            report(maker.outlook(len(pictures) - len(todo)))
+            for picture in todo:
+                if doubts[picture.stem] != "new":
+                    report(f"features: {picture.stem}: {doubts[picture.stem]}; making it again")
+        with tqdm(total=len(pictures), initial=len(pictures) - len(todo), desc="features", disable=not progress) as bar:
+            for picture in todo:
+                bar.set_postfix_str(f"{picture.stem}, {maker.time_left()}")
+                maker.make(picture)
+                bar.update()
+            bar.set_postfix_str("")
+        return store.manifest
+
+
+def discard_maps(folder: str | Path) -> int:
+    """Delete the maps of a folder that `extract_features` filled, once index maps have been made of them.
+
+    The manifest stays, so that finished stages of a run are still found; `extract_features` makes the maps again.
+
+    Returns:
+        Bytes that were freed.
+
+    Raises:
+        ValueError: if the folder has no manifest, is in use, or holds a map that has changed since it was written; then
+            nothing is deleted.
+    """
+    folder = Path(folder)
+    manifest = read_manifest(folder)
+    if manifest is None:
+        raise ValueError(
+            f"folder: expected maps that kfgs made (with features.json), got none in {folder}; maps of other programs "
+            "cannot be made again by kfgs: delete them by hand"
+        )
+    with locked(folder):
+        manifest = read_manifest(folder) or manifest
+        files = [folder / record.file for record in manifest.maps.values() if (folder / record.file).is_file()]
+        for stem, record in manifest.maps.items():
+            path = map_file(folder, stem)
+            if path != folder / record.file or (path.is_file() and path.stat().st_size != record.bytes):
+                raise ValueError(
+                    f"folder: expected maps as they were written, got another file in {folder / record.file}; move it away"
+                )
+        replace(manifest, discarded=True).save(folder)  # first, so that a killed call can be repeated
+        freed = sum(path.stat().st_size for path in files)
+        for path in files:
+            path.unlink()
+    return freed
+
+
+class _Maker:
+    """Makes maps one after the other, and knows how large they are and how long they take."""
+
+    def __init__(self, teacher: Teacher, store: MapStore, digests: dict[str, str], count: int) -> None:
+        self.teacher, self.store, self.digests, self.left = teacher, store, digests, count
+        self.shapes: dict[tuple[int, int], tuple[int, int, int]] = {}  # of a picture: of its map
+        records = list(store.manifest.maps.values())
+        self.channels: MapRecord | None = records[-1] if records else None
+        self.seconds = [record.seconds for record in records][-10:]
+        self.checked_space = False
+
+    def learn(self, pictures: Sequence[Picture], todo: list[Picture]) -> None:
+        """Take the map's size from a map that is there, and see whether the others will fit."""
+        waiting = {picture.stem for picture in todo}
+        done = next((picture for picture in pictures if picture.stem not in waiting), None)
+        if done is not None:
+            H, W, _ = done.read().shape
+            self.shapes[H, W] = self.store.manifest.maps[done.stem].shape
+        if self.channels is not None:
+            self._check_space(self.channels.bytes)
+
+    def make(self, picture: Picture) -> None:
+        """Read, encode, check, write, record."""
+        start = time.perf_counter()
+        image = picture.read()
+        half = encode_half(self.teacher, image, picture.path)
+        seconds = time.perf_counter() - start
+        h, w, D = map(int, half.shape)
+        self._check_shape(picture, (int(image.shape[0]), int(image.shape[1])), (h, w, D))
+        if not self.checked_space:
+            self._check_space(half.nbytes)
+        file = write_npy_map(map_file(self.store.folder, picture.stem), half)
+        self.channels = self.store.add(
+            picture.stem,
+            file,
+            shape=(h, w, D),
+            image=picture.path.name,
+            image_digest=self.digests[picture.stem],
+            seconds=round(seconds, 3),
+        )
+        self.seconds = [*self.seconds[-9:], time.perf_counter() - start]
+        self.left -= 1
+
+    def _check_shape(self, picture: Picture, size: tuple[int, int], shape: tuple[int, int, int]) -> None:
+        others = self.channels
+        if others is not None and others.shape[2] != shape[2]:
+            raise ValueError(
+                f"teacher {self.teacher.name!r}: expected {others.shape[2]} channels for {picture.path} as in "
+                f"{others.file}, got {shape[2]}; use one teacher with the same options for all pictures"
+            )
+        expected = self.shapes.setdefault(size, shape)
+        if expected != shape:
+            raise ValueError(
+                f"teacher {self.teacher.name!r}: expected a map of (h, w, D) = {expected} for {picture.path} as for other "
+                f"pictures of {size[0]} x {size[1]}, got {shape}; use the same options for all pictures"
+            )
+
+    def _check_space(self, map_bytes: int) -> None:
+        self.checked_space = True
+        check_space(self.store.folder, map_bytes * self.left, self.left)
+
+    def outlook(self, found: int) -> str:
+        """What is found and what is to be done, in a line."""
+        text = f"features: {found} maps found, {self.left} to make by {self.teacher.name}"
+        known = self.left and self.channels is not None
+        return text + (f" ({gigabytes(self.left * self.channels.bytes)}, {self.time_left()})" if known else "")  # type: ignore[union-attr]
+
+    def time_left(self) -> str:
+        """How long the maps to be made will take, going by the last ten."""
+        return f"about {duration(self.left * median(self.seconds))} left" if self.seconds else "time left not known yet"
+
+
+def check_pictures(pictures: Sequence[Picture], folder: Path) -> None:
+    """Raise an error unless there are pictures that exist, each with a name of its own within `folder`."""
+    if len(pictures) == 0:
+        raise ValueError("pictures: expected at least one, got none; name the views to encode")
+    stems = [picture.stem for picture in pictures]
+    if len(set(stems)) != len(stems):
+        twice = next(stem for stem in stems if stems.count(stem) > 1)
+        raise ValueError(f"pictures: expected each stem once, got {twice!r} twice; rename one of the pictures")
+    for picture in pictures:
+        map_file(folder, picture.stem)
+        if not picture.path.is_file():
+            raise FileNotFoundError(f"{picture.path}: no such file; expected the picture of view {picture.stem!r}")
+
+
+def _make_room(folder: Path, pictures: Sequence[Picture], identity: dict[str, object], *, overwrite: bool) -> None:
+    """Refuse maps that are not ours, or give them up if that was asked for."""
+    found = read_manifest(folder)
+    shadowed = (file for p in pictures if (file := folder / f"{p.stem}{LAYOUTS[0].suffix}").is_file())
+    if (first := next(shadowed, None)) is not None:
+        raise ValueError(
+            f"folder: expected one without maps of other programs, got {first}, which would be read instead of ours; use "
+            "another folder"
+        )
+    if found is None:
+        foreign = [file for p in pictures if (file := map_file(folder, p.stem)).is_file()]
+        if foreign and not overwrite:
+            raise ValueError(
+                f"folder: expected one without maps of other programs, got {foreign[0]} and no features.json; use another "
+                "folder, or pass overwrite=True"
+            )
+    elif overwrite and found.teacher != identity:
+        for stem in found.maps:
+            map_file(folder, stem).unlink(missing_ok=True)
+        Manifest(identity).save(folder)
