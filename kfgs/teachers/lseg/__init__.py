@@ -1,5 +1,7 @@
 """LSeg (Li et al., ICLR 2022), the teacher of the paper: dense features in the space of CLIP's text tower."""
 
 from .network import LSegConfig
+from .options import LSegOptions
+from .teacher import LSeg, load_lseg
 
-__all__ = ["LSegConfig"]
+__all__ = ["LSeg", "LSegConfig", "LSegOptions", "load_lseg"]

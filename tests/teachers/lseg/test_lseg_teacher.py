@@ -1,0 +1,283 @@
+"""LSeg as a teacher: options, preprocessing, the text tower on demand, messages. A tiny network runs the same code."""
+
+import gc
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from kfgs.teachers.lseg import LSeg, LSegConfig, LSegOptions, load_lseg
+from kfgs.teachers.lseg.keys import network_from_state, text_from_state
+from kfgs.teachers.lseg.layout import random_state
+from kfgs.teachers.lseg.text import ClipText
+from kfgs.teachers.lseg.windows import multi_scale_features
+from kfgs.teachers.protocol import Teacher, check_features, identify
+
+TINY = LSegConfig(
+    width=32, depth=4, heads=2, window=64, position_grid=3, hooks=(0, 1, 2, 3), neck=(8, 16, 24, 32), fusion=12, dim=10,
+    text_width=16, text_layers=2, text_heads=2, context=6, vocabulary=40,
+)  # fmt: skip
+STATE = random_state(TINY, torch.Generator().manual_seed(0))
+
+
+def tokenize(prompts: list[str]) -> Tensor:  # [n, 6]: letters, and the end token 39
+    ids = torch.zeros(len(prompts), 6, dtype=torch.int64)
+    for row, prompt in zip(ids, prompts, strict=True):
+        for k, letter in enumerate(prompt[:5]):
+            row[k] = ord(letter) - ord("a")
+        row[min(len(prompt), 5)] = 39
+    return ids
+
+
+def tiny(options: LSegOptions | None = None, **more) -> LSeg:
+    return LSeg(network_from_state(STATE, TINY, source="tiny"), options, **more)
+
+
+def with_text(calls: list[int] | None = None) -> LSeg:
+    def load() -> tuple[ClipText, object]:
+        if calls is not None:
+            calls.append(1)
+        return text_from_state(STATE, TINY, source="tiny"), tokenize
+
+    return tiny(load_text=load)
+
+
+def picture(height: int, width: int) -> Tensor:
+    return torch.rand(3, height, width, generator=torch.Generator().manual_seed(height + 7 * width))
+
+
+def test_features_are_those_of_the_windows_of_the_resized_and_normalised_picture() -> None:
+    teacher, image = tiny(), picture(96, 128)
+    found = teacher.encode_image(image)
+    resized = functional.interpolate((image[None] - 0.5) / 0.5, size=(48, 64), mode="bilinear", align_corners=True)[0]
+    expected = multi_scale_features(resized, teacher.network, window=64, scales=(0.75, 1.0, 1.25, 1.75), flip=True)
+    assert found.shape == (10, 48, 64)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
+    assert check_features("lseg", found) is found
+
+
+def test_a_picture_no_larger_than_the_window_is_not_resized() -> None:
+    teacher, image = tiny(LSegOptions.fast()), picture(64, 64)
+    window = teacher.network(image[None] * 2 - 1)
+    expected = functional.interpolate(window, size=(64, 64), mode="bilinear", align_corners=True)[0]
+    torch.testing.assert_close(teacher.encode_image(image), expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("size", "picture_size", "expected"),
+    [
+        ("auto", (480, 640), (360, 480)),  # 4:3, as in the paper
+        ("auto", (479, 639), (360, 480)),  # and what a resampled picture may lack
+        ("auto", (640, 480), (480, 360)),
+        ("auto", (1080, 1920), (270, 480)),
+        ("auto", (100, 480), (100, 480)),
+        ("auto", (1, 5000), (1, 480)),
+        ("auto", (3, 960), (2, 480)),  # 1.5 is rounded up
+        (None, (1080, 1920), (1080, 1920)),
+        ((360, 480), (480, 640), (360, 480)),
+        ((360, 480), (1080, 1920), (360, 480)),  # the script's, which squeezes it
+        ((360, 480), (640, 480), (640, 480)),  # and leaves what is not wider than 480
+    ],
+)
+def test_size_of_the_map(size, picture_size: tuple[int, int], expected: tuple[int, int]) -> None:
+    assert LSegOptions(size=size).map_size(*picture_size) == expected
+
+
+def test_map_has_the_size_that_was_told() -> None:
+    for size, shape in [("auto", (40, 130)), (None, (40, 130)), ((20, 30), (40, 130)), ((20, 30), (40, 30))]:
+        options = replace(LSegOptions.fast(), size=size)
+        found = tiny(options).encode_image(picture(*shape))
+        assert tuple(found.shape[1:]) == options.map_size(*shape, window=64)
+
+
+def test_paper_runs_26_times_and_fast_once() -> None:
+    assert LSegOptions.paper() == LSegOptions(size=(360, 480))
+    assert LSegOptions.paper().forwards(480, 640) == LSegOptions().forwards(480, 640) == 26
+    for shape in [(480, 640), (640, 480), (480, 480), (7, 2000)]:
+        assert LSegOptions.fast().forwards(*shape) == 1
+    teacher, calls = tiny(LSegOptions.fast()), []
+    teacher.network.register_forward_hook(lambda *_: calls.append(1))
+    teacher.encode_image(picture(90, 101))
+    assert len(calls) == 1
+
+
+def test_text_is_unit_rows_of_the_tower_in_the_order_of_the_prompts() -> None:
+    teacher = with_text()
+    prompts = ["wall", "a", "door"] + ["b" * (k % 5) for k in range(80)]  # more than are embedded at a time
+    rows = teacher.encode_text(prompts)
+    expected = text_from_state(STATE, TINY, source="tiny")(tokenize(prompts))
+    assert rows.shape == (83, 10)
+    torch.testing.assert_close(rows.norm(dim=1), torch.ones(83), rtol=1e-6, atol=0)
+    torch.testing.assert_close(rows, functional.normalize(expected, dim=1), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(teacher.encode_text(("door",))[0], rows[2], rtol=1e-4, atol=1e-5)
+
+
+def test_text_tower_comes_at_the_first_prompt_and_stays() -> None:
+    calls: list[int] = []
+    teacher = with_text(calls)
+    teacher.encode_image(picture(8, 8))
+    assert calls == []
+    assert teacher.text is None
+    teacher.encode_text(["a"])
+    teacher.encode_text(["b"])
+    assert calls == [1]
+    assert not any(parameter.requires_grad for parameter in teacher.parameters())
+
+
+def test_features_can_enter_a_gradient() -> None:
+    """encode_* take no gradient, but what they return is no inference tensor that autograd refuses."""
+    teacher = with_text()
+    weight = torch.ones(10, requires_grad=True)
+    features = teacher.encode_image(picture(8, 9)).flatten(1)
+    (weight @ features).sum().backward()
+    torch.testing.assert_close(weight.grad, features.sum(1))
+    (teacher.encode_text(["a"]) @ weight).sum().backward()
+
+
+def test_bfloat16_is_near_float32_and_not_equal() -> None:
+    image = picture(50, 64)
+    exact = tiny(LSegOptions.fast()).encode_image(image)
+    rough = tiny(replace(LSegOptions.fast(), precision="bfloat16")).encode_image(image)
+    assert rough.dtype == torch.float32
+    assert functional.cosine_similarity(exact, rough, dim=0).min() > 0.995
+    assert not torch.equal(exact, rough)
+
+
+def test_teacher_protocol_device_and_module() -> None:
+    teacher = tiny()
+    assert isinstance(teacher, Teacher)
+    assert teacher.name == "lseg"
+    assert teacher.to("cpu") is teacher
+    assert teacher.device == torch.device("cpu")
+    assert not teacher.training
+    assert not teacher.network.training
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_follows_its_device() -> None:
+    image = picture(50, 64)
+    expected = with_text().encode_image(image)
+    teacher = with_text().to("cuda")
+    found = teacher.encode_image(image)
+    assert found.device.type == teacher.encode_text(["a"]).device.type == "cuda"
+    assert functional.cosine_similarity(found.cpu(), expected, dim=0).min() > 0.999  # convolutions in TF32
+
+
+def test_identity_is_json_tells_the_options_and_asks_for_the_digest_once() -> None:
+    calls: list[int] = []
+    teacher = tiny(LSegOptions(scales=(1.0,), size=(30, 40)), digest=lambda: calls.append(1) or "abc")
+    assert calls == []
+    identity = identify(teacher)
+    assert identity["weights"] == "abc"
+    assert identity["options"] == {"scales": [1.0], "flip": True, "size": [30, 40], "precision": "float32"}
+    assert identity["config"]["window"] == 64
+    assert json.loads(json.dumps(identity)) == identity == teacher.identity
+    assert calls == [1]
+    assert tiny().identity["weights"] is None
+
+
+def test_load_lseg_reads_image_network_and_text_tower_of_one_file(tmp_path: Path) -> None:
+    config = replace(TINY, context=77, vocabulary=49408)  # as the real tokenizer has it
+    state = random_state(config, torch.Generator().manual_seed(1))
+    path = tmp_path / "demo.ckpt"
+    torch.save({"state_dict": state, "epoch": 200, "hyper_parameters": {"backbone": "clip_vitl16_384"}}, path)
+    teacher = load_lseg(path, config=config, scales=[1], flip=False)
+    assert teacher.options == LSegOptions(scales=(1.0,), flip=False)
+    expected = LSeg(network_from_state(state, config, source=""), teacher.options).encode_image(picture(20, 30))
+    torch.testing.assert_close(teacher.encode_image(picture(20, 30)), expected, rtol=0, atol=0)
+    rows = teacher.encode_text(["wall", "swivel chair"])
+    assert rows.shape == (2, 10)
+    assert float(rows[0] @ rows[1]) < 0.999
+    assert len(teacher.identity["weights"]) == 64
+    del teacher
+    gc.collect()  # the mapped file is let go
+
+
+def test_load_lseg_combines_fast_with_single_settings(tmp_path: Path) -> None:
+    path = tmp_path / "demo.ckpt"
+    torch.save({"state_dict": STATE}, path)
+    assert load_lseg(path, config=TINY).options == LSegOptions()
+    assert load_lseg(path, config=TINY, fast=True).options == LSegOptions.fast()
+    assert load_lseg(path, config=TINY, fast=True, flip=True, size=None).options == LSegOptions(
+        scales=LSegOptions.fast().scales, flip=True, size=None
+    )
+    assert load_lseg(path, config=TINY, options=LSegOptions.paper()).options == LSegOptions.paper()
+    with pytest.raises(ValueError, match="options: expected either options or size, scales, flip, fast, got both; use"):
+        load_lseg(path, config=TINY, options=LSegOptions(), fast=True)
+
+
+def test_file_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"demo_e200\.ckpt"):
+        load_lseg(tmp_path / "demo_e200.ckpt")
+
+
+@pytest.mark.parametrize(
+    ("image", "error", "message"),
+    [
+        ([[0.0]], TypeError, r"image: expected a tensor \[3, H, W\], got list; use torch.as_tensor"),
+        (torch.zeros(8, 9, 3), ValueError, r"image: expected \[3, H, W\], got \(8, 9, 3\)"),
+        (torch.zeros(1, 3, 8, 9), ValueError, r"image: expected \[3, H, W\], got \(1, 3, 8, 9\)"),
+        (torch.zeros(3, 8, 9, dtype=torch.uint8), ValueError, "floats in .0, 1., got torch.uint8; divide bytes by 255"),
+        (torch.zeros(3, 0, 9), ValueError, r"image: expected at least one pixel, got \(3, 0, 9\); leave empty"),
+        (torch.full((3, 8, 9), 255.0), ValueError, r"finite values in \[0, 1\], got 255 to 255; divide bytes by 255"),
+        (torch.full((3, 8, 9), -0.5), ValueError, r"finite values in \[0, 1\], got -0.5 to -0.5"),
+        (torch.full((3, 8, 9), torch.nan), ValueError, r"finite values in \[0, 1\], got nan to nan"),
+        (torch.tensor([0.0, torch.nan] * 3).reshape(3, 1, 2), ValueError, r"finite values in \[0, 1\], got nan"),
+        (torch.full((3, 8, 9), torch.inf), ValueError, r"finite values in \[0, 1\], got inf to inf"),
+    ],
+)
+def test_pictures_that_are_refused(image, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        tiny().encode_image(image)
+
+
+@pytest.mark.parametrize(
+    ("prompts", "error", "message"),
+    [
+        ([], ValueError, "prompts: expected at least one text, got none; name what to look for"),
+        ("wall", TypeError, "prompts: expected a list of texts, got the text 'wall'; put it into a list"),
+        (["wall", 3], TypeError, "prompts: expected texts, got int 3; use str"),
+    ],
+)
+def test_prompts_that_are_refused(prompts, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        with_text().encode_text(prompts)
+
+
+def test_without_text_prompts_are_refused() -> None:
+    with pytest.raises(
+        NotImplementedError, match="teacher 'lseg': expected one with a text tower, got one made without"
+    ):
+        tiny().encode_text(["wall"])
+
+
+@pytest.mark.parametrize(
+    ("values", "error", "message"),
+    [
+        ({"scales": ()}, ValueError, r"scales: expected at least one scale, got none; pass \(1.0,\)"),
+        ({"scales": (1.0, 0.0)}, ValueError, r"scales: expected a number in \(0, 16\], got 0.0"),
+        ({"scales": (float("nan"),)}, ValueError, r"scales: expected a number in \(0, 16\], got nan"),
+        ({"scales": (520.0,)}, ValueError, r"scales: expected a number in \(0, 16\], got 520.0"),
+        ({"scales": "1"}, TypeError, "scales: expected numbers, got '1'; pass"),
+        ({"scales": 1.0}, TypeError, r"scales: expected numbers, got 1.0; pass \(1.0,\) for one scale"),
+        (
+            {"size": "full"},
+            ValueError,
+            r"size: expected 'auto', \(height, width\) or None, got 'full'; pass \(360, 480\)",
+        ),
+        ({"size": 480}, ValueError, r"size: expected 'auto', \(height, width\) or None, got 480"),
+        ({"size": (480,)}, ValueError, r"size: expected 'auto', \(height, width\) or None, got \(480,\)"),
+        ({"size": (0, 480)}, ValueError, r"size: expected a number in \[1, inf\), got 0"),
+        ({"size": (3.5, 480)}, ValueError, "size: expected a whole number, got 3.5; pass an int"),
+        ({"precision": "half"}, ValueError, "precision: expected one of 'float32', 'bfloat16', got 'half'"),
+        ({"flip": "no"}, ValueError, "flip: expected one of False, True, got 'no'"),
+    ],
+)
+def test_options_that_are_refused(values, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        LSegOptions(**values)
