@@ -1,10 +1,17 @@
 import pickle
+from dataclasses import replace
 
 import numpy as np
+import oracles_langsplat as oracle
 import pytest
 import torch
+from safetensors.torch import save_file
 
-from kfgs.teachers import FeatureFolder, save_feature_map
+from kfgs._files import digest_file
+from kfgs.quant import sample_grid
+from kfgs.teachers import FeatureFolder, Manifest, save_feature_map
+from kfgs.teachers.layouts import write_npy_map
+from kfgs.teachers.manifest import MapRecord
 
 
 def features(seed: int, size: tuple[int, int, int] = (3, 4, 8)) -> torch.Tensor:  # [h, w, D]
@@ -140,3 +147,190 @@ def test_damaged_and_hostile_files_are_named(tmp_path):
     for stem in ("cut", "junk", "code", "empty", "object"):
         with pytest.raises(ValueError, match=rf"{stem}.*: expected a feature map, but it cannot be read"):
             FeatureFolder(tmp_path, [stem])[0]
+
+
+def save_masks(folder, stem: str, size: tuple[int, int] = (6, 8), seed: int = 0):
+    generator = np.random.default_rng(seed)
+    index = generator.integers(-1, 5, (4, *size)).astype(np.float32)
+    rows = generator.normal(size=(5, 8)).astype(np.float32)
+    np.save(folder / f"{stem}_s.npy", index)
+    np.save(folder / f"{stem}_f.npy", rows)
+    return index, rows
+
+
+def save_any(folder, stem: str, layout: str, want: torch.Tensor) -> None:
+    if layout == "pt":
+        save_pt(folder, stem, want.permute(2, 0, 1).contiguous())
+    elif layout == "npy":
+        np.save(folder / f"{stem}.npy", want.numpy())
+    else:
+        save_file({"f": want}, folder / f"{stem}.safetensors")
+
+
+def own_map(folder, stem: str, want: torch.Tensor) -> MapRecord:
+    """A map as kfgs writes it, and what its manifest says about it."""
+    file = write_npy_map(folder / f"{stem}.npy", want)
+    info = file.stat()
+    shape = (int(want.shape[0]), int(want.shape[1]), int(want.shape[2]))
+    return MapRecord(file.name, shape, info.st_size, info.st_mtime_ns, digest_file(file), f"{stem}.png", "0" * 64, 0.1)
+
+
+@pytest.mark.parametrize("layout", ["pt", "npy", "safetensors"])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32])
+def test_grid_is_that_of_the_whole_map(tmp_path, layout, dtype):
+    save_any(tmp_path, "a", layout, features(4, (70, 50, 8)).to(dtype))
+    maps = FeatureFolder(tmp_path, ["a"])
+    assert maps.shape == (70, 50, 8)
+    for step, samples in (((2, 3), 1), (None, 100), (None, 10_000), ((100, 100), 1)):
+        got = maps.grid(0, step, samples)
+        assert got.dtype == torch.float32
+        assert torch.equal(got, sample_grid(maps[0], step, samples=samples))
+
+
+@pytest.mark.parametrize("layout", ["pt", "npy", "safetensors"])
+def test_grid_looks_at_nothing_else(tmp_path, layout):
+    want = features(4, (70, 50, 8))
+    want[0::2] = torch.nan
+    save_any(tmp_path, "a", layout, want)
+    maps = FeatureFolder(tmp_path, ["a"])
+    assert torch.equal(maps.grid(0, (2, 3), 1), want[1::2, 1::3].reshape(-1, 8))
+    with pytest.raises(ValueError, match=r"a.*: expected finite features, got 14000 NaN"):
+        maps[0]
+    with pytest.raises(ValueError, match=r"a.*: expected finite features, got 4760 NaN"):
+        maps.grid(0, (1, 3), 1)
+    with pytest.raises(ValueError, match=r"step\[0\]: expected a number"):
+        maps.grid(0, (0, 3), 1)
+
+
+def test_grid_of_a_map_of_another_size_is_refused_by_name(tmp_path):
+    np.save(tmp_path / "a.npy", features(0).numpy())
+    np.save(tmp_path / "b.npy", features(0, (4, 4, 8)).numpy())
+    with pytest.raises(ValueError, match=r"b\.npy: expected a map of \(h, w, D\) = \(3, 4, 8\) as in a\.npy"):
+        FeatureFolder(tmp_path).grid(1, (1, 1), 1)
+
+
+def test_langsplat_maps_by_level_and_stride(tmp_path):
+    made = {stem: save_masks(tmp_path, stem, seed=i) for i, stem in enumerate(("a", "b"))}
+    assert FeatureFolder(tmp_path).stems == ["a", "b"]  # not a_f, a_s
+    maps = FeatureFolder(tmp_path, ["a", "b"], channels=8, level="l", stride=2)
+    for i, (index, rows) in enumerate(made.values()):
+        want = torch.from_numpy(oracle.dense(index, rows, 3, 3, 4)).float()
+        assert torch.equal(maps[i], want)
+        assert torch.equal(maps[:][i], want)
+        assert torch.equal(maps.grid(i, (2, 3), 1), sample_grid(want, (2, 3)))
+    assert FeatureFolder(tmp_path, ["b"]).shape == (6, 8, 8)
+    with pytest.raises(ValueError, match="level: expected one of"):
+        FeatureFolder(tmp_path, level=4)
+    with pytest.raises(ValueError, match="stride: expected a number in"):
+        FeatureFolder(tmp_path, stride=0)
+
+
+def test_langsplat_digests_tell_level_stride_and_both_files(tmp_path):
+    save_masks(tmp_path, "a")
+    seen = [FeatureFolder(tmp_path, level=level, stride=stride).digests() for level, stride in ((0, 1), (1, 1), (0, 2))]
+    np.save(tmp_path / "a_f.npy", np.ones((5, 8), np.float32))
+    seen.append(FeatureFolder(tmp_path).digests())
+    assert len({str(digests) for digests in seen}) == 4
+    assert seen[0][0][0] == "a_s.npy level 0 stride 1"
+    np.save(tmp_path / "b.npy", features(0).numpy())
+    assert FeatureFolder(tmp_path).digests()[1] == ["b.npy", digest_file(tmp_path / "b.npy")]
+
+
+@pytest.mark.parametrize("name", ["rgb_1.png.npy", "rgb_1.JPG_fmap_CxHxW.pt", "rgb_1.jpeg.safetensors"])
+def test_the_whole_name_of_the_picture_is_a_stem_too(tmp_path, name):
+    want = features(5)
+    stem, _, layout = name.replace("_fmap_CxHxW", "").rpartition(".")
+    save_any(tmp_path, stem, layout, want)
+    assert (tmp_path / name).is_file()
+    assert torch.equal(FeatureFolder(tmp_path, ["rgb_1"])[0], want)
+    assert FeatureFolder(tmp_path).stems == ["rgb_1"]
+
+
+def test_pictures_in_subfolders_have_their_maps_there(tmp_path):
+    for i, folder in enumerate(("left", "right")):
+        (tmp_path / folder).mkdir()
+        np.save(tmp_path / folder / "0001.npy", features(i).numpy())
+    maps = FeatureFolder(tmp_path, ["right/0001", "left/0001"])
+    assert torch.equal(maps[0], features(1))
+    assert torch.equal(maps[1], features(0))
+    with pytest.raises(
+        ValueError, match=r"expected one map for view '0001', got 2: left.0001\.npy, right.0001\.npy; name"
+    ):
+        FeatureFolder(tmp_path, ["0001"])
+
+
+def test_last_parts_of_names_are_looked_for_when_nothing_else_fits(tmp_path):
+    (tmp_path / "feat").mkdir()
+    np.save(tmp_path / "feat" / "b.npy", features(1).numpy())
+    np.save(tmp_path / "a.npy", features(0).numpy())
+    maps = FeatureFolder(tmp_path, ["train/a", "train/b"])
+    assert [file.relative_to(tmp_path).as_posix() for file in maps.files] == ["a.npy", "feat/b.npy"]
+    with pytest.raises(FileNotFoundError, match=r"2 views, 1 missing: b_fmap"):
+        FeatureFolder(tmp_path, ["a", "b"])  # a fits as it is: then so must b
+    with pytest.raises(FileNotFoundError, match=r"2 views, 2 missing: left/a_fmap"):
+        FeatureFolder(tmp_path, ["left/a", "right/a"])  # which of them?
+
+
+def test_names_of_other_maps_are_shown_when_none_fits(tmp_path):
+    for i in range(4):
+        np.save(tmp_path / f"frame_{i}.npy", features(i).numpy())
+    said = r"its 4 maps are called frame_0, frame_1, frame_2, \.\.\., but the pictures rgb_0, rgb_1: rename the maps"
+    with pytest.raises(FileNotFoundError, match=said):
+        FeatureFolder(tmp_path, ["rgb_0", "rgb_1"])
+
+
+def test_pictures_sizes_tell_the_order_of_the_axes(tmp_path):
+    want = features(6, (6, 8, 20))
+    np.save(tmp_path / "a.npy", want.permute(2, 0, 1).numpy())
+    np.save(tmp_path / "b.npy", want.numpy())
+    maps = FeatureFolder(tmp_path, ["a", "b"], sizes=[(60, 80), (60, 80)])
+    assert torch.equal(maps[0], want)
+    assert torch.equal(maps[1:][0], want)
+    assert torch.equal(FeatureFolder(tmp_path, ["a"], channels=20)[0], want)
+    with pytest.raises(ValueError, match=r"sizes: expected 2 \(one per view\), got 1"):
+        FeatureFolder(tmp_path, ["a", "b"], sizes=[(60, 80)])
+
+
+def test_digests_come_from_the_manifest_of_these_very_files(tmp_path):
+    records = {stem: own_map(tmp_path, stem, features(i)) for i, stem in enumerate(("a", "b"))}
+    Manifest({"name": "t"}, records).save(tmp_path)
+    want = [[f"{stem}.npy", digest_file(tmp_path / f"{stem}.npy")] for stem in ("b", "a")]
+    assert FeatureFolder(tmp_path, ["b", "a"]).digests() == want
+    Manifest({"name": "t"}, {"a": records["a"]}).save(tmp_path)
+    assert FeatureFolder(tmp_path, ["b", "a"]).digests() is None  # b is not recorded
+    Manifest({"name": "t"}, {**records, "b": replace(records["b"], mtime_ns=1)}).save(tmp_path)
+    assert FeatureFolder(tmp_path, ["b", "a"]).digests() is None  # b was written since
+    (tmp_path / "features.json").unlink()
+    assert FeatureFolder(tmp_path, ["b", "a"]).digests() is None
+
+
+def test_a_map_of_the_manifest_is_rows_first_whatever_it_looks_like(tmp_path):
+    want = torch.zeros(512, 9, 100)
+    want[300, 2, 7] = 3.0
+    record = own_map(tmp_path, "a", want)
+    with pytest.raises(ValueError, match="which may also be"):
+        _ = FeatureFolder(tmp_path).shape
+    Manifest({"name": "t"}, {"a": record}).save(tmp_path)
+    assert torch.equal(FeatureFolder(tmp_path)[0], want)
+
+
+def test_discarded_maps_keep_shape_and_digests_and_say_so_when_read(tmp_path):
+    records = {stem: own_map(tmp_path, stem, features(i)) for i, stem in enumerate(("a", "b"))}
+    Manifest({"name": "t"}, records).save(tmp_path)
+    whole = FeatureFolder(tmp_path, ["b", "a"])
+    before = whole.digests(), whole.shape, whole.files
+    for stem in records:
+        (tmp_path / f"{stem}.npy").unlink()
+    with pytest.raises(FileNotFoundError, match="2 views, 2 missing"):  # deleted, but nobody said why
+        FeatureFolder(tmp_path, ["b", "a"])
+    Manifest({"name": "t"}, records, discarded=True).save(tmp_path)
+    maps = FeatureFolder(tmp_path, ["b", "a"])
+    assert (maps.digests(), maps.shape, maps.files) == before
+    assert FeatureFolder(tmp_path).stems == ["a", "b"]
+    for read in (lambda: maps[1], lambda: maps.grid(1, None, 10)):
+        with pytest.raises(FileNotFoundError, match=r"a\.npy: .* discarded once .* make it again with `kfgs features`"):
+            read()
+    with pytest.raises(FileNotFoundError, match="3 views, 1 missing: c_fmap"):
+        FeatureFolder(tmp_path, ["a", "b", "c"])
+    with pytest.raises(ValueError, match=r"b\.npy: expected 512 channels, got 8"):
+        _ = FeatureFolder(tmp_path, ["b"], channels=512).shape

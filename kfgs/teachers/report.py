@@ -1,0 +1,210 @@
+"""Looking over a folder of feature maps before a long run: every view, all that does not fit, by file."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+
+from .._check import check_whole
+from ..quant import EPS, row_norms
+from .langsplat import parse_level
+from .layouts import FEATURE_3DGS, ROW_BLOCK, Reading, StoredMap, fits_aspect, open_map, read_block
+from .manifest import read_manifest
+from .stems import explain_missing, find_maps, list_maps
+
+HOLES = 0.5  # share of all-zero features from which a map is worth a note
+
+
+@dataclass(frozen=True)
+class FeatureReport:
+    """What is wrong with a folder of maps, file by file."""
+
+    folder: Path
+    views: int
+    """Pictures that a map was looked for."""
+    shape: tuple[int, int, int] | None
+    """(h, w, D) of most maps; None if none could be opened."""
+    dtype: str
+    """The kind of floats of most maps: `float16`."""
+    bytes: int
+    """Of all maps on disk."""
+    problems: dict[str, list[str]]
+    """What keeps a map from being used, by the file's name (the name it should have, where there is none)."""
+    notes: dict[str, list[str]]
+    """What is worth knowing about a file, or about the folder ('')."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether every view has a map that fits."""
+        return not self.problems
+
+    def __str__(self) -> str:
+        """A line for the folder, and one for each file that has something said about it."""
+        size = "no map could be opened" if self.shape is None else f"{' x '.join(map(str, self.shape))} {self.dtype}"
+        fit, disk = self.views - len(self.problems), self.bytes / 1e6
+        lines = [f"{self.folder}: {fit} of {self.views} views have a map that fits; {size}, {disk:,.1f} MB"]
+        lines += [f"{name}: {'; '.join(texts)}" for name, texts in self.problems.items()]
+        lines += [f"note: {name + ': ' if name else ''}{'; '.join(texts)}" for name, texts in self.notes.items()]
+        return "\n".join(lines)
+
+    def raise_if_bad(self) -> None:
+        """Do nothing if every map fits.
+
+        Raises:
+            ValueError: with the first five problems and how many there are.
+        """
+        if self.ok:
+            return
+        first = [f"{name}: {'; '.join(texts)}" for name, texts in list(self.problems.items())[:5]]
+        more = f" | and {len(self.problems) - 5} more" if len(self.problems) > 5 else ""
+        raise ValueError(
+            f"{self.folder}: expected a map that fits for each of {self.views} views, got {len(self.problems)} that do "
+            f"not: {' | '.join(first)}{more}; encode these views again or leave them out"
+        )
+
+
+@dataclass
+class _Findings:
+    """What has been found so far."""
+
+    problems: dict[str, list[str]] = field(default_factory=dict)
+    notes: dict[str, list[str]] = field(default_factory=dict)
+
+    def problem(self, name: str, text: str) -> None:
+        self.problems.setdefault(name, []).append(text)
+
+    def note(self, name: str, text: str) -> None:
+        self.notes.setdefault(name, []).append(text)
+
+
+def check_feature_folder(
+    folder: str | Path,
+    pictures: Sequence[tuple[str, tuple[int, int]]],
+    channels: int | None = None,
+    *,
+    values: bool = True,
+    level: int | str = 0,
+    stride: int = 1,
+) -> FeatureReport:
+    """Look at the map of every view, and report all that does not fit at once.
+
+    A problem is: no map, or several; a file that cannot be read or holds no map of floats; other channels than expected;
+    another size than most maps have; an aspect that is not the picture's, up to one cell; NaN or infinite values; a map
+    of nothing but zeros. A note is: double precision, many all-zero features, maps of no view, discarded maps.
+
+    One map is looked at at a time, a few rows in memory.
+
+    Args:
+        folder: folder of maps, in any layout that `FeatureFolder` reads.
+        pictures: stem and (height, width) of each view's picture.
+        channels: D that is expected, if it is known.
+        values: False looks at the shape and the kind only, in milliseconds, and reads no value.
+        level: of LangSplat's masks, as for `FeatureFolder`.
+        stride: of LangSplat's masks, as for `FeatureFolder`.
+
+    Raises:
+        NotADirectoryError: if `folder` is no folder.
+        ValueError: if there is no picture.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise NotADirectoryError(f"folder: expected a folder of feature maps, got {root}; check its name")
+    if not pictures:
+        raise ValueError("pictures: expected at least one view, got none; name the views to look at")
+    check_whole("stride", stride, 1)
+    found, stems = _Findings(), [stem for stem, _ in pictures]
+    files = _present(root, stems, found)
+    reading = {
+        stem: Reading(channels, (int(size[0]), int(size[1])), parse_level(level), stride) for stem, size in pictures
+    }
+    shapes: dict[str, tuple[int, int, int]] = {}
+    kinds: Counter[str] = Counter()
+    for stem, file in files.items():
+        name, stored = file.relative_to(root).as_posix(), _open(file, reading[stem], root, found)
+        if stored is None:
+            continue
+        h, w, D = map(int, stored.shape)
+        shapes[stem] = h, w, D
+        kinds[str(stored.dtype).removeprefix("torch.")] += 1
+        if str(stored.dtype).endswith(("float64", "f8")):
+            found.note(name, "double precision, which is read as single")
+        if values:
+            _look_at_values(name, stored, found)
+    common = Counter(shapes.values()).most_common(1)[0][0] if shapes else None
+    for stem, shape in shapes.items():
+        size = reading[stem].size or (1, 1)
+        for text in _misfits(shape, common or shape, size, channels):
+            found.problem(files[stem].relative_to(root).as_posix(), text)
+    used = sum(file.stat().st_size for file in files.values())
+    kind = kinds.most_common(1)[0][0] if kinds else ""
+    return FeatureReport(root, len(pictures), common, kind, used, found.problems, found.notes)
+
+
+def _present(root: Path, stems: list[str], found: _Findings) -> dict[str, Path]:
+    """The one file of each view that has one; what is missing, doubtful or superfluous goes into the findings."""
+    manifest = read_manifest(root)
+    gone = manifest.maps if manifest and manifest.discarded else {}
+    maps = dict(zip(stems, find_maps(root, stems), strict=True))
+    discarded = [stem for stem in stems if not maps[stem] and stem in gone]
+    missing = [stem for stem in stems if not maps[stem] and stem not in gone]
+    for stem in missing:
+        found.problem(stem + FEATURE_3DGS.suffix, "missing, and no other layout of this view either")
+    if len(missing) == len(stems):
+        found.note("", explain_missing(root, stems, missing))
+    for stem, files in maps.items():
+        if len(files) > 1:
+            names = ", ".join(file.relative_to(root).as_posix() for file in files[:3])
+            found.problem(stem + FEATURE_3DGS.suffix, f"{len(files)} maps may be meant: {names}")
+    if discarded:
+        found.note("", f"{len(discarded)} maps were discarded once their index maps had been made")
+    chosen = {stem: files[0] for stem, files in maps.items() if len(files) == 1}
+    others = sorted(set(list_maps(root)) - set(stems)) if chosen else []
+    if others:
+        found.note("", f"{len(others)} maps belong to none of these views: {', '.join(others[:3])}")
+    return chosen
+
+
+def _open(file: Path, reading: Reading, root: Path, found: _Findings) -> StoredMap | None:
+    try:
+        return open_map(file, reading)
+    except (ValueError, TypeError) as error:
+        found.problem(file.relative_to(root).as_posix(), str(error).removeprefix(f"{file}: "))
+        return None
+
+
+def _misfits(
+    shape: tuple[int, int, int], common: tuple[int, int, int], size: tuple[int, int], channels: int | None
+) -> Iterator[str]:
+    """What is wrong with a map's sizes, beside those of most maps and of its picture (H, W)."""
+    (h, w, D), (H, W) = shape, size
+    if (common[2] if channels is None else channels) != D:
+        yield f"expected {common[2] if channels is None else channels} channels, got {D}"
+    if (h, w) != common[:2]:
+        yield f"expected {common[0]} x {common[1]} cells as most maps have, got {h} x {w}"
+    if not fits_aspect((h, w), size):
+        hint = " (transposed?)" if fits_aspect((w, h), size) else ""
+        yield f"expected the aspect of a picture of {H} x {W} pixels, got {h} x {w} cells{hint}"
+
+
+def _look_at_values(name: str, stored: StoredMap, found: _Findings) -> None:
+    """Count what is not finite, and features of nothing but zeros, a few rows at a time."""
+    h, w, _ = stored.shape
+    bad = zeros = 0
+    try:
+        for start in range(0, h, ROW_BLOCK):
+            rows = read_block(stored, slice(start, start + ROW_BLOCK))
+            bad += int((~torch.isfinite(rows)).sum())
+            zeros += int((row_norms(rows) <= EPS).sum())
+    except ValueError as error:  # mask numbers beyond the masks
+        found.problem(name, str(error).rpartition(f"{name}: ")[2])
+        return
+    if bad:
+        found.problem(name, f"{bad} NaN or infinite values")
+    if zeros == h * w:
+        found.problem(name, "every feature is all-zero")
+    elif zeros >= HOLES * h * w:
+        found.note(name, f"{100 * zeros / (h * w):.0f} % of the features are all-zero: nothing is known there")
