@@ -114,3 +114,24 @@ def test_maps_that_are_not_finite_are_refused(value):
         ValueError, match=r"maps\[1\]: expected finite features, got NaN or infinity; encode that image"
     ):
         quantize_maps(maps, Codebook(torch.eye(2)))
+
+
+def test_quantising_goes_on_with_the_map_it_was_at(tmp_path):
+    class Maps(list):
+        read: list[int] = []  # noqa: RUF012
+
+        def __getitem__(self, i):
+            self.read.append(i)
+            if self.read == [0, 1, 2]:
+                raise KeyboardInterrupt
+            return super().__getitem__(i)
+
+    generator = torch.Generator().manual_seed(5)
+    maps = Maps(torch.randn(4, 5, 3, generator=generator) for _ in range(4))
+    book = Codebook(torch.randn(6, 3, generator=generator))
+    with pytest.raises(KeyboardInterrupt):
+        quantize_maps(maps, book, scratch=tmp_path / "scratch")
+    found = quantize_maps(maps, book, scratch=tmp_path / "scratch")
+    assert maps.read == [0, 1, 2, 2, 3]
+    whole = quantize_maps(list(maps), book)
+    assert all(np.array_equal(a, b) and a.dtype == b.dtype for a, b in zip(found, whole, strict=True))
