@@ -4,7 +4,7 @@ import oracles_quant as oracle
 import pytest
 import torch
 
-from kfgs.quant import Codebook, CodebookConfig, fit_codebook
+from kfgs.quant import Codebook, CodebookConfig, fit_codebook, sample_grid
 
 
 class Lazy:
@@ -19,6 +19,23 @@ class Lazy:
     def __getitem__(self, i):
         self.reads.append(i)
         return self.maps[i].clone()
+
+
+class OnDisk:
+    """Maps that give their grids alone, as those on disk do: to ask for a whole map is an error."""
+
+    def __init__(self, maps):
+        self.maps, self.asked = maps, []
+
+    def __len__(self):
+        return len(self.maps)
+
+    def __getitem__(self, i):
+        raise AssertionError(f"the whole of map {i} was read")
+
+    def grid(self, i, step, samples):
+        self.asked.append((i, step, samples))
+        return sample_grid(self.maps[i], step, samples=samples)
 
 
 def scene(classes=6, images=5, size=(9, 12), dim=24, noise=0.05, seed=0):
@@ -154,6 +171,31 @@ def test_grid_is_used():
     fit = fit_codebook(maps, CodebookConfig(epochs=1, grid_step=(2, 3)))
     assert int(fit.usage.sum()) == 5 * 4 * 4
     assert int(fit_codebook(maps, CodebookConfig(epochs=1, samples=60)).usage.sum()) == 5 * 9 * 6
+
+
+@pytest.mark.parametrize(("step", "samples"), [((2, 3), 28_800), (None, 60), (None, 28_800)])
+def test_maps_that_offer_a_grid_are_asked_for_nothing_else(step, samples):
+    maps = [m.half() for m in scene(noise=0.4)[0]]
+    config = CodebookConfig(maximum=12, epochs=3, grid_step=step, samples=samples)
+    disk, lazy = OnDisk(maps), Lazy(maps)
+    fit, whole = fit_codebook(disk, config), fit_codebook(lazy, config)
+    assert torch.equal(fit.codebook.codewords, whole.codebook.codewords)
+    assert torch.equal(fit.usage, whole.usage)
+    assert (fit.history, fit.coverage, fit.mean_similarity) == (whole.history, whole.coverage, whole.mean_similarity)
+    assert disk.asked == [(i, step, samples) for i in lazy.reads]
+
+
+def test_grids_that_are_none_are_refused():
+    class Wrong(OnDisk):
+        def grid(self, i, step, samples):
+            return self.maps[i]
+
+    with pytest.raises(ValueError, match=r"maps\.grid\(0\): expected \[n, D\], got \(9, 12, 24\)"):
+        fit_codebook(Wrong(scene()[0]))
+    maps = scene()[0]
+    maps[2] = torch.full((9, 12, 24), torch.nan)
+    with pytest.raises(ValueError, match=r"maps\[2\]: expected finite features, got NaN or infinity"):
+        fit_codebook(OnDisk(maps))
 
 
 def test_a_constant_scene_has_one_codeword():

@@ -2,7 +2,7 @@ import oracles_quant as oracle
 import pytest
 import torch
 
-from kfgs.quant import choose_grid_step, farthest_points, sample_grid
+from kfgs.quant import choose_grid_step, farthest_points, grid_slices, sample_grid
 
 
 def test_grid_of_the_paper_is_rows_1_2_columns_1_3():
@@ -25,6 +25,22 @@ def test_grid_of_the_paper_is_rows_1_2_columns_1_3():
 def test_step_is_the_finest_within_the_limit(size, samples, step):
     assert choose_grid_step(*size, samples) == step
     assert 1 <= len(sample_grid(torch.zeros(*size, 1), samples=samples)) <= samples
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 10), (7, 5), (36, 48)])
+@pytest.mark.parametrize(("step", "samples"), [(None, 1), (None, 9), (None, 10_000), ((2, 3), 1), ((9, 1), 1)])
+def test_slices_are_where_the_grid_looks(size, step, samples):
+    feature_map = torch.arange(size[0] * size[1] * 2).reshape(*size, 2)
+    rows, columns = grid_slices(*size, step, samples=samples)
+    assert torch.equal(feature_map[rows, columns].reshape(-1, 2), sample_grid(feature_map, step, samples=samples))
+    assert len(range(size[0])[rows]) * len(range(size[1])[columns]) > 0
+
+
+def test_slices_of_the_paper_are_rows_1_2_columns_1_3():
+    assert grid_slices(360, 480) == (slice(1, 360, 2), slice(1, 480, 3))
+    assert grid_slices(360, 480, (5, 1)) == (slice(2, 360, 5), slice(0, 480, 1))
+    with pytest.raises(ValueError, match=r"step\[0\]: expected a number in \[1, inf\), got 0"):
+        grid_slices(3, 2, (0, 1))
 
 
 def test_a_map_of_one_pixel_keeps_it_whatever_the_step():
