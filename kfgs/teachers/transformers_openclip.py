@@ -1,0 +1,168 @@
+"""CLIP in OpenCLIP's layout (LERF's and LangSplat's ViT-B-16 of LAION, for instance) as a CLIPModel of transformers."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .._files import read_json
+from .transformers_source import one_line, quiet, refuse_gaps, require_transformers
+
+_CONFIG = "open_clip_config.json"
+_WEIGHTS = ("open_clip_model.safetensors", "open_clip_pytorch_model.safetensors", "open_clip_pytorch_model.bin")
+_HEAD_WIDTHS = {1280: 80, 1408: 88, 1664: 104}  # image towers of ViT-H, g and bigG by their width; all others have 64
+
+_TOWER = [  # OpenCLIP's names within a tower -> those of transformers; attention's input projection is split apart
+    (r"^transformer\.resblocks\.(\d+)\.", r"encoder.layers.\1."),
+    (r"\.attn\.out_proj\.", ".self_attn.out_proj."),
+    (r"\.ln_1\.", ".layer_norm1."),
+    (r"\.ln_2\.", ".layer_norm2."),
+    (r"\.mlp\.c_fc\.", ".mlp.fc1."),
+    (r"\.mlp\.c_proj\.", ".mlp.fc2."),
+    (r"^conv1\.", "embeddings.patch_embedding."),
+    (r"^class_embedding$", "embeddings.class_embedding"),
+    (r"^positional_embedding$", "embeddings.position_embedding.weight"),
+    (r"^token_embedding\.", "embeddings.token_embedding."),
+    (r"^ln_pre\.", "pre_layrnorm."),  # spelt so in transformers
+    (r"^ln_post\.", "post_layernorm."),
+    (r"^ln_final\.", "final_layer_norm."),
+]
+
+
+def find_openclip(source: Path | str) -> Path | None:
+    """The weights in OpenCLIP's layout that `source` holds, or is; None if it has none."""
+    if not isinstance(source, Path):
+        return None
+    if source.is_file():
+        return source
+    return next((source / name for name in _WEIGHTS if (source / name).is_file()), None)
+
+
+def load_openclip(file: Path) -> Any:
+    """A CLIPModel with the weights of an OpenCLIP file.
+
+    Sizes come from the weights' shapes, heads and the activation from `open_clip_config.json` beside them (without one:
+    64 channels per head, or the wider ones of ViT-H, g and bigG, and exact GELU, as LAION trained).
+
+    Raises:
+        ValueError: if the file is no CLIP of plain vision and text transformers, or is damaged; the message says what.
+    """
+    from .checkpoint import read_checkpoint
+
+    transformers = require_transformers()
+    state = _unwrapped(read_checkpoint(file))
+    known = read_json(file.with_name(_CONFIG)) if file.with_name(_CONFIG).is_file() else {}
+    settings = known.get("model_cfg", {}) if isinstance(known, dict) else {}
+    _refuse_others(file, state, settings)
+    try:
+        config = _config_of(transformers, state, settings)
+        mapped = _mapped(state)
+        with quiet(transformers):
+            model, info = transformers.CLIPModel.from_pretrained(
+                None, config=config, state_dict=mapped, dtype=torch.float32, output_loading_info=True
+            )
+    except Exception as error:  # shapes that do not fit, sizes of no model: transformers has its own errors for those
+        first = one_line(error)
+        raise ValueError(
+            f"{file}: expected a CLIP in OpenCLIP's layout, but its weights do not fit together ({first}); use the file "
+            "and the config of one model"
+        ) from error
+    refuse_gaps(file, "CLIPModel", info)
+    return model.eval()
+
+
+def _unwrapped(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Without the prefix that training on several devices leaves, in single precision."""
+    floats = {
+        name: tensor.float() for name, tensor in state.items() if tensor.is_floating_point()
+    }  # not the text's mask
+    return {name.removeprefix("module."): tensor for name, tensor in floats.items()}
+
+
+def _refuse_others(file: Path, state: dict[str, Tensor], settings: dict[str, Any]) -> None:
+    needed = ("visual.conv1.weight", "visual.proj", "visual.positional_embedding", "text_projection", "ln_final.weight")
+    missing = [name for name in needed if name not in state]
+    if not missing:
+        return
+    what = f"{len(state)} tensors, the first {next(iter(state), 'none')!r}"
+    if any(name.startswith("visual.trunk.") for name in state):
+        what = "an image tower of timm"
+    elif any(name.startswith("text.transformer.") for name in state):
+        what = "a text tower of another library, as CoCa's or a multilingual one"
+    elif "visual.layer1.0.conv1.weight" in state:
+        what = "a ResNet image tower"
+    elif any(name.startswith("vision_model.") for name in state):
+        what = "weights in the layout of transformers (pass their folder, with config.json)"
+    raise ValueError(
+        f"{file}: expected a CLIP of two plain transformers in OpenCLIP's layout, got {what} (no {missing[0]!r}); use a "
+        "ViT model such as ViT-B-16, or a folder of save_pretrained"
+    )
+
+
+def _config_of(transformers: Any, state: dict[str, Tensor], settings: dict[str, Any]) -> Any:
+    vision, text = settings.get("vision_cfg", {}), settings.get("text_cfg", {})
+    width, _, patch, _ = state["visual.conv1.weight"].shape
+    cells = round((state["visual.positional_embedding"].shape[0] - 1) ** 0.5)
+    length, text_width = state["positional_embedding"].shape
+    vocabulary = state["token_embedding.weight"].shape[0]
+    act = "quick_gelu" if settings.get("quick_gelu") else "gelu"
+    image_heads = width // int(vision.get("head_width", _HEAD_WIDTHS.get(width, 64)))
+    return transformers.CLIPConfig(
+        projection_dim=state["text_projection"].shape[1],
+        vision_config={
+            "hidden_size": width,
+            "intermediate_size": state["visual.transformer.resblocks.0.mlp.c_fc.weight"].shape[0],
+            "num_hidden_layers": _layers(state, "visual.transformer."),
+            "num_attention_heads": max(1, image_heads),
+            "image_size": cells * patch,
+            "patch_size": patch,
+            "hidden_act": act,
+            "projection_dim": state["visual.proj"].shape[1],
+        },
+        text_config={
+            "hidden_size": text_width,
+            "intermediate_size": state["transformer.resblocks.0.mlp.c_fc.weight"].shape[0],
+            "num_hidden_layers": _layers(state, "transformer."),
+            "num_attention_heads": int(text.get("heads", max(1, text_width // 64))),
+            "max_position_embeddings": length,
+            "vocab_size": vocabulary,
+            "hidden_act": act,
+            "projection_dim": state["text_projection"].shape[1],
+            "bos_token_id": vocabulary - 2,
+            "eos_token_id": vocabulary - 1,  # where the text is pooled
+            "pad_token_id": 0,
+        },
+    )
+
+
+def _layers(state: dict[str, Tensor], prefix: str) -> int:
+    pattern = re.compile(re.escape(prefix) + r"resblocks\.(\d+)\.")
+    return 1 + max(int(found[1]) for name in state if (found := pattern.match(name)))
+
+
+def _mapped(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """OpenCLIP's names and layouts as those of transformers."""
+    mapped = {
+        "visual_projection.weight": state["visual.proj"].T.contiguous(),
+        "text_projection.weight": state["text_projection"].T.contiguous(),
+        "logit_scale": state.get("logit_scale", torch.tensor(0.0)).reshape(()),
+    }
+    for name, tensor in state.items():
+        if name in ("visual.proj", "text_projection", "logit_scale", "logit_bias", "attn_mask"):
+            continue
+        tower = "vision_model." if name.startswith("visual.") else "text_model."
+        inner = name.removeprefix("visual.")
+        for pattern, replacement in _TOWER:
+            inner = re.sub(pattern, replacement, inner)
+        if ".attn.in_proj_" in inner:
+            kind = inner.rpartition("_")[2]  # weight or bias
+            stem = inner.partition(".attn.in_proj_")[0]
+            for letter, part in zip("qkv", tensor.chunk(3), strict=True):
+                mapped[f"{tower}{stem}.self_attn.{letter}_proj.{kind}"] = part.contiguous()
+        else:
+            mapped[tower + inner] = tensor
+    return mapped

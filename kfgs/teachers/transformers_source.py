@@ -1,0 +1,182 @@
+"""Where a model of transformers comes from: a package that works, a folder or a hub id, and weights that fit."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from .._files import digest_file, digest_value, read_json
+from .transformers_table import TRANSFORMERS
+
+_HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
+_WEIGHTS = ("*.safetensors", "*.bin")
+
+
+def require_transformers() -> Any:
+    """The package transformers.
+
+    A torchvision that is installed but does not import (the build of another torch) makes every model class of
+    transformers fail with a message about something else, so it is looked at first.
+
+    Raises:
+        ImportError: if transformers is missing, or torchvision is broken.
+    """
+    if importlib.util.find_spec("torchvision") is not None:
+        try:
+            importlib.import_module("torchvision")
+        except Exception as error:  # RuntimeError: operator torchvision::nms does not exist, OSError, ...
+            raise ImportError(
+                f"torchvision: expected none, or the build that belongs to torch {torch.__version__}, got one that is "
+                f"installed but does not import ({one_line(error)}), and transformers fails with it; run "
+                "`pip uninstall torchvision` (kfgs does not need it), or install the build of this torch"
+            ) from error
+    try:
+        return importlib.import_module("transformers")
+    except ImportError as error:
+        raise ImportError(
+            f"transformers: expected it for the teachers {', '.join(TRANSFORMERS)}, but it cannot be imported "
+            f'({one_line(error)}); install it with `pip install "kfgs[hf]"`'
+        ) from error
+
+
+def find_source(kind: str, source: str | Path) -> Path | str:
+    """A folder or file that exists, or else the hub id that `source` can only be.
+
+    Raises:
+        FileNotFoundError: if there is no such path and it is no hub id either.
+    """
+    path = Path(source).expanduser()
+    if path.exists():
+        return path
+    if isinstance(source, str) and _HUB_ID.fullmatch(source):
+        return source
+    raise FileNotFoundError(
+        f"{source}: expected the weights of teacher {kind!r} (a folder as save_pretrained writes it, or a hub id "
+        "owner/name), got a path where nothing lies; check its name"
+    )
+
+
+def read_config(kind: str, source: Path | str, *, local_only: bool) -> dict[str, Any]:
+    """The model's config.json, checked to be of one of the kind's model types.
+
+    Raises:
+        FileNotFoundError: if the folder has none.
+        ValueError: if it is of another model, cannot be read, or the hub cannot be reached.
+    """
+    if isinstance(source, Path):
+        file = source / "config.json"
+        if not file.is_file():
+            what = "a file" if source.is_file() else "a folder without config.json"
+            raise FileNotFoundError(
+                f"{source}: expected a folder as save_pretrained writes it (config.json and weights) for teacher {kind!r}, "
+                f"got {what}; download the whole repository"
+            )
+        config = read_json(file)
+    else:
+        with _explained(kind, source):
+            config, _ = require_transformers().PreTrainedConfig.get_config_dict(source, local_files_only=local_only)
+    found = config.get("model_type") if isinstance(config, dict) else None
+    expected = TRANSFORMERS[kind].models
+    if found not in expected:
+        others = [name for name, row in TRANSFORMERS.items() if found in row.models]
+        hint = f"load it as teacher {' or '.join(map(repr, others))}" if others else "name the folder of such a model"
+        raise ValueError(
+            f"{source}: expected a model of type {' or '.join(map(repr, expected))} for teacher {kind!r}, got "
+            f"{found!r}; {hint}"
+        )
+    return config
+
+
+def load_model(kind: str, source: Path | str, model_type: str, *, local_only: bool) -> Any:
+    """The model in float32, with every weight out of the files and none left as it was drawn.
+
+    Raises:
+        ValueError: if the weights are missing, damaged, or do not fit the config.
+    """
+    transformers = require_transformers()
+    name = TRANSFORMERS[kind].models[model_type][0]
+    with _explained(kind, source), quiet(transformers):
+        model, info = getattr(transformers, name).from_pretrained(
+            source, dtype=torch.float32, local_files_only=local_only, output_loading_info=True
+        )
+    refuse_gaps(source, name, info)
+    return model.eval()
+
+
+def load_tokenizer_of(kind: str, source: Path | str, *, local_only: bool) -> Any:
+    """The tokenizer beside the weights.
+
+    Raises:
+        ValueError: if there is none, or it cannot be read.
+    """
+    transformers = require_transformers()
+    with _explained(kind, source, "a tokenizer"), quiet(transformers):
+        return transformers.AutoTokenizer.from_pretrained(source, local_files_only=local_only, trust_remote_code=False)
+
+
+def refuse_gaps(source: Path | str, name: str, info: dict[str, Any]) -> None:
+    """Raise a ValueError if weights were missing or of another shape: transformers would only have drawn them anew."""
+    gaps = sorted(map(str, info.get("missing_keys") or ())) + sorted(
+        str(entry[0] if isinstance(entry, (tuple, list)) else entry) for entry in info.get("mismatched_keys") or ()
+    )
+    if gaps:
+        raise ValueError(
+            f"{source}: expected every weight of {name}, {len(gaps)} missing or of another shape, the first {gaps[0]!r}; "
+            "use weights and config of the same model"
+        )
+
+
+def weights_of(source: Path | str, model: Any = None) -> str:
+    """What tells these weights from others: a digest of the folder's files, or the hub's commit."""
+    if isinstance(source, str):
+        return f"commit {getattr(model.config, '_commit_hash', None)}"
+    files = [source] if source.is_file() else sorted(file for glob in _WEIGHTS for file in source.glob(glob))
+    config = [] if source.is_file() else sorted(source.glob("*config.json"))
+    return digest_value([[file.name, digest_file(file)] for file in [*config, *files]])
+
+
+@contextmanager
+def quiet(transformers: Any) -> Iterator[None]:
+    """Keep transformers from drawing progress bars and from reporting what `refuse_gaps` says better."""
+    log = transformers.utils.logging
+    level, bars = log.get_verbosity(), log.is_progress_bar_enabled()
+    log.set_verbosity_error()
+    log.disable_progress_bar()
+    try:
+        yield
+    finally:
+        log.set_verbosity(level)
+        if bars:
+            log.enable_progress_bar()
+
+
+@contextmanager
+def _explained(kind: str, source: Path | str, what: str = "weights") -> Iterator[None]:
+    """Turn what transformers raises while it reads into one line that names the source."""
+    try:
+        yield
+    except ImportError as error:  # sentencepiece, for instance
+        raise ImportError(
+            f"{source}: expected {what} of teacher {kind!r}, but a package is missing ({one_line(error)}); install it"
+        ) from error
+    except Exception as error:
+        if isinstance(source, Path):
+            hint = "download the whole repository again"
+            message = f"expected {what} of teacher {kind!r}, but they cannot be read"
+        else:
+            hint = "download the folder and pass its path"
+            message = f"expected {what} of teacher {kind!r}, could not reach them on the hub (nor is it a local folder)"
+        raise ValueError(f"{source}: {message} ({one_line(error)}); {hint}") from error
+
+
+def one_line(error: BaseException) -> str:
+    """The first line of an error, with its type and at most 160 characters."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0][:160] if lines else ''}".rstrip(": ")

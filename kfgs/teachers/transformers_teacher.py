@@ -1,0 +1,196 @@
+"""Teachers over transformers: CLIP, SigLIP, TIPS, DINO, RADIO, read from a folder or a hub id."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from kornia.enhance import normalize as normalize_picture
+from torch import Tensor
+from torch.nn.functional import interpolate, normalize
+
+from .._check import check_choice, check_shapes, check_whole
+from .transformers_openclip import find_openclip, load_openclip
+from .transformers_patches import Patches, patch_size
+from .transformers_source import find_source, load_model, read_config, weights_of
+from .transformers_table import TRANSFORMERS, TeacherRow
+from .transformers_text import Tokenize, bpe_tokenize, has_tokenizer, hub_tokenize
+
+_CHUNK = 64  # prompts at a time
+
+
+def load_transformers_teacher(
+    kind: str,
+    source: str | Path,
+    *,
+    size: int | None = None,
+    residual: bool = False,
+    local_only: bool = False,
+) -> TransformersTeacher:
+    """Load one of the teachers of the table `TRANSFORMERS`.
+
+    Args:
+        kind: a name of the table: clip, openclip, siglip, siglip2, tipsv2, dinov2, dinov3, radio.
+        source: a folder as `save_pretrained` writes it, or a hub id `owner/name`, which is downloaded since it was asked
+            for by name. clip and openclip also take a file or a folder in OpenCLIP's own layout.
+        size: longer side, in pixels, that pictures are resized to before they are cut into patches; None: their own. A
+            map has one cell per patch, so that a larger picture gives a finer map.
+        residual: clip, openclip: keep the residual connection and the MLP of the last block beside its values (as in
+            MaskCLIP's code). tipsv2: the values of the last block instead of its attention, residual and MLP kept.
+        local_only: take a hub id from the local cache alone.
+
+    Raises:
+        ImportError: if transformers is missing (`pip install "kfgs[hf]"`) or a broken torchvision is in its way.
+        FileNotFoundError: if there are no weights.
+        ValueError: if the options do not suit the kind, or the weights are of another model, damaged or incomplete.
+    """
+    check_choice("kind", kind, TRANSFORMERS)
+    row = TRANSFORMERS[kind]
+    if size is not None:
+        check_whole("size", size, 1)
+    if residual and not row.residual:
+        able = [name for name, other in TRANSFORMERS.items() if other.residual]
+        raise ValueError(
+            f"residual: expected False for teacher {kind!r}, got True; only {', '.join(able)} have that path"
+        )
+    found = find_source(kind, source)
+    openclip = _openclip_of(row, found)
+    if openclip is not None:
+        model, model_type, weights = load_openclip(openclip), "clip", weights_of(openclip)
+    else:
+        model_type = read_config(kind, found, local_only=local_only)["model_type"]
+        model = load_model(kind, found, model_type, local_only=local_only)
+        weights = weights_of(found, model)
+    identity = {"name": kind, "options": {"size": size, "residual": bool(residual)}, "weights": weights}
+    if isinstance(found, str):
+        identity["source"] = found
+    tokenize = None
+    if row.text is not None:
+        folder = found.parent if isinstance(found, Path) and found.is_file() else found
+        if "clip" in row.models and isinstance(folder, Path) and not has_tokenizer(folder):
+            tokenize = bpe_tokenize()
+        else:
+            longest = int(model.config.text_config.max_position_embeddings)
+            tokenize = hub_tokenize(kind, folder, row.text, longest, local_only=local_only)
+    return TransformersTeacher(model, row, row.models[model_type][1], identity, tokenize)
+
+
+def _openclip_of(row: TeacherRow, source: Path | str) -> Path | None:
+    """Weights in OpenCLIP's layout, if the kind takes them and no model in the layout of transformers lies there."""
+    if "clip" not in row.models:
+        return None
+    complete = (
+        isinstance(source, Path) and (source / "config.json").is_file() and any(source.glob("model*.safetensors"))
+    )
+    return None if complete else find_openclip(source)
+
+
+class TransformersTeacher:
+    """A vision transformer of transformers as a teacher; made by `load_transformers_teacher`.
+
+    A picture is resized (bilinear, antialiased) so that both sides are multiples of the patch size, normalised as the
+    model was trained, and gives one feature per patch.
+
+    Attributes:
+        model: the model of transformers, in evaluation mode.
+        name: the kind, a name of the table.
+        identity: what decides the features: name, options, and a digest of the weights or the hub's commit.
+        templates: the name of the prompt templates that suit it.
+    """
+
+    def __init__(
+        self, model: Any, row: TeacherRow, patches: Patches, identity: dict[str, Any], tokenize: Tokenize | None
+    ) -> None:
+        self.model, self.row, self.identity = model, row, identity
+        self.name: str = identity["name"]
+        self.templates = row.templates
+        self._patches, self._tokenize = patches, tokenize
+
+    def to(self, device: torch.device | str) -> TransformersTeacher:
+        """Move the model to a device; features are computed and returned there."""
+        self.model.to(device)
+        return self
+
+    @torch.inference_mode()
+    def encode_image(self, image: Tensor) -> Tensor:  # [3, H, W] RGB in [0, 1] -> [D, h, w]
+        """One feature per patch, not normalised.
+
+        Raises:
+            TypeError: if the picture is not floating-point.
+            ValueError: if it is not [3, H, W].
+        """
+        check_picture(image)
+        weight = next(self.model.parameters())
+        ph, pw = patch_size(self.model)
+        height, width = fit_patches(
+            (int(image.shape[1]), int(image.shape[2])), (ph, pw), self.identity["options"]["size"]
+        )
+        pixels = resize_picture(image.to(weight.device, weight.dtype), (height, width))[None]
+        mean, std = (
+            torch.tensor(values, device=weight.device, dtype=weight.dtype) for values in self.row.normalisation
+        )
+        pixels = normalize_picture(pixels, mean, std)
+        tokens = self._patches(self.model, pixels, self.identity["options"]["residual"])  # [1, h*w, D]
+        return tokens[0].T.reshape(-1, height // ph, width // pw).float().contiguous()
+
+    @torch.inference_mode()
+    def encode_text(self, prompts: Sequence[str]) -> Tensor:  # -> [n, D]
+        """One unit row per prompt.
+
+        Raises:
+            NotImplementedError: if the model has no text tower in the space of its patches.
+            TypeError: if `prompts` is a single text.
+            ValueError: if a prompt is too long, or there is no tokenizer beside the weights.
+        """
+        rule = self.row.text
+        if rule is None or self._tokenize is None:
+            able = [name for name, row in TRANSFORMERS.items() if row.text]
+            raise NotImplementedError(
+                f"teacher {self.name!r}: expected one with a text encoder, got one that sees only pictures; use "
+                f"{', '.join(able)} or lseg for words, or query it by examples"
+            )
+        if isinstance(prompts, str):
+            raise TypeError(f"prompts: expected a list of texts, got the text {prompts!r}; put it into a list")
+        device = next(self.model.parameters()).device
+        rows = []
+        for start in range(0, len(prompts), _CHUNK):
+            ids, mask = self._tokenize(list(prompts[start : start + _CHUNK]))
+            named = {"attention_mask": mask.to(device)} if rule.mask else {}
+            rows.append(self.model.get_text_features(input_ids=ids.to(device), **named).pooler_output.float())
+        return normalize(torch.cat(rows), dim=1) if rows else torch.zeros(0, self._text_channels(), device=device)
+
+    def _text_channels(self) -> int:
+        config = self.model.config
+        text = config.text_config
+        found = getattr(config, "projection_dim", None) or getattr(text, "projection_size", None) or text.hidden_size
+        return int(found)
+
+
+def fit_patches(size: tuple[int, int], patch: tuple[int, int], longest: int | None) -> tuple[int, int]:
+    """The (height, width) a picture is resized to: longer side `longest`, each side the nearest multiple of its patch.
+
+    Example:
+        >>> fit_patches((480, 640), (14, 14), None)  # 34.3 and 45.7 patches
+        (476, 644)
+        >>> fit_patches((480, 640), (16, 16), 320)
+        (240, 320)
+    """
+    scale = 1.0 if longest is None else longest / max(size)
+    height, width = (max(1, int(side * scale / cell + 0.5)) * cell for side, cell in zip(size, patch, strict=True))
+    return height, width
+
+
+def check_picture(image: Tensor) -> None:
+    """Raise unless `image` is a picture [3, H, W] of floats (TypeError for another kind, ValueError for a shape)."""
+    check_shapes(("image", image, (3, "H", "W")))
+    if not image.is_floating_point():
+        raise TypeError(f"image: expected floats in [0, 1], got {image.dtype}; divide bytes by 255")
+
+
+def resize_picture(image: Tensor, size: tuple[int, int]) -> Tensor:  # [3, H, W] -> [3, *size]
+    """Resize bilinearly, with antialiasing (torch's: kornia's blurs with a wider kernel, and more slowly)."""
+    if tuple(image.shape[1:]) == size:
+        return image
+    return interpolate(image[None], size, mode="bilinear", align_corners=False, antialias=True)[0]

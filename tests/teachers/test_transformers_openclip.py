@@ -1,0 +1,134 @@
+"""CLIP in OpenCLIP's layout, against a small CLIP written with OpenCLIP's structure."""
+
+import json
+
+import pytest
+import torch
+
+transformers = pytest.importorskip("transformers")
+
+from oracles_transformers import OpenClip  # noqa: E402
+from safetensors.torch import save_file  # noqa: E402
+from tiny_transformers import tokenizer, write_teacher  # noqa: E402
+
+from kfgs.teachers.transformers_teacher import load_transformers_teacher  # noqa: E402
+
+SETTINGS = {"model_cfg": {"vision_cfg": {"head_width": 16}, "text_cfg": {"heads": 2}}}
+
+
+@pytest.fixture(scope="module")
+def clip():
+    torch.manual_seed(0)
+    return OpenClip(
+        width=48, heads=3, layers=2, patch=8, cells=4, text_width=32, text_heads=2, length=16, vocabulary=64, dim=20
+    ).eval()
+
+
+def write(folder, state, *, bin=True, settings=SETTINGS):
+    folder.mkdir(exist_ok=True)
+    if bin:
+        torch.save(state, folder / "open_clip_pytorch_model.bin")
+    else:
+        save_file({name: tensor.contiguous() for name, tensor in state.items()}, folder / "open_clip_model.safetensors")
+    if settings:
+        (folder / "open_clip_config.json").write_text(json.dumps(settings))
+    return folder
+
+
+@pytest.mark.parametrize("bin", [True, False])
+def test_both_towers_equal_openclip(clip, tmp_path, bin):
+    teacher = load_transformers_teacher("openclip", write(tmp_path / "model", clip.state_dict(), bin=bin))
+    pixels = torch.randn(2, 3, 32, 32)
+    ids = torch.tensor([[62, 5, 9, 63, 0, 0], [62, 30, 7, 12, 8, 63]])
+    with torch.no_grad():
+        image = teacher.model.get_image_features(pixels).pooler_output
+        text = teacher.model.get_text_features(ids).pooler_output
+        torch.testing.assert_close(image, clip.image(pixels), rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(text, clip.text(ids), rtol=1e-4, atol=1e-4)
+    assert teacher.encode_image(torch.rand(3, 40, 56)).shape == (20, 5, 7)
+    assert teacher.name == "openclip"
+
+
+def test_values_of_the_class_token_feed_the_same_projection(clip, tmp_path):
+    """With one patch and no attention to choose, the dense path is the last block's value, norm and projection."""
+    teacher = load_transformers_teacher("clip", write(tmp_path / "model", clip.state_dict()))
+    picture = torch.rand(3, 32, 32)
+    mean = torch.tensor([0.48145466, 0.4578275, 0.40821073])[:, None, None]
+    std = torch.tensor([0.26862954, 0.26130258, 0.27577711])[:, None, None]
+    visual = clip.visual
+    with torch.no_grad():
+        x = visual.conv1(((picture - mean) / std)[None]).flatten(2).transpose(1, 2)
+        x = visual.ln_pre(torch.cat([visual.class_embedding[None, None], x], 1) + visual.positional_embedding)
+        block, last = visual.transformer.resblocks
+        y = block.ln_1(x)
+        x = x + block.attn(y, y, y, need_weights=False)[0]
+        x = x + block.mlp.c_proj(torch.nn.functional.gelu(block.mlp.c_fc(block.ln_2(x))))
+        values = last.ln_1(x) @ last.attn.in_proj_weight[96:].T + last.attn.in_proj_bias[96:]
+        expected = (visual.ln_post(last.attn.out_proj(values)) @ visual.proj)[0, 1:]
+    torch.testing.assert_close(teacher.encode_image(picture).flatten(1).T, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_a_file_in_half_precision_from_several_devices_is_the_same(clip, tmp_path):
+    state = {f"module.{name}": tensor.half() for name, tensor in clip.state_dict().items()}
+    write(tmp_path / "half", state)
+    teacher = load_transformers_teacher("openclip", tmp_path / "half" / "open_clip_pytorch_model.bin")
+    full = load_transformers_teacher("openclip", write(tmp_path / "full", clip.state_dict()))
+    assert next(teacher.model.parameters()).dtype == torch.float32
+    picture = torch.rand(3, 32, 32)
+    torch.testing.assert_close(teacher.encode_image(picture), full.encode_image(picture), rtol=0.02, atol=0.02)
+    assert teacher.identity["weights"] != full.identity["weights"]
+
+
+def test_tokenizer_beside_the_weights_is_used(clip, tmp_path):
+    folder = write(tmp_path / "model", clip.state_dict())
+    tokenizer("openclip").save_pretrained(folder)
+    teacher = load_transformers_teacher("openclip", folder)
+    ids = torch.tensor(tokenizer("openclip")(["wall"])["input_ids"])
+    ids[ids == 1] = 63  # the tiny tokenizer's end of text against the last of the vocabulary
+    teacher.model.text_model.eos_token_id = 1
+    rows = teacher.encode_text(["wall"])
+    assert rows.shape == (1, 20)
+    torch.testing.assert_close(rows.norm(dim=1), torch.ones(1))
+
+
+def test_a_folder_of_save_pretrained_is_no_openclip(tmp_path):
+    teacher = load_transformers_teacher("openclip", write_teacher(tmp_path / "model", "openclip"))
+    assert teacher.model.config.vision_config.hidden_act == "quick_gelu"
+
+
+def test_activation_and_heads_come_from_the_settings(clip, tmp_path):
+    quick = {"model_cfg": {**SETTINGS["model_cfg"], "quick_gelu": True}}
+    model = load_transformers_teacher("openclip", write(tmp_path / "quick", clip.state_dict(), settings=quick)).model
+    assert model.config.vision_config.hidden_act == "quick_gelu"
+    assert model.config.vision_config.num_attention_heads == 3
+    model = load_transformers_teacher("openclip", write(tmp_path / "bare", clip.state_dict(), settings=None)).model
+    assert model.config.vision_config.hidden_act == "gelu"
+    assert model.config.vision_config.num_attention_heads == 1  # 48 channels: less than a head of 64
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        (["visual.trunk.blocks.0.attn.qkv.weight"], "an image tower of timm"),
+        (["visual.proj", "text.transformer.wte.weight"], "a text tower of another library"),
+        (["visual.layer1.0.conv1.weight", "text_projection"], "a ResNet image tower"),
+        (["vision_model.embeddings.class_embedding"], "layout of transformers"),
+        (["image_encoder.pos_embed"], "1 tensors, the first 'image_encoder.pos_embed'"),
+    ],
+)
+def test_other_models_are_named(tmp_path, keys, words):
+    folder = write(tmp_path / "model", {key: torch.zeros(2, 2) for key in keys})
+    with pytest.raises(
+        ValueError, match=f"expected a CLIP of two plain transformers in OpenCLIP's layout, got .*{words}"
+    ):
+        load_transformers_teacher("openclip", folder)
+
+
+def test_weights_that_do_not_fit_together_or_are_missing_are_refused(clip, tmp_path):
+    state = clip.state_dict()
+    del state["visual.transformer.resblocks.1.ln_2.bias"]
+    with pytest.raises(ValueError, match=r"1 missing.*first 'vision_model.encoder.layers.1.layer_norm2.bias'"):
+        load_transformers_teacher("openclip", write(tmp_path / "a", state))
+    state = {**clip.state_dict(), "visual.transformer.resblocks.1.ln_2.bias": torch.zeros(7)}
+    with pytest.raises(ValueError, match="expected a CLIP in OpenCLIP's layout, but its weights do not fit together"):
+        load_transformers_teacher("openclip", write(tmp_path / "b", state))

@@ -1,0 +1,249 @@
+"""Every teacher of the table, from tiny models through the real `save_pretrained` and `from_pretrained`."""
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+transformers = pytest.importorskip("transformers")
+
+from oracles_transformers import clip_features, siglip_features  # noqa: E402
+from tiny_transformers import CHANNELS, KINDS, write_teacher  # noqa: E402
+
+from kfgs.teachers import identify  # noqa: E402
+from kfgs.teachers.protocol import Teacher, check_features  # noqa: E402
+from kfgs.teachers.transformers_table import TRANSFORMERS  # noqa: E402
+from kfgs.teachers.transformers_teacher import fit_patches, load_transformers_teacher  # noqa: E402
+
+TEXT = [name for name in CHANNELS if TRANSFORMERS[KINDS.get(name, name)].text]
+BLIND = [name for name in CHANNELS if name not in TEXT]
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    root = tmp_path_factory.mktemp("teachers")
+    transformers.utils.logging.disable_progress_bar()
+    found = {name: write_teacher(root / name, name) for name in CHANNELS}
+    transformers.utils.logging.enable_progress_bar()
+    return found
+
+
+@pytest.fixture(scope="module")
+def load(folders):
+    return lambda name, **options: load_transformers_teacher(KINDS.get(name, name), folders[name], **options)
+
+
+def picture(height=40, width=56, seed=0):
+    return torch.rand(3, height, width, generator=torch.Generator().manual_seed(seed))
+
+
+def test_every_row_of_the_table_is_tested():
+    assert {KINDS.get(name, name) for name in CHANNELS} == set(TRANSFORMERS)
+    models = {model for row in TRANSFORMERS.values() for model in row.models}
+    assert models == {"clip", "siglip", "siglip2", "tipsv2", "dinov2", "dinov2_with_registers", "dinov3_vit", "radio"}
+
+
+@pytest.mark.parametrize("name", CHANNELS)
+def test_map_has_one_feature_per_patch(load, name):
+    teacher = load(name)
+    assert isinstance(teacher, Teacher)
+    assert teacher.name == KINDS.get(name, name)
+    features = check_features(teacher.name, teacher.encode_image(picture()))
+    assert features.shape == (CHANNELS[name], 5, 7)
+    assert features.dtype == torch.float32
+    assert features.flatten(1).std(dim=1).min() > 1e-3  # it sees the picture
+    assert not teacher.model.training
+    assert teacher.to("cpu") is teacher
+
+
+@pytest.mark.parametrize("name", CHANNELS)
+def test_cells_lie_where_their_patches_lie(load, name):
+    """A change in one patch changes the feature of that cell most: neither axis is transposed or flipped."""
+    teacher = load(name)
+    image = 0.5 + 0.01 * picture()
+    other = image.clone()
+    other[:, 8:16, 40:48] = torch.rand(3, 8, 8, generator=torch.Generator().manual_seed(1))  # row 1, column 5
+    change = (teacher.encode_image(other) - teacher.encode_image(image)).norm(dim=0)
+    assert divmod(int(change.argmax()), 7) == (1, 5)
+
+
+@pytest.mark.parametrize("residual", [False, True])
+def test_clip_gives_projected_values_of_its_last_block(load, residual):
+    teacher = load("clip", residual=residual)
+    image = picture(32, 32)
+    mean = torch.tensor([0.48145466, 0.4578275, 0.40821073])[:, None, None]
+    std = torch.tensor([0.26862954, 0.26130258, 0.27577711])[:, None, None]
+    with torch.no_grad():
+        pixels = ((image - mean) / std)[None]
+        states = teacher.model.vision_model(pixels, output_hidden_states=True).hidden_states
+    hidden = states[-2][0].double().numpy()  # what enters the last block
+    expected = clip_features(hidden, teacher.model.state_dict(), 1, 1e-5, residual=residual)
+    got = teacher.encode_image(image).flatten(1).T.numpy()
+    np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_residual_of_tips_is_the_last_block_with_values_for_attention(load):
+    teacher = load("tipsv2", residual=True)
+    vision = teacher.model.vision_model
+    block = vision.encoder.layer[-1]
+    with torch.no_grad():
+        x = vision.encoder.layer[0](vision.embeddings(picture()[None]))
+        x = x + block.layer_scale1(block.attention.o_proj(block.attention.v_proj(block.norm1(x))))
+        x = x + block.layer_scale2(block.mlp(block.norm2(x)))
+        expected = vision.layernorm(x)[0, 2:]  # class token and one register
+    got = teacher.encode_image(picture()).flatten(1).T
+    torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-5)
+    assert (got - load("tipsv2").encode_image(picture()).flatten(1).T).abs().max() > 0.05
+
+
+def test_tips_and_dino_give_the_last_hidden_state_without_prefix(load):
+    for name, prefix in (("tipsv2", 2), ("dinov2", 1), ("dinov2-registers", 5), ("dinov3", 5)):
+        teacher = load(name)
+        mean, std = (torch.tensor(values)[:, None, None] for values in teacher.row.normalisation)
+        with torch.no_grad():
+            tower = getattr(teacher.model, "vision_model", teacher.model)
+            hidden = tower(((picture() - mean) / std)[None]).last_hidden_state[0]
+        assert hidden.shape[0] == prefix + 35
+        got = teacher.encode_image(picture()).flatten(1).T
+        torch.testing.assert_close(got, hidden[prefix:], rtol=1e-5, atol=1e-6)
+
+
+def test_pictures_are_normalised_as_each_model_was_trained():
+    means = {kind: TRANSFORMERS[kind].normalisation[0][0] for kind in TRANSFORMERS}
+    assert means == {
+        "clip": 0.48145466, "openclip": 0.48145466, "siglip": 0.5, "siglip2": 0.5, "tipsv2": 0.0, "dinov2": 0.485,
+        "dinov3": 0.485, "radio": 0.0,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["siglip", "siglip2"])
+def test_siglip_sends_each_patch_through_the_pooling_head(load, name):
+    teacher = load(name)
+    with torch.no_grad():
+        hidden = teacher.model.vision_model((picture()[None] - 0.5) / 0.5, interpolate_pos_encoding=True)
+    hidden = hidden.last_hidden_state[0].double().numpy()
+    expected = siglip_features(hidden, teacher.model.state_dict(), 1e-6)
+    got = teacher.encode_image(picture()).flatten(1).T.numpy()
+    np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_naflex_patches_are_rows_of_pixels_with_colour_last(load):
+    teacher = load("siglip2-naflex")
+    pixels = (picture() - 0.5) / 0.5
+    patches = [
+        pixels[:, 8 * i : 8 * i + 8, 8 * j : 8 * j + 8].permute(1, 2, 0).flatten() for i in range(5) for j in range(7)
+    ]
+    with torch.no_grad():
+        hidden = teacher.model.vision_model(
+            torch.stack(patches)[None],
+            pixel_attention_mask=torch.ones(1, 35, dtype=torch.long),
+            spatial_shapes=torch.tensor([[5, 7]]),
+        ).last_hidden_state[0]
+    expected = siglip_features(hidden.double().numpy(), teacher.model.state_dict(), 1e-6)
+    got = teacher.encode_image(picture()).flatten(1).T.numpy()
+    np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_sides_become_the_nearest_multiple_of_the_patch():
+    assert fit_patches((480, 640), (14, 14), None) == (476, 644)
+    assert fit_patches((480, 640), (16, 16), 320) == (240, 320)
+    assert fit_patches((640, 480), (16, 16), 320) == (320, 240)  # the longer side, whichever it is
+    assert fit_patches((3, 640), (16, 16), None) == (16, 640)  # at least one patch
+    assert fit_patches((32, 64), (8, 16), 128) == (64, 128)
+
+
+def test_size_sets_the_grid(load):
+    assert load("dinov2", size=80).encode_image(picture()).shape == (32, 7, 10)  # 57.1 x 80 pixels
+    assert load("clip", size=24).encode_image(picture(56, 40)).shape == (24, 3, 2)
+
+
+def test_resizing_is_antialiased(load):
+    """Stripes of one pixel, four times too fine for the encoder, look like their mean."""
+    stripes = torch.zeros(3, 128, 128)
+    stripes[:, :, ::4] = 1.0
+    teacher = load("dinov2", size=32)
+    difference = teacher.encode_image(stripes) - teacher.encode_image(torch.full((3, 128, 128), 0.25))
+    assert difference.abs().max() < 0.15 * teacher.encode_image(stripes).abs().max()
+
+
+@pytest.mark.parametrize("name", TEXT)
+def test_text_rows_are_the_normalised_text_features(load, name):
+    teacher = load(name)
+    rows = teacher.encode_text(["wall", "a red chair"])
+    assert rows.shape == (2, CHANNELS[name])
+    torch.testing.assert_close(rows.norm(dim=1), torch.ones(2))
+    tokenizer = transformers.AutoTokenizer.from_pretrained(teacher.model.name_or_path)
+    rule = TRANSFORMERS[teacher.name].text
+    padding = {"padding": "max_length", "max_length": 16} if rule.pad else {"padding": True}
+    found = tokenizer(["wall", "a red chair"], return_tensors="pt", padding_side="right", **padding)
+    named = {"attention_mask": found["attention_mask"]} if rule.mask else {}
+    with torch.no_grad():
+        expected = teacher.model.get_text_features(input_ids=found["input_ids"], **named).pooler_output
+    torch.testing.assert_close(rows, normalize(expected, dim=1))
+
+
+@pytest.mark.parametrize("name", TEXT)
+def test_text_rows_do_not_depend_on_company_or_capitals(load, name):
+    teacher = load(name)
+    rows = teacher.encode_text(["wall"] * 70 + ["a red chair"])  # more than one chunk, shorter beside longer
+    torch.testing.assert_close(teacher.encode_text(["Wall"])[0], rows[0], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(teacher.encode_text(["a red chair"])[0], rows[70], rtol=1e-4, atol=1e-5)
+    assert teacher.encode_text([]).shape == (0, CHANNELS[name])
+
+
+@pytest.mark.parametrize("name", BLIND)
+def test_teachers_without_text_say_so(load, name):
+    with pytest.raises(NotImplementedError, match=r"expected one with a text encoder, got one that sees only pictures"):
+        load(name).encode_text(["wall"])
+
+
+def test_a_single_text_and_a_long_one_are_refused(load):
+    with pytest.raises(TypeError, match="prompts: expected a list of texts, got the text 'wall'"):
+        load("clip").encode_text("wall")
+    with pytest.raises(ValueError, match="prompts: expected at most 16 tokens for teacher 'clip', got 22 .*shorten it"):
+        load("clip").encode_text(["abcdefghijklmnopqrst"])
+    with pytest.raises(ValueError, match="at most 16 tokens for teacher 'tipsv2', got 21"):
+        load("tipsv2").encode_text(["a", "abcdefghijklmnopqrst"])
+
+
+def test_pictures_of_bytes_or_other_shapes_are_refused(load):
+    teacher = load("dinov2")
+    with pytest.raises(TypeError, match=r"image: expected floats in \[0, 1\], got torch.uint8; divide bytes by 255"):
+        teacher.encode_image(torch.zeros(3, 8, 8, dtype=torch.uint8))
+    with pytest.raises(ValueError, match=r"image: expected \[3, H, W\], got \(8, 8, 3\)"):
+        teacher.encode_image(torch.zeros(8, 8, 3))
+
+
+def test_identity_tells_weights_and_options_apart_but_not_folders(load, folders, tmp_path):
+    plain = identify(load("dinov2"))
+    assert plain == identify(load("dinov2"))
+    assert set(plain) == {"name", "options", "weights"}
+    assert plain != identify(load("dinov2", size=80))
+    assert identify(load("clip")) != identify(load("clip", residual=True))
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    for file in folders["dinov2"].iterdir():
+        (moved / file.name).write_bytes(file.read_bytes())
+    assert identify(load_transformers_teacher("dinov2", moved)) == plain
+    weights = transformers.Dinov2Model.from_pretrained(moved)
+    with torch.no_grad():
+        weights.layernorm.bias[0] += 1
+    weights.save_pretrained(moved)
+    assert identify(load_transformers_teacher("dinov2", moved))["weights"] != plain["weights"]
+
+
+def test_hook_is_taken_away_again(load):
+    teacher = load("clip")
+    teacher.encode_image(picture())
+    assert not teacher.model.vision_model.encoder.layers[-1].self_attn._forward_hooks
+
+
+def test_options_that_do_not_suit_are_refused(load, folders):
+    with pytest.raises(
+        ValueError, match="residual: expected False for teacher 'siglip', got True; only clip, openclip"
+    ):
+        load("siglip", residual=True)
+    with pytest.raises(ValueError, match="size: expected a whole number, got 1.5"):
+        load("clip", size=1.5)
+    with pytest.raises(ValueError, match="kind: expected one of 'clip'.*got 'clap'"):
+        load_transformers_teacher("clap", folders["clip"])
