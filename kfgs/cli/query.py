@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from .._check import check_range
 from .checks import check_alone, check_folder, open_field, open_splats
-from .say import load_classes, say, training_cameras, wrote
+from .say import say, training_cameras, warnings_as_notes, wrote
+from .words import ask
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
+
+Negatives = Literal["classes", "canonical", "none"]
+Score = Literal["cosine", "softmax", "relevancy"]
 
 
 def select(
@@ -22,7 +26,10 @@ def select(
     classes: Path | None = None,
     text: Path | None = None,
     threshold: float | None = None,
-    negatives: bool = True,
+    negatives: Negatives | None = None,
+    score: Score | None = None,
+    teacher: str | None = None,
+    weights: str | None = None,
     images: Path | None = None,
 ) -> None:
     """Which Gaussians are the chair? How many there are, where, how large, and the view that shows each best.
@@ -31,15 +38,21 @@ def select(
     which `kfgs edit` takes them.
 
     Args:
-        query: a class name, "chair".
+        query: a class name, "chair"; of a field with --teacher any phrase, "the red chair by the window".
         source: a field folder (`RUN/field`), asked by text; or a splat with classes, asked by label.
         out: folder for selection.json (with the indices) and selection.ply (the Gaussians), if wanted.
-        scene: scene folder: classes.json, text.npy, and the cameras that score and show.
+        scene: scene folder: classes.json and text.npy, or text.safetensors; and the cameras that score and show.
         classes: JSON list of class names; SCENE/classes.json when not given.
-        text: .npy of one embedding per class; SCENE/text.npy when not given.
-        threshold: scores must be above it. Of a field the paper's gamma: when not given 0.5, or with --no-negatives read off
+        text: .npy of one embedding per class, or a table that `kfgs text` made (.safetensors), which needs no classes;
+            SCENE/text.npy or SCENE/text.safetensors when not given.
+        threshold: scores must be above it. Of a field the paper's gamma: when not given 0.5 for a relevancy, else read off
             the scores' distribution. Of a splat all of the class are taken when not given.
-        negatives: tell the class from all others (relevancy) instead of by its cosine alone; of a field.
+        negatives: what to tell the query from: all other classes, LERF's canonical words, or nothing; of a field. When not
+            given: the classes for one of them, the canonical words for any other phrase.
+        score: relevancy (against the most similar negative), softmax (over query and negatives) or cosine; of a field. When
+            not given: relevancy, or with --negatives none cosine.
+        teacher: embed the query with this teacher's text encoder: lseg, clip, siglip, ...; of a field.
+        weights: the teacher's checkpoint file (lseg), or folder or hub id (the others).
         images: folder of the scene's pictures, if it is not SCENE/images.
     """
     from .._files import write_json
@@ -60,15 +73,20 @@ def select(
     is_field = (source / "field.json").is_file()
     counted = not is_field and threshold is None  # parts are numbered as `kfgs edit` does
     if is_field:
-        field, label_set = open_field(source), load_classes(scene, classes, text)
+        field, (label_set, query, known) = open_field(source), ask(query, (scene, classes, text), teacher, weights)
         cameras = None if scene is None else training_cameras(field, scene, images)
-        found = query_field(field, label_set, query, threshold, cameras=cameras, negatives=negatives)
+        against = _negatives(negatives, score, known)
+        with warnings_as_notes():
+            found = query_field(
+                field, label_set, query, threshold, cameras=cameras, negatives=against, score=score
+            )
         cloud = SplatFile(field.gaussians, {"score": found.scores.numpy()})
         if cameras is None:
             say("note: each Gaussian's own latent decides, which is noisy; with --scene the field's views do")
     else:
-        for name, given in (("classes", classes), ("text", text), ("negatives", negatives)):
-            check_alone(name, given, "beside a splat, which has its own classes")
+        given = {"classes": classes, "text": text, "negatives": negatives, "score": score, "teacher": teacher}
+        for name, value in (given | {"weights": weights}).items():
+            check_alone(name, value, "beside a splat, which has its own classes")
         cloud = open_splats("source", source, labelled=True)
         found = select_labelled(cloud, query, threshold)
         cameras = None if scene is None else load_scene(scene, images=images).undistorted().cameras
@@ -85,3 +103,14 @@ def select(
         facts = {"query": query, "threshold": found.threshold, "how": found.how, "count": len(found), "parts": parts}
         write_json(out / "selection.json", facts)
         wrote([out / "selection.json", *write_splats(out / "selection.ply", cloud.select(found.mask)).paths])
+
+
+def _negatives(negatives: Negatives | None, score: Score | None, known: bool) -> Any:
+    """The kind of negatives: as asked, if the score can use it; else the classes for a class, canonical for a phrase."""
+    if negatives is None:
+        return "none" if score == "cosine" else "classes" if known else "canonical"
+    if score == "cosine" and negatives != "none":
+        raise ValueError(f"negatives: expected none beside --score cosine, got {negatives}; leave one of both out")
+    if score in ("softmax", "relevancy") and negatives == "none":
+        raise ValueError(f"negatives: expected classes or canonical for --score {score}, got none; leave it out")
+    return negatives

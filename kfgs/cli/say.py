@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -42,18 +45,61 @@ def fit_config(preset: Preset, mode: Mode, seed: int, steps: int | None, max_gau
 
 
 def load_classes(scene: Path | None, classes: Path | None, text: Path | None) -> Any:
-    """The label set of a scene folder, or of two files."""
-    from ..evaluation import load_label_set
+    """The label set of a scene folder, of two files, or of one table that `kfgs text` made.
 
-    if classes is None and scene is not None:
-        classes = scene / "classes.json"
-    if text is None and scene is not None:
-        text = scene / "text.npy"
-    if classes is None or text is None:
+    The scene's `classes.json`, where there is one, chooses and orders the classes of the scene's own table, since label
+    pictures hold indices into it. A table given by name is taken whole unless classes are given too.
+    """
+    from ..labels import load_label_set
+
+    found = find_classes(scene, classes, text)
+    if found is None:
         raise ValueError(
-            "classes, text: expected class names (.json) and embeddings (.npy), got none; pass --classes and --text, or --scene"
+            "classes, text: expected class names (.json) and embeddings (.npy), or a table of words (.safetensors), got none; "
+            "pass --classes and --text, or --scene, or --text alone with what `kfgs text` made"
         )
-    return load_label_set(classes, text)
+    label_set = load_label_set(*found)
+    listed = None if scene is None else scene / "classes.json"
+    if text is not None and len(found) == 1 and listed is not None and listed.is_file():
+        from .._files import read_json
+
+        if tuple(read_json(listed)) != label_set.names:
+            say(
+                f"note: labels count the classes of {text}, not those of {listed}; --classes {listed} chooses the latter"
+            )
+    return label_set
+
+
+def find_classes(scene: Path | None, classes: Path | None, text: Path | None) -> tuple[Path, ...] | None:
+    """The files that `load_label_set` takes: a table alone, or names and rows; None where nothing says where they are."""
+    if classes is not None and classes.suffix == ".safetensors":
+        if text is not None:
+            raise ValueError(f"text: expected none beside the table {classes}, got {text}; leave it out")
+        return (classes,)
+    if text is not None and classes is None and text.suffix == ".safetensors":
+        return (text,)
+    if scene is not None:
+        if text is None:
+            rows, table = scene / "text.npy", scene / "text.safetensors"
+            text = table if table.is_file() and not rows.is_file() else rows
+        listed = scene / "classes.json"
+        if classes is None and text.suffix == ".safetensors" and not listed.is_file():
+            return (text,)
+        classes = listed if classes is None else classes
+    return None if classes is None or text is None else (classes, text)
+
+
+@contextmanager
+def warnings_as_notes() -> Iterator[None]:
+    """Say the warnings of kfgs's own functions about words and teachers as notes, in a line each."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("always", message="classes: ")
+
+        def note(message: Warning | str, *_: Any, **__: Any) -> None:
+            say(f"note: {message}")
+
+        warnings.showwarning = note
+        yield
 
 
 def training_cameras(field: Any, scene: Path | None, images: Path | None) -> list[Any]:

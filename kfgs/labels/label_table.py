@@ -73,12 +73,12 @@ def read_label_table(path: str | Path) -> LabelTable:
                 )
             parts = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 (no mapping)
         names, negative_names, info = (json.loads(found[key]) for key in ("names", "negative_names", "info"))
-        embeddings = parts["embeddings"]
-    except (SafetensorError, KeyError, json.JSONDecodeError) as error:
+        table = LabelTable(tuple(names), parts["embeddings"], parts.get("negatives"), tuple(negative_names), {**info})
+    except (SafetensorError, KeyError, TypeError, json.JSONDecodeError) as error:
         raise ValueError(
             f"{path}: expected a kfgs {KIND}, but it cannot be read ({error}); make it again with `kfgs text`"
         ) from error
     for name, rows in parts.items():
         if rows.ndim != 2 or not torch.isfinite(rows).all():
             raise ValueError(f"{path}: expected finite rows of {name}, got others; make it again with `kfgs text`")
-    return LabelTable(tuple(names), embeddings, parts.get("negatives"), tuple(negative_names), dict(info))
+    return table

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -12,10 +13,10 @@ from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
 
-from .._check import check_range
+from .._check import check_choice, check_range
 from .._files import atomic_path, write_json
 from ..cameras import Camera, resize_labels, undistort_labels
-from ..evaluation import LabelSet, SegmentationReport, evaluate_segmentation, load_label_map
+from ..evaluation import SegmentationReport, evaluate_segmentation, load_label_map
 from ..evaluation.segmentation import VOID
 from ..fields import SemanticField
 from ..formats.ply import Columns, other_elements, points_from_columns, read_ply, write_ply
@@ -23,11 +24,12 @@ from ..formats.ply_3dgs import columns_from_gaussians
 from ..formats.sidecar import write_names
 from ..formats.splat_file import SCORE, SplatFile
 from ..gaussians import Gaussians
-from ..labels import Selection, Transfer, classify, select_by_label, transfer_labels
+from ..labels import LabelSet, Score, Selection, Transfer, classify, select_by_label, teacher_mismatch, transfer_labels
 from ..scenes import Scene
 from ..viz import FeatureColors, overlay_labels, palette, save_picture
 
 Decode = Literal["exact", "latent"]
+Negatives = Literal["classes", "canonical", "none"]
 
 
 def save_label_map(path: Path, labels: Tensor) -> None:  # [H, W] int64
@@ -82,6 +84,7 @@ def segment_scene(
             f"classes: expected at most {VOID} (label pictures hold a byte per pixel, {VOID} = none), got {len(classes)}; "
             "segment with fewer classes, or call SemanticField.segment, which has no such limit"
         )
+    warn_of_other_teacher(field, classes)
     views = scene.views(split)
     shown = {views[i] for i in np.linspace(0, len(views) - 1, min(pictures, len(views))).round().astype(int)}
     colors = feature_colors(field)
@@ -153,6 +156,7 @@ def label_field(
         cameras: views that vote on each Gaussian (`classify_by_views`; the score is the winner's share). Without them
             each Gaussian's own latent decides, as in Sec. 3.4 (the score is its cosine with the class).
     """
+    warn_of_other_teacher(field, classes)
     if cameras is None:
         labels, scores = field.classify(classes.embeddings)
     else:
@@ -167,21 +171,67 @@ def query_field(
     threshold: float | None = None,
     *,
     cameras: Sequence[Camera] | None = None,
-    negatives: bool = False,
+    negatives: Negatives = "none",
+    score: Score | None = None,
+    logit_scale: float | str = "lseg",
 ) -> Selection:
     """The field's Gaussians of one class: those more similar to it than gamma (Sec. 3.4).
+
+    Warns where the words were embedded by another teacher than the field's, as far as both are known.
 
     Args:
         field: a finished field.
         classes: names and embeddings.
         name: the class asked for.
-        threshold: gamma, which scores must exceed. When not given, 0.5 with negatives, else from the scores' distribution.
+        threshold: gamma, which scores must exceed. When not given, 0.5 for a relevancy, else from the scores' distribution.
         cameras: views whose pixels score each Gaussian; without them its own latent does, as in the paper.
-        negatives: tell the class from all others by relevancy, instead of taking its cosine alone.
+        negatives: what to tell the class from: all others of `classes`, its `negatives` (LERF's canonical words, less the
+            class's own name), or nothing.
+        score: "cosine", "softmax" or "relevancy" (`labels.text_scores`); when not given the relevancy with negatives, the
+            cosine without.
+        logit_scale: of the softmax, as in `labels.text_scores`.
+
+    Raises:
+        ValueError: if there is no such class, no negatives of that kind, or shapes disagree.
     """
+    check_choice("negatives", negatives, ("classes", "canonical", "none"))
+    warn_of_other_teacher(field, classes)
     target = classes.index(name)
-    others = classes.embeddings[torch.arange(len(classes)) != target] if negatives else None
-    return field.query(classes.embeddings[target], threshold, negatives=others, cameras=cameras)
+    against = None if negatives == "none" else _negatives(classes, target, negatives)
+    return field.query(
+        classes.embeddings[target],
+        threshold,
+        negatives=against,
+        cameras=cameras,
+        score=score,
+        logit_scale=logit_scale,
+    )
+
+
+def _negatives(classes: LabelSet, target: int, kind: Negatives) -> Tensor:  # [M, D]
+    """The rows that a class is told from."""
+    if kind == "classes":
+        rows = classes.embeddings[torch.arange(len(classes)) != target]
+        if len(rows) == 0:
+            raise ValueError(
+                f"negatives: expected other classes than {classes.names[target]!r}, got none; use 'canonical' or 'none'"
+            )
+        return rows
+    own = classes.names[target].casefold()
+    others = [i for i, word in enumerate(classes.negative_names) if word.casefold() != own]
+    if classes.negatives is None or not others:
+        raise ValueError(
+            "negatives: expected canonical words in the classes' table, got none; make the table with `kfgs text`, or use "
+            "'classes' or 'none'"
+        )
+    return classes.negatives[others]
+
+
+def warn_of_other_teacher(field: SemanticField, classes: LabelSet) -> None:
+    """Warn where the words were embedded by another teacher than the field's (`labels.teacher_mismatch`)."""
+    words = teacher_mismatch(field.info, classes.info)
+    if words is not None:
+        warnings.warn(words, stacklevel=3)
 
 
 def select_labelled(splats: SplatFile, name: str, threshold: float | None = None) -> Selection:

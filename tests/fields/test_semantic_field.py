@@ -1,4 +1,5 @@
 import json
+import math
 import pickle
 from functools import cache
 
@@ -115,6 +116,40 @@ def test_query_by_views_and_with_negatives(mode):
         made.query(embeddings()[0], cameras=[])
     with pytest.raises(ValueError, match=r"negatives: expected \[M, 16\], got \(2, 5\)"):
         made.query(embeddings()[0], negatives=torch.ones(2, 5))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_query_by_any_score(mode):
+    """Each ball lies at a codeword, so its cosines with the three classes are 1, 0 or sqrt(1/2), and scores follow."""
+    made, root = field(mode), 0.5**0.5
+    against = {"negatives": embeddings()[:2], "cameras": None}
+    cosine = made.query(embeddings()[2], 0.5, score="cosine", **against)
+    torch.testing.assert_close(cosine.scores, torch.tensor([0, 0, root, root]))
+    raw = made.query(embeddings()[2], 0.3, score="softmax", logit_scale="raw", **against)
+    low, high = 1 / (2 + math.e), math.exp(root) / (math.exp(root) + 2)
+    torch.testing.assert_close(raw.scores, torch.tensor([low, low, high, high]))
+    assert raw.mask.tolist() == [False, False, True, True]
+    relevant = made.query(embeddings()[2], score="relevancy", **against)
+    torch.testing.assert_close(relevant.scores[2:], torch.sigmoid(torch.tensor([10 * root] * 2)))
+    by_views = made.query(embeddings()[2], 0.3, score="softmax", negatives=embeddings()[:2], cameras=[camera()])
+    assert by_views.mask.tolist() == [False, False, True, True]
+    with pytest.raises(ValueError, match="negatives: expected some for score 'relevancy', got none"):
+        made.query(embeddings()[2], score="relevancy")
+
+
+def test_text_of_another_size_is_guessed_to_be_another_teachers():
+    for ask in (
+        lambda: field().query(torch.ones(7)),
+        lambda: field().classify(torch.ones(2, 7)),
+        lambda: field().segment(camera(), torch.ones(2, 7)),
+        lambda: field().query(torch.ones(16), negatives=torch.ones(2, 7)),
+    ):
+        with pytest.raises(
+            ValueError, match=r"16\], got \((2, )?7,?\): text of another teacher\? Embed the words with"
+        ):
+            ask()
+    with pytest.raises(ValueError, match=r"embedding: expected \[16\], got \(1, 16\); pass a tensor"):
+        field().query(torch.ones(1, 16))
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -3,8 +3,10 @@ import json
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 
-from kfgs.evaluation import LabelSet, load_label_set
+from kfgs.labels import LabelSet, classify, load_label_set, teacher_mismatch
+from kfgs.quant import Codebook
 
 
 def _write(folder, names, rows):
@@ -44,3 +46,142 @@ def test_bad_input_is_named(tmp_path):
         LabelSet(("a", "a"), torch.zeros(2, 3))
     with pytest.raises(ValueError, match="expected one of wall, got 'chair'"):
         LabelSet(("wall",), torch.zeros(1, 3)).index("chair")
+
+
+def _words():
+    info = {"teacher": {"name": "letters", "weights": "abc"}, "templates": ["{}"], "synonyms": {"chair": ["seat"]}}
+    rows = torch.tensor([[1.0, 2, 3], [0, 1, 0], [4, 0, 1]])
+    return LabelSet(("wall", "chair", "größe"), rows, torch.eye(3)[:2], ("object", "stuff"), info)
+
+
+def test_a_table_is_one_file_with_everything_in_it(tmp_path):
+    _words().save(tmp_path / "text.safetensors")
+    found = load_label_set(tmp_path / "text.safetensors")
+    assert found.names == ("wall", "chair", "größe")
+    assert found.embeddings.equal(_words().embeddings)
+    assert found.negatives.equal(torch.eye(3)[:2])
+    assert (found.negative_names, found.info) == (("object", "stuff"), _words().info)
+    LabelSet(("a",), torch.ones(1, 2, dtype=torch.float16)).save(tmp_path / "few.safetensors")
+    few = load_label_set(tmp_path / "few.safetensors")
+    assert (few.negatives, few.negative_names, few.info) == (None, (), {})
+    assert few.embeddings.dtype == torch.float32
+
+
+def test_class_names_choose_and_order_the_rows_of_a_table(tmp_path):
+    _words().save(tmp_path / "text.safetensors")
+    (tmp_path / "classes.json").write_text('["chair", "wall"]')
+    found = load_label_set(tmp_path / "classes.json", tmp_path / "text.safetensors")
+    assert found.names == ("chair", "wall")
+    assert found.embeddings.equal(_words().embeddings[[1, 0]])
+    assert found.info == _words().info
+
+
+def test_select_and_with_class():
+    more = _words().with_class("lamp", torch.tensor([0.0, 0, 7]))
+    assert more.names == ("wall", "chair", "größe", "lamp")
+    assert more.embeddings[:3].equal(_words().embeddings)  # labels stay
+    assert more.select(["lamp", "wall"]).embeddings.tolist() == [[0, 0, 7], [1, 2, 3]]
+    assert more.negative_names == ("object", "stuff")
+    assert (more.knows("Lamp"), more.knows("lam")) == (True, False)
+    assert "LabelSet(4 classes: wall, chair" in repr(more)
+    with pytest.raises(ValueError, match="got 'char'; did you mean 'chair'"):
+        more.select(["char"])
+    with pytest.raises(ValueError, match="names: expected different names"):
+        more.select(["wall", "wall"])
+    with pytest.raises(ValueError, match="names: expected different names.*rename or leave out repeats"):
+        more.with_class("wall", torch.ones(3))
+    with pytest.raises(TypeError, match="names: expected a list of class names, got the text 'wall'"):
+        more.select("wall")
+    with pytest.raises(ValueError, match=r"embedding: expected \(3,\) .*got \(4,\); text of another teacher\?"):
+        more.with_class("door", torch.ones(4))
+
+
+def test_a_table_that_is_none_is_named(tmp_path):
+    path = tmp_path / "t.safetensors"
+    with pytest.raises(
+        FileNotFoundError, match="no such file; expected a table of words there, which `kfgs text` makes"
+    ):
+        load_label_set(path)
+    path.write_bytes(b"\x08\0\0\0\0\0\0\0nonsense")
+    with pytest.raises(ValueError, match="expected a kfgs label set, but it cannot be read"):
+        load_label_set(path)
+    Codebook(torch.eye(3)).save(path)
+    with pytest.raises(ValueError, match="expected a kfgs label set, version 1, got codebook"):
+        load_label_set(path)
+    head = {"kfgs": "label set", "version": "1", "names": '["a"]', "negative_names": "[]", "info": "{}"}
+    for changed, words in [
+        ({"names": "null"}, "cannot be read"),
+        ({"names": "[1]"}, "names: expected words"),
+        ({"names": '["a'}, "cannot be read"),
+        ({"info": "3"}, "cannot be read"),
+        ({"names": '["a", "b"]'}, r"embeddings: expected \[C, D\] with C = 2"),
+        ({"negative_names": '["stuff"]'}, r"negatives: expected \(1, 3\) .*got None; embed them"),
+    ]:
+        save_file({"embeddings": torch.ones(1, 3)}, path, metadata=head | changed)
+        with pytest.raises(ValueError, match=words):
+            load_label_set(path)
+    save_file({"embeddings": torch.full((1, 3), torch.nan)}, path, metadata=head)
+    with pytest.raises(ValueError, match="expected finite rows of embeddings, got others; make it again"):
+        load_label_set(path)
+    save_file({"others": torch.ones(1, 3)}, path, metadata=head)
+    with pytest.raises(ValueError, match="cannot be read .*embeddings"):
+        load_label_set(path)
+
+
+def test_what_cannot_be_a_table_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="path: expected a file name that ends in .safetensors, got .*text.npy"):
+        _words().save(tmp_path / "text.npy")
+    with pytest.raises(ValueError, match="info: expected what JSON can hold"):
+        LabelSet(("a",), torch.ones(1, 2), info={"seconds": float("nan")}).save(tmp_path / "t.safetensors")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(ValueError, match="embeddings: expected none beside the table"):
+        load_label_set(tmp_path / "t.safetensors", tmp_path / "t.npy")
+    (tmp_path / "classes.json").write_text('["a"]')
+    with pytest.raises(ValueError, match="embeddings: expected an .npy file of one row per name in .*got none"):
+        load_label_set(tmp_path / "classes.json")
+    with pytest.raises(ValueError, match=r"negatives: expected \(1, 2\) \(from negative_names and embeddings\), got"):
+        LabelSet(("a",), torch.ones(1, 2), torch.ones(1, 3), ("stuff",))
+
+
+def test_another_teacher_is_noticed_by_name_or_weights_alone():
+    words = _words().info
+    assert teacher_mismatch({}, words) is None
+    assert teacher_mismatch({"teacher": {"name": "letters"}}, words) is None
+    assert (
+        teacher_mismatch({"teacher": {"name": "letters", "weights": "abc", "options": {"flip": True}}}, words) is None
+    )
+    assert teacher_mismatch({"teacher": {"name": "lseg"}}, {}) is None
+    found = teacher_mismatch({"teacher": {"name": "lseg", "weights": "abc"}}, words)
+    assert "expected text of the field's teacher (name 'lseg'), got text of another ('letters')" in found
+    other = teacher_mismatch({"teacher": {"name": "letters", "weights": "xyz"}}, words)
+    assert "(weights 'xyz'), got text of another ('abc')" in other
+
+
+def test_the_text_spaces_of_two_clips_do_not_mix(shared_data):
+    """Both have 512 channels, so nothing but the teacher's name can tell; the same word is not even its own neighbour."""
+    names = json.loads((shared_data / "text" / "names.json").read_text())
+    coco, lvis = (
+        torch.nn.functional.normalize(torch.from_numpy(np.load(shared_data / "text" / file).astype(np.float32)), dim=1)
+        for file in ("coco_stuff_171_vitb16.npy", "lvis_1203_vitb32.npy")
+    )
+    both = [name for name in names["coco_stuff_171"] if name in names["lvis_1203"]]
+    assert len(both) == 61
+    ours = coco[[names["coco_stuff_171"].index(name) for name in both]]
+    nearest = (ours @ lvis.T).argmax(dim=1).tolist()
+    assert not any(names["lvis_1203"][i] == name for i, name in zip(nearest, both, strict=True))
+    assert (ours @ lvis.T).mean().abs() < 0.05
+    within = lvis @ lvis.T
+    assert within[~torch.eye(len(lvis), dtype=torch.bool)].mean() > 0.7
+
+
+def test_a_thousand_real_words_come_back_from_a_table(shared_data, tmp_path):
+    names = json.loads((shared_data / "text" / "names.json").read_text())["lvis_1203"]
+    rows = torch.from_numpy(np.load(shared_data / "text" / "lvis_1203_vitb32.npy"))
+    LabelSet(tuple(names), rows, info={"teacher": {"name": "clip-vit-b32"}}).save(tmp_path / "lvis.safetensors")
+    found = load_label_set(tmp_path / "lvis.safetensors")
+    assert found.names == tuple(names)
+    assert found.embeddings.equal(rows.float())
+    chairs = found.select([name for name in names if "chair" in name])
+    assert classify(rows[[names.index("rocking_chair")]].float(), chairs.embeddings).labels.item() == chairs.index(
+        "rocking_chair"
+    )

@@ -1,0 +1,147 @@
+"""Words and teachers: the command text, and any phrase as a query."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from .checks import check_alone
+from .say import find_classes, load_classes, say, wrote
+
+# Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
+
+
+def text(
+    names: Annotated[str, tyro.conf.Positional],
+    teacher: str,
+    out: Path,
+    weights: str | None = None,
+    templates: str = "bare",
+    negatives: bool = True,
+) -> None:
+    """Embed words with a teacher's text encoder, once, into a table that all other commands take as --text.
+
+    Args:
+        names: classes.json (a list), a .txt file (a class a line), or words between commas. A class may have synonyms:
+            "chair;armchair;seat" is called chair.
+        teacher: lseg, clip, siglip, ... (a wrong name lists them), or package.module:name of your own.
+        out: the table to write, .safetensors; as SCENE/text.safetensors it is found by itself.
+        weights: checkpoint file (lseg), or folder or hub id (the others).
+        templates: bare (as LSeg and the paper), clip7, tcl9, siglip, or one of your own with {} for the word.
+        negatives: embed LERF's canonical words (object, things, stuff, texture) as well, for `kfgs select --negatives
+            canonical`.
+    """
+    from ..labels import CANONICAL
+    from ..labels.label_table import SUFFIX
+    from ..teachers.prompts import template_set
+
+    if out.suffix != SUFFIX or out.is_dir():
+        raise ValueError(f"out: expected a file whose name ends in {SUFFIX}, got {out}; give another name")
+    words, patterns = read_words(names), template_set(templates)
+    made = embed(teacher, weights, words, templates=patterns, negatives=CANONICAL if negatives else None)
+    made.save(out)
+    say(f"{len(made)} classes, {made.dim} channels each, by {made.info['teacher']['name']}")
+    for name, more in made.info["synonyms"].items():
+        say(f"  {name}: also {', '.join(more)}")
+    wrote([out])
+
+
+def read_words(names: str) -> list[str]:
+    """Class names out of a .json list, a .txt file with a class a line, or words between commas.
+
+    Raises:
+        FileNotFoundError: if the file is not there.
+        ValueError: if it is of another kind, or holds no words.
+    """
+    from .._files import read_json
+
+    path = Path(names)
+    found: Any
+    if path.suffix.lower() == ".json":
+        found = read_json(path)
+    elif path.suffix.lower() == ".txt":
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such file; expected a text file there with a class a line")
+        try:
+            found = path.read_text(encoding="utf-8-sig").splitlines()
+        except UnicodeDecodeError as error:
+            raise ValueError(
+                f"{path}: expected a text file in UTF-8, but it cannot be read ({error}); save it so"
+            ) from error
+    elif path.exists():
+        raise ValueError(
+            f"names: expected a .json or .txt file, or words between commas, got {names}; write one of these"
+        )
+    else:
+        found = names.split(",")
+    if not isinstance(found, list) or not all(isinstance(word, str) for word in found):
+        raise ValueError(
+            f'names: expected a list of words like ["wall", "floor"] in {names}, got {found!r:.80}; write one'
+        )
+    words = [word.strip() for word in found if word.strip()]
+    if not words:
+        raise ValueError(f"names: expected at least one word, got none in {names!r}; write wall,floor or name a file")
+    return words
+
+
+def embed(teacher: str, weights: str | None, names: Sequence[str], **options: Any) -> Any:
+    """The label set that a teacher makes of words (`teachers.prompts.make_label_set`).
+
+    Raises:
+        ValueError: if the teacher has no text encoder, beside what loading it can raise.
+    """
+    from ..teachers.load import load_teacher
+    from ..teachers.prompts import make_label_set
+
+    try:
+        return make_label_set(load_teacher(teacher, weights), names, **options)
+    except NotImplementedError as error:
+        raise ValueError(str(error)) from error
+
+
+def ask(
+    query: str, sources: tuple[Path | None, Path | None, Path | None], teacher: str | None, weights: str | None
+) -> tuple[Any, str, bool]:
+    """The label set to look a query up in, its name in there, and whether it is one of the table's own classes.
+
+    Without a teacher the query is a class of the table. With one it may be any phrase: where there is a table too, it
+    joins that table's classes; canonical negatives come from the teacher.
+
+    Args:
+        query: class name or phrase.
+        sources: scene, classes and text, as `load_classes` takes them.
+        teacher: name of a teacher with text.
+        weights: its weights.
+    """
+    from ..labels import teacher_mismatch
+
+    if teacher is None:
+        check_alone("weights", weights, "without --teacher, whose weights they are")
+        label_set = load_classes(*sources)
+        try:
+            return label_set, label_set.names[label_set.index(query)], True
+        except ValueError as error:
+            raise ValueError(
+                f"{error}; for any other phrase pass --teacher and --weights, or add it to the table with `kfgs text`"
+            ) from error
+    found = find_classes(*sources)
+    there = found is not None and (any(sources[1:]) or all(path.is_file() for path in found))
+    label_set = load_classes(*sources) if there else None
+    asked = embed(teacher, weights, [query])
+    if label_set is None:
+        return asked, asked.names[0], False
+    note = teacher_mismatch(asked.info, label_set.info)
+    if note is not None:
+        say(f"note: {note}")
+    name = asked.names[0]
+    known = label_set.knows(name)
+    if not known:
+        label_set = label_set.with_class(name, asked.embeddings[0])  # refuses other channels
+    label_set = dataclasses.replace(
+        label_set, negatives=asked.negatives, negative_names=asked.negative_names, info=asked.info
+    )
+    return label_set, label_set.names[label_set.index(name)], known

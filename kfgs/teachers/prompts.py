@@ -1,0 +1,167 @@
+"""From class names to embeddings: synonyms and templates around a teacher's text encoder."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from .._check import check_shapes
+from ..labels.label_set import LabelSet
+from ..labels.relevancy import CANONICAL
+from ..quant.codebook import EPS, row_norms, unit_rows
+from .protocol import Teacher, identify
+
+CHUNK = 64  # prompts encoded at once: 60 MB of activations in CLIP ViT-L's text tower
+_CLIP7 = (
+    "itap of a {}.",
+    "a bad photo of the {}.",
+    "a origami {}.",
+    "a photo of the large {}.",
+    "a {} in a video game.",
+    "art of the {}.",
+    "a photo of the small {}.",
+)
+TEMPLATES: dict[str, tuple[str, ...]] = {
+    "bare": ("{}",),  # LSeg, Feature 3DGS, the paper, LERF
+    "clip7": _CLIP7,  # the seven that CLIP's authors found enough on ImageNet
+    "tcl9": (*_CLIP7, "a photo of many {}.", "a photo of {}s."),  # TCL, and TIPSv2 on ADE20K
+    "siglip": ("This is a photo of {}.",),
+}
+
+
+def embed_labels(
+    teacher: Teacher,
+    names: Sequence[str],
+    *,
+    templates: str | Sequence[str] = "bare",
+    synonyms: Mapping[str, Sequence[str]] | None = None,
+) -> Tensor:  # [C, D] float32, unit rows, on the teacher's device
+    """One embedding per class: each of its words in each template, as unit rows; their mean; the mean's direction.
+
+    A name may carry synonyms as ADE20K's do, "chair;armchair;seat": the first is the class's name. Underscores become
+    spaces in prompts. A word that comes twice counts once.
+
+    Args:
+        teacher: with a text encoder.
+        names: C class names.
+        templates: a name of `TEMPLATES`, one template, or several; `{}` stands for the word. LSeg takes bare words.
+        synonyms: further words of a class, by its name.
+
+    Raises:
+        ValueError: if there is no name, one is empty or comes twice, synonyms are of no class, a template has no `{}`, or
+            the encoder's rows are not finite.
+        NotImplementedError: if the teacher has no text encoder.
+    """
+    words = _words(names, synonyms)
+    patterns = template_set(templates)
+    prompts = [[pattern.replace("{}", word) for word in one for pattern in patterns] for one in words.values()]
+    distinct = list(dict.fromkeys(prompt for group in prompts for prompt in group))
+    rows = _encode(teacher, distinct)
+    place = {prompt: i for i, prompt in enumerate(distinct)}
+    means = torch.stack([rows[[place[prompt] for prompt in group]].mean(dim=0) for group in prompts])
+    lost = row_norms(means) <= EPS
+    if bool(lost.any()):
+        raise ValueError(
+            f"names: expected prompts with a common direction, got none for {list(words)[int(lost.nonzero()[0])]!r}; "
+            "use fewer templates or synonyms"
+        )
+    return unit_rows(means)
+
+
+def make_label_set(
+    teacher: Teacher,
+    names: Sequence[str],
+    *,
+    templates: str | Sequence[str] = "bare",
+    synonyms: Mapping[str, Sequence[str]] | None = None,
+    negatives: Sequence[str] | None = CANONICAL,
+) -> LabelSet:
+    """Class names with their embeddings (`embed_labels`), on the CPU, and what made them in `info`.
+
+    Args:
+        teacher: with a text encoder.
+        names: as in `embed_labels`; each class is called by its first word.
+        templates: as in `embed_labels`; negatives take the same ones.
+        synonyms: as in `embed_labels`.
+        negatives: what a query is told from where no other class is known; LERF's canonical words, or None.
+
+    Raises:
+        ValueError: as `embed_labels`.
+        NotImplementedError: if the teacher has no text encoder.
+    """
+    words = _words(names, synonyms)
+    rows = embed_labels(teacher, names, templates=templates, synonyms=synonyms)
+    against = tuple(negatives or ())
+    info = {
+        "teacher": identify(teacher),
+        "templates": list(template_set(templates)),
+        "synonyms": {name: more for name, (_, *more) in words.items() if more},
+    }
+    other = embed_labels(teacher, against, templates=templates).cpu() if against else None
+    return LabelSet(tuple(words), rows.cpu(), other, against, info)
+
+
+def template_set(templates: str | Sequence[str]) -> tuple[str, ...]:
+    """Templates by the name of their set, or one, or several as they are.
+
+    Raises:
+        ValueError: if there is none, or one has no `{}`; the message offers the names of sets.
+    """
+    found = TEMPLATES.get(templates, (templates,)) if isinstance(templates, str) else tuple(templates)
+    if not found or any("{}" not in one for one in found):
+        wrong = next((one for one in found if "{}" not in one), "none")
+        near = difflib.get_close_matches(wrong, TEMPLATES, n=1)
+        raise ValueError(
+            f"templates: expected one of {', '.join(TEMPLATES)}, or text with {{}} for the word, got {wrong!r}; "
+            + (f"did you mean {near[0]!r}?" if near else 'write it as in "a photo of a {}."')
+        )
+    return found
+
+
+def _words(names: Sequence[str], synonyms: Mapping[str, Sequence[str]] | None) -> dict[str, list[str]]:
+    """The words of each class by its name, which is the first; all as they are written in prompts but for the keys."""
+    if isinstance(names, str):
+        raise TypeError(f"names: expected a list of class names, got the text {names!r}; put it into a list")
+    split = [[part.strip() for part in name.split(";")] for name in names]
+    if not split or any(not part.replace("_", "").strip() for one in split for part in one):
+        raise ValueError(f"names: expected at least one name and no empty word, got {list(names)!r:.200}; leave it out")
+    keys = [one[0] for one in split]
+    twice = sorted({key for key in keys if keys.count(key) > 1})
+    if twice:
+        raise ValueError(f"names: expected different names, got {twice[0]!r} more than once; leave out repeats")
+    more = dict(synonyms or {})
+    unknown = [name for name in more if name not in keys]
+    if unknown:
+        raise ValueError(
+            f"synonyms: expected words of the classes {', '.join(keys[:10])}, got some of {unknown[0]!r}; name a class by "
+            "its first word"
+        )
+    for name, one in more.items():
+        if isinstance(one, str) or not all(isinstance(word, str) and word.strip(" _") for word in one):
+            raise ValueError(f"synonyms: expected a list of words for {name!r}, got {one!r:.80}; write them as [...]")
+    words = {one[0]: [*one, *more.get(one[0], ())] for one in split}
+    return {
+        key: list(dict.fromkeys(" ".join(word.replace("_", " ").split()) for word in one)) for key, one in words.items()
+    }
+
+
+def _encode(teacher: Teacher, prompts: list[str]) -> Tensor:  # [n, D] float32, unit rows
+    """The prompts' rows, a chunk at a time."""
+    parts = []
+    with torch.no_grad():
+        for start in range(0, len(prompts), CHUNK):
+            chunk = prompts[start : start + CHUNK]
+            rows = teacher.encode_text(chunk)
+            check_shapes((f"text of {teacher.name}", rows, (len(chunk), "D")))
+            norms = row_norms(rows.float())
+            bad = ~(torch.isfinite(norms) & (norms > EPS))
+            if bool(bad.any()):
+                raise ValueError(
+                    f"text of {teacher.name}: expected finite rows with a direction, got another for "
+                    f"{chunk[int(bad.nonzero()[0])]!r}; leave the word out, or check the weights"
+                )
+            parts.append(unit_rows(rows.float()))
+    return torch.cat(parts)

@@ -1,0 +1,126 @@
+import numpy as np
+import pytest
+import torch
+from cases_words import DIM, MUTE, TEACHER, letters
+from oracles_words import ensemble
+
+from kfgs.labels import CANONICAL, LabelSet, load_label_set
+from kfgs.teachers import CallableTeacher
+from kfgs.teachers.prompts import CHUNK, TEMPLATES, embed_labels, make_label_set
+
+
+def one(prompt):
+    return letters([prompt])[0].double().numpy()
+
+
+@pytest.mark.parametrize("templates", ["bare", "clip7", "tcl9", "siglip", "a {} of mine", ("{}!", "the {}")])
+def test_rows_are_the_mean_direction_of_words_in_templates(templates):
+    names = ["chair;armchair;seat", "potted_plant", "Wall"]
+    found = embed_labels(TEACHER, names, templates=templates, synonyms={"Wall": ["brick wall"]})
+    written = TEMPLATES.get(templates, (templates,)) if isinstance(templates, str) else templates
+    words = [["chair", "armchair", "seat"], ["potted plant"], ["Wall", "brick wall"]]
+    expected = np.stack([ensemble(one, group, written) for group in words])
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6)
+    assert found.dtype == torch.float32
+
+
+def test_templates_are_those_of_the_literature():
+    assert TEMPLATES["bare"] == ("{}",)
+    assert [len(TEMPLATES[name]) for name in ("clip7", "tcl9", "siglip")] == [7, 9, 1]
+    assert TEMPLATES["tcl9"][:7] == TEMPLATES["clip7"]
+    assert all(template.count("{}") == 1 for group in TEMPLATES.values() for template in group)
+
+
+def test_bare_words_are_the_teachers_own_rows():
+    found = embed_labels(TEACHER, ["wall", "chair"])
+    torch.testing.assert_close(found, TEACHER.encode_text(["wall", "chair"]))
+
+
+def test_a_synonym_that_is_the_word_itself_counts_once():
+    same = embed_labels(TEACHER, ["potted_plant;potted plant;pot"])
+    torch.testing.assert_close(same, embed_labels(TEACHER, ["potted plant;pot"]))
+    assert (same - embed_labels(TEACHER, ["pot;potted plant"])).abs().max() < 1e-6  # their order does not count
+    assert (same - embed_labels(TEACHER, ["potted plant"])).abs().max() > 0.01
+
+
+def test_prompts_go_to_the_teacher_in_chunks_each_once():
+    seen = []
+
+    def text(prompts):
+        seen.append(list(prompts))
+        return letters(prompts)
+
+    names = [f"thing {i}" for i in range(CHUNK + 10)]
+    synonyms = {name: ["shared word"] for name in names}
+    found = embed_labels(CallableTeacher(lambda image: image, text), names, synonyms=synonyms)
+    asked = [prompt for part in seen for prompt in part]
+    assert max(map(len, seen)) == CHUNK
+    assert len(asked) == len(set(asked)) == len(names) + 1
+    np.testing.assert_allclose(found[70], ensemble(one, ["thing 70", "shared word"], ["{}"]), rtol=0, atol=2e-6)
+
+
+def test_braces_in_a_word_are_letters():
+    found = embed_labels(TEACHER, ["{0}", "a}b"], templates="the {} here")
+    torch.testing.assert_close(found, TEACHER.encode_text(["the {0} here", "the a}b here"]))
+
+
+def test_a_label_set_knows_what_made_it(tmp_path):
+    made = make_label_set(TEACHER, ["chair;seat", "wall"], templates="siglip", synonyms={"wall": ["side"]})
+    assert isinstance(made, LabelSet)
+    assert made.names == ("chair", "wall")
+    assert made.negative_names == CANONICAL == ("object", "things", "stuff", "texture")
+    torch.testing.assert_close(made.negatives, embed_labels(TEACHER, CANONICAL, templates="siglip"))
+    assert made.info == {
+        "teacher": {"name": "letters", "weights": "abc"},
+        "templates": ["This is a photo of {}."],
+        "synonyms": {"chair": ["seat"], "wall": ["side"]},
+    }
+    made.save(tmp_path / "t.safetensors")
+    assert load_label_set(tmp_path / "t.safetensors").info == made.info
+    assert make_label_set(TEACHER, ["wall"], negatives=None).negatives is None
+    assert make_label_set(TEACHER, ["wall"], negatives=["air"]).negatives.shape == (1, DIM)
+
+
+def test_rows_of_a_teacher_in_inference_mode_can_be_trained_with():
+    @torch.inference_mode()
+    def text(prompts):
+        return letters(prompts)
+
+    found = embed_labels(CallableTeacher(lambda image: image, text), ["wall", "chair"])
+    weight = torch.ones(2, DIM, requires_grad=True)
+    (found * weight).sum().backward()
+    assert weight.grad.equal(found)
+
+
+@pytest.mark.parametrize(
+    ("names", "options", "message"),
+    [
+        ([], {}, "names: expected at least one name and no empty word"),
+        (["wall", " "], {}, "names: expected at least one name and no empty word"),
+        (["wall;_"], {}, "names: expected at least one name and no empty word"),
+        (["wall", "wall;side"], {}, "names: expected different names, got 'wall' more than once; leave out repeats"),
+        (["wall"], {"synonyms": {"wal": ["side"]}}, "synonyms: expected words of the classes wall, got some of 'wal'"),
+        (["wall"], {"synonyms": {"wall": "side"}}, "synonyms: expected a list of words for 'wall', got 'side'"),
+        (["wall"], {"templates": "clip8"}, "got 'clip8'; did you mean 'clip7'?"),
+        (["wall"], {"templates": ("{}", "a photo")}, r"text with {} for the word, got 'a photo'; write it as in"),
+        (["wall"], {"templates": ()}, "templates: expected one of bare, clip7, tcl9, siglip"),
+    ],
+)
+def test_wrong_words_and_templates_are_named(names, options, message):
+    with pytest.raises(ValueError, match=message):
+        embed_labels(TEACHER, names, **options)
+
+
+def test_wrong_rows_are_named():
+    def teacher(rows):
+        return CallableTeacher(lambda image: image, rows, name="odd")
+
+    with pytest.raises(ValueError, match="text of odd: expected finite rows with a direction, got another for 'b'"):
+        embed_labels(teacher(lambda prompts: torch.eye(3)[: len(prompts)] * torch.tensor([[1.0], [0.0]])), ["a", "b"])
+    opposite = {"up": [1.0, 0.0], "down": [-1.0, 0.0]}
+    with pytest.raises(ValueError, match="names: expected prompts with a common direction, got none for 'up'"):
+        embed_labels(teacher(lambda prompts: torch.tensor([opposite[word] for word in prompts])), ["up;down"])
+    with pytest.raises(NotImplementedError, match="teacher 'mute': expected one with a text encoder"):
+        embed_labels(MUTE, ["wall"])
+    with pytest.raises(TypeError, match="names: expected a list of class names, got the text 'wall'"):
+        embed_labels(TEACHER, "wall")
