@@ -6,7 +6,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from kfgs.teachers.lseg.keys import network_from_state
+from kfgs.teachers.lseg.keys import network_from_state, text_from_state
 from kfgs.teachers.lseg.layout import random_state
 from kfgs.teachers.lseg.network import LSegConfig
 
@@ -112,7 +112,7 @@ def test_a_planted_mistake_is_noticed(case, mistake, monkeypatch):
     state, x, expected = case
     network = network_from_state(state, TINY, source="tiny").double()
     MISTAKES[mistake](network, monkeypatch)
-    assert relative(network(x), expected) > 1e-9  # the right one stays below 1e-12
+    assert relative(network(x), expected) > 1e-5  # which is more than float32 is granted
 
 
 def test_a_window_of_another_size_is_refused(case):
@@ -142,3 +142,16 @@ def test_the_defaults_are_those_of_the_released_checkpoint():
 def test_sizes_that_contradict_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         LSegConfig(**{**SIZES, **change})
+
+
+@pytest.mark.slow
+def test_at_its_full_size_it_is_still_transformers_dpt_and_clip():
+    """20 s and 3 GiB; benchmarks/lseg_exact.py says by how much they differ."""
+    config, generator = LSegConfig(), torch.Generator().manual_seed(12)
+    state = random_state(config, generator)
+    x = 2 * torch.rand(1, 3, 480, 480, generator=generator) - 1
+    ids = torch.zeros(2, 77, dtype=torch.int64)
+    ids[0, :3], ids[1, :5] = torch.tensor([49406, 320, 49407]), torch.tensor([49406, 17, 40000, 9, 49407])
+    network, tower = (build(state, config, source="full") for build in (network_from_state, text_from_state))
+    assert relative(network(x), oracles_lseg.features(state, config, x, "eager")) < 1e-5
+    assert relative(tower(ids), oracles_lseg.text(state, config, ids, torch.float32, "eager")) < 1e-5

@@ -1,0 +1,89 @@
+"""Is LSeg's network at its full size the one of transformers? Seeded random weights in the checkpoint's layout.
+
+    python benchmarks/lseg_exact.py
+
+One window of 480 x 480 through kfgs and through transformers' DPT, and 32 prompts through both text towers, in float32, with
+torch's fused attention (as in kfgs) and with transformers' own. Printed are the largest difference over the largest value,
+seconds, and the peak memory of this process before transformers is loaded. It takes about a minute on two cores, 3 GiB, and
+`pip install transformers`.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from kfgs.teachers.lseg.keys import network_from_state, text_from_state
+from kfgs.teachers.lseg.layout import random_state
+from kfgs.teachers.lseg.network import LSegConfig
+
+TESTS = Path(__file__).resolve().parents[1] / "tests"
+
+
+def main() -> None:
+    """Print what was compared, and how far apart it is."""
+    config, generator = LSegConfig(), torch.Generator().manual_seed(0)
+    state = random_state(config, generator)
+    window = 2 * torch.rand(1, 3, config.window, config.window, generator=generator) - 1
+    ids = prompts(config, 32, generator)
+    print(f"{len(state)} tensors, {sum(value.numel() for value in state.values()) / 1e6:.1f} M values")
+    print(f"state: peak {peak_gib():.2f} GiB; torch {torch.__version__}, {torch.get_num_threads()} threads")
+
+    network = network_from_state(state, config, source="random")
+    tower = text_from_state(state, config, source="random")
+    print(f"image network: {sum(value.numel() for value in network.parameters()) / 1e6:.1f} M parameters")
+    print(f"text tower:    {sum(value.numel() for value in tower.parameters()) / 1e6:.1f} M parameters")
+    print(f"both built: peak {peak_gib():.2f} GiB")
+    with torch.inference_mode():
+        features, seconds = timed(lambda: network(window))
+        print(f"kfgs, a window:  {seconds:.2f} s, peak {peak_gib():.2f} GiB, {tuple(features.shape)}")
+        rows, seconds = timed(lambda: tower(ids))
+        print(f"kfgs, prompts:   {seconds:.2f} s, {tuple(rows.shape)}")
+
+    sys.path.append(str(TESTS))
+    import oracles_lseg
+
+    for attention in ("sdpa", "eager"):
+        expected, seconds = timed(partial(oracles_lseg.features, state, config, window, attention))
+        print(f"transformers ({attention}), a window: {seconds:.2f} s with loading; {difference(features, expected)}")
+        expected, seconds = timed(partial(oracles_lseg.text, state, config, ids, torch.float32, attention))
+        print(f"transformers ({attention}), prompts:  {seconds:.2f} s with loading; {difference(rows, expected)}")
+
+
+def prompts(config: LSegConfig, count: int, generator: torch.Generator) -> Tensor:  # [count, context] int64
+    """Token numbers as a tokenizer gives them: start, 1 to 8 words, end, zeros."""
+    ids = torch.zeros(count, config.context, dtype=torch.int64)
+    for row in ids:
+        words = 1 + int(torch.randint(8, (), generator=generator))
+        row[0], row[words + 1] = config.vocabulary - 2, config.vocabulary - 1
+        row[1 : words + 1] = torch.randint(config.vocabulary - 2, (words,), generator=generator)
+    return ids
+
+
+def timed(call: Callable[[], Tensor]) -> tuple[Tensor, float]:
+    """What a call returns, and its seconds."""
+    start = time.perf_counter()
+    found = call()
+    return found, time.perf_counter() - start
+
+
+def difference(ours: Tensor, theirs: Tensor) -> str:
+    """How far apart two tensors are, in words."""
+    most, largest = float((ours - theirs).abs().max()), float(theirs.abs().max())
+    return f"largest value {largest:.1f}, largest difference {most:.1e}, relative {most / largest:.1e}"
+
+
+def peak_gib() -> float:
+    """The most memory this process has held."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+if __name__ == "__main__":
+    main()
