@@ -1,4 +1,5 @@
-"""The command line: `kfgs demo | sfm | fit | segment | label | info | color | attach | select | edit | convert`.
+"""The command line: `kfgs demo | sfm | plan | features | text | fit | segment | label | info | color | attach |
+select | edit | convert`.
 
 Every command names the files it wrote, shows progress on long work, and ends with 0 (done), 1 (bad input, with one
 message that says what to do), 2 (wrong usage), 130 (interrupted; the same command goes on where it stopped) or 141
@@ -16,10 +17,11 @@ import tyro
 from .color import attach, color, convert, edit
 from .query import select
 from .semantic import demo, fit, info, label, segment, sfm
+from .teach import features, plan
 
 COMMANDS: dict[str, Any] = {
     command.__name__: command
-    for command in (demo, sfm, fit, segment, label, info, color, attach, select, edit, convert)
+    for command in (demo, sfm, plan, features, fit, segment, label, info, color, attach, select, edit, convert)
 }
 
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
+from .checks import check_alone, check_folder
 from .say import Mode, Preset, fit_config, load_classes, say, training_cameras, wrote
+from .teach import choose_teacher, scene_folder
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
@@ -65,8 +67,13 @@ def sfm(
 
 def fit(
     scene: SceneFolder,
-    features: Path,
     out: Path,
+    features: Path | None = None,
+    teacher: str | None = None,
+    weights: str | None = None,
+    fast: bool = False,
+    size: tuple[int, ...] = (),
+    discard_features: bool = False,
     preset: Preset = "cpu",
     mode: Mode = "adc+sc",
     split: str = "train",
@@ -81,8 +88,16 @@ def fit(
 
     Args:
         scene: folder with images and a COLMAP model or transforms.json.
-        features: folder of teacher maps, `<stem>_fmap_CxHxW.pt` or `<stem>.npy`.
         out: run folder; running again goes on where it stopped. `out/field` receives the field.
+        features: folder of teacher maps as `kfgs features`, Feature 3DGS or LangSplat write them; SCENE/features when not
+            given.
+        teacher: run this teacher instead of reading maps (see `kfgs features`), and store none of them: it runs twice, once
+            for the codebook's samples and once for the index maps.
+        weights: of the teacher.
+        fast: of the teacher, see `kfgs features`.
+        size: of the teacher's maps, see `kfgs features`.
+        discard_features: delete the dense maps when the index maps are made of them; later runs with the same codebook
+            options do not need them.
         preset: `cpu` (minutes on two cores) or `paper` (30,000 steps).
         mode: `adc+sc` (codebook and autoencoder, 9 channels), `adc` (codebook), `decouple` (raw features).
         split: views to learn from.
@@ -95,15 +110,32 @@ def fit(
     """
     from ..pipeline import fit_scene, write_training_pictures
     from ..scenes import load_scene
-    from ..teachers import FeatureFolder
+    from ..teachers import FeatureFolder, RecomputedMaps, discard_maps
 
     config = fit_config(preset, mode, seed, steps, max_gaussians, split)
     config = dataclasses.replace(config, undistorted_features=undistorted_features)
-    loaded = load_scene(scene, images=images).undistorted()
+    check_folder("out", out)
+    as_taken = load_scene(scene, images=images)
+    loaded = as_taken.undistorted()
     for note in loaded.notes:
         say(f"note: {note}")
-    maps = FeatureFolder(features, [loaded.stem(i) for i in loaded.views(split)])
+    views = loaded.views(split)
+    maps: Any
+    if teacher is not None:
+        check_alone("features", features, "beside --teacher, whose maps are not stored")
+        check_alone("discard-features", discard_features or None, "beside --teacher, which stores no dense maps")
+        check_alone(
+            "undistorted-features", undistorted_features or None, "beside --teacher, which sees the pictures as taken"
+        )
+        maps = RecomputedMaps(choose_teacher(teacher, weights, fast, size, device), as_taken, views, out / "teacher")
+    else:
+        for name, given in (("weights", weights), ("fast", fast or None), ("size", size or None)):
+            check_alone(name, given, "without --teacher, whose option it is")
+        folder = scene_folder(scene) / "features" if features is None else features
+        maps = FeatureFolder(folder, [loaded.stem(i) for i in views])
     result = fit_scene(loaded, maps, out, config, report=say, progress=True, device=device)
+    if discard_features:
+        say(f"{maps.path}: {discard_maps(maps.path) / 1e9:.2f} GB of dense maps deleted; index maps are in {out}")
     say(result.field.summary())
     wrote([result.field_path, *write_training_pictures(result)])
 

@@ -1,4 +1,4 @@
-"""What lies at a path, in words: a field, a run, a scene, a splat file, a point cloud."""
+"""What lies at a path, in words: a field, a run, a scene, feature maps, a splat file, a point cloud."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from ..fields import SemanticField
 from ..formats import SplatFile, find_format, read_splats
 from ..formats.ply import read_ply
 from ..scenes import load_scene
+from ..teachers.manifest import MANIFEST, read_manifest
 
 
 def describe(path: str | Path) -> str:
-    """Describe a field folder, a run folder, a scene folder, a splat file of any format, or a PLY file of points.
+    """Describe a field, run or scene folder, a folder of feature maps that kfgs made, a splat file, or a PLY of points.
 
     Raises:
         FileNotFoundError: if there is nothing there.
@@ -32,6 +33,8 @@ def describe(path: str | Path) -> str:
         return SemanticField.load(path).summary()
     if (path / "field" / "field.json").is_file():
         return SemanticField.load(path / "field").summary()
+    if (path / MANIFEST).is_file():
+        return _describe_maps(path)
     if (path / "stages").is_dir():
         done = [read_json(file) for file in sorted((path / "stages").glob("[!.]*/stage.json"))]
         lines = [f"  {about['name']}: done in {about['seconds']:.1f} s" for about in done]
@@ -46,6 +49,23 @@ def describe(path: str | Path) -> str:
         f"  splits: {splits}",
         f"  extent: {scene.extent:.3f} world units",
         *(f"  note: {note}" for note in scene.notes),
+    ]
+    return "\n".join(lines)
+
+
+def _describe_maps(path: Path) -> str:
+    manifest = read_manifest(path)
+    assert manifest is not None
+    records = manifest.maps.values()
+    shapes = sorted({record.shape for record in records})
+    there = sum((path / record.file).is_file() for record in records)
+    lines = [
+        f"{path}: {len(records)} feature maps by {manifest.teacher.get('name', 'an unknown teacher')}",
+        *(f"  {h} x {w} cells, {D} channels" for h, w, D in shapes),
+        f"  {sum(record.bytes for record in records) / 1e9:.2f} GB in half precision"
+        + (f", {there} of {len(records)} maps still there" if there < len(records) else ""),
+        f"  teacher's time: {sum(record.seconds for record in records):.0f} s",
+        *(f"  {name}: {value}" for name, value in manifest.teacher.items() if name != "name"),
     ]
     return "\n".join(lines)
 

@@ -1,0 +1,190 @@
+"""Commands of the teachers: plan what it will cost, and make feature maps or look them over."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from .checks import check_alone, check_folder
+from .say import Mode, Preset, fit_config, say, wrote
+
+# Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
+
+SceneFolder = Annotated[Path, tyro.conf.Positional]
+
+
+def features(
+    scene: SceneFolder,
+    teacher: str | None = None,
+    weights: str | None = None,
+    out: Path | None = None,
+    split: str = "train",
+    fast: bool = False,
+    size: tuple[int, ...] = (),
+    images: Path | None = None,
+    device: str = "auto",
+    overwrite: bool = False,
+    check: Path | None = None,
+) -> None:
+    """Run a teacher over a scene's pictures, one at a time, and keep its maps; or look over maps that exist.
+
+    A killed run goes on with the same command: finished pictures are not done again.
+
+    Args:
+        scene: folder with images and a COLMAP model or transforms.json.
+        teacher: lseg, clip, siglip, ... (a wrong name lists them), or package.module:name of your own.
+        weights: checkpoint file (lseg, sam), or folder or hub id (the others).
+        out: folder for the maps; SCENE/features when not given.
+        split: views to encode; `all` for every view.
+        fast: one pass over each picture instead of the teacher's exact multi-scale evaluation (lseg).
+        size: HEIGHT WIDTH of the maps (lseg), or the long side in pixels that pictures are brought to (the others).
+        images: folder of the pictures, if it is not SCENE/images.
+        device: where the teacher runs: `auto` (a GPU if there is one), `cpu` or `cuda`.
+        overwrite: give up maps of another teacher, weights or options that lie there; without it they are an error.
+        check: look over this folder of maps instead (Feature 3DGS, LangSplat, .npy, .safetensors), and report every file
+            that does not fit.
+    """
+    from ..scenes import load_scene
+    from ..teachers import extract_features, pictures_of
+
+    if check is not None:
+        for name, given in (("teacher", teacher), ("weights", weights), ("out", out)):
+            check_alone(name, given, "beside --check, which encodes nothing")
+    loaded = load_scene(scene, images=images)
+    for note in loaded.notes:
+        say(f"note: {note}")
+    views = list(range(len(loaded))) if split == "all" else loaded.views(split)
+    if check is not None:
+        look_over(loaded, views, check)
+        return
+    target = out if out is not None else scene_folder(scene) / "features"
+    check_folder("out", target)
+    chosen = choose_teacher(teacher, weights, fast, size, device)
+    made = extract_features(chosen, pictures_of(loaded, views), target, overwrite=overwrite, report=say, progress=True)
+    shapes = sorted({" x ".join(map(str, record.shape)) for record in made.maps.values()})
+    say(f"{len(made.maps)} maps of {', '.join(shapes)} by {teacher_words(made.teacher)}")
+    say(f"next: kfgs fit {scene} --out run" + ("" if out is None else f" --features {out}"))
+    wrote([target])
+
+
+def plan(
+    scene: SceneFolder,
+    teacher: str = "lseg",
+    weights: str | None = None,
+    fast: bool = False,
+    size: tuple[int, ...] = (),
+    preset: Preset = "cpu",
+    mode: Mode = "adc+sc",
+    steps: int | None = None,
+    split: str = "train",
+    store: Literal["keep", "discard", "recompute"] = "keep",
+    images: Path | None = None,
+    device: str = "auto",
+    out: Path | None = None,
+) -> None:
+    """Predict disk, memory and minutes of `kfgs features` and `kfgs fit`, before either starts.
+
+    Args:
+        scene: folder with images and a COLMAP model or transforms.json.
+        teacher: lseg, clip, siglip, ... as for `kfgs features`.
+        weights: folder of the teacher, whose config.json then tells its size; the released size when not given.
+        fast: as for `kfgs features`.
+        size: as for `kfgs features`.
+        preset: as for `kfgs fit`.
+        mode: as for `kfgs fit`.
+        steps: as for `kfgs fit`.
+        split: views to encode and to learn from.
+        store: what becomes of the dense maps: `keep` them; `discard` them when they are index maps (fit
+            --discard-features); `recompute` instead of storing (fit --teacher).
+        images: folder of the pictures, if it is not SCENE/images.
+        device: as for `kfgs fit`.
+        out: also write the plan to this .json file.
+    """
+    from .._files import write_json
+    from ..pipeline.plan import plan_scene
+    from ..scenes import load_scene
+
+    config = fit_config(preset, mode, 0, steps, None, split)
+    loaded = load_scene(scene, images=images)
+    found = plan_scene(
+        loaded,
+        teacher=teacher,
+        weights=weights,
+        options=teacher_options(teacher, fast, size),
+        config=config,
+        dense=store,
+        device=device,
+        folder=scene_folder(scene),
+    )
+    say(str(found))
+    if out is not None:
+        write_json(out, found.to_json())
+        wrote([out])
+
+
+def choose_teacher(name: str | None, weights: str | None, fast: bool, size: tuple[int, ...], device: str) -> Any:
+    """The teacher that a command asks for, on its device.
+
+    Raises:
+        ValueError: if none is named, or an option does not fit the teacher.
+    """
+    from ..pipeline.device import training_device
+    from ..teachers.load import load_teacher, teacher_names
+
+    if name is None:
+        raise ValueError(
+            f"teacher: expected one of {', '.join(teacher_names())}, or package.module:name, got none; pass --teacher "
+            "(and --weights), or --check FOLDER to look over maps that exist"
+        )
+    target = training_device(device)
+    teacher = load_teacher(name, weights, **teacher_options(name, fast, size))
+    return teacher.to(target) if hasattr(teacher, "to") else teacher
+
+
+def teacher_options(name: str, fast: bool, size: tuple[int, ...]) -> dict[str, Any]:
+    """The options of a teacher that --fast and --size stand for.
+
+    Raises:
+        ValueError: if the teacher has no such option, or takes another number of numbers.
+    """
+    options: dict[str, Any] = {}
+    if fast:
+        if name != "lseg":
+            raise ValueError(f"fast: expected none beside teacher {name!r}, which has one pass only; leave it out")
+        options["fast"] = True
+    if size:
+        wanted = 2 if name == "lseg" else 1
+        if len(size) != wanted or ":" in name:
+            what = "HEIGHT WIDTH" if name == "lseg" else "the long side in pixels" if ":" not in name else "none"
+            raise ValueError(
+                f"size: expected {what} for teacher {name!r}, got {' '.join(map(str, size))}; correct --size"
+            )
+        options["size"] = size if name == "lseg" else size[0]
+    return options
+
+
+def look_over(scene: Any, views: list[int], folder: Path) -> None:
+    """Report every map of a folder that does not fit the scene's views; a ValueError counts them."""
+    from ..teachers import check_feature_folder
+
+    report = check_feature_folder(folder, [(scene.stem(i), scene.cameras[i].size) for i in views])
+    say(str(report))
+    report.raise_if_bad()
+
+
+def scene_folder(scene: Path) -> Path:
+    """The folder that a scene given as a folder or as a transforms.json lies in."""
+    return scene if scene.is_dir() else scene.parent
+
+
+def teacher_words(identity: dict[str, Any]) -> str:
+    """A teacher's identity in a few words: `lseg (weights 3f2a...)`."""
+    weights = identity.get("weights")
+    rest = {name: value for name, value in identity.items() if name not in ("name", "weights") and value}
+    words = [str(identity.get("name", "unknown"))]
+    words += [f"weights {str(weights)[:12]}"] if weights else []
+    words += [json.dumps(rest, sort_keys=True)] if rest else []
+    return ", ".join(words)
