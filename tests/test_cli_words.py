@@ -1,0 +1,243 @@
+"""Words on the command line: a table made once, and queries that it answers."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from cases_color import surface
+from cases_words import DIM, TEACHER, letters
+from small_room import make_room
+
+from kfgs.cli import main
+from kfgs.cli.say import find_classes, load_classes
+from kfgs.cli.words import read_words, text
+from kfgs.fields import SemanticField
+from kfgs.labels import load_label_set
+from kfgs.scenes import load_scene
+from kfgs.teachers.prompts import make_label_set
+
+LETTERS = ["--teacher", "cases_words:TEACHER"]
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    return make_room(tmp_path_factory.mktemp("words") / "scene")
+
+
+@pytest.fixture(scope="module")
+def names(room):
+    return json.loads((room / "classes.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def truth(room):
+    return surface(room)[1]
+
+
+@pytest.fixture(scope="module")
+def field(room, truth, names, tmp_path_factory):
+    """The room's surface, each Gaussian with the text embedding of its class, as the teacher of letters gives it."""
+    cloud, folder = surface(room)[0], tmp_path_factory.mktemp("field") / "field"
+    scene = load_scene(room)
+    info = {"views": [scene.cameras[i].name for i in scene.views("train")], "teacher": TEACHER.identity}
+    SemanticField(cloud.replace(features=make_label_set(TEACHER, names).embeddings[truth]), info=info).save(folder)
+    return folder
+
+
+def count(truth, names, name):
+    return int((truth == names.index(name)).sum())
+
+
+def test_words_of_a_file_or_between_commas(tmp_path):
+    assert read_words(" wall, chair;seat ,") == ["wall", "chair;seat"]
+    (tmp_path / "a.txt").write_text("\ufeffwall\n\n chair;seat\n")
+    assert read_words(str(tmp_path / "a.txt")) == ["wall", "chair;seat"]
+    (tmp_path / "a.json").write_text('["wall", "chair, big"]')
+    assert read_words(str(tmp_path / "a.json")) == ["wall", "chair, big"]
+
+
+def test_text_writes_a_table_with_its_origin(tmp_path, capsys):
+    out = tmp_path / "new" / "t.safetensors"
+    text("wall,chair;seat", "cases_words:TEACHER", out, templates="a {}")
+    said = capsys.readouterr().out
+    assert f"2 classes, {DIM} channels each, by letters" in said
+    assert "chair: also seat" in said
+    assert f"wrote:\n  {out}" in said
+    found = load_label_set(out)
+    assert found.names == ("wall", "chair")
+    assert found.info["templates"] == ["a {}"]
+    expected = make_label_set(TEACHER, ["wall", "chair;seat"], templates="a {}")
+    assert found.embeddings.equal(expected.embeddings)
+    assert found.negatives.equal(expected.negatives)
+    text("wall", "cases_words:TEACHER", out, negatives=False)
+    assert load_label_set(out).negatives is None
+
+
+@pytest.mark.parametrize(
+    ("names", "options", "message"),
+    [
+        ("wall", {"out": "t.npy"}, "out: expected a file whose name ends in .safetensors"),
+        ("wall", {"out": "."}, "out: expected a file whose name ends in .safetensors"),
+        ("wall", {"teacher": "cases_words:MUTE"}, "teacher 'mute': expected one with a text encoder"),
+        ("wall", {"teacher": "no_such_teacher"}, "teacher: expected one of lseg"),
+        ("wall", {"templates": "clip8"}, "did you mean 'clip7'"),
+        (" , ", {}, "names: expected at least one word, got none"),
+        ("{tmp}", {}, "names: expected a .json or .txt file, or words between commas, got"),
+        ("{tmp}/no.json", {}, "no such file; expected a JSON file"),
+        ("{tmp}/no.txt", {}, "no such file; expected a text file there with a class a line"),
+        ("{tmp}/a.json", {}, "names: expected a list of words like"),
+        ("{tmp}/a.txt", {}, "expected a text file in UTF-8"),
+    ],
+)
+def test_text_names_what_is_wrong_and_writes_nothing(tmp_path, names, options, message):
+    (tmp_path / "a.json").write_text('{"wall": 1}')
+    (tmp_path / "a.txt").write_bytes(b"\xff\xfew\x00")
+    given = {"teacher": "cases_words:TEACHER", "out": "t.safetensors"} | options
+    given["out"] = tmp_path / given["out"]
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        text(names.format(tmp=tmp_path), **given)
+    assert {path.name for path in tmp_path.iterdir()} == {"a.json", "a.txt"}
+
+
+def test_a_table_alone_serves_select_label_and_segment(field, room, truth, names, tmp_path, capsys):
+    table = tmp_path / "t.safetensors"
+    text(str(room / "classes.json"), "cases_words:TEACHER", table)
+    assert main(["select", "lamp", str(field), "--text", str(table)]) == 0
+    said = capsys.readouterr().out
+    assert f"lamp: {count(truth, names, 'lamp')} of 4000 Gaussians" in said
+    assert f"{len(names) - 1} negatives" in said
+    assert main(["label", str(field), "--text", str(table), "--out", str(tmp_path / "o")]) == 0
+    said = capsys.readouterr().out
+    for name in names:
+        assert f"  {name:<16s} {count(truth, names, name):8d} Gaussians" in said
+    assert main(["segment", str(field), "--scene", str(room), "--text", str(table), "--out", str(tmp_path / "s")]) == 0
+    assert "mIoU" in capsys.readouterr().out
+
+
+def test_a_table_in_the_scene_is_found(field, room, truth, names, tmp_path, capsys):
+    scene = tmp_path / "scene"
+    shutil.copytree(room, scene, ignore=shutil.ignore_patterns("classes.json", "text.npy"))
+    text(",".join(reversed(names)), "cases_words:TEACHER", scene / "text.safetensors")
+    assert load_classes(scene, None, None).names == tuple(reversed(names))
+    assert main(["select", "lamp", str(field), "--scene", str(scene)]) == 0
+    assert "lamp: " in capsys.readouterr().out
+    shutil.copy(room / "classes.json", scene)  # label pictures count as it does
+    assert load_classes(scene, None, None).names == tuple(names)
+    assert capsys.readouterr().out == ""
+    whole = load_classes(scene, None, scene / "text.safetensors")
+    assert whole.names == tuple(reversed(names))
+    assert "note: labels count the classes of" in capsys.readouterr().out
+    np.save(scene / "text.npy", np.ones((len(names), 3), np.float32))
+    assert load_classes(scene, None, None).embeddings.shape == (len(names), 3)  # the pair of old goes first
+
+
+def test_where_classes_are_looked_for(tmp_path):
+    scene, table, names, rows = (tmp_path / name for name in ("s", "t.safetensors", "c.json", "t.npy"))
+    assert find_classes(None, None, table) == (table,)
+    assert find_classes(None, table, None) == (table,)
+    assert find_classes(None, names, table) == (names, table)
+    assert find_classes(scene, None, None) == (scene / "classes.json", scene / "text.npy")
+    assert find_classes(scene, names, None) == (names, scene / "text.npy")
+    assert find_classes(scene, None, table) == (table,)
+    assert find_classes(None, None, rows) is None
+    with pytest.raises(ValueError, match="text: expected none beside the table"):
+        find_classes(None, table, rows)
+    with pytest.raises(
+        ValueError, match="pass --classes and --text, or --scene, or --text alone with what `kfgs text`"
+    ):
+        load_classes(None, names, None)
+
+
+def test_any_phrase_with_a_teacher_and_no_table(field, truth, names, capsys):
+    """Letters count without case, so LAMP is where the lamp is, and "object" is another word."""
+    assert main(["select", "LAMP", str(field), *LETTERS]) == 0
+    said = capsys.readouterr().out
+    assert "more like the query than like any of 4 negatives" in said
+    field_rows, lamp = (
+        SemanticField.load(field).features.double(),
+        letters(["lamp", *["object", "things", "stuff", "texture"]]),
+    )
+    cosine = torch.nn.functional.normalize(field_rows, dim=1) @ torch.nn.functional.normalize(lamp.double(), dim=1).T
+    expected = int((cosine[:, 0] > cosine[:, 1:].amax(dim=1) + 1e-6).sum())
+    assert f"LAMP: {expected} of 4000 Gaussians" in said
+    assert expected >= count(truth, names, "lamp")
+
+
+def test_a_phrase_joins_the_classes_of_a_table(field, room, truth, names, tmp_path, capsys):
+    table = tmp_path / "t.safetensors"
+    text(str(room / "classes.json"), "cases_words:TEACHER", table)
+    arguments = [str(field), "--text", str(table), *LETTERS]
+    lamps = count(truth, names, "lamp")
+    assert main(["select", "palm", *arguments, "--negatives", "none", "--threshold", "0.999"]) == 0  # the same letters
+    assert f"palm: {lamps} of 4000 Gaussians, score > 0.999" in capsys.readouterr().out
+    assert main(["select", "palm", *arguments, "--negatives", "classes"]) == 0
+    said = capsys.readouterr().out
+    assert "palm: 0 of 4000 Gaussians" in said  # nothing is more like it than like a lamp
+    assert f"{len(names)} negatives" in said
+    assert main(["select", "palm", *arguments]) == 0
+    assert "4 negatives" in capsys.readouterr().out
+    assert main(["select", "Lamp", *arguments]) == 0  # a class of the table
+    said = capsys.readouterr().out
+    assert f"lamp: {lamps} of 4000 Gaussians" in said
+    assert f"{len(names) - 1} negatives" in said
+    assert main(["select", "lamp", *arguments, "--negatives", "canonical"]) == 0
+    assert "4 negatives" in capsys.readouterr().out
+
+
+def test_scores_by_name(field, room, truth, names, tmp_path, capsys):
+    table = tmp_path / "t.safetensors"
+    text(str(room / "classes.json"), "cases_words:TEACHER", table)
+    arguments = ["select", "lamp", str(field), "--text", str(table), "--score"]
+    lamps = count(truth, names, "lamp")
+    assert main([*arguments, "cosine", "--threshold", "0.999"]) == 0
+    assert f"lamp: {lamps} of 4000 Gaussians, score > 0.999 (given)" in capsys.readouterr().out
+    assert main([*arguments, "softmax", "--threshold", "0.5", "--out", str(tmp_path / "o")]) == 0
+    said = capsys.readouterr().out
+    assert f"softmax over {len(names)} words, logit scale 14.29" in said
+    facts = json.loads((tmp_path / "o" / "selection.json").read_text())
+    assert "softmax" in facts["how"]
+
+
+def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
+    table = tmp_path / "t.safetensors"
+    made = make_label_set(TEACHER, names)
+    made.info["teacher"] = {"name": "clip"}
+    made.save(table)
+    assert main(["select", "lamp", str(field), "--text", str(table)]) == 0
+    said = capsys.readouterr().out
+    assert "note: classes: expected text of the field's teacher (name 'letters'), got text of another ('clip')" in said
+    assert main(["select", "palm", str(field), "--text", str(table), *LETTERS]) == 0
+    assert "got text of another ('clip')" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["lampp", "--text", "{table}"],
+            "did you mean 'lamp'?; for any other phrase pass --teacher and --weights, or add",
+        ),
+        (["lamp", "--text", "{table}", "--weights", "a.pt"], "weights: expected none without --teacher"),
+        (["lamp", *LETTERS, "--negatives", "classes"], "negatives: expected other classes than 'lamp', got none"),
+        (["lamp", "--text", "{table}", "--score", "cosine", "--negatives", "classes"], "none beside --score cosine"),
+        (["lamp", "--text", "{table}", "--score", "softmax", "--negatives", "none"], "expected classes or canonical"),
+        (["lamp", "--teacher", "cases_words:MUTE"], "teacher 'mute': expected one with a text encoder"),
+        (["palm", "--text", "{other}", *LETTERS], "got (16,); text of another teacher?"),
+        (["lamp", "--text", "{other}"], "embedding: expected [16], got (5,): text of another teacher?"),
+        (["lamp", "--text", "{bare}", "--negatives", "canonical"], "canonical words in the classes' table, got none"),
+        (["lamp", "--text", "{tmp}/no.safetensors"], "no such file; expected a table of words there"),
+    ],
+)
+def test_wrong_queries_are_named(field, names, tmp_path, capsys, arguments, message):
+    made = make_label_set(TEACHER, names)
+    paths = {name: tmp_path / f"{name}.safetensors" for name in ("table", "bare", "other")}
+    made.save(paths["table"])
+    make_label_set(TEACHER, names, negatives=None).save(paths["bare"])
+    type(made)(made.names, torch.eye(len(names), 5) + 1).save(paths["other"])
+    given = [argument.format(tmp=tmp_path, **paths) for argument in arguments]
+    assert main(["select", given[0], str(field), *given[1:]]) == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
