@@ -1,0 +1,137 @@
+"""How much memory and time do 90 maps of 360 x 480 x 512 take, from pictures to index maps?
+
+    python benchmarks/streaming.py SCENE [--images 90] [--size 360 480] [--channels 512] [--epochs 28] [--folder DIR]
+
+Each stage runs in a process of its own, whose highest resident memory is what Linux says (VmHWM): writing the maps with
+`extract_features`, fitting the codebook, making the index maps. The teacher is a seeded random matrix on smoothed
+pictures, which takes next to nothing, so what is measured is all that surrounds a teacher. The maps (15.9 GB as they
+stand) are deleted at the end, unless --folder names a place to keep them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from kfgs.cameras import resize_map
+from kfgs.quant import Codebook, CodebookConfig, fit_codebook, quantize_maps
+from kfgs.scenes import load_scene
+from kfgs.teachers import FeatureFolder
+from kfgs.teachers.cache import Picture, extract_features, pictures_of
+
+STAGES = ("start", "extract", "codebook", "index maps")
+
+
+class RandomTeacher:
+    """Features that are a seeded random function of the smoothed colours: D channels, as many directions as colours."""
+
+    name = "random"
+
+    def __init__(self, size: tuple[int, int], channels: int) -> None:
+        self.size = size
+        self.identity = {"name": self.name, "size": list(size), "channels": channels}
+        self.matrix = torch.randn(channels, 3, generator=torch.Generator().manual_seed(0))
+
+    def encode_image(self, image: torch.Tensor) -> torch.Tensor:  # [3, H, W] -> [D, h, w]
+        """Smooth, mix, bend."""
+        cells = resize_map(image.permute(1, 2, 0), self.size, antialias=True) - 0.5
+        return torch.tanh((cells @ self.matrix.T).mul_(4)).mul_(0.5).permute(2, 0, 1)
+
+    def encode_text(self, prompts: object) -> torch.Tensor:
+        """There is no text."""
+        raise NotImplementedError
+
+
+def main() -> None:
+    """Run every stage in its own process and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scene", type=Path)
+    parser.add_argument(
+        "--images", type=int, default=90, help="views are taken again under other names if there are fewer"
+    )
+    parser.add_argument("--size", type=int, nargs=2, default=(360, 480), metavar=("H", "W"))
+    parser.add_argument("--channels", type=int, default=512)
+    parser.add_argument("--epochs", type=int, default=28)
+    parser.add_argument("--folder", type=Path, help="where the maps go, and stay; a temporary folder if not given")
+    parser.add_argument("--json", type=Path, help="also write the numbers here")
+    parser.add_argument("--stage", choices=STAGES, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.stage:
+        print(json.dumps(run_stage(args)))
+        return
+    with tempfile.TemporaryDirectory(prefix="kfgs_streaming_") as temporary:
+        args.folder = args.folder or Path(temporary)
+        rows = [run_apart(args, stage) for stage in STAGES]
+    dense = args.images * args.size[0] * args.size[1] * args.channels * 2
+    print(
+        f"{args.images} maps of {args.size[0]} x {args.size[1]} x {args.channels}: {dense / 1e9:.2f} GB in half precision"
+    )
+    print("| stage | seconds | peak memory, GB | |\n| --- | --- | --- | --- |")
+    for row in rows:
+        print(f"| {row['stage']} | {row['seconds']:.1f} | {row['peak'] / 1e9:.2f} | {row['note']} |")
+    if args.json:
+        args.json.write_text(json.dumps({"dense_bytes": dense, "stages": rows}, indent=2) + "\n")
+
+
+def run_apart(args: argparse.Namespace, stage: str) -> dict[str, Any]:
+    """One stage in a fresh process."""
+    size, options = map(str, args.size), ("images", "channels", "epochs", "folder")
+    command = [sys.executable, __file__, str(args.scene), "--stage", stage, "--size", *size]
+    command += [text for name in options for text in (f"--{name}", str(getattr(args, name)))]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)  # the bars go to the terminal
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+def run_stage(args: argparse.Namespace) -> dict[str, Any]:
+    """One stage in this process: its name, seconds, peak memory in bytes, and a word about the result."""
+    start = time.perf_counter()
+    work = {"start": lambda args: "imports alone", "extract": extract, "codebook": codebook, "index maps": index_maps}
+    note = work[args.stage](args)
+    return {"stage": args.stage, "seconds": time.perf_counter() - start, "peak": highest_memory(), "note": note}
+
+
+def extract(args: argparse.Namespace) -> str:
+    """Pictures to maps."""
+    pictures = pictures_of(load_scene(args.scene))
+    turns = [pictures[i % len(pictures)] for i in range(args.images)]
+    named = [Picture(f"{i:04d}", picture.path) for i, picture in enumerate(turns)]
+    made = extract_features(RandomTeacher(tuple(args.size), args.channels), named, args.folder / "maps", progress=True)
+    return f"{sum(record.bytes for record in made.maps.values()) / 1e9:.2f} GB written"
+
+
+def codebook(args: argparse.Namespace) -> str:
+    """Maps to a codebook."""
+    config = CodebookConfig(epochs=args.epochs, learning_rate=8e-4)
+    fit = fit_codebook(FeatureFolder(args.folder / "maps"), config, progress=True)
+    fit.codebook.save(args.folder / "codebook.safetensors")
+    return f"K = {fit.codebook.size}, coverage {fit.coverage:.3f}, {args.epochs} epochs"
+
+
+def index_maps(args: argparse.Namespace) -> str:
+    """Maps and codebook to index maps."""
+    book = Codebook.load(args.folder / "codebook.safetensors")
+    found = quantize_maps(FeatureFolder(args.folder / "maps"), book, progress=True)
+    found.save(args.folder / "index_maps.safetensors")
+    return f"{found.nbytes / 1e6:.1f} MB"
+
+
+def highest_memory() -> int:
+    """Bytes that this process has had in memory at most (pages of mapped files that it has touched count)."""
+    status = Path("/proc/self/status").read_text()
+    found = re.search(r"^VmHWM:\s*(\d+) kB", status, re.MULTILINE)
+    assert found is not None
+    return int(found.group(1)) * 1024
+
+
+if __name__ == "__main__":
+    main()
