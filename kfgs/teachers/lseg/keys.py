@@ -138,11 +138,12 @@ def _check(state: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]], s
     if not (missing or unknown or other):
         return
     what = recognise(state)
+    hint = "pass that file"
     if what is None:
         lists = ((missing, "missing"), (unknown, "unknown"), (other, "of another shape"))
         parts = [f"{len(names)} {kind} ({_first(names)})" for names, kind in lists if names]
-        what = f"{len(state)} tensors, {', '.join(parts)}"
-    raise ValueError(f"{source}: expected {_EXPECTED}, got {what}; use the file as its authors published it")
+        what, hint = f"{len(state)} tensors, {', '.join(parts)}", "use the file as its authors published it"
+    raise ValueError(f"{source}: expected {_EXPECTED}, got {what}; {hint}")
 
 
 def _known(name: str, shapes: Mapping[str, tuple[int, ...]]) -> bool:

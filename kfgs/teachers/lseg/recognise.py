@@ -9,7 +9,7 @@ from torch import Tensor
 # The first rule of which some tensor's name begins with the prefix; LSeg's own prefixes come before.
 _BY_PREFIX = (
     (("student.", "teacher."), "a self-supervised training checkpoint (DINO, iBOT)"),
-    (("image_encoder.", "mask_decoder.", "prompt_encoder."), "a SAM checkpoint"),
+    (("image_encoder.", "mask_decoder.", "prompt_encoder.", "vision_encoder."), "a SAM checkpoint"),
     (("visual.", "transformer.resblocks.", "token_embedding."), "CLIP alone, without LSeg's decoder"),
     (("vision_model.", "text_model."), "CLIP or SigLIP of transformers, without LSeg's decoder"),
     (("conv1.", "layer1."), "a ResNet"),
@@ -18,10 +18,10 @@ _BY_PREFIX = (
 
 
 def recognise(state: Mapping[str, Tensor]) -> str | None:  # names without "net."
-    """What a state seems to be in words, or None if it looks like LSeg's of the expected backbone, or like nothing known."""
+    """What a state seems to be in words, or None if it looks like LSeg's of the expected backbone or like nothing known."""
     names = list(state)
     if not names:
-        return "no tensors"
+        return "no tensors of its image network"
     if any(name.startswith("pretrained.layer1") for name in names):
         return "LSeg of backbone clip_resnet101, or another without a ViT"
     if any(name.startswith(("pretrained.", "scratch.")) for name in names):

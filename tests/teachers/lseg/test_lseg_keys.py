@@ -153,7 +153,8 @@ def named(*names, shape=(4,)):
 @pytest.mark.parametrize(
     ("found", "what"),
     [
-        ({}, "got no tensors"),
+        ({}, "got no tensors of its image network; pass that file"),
+        (named("net.clip_pretrained.logit_scale"), "got no tensors of its image network; pass that file"),
         (named("net.pretrained.layer1.0.weight", "net.scratch.head1.weight"), "got LSeg of backbone clip_resnet101"),
         (named("net.pretrained.model.pos_embed", shape=(1, 145, 768)), "got LSeg of backbone clip_vitb32_384"),
         (named("scratch.head1.weight", shape=(768, 256, 1, 1)), "got LSeg of backbone clipRN50x16_vitl16_384"),
