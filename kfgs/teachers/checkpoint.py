@@ -164,7 +164,7 @@ def _tensors(path: Path, found: Any, extent: Callable[[Storage], tuple[int, int]
     file: Any = torch.UntypedStorage.from_file(str(path), False, path.stat().st_size)
     tensors = {}
     for name, entry in state.items():
-        if isinstance(entry, Inert) and entry.name.startswith(("torch._utils.", "torch._tensor.")):
+        if _is_odd_tensor(entry):
             raise _refusal(path, f"one whose entry {one_line(name)} is no plain dense tensor ({one_line(entry.name)})")
         if isinstance(entry, Entry):
             try:
@@ -174,12 +174,17 @@ def _tensors(path: Path, found: Any, extent: Callable[[Storage], tuple[int, int]
     return tensors
 
 
+def _is_odd_tensor(value: Any) -> bool:
+    """Whether this would be a sparse, quantised or other tensor that is not read; dropping it would hide that."""
+    return isinstance(value, Inert) and value.name.startswith(("torch._utils.", "torch._tensor."))
+
+
 def _find_state(found: Any, depth: int = 0) -> dict[str, Any] | None:
     """The dict that holds tensors, itself or under one of the usual keys."""
     if type(found) is not dict or depth > 3:
         return None
     inner = (_find_state(found.get(key), depth + 1) for key in _STATES)
-    own = found if any(isinstance(value, Entry) for value in found.values()) else None
+    own = found if any(isinstance(value, Entry) or _is_odd_tensor(value) for value in found.values()) else None
     return next((state for state in inner if state is not None), own)
 
 

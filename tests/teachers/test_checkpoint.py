@@ -402,7 +402,10 @@ KINDS = {
     "pickle": (pickle.dumps({"a": [1, 2]}), "a plain pickle of a dict with keys a"),
     "zip": (zip_of({"photo.txt": b"hello"}), r"a zip archive that torch.save did not write \(it holds photo.txt"),
     "no records": (zip_of({}), "an empty zip archive"),
-    "compressed": (zip_of({"a/data.pkl": bytes(10**6)}, zipfile.ZIP_DEFLATED), "an archive that is compressed or encrypted"),
+    "compressed": (
+        zip_of({"a/data.pkl": bytes(10**6)}, zipfile.ZIP_DEFLATED),
+        "an archive that is compressed or encrypted",
+    ),
     "cut safetensors": (
         struct.pack("<Q", 80) + b'{"a":{"dtype":"F32","shape":[2],',
         "a .safetensors file that is damaged",
@@ -412,7 +415,10 @@ KINDS = {
         zip_of({"x/data.pkl": rebuilt(FLOATS.format(4), "I0\n(I2\nt(I1\ntI00\n(d")}),
         "an archive without its record data/0",
     ),
-    "big-endian": (zip_of({"x/data.pkl": b"N.", "x/byteorder": b"big"}), "the other byte order"),
+    "big-endian": (
+        zip_of({"x/data.pkl": b"N.", "x/byteorder": b"big"}),
+        "one written on a machine of the other byte order",
+    ),
 }
 
 
