@@ -159,9 +159,8 @@ def _as_float(state: Mapping[str, Tensor], names: Mapping[str, str]) -> dict[str
     return {own: state[theirs].detach().to(torch.float32) for own, theirs in names.items()}
 
 
-def _resize_positions(
-    positions: Tensor, side: int, grid: int
-) -> Tensor:  # [1, 1 + side^2, width] -> [1 + grid^2, width]
+def _resize_positions(positions: Tensor, side: int, grid: int) -> Tensor:
+    """The table [1, 1 + side * side, width] for a grid of another side: [1 + grid * grid, width], the first row kept."""
     readout, patches = positions[0, :1], positions[0, 1:]
     if side == grid:
         return positions[0]
