@@ -1,0 +1,272 @@
+"""The stages of a run as a plan foretells them, from the sizes of pictures, maps and cloud."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from ..quant.sampling import choose_grid_step
+from ..scenes import Scene
+from ..teachers.costs import TeacherCost, teacher_cost
+from . import work
+from .fit import FitConfig
+from .machine import Speed, measure_speed
+
+Dense = Literal["keep", "discard", "recompute"]
+DENSE: tuple[Dense, ...] = ("keep", "discard", "recompute")
+_HALF, _FLOAT = 2, 4  # bytes
+
+
+@dataclass(frozen=True)
+class StagePlan:
+    """One stage. None: not known."""
+
+    name: str
+    what: str
+    """What it does, in words with its sizes."""
+    seconds: float | None
+    peak_bytes: int | None
+    """Memory of the whole process while it runs."""
+    disk_bytes: int | None
+    """What it writes, and lies on the disk together with what the other stages write."""
+    kept_bytes: int | None
+    """What of it is left in the end."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Everything that the stages' costs follow from."""
+
+    views: tuple[tuple[int, tuple[int, int], TeacherCost], ...]  # so many pictures of that size, and what each costs
+    points: int
+    config: FitConfig
+    dense: Dense
+    speed: Speed
+
+    @classmethod
+    def of(
+        cls,
+        scene: Scene,
+        teacher: str | TeacherCost,
+        weights: str | Path | None,
+        options: dict[str, Any],
+        config: FitConfig,
+        dense: Dense,
+    ) -> Sizes:
+        """What a scene and options say, and how fast the machine is now; the arguments are those of `plan_scene`."""
+
+        def cost(size: tuple[int, int]) -> TeacherCost:
+            return teacher_cost(teacher, size, weights=weights, **options) if isinstance(teacher, str) else teacher
+
+        counts = Counter(scene.cameras[i].size for i in scene.views(config.split))
+        views = tuple((count, size, cost(size)) for size, count in counts.items())
+        return cls(views, len(scene.points), config, dense, measure_speed())
+
+    @property
+    def cost(self) -> TeacherCost:
+        """Of the first picture, which stands for the others where there is one number for all."""
+        return self.views[0][2]
+
+    @property
+    def count(self) -> int:
+        """Pictures."""
+        return sum(count for count, _, _ in self.views)
+
+    @property
+    def known(self) -> bool:
+        """Whether it is known what maps the teacher makes."""
+        return self.cost.map_size is not None and self.cost.channels is not None
+
+    @property
+    def existing(self) -> bool:
+        """Whether the maps are there, so that no teacher runs."""
+        return self.cost.forwards == 0
+
+    @property
+    def channels(self) -> int:
+        """D of a map, 0 if it is not known."""
+        return self.cost.channels or 0
+
+    @property
+    def pixels(self) -> int:
+        """Of all maps."""
+        return sum(count * cost.map_size[0] * cost.map_size[1] for count, _, cost in self.views if cost.map_size)
+
+    @property
+    def samples(self) -> int:
+        """Of all maps that the codebook looks at."""
+        return sum(count * self._grid(cost) for count, _, cost in self.views)
+
+    @property
+    def largest(self) -> int:
+        """Bytes of the largest map in float32."""
+        return max(_FLOAT * h * w * self.channels for h, w in (cost.map_size or (0, 0) for _, _, cost in self.views))
+
+    @property
+    def dense_bytes(self) -> int:
+        """Of all maps on disk."""
+        return _HALF * self.pixels * self.channels
+
+    def _grid(self, cost: TeacherCost) -> int:
+        h, w = cost.map_size or (0, 0)
+        options = self.config.codebook
+        rows, columns = options.grid_step or choose_grid_step(h, w, options.samples)
+        return max(1, -(-(h - rows // 2) // rows)) * max(1, -(-(w - columns // 2) // columns))
+
+    def title(self, device: torch.device) -> str:
+        """What is planned, in a line."""
+        (height, width), steps = self.views[0][1], self.config.field.steps
+        maps = f"{self.channels} channels at {say_size(self.cost.map_size)}" if self.known else "maps of unknown size"
+        stored = {"keep": "kept", "discard": "discarded", "recompute": "made anew instead of stored"}[self.dense]
+        return (
+            f"{self.count} views of {width}x{height}, {self.cost.name} ({maps}, {stored}), {self.config.mode}, "
+            f"{steps} steps, on {device} ({self.speed.threads} threads, {self.speed.flops / 1e9:.0f} GFLOP/s)"
+        )
+
+    def stages(self, device: torch.device) -> list[StagePlan]:
+        """All stages in their order."""
+        found = [] if self.existing else [self.features(device)]
+        if self.config.mode != "decouple":
+            found += [self.codebook(), self.index_maps(device)]
+        if self.config.mode == "adc+sc":
+            found.append(self.autoencoder())
+        return [*found, self.field(device)]
+
+    def _teacher_seconds(self, device: torch.device) -> float | None:
+        """One run over all pictures, what is written not counted."""
+        total = add([None if cost.flops is None else count * cost.flops for count, _, cost in self.views])
+        if total is None:
+            return None
+        if device.type == "cuda":
+            speed = measure_speed(device).flops * work.GPU_FEATURES_EFFICIENCY
+            return total / speed + self.count * work.PICTURE_WORK / self.speed.flops
+        return work.features_work(total, self.count, 0) / self.speed.flops
+
+    def features(self, device: torch.device) -> StagePlan:
+        """The teacher over all pictures, and its maps (or the codebook's samples of them) on disk."""
+        flops, forwards = self.cost.flops, self.cost.forwards
+        if flops is None:
+            disk = self.dense_bytes if self.known and self.dense != "recompute" else None
+            return StagePlan("features", f"{self.count} pictures, cost unknown", None, None, disk, disk)
+        network = f"{forwards} x {flops / forwards / 1e12:.2f} TFLOP" if forwards > 1 else f"{flops / 1e12:.2f} TFLOP"
+        peak = work.BASE_BYTES + max(cost.peak_bytes or 0 for _, _, cost in self.views)
+        seconds = self._teacher_seconds(device)
+        if self.dense == "recompute":
+            disk, kept = _HALF * self.samples * self.channels, 0
+            what = f"{self.count} pictures of {network}, samples stored"
+        else:
+            disk, kept = self.dense_bytes, self.dense_bytes if self.dense == "keep" else 0
+            what = f"{self.count} pictures of {network}"
+        assert seconds is not None
+        seconds += disk / _HALF * work.WRITE_WORK / self.speed.flops
+        return StagePlan("features", what, seconds, peak, disk, kept)
+
+    def codebook(self) -> StagePlan:
+        """Adaptive Data Compression, Sec. 3.3.1."""
+        options, first = self.config.codebook, self._grid(self.cost)
+        if not self.known:
+            return StagePlan("codebook", f"{options.epochs + 1} passes over unknown maps", None, None, None, None)
+        size = _FLOAT * options.maximum * self.channels
+        amount = work.codebook_work(
+            self.samples, self.channels, options.maximum, options.epochs, first, raw=self.samples * self.channels
+        )
+        peak = work.BASE_BYTES + work.codebook_peak(first, self.channels, options.maximum, 0)
+        what = f"{options.epochs + 1} passes over {first:,} features a map"
+        return StagePlan("codebook", what, amount / self.speed.flops, peak, size, size)
+
+    def index_maps(self, device: torch.device) -> StagePlan:
+        """Quantisation of every pixel, Eq. 5."""
+        if not self.known:
+            return StagePlan("index maps", f"{self.count} maps of unknown size", None, None, None, None)
+        K = self.config.codebook.maximum
+        seconds: float | None = work.quantize_work(self.pixels, self.channels, K) / self.speed.flops
+        peak, what = work.BASE_BYTES + 2 * self.largest, f"{self.count} maps of {say_size(self.cost.map_size)}"
+        if self.dense == "recompute" and not self.existing:
+            seconds, what = add([seconds, self._teacher_seconds(device)]), f"{what}, each made anew"
+            peak += max(cost.peak_bytes or 0 for _, _, cost in self.views)
+        size = self.pixels * (1 if K <= 255 else 2)
+        return StagePlan("index maps", what, seconds, peak, size, size)
+
+    def autoencoder(self) -> StagePlan:
+        """Semantic Compression, Sec. 3.3.2."""
+        options, K = self.config.autoencoder, self.config.codebook.maximum
+        what = f"{options.steps:,} steps on {K} codewords"
+        if not self.known:
+            return StagePlan("autoencoder", what, None, None, None, None)
+        size = _FLOAT * work.autoencoder_weights(options, self.channels)
+        seconds = work.autoencoder_work(options, self.channels, K) / self.speed.flops
+        return StagePlan("autoencoder", what, seconds, work.BASE_BYTES + 8 * size, size, size)
+
+    def field(self, device: torch.device) -> StagePlan:
+        """Training; parameters of the stage and of the finished field are kept, a checkpoint goes."""
+        options = self.config.field
+        mean, last = work.gaussian_counts(options, self.points)
+        guessed = f"{options.steps:,} steps, {self.points / 1e3:.1f}k points, perhaps {last / 1e3:.1f}k Gaussians"
+        if not self.known:
+            return StagePlan("field", guessed, None, None, None, None)
+        compressed = self.config.mode == "adc+sc"
+        channels = self.config.autoencoder.latent if compressed else self.channels
+        h, w = self.cost.map_size or (0, 0)
+        pixels = work.render_pixels(options, self.views[0][1], (h, w))
+        step = work.step_work(pixels, mean, channels, h * w) / self.speed.flops
+        if device.type == "cuda":
+            faster = measure_speed(device).flops / self.speed.flops
+            step = max(work.GPU_STEP_SECONDS, step / faster)
+        if self.config.mode == "decouple":  # every step reads a dense map
+            step += h * w * channels * work.READ_WORK / self.speed.flops
+        size = work.field_bytes(last, channels)
+        shared = 0 if not compressed else _FLOAT * work.autoencoder_weights(self.config.autoencoder, channels)
+        book = 0 if self.config.mode == "decouple" else _FLOAT * self.config.codebook.maximum * self.channels
+        kept = 2 * size + shared + book
+        targets = (_FLOAT * h * w * channels * 2, self.pixels)
+        peak = work.BASE_BYTES + work.field_peak(pixels, last, channels, targets)
+        return StagePlan("field", guessed, options.steps * step, peak, kept + 3 * size, kept)
+
+    def notes(self, device: torch.device) -> list[str]:
+        """What a reader should know besides the numbers."""
+        found = []
+        if self.cost.flops is None:
+            found.append(f"the cost of {self.cost.name!r} is unknown: no size, time or memory of its maps is foretold")
+        if device.type == "cuda":
+            found.append(
+                "times of features and field on the GPU are estimates from operations and an assumed efficiency; none was "
+                "measured"
+            )
+        if self.points < 2:
+            found.append(f"the scene has {self.points} points; training needs some: estimate them with `kfgs sfm`")
+        if self.existing or not self.known:
+            return found
+        if self.dense == "keep" and self.config.mode != "decouple":
+            left = f"the {say_bytes(self.dense_bytes)} of maps can be deleted once there are index maps"
+            found.append(f"{left} (kfgs fit --discard-features)")
+        return found
+
+
+def add(values: list[Any]) -> Any:
+    """Their sum, or None if one is not known."""
+    return None if any(value is None for value in values) else sum(values)
+
+
+def say_size(size: tuple[int, int] | None) -> str:
+    """(h, w) for people."""
+    return "unknown size" if size is None else f"{size[0]}x{size[1]}"
+
+
+def say_bytes(count: float | None) -> str:
+    """Bytes for people."""
+    if count is None:
+        return "unknown"
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
+
+
+def say_time(seconds: float | None) -> str:
+    """Seconds for people."""
+    if seconds is None:
+        return "unknown"
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

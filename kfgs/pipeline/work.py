@@ -1,0 +1,140 @@
+"""How much work and memory each stage of a run takes, as formulas of its sizes with measured constants.
+
+Work is counted in operations of a large float32 matrix product: what a stage takes in seconds, times the speed that such a
+product had in the same process. So the constants carry over to a machine of another speed, as far as its memory keeps up.
+They were measured by `benchmarks/plan_constants.py` on 2026-11-21, on 2 shared cores of a Xeon with AVX-512 (torch 2.13,
+420 GFLOP/s); a machine with many more cores will find times too short, since not every stage divides among them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+from ..fields import FieldConfig
+from ..quant import AutoencoderConfig
+
+FEATURES_EFFICIENCY = 0.45
+"""Share of the matrix product's speed that a vision transformer reaches (its convolutions, norms and softmax included)."""
+PICTURE_WORK = 2e10
+"""Per picture: reading, resizing, digests."""
+WRITE_WORK = 2_400.0
+"""Per number of a dense map: rounding it to half precision, writing and digesting it."""
+READ_WORK = 1_800.0
+"""Per number of a map that is read in half precision and made a float32 one."""
+LOOK_WORK = 200.0
+"""Codebook, per number of a sample: norms, balance of classes, gradient (Eq. 6-9)."""
+LOOK_CODEWORD_WORK = 6.0
+"""The same, per number and codeword: similarities (Eq. 5)."""
+FARTHEST_EFFICIENCY = 0.4
+"""Share of the product's speed in the all-pairs similarities of farthest-point sampling."""
+QUANTIZE_WORK = 300.0
+"""Index maps, per number of a map: norms and checks."""
+QUANTIZE_CODEWORD_WORK = 2.5
+"""The same, per number and codeword."""
+AUTOENCODER_WEIGHT_WORK = 500.0
+"""Autoencoder, per weight and step, by the speed of all threads: Adam, on one thread."""
+AUTOENCODER_ROW_WORK = 8.0
+"""The same, per weight, step and codeword: the products."""
+STEP_WORK = 3.5e8
+"""Field, per step: Python, small kernels."""
+STEP_PIXEL_WORK = (9.0e3, 1.6e3)
+"""The same, per rendered pixel: a constant, and per channel."""
+STEP_GAUSSIAN_WORK = (5.0e3, 3.8e3)
+"""The same, per Gaussian."""
+STEP_TARGET_WORK = 5.2e3
+"""The same, per number of the target map."""
+GPU_FEATURES_EFFICIENCY = 0.4
+"""Assumed, not measured: share of the GPU's own float32 product that a vision transformer reaches."""
+GPU_STEP_SECONDS = 0.005
+"""Assumed, not measured: the least a step of the field takes on a GPU, where launching kernels takes longest."""
+
+BASE_BYTES = 700_000_000
+"""Python, torch, kornia, compiled kernels and a scene."""
+GROWTH = {"dense": 6.0, "sparse": 1.15}
+"""How many times more Gaussians than points training ends with: at a densification gradient below 4e-4, from the paper's
+110.5k (Table 2, 9 channels) against the 18.5k points of room_0; above it, from room_0 and the toy room with the CPU preset."""
+
+
+def features_work(flops: float, pictures: int, written: float) -> float:
+    """Encoding pictures with so many operations in all, and writing so many numbers."""
+    return flops / FEATURES_EFFICIENCY + pictures * PICTURE_WORK + written * WRITE_WORK
+
+
+def codebook_work(samples: float, channels: int, codewords: int, epochs: int, first: int, *, raw: float) -> float:
+    """Fitting the codebook.
+
+    Args:
+        samples: features that are looked at in one pass, all maps together.
+        channels: D.
+        codewords: K_max.
+        epochs: passes, without the last one that counts.
+        first: samples of the first map, from which the first codewords are chosen.
+        raw: numbers that are read from files in one pass.
+    """
+    looks = samples * channels * (epochs + 1) * (LOOK_WORK + LOOK_CODEWORD_WORK * codewords)
+    return looks + (epochs + 1) * raw * READ_WORK + float(first) ** 2 * channels / FARTHEST_EFFICIENCY
+
+
+def quantize_work(pixels: float, channels: int, codewords: int) -> float:
+    """Reading all maps once, and finding each pixel's codeword."""
+    return pixels * channels * (READ_WORK + QUANTIZE_WORK + QUANTIZE_CODEWORD_WORK * codewords)
+
+
+def autoencoder_weights(config: AutoencoderConfig, channels: int) -> int:
+    """Weights and biases of encoder and decoder."""
+    encoder, decoder = (channels, *config.encoder, config.latent), (config.latent, *config.decoder, channels)
+    return sum((a + 1) * b for widths in (encoder, decoder) for a, b in pairwise(widths))
+
+
+def autoencoder_work(config: AutoencoderConfig, channels: int, codewords: int) -> float:
+    """All steps; each takes all codewords."""
+    per_weight = AUTOENCODER_WEIGHT_WORK + AUTOENCODER_ROW_WORK * codewords
+    return config.steps * autoencoder_weights(config, channels) * per_weight
+
+
+def step_work(pixels: float, gaussians: float, channels: int, target: float) -> float:
+    """One step of the field: rendering, loss, gradients and Adam. `target` is the pixels of the map compared with."""
+    by_pixel = STEP_PIXEL_WORK[0] + STEP_PIXEL_WORK[1] * channels
+    by_gaussian = STEP_GAUSSIAN_WORK[0] + STEP_GAUSSIAN_WORK[1] * channels
+    return STEP_WORK + pixels * by_pixel + gaussians * by_gaussian + target * channels * STEP_TARGET_WORK
+
+
+def render_pixels(config: FieldConfig, camera: tuple[int, int], target: tuple[int, int]) -> float:
+    """Pixels that are rendered for a camera of (height, width) pixels and a map of (h, w), mean over the steps."""
+    if config.render_scale is not None:
+        h, w = (min(max(1, round(n * config.render_scale)), c) for n, c in zip(target, camera, strict=True))
+        return float(h * w)
+    total, before = 0.0, 0
+    for last, divisor in (*config.coarse, (config.steps, 1)):
+        until = min(last, config.steps)
+        total += max(0, until - before) / divisor**2
+        before = max(before, until)
+    return camera[0] * camera[1] * total / config.steps
+
+
+def gaussian_counts(config: FieldConfig, points: int) -> tuple[float, int]:
+    """Mean number of Gaussians over the steps, and the last one: a guess (`GROWTH`), growing evenly while it densifies."""
+    until = min(config.densify_until, config.steps)
+    if until <= config.densify_from:
+        return float(points), points
+    last = round(points * GROWTH["dense" if config.densify_gradient < 4e-4 else "sparse"])
+    if config.max_gaussians is not None:
+        last = max(points, min(last, config.max_gaussians))
+    after, during = config.steps - until, until - config.densify_from
+    return (config.densify_from * points + during * (points + last) / 2 + after * last) / config.steps, last
+
+
+def field_bytes(gaussians: int, channels: int) -> int:
+    """Mean, rotation, scale, opacity and features of so many Gaussians, in float32."""
+    return 4 * gaussians * (11 + channels)
+
+
+def codebook_peak(samples: int, channels: int, codewords: int, whole_map: int) -> int:
+    """Samples of one map (four arrays of them), similarities, and the first map's pairs by blocks of 2048 rows."""
+    return 4 * (4 * samples * channels + 3 * samples * codewords + 3 * min(2048, samples) * samples) + whole_map
+
+
+def field_peak(pixels: float, gaussians: int, channels: int, targets: Sequence[int]) -> int:
+    """Parameters with gradients and moments, about eight maps of the rendered size, and what holds the targets."""
+    return int(8 * field_bytes(gaussians, channels) + 8 * 4 * pixels * (channels + 2) + sum(targets))

@@ -1,0 +1,240 @@
+"""What a plan foretells: disk by closed form, stages by mode, the verdict in words, and real runs within its bounds."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from small_room import CONFIG, ROOM, make_room
+
+from kfgs.cameras import Camera
+from kfgs.fields import FieldConfig
+from kfgs.pipeline import FitConfig, fit_scene, plan_stages
+from kfgs.pipeline.machine import Speed, disk_free, measure_speed, memory_free
+from kfgs.pipeline.plan import Plan, plan_scene
+from kfgs.pipeline.work import gaussian_counts, render_pixels
+from kfgs.scenes import Scene, load_scene
+from kfgs.teachers import FeatureFolder
+from kfgs.teachers.costs import TeacherCost
+
+GB = 1e9
+
+
+@pytest.fixture(autouse=True)
+def a_known_speed(request, monkeypatch):
+    """The machine is always as fast, except where a real run is compared."""
+    if "real_speed" not in request.fixturenames:
+        monkeypatch.setattr(plan_stages, "measure_speed", lambda device="cpu": Speed(4e11, 2))
+
+
+@pytest.fixture
+def real_speed():
+    """Ask for the machine's own speed."""
+
+
+@pytest.fixture
+def big(monkeypatch):
+    """A machine with room for everything."""
+    machine(monkeypatch, disk=10**13, memory=10**12)
+
+
+def machine(monkeypatch, *, disk, memory):
+    monkeypatch.setattr("kfgs.pipeline.plan.disk_free", lambda folder: disk)
+    monkeypatch.setattr("kfgs.pipeline.plan.memory_free", lambda: memory)
+
+
+def scene(views=90, size=(479, 639), points=18_543):
+    height, width = size
+    K = torch.tensor([[500.0, 0, width / 2], [0, 500.0, height / 2], [0, 0, 1]])
+    cameras = [Camera(torch.eye(4), K, width, height, name=f"{i}.png") for i in range(views)]
+    paths = [Path(f"{i}.png") for i in range(views)]
+    return Scene(
+        cameras, paths, torch.zeros(points, 3), torch.zeros(points, 3, dtype=torch.uint8), {"train": list(range(views))}
+    )
+
+
+def stages(plan):
+    return {stage.name: stage for stage in plan.stages}
+
+
+def test_the_papers_90_views_take_15_9_gigabytes(big):
+    plan = plan_scene(scene(), config=FitConfig.cpu())
+    assert [stage.name for stage in plan.stages] == ["features", "codebook", "index maps", "autoencoder", "field"]
+    maps = 90 * 360 * 480 * 512 * 2
+    assert stages(plan)["features"].disk_bytes == stages(plan)["features"].kept_bytes == maps
+    assert stages(plan)["index maps"].disk_bytes == 90 * 360 * 480
+    assert maps / GB == pytest.approx(15.9, abs=0.05)
+    assert plan.disk_bytes == sum(stage.disk_bytes for stage in plan.stages)
+    assert plan.peak_bytes == max(stage.peak_bytes for stage in plan.stages) < 4 * GB
+    assert plan.seconds == pytest.approx(sum(stage.seconds for stage in plan.stages))
+    assert plan.fits
+
+
+def test_recomputing_takes_the_samples_disk_and_twice_the_teacher(big):
+    keep, anew = (stages(plan_scene(scene(), config=FitConfig.cpu(), dense=dense)) for dense in ("keep", "recompute"))
+    assert anew["features"].disk_bytes == 90 * 180 * 160 * 512 * 2  # 2.65 GB
+    assert anew["features"].kept_bytes == 0
+    extra = anew["index maps"].seconds - keep["index maps"].seconds
+    assert extra == pytest.approx(keep["features"].seconds, rel=0.1)
+    assert anew["index maps"].peak_bytes > keep["index maps"].peak_bytes
+
+
+def test_discarded_maps_need_the_disk_only_for_a_while(big):
+    plan = plan_scene(scene(), config=FitConfig.cpu(), dense="discard")
+    assert plan.disk_bytes > 15.9 * GB > 0.1 * GB > plan.kept_bytes
+    assert "(for a while)" in next(line for line in str(plan).splitlines() if line.startswith("features"))
+
+
+def test_fast_is_26_times_faster_and_takes_the_same_disk(big):
+    slow, fast = (stages(plan_scene(scene(), options=options))["features"] for options in ({}, {"fast": True}))
+    assert 20 < slow.seconds / fast.seconds <= 26
+    assert slow.disk_bytes == fast.disk_bytes
+
+
+@pytest.mark.parametrize(
+    ("mode", "names"),
+    [
+        ("decouple", ["features", "field"]),
+        ("adc", ["features", "codebook", "index maps", "field"]),
+    ],
+)
+def test_modes_have_their_own_stages(big, mode, names):
+    plan = plan_scene(scene(), config=FitConfig(mode=mode))
+    assert [stage.name for stage in plan.stages] == names
+    nine = stages(plan_scene(scene(), config=FitConfig()))["field"]
+    assert stages(plan)["field"].seconds > 10 * nine.seconds  # 512 channels instead of 9
+    assert stages(plan)["field"].peak_bytes > nine.peak_bytes
+
+
+def test_maps_that_exist_need_no_teacher(big):
+    plan = plan_scene(scene(), teacher=TeacherCost.of_maps("folder", (90, 120, 512)), config=FitConfig.cpu())
+    assert plan.stages[0].name == "codebook"
+    assert plan.disk_bytes < 0.1 * GB
+
+
+def test_views_of_two_sizes_are_added_up(big):
+    both = scene(6)
+    half = [camera.resized(240, 320) for camera in both.cameras[4:]]
+    both.cameras[4:] = half
+    one, other, mixed = (
+        stages(plan_scene(s, teacher="clip"))["features"] for s in (scene(4), scene(2, (240, 320)), both)
+    )
+    assert mixed.disk_bytes == one.disk_bytes + other.disk_bytes
+    assert mixed.seconds == pytest.approx(one.seconds + other.seconds)
+
+
+def test_times_follow_the_measured_speed(big, monkeypatch):
+    fast = plan_scene(scene())
+    monkeypatch.setattr(plan_stages, "measure_speed", lambda device="cpu": Speed(2e11, 2))
+    assert plan_scene(scene()).seconds == pytest.approx(2 * fast.seconds)
+
+
+def test_an_unknown_teacher_is_said_to_be_unknown(big):
+    plan = plan_scene(scene(), teacher="mine:encode")
+    assert plan.seconds is plan.disk_bytes is plan.peak_bytes is plan.fits is None
+    text = str(plan)
+    assert "the cost of 'mine:encode' is unknown" in text
+    assert "unknown whether it fits" in text
+    known = plan_scene(scene(), teacher=TeacherCost("mine", 64, (90, 120), None, None, None))
+    assert known.disk_bytes > 90 * 90 * 120 * 64 * 2
+    assert known.seconds is None
+    assert stages(known)["field"].seconds > 0
+
+
+def test_too_little_disk_is_said_with_what_helps(monkeypatch):
+    machine(monkeypatch, disk=int(12.3e9), memory=10**11)
+    plan = plan_scene(scene())
+    assert plan.fits is False
+    assert re.search(
+        r"does not fit: needs 16\.0 GB on disk, 12\.3 GB free; --fast does not change that, recompute instead of storing: "
+        r"2\.7 GB on disk.*kfgs fit SCENE --teacher",
+        plan.verdict,
+    )
+    machine(monkeypatch, disk=10**9, memory=10**11)
+    assert "smaller maps (--size), or use a larger disk" in plan_scene(scene(), dense="recompute").verdict
+
+
+def test_too_little_memory_is_said(monkeypatch):
+    machine(monkeypatch, disk=10**13, memory=10**9)
+    plan = plan_scene(scene())
+    assert plan.fits is False
+    assert re.search(
+        r"does not fit: needs .* GB of memory \(features\), 1\.0 GB free; ask for smaller maps", plan.verdict
+    )
+    machine(monkeypatch, disk=10**13, memory=None)
+    assert plan_scene(scene()).fits
+
+
+def test_the_table_is_aligned_and_the_json_complete(big):
+    plan = plan_scene(scene(), config=FitConfig.cpu())
+    lines = str(plan).splitlines()
+    table = lines[2 : 2 + 1 + 5 + 2]
+    column = table[0].index("memory") + len("memory")
+    assert [line[column] for line in table] == [" "] * len(table)  # the end of a right-aligned column
+    assert all(line[column - 1] != " " for line in table)
+    assert lines[0].startswith("90 views of 639x479, lseg (512 channels at 360x480, kept), adc+sc, 2000 steps")
+    read = json.loads(json.dumps(plan.to_json()))
+    assert read["disk_bytes"] == plan.disk_bytes
+    assert read["stages"][0]["name"] == "features"
+    assert read["verdict"] == "fits"
+
+
+def test_a_gpus_times_are_called_estimates(big, monkeypatch):
+    monkeypatch.setattr("kfgs.pipeline.plan.training_device", lambda device: torch.device("cuda"))
+    monkeypatch.setattr(
+        plan_stages,
+        "measure_speed",
+        lambda device="cpu": Speed(4e13 if torch.device(device).type == "cuda" else 4e11, 2),
+    )
+    plan = plan_scene(scene(), device="cuda")
+    assert "assumed efficiency; none was measured" in str(plan)
+    assert stages(plan)["features"].seconds < 600
+
+
+def test_a_scene_without_points_is_told(big):
+    assert "the scene has 0 points" in str(plan_scene(scene(points=0)))
+
+
+def test_dense_maps_of_decouple_must_be_kept():
+    with pytest.raises(ValueError, match=r"dense: expected 'keep' with mode 'decouple', .* got 'discard'; keep them"):
+        plan_scene(scene(2), config=FitConfig(mode="decouple"), dense="discard")
+    with pytest.raises(ValueError, match=r"dense: expected one of 'keep', 'discard', 'recompute', got 'none'"):
+        plan_scene(scene(2), dense="none")
+
+
+def test_gaussians_grow_while_it_densifies():
+    config = FieldConfig(steps=100, densify_from=20, densify_until=60)
+    mean, last = gaussian_counts(config, 1000)
+    assert last == 6000
+    assert mean == pytest.approx((20 * 1000 + 40 * 3500 + 40 * 6000) / 100)
+    assert gaussian_counts(FieldConfig(steps=100, max_gaussians=2000, densify_from=20), 1000)[1] == 2000
+    assert gaussian_counts(FieldConfig(steps=100, max_gaussians=500, densify_from=20), 1000)[1] == 1000
+    assert gaussian_counts(FieldConfig(steps=100, densify_from=500), 1000) == (1000, 1000)
+
+
+def test_rendered_pixels_follow_scale_and_coarse_steps():
+    assert render_pixels(FieldConfig(), (479, 639), (360, 480)) == 479 * 639
+    assert render_pixels(FieldConfig(render_scale=2.0), (479, 639), (90, 120)) == 180 * 240
+    assert render_pixels(FieldConfig(render_scale=2.0), (479, 639), (360, 480)) == 479 * 639  # the camera's at most
+    coarse = FieldConfig(steps=100, coarse=((50, 2),))
+    assert render_pixels(coarse, (40, 60), (40, 60)) == pytest.approx(2400 * (0.5 / 4 + 0.5))
+
+
+def test_the_machine_is_looked_at(tmp_path):
+    assert measure_speed(seconds=0.05).flops > 1e8
+    assert disk_free(tmp_path / "not" / "there") > 0
+    assert memory_free() is None or memory_free() > 10**7
+
+
+def test_a_real_run_writes_what_was_planned(tmp_path, real_speed):
+    """Disk to a tenth; time within a factor that bounds slips of units, not the noise of a busy machine."""
+    room = load_scene(make_room(tmp_path / "scene"))
+    maps = FeatureFolder(tmp_path / "scene" / "features", [room.stem(i) for i in room.views("train")])
+    plan = plan_scene(room, teacher=TeacherCost.of_maps("folder", maps.shape), config=CONFIG, folder=tmp_path)
+    assert isinstance(plan, Plan)
+    result = fit_scene(room, maps, tmp_path / "run", CONFIG)
+    written = sum(path.stat().st_size for path in (tmp_path / "run").rglob("*.safetensors"))
+    assert plan.kept_bytes == pytest.approx(written, rel=0.25)
+    assert plan.seconds / 20 < result.seconds < plan.seconds * 20
+    assert ROOM.feature_dim == maps.shape[2]
