@@ -63,8 +63,8 @@ def find_source(kind: str, source: str | Path) -> Path | str:
     )
 
 
-def read_config(kind: str, source: Path | str, *, local_only: bool) -> dict[str, Any]:
-    """The model's config.json, checked to be of one of the kind's model types.
+def read_config(kind: str, source: Path | str, *, local_only: bool) -> tuple[str, str | None]:
+    """The model type in config.json, one of the kind's, and the hub's commit (None for a folder).
 
     Raises:
         FileNotFoundError: if the folder has none.
@@ -78,10 +78,13 @@ def read_config(kind: str, source: Path | str, *, local_only: bool) -> dict[str,
                 f"{source}: expected a folder as save_pretrained writes it (config.json and weights) for teacher {kind!r}, "
                 f"got {what}; download the whole repository"
             )
-        config = read_json(file)
     else:
+        require_transformers()
         with _explained(kind, source):
-            config, _ = require_transformers().PreTrainedConfig.get_config_dict(source, local_files_only=local_only)
+            from huggingface_hub import hf_hub_download  # comes with transformers
+
+            file = Path(hf_hub_download(source, "config.json", local_files_only=local_only))
+    config = read_json(file)
     found = config.get("model_type") if isinstance(config, dict) else None
     expected = TRANSFORMERS[kind].models
     if found not in expected:
@@ -91,10 +94,10 @@ def read_config(kind: str, source: Path | str, *, local_only: bool) -> dict[str,
             f"{source}: expected a model of type {' or '.join(map(repr, expected))} for teacher {kind!r}, got "
             f"{found!r}; {hint}"
         )
-    return config
+    return found, None if isinstance(source, Path) else file.parent.name  # .../snapshots/<commit>/config.json
 
 
-def load_model(kind: str, source: Path | str, model_type: str, *, local_only: bool) -> Any:
+def load_model(kind: str, source: Path | str, model_type: str, commit: str | None, *, local_only: bool) -> Any:
     """The model in float32, with every weight out of the files and none left as it was drawn.
 
     Raises:
@@ -104,13 +107,17 @@ def load_model(kind: str, source: Path | str, model_type: str, *, local_only: bo
     name = TRANSFORMERS[kind].models[model_type][0]
     with _explained(kind, source), quiet(transformers):
         model, info = getattr(transformers, name).from_pretrained(
-            source, dtype=torch.float32, local_files_only=local_only, output_loading_info=True
+            source,
+            dtype=torch.float32,
+            output_loading_info=True,
+            local_files_only=local_only,
+            **_revision(commit),
         )
     refuse_gaps(source, name, info)
     return model.eval()
 
 
-def load_tokenizer_of(kind: str, source: Path | str, *, local_only: bool) -> Any:
+def load_tokenizer_of(kind: str, source: Path | str, commit: str | None, *, local_only: bool) -> Any:
     """The tokenizer beside the weights.
 
     Raises:
@@ -118,7 +125,9 @@ def load_tokenizer_of(kind: str, source: Path | str, *, local_only: bool) -> Any
     """
     transformers = require_transformers()
     with _explained(kind, source, "a tokenizer"), quiet(transformers):
-        return transformers.AutoTokenizer.from_pretrained(source, local_files_only=local_only, trust_remote_code=False)
+        return transformers.AutoTokenizer.from_pretrained(
+            source, local_files_only=local_only, trust_remote_code=False, **_revision(commit)
+        )
 
 
 def refuse_gaps(source: Path | str, name: str, info: dict[str, Any]) -> None:
@@ -133,10 +142,10 @@ def refuse_gaps(source: Path | str, name: str, info: dict[str, Any]) -> None:
         )
 
 
-def weights_of(source: Path | str, model: Any = None) -> str:
-    """What tells these weights from others: a digest of the folder's files, or the hub's commit."""
+def weights_of(source: Path | str, commit: str | None = None) -> str:
+    """What tells these weights from others: a digest of the folder's files (or of a file), or the hub's commit."""
     if isinstance(source, str):
-        return f"commit {getattr(model.config, '_commit_hash', None)}"
+        return f"commit {commit}"
     files = [source] if source.is_file() else sorted(file for glob in _WEIGHTS for file in source.glob(glob))
     config = [] if source.is_file() else sorted(source.glob("*config.json"))
     return digest_value([[file.name, digest_file(file)] for file in [*config, *files]])
@@ -174,6 +183,10 @@ def _explained(kind: str, source: Path | str, what: str = "weights") -> Iterator
             hint = "download the folder and pass its path"
             message = f"expected {what} of teacher {kind!r}, could not reach them on the hub (nor is it a local folder)"
         raise ValueError(f"{source}: {message} ({one_line(error)}); {hint}") from error
+
+
+def _revision(commit: str | None) -> dict[str, str]:
+    return {} if commit is None else {"revision": commit}
 
 
 def one_line(error: BaseException) -> str:

@@ -14,7 +14,7 @@ from torch.nn.functional import interpolate, normalize
 from .._check import check_choice, check_shapes, check_whole
 from .transformers_openclip import find_openclip, load_openclip
 from .transformers_patches import Patches, patch_size
-from .transformers_source import find_source, load_model, read_config, weights_of
+from .transformers_source import find_source, load_model, load_tokenizer_of, read_config, weights_of
 from .transformers_table import TRANSFORMERS, TeacherRow
 from .transformers_text import Tokenize, bpe_tokenize, has_tokenizer, hub_tokenize
 
@@ -58,22 +58,15 @@ def load_transformers_teacher(
     found = find_source(kind, source)
     openclip = _openclip_of(row, found)
     if openclip is not None:
-        model, model_type, weights = load_openclip(openclip), "clip", weights_of(openclip)
+        model, model_type, commit = load_openclip(openclip), "clip", None
     else:
-        model_type = read_config(kind, found, local_only=local_only)["model_type"]
-        model = load_model(kind, found, model_type, local_only=local_only)
-        weights = weights_of(found, model)
+        model_type, commit = read_config(kind, found, local_only=local_only)
+        model = load_model(kind, found, model_type, commit, local_only=local_only)
+    weights = weights_of(openclip or found, commit)
     identity = {"name": kind, "options": {"size": size, "residual": bool(residual)}, "weights": weights}
     if isinstance(found, str):
         identity["source"] = found
-    tokenize = None
-    if row.text is not None:
-        folder = found.parent if isinstance(found, Path) and found.is_file() else found
-        if "clip" in row.models and isinstance(folder, Path) and not has_tokenizer(folder):
-            tokenize = bpe_tokenize()
-        else:
-            longest = int(model.config.text_config.max_position_embeddings)
-            tokenize = hub_tokenize(kind, folder, row.text, longest, local_only=local_only)
+    tokenize = _tokenize_of(kind, found, commit, model, local_only=local_only) if row.text is not None else None
     return TransformersTeacher(model, row, row.models[model_type][1], identity, tokenize)
 
 
@@ -85,6 +78,19 @@ def _openclip_of(row: TeacherRow, source: Path | str) -> Path | None:
         isinstance(source, Path) and (source / "config.json").is_file() and any(source.glob("model*.safetensors"))
     )
     return None if complete else find_openclip(source)
+
+
+def _tokenize_of(kind: str, source: Path | str, commit: str | None, model: Any, *, local_only: bool) -> Tokenize:
+    """The tokenizer beside the weights; CLIP's own vocabulary where none lies there and the kind has that one."""
+    row = TRANSFORMERS[kind]
+    folder = source.parent if isinstance(source, Path) and source.is_file() else source
+    if "clip" in row.models and isinstance(folder, Path) and not has_tokenizer(folder):
+        return bpe_tokenize()
+    assert row.text is not None
+    longest = int(model.config.text_config.max_position_embeddings)
+    return hub_tokenize(
+        kind, folder, row.text, longest, lambda: load_tokenizer_of(kind, folder, commit, local_only=local_only)
+    )
 
 
 class TransformersTeacher:

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .transformers_source import load_tokenizer_of
 from .transformers_table import TextRule
 
 Tokenize = Callable[[list[str]], tuple[Tensor, Tensor]]  # n prompts -> ids [n, T], mask [n, T] (0: padding)
@@ -22,8 +21,16 @@ def has_tokenizer(folder: Path) -> bool:
     return any((folder / name).is_file() for name in _TOKENIZER_FILES)
 
 
-def hub_tokenize(kind: str, source: Path | str, rule: TextRule, longest: int, *, local_only: bool) -> Tokenize:
-    """The tokenizer of `source`, read at the first prompt, so that pictures alone need none."""
+def hub_tokenize(kind: str, source: Path | str, rule: TextRule, longest: int, load: Callable[[], Any]) -> Tokenize:
+    """A tokenizer of transformers that `load` reads at the first prompt, so that pictures alone need none.
+
+    Args:
+        kind: the teacher's name, for messages.
+        source: the folder or hub id that `load` reads from.
+        rule: what the text tower was trained with.
+        longest: tokens that the text tower takes; a longer prompt is refused, not cut.
+        load: reads the tokenizer.
+    """
     loaded: list[Any] = []
 
     def tokenize(prompts: list[str]) -> tuple[Tensor, Tensor]:
@@ -33,7 +40,7 @@ def hub_tokenize(kind: str, source: Path | str, rule: TextRule, longest: int, *,
                 "...), got none; download those files too, or use a text table made elsewhere"
             )
         if not loaded:
-            loaded.append(load_tokenizer_of(kind, source, local_only=local_only))
+            loaded.append(load())
         found = loaded[0](
             [prompt.lower() for prompt in prompts] if rule.lower else prompts,
             **({"padding": "max_length", "max_length": longest} if rule.pad else {"padding": True}),

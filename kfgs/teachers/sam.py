@@ -1,0 +1,160 @@
+"""Segment Anything's image encoder as a teacher, over kornia: 256 channels on a grid of 64 cells along the longer side."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from kornia.enhance import normalize as normalize_picture
+from kornia.models.sam import Sam, SamConfig
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from .checkpoint import read_checkpoint, weights_digest
+from .transformers_teacher import check_picture, resize_picture
+
+_SIDE = 1024  # pixels of the square that the encoder sees
+_GRID = 64  # cells of its map
+_MEAN, _STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)  # of bytes
+_PREFIX = "image_encoder."
+
+
+def load_sam(source: str | Path) -> SamTeacher:
+    """Load the image encoder out of a checkpoint of Segment Anything (vit_b, vit_l, vit_h, or MobileSAM).
+
+    Which one it is follows from the shapes of its weights.
+
+    Args:
+        source: `sam_vit_b_01ec64.pth`, `sam_vit_l_0b3195.pth`, `sam_vit_h_4b8939.pth` or `mobile_sam.pt` as Meta and
+            MobileSAM publish them; read without running what a pickle may carry.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is damaged, or no checkpoint of SAM; the message says what is missing.
+    """
+    path = Path(source).expanduser()
+    state = read_checkpoint(path)
+    encoder_state = {
+        name.removeprefix(_PREFIX): tensor.float() if tensor.is_floating_point() else tensor
+        for name, tensor in state.items()
+        if name.startswith(_PREFIX)
+    }
+    if not encoder_state:
+        raise ValueError(
+            f"{path}: expected a checkpoint of Segment Anything, with weights {_PREFIX}..., got {len(state)} weights, the "
+            f"first {next(iter(state), 'none')!r}; use sam_vit_b_01ec64.pth or another of SAM 1 (not 2 or 3)"
+        )
+    config = _config_of(path, encoder_state)
+    encoder = _build(config)
+    _check_fit(path, encoder, encoder_state)
+    encoder.load_state_dict(encoder_state, assign=True)
+    identity = {"name": "sam", "options": {}, "weights": weights_digest(path)}
+    return SamTeacher(encoder.eval().requires_grad_(False), identity)
+
+
+class SamTeacher:
+    """SAM's image encoder; made by `load_sam`. It knows no text.
+
+    The longer side of a picture is resized to 1024, the rest of the square is padded at the bottom or right, and the
+    padding is cut from the map again, as Feature 3DGS does: [256, int(64 H / W + 0.5), 64] of a picture wider than high.
+
+    Attributes:
+        encoder: kornia's image encoder, in evaluation mode.
+        name: "sam".
+        identity: name and a digest of the weights.
+    """
+
+    name = "sam"
+
+    def __init__(self, encoder: nn.Module, identity: dict[str, Any]) -> None:
+        self.encoder, self.identity = encoder, identity
+
+    def to(self, device: torch.device | str) -> SamTeacher:
+        """Move the encoder to a device; features are computed and returned there."""
+        self.encoder.to(device)
+        return self
+
+    @torch.inference_mode()
+    def encode_image(self, image: Tensor) -> Tensor:  # [3, H, W] RGB in [0, 1] -> [256, h, w], the longer of h, w is 64
+        """One feature per cell, not normalised.
+
+        Raises:
+            TypeError: if the picture is not floating-point.
+            ValueError: if it is not [3, H, W].
+        """
+        check_picture(image)
+        weight = next(self.encoder.parameters())
+        height, width = _scaled(image, _SIDE)
+        pixels = resize_picture(image.to(weight.device, weight.dtype), (height, width))[None]
+        mean, std = (torch.tensor(values, device=weight.device, dtype=weight.dtype) / 255 for values in (_MEAN, _STD))
+        pixels = pad(normalize_picture(pixels, mean, std), (0, _SIDE - width, 0, _SIDE - height))
+        rows, columns = _scaled(image, _GRID)
+        return self.encoder(pixels)[0, :, :rows, :columns].float().contiguous()
+
+    def encode_text(self, prompts: Sequence[str]) -> Tensor:
+        """Always raises: SAM has no text encoder.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError(
+            "teacher 'sam': expected one with a text encoder, got one that sees only pictures; use clip, siglip, tipsv2 or "
+            "lseg for words, or query it by examples"
+        )
+
+
+def _scaled(image: Tensor, longest: int) -> tuple[int, int]:
+    """(height, width) of a picture whose longer side becomes `longest`."""
+    H, W = image.shape[1:]
+    scale = longest / max(H, W)
+    return max(1, int(scale * H + 0.5)), max(1, int(scale * W + 0.5))
+
+
+def _config_of(path: Path, state: dict[str, Tensor]) -> SamConfig:
+    """The encoder's sizes: width, depth, heads, and which blocks see the whole picture."""
+    if "patch_embed.seq.0.c.weight" in state:
+        return SamConfig("mobile_sam")
+    try:
+        width = state["patch_embed.proj.weight"].shape[0]
+        blocks = {int(found[1]) for name in state if (found := re.match(r"blocks\.(\d+)\.", name))}
+        positions = {i: state[f"blocks.{i}.attn.rel_pos_h"] for i in blocks}  # [2 side - 1, channels of a head]
+        everywhere = tuple(sorted(i for i, table in positions.items() if table.shape[0] == 2 * _GRID - 1))
+        heads = width // positions[0].shape[1]
+    except (KeyError, IndexError, ZeroDivisionError) as error:
+        raise ValueError(
+            f"{path}: expected the image encoder of Segment Anything (vit_b, vit_l, vit_h or mobile_sam), got one without "
+            f"{error}; use a checkpoint of SAM 1"
+        ) from error
+    return SamConfig(
+        encoder_embed_dim=width,
+        encoder_depth=len(blocks),
+        encoder_num_heads=heads,
+        encoder_global_attn_indexes=everywhere,
+    )
+
+
+def _build(config: SamConfig) -> nn.Module:
+    """The encoder; on no device where all its tensors come from a checkpoint, since drawing 637 M weights takes long."""
+    if config.model_type is not None:  # TinyViT computes a table of indices that no checkpoint holds
+        return Sam.from_config(config).image_encoder
+    with torch.device("meta"):
+        return Sam.from_config(config).image_encoder
+
+
+def _check_fit(path: Path, encoder: nn.Module, state: dict[str, Tensor]) -> None:
+    """Raise a ValueError that names the first weight that is missing, left over, or of another shape."""
+    expected = {name: tuple(tensor.shape) for name, tensor in encoder.state_dict().items()}
+    got = {name: tuple(tensor.shape) for name, tensor in state.items()}
+    wrong = [
+        f"{name!r} {got.get(name, 'missing')} instead of {expected.get(name, 'none')}"
+        for name in [*expected, *(name for name in got if name not in expected)]
+        if got.get(name) != expected.get(name)
+    ]
+    if wrong:
+        raise ValueError(
+            f"{path}: expected the weights of SAM's image encoder, {len(wrong)} missing, left over or of another shape, the "
+            f"first {wrong[0]}; use a checkpoint of SAM 1 as it was published"
+        )

@@ -1,0 +1,169 @@
+"""Where a model comes from: what is wrong with a folder, a hub id, a file or the environment, in one line."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+transformers = pytest.importorskip("transformers")
+
+from safetensors.torch import load_file, save_file  # noqa: E402
+from tiny_transformers import write_teacher  # noqa: E402
+
+import kfgs  # noqa: E402
+from kfgs.teachers.transformers_teacher import load_transformers_teacher  # noqa: E402
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return write_teacher(tmp_path / "clip", "clip")
+
+
+def one_line(error: pytest.ExceptionInfo) -> bool:
+    return "\n" not in str(error.value)
+
+
+def test_model_of_another_type_is_named(folder):
+    with pytest.raises(
+        ValueError, match="model of type 'siglip' for teacher 'siglip', got 'clip'; load it as teacher 'cl"
+    ):
+        load_transformers_teacher("siglip", folder)
+    (folder / "config.json").write_text(json.dumps({"model_type": "bert"}))
+    with pytest.raises(ValueError, match="for teacher 'clip', got 'bert'; name the folder of such a model"):
+        load_transformers_teacher("clip", folder)
+
+
+def test_folder_without_config_and_files_are_refused(folder, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FileNotFoundError, match="as save_pretrained writes it .* got a folder without config.json"):
+        load_transformers_teacher("dinov2", tmp_path / "empty")
+    with pytest.raises(FileNotFoundError, match="got a folder without config.json"):
+        load_transformers_teacher("clip", tmp_path / "empty")
+    with pytest.raises(FileNotFoundError, match="for teacher 'dinov2', got a file"):
+        load_transformers_teacher("dinov2", folder / "model.safetensors")
+    (folder / "config.json").write_text("{")
+    with pytest.raises(ValueError, match="expected a JSON file"):
+        load_transformers_teacher("clip", folder)
+
+
+def test_path_where_nothing_lies_is_not_looked_up_on_the_hub(tmp_path):
+    for source in (tmp_path / "none", str(tmp_path / "none"), Path("owner/name"), "./clip", "clip-vit", "a/b/c"):
+        with pytest.raises(FileNotFoundError, match="or a hub id owner/name\\), got a path where nothing lies"):
+            load_transformers_teacher("clip", source)
+
+
+def test_hub_id_out_of_reach_is_one_line(monkeypatch):
+    with pytest.raises(
+        ValueError, match="owner/name: .* could not reach them on the hub.*download the folder and"
+    ) as error:
+        load_transformers_teacher("clip", "owner/name", local_only=True)
+    assert one_line(error)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    with pytest.raises(ValueError, match="owner/name: .* could not reach them on the hub") as error:
+        load_transformers_teacher("dinov2", "owner/name")
+    assert one_line(error)
+
+
+def test_hub_id_is_read_from_the_local_cache(tmp_path, monkeypatch):
+    commit = "0123456789abcdef0123456789abcdef01234567"
+    repository = tmp_path / "models--owner--tiny-dino"
+    write_teacher(repository / "snapshots" / commit, "dinov2")
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text(commit)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    teacher = load_transformers_teacher("dinov2", "owner/tiny-dino", local_only=True)
+    assert teacher.encode_image(torch.rand(3, 16, 24)).shape == (32, 2, 3)
+    assert teacher.identity["source"] == "owner/tiny-dino"
+    assert teacher.identity["weights"] == f"commit {commit}"
+
+
+def test_missing_and_damaged_weights_are_refused(folder):
+    weights = folder / "model.safetensors"
+    state = load_file(weights)
+    name = "vision_model.encoder.layers.1.self_attn.v_proj.weight"
+    save_file({key: tensor for key, tensor in state.items() if key != name}, weights, {"format": "pt"})
+    with pytest.raises(
+        ValueError, match=f"expected every weight of CLIPModel, 1 missing .* the first '{name}'"
+    ) as error:
+        load_transformers_teacher("clip", folder)
+    assert one_line(error)
+    save_file({**state, name: torch.zeros(32, 5)}, weights, {"format": "pt"})
+    with pytest.raises(ValueError, match="clip: expected ") as error:
+        load_transformers_teacher("clip", folder)
+    assert one_line(error)
+    weights.write_bytes(weights.read_bytes()[:1000])
+    with pytest.raises(ValueError, match="expected weights of teacher 'clip', but they cannot be read") as error:
+        load_transformers_teacher("clip", folder)
+    assert one_line(error)
+    weights.unlink()
+    with pytest.raises(
+        ValueError, match="expected weights of teacher 'clip', but they cannot be read.*model.safetensors"
+    ):
+        load_transformers_teacher("clip", folder)
+
+
+def test_weights_as_a_bin_file_run_nothing(folder, tmp_path):
+    class Payload:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "run"),)
+
+    (folder / "model.safetensors").unlink()
+    torch.save({"weight": Payload()}, folder / "pytorch_model.bin")
+    with pytest.raises(ValueError, match="expected weights of teacher 'clip', but they cannot be read"):
+        load_transformers_teacher("clip", folder)
+    assert not (tmp_path / "run").exists()
+
+
+def test_pictures_need_no_tokenizer_but_words_do(tmp_path):
+    folder = write_teacher(tmp_path / "siglip", "siglip")
+    for file in folder.glob("tokenizer*"):
+        file.unlink()
+    teacher = load_transformers_teacher("siglip", folder)
+    assert teacher.encode_image(torch.rand(3, 16, 24)).shape == (32, 2, 3)
+    with pytest.raises(
+        ValueError, match="expected a tokenizer beside the weights of teacher 'siglip' .*, got none; downl"
+    ):
+        teacher.encode_text(["wall"])
+    (folder / "tokenizer.json").write_text("{}")
+    with pytest.raises(ValueError, match="expected a tokenizer of teacher 'siglip', but they cannot be read"):
+        teacher.encode_text(["wall"])
+
+
+def test_loading_draws_no_bar_and_says_nothing(folder, capfd):
+    load_transformers_teacher("clip", folder)
+    captured = capfd.readouterr()
+    assert captured.out == ""
+    assert captured.err == ""
+
+
+def test_missing_package_names_the_line_to_install_it(folder, monkeypatch):
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(ImportError, match=r'transformers: expected it .* install it with `pip install "kfgs\[hf\]"`'):
+        load_transformers_teacher("clip", folder)
+
+
+def test_torchvision_that_does_not_import_is_reported_as_what_it_is(folder, tmp_path):
+    package = tmp_path / "site" / "torchvision"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("raise RuntimeError('operator torchvision::nms does not exist')")
+    code = f"from kfgs.teachers.transformers_teacher import load_transformers_teacher as load; load('clip', {str(folder)!r})"
+    root = str(Path(kfgs.__file__).parents[1])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path / "site"), root])}
+    found = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
+    assert found.returncode == 1
+    last = found.stderr.strip().splitlines()[-1]
+    assert last.startswith("ImportError: torchvision: expected none, or the build that belongs to torch")
+    assert "RuntimeError: operator torchvision::nms does not exist" in last
+    assert "`pip uninstall torchvision`" in last
+
+
+def test_table_is_read_without_transformers():
+    code = (
+        "import sys; from kfgs.teachers.transformers_table import TRANSFORMERS; "
+        "assert 'clip' in TRANSFORMERS and 'transformers' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(kfgs.__file__).parents[1], timeout=120)
