@@ -23,6 +23,7 @@ except ImportError:  # Windows: two processes on one folder are not told apart t
     fcntl = None  # type: ignore[assignment]
 
 LOCK = ".features.lock"
+ROW_BLOCK = 8  # rows of a map rounded at a time: 4 MB at 480 x 512 channels
 
 
 @contextmanager
@@ -63,8 +64,13 @@ def encode_half(teacher: Teacher, picture: Tensor, path: Path) -> Tensor:  # [H,
         features = check_features(teacher.name, teacher.encode_image(picture.permute(2, 0, 1).contiguous()))
         D, h, w = features.shape
         half = torch.empty(h, w, D, dtype=torch.float16, device=features.device)
-        half.copy_(features.permute(1, 2, 0))
-        if not bool(torch.isfinite(half).all()):
+        finite = torch.ones((), dtype=torch.bool, device=features.device)
+        for start in range(0, h, ROW_BLOCK):  # what is in a processor's cache is cheap to look at twice
+            rows = half[start : start + ROW_BLOCK]
+            rows.copy_(features[:, start : start + ROW_BLOCK].permute(1, 2, 0))
+            # NaN and infinity outlast a sum, which overflows from none that is finite; isfinite takes six times as long
+            finite &= torch.isfinite(rows.sum(dtype=torch.float32))
+        if not bool(finite):
             _refuse(teacher.name, features, path)
     return half.cpu()
 
