@@ -20,6 +20,7 @@ from .layouts import (
     ROW_BLOCK,
     Reading,
     StoredMap,
+    count_bad,
     layout_of,
     open_map,
     partner_of,
@@ -48,7 +49,8 @@ class FeatureFolder(Sequence[Tensor]):
         channels: D that is expected, for instance that of the text embeddings; taken from the first map if None.
         sizes: (H, W) of each view's picture, which tells [h, w, D] from [D, h, w] where nothing else does.
         level: of LangSplat's masks: 0 to 3, or `default`, `s`, `m`, `l`.
-        stride: of LangSplat's masks, which are as large as the pictures: one cell per so many pixels.
+        stride: of LangSplat's masks, which are as large as the pictures: one cell per so many pixels; None: the least
+            stride that leaves no more cells than 360 x 480.
 
     Raises:
         NotADirectoryError: if `path` is no folder.
@@ -74,12 +76,13 @@ class FeatureFolder(Sequence[Tensor]):
         channels: int | None = None,
         sizes: Sequence[tuple[int, int]] | None = None,
         level: int | str = 0,
-        stride: int = 1,
+        stride: int | None = None,
     ) -> None:
         self.path = Path(path)
         if not self.path.is_dir():
             raise NotADirectoryError(f"path: expected a folder of feature maps, got {self.path}; check its name")
-        check_whole("stride", stride, 1)
+        if stride is not None:
+            check_whole("stride", stride, 1)
         self.channels = channels
         self.reading = Reading(channels=channels, level=parse_level(level), stride=stride)
         manifest = read_manifest(self.path)
@@ -133,7 +136,7 @@ class FeatureFolder(Sequence[Tensor]):
         values, bad = torch.empty(self.shape, dtype=torch.float32), 0
         for start in range(0, self.shape[0], ROW_BLOCK):  # by rows, so that the values are all that is in memory
             rows = slice(start, start + ROW_BLOCK)
-            bad += _count_bad(read_block(stored, rows, out=values[rows]))
+            bad += count_bad(read_block(stored, rows, out=values[rows]))
         self._check_finite(index, bad)
         return values
 
@@ -145,7 +148,7 @@ class FeatureFolder(Sequence[Tensor]):
         """
         stored = self._checked(i)
         values = read_block(stored, *grid_slices(*self.shape[:2], step, samples=samples))
-        self._check_finite(i, _count_bad(values))
+        self._check_finite(i, count_bad(values))
         return values.reshape(-1, self.shape[2])
 
     def digests(self) -> list[list[str]] | None:
@@ -160,7 +163,7 @@ class FeatureFolder(Sequence[Tensor]):
             record = self._record(i)
             if langsplat[i]:
                 both = digest_file(file) + digest_file(partner_of(file, LANGSPLAT))
-                result.append([f"{file.name} level {self.reading.level} stride {self.reading.stride}", both])
+                result.append([f"{file.name} level {self.reading.level} stride {self.reading.stride or 'auto'}", both])
             elif record is not None:
                 result.append([file.name, record.digest])
             elif any(langsplat):
@@ -213,8 +216,11 @@ def save_feature_map(path: str | Path, stem: str, features: Tensor) -> Path:  # 
         ValueError: if `features` is not [h, w, D], or not finite once it is float16 (largest value 65504).
     """
     check_shapes(("features", features, "h w D"))
-    half = features.detach().cpu().permute(2, 0, 1).to(torch.float16).contiguous()
-    if not torch.isfinite(half).all():
+    h, w, D = features.shape
+    half = torch.empty(D, h, w, dtype=torch.float16)
+    for i in range(h):  # row by row, which transposes in the cache: 0.3 s instead of 5 s at 360 x 480 x 512
+        half[:, i] = features[i].detach().to(torch.float16).T.contiguous()
+    if count_bad(half):
         raise ValueError(
             f"features: expected finite values below 65504 (they are stored as float16), got others in {stem!r}; "
             "normalise the rows"
@@ -252,7 +258,3 @@ def _find_files(folder: Path, stems: list[str], gone: dict[str, MapRecord]) -> l
     if missing:
         raise FileNotFoundError(f"{folder}: {explain_missing(folder, stems, missing)}")
     return [files[0] for files in found]
-
-
-def _count_bad(values: Tensor) -> int:
-    return int((~torch.isfinite(values)).sum())

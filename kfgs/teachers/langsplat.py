@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from .._check import check_choice, check_whole
 
 INDEX, ROWS = "_s.npy", "_f.npy"  # what follows the stem: masks [L, H, W], and their features [M, D]
+CELLS = 360 * 480  # most cells of a map when no stride is named: those of the paper's maps, 354 MB at 512 channels
 LEVELS = ("default", "s", "m", "l")  # SAM's own choice of masks; subparts, parts, wholes
 
 
@@ -24,15 +25,16 @@ class MaskFeatures:
             [M, D]; -1 is no mask.
         level: which of the L sets of masks.
         stride: one cell per so many pixels; the map is [round(H / stride), round(W / stride), D], and a cell has the
-            feature of the pixel at its centre.
+            feature of the pixel at its centre. None: the least one that leaves at most `CELLS` cells.
 
     Raises:
         FileNotFoundError: if `<stem>_f.npy` is missing.
         ValueError: if the arrays are of another shape or kind. When read: if an index is no whole number in [-1, M).
     """
 
-    def __init__(self, file: Path, level: int = 0, stride: int = 1) -> None:
-        check_whole("stride", stride, 1)
+    def __init__(self, file: Path, level: int = 0, stride: int | None = None) -> None:
+        if stride is not None:
+            check_whole("stride", stride, 1)
         self.file = file
         partner = file.with_name(file.name.removesuffix(INDEX) + ROWS)
         index = np.load(file, mmap_mode="r", allow_pickle=False)
@@ -47,7 +49,9 @@ class MaskFeatures:
             raise ValueError(f"expected level {level} ({LEVELS[level]}), got masks of {index.shape[0]} levels")
         self._index = index[level]  # [H, W]
         self._rows = np.concatenate([rows, np.zeros_like(rows[:1] if len(rows) else rows, shape=(1, rows.shape[1]))])
-        self._i, self._j = _centres(index.shape[1], stride), _centres(index.shape[2], stride)
+        H, W = index.shape[1:]
+        chosen = _finest_stride(H, W) if stride is None else stride
+        self._i, self._j = _centres(H, chosen), _centres(W, chosen)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -85,7 +89,19 @@ def parse_level(level: int | str) -> int:
     return LEVELS.index(level) if isinstance(level, str) else int(level)
 
 
+def _finest_stride(height: int, width: int) -> int:
+    """The least stride that leaves at most `CELLS` cells of a picture."""
+    stride = 1
+    while _cells(height, stride) * _cells(width, stride) > CELLS:
+        stride += 1
+    return stride
+
+
+def _cells(size: int, stride: int) -> int:
+    return max(int(size / stride + 0.5), 1)
+
+
 def _centres(size: int, stride: int) -> NDArray[np.int64]:
     """The pixels that hold the centres of the cells, when `size` pixels are cut into round(size / stride) cells."""
-    cells = max(int(size / stride + 0.5), 1)
+    cells = _cells(size, stride)
     return ((2 * np.arange(cells) + 1) * size) // (2 * cells)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 import zipfile
 from collections.abc import Callable
@@ -54,8 +55,9 @@ class Reading:
     """(H, W) of the view's picture, if it is known: the map has its aspect."""
     level: int = 0
     """Which of LangSplat's four sets of masks (`langsplat.LEVELS`)."""
-    stride: int = 1
-    """One cell per so many pixels of LangSplat's masks, which are as large as the picture."""
+    stride: int | None = None
+    """One cell per so many pixels of LangSplat's masks, which are as large as the picture; None: as many as needed to
+    have no more cells than the paper's maps."""
 
 
 @dataclass(frozen=True)
@@ -174,6 +176,12 @@ def read_block(
     return out
 
 
+def count_bad(values: Tensor) -> int:  # any shape, not empty
+    """NaN and infinite values, without a copy of the tensor if there are none (its extremes then are finite)."""
+    low, high = values.aminmax()  # NaN if any value is
+    return 0 if math.isfinite(low) and math.isfinite(high) else int((~torch.isfinite(values)).sum())
+
+
 def find_axes(name: str, shape: tuple[int, ...], reading: Reading = Reading()) -> Axes:
     """The order of the axes of a map that may be [h, w, D], as kfgs writes it, or [D, h, w], as encoders give it.
 
@@ -232,14 +240,14 @@ def write_npy_map(
         for start in range(0, features.shape[0], ROW_BLOCK):
             rows = features[start : start + ROW_BLOCK]
             if isinstance(rows, Tensor):
-                half = rows.detach().to(torch.float16).cpu().contiguous().numpy().astype("<f2", copy=False)
+                half = rows.detach().to(torch.float16).cpu().contiguous()
             else:
                 with np.errstate(over="ignore"):
-                    half = np.ascontiguousarray(rows, "<f2")
-            if not np.isfinite(half).all():
+                    half = torch.from_numpy(np.array(rows, np.float16, order="C"))
+            if count_bad(half):
                 raise ValueError(
                     f"features: expected finite values below 65504 (they are stored as float16), got others for "
                     f"{target.name!r}; normalise the rows"
                 )
-            file.write(half.data)
+            file.write(half.numpy().astype("<f2", copy=False).data)
     return target

@@ -7,12 +7,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import torch
-
 from .._check import check_whole
 from ..quant import EPS, row_norms
 from .langsplat import parse_level
-from .layouts import FEATURE_3DGS, ROW_BLOCK, Reading, StoredMap, fits_aspect, open_map, read_block
+from .layouts import FEATURE_3DGS, ROW_BLOCK, Reading, StoredMap, count_bad, fits_aspect, open_map, read_block
 from .manifest import read_manifest
 from .stems import explain_missing, find_maps, list_maps
 
@@ -88,7 +86,7 @@ def check_feature_folder(
     *,
     values: bool = True,
     level: int | str = 0,
-    stride: int = 1,
+    stride: int | None = None,
 ) -> FeatureReport:
     """Look at the map of every view, and report all that does not fit at once.
 
@@ -115,7 +113,8 @@ def check_feature_folder(
         raise NotADirectoryError(f"folder: expected a folder of feature maps, got {root}; check its name")
     if not pictures:
         raise ValueError("pictures: expected at least one view, got none; name the views to look at")
-    check_whole("stride", stride, 1)
+    if stride is not None:
+        check_whole("stride", stride, 1)
     found, stems = _Findings(), [stem for stem, _ in pictures]
     files = _present(root, stems, found)
     reading = {
@@ -197,7 +196,7 @@ def _look_at_values(name: str, stored: StoredMap, found: _Findings) -> None:
     try:
         for start in range(0, h, ROW_BLOCK):
             rows = read_block(stored, slice(start, start + ROW_BLOCK))
-            bad += int((~torch.isfinite(rows)).sum())
+            bad += count_bad(rows)
             zeros += int((row_norms(rows) <= EPS).sum())
     except ValueError as error:  # mask numbers beyond the masks
         found.problem(name, str(error).rpartition(f"{name}: ")[2])

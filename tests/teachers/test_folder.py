@@ -227,11 +227,14 @@ def test_langsplat_maps_by_level_and_stride(tmp_path):
 
 def test_langsplat_digests_tell_level_stride_and_both_files(tmp_path):
     save_masks(tmp_path, "a")
-    seen = [FeatureFolder(tmp_path, level=level, stride=stride).digests() for level, stride in ((0, 1), (1, 1), (0, 2))]
+    seen = [
+        FeatureFolder(tmp_path, level=level, stride=stride).digests()
+        for level, stride in ((0, None), (1, None), (0, 2))
+    ]
     np.save(tmp_path / "a_f.npy", np.ones((5, 8), np.float32))
     seen.append(FeatureFolder(tmp_path).digests())
     assert len({str(digests) for digests in seen}) == 4
-    assert seen[0][0][0] == "a_s.npy level 0 stride 1"
+    assert seen[0][0][0] == "a_s.npy level 0 stride auto"
     np.save(tmp_path / "b.npy", features(0).numpy())
     assert FeatureFolder(tmp_path).digests()[1] == ["b.npy", digest_file(tmp_path / "b.npy")]
 

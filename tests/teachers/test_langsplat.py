@@ -37,6 +37,16 @@ def test_mask_numbers_may_be_of_any_kind(tmp_path, kind):
     assert np.array_equal(got[ALL, ALL], oracle.dense(index, rows.astype(np.float16), 3, 7, 10))
 
 
+@pytest.mark.parametrize(
+    ("size", "want"),
+    [((360, 480), (360, 480)), ((361, 480), (181, 240)), ((1080, 1440), (360, 480)), ((3000, 17), (3000, 17))],
+)
+def test_without_a_stride_there_are_no_more_cells_than_in_the_papers_maps(tmp_path, size, want):
+    file = write(tmp_path, "a", np.zeros((1, *size), np.int8), np.ones((1, 512), np.float32))
+    assert MaskFeatures(file).shape == (*want, 512)
+    assert MaskFeatures(file, 0, 1).shape == (*size, 512)
+
+
 def test_no_mask_is_an_all_zero_feature_even_where_there_is_no_mask_at_all(tmp_path):
     index, rows = np.full((4, 3, 4), -1.0, np.float32), np.ones((0, 6), np.float32)
     assert not MaskFeatures(write(tmp_path, "a", index, rows))[ALL, ALL].any()
