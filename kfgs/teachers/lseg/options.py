@@ -46,11 +46,12 @@ class LSegOptions:
         check_choice("flip", self.flip, (False, True))
         if self.size is None or self.size == "auto":
             return
-        if isinstance(self.size, str) or not isinstance(self.size, Sequence) or len(self.size) != 2:
+        if not isinstance(self.size, tuple | list) or len(self.size) != 2:
             raise ValueError(f"size: expected 'auto', (height, width) or None, got {self.size!r}; pass (360, 480)")
-        for side in self.size:
+        height, width = self.size
+        for side in (height, width):
             check_whole("size", side, 1)
-        object.__setattr__(self, "size", (int(self.size[0]), int(self.size[1])))
+        object.__setattr__(self, "size", (int(height), int(width)))
 
     @staticmethod
     def paper() -> LSegOptions:

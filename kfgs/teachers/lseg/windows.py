@@ -138,7 +138,8 @@ def _parts(length: int, out: int, window: int) -> list[_Part]:
     """The windows over one axis: `length` pixels at this scale, `out` in the result."""
     starts = window_starts(length, window)
     pixel = torch.arange(length)
-    count = sum(((start <= pixel) & (pixel < start + window)).double() for start in starts)  # [length]
+    covered = torch.stack([(start <= pixel) & (pixel < start + window) for start in starts])  # [windows, length]
+    count = covered.sum(dim=0).double()
     enlarge, resize = _interpolation(window // 2, window), _interpolation(length, out)
     parts = []
     for start in starts:
