@@ -62,7 +62,7 @@ def test_text_writes_a_table_with_its_origin(tmp_path, capsys):
     out = tmp_path / "new" / "t.safetensors"
     text("wall,chair;seat", "cases_words:TEACHER", out, templates="a {}")
     said = capsys.readouterr().out
-    assert f"2 classes, {DIM} channels each, by letters" in said
+    assert f"2 classes, {DIM} channels each, by letters, as 'a {{}}'" in said
     assert "chair: also seat" in said
     assert f"wrote:\n  {out}" in said
     found = load_label_set(out)
@@ -184,6 +184,23 @@ def test_a_phrase_joins_the_classes_of_a_table(field, room, truth, names, tmp_pa
     assert f"{len(names) - 1} negatives" in said
     assert main(["select", "lamp", *arguments, "--negatives", "canonical"]) == 0
     assert "4 negatives" in capsys.readouterr().out
+    text("lamp", "cases_words:TEACHER", table)
+    assert main(["select", "lamp", str(field), "--text", str(table)]) == 0
+    assert "4 negatives" in capsys.readouterr().out  # there are no other classes
+
+
+def test_a_phrase_takes_the_templates_of_the_table(field, truth, names, tmp_path, capsys):
+    table = tmp_path / "t.safetensors"
+    text("lamp", "cases_words:TEACHER", table, templates="{} ll")
+    framed, lamp = torch.nn.functional.normalize(letters(["palm ll", "lamp"]).double(), dim=1)
+    cosine = float(framed @ lamp)
+    assert 0.5 < cosine < 0.98  # asked bare it would be 1
+    arguments = [str(field), "--text", str(table), *LETTERS, "--negatives", "none", "--threshold"]
+    found = []
+    for threshold in (cosine - 1e-3, cosine + 1e-3):
+        assert main(["select", "palm", *arguments, str(threshold)]) == 0
+        found.append(int(capsys.readouterr().out.split("palm: ")[1].split()[0]))
+    assert found[0] - found[1] == count(truth, names, "lamp")
 
 
 def test_scores_by_name(field, room, truth, names, tmp_path, capsys):

@@ -14,8 +14,8 @@ from .words import ask
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
-Negatives = Literal["classes", "canonical", "none"]
-Score = Literal["cosine", "softmax", "relevancy"]
+Negatives = Literal["auto", "classes", "canonical", "none"]
+Score = Literal["auto", "cosine", "softmax", "relevancy"]
 
 
 def select(
@@ -26,8 +26,8 @@ def select(
     classes: Path | None = None,
     text: Path | None = None,
     threshold: float | None = None,
-    negatives: Negatives | None = None,
-    score: Score | None = None,
+    negatives: Negatives = "auto",
+    score: Score = "auto",
     teacher: str | None = None,
     weights: str | None = None,
     images: Path | None = None,
@@ -47,10 +47,10 @@ def select(
             SCENE/text.npy or SCENE/text.safetensors when not given.
         threshold: scores must be above it. Of a field the paper's gamma: when not given 0.5 for a relevancy, else read off
             the scores' distribution. Of a splat all of the class are taken when not given.
-        negatives: what to tell the query from: all other classes, LERF's canonical words, or nothing; of a field. When not
-            given: the classes for one of them, the canonical words for any other phrase.
-        score: relevancy (against the most similar negative), softmax (over query and negatives) or cosine; of a field. When
-            not given: relevancy, or with --negatives none cosine.
+        negatives: what to tell the query from: all other classes, LERF's canonical words, or nothing; of a field.
+            `auto`: the classes for one of them, the canonical words for any other phrase.
+        score: relevancy (against the most similar negative), softmax (over query and negatives) or cosine; of a field.
+            `auto`: relevancy, or with --negatives none cosine.
         teacher: embed the query with this teacher's text encoder: lseg, clip, siglip, ...; of a field.
         weights: the teacher's checkpoint file (lseg), or folder or hub id (the others).
         images: folder of the scene's pictures, if it is not SCENE/images.
@@ -75,18 +75,17 @@ def select(
     if is_field:
         field, (label_set, query, known) = open_field(source), ask(query, (scene, classes, text), teacher, weights)
         cameras = None if scene is None else training_cameras(field, scene, images)
-        against = _negatives(negatives, score, known)
+        how = None if score == "auto" else score
+        against = _negatives(negatives, score, known and len(label_set) > 1)
         with warnings_as_notes():
-            found = query_field(
-                field, label_set, query, threshold, cameras=cameras, negatives=against, score=score
-            )
+            found = query_field(field, label_set, query, threshold, cameras=cameras, negatives=against, score=how)
         cloud = SplatFile(field.gaussians, {"score": found.scores.numpy()})
         if cameras is None:
             say("note: each Gaussian's own latent decides, which is noisy; with --scene the field's views do")
     else:
         given = {"classes": classes, "text": text, "negatives": negatives, "score": score, "teacher": teacher}
         for name, value in (given | {"weights": weights}).items():
-            check_alone(name, value, "beside a splat, which has its own classes")
+            check_alone(name, None if value == "auto" else value, "beside a splat, which has its own classes")
         cloud = open_splats("source", source, labelled=True)
         found = select_labelled(cloud, query, threshold)
         cameras = None if scene is None else load_scene(scene, images=images).undistorted().cameras
@@ -105,10 +104,10 @@ def select(
         wrote([out / "selection.json", *write_splats(out / "selection.ply", cloud.select(found.mask)).paths])
 
 
-def _negatives(negatives: Negatives | None, score: Score | None, known: bool) -> Any:
+def _negatives(negatives: Negatives, score: Score, others: bool) -> Any:
     """The kind of negatives: as asked, if the score can use it; else the classes for a class, canonical for a phrase."""
-    if negatives is None:
-        return "none" if score == "cosine" else "classes" if known else "canonical"
+    if negatives == "auto":
+        return "none" if score == "cosine" else "classes" if others else "canonical"
     if score == "cosine" and negatives != "none":
         raise ValueError(f"negatives: expected none beside --score cosine, got {negatives}; leave one of both out")
     if score in ("softmax", "relevancy") and negatives == "none":

@@ -20,7 +20,7 @@ def text(
     teacher: str,
     out: Path,
     weights: str | None = None,
-    templates: str = "bare",
+    templates: str | None = None,
     negatives: bool = True,
 ) -> None:
     """Embed words with a teacher's text encoder, once, into a table that all other commands take as --text.
@@ -31,7 +31,8 @@ def text(
         teacher: lseg, clip, siglip, ... (a wrong name lists them), or package.module:name of your own.
         out: the table to write, .safetensors; as SCENE/text.safetensors it is found by itself.
         weights: checkpoint file (lseg), or folder or hub id (the others).
-        templates: bare (as LSeg and the paper), clip7, tcl9, siglip, or one of your own with {} for the word.
+        templates: bare (as LSeg and the paper), clip7, tcl9, siglip, or one of your own with {} for the word; what suits
+            the teacher when not given.
         negatives: embed LERF's canonical words (object, things, stuff, texture) as well, for `kfgs select --negatives
             canonical`.
     """
@@ -41,10 +42,11 @@ def text(
 
     if out.suffix != SUFFIX or out.is_dir():
         raise ValueError(f"out: expected a file whose name ends in {SUFFIX}, got {out}; give another name")
-    words, patterns = read_words(names), template_set(templates)
+    words, patterns = read_words(names), None if templates is None else template_set(templates)
     made = embed(teacher, weights, words, templates=patterns, negatives=CANONICAL if negatives else None)
     made.save(out)
-    say(f"{len(made)} classes, {made.dim} channels each, by {made.info['teacher']['name']}")
+    templates_used = ", ".join(map(repr, made.info["templates"]))
+    say(f"{len(made)} classes, {made.dim} channels each, by {made.info['teacher']['name']}, as {templates_used}")
     for name, more in made.info["synonyms"].items():
         say(f"  {name}: also {', '.join(more)}")
     wrote([out])
@@ -109,7 +111,7 @@ def ask(
     """The label set to look a query up in, its name in there, and whether it is one of the table's own classes.
 
     Without a teacher the query is a class of the table. With one it may be any phrase: where there is a table too, it
-    joins that table's classes; canonical negatives come from the teacher.
+    joins that table's classes, in the same templates; canonical negatives come from the teacher.
 
     Args:
         query: class name or phrase.
@@ -131,7 +133,7 @@ def ask(
     found = find_classes(*sources)
     there = found is not None and (any(sources[1:]) or all(path.is_file() for path in found))
     label_set = load_classes(*sources) if there else None
-    asked = embed(teacher, weights, [query])
+    asked = embed(teacher, weights, [query], templates=None if label_set is None else label_set.info.get("templates"))
     if label_set is None:
         return asked, asked.names[0], False
     note = teacher_mismatch(asked.info, label_set.info)

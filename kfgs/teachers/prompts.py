@@ -36,7 +36,7 @@ def embed_labels(
     teacher: Teacher,
     names: Sequence[str],
     *,
-    templates: str | Sequence[str] = "bare",
+    templates: str | Sequence[str] | None = None,
     synonyms: Mapping[str, Sequence[str]] | None = None,
 ) -> Tensor:  # [C, D] float32, unit rows, on the teacher's device
     """One embedding per class: each of its words in each template, as unit rows; their mean; the mean's direction.
@@ -47,7 +47,8 @@ def embed_labels(
     Args:
         teacher: with a text encoder.
         names: C class names.
-        templates: a name of `TEMPLATES`, one template, or several; `{}` stands for the word. LSeg takes bare words.
+        templates: a name of `TEMPLATES`, one template, or several; `{}` stands for the word. When not given what suits the
+            teacher, if it says so (its `templates`); else bare words, as LSeg takes them.
         synonyms: further words of a class, by its name.
 
     Raises:
@@ -56,7 +57,7 @@ def embed_labels(
         NotImplementedError: if the teacher has no text encoder.
     """
     words = _words(names, synonyms)
-    patterns = template_set(templates)
+    patterns = _templates_of(teacher, templates)
     prompts = [[pattern.replace("{}", word) for word in one for pattern in patterns] for one in words.values()]
     distinct = list(dict.fromkeys(prompt for group in prompts for prompt in group))
     rows = _encode(teacher, distinct)
@@ -75,7 +76,7 @@ def make_label_set(
     teacher: Teacher,
     names: Sequence[str],
     *,
-    templates: str | Sequence[str] = "bare",
+    templates: str | Sequence[str] | None = None,
     synonyms: Mapping[str, Sequence[str]] | None = None,
     negatives: Sequence[str] | None = CANONICAL,
 ) -> LabelSet:
@@ -97,7 +98,7 @@ def make_label_set(
     against = tuple(negatives or ())
     info = {
         "teacher": identify(teacher),
-        "templates": list(template_set(templates)),
+        "templates": list(_templates_of(teacher, templates)),
         "synonyms": {name: more for name, (_, *more) in words.items() if more},
     }
     other = embed_labels(teacher, against, templates=templates).cpu() if against else None
@@ -119,6 +120,11 @@ def template_set(templates: str | Sequence[str]) -> tuple[str, ...]:
             + (f"did you mean {near[0]!r}?" if near else 'write it as in "a photo of a {}."')
         )
     return found
+
+
+def _templates_of(teacher: Teacher, templates: str | Sequence[str] | None) -> tuple[str, ...]:
+    """The templates asked for, or those that suit the teacher."""
+    return template_set(getattr(teacher, "templates", "bare") if templates is None else templates)
 
 
 def _words(names: Sequence[str], synonyms: Mapping[str, Sequence[str]] | None) -> dict[str, list[str]]:

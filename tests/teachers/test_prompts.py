@@ -36,6 +36,14 @@ def test_bare_words_are_the_teachers_own_rows():
     torch.testing.assert_close(found, TEACHER.encode_text(["wall", "chair"]))
 
 
+def test_a_teacher_may_say_which_templates_suit_it():
+    teacher = CallableTeacher(lambda image: image, letters)
+    teacher.templates = "siglip"
+    torch.testing.assert_close(embed_labels(teacher, ["wall"]), embed_labels(TEACHER, ["wall"], templates="siglip"))
+    assert make_label_set(teacher, ["wall"]).info["templates"] == ["This is a photo of {}."]
+    assert make_label_set(teacher, ["wall"], templates="bare").info["templates"] == ["{}"]
+
+
 def test_a_synonym_that_is_the_word_itself_counts_once():
     same = embed_labels(TEACHER, ["potted_plant;potted plant;pot"])
     torch.testing.assert_close(same, embed_labels(TEACHER, ["potted plant;pot"]))
