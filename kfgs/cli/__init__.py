@@ -18,10 +18,11 @@ from .color import attach, color, convert, edit
 from .query import select
 from .semantic import demo, fit, info, label, segment, sfm
 from .teach import features, plan
+from .words import text
 
 COMMANDS: dict[str, Any] = {
     command.__name__: command
-    for command in (demo, sfm, plan, features, fit, segment, label, info, color, attach, select, edit, convert)
+    for command in (demo, sfm, plan, features, text, fit, segment, label, info, color, attach, select, edit, convert)
 }
 
 

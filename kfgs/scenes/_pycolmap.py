@@ -8,6 +8,8 @@ ImagingZipEncode). So Pillow, where it is installed, is loaded with this file, w
 from __future__ import annotations
 
 import contextlib
+import signal
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -28,6 +30,7 @@ def import_pycolmap() -> Any:
     Raises:
         ImportError: if it is not installed, with the install line.
     """
+    before = signal.getsignal(signal.SIGTERM)
     try:
         import pycolmap
     except ImportError as error:
@@ -35,6 +38,9 @@ def import_pycolmap() -> Any:
             "pycolmap: needed to read COLMAP models and to run SfM, but it cannot be imported; "
             f"run `pip install 'pycolmap>=4.0'` ({error})"
         ) from error
+    # Its log library prints a stack for a process that is asked to end; what was there before does not.
+    if before is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)
     return pycolmap
 
 
