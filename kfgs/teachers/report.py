@@ -12,7 +12,7 @@ from ..quant import EPS, row_norms
 from .langsplat import parse_level
 from .layouts import FEATURE_3DGS, ROW_BLOCK, Reading, StoredMap, count_bad, fits_aspect, open_map, read_block
 from .manifest import read_manifest
-from .stems import explain_missing, find_maps, list_maps
+from .stems import explain_missing, find_maps, list_maps, three
 
 HOLES = 0.5  # share of all-zero features from which a map is worth a note
 
@@ -159,11 +159,11 @@ def _present(root: Path, stems: list[str], found: _Findings) -> dict[str, Path]:
             names = ", ".join(file.relative_to(root).as_posix() for file in files[:3])
             found.problem(stem + FEATURE_3DGS.suffix, f"{len(files)} maps may be meant: {names}")
     if discarded:
-        found.note("", f"{len(discarded)} maps were discarded once their index maps had been made")
+        found.note("", f"maps that were discarded once index maps had been made: {len(discarded)} of {len(stems)}")
     chosen = {stem: files[0] for stem, files in maps.items() if len(files) == 1}
     others = sorted(set(list_maps(root)) - set(stems)) if chosen else []
     if others:
-        found.note("", f"{len(others)} maps belong to none of these views: {', '.join(others[:3])}")
+        found.note("", f"maps of none of these views: {len(others)} ({three(others)})")
     return chosen
 
 

@@ -66,10 +66,15 @@ def explain_missing(folder: Path, stems: Sequence[str], missing: Sequence[str]) 
     others = [stem for stem in list_maps(folder, deep=True) if stem not in set(stems)]
     if len(missing) == len(stems) and others:
         return (
-            f"{text}; its {len(others)} maps are called {_three(others)}, but the pictures {_three(list(stems))}: rename "
-            "the maps by their pictures"
+            f"{text}; the maps there ({len(others)}) are called {three(others)}, but the pictures {three(list(stems))}: "
+            "rename the maps by their pictures"
         )
     return f"{text}; encode these views or leave them out of `stems`"
+
+
+def three(names: list[str]) -> str:
+    """The first three names, for a message."""
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
 
 
 def _direct(folder: Path, stem: str) -> list[Path]:
@@ -89,7 +94,3 @@ def _is_partner(file: Path) -> bool:
 def _rank(file: Path) -> tuple[int, str]:
     layout = layout_of(file)
     return (LAYOUTS.index(layout) if layout else len(LAYOUTS)), file.name
-
-
-def _three(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")

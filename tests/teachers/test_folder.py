@@ -277,7 +277,7 @@ def test_last_parts_of_names_are_looked_for_when_nothing_else_fits(tmp_path):
 def test_names_of_other_maps_are_shown_when_none_fits(tmp_path):
     for i in range(4):
         np.save(tmp_path / f"frame_{i}.npy", features(i).numpy())
-    said = r"its 4 maps are called frame_0, frame_1, frame_2, \.\.\., but the pictures rgb_0, rgb_1: rename the maps"
+    said = r"the maps there \(4\) are called frame_0, frame_1, frame_2, \.\.\., but the pictures rgb_0, rgb_1: rename the maps"
     with pytest.raises(FileNotFoundError, match=said):
         FeatureFolder(tmp_path, ["rgb_0", "rgb_1"])
 

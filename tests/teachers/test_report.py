@@ -103,8 +103,8 @@ def test_notes_are_no_problems(folder):
     assert report.ok
     zeros = "50 % of the features are all-zero: nothing is known there"
     assert report.notes["a.npy"] == ["double precision, which is read as single", zeros]
-    assert report.notes[""] == ["5 maps belong to none of these views: c, x0, x1"]
-    assert str(report).splitlines()[1] == "note: 5 maps belong to none of these views: c, x0, x1"
+    assert report.notes[""] == ["maps of none of these views: 5 (c, x0, x1, ...)"]
+    assert str(report).splitlines()[1] == "note: maps of none of these views: 5 (c, x0, x1, ...)"
 
 
 def test_langsplat_with_masks_of_another_run(tmp_path):
@@ -122,7 +122,7 @@ def test_names_that_fit_no_picture_are_shown(folder):
     report = check_feature_folder(folder, pictures("rgb_a", "rgb_b"))
     assert report.shape is None
     assert list(report.problems) == ["rgb_a_fmap_CxHxW.pt", "rgb_b_fmap_CxHxW.pt"]
-    assert "its 3 maps are called a, b, c, but the pictures rgb_a, rgb_b" in report.notes[""][0]
+    assert "the maps there (3) are called a, b, c, but the pictures rgb_a, rgb_b" in report.notes[""][0]
     assert "0 of 2 views have a map that fits; no map could be opened" in str(report)
 
 
@@ -141,7 +141,7 @@ def test_discarded_maps_are_a_note(tmp_path):
     Manifest({"name": "t"}, {"b": record}, discarded=True).save(tmp_path)
     report = check_feature_folder(tmp_path, pictures("a", "b"))
     assert report.ok
-    assert report.notes == {"": ["1 maps were discarded once their index maps had been made"]}
+    assert report.notes == {"": ["maps that were discarded once index maps had been made: 1 of 2"]}
 
 
 def test_bad_arguments(tmp_path):
