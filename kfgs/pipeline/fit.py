@@ -220,7 +220,8 @@ def fit_scene(
 
     Args:
         scene: posed, undistorted views with their sparse points.
-        maps: one teacher map [h, w, D] per training view; read one at a time.
+        maps: one teacher map [h, w, D] per training view; read one at a time, for the codebook and for the index maps.
+            Once both are in the run folder the maps may be gone (`discard_maps`), except for mode `decouple`.
         folder: the run folder; `folder/field` receives the finished field.
         config: the method's options; the paper's when not given.
         report: receives one line per stage.
@@ -229,7 +230,9 @@ def fit_scene(
         device: where to train the field, see `training_device`; the other stages and the result stay on the CPU.
 
     Raises:
-        ValueError: if the counts of views and maps differ, a camera has distortion, or there is no such device.
+        ValueError: if the counts of views and maps differ, a camera has distortion, there is no such device, or mode
+            `decouple` is asked of maps that are made anew at each look (`RecomputedMaps`).
+        FileNotFoundError: if a stage is to be made of maps that were discarded.
     """
     config = config or FitConfig.paper()
     target_device = training_device(device)

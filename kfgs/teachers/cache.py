@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from .._files import digest_file
 from ..scenes import Scene, read_image
-from .layouts import LAYOUTS, write_npy_map
+from .layouts import LAYOUTS, layout_of, write_npy_map
 from .manifest import Manifest, MapRecord, read_manifest
 from .map_store import MapStore, check_space, duration, encode_half, gigabytes, locked, map_file, plain_identity, sweep
 from .protocol import Teacher, identify
@@ -227,8 +227,14 @@ def check_pictures(pictures: Sequence[Picture], folder: Path) -> None:
 def _make_room(folder: Path, pictures: Sequence[Picture], identity: dict[str, object], *, overwrite: bool) -> None:
     """Refuse maps that are not ours, or give them up if that was asked for."""
     found = read_manifest(folder)
-    shadowed = (file for p in pictures if (file := folder / f"{p.stem}{LAYOUTS[0].suffix}").is_file())
-    if (first := next(shadowed, None)) is not None:
+    ours = next(i for i, layout in enumerate(LAYOUTS) if layout.suffix == ".npy")
+    shadows = (
+        file
+        for picture in pictures
+        for layout in LAYOUTS[:ours]
+        if (file := folder / f"{picture.stem}{layout.suffix}").is_file() and layout_of(file) is layout
+    )
+    if (first := next(shadows, None)) is not None:
         raise ValueError(
             f"folder: expected one without maps of other programs, got {first}, which would be read instead of ours; use "
             "another folder"

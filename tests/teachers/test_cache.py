@@ -144,6 +144,12 @@ def test_maps_of_other_programs_are_left_alone(pictures, tmp_path):
         extract_features(Counting(), pictures, folder)
     assert np.load(folder / "a.npy").sum() == 60
     extract_features(Counting(), pictures, folder, overwrite=True)
+    (folder / "a_s.npy").touch()
+    extract_features(Counting(), pictures, folder)  # half of what LangSplat writes is nothing
+    (folder / "a_f.npy").touch()
+    with pytest.raises(ValueError, match=r"got .*a_s.npy, which would be read instead of ours"):
+        extract_features(Counting(), pictures, folder)
+    (folder / "a_s.npy").unlink()
     (folder / "b_fmap_CxHxW.pt").touch()
     with pytest.raises(ValueError, match=r"got .*b_fmap_CxHxW.pt, which would be read instead of ours"):
         extract_features(Counting(), pictures, folder, overwrite=True)
