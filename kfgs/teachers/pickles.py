@@ -44,6 +44,9 @@ _FRESH: dict[str, Callable[[], Any]] = {
     "EMPTY_DICT": dict,
     "EMPTY_SET": lambda: Inert("builtins.set"),  # no element is hashed: a nested tuple would overflow C's stack
 }
+_STEPS = (
+    10_000_000  # about 300,000 tensors; bounds the time, and the memory that one-byte opcodes ask for (60 bytes each)
+)
 _WITHOUT_RESULT = _words("MARK POP POP_MARK ADDITEMS APPEND APPENDS SETITEM SETITEMS BUILD")
 
 
@@ -102,7 +105,9 @@ def read_pickle(
     """
     machine = _Machine(builders, persistent)
     try:
-        for opcode, argument, _ in pickletools.genops(source):  # type: ignore[arg-type]
+        for step, (opcode, argument, _) in enumerate(pickletools.genops(source)):  # type: ignore[arg-type]
+            if step >= _STEPS:
+                raise BrokenPickleError(f"it has more than {_STEPS:,} opcodes")
             if opcode.name == "STOP":
                 return machine.stack.pop()
             machine.step(opcode.name, argument)

@@ -324,10 +324,25 @@ def test_hostile_tensors_are_refused(tmp_path: Path, arguments: str, numel: int,
         read_checkpoint(tmp_path / "a.pt")
 
 
-def test_the_same_pickle_with_right_arguments_is_read(tmp_path: Path) -> None:
-    body = rebuilt(FLOATS.format(4), "I1\n(I2\nt(I2\ntI00\n(d")
+@pytest.mark.parametrize("storage", [FLOATS, FLOATS.replace("ctorch", "ctorch.cuda")])  # old files name the device's
+def test_the_same_pickle_with_right_arguments_is_read(tmp_path: Path, storage: str) -> None:
+    body = rebuilt(storage.format(4), "I1\n(I2\nt(I2\ntI00\n(d")
     (tmp_path / "a.pt").write_bytes(zip_of({"x/data.pkl": body, "x/data/0": np.arange(4, dtype=np.float32).tobytes()}))
     assert read_checkpoint(tmp_path / "a.pt")["a"].tolist() == [1, 3]
+
+
+@pytest.mark.parametrize(("numel", "expected"), [(2, [2, 3]), (3, None)])
+def test_views_of_storages_as_torch_wrote_them_before_0_4(tmp_path: Path, numel: int, expected: list | None) -> None:
+    """A storage of 4 values, and a view of it from its third value on: two fit, three do not."""
+    view = f"(S'storage'\nctorch\nFloatStorage\nS'0'\nS'cpu'\nI4\n(S'v'\nI2\nI{numel}\nttQ"
+    head = contained(rebuilt(view, f"I0\n(I{numel}\nt(I1\ntI00\n(d"), "legacy").removesuffix(pickle.dumps([], 2))
+    values = struct.pack("<q4f", 4, 0, 1, 2, 3)
+    (tmp_path / "a.pt").write_bytes(head + pickle.dumps(["0"], 2) + values)
+    if expected is None:
+        with pytest.raises(ValueError, match="does not fit into the 2 values of its storage"):
+            read_checkpoint(tmp_path / "a.pt")
+    else:
+        assert read_checkpoint(tmp_path / "a.pt")["a"].tolist() == expected
 
 
 @pytest.mark.parametrize(
