@@ -40,7 +40,8 @@ def read_checkpoint(path: str | Path) -> dict[str, Tensor]:
     `model`, `module`, `net`, `network` or `params`, in this order. What is no tensor is left out.
 
     **Memory**: tensors are views of the file, mapped privately: pages are read when looked at, writing to a tensor does
-    not change the file. The exceptions are tensors of the old format, which are copied when they are not aligned.
+    not change the file. The exceptions are tensors of the old format, which are copied when they are not aligned. The
+    file may be deleted or replaced by another of its name, but not be written over while the tensors are in use.
 
     Raises:
         FileNotFoundError: if there is no such file.
