@@ -1,4 +1,5 @@
 import pickle
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 from safetensors.torch import save_file
 
 from kfgs._files import digest_file
-from kfgs.quant import sample_grid
+from kfgs.quant import CodebookConfig, fit_codebook, sample_grid
 from kfgs.teachers import FeatureFolder, Manifest, save_feature_map
 from kfgs.teachers.layouts import write_npy_map
 from kfgs.teachers.manifest import MapRecord
@@ -337,3 +338,39 @@ def test_discarded_maps_keep_shape_and_digests_and_say_so_when_read(tmp_path):
         FeatureFolder(tmp_path, ["a", "b", "c"])
     with pytest.raises(ValueError, match=r"b\.npy: expected 512 channels, got 8"):
         _ = FeatureFolder(tmp_path, ["b"], channels=512).shape
+
+
+def test_a_map_is_read_without_a_second_copy(tmp_path):
+    np.save(tmp_path / "a.npy", features(0, (250, 64, 32)).numpy().astype(np.float16))
+    maps = FeatureFolder(tmp_path)
+    tracemalloc.start()  # sees NumPy's memory; the result itself is torch's
+    try:
+        whole = maps[0]
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < whole.numel() * 4 / 10
+
+
+@pytest.mark.parametrize("layout", ["pt", "npy", "safetensors"])
+def test_a_codebook_is_the_same_with_grids_and_with_whole_maps(tmp_path, layout):
+    for i in range(3):
+        save_any(tmp_path, f"view_{i}", layout, features(i, (40, 30, 8)).half())
+    maps = FeatureFolder(tmp_path)
+    config = CodebookConfig(initial=3, maximum=9, epochs=2, samples=200)
+    disk, memory = fit_codebook(maps, config), fit_codebook([maps[i] for i in range(3)], config)
+    assert torch.equal(disk.codebook.codewords, memory.codebook.codewords)
+    assert disk.history == memory.history
+
+
+def test_masks_of_three_things_make_a_codebook_of_three(tmp_path):
+    generator = np.random.default_rng(0)
+    things = np.linalg.qr(generator.normal(size=(8, 3)))[0].T.astype(np.float32)  # orthogonal unit rows
+    for i in range(4):  # each view has its own masks of the same things, and pixels in none
+        save_masks(tmp_path, f"view_{i}", (30, 40), seed=i)
+        np.save(tmp_path / f"view_{i}_f.npy", things[[(i + m) % 3 for m in range(5)]])
+    fit = fit_codebook(FeatureFolder(tmp_path, level="m"), CodebookConfig(initial=2, epochs=2))
+    assert fit.codebook.size == 3
+    assert np.abs(fit.codebook.unit.numpy() @ things.T).max(axis=1).tolist() == pytest.approx([1.0] * 3, abs=1e-3)
+    masked = sum(int((np.load(tmp_path / f"view_{i}_s.npy")[2] >= 0).sum()) for i in range(4))
+    assert int(fit.usage.sum()) == masked
