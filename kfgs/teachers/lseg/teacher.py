@@ -59,6 +59,10 @@ class LSeg(nn.Module):
         self._weights: str | None = None
         self.eval()
 
+    def train(self, mode: bool = True) -> LSeg:
+        """Stay in evaluation mode: a teacher is not trained, and its normalisation must not follow the pictures."""
+        return super().train(False)
+
     @property
     def device(self) -> torch.device:
         """Where the network is."""

@@ -155,7 +155,8 @@ def test_teacher_protocol_device_and_module() -> None:
     assert teacher.to("cpu") is teacher
     assert teacher.device == torch.device("cpu")
     assert not teacher.training
-    assert not teacher.network.training
+    torch.nn.Sequential(teacher).train()  # as part of something that is trained
+    assert not any(part.training for part in teacher.modules())
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -196,6 +197,24 @@ def test_load_lseg_reads_image_network_and_text_tower_of_one_file(tmp_path: Path
     assert len(teacher.identity["weights"]) == 64
     del teacher
     gc.collect()  # the mapped file is let go
+
+
+def test_benchmarks_random_checkpoint_loads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = Path(__file__).resolve().parents[3] / "benchmarks"
+    if not (folder / "random_lseg.py").is_file():  # a source distribution comes without them
+        pytest.skip(f"no folder {folder}")
+    monkeypatch.syspath_prepend(str(folder))
+    from random_lseg import save_random_checkpoint
+
+    path = tmp_path / "random.ckpt"
+    count = save_random_checkpoint(path, TINY, seed=5)
+    assert count == len(random_state(TINY))
+    teacher = load_lseg(path, config=TINY, fast=True)
+    state = random_state(TINY, torch.Generator().manual_seed(5), half_text=False)
+    torch.testing.assert_close(teacher.network.head.weight, state["net.scratch.head1.weight"], rtol=0, atol=0)
+    assert torch.isfinite(teacher.encode_image(picture(30, 40))).all()
+    save_random_checkpoint(path.with_name("half.ckpt"), TINY, half_text=True)
+    assert path.with_name("half.ckpt").stat().st_size < path.stat().st_size
 
 
 def test_load_lseg_combines_fast_with_single_settings(tmp_path: Path) -> None:
