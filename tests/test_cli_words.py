@@ -212,7 +212,7 @@ def test_scores_by_name(field, room, truth, names, tmp_path, capsys):
     assert f"lamp: {lamps} of 4000 Gaussians, score > 0.999 (given)" in capsys.readouterr().out
     assert main([*arguments, "softmax", "--threshold", "0.5", "--out", str(tmp_path / "o")]) == 0
     said = capsys.readouterr().out
-    assert f"softmax over {len(names)} words, logit scale 14.29" in said
+    assert f"softmax over {len(names)} words, logit scale 100" in said
     facts = json.loads((tmp_path / "o" / "selection.json").read_text())
     assert "softmax" in facts["how"]
 

@@ -219,7 +219,7 @@ class SemanticField:
         negatives: Tensor | None = None,  # [M, D]
         cameras: Iterable[Camera] | None = None,
         score: Score | None = None,
-        logit_scale: float | str = "lseg",
+        logit_scale: float | str = "clip",
     ) -> Selection:
         """The Gaussians that are more similar to one target than a threshold (gamma of Sec. 3.4).
 

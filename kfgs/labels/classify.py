@@ -93,7 +93,7 @@ def select_by_query(
     negatives: Tensor | None = None,  # [M, D]
     *,
     score: Score | None = None,
-    logit_scale: float | str = "lseg",
+    logit_scale: float | str = "clip",
 ) -> Selection:
     """Select the features whose cosine with one query is **above** a threshold (Sec. 3.4, single target).
 

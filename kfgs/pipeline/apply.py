@@ -173,7 +173,7 @@ def query_field(
     cameras: Sequence[Camera] | None = None,
     negatives: Negatives = "none",
     score: Score | None = None,
-    logit_scale: float | str = "lseg",
+    logit_scale: float | str = "clip",
 ) -> Selection:
     """The field's Gaussians of one class: those more similar to it than gamma (Sec. 3.4).
 
