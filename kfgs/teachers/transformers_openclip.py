@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .._files import read_json
-from .transformers_source import one_line, quiet, refuse_gaps, require_transformers
+from .transformers_source import explained, one_line, quiet, refuse_gaps, require_transformers
 
 _CONFIG = "open_clip_config.json"
 _WEIGHTS = ("open_clip_model.safetensors", "open_clip_pytorch_model.safetensors", "open_clip_pytorch_model.bin")
@@ -33,20 +33,46 @@ _TOWER = [  # OpenCLIP's names within a tower -> those of transformers; attentio
 ]
 
 
-def find_openclip(source: Path | str) -> Path | None:
-    """The weights in OpenCLIP's layout that `source` holds, or is; None if it has none."""
-    if not isinstance(source, Path):
-        return None
+def find_openclip(kind: str, source: Path | str, *, local_only: bool) -> Path | None:
+    """The weights in OpenCLIP's layout that `source` holds, or is; None if it has none, or is complete without them.
+
+    Raises:
+        ValueError: if a hub id has them, but they do not come.
+    """
+    if isinstance(source, str):
+        return _fetch(kind, source, local_only=local_only) if kind == "openclip" else None
     if source.is_file():
         return source
+    if (source / "config.json").is_file() and any(source.glob("model*.safetensors")):
+        return None
     return next((source / name for name in _WEIGHTS if (source / name).is_file()), None)
 
 
-def load_openclip(file: Path) -> Any:
+def _fetch(kind: str, source: str, *, local_only: bool) -> Path | None:
+    """The weights out of a repository of the hub in OpenCLIP's layout; None if it has another."""
+    require_transformers()
+    from huggingface_hub import hf_hub_download
+    from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
+
+    def fetch(name: str) -> Path | None:
+        try:
+            return Path(hf_hub_download(source, name, local_files_only=local_only))
+        except EntryNotFoundError as error:
+            if isinstance(error, LocalEntryNotFoundError) and not local_only:  # the hub was not reached
+                raise
+            return None
+
+    with explained(kind, source):
+        if fetch(_CONFIG) is None:
+            return None
+        return next((file for name in _WEIGHTS if (file := fetch(name)) is not None), None)
+
+
+def load_openclip(file: Path, *, activation: str) -> Any:
     """A CLIPModel with the weights of an OpenCLIP file.
 
-    Sizes come from the weights' shapes, heads and the activation from `open_clip_config.json` beside them (without one:
-    64 channels per head, or the wider ones of ViT-H, g and bigG, and exact GELU, as LAION trained).
+    Sizes come from the weights' shapes, heads and the activation from `open_clip_config.json` beside them; without one,
+    64 channels per head (more in ViT-H, g and bigG) and the `activation` given: gelu, or quick_gelu as OpenAI trained.
 
     Raises:
         ValueError: if the file is no CLIP of plain vision and text transformers, or is damaged; the message says what.
@@ -59,7 +85,7 @@ def load_openclip(file: Path) -> Any:
     settings = known.get("model_cfg", {}) if isinstance(known, dict) else {}
     _refuse_others(file, state, settings)
     try:
-        config = _config_of(transformers, state, settings)
+        config = _config_of(transformers, state, settings, activation)
         mapped = _mapped(state)
         with quiet(transformers):
             model, info = transformers.CLIPModel.from_pretrained(
@@ -103,13 +129,13 @@ def _refuse_others(file: Path, state: dict[str, Tensor], settings: dict[str, Any
     )
 
 
-def _config_of(transformers: Any, state: dict[str, Tensor], settings: dict[str, Any]) -> Any:
+def _config_of(transformers: Any, state: dict[str, Tensor], settings: dict[str, Any], activation: str) -> Any:
     vision, text = settings.get("vision_cfg", {}), settings.get("text_cfg", {})
     width, _, patch, _ = state["visual.conv1.weight"].shape
     cells = round((state["visual.positional_embedding"].shape[0] - 1) ** 0.5)
     length, text_width = state["positional_embedding"].shape
     vocabulary = state["token_embedding.weight"].shape[0]
-    act = "quick_gelu" if settings.get("quick_gelu") else "gelu"
+    act = ("quick_gelu" if settings.get("quick_gelu") else "gelu") if settings else activation
     image_heads = width // int(vision.get("head_width", _HEAD_WIDTHS.get(width, 64)))
     return transformers.CLIPConfig(
         projection_dim=state["text_projection"].shape[1],

@@ -16,7 +16,6 @@ from .._files import digest_file, digest_value, read_json
 from .transformers_table import TRANSFORMERS
 
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
-_WEIGHTS = ("*.safetensors", "*.bin")
 
 
 def require_transformers() -> Any:
@@ -80,7 +79,7 @@ def read_config(kind: str, source: Path | str, *, local_only: bool) -> tuple[str
             )
     else:
         require_transformers()
-        with _explained(kind, source):
+        with explained(kind, source):
             from huggingface_hub import hf_hub_download  # comes with transformers
 
             file = Path(hf_hub_download(source, "config.json", local_files_only=local_only))
@@ -105,8 +104,14 @@ def load_model(kind: str, source: Path | str, model_type: str, commit: str | Non
     """
     transformers = require_transformers()
     name = TRANSFORMERS[kind].models[model_type][0]
-    with _explained(kind, source), quiet(transformers):
-        model, info = getattr(transformers, name).from_pretrained(
+    model_class = getattr(transformers, name, None)
+    if model_class is None:
+        raise ImportError(
+            f"transformers: expected a version with {name} for teacher {kind!r}, got {transformers.__version__}; run "
+            "`pip install --upgrade transformers`"
+        )
+    with explained(kind, source), quiet(transformers):
+        model, info = model_class.from_pretrained(
             source,
             dtype=torch.float32,
             output_loading_info=True,
@@ -124,7 +129,7 @@ def load_tokenizer_of(kind: str, source: Path | str, commit: str | None, *, loca
         ValueError: if there is none, or it cannot be read.
     """
     transformers = require_transformers()
-    with _explained(kind, source, "a tokenizer"), quiet(transformers):
+    with explained(kind, source, "a tokenizer"), quiet(transformers):
         return transformers.AutoTokenizer.from_pretrained(
             source, local_files_only=local_only, trust_remote_code=False, **_revision(commit)
         )
@@ -146,9 +151,10 @@ def weights_of(source: Path | str, commit: str | None = None) -> str:
     """What tells these weights from others: a digest of the folder's files (or of a file), or the hub's commit."""
     if isinstance(source, str):
         return f"commit {commit}"
-    files = [source] if source.is_file() else sorted(file for glob in _WEIGHTS for file in source.glob(glob))
-    config = [] if source.is_file() else sorted(source.glob("*config.json"))
-    return digest_value([[file.name, digest_file(file)] for file in [*config, *files]])
+    folder = source if source.is_dir() else source.parent
+    weights = [source] if source.is_file() else sorted(source.glob("*.safetensors")) or sorted(source.glob("*.bin"))
+    configs = [folder / name for name in ("config.json", "open_clip_config.json")]
+    return digest_value([[file.name, digest_file(file)] for file in [*configs, *weights] if file.is_file()])
 
 
 @contextmanager
@@ -167,7 +173,7 @@ def quiet(transformers: Any) -> Iterator[None]:
 
 
 @contextmanager
-def _explained(kind: str, source: Path | str, what: str = "weights") -> Iterator[None]:
+def explained(kind: str, source: Path | str, what: str = "weights") -> Iterator[None]:
     """Turn what transformers raises while it reads into one line that names the source."""
     try:
         yield
@@ -192,4 +198,4 @@ def _revision(commit: str | None) -> dict[str, str]:
 def one_line(error: BaseException) -> str:
     """The first line of an error, with its type and at most 160 characters."""
     lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0][:160] if lines else ''}".rstrip(": ")
+    return f"{type(error).__name__}: {lines[0][:200] if lines else ''}".rstrip(": ")

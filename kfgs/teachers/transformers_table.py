@@ -43,11 +43,16 @@ class TeacherRow:
     text: TextRule | None = None  # None: no text tower in the space of the patches
     templates: str = "bare"  # the templates that suit it, by name in `prompts.TEMPLATES`
     residual: bool = False  # can `residual=True` be asked of it?
+    activation: str | None = None  # of files in OpenCLIP's layout that do not say; None: the kind takes no such files
 
 
 TRANSFORMERS: dict[str, TeacherRow] = {
-    "clip": TeacherRow({"clip": ("CLIPModel", clip_patches)}, _CLIP, TextRule(), "clip7", residual=True),
-    "openclip": TeacherRow({"clip": ("CLIPModel", clip_patches)}, _CLIP, TextRule(), "clip7", residual=True),
+    "clip": TeacherRow(
+        {"clip": ("CLIPModel", clip_patches)}, _CLIP, TextRule(), "clip7", residual=True, activation="quick_gelu"
+    ),
+    "openclip": TeacherRow(
+        {"clip": ("CLIPModel", clip_patches)}, _CLIP, TextRule(), "clip7", residual=True, activation="gelu"
+    ),
     "siglip": TeacherRow({"siglip": ("SiglipModel", siglip_patches)}, _HALF, TextRule(lower=True, pad=True), "siglip"),
     "siglip2": TeacherRow(  # those of fixed size are SigLIP models; the others are called NaFlex
         {"siglip": ("SiglipModel", siglip_patches), "siglip2": ("Siglip2Model", naflex_patches)},

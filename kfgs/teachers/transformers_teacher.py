@@ -16,7 +16,7 @@ from .transformers_openclip import find_openclip, load_openclip
 from .transformers_patches import Patches, patch_size
 from .transformers_source import find_source, load_model, load_tokenizer_of, read_config, weights_of
 from .transformers_table import TRANSFORMERS, TeacherRow
-from .transformers_text import Tokenize, bpe_tokenize, has_tokenizer, hub_tokenize
+from .transformers_text import CLIP_VOCABULARY, Tokenize, bpe_tokenize, has_tokenizer, hub_tokenize
 
 _CHUNK = 64  # prompts at a time
 
@@ -56,13 +56,14 @@ def load_transformers_teacher(
             f"residual: expected False for teacher {kind!r}, got True; only {', '.join(able)} have that path"
         )
     found = find_source(kind, source)
-    openclip = _openclip_of(row, found)
+    openclip = find_openclip(kind, found, local_only=local_only) if row.activation is not None else None
     if openclip is not None:
-        model, model_type, commit = load_openclip(openclip), "clip", None
+        model, model_type = load_openclip(openclip, activation=str(row.activation)), "clip"
+        commit = openclip.parent.name if isinstance(found, str) else None
     else:
         model_type, commit = read_config(kind, found, local_only=local_only)
         model = load_model(kind, found, model_type, commit, local_only=local_only)
-    weights = weights_of(openclip or found, commit)
+    weights = weights_of(openclip or found if isinstance(found, Path) else found, commit)
     identity = {"name": kind, "options": {"size": size, "residual": bool(residual)}, "weights": weights}
     if isinstance(found, str):
         identity["source"] = found
@@ -70,24 +71,16 @@ def load_transformers_teacher(
     return TransformersTeacher(model, row, row.models[model_type][1], identity, tokenize)
 
 
-def _openclip_of(row: TeacherRow, source: Path | str) -> Path | None:
-    """Weights in OpenCLIP's layout, if the kind takes them and no model in the layout of transformers lies there."""
-    if "clip" not in row.models:
-        return None
-    complete = (
-        isinstance(source, Path) and (source / "config.json").is_file() and any(source.glob("model*.safetensors"))
-    )
-    return None if complete else find_openclip(source)
-
-
 def _tokenize_of(kind: str, source: Path | str, commit: str | None, model: Any, *, local_only: bool) -> Tokenize:
     """The tokenizer beside the weights; CLIP's own vocabulary where none lies there and the kind has that one."""
     row = TRANSFORMERS[kind]
     folder = source.parent if isinstance(source, Path) and source.is_file() else source
-    if "clip" in row.models and isinstance(folder, Path) and not has_tokenizer(folder):
+    words = model.config.text_config
+    bare = isinstance(folder, Path) and not has_tokenizer(folder)
+    if bare and row.activation is not None and words.vocab_size == CLIP_VOCABULARY:
         return bpe_tokenize()
     assert row.text is not None
-    longest = int(model.config.text_config.max_position_embeddings)
+    longest = int(words.max_position_embeddings)
     return hub_tokenize(
         kind, folder, row.text, longest, lambda: load_tokenizer_of(kind, folder, commit, local_only=local_only)
     )

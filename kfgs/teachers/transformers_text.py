@@ -13,6 +13,7 @@ from .transformers_table import TextRule
 
 Tokenize = Callable[[list[str]], tuple[Tensor, Tensor]]  # n prompts -> ids [n, T], mask [n, T] (0: padding)
 
+CLIP_VOCABULARY = 49408  # entries of CLIP's own, which kfgs brings along
 _TOKENIZER_FILES = ("tokenizer.json", "vocab.json", "tokenizer.model", "spiece.model")
 
 

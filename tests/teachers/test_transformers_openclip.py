@@ -11,6 +11,7 @@ from oracles_transformers import OpenClip  # noqa: E402
 from safetensors.torch import save_file  # noqa: E402
 from tiny_transformers import tokenizer, write_teacher  # noqa: E402
 
+from kfgs.teachers.bpe import load_tokenizer  # noqa: E402
 from kfgs.teachers.transformers_teacher import load_transformers_teacher  # noqa: E402
 
 SETTINGS = {"model_cfg": {"vision_cfg": {"head_width": 16}, "text_cfg": {"heads": 2}}}
@@ -81,14 +82,49 @@ def test_a_file_in_half_precision_from_several_devices_is_the_same(clip, tmp_pat
 
 def test_tokenizer_beside_the_weights_is_used(clip, tmp_path):
     folder = write(tmp_path / "model", clip.state_dict())
-    tokenizer("openclip").save_pretrained(folder)
+    words = tokenizer("openclip")
+    words.save_pretrained(folder)
     teacher = load_transformers_teacher("openclip", folder)
-    ids = torch.tensor(tokenizer("openclip")(["wall"])["input_ids"])
-    ids[ids == 1] = 63  # the tiny tokenizer's end of text against the last of the vocabulary
-    teacher.model.text_model.eos_token_id = 1
-    rows = teacher.encode_text(["wall"])
-    assert rows.shape == (1, 20)
-    torch.testing.assert_close(rows.norm(dim=1), torch.ones(1))
+    teacher.model.text_model.eos_token_id = 1  # that of the tiny tokenizer; real ones have the last of the vocabulary
+    ids = torch.tensor(words(["wall"])["input_ids"])
+    with torch.no_grad():
+        expected = teacher.model.get_text_features(ids).pooler_output
+    torch.testing.assert_close(teacher.encode_text(["wall"]), torch.nn.functional.normalize(expected, dim=1))
+
+
+def test_vocabulary_of_clip_stands_in_for_a_missing_tokenizer(clip, tmp_path):
+    with pytest.raises(ValueError, match="expected a tokenizer beside the weights of teacher 'openclip'"):
+        load_transformers_teacher("openclip", write(tmp_path / "small", clip.state_dict())).encode_text(["wall"])
+    torch.manual_seed(1)
+    full = OpenClip(
+        width=16, heads=1, layers=1, patch=8, cells=2, text_width=16, text_heads=2, length=77, vocabulary=49408, dim=8
+    ).eval()
+    teacher = load_transformers_teacher("openclip", write(tmp_path / "full", full.state_dict()))
+    rows = teacher.encode_text(["wall", "a red chair"])
+    with torch.no_grad():
+        expected = full.text(load_tokenizer()(["wall", "a red chair"]))
+    torch.testing.assert_close(rows, torch.nn.functional.normalize(expected, dim=1), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("bin", [True, False])
+def test_hub_repository_in_openclip_layout(clip, tmp_path, monkeypatch, bin):
+    commit = "0123456789abcdef0123456789abcdef01234567"
+    repository = tmp_path / "models--owner--tiny-clip"
+    (repository / "snapshots").mkdir(parents=True)
+    folder = write(repository / "snapshots" / commit, clip.state_dict(), bin=bin)
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text(commit)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    teacher = load_transformers_teacher("openclip", "owner/tiny-clip", local_only=True)
+    assert teacher.identity == {
+        "name": "openclip",
+        "options": {"size": None, "residual": False},
+        "weights": f"commit {commit}",
+        "source": "owner/tiny-clip",
+    }
+    picture = torch.rand(3, 32, 32)
+    local = load_transformers_teacher("openclip", folder)
+    torch.testing.assert_close(teacher.encode_image(picture), local.encode_image(picture))
 
 
 def test_a_folder_of_save_pretrained_is_no_openclip(tmp_path):
@@ -104,6 +140,8 @@ def test_activation_and_heads_come_from_the_settings(clip, tmp_path):
     model = load_transformers_teacher("openclip", write(tmp_path / "bare", clip.state_dict(), settings=None)).model
     assert model.config.vision_config.hidden_act == "gelu"
     assert model.config.vision_config.num_attention_heads == 1  # 48 channels: less than a head of 64
+    model = load_transformers_teacher("clip", tmp_path / "bare").model  # OpenAI's own
+    assert model.config.vision_config.hidden_act == model.config.text_config.hidden_act == "quick_gelu"
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,8 @@ from safetensors.torch import load_file, save_file  # noqa: E402
 from tiny_transformers import write_teacher  # noqa: E402
 
 import kfgs  # noqa: E402
+from kfgs.teachers.transformers_patches import last_patches  # noqa: E402
+from kfgs.teachers.transformers_table import TRANSFORMERS  # noqa: E402
 from kfgs.teachers.transformers_teacher import load_transformers_teacher  # noqa: E402
 
 
@@ -144,6 +147,14 @@ def test_missing_package_names_the_line_to_install_it(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(ImportError, match=r'transformers: expected it .* install it with `pip install "kfgs\[hf\]"`'):
         load_transformers_teacher("clip", folder)
+
+
+def test_old_transformers_is_named(tmp_path, monkeypatch):
+    folder = write_teacher(tmp_path / "dino", "dinov2")
+    row = replace(TRANSFORMERS["dinov2"], models={"dinov2": ("Dinov9Model", last_patches)})
+    monkeypatch.setitem(TRANSFORMERS, "dinov2", row)
+    with pytest.raises(ImportError, match="expected a version with Dinov9Model for teacher 'dinov2', got .*--upgrade"):
+        load_transformers_teacher("dinov2", folder)
 
 
 def test_torchvision_that_does_not_import_is_reported_as_what_it_is(folder, tmp_path):
