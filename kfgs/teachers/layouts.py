@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 import warnings
 import zipfile
 from collections.abc import Callable
@@ -80,7 +81,12 @@ def _open_torch(file: Path, _: Reading) -> Any:
     mapped = zipfile.is_zipfile(file)  # files of torch < 1.6 are not zip archives and cannot be mapped
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about the pickle's protocol; what matters is raised
-        return torch.load(file, map_location="cpu", mmap=mapped, weights_only=True)
+        try:
+            return torch.load(file, map_location="cpu", mmap=mapped, weights_only=True)
+        except pickle.UnpicklingError as error:  # its own text is a page about torch 2.6
+            code = "global" in str(error).lower() or "class" in str(error).lower()
+            words = "it holds objects beside tensors, which are not run" if code else "not a tensor that torch saved"
+            raise ValueError(words) from error
 
 
 def _open_numpy(file: Path, _: Reading) -> Any:
@@ -137,8 +143,7 @@ def open_map(file: Path, reading: Reading = Reading()) -> StoredMap:  # [h, w, D
         found = layout.open(file, reading)
     except Exception as error:  # a damaged pickle raises almost anything: struct.error, KeyError, EOFError, ...
         raise ValueError(
-            f"{file}: expected a feature map, but it cannot be read ({type(error).__name__}: {str(error)[:120]}); "
-            "encode it again"
+            f"{file}: expected a feature map, but it cannot be read ({_reason(error)}); encode it again"
         ) from error
     if isinstance(found, MaskFeatures):
         return found
@@ -155,6 +160,12 @@ def open_map(file: Path, reading: Reading = Reading()) -> StoredMap:  # [h, w, D
     if order == "D h w":
         found = found.permute(1, 2, 0) if isinstance(found, Tensor) else found.transpose(1, 2, 0)
     return found  # type: ignore[no-any-return]
+
+
+def _reason(error: Exception) -> str:
+    """An error's first sentence, with its kind where it is not one of a value."""
+    text = str(error).split(". ")[0].strip()[:120]
+    return text if isinstance(error, ValueError) and text else f"{type(error).__name__}: {text}"
 
 
 def read_block(

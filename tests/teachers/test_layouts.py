@@ -1,3 +1,5 @@
+import os
+
 import numpy as np
 import pytest
 import torch
@@ -134,3 +136,36 @@ def test_a_view_of_both_layouts_is_told_by_the_partner(tmp_path):
     np.save(tmp_path / "a_f.npy", np.zeros((2, 8), np.float32))
     assert layout_of(tmp_path / "a_s.npy") is LANGSPLAT
     assert layout_of(tmp_path / "a.txt") is None
+
+
+class Harmful:
+    """What a pickle may ask for; loading it would make a file."""
+
+    def __init__(self, file):
+        self.file = file
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.file),)
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_a_file_with_code_in_it_is_named_and_runs_nothing(tmp_path, zipped):
+    made, file = tmp_path / "made", tmp_path / "a_fmap_CxHxW.pt"
+    torch.save({"features": Harmful(made)}, file, _use_new_zipfile_serialization=zipped)
+    with pytest.raises(
+        ValueError, match=r"a_fmap.*cannot be read \(it holds objects beside tensors, which are not run\)"
+    ):
+        open_map(file)
+    assert not made.exists()
+
+
+@pytest.mark.parametrize(
+    ("start", "words"),
+    [(b"\x89PNG\r\n\x1a\n" + bytes(100), "not a tensor that torch saved"), (b"", "EOFError"), (b"junk", "error: ")],
+)
+def test_what_torch_did_not_save_is_named_in_a_few_words(tmp_path, start, words):
+    file = tmp_path / "a_fmap_CxHxW.pt"
+    file.write_bytes(start)
+    with pytest.raises(ValueError, match=rf"a_fmap_CxHxW\.pt: .* cannot be read \({words}") as caught:
+        open_map(file)
+    assert len(str(caught.value)) < len(str(file)) + 150
