@@ -77,6 +77,13 @@ def test_it_is_a_teacher_without_text(teacher, file):
         teacher.encode_text(["wall"])
 
 
+def test_features_come_from_the_device_of_the_encoder(file):
+    teacher = load_sam(file).to("meta")  # a device without values, on which a tensor of the CPU is refused
+    features = teacher.encode_image(torch.rand(3, 30, 40))
+    assert features.device.type == "meta"
+    assert features.shape == (256, 48, 64)
+
+
 def test_pictures_of_bytes_are_refused(teacher):
     with pytest.raises(TypeError, match=r"image: expected floats in \[0, 1\], got torch.uint8"):
         teacher.encode_image(torch.zeros(3, 8, 8, dtype=torch.uint8))

@@ -232,6 +232,16 @@ def test_identity_tells_weights_and_options_apart_but_not_folders(load, folders,
     assert identify(load_transformers_teacher("dinov2", moved))["weights"] != plain["weights"]
 
 
+@pytest.mark.parametrize("name", [name for name in CHANNELS if name != "siglip2-naflex"])  # reads sizes from a tensor
+def test_features_come_from_the_device_of_the_model(load, name):
+    teacher = load(name).to("meta")  # a device without values, on which a tensor of the CPU is refused
+    features = teacher.encode_image(picture())
+    assert features.device.type == "meta"
+    assert features.shape == (CHANNELS[name], 5, 7)
+    if name in TEXT and not teacher.row.text.mask:  # transformers reads the values of masks
+        assert teacher.encode_text(["wall", "a red chair"]).device.type == "meta"
+
+
 def test_hook_is_taken_away_again(load):
     teacher = load("clip")
     teacher.encode_image(picture())
