@@ -174,7 +174,7 @@ class Sizes:
         amount = work.codebook_work(
             self.samples, self.channels, options.maximum, options.epochs, first, raw=self.samples * self.channels
         )
-        peak = work.BASE_BYTES + work.codebook_peak(first, self.channels, options.maximum, 0)
+        peak = work.BASE_BYTES + work.codebook_peak(first, self.channels, options.maximum)
         what = f"{options.epochs + 1} passes over {first:,} features a map"
         return StagePlan("codebook", what, amount / self.speed.flops, peak, size, size)
 
