@@ -31,6 +31,8 @@ class Plan:
     """Bytes that processes can still have; None where the system does not say."""
     disk_recomputed: int | None = None
     """Disk that the same run needs if maps are made anew instead of stored."""
+    forwards: int = 1
+    """How often the teacher's network runs for a picture."""
 
     @property
     def seconds(self) -> float | None:
@@ -80,9 +82,10 @@ class Plan:
     def _less_disk(self) -> str:
         less = self.disk_recomputed
         if self.dense != "recompute" and less is not None and less <= self.disk_free:
+            fast = "--fast does not change that; " if self.forwards > 1 else ""
             return (
-                f"--fast does not change that, recompute instead of storing: {say_bytes(less)} on disk, twice the teacher's "
-                "time (kfgs fit SCENE --teacher ...)"
+                f"{fast}recompute instead of storing: {say_bytes(less)} on disk, twice the teacher's time "
+                "(kfgs fit SCENE --teacher ...)"
             )
         return "ask for smaller maps (--size), or use a larger disk"
 
@@ -158,6 +161,7 @@ def plan_scene(
         speed=sizes.speed,
         disk_free=disk_free(folder),
         memory_free=memory_free(),
+        forwards=sizes.cost.forwards,
     )
     if config.mode == "decouple" or dense == "recompute" or sizes.existing:
         return plan

@@ -228,7 +228,7 @@ class Sizes:
 
     def notes(self, device: torch.device) -> list[str]:
         """What a reader should know besides the numbers."""
-        found = []
+        found = ["times are rough, within a factor of two or so, at the speed that this machine has at the moment"]
         if self.cost.flops is None:
             found.append(f"the cost of {self.cost.name!r} is unknown: no size, time or memory of its maps is foretold")
         if device.type == "cuda":

@@ -32,11 +32,11 @@ QUANTIZE_WORK = 250.0
 """Index maps, per number of a map: norms and checks."""
 QUANTIZE_CODEWORD_WORK = 2.5
 """The same, per number and codeword."""
-AUTOENCODER_WEIGHT_WORK = 600.0
+AUTOENCODER_WEIGHT_WORK = 1_500.0
 """Autoencoder, per weight and step, by the speed of all threads: Adam, on one thread."""
 AUTOENCODER_ROW_WORK = 8.0
 """The same, per weight, step and codeword: the products."""
-STEP_WORK = 1.8e9
+STEP_WORK = 2.8e9
 """Field, per step: Python, small kernels."""
 STEP_PIXEL_WORK = (8.0e3, 2.8e3)
 """The same, per rendered pixel: a constant, and per channel."""

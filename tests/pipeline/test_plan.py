@@ -147,11 +147,12 @@ def test_too_little_disk_is_said_with_what_helps(monkeypatch):
     plan = plan_scene(scene())
     assert plan.fits is False
     assert re.search(
-        r"does not fit: needs 16\.0 GB on disk, 12\.3 GB free; --fast does not change that, recompute instead of storing: "
+        r"does not fit: needs 16\.0 GB on disk, 12\.3 GB free; --fast does not change that; recompute instead of storing: "
         r"2\.7 GB on disk.*kfgs fit SCENE --teacher",
         plan.verdict,
     )
-    machine(monkeypatch, disk=10**9, memory=10**11)
+    machine(monkeypatch, disk=10**8, memory=10**11)
+    assert "--fast" not in plan_scene(scene(), teacher="clip").verdict  # which has one pass only
     assert "smaller maps (--size), or use a larger disk" in plan_scene(scene(), dense="recompute").verdict
 
 
