@@ -240,6 +240,10 @@ class Sizes:
             found.append(f"the scene has {self.points} points; training needs some: estimate them with `kfgs sfm`")
         if self.existing or not self.known:
             return found
+        if self.dense == "recompute" and self.samples == self.pixels:
+            found.append(
+                "the codebook looks at every feature of these maps: keeping them takes no more disk, and half the time"
+            )
         if self.dense == "keep" and self.config.mode != "decouple":
             left = f"the {say_bytes(self.dense_bytes)} of maps can be deleted once there are index maps"
             found.append(f"{left} (kfgs fit --discard-features)")

@@ -80,6 +80,12 @@ def test_recomputing_takes_the_samples_disk_and_twice_the_teacher(big):
     assert anew["index maps"].peak_bytes > keep["index maps"].peak_bytes
 
 
+def test_maps_so_small_that_recomputing_saves_nothing_are_named(big):
+    told = "keeping them takes no more disk, and half the time"
+    assert told in str(plan_scene(scene(), teacher="clip", dense="recompute"))
+    assert told not in str(plan_scene(scene(), dense="recompute"))
+
+
 def test_discarded_maps_need_the_disk_only_for_a_while(big):
     plan = plan_scene(scene(), config=FitConfig.cpu(), dense="discard")
     assert plan.disk_bytes > 15.9 * GB > 0.1 * GB > plan.kept_bytes
