@@ -40,6 +40,8 @@ THIRD_PARTY = {
     "llvmlite": "kfgs/splat/engines/",
     "triton": "kfgs/splat/engines/",
     "transformers": "kfgs/teachers/",
+    "tokenizers": "kfgs/teachers/",
+    "huggingface_hub": "kfgs/teachers/",
 }
 
 

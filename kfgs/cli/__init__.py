@@ -16,6 +16,7 @@ import tyro
 
 from .color import attach, color, convert, edit
 from .query import select
+from .say import warnings_as_notes
 from .semantic import demo, fit, info, label, segment, sfm
 from .teach import features, plan
 from .words import text
@@ -32,12 +33,13 @@ def main(arguments: list[str] | None = None) -> int:
     # the difference between 25 training steps a second and one (measured on two cores).
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            COMMANDS,
-            prog="kfgs",
-            description="Decoupled semantic fields of 3-D Gaussians: distil, compress, segment, label, edit.",
-            args=arguments,
-        )
+        with warnings_as_notes():
+            tyro.extras.subcommand_cli_from_dict(
+                COMMANDS,
+                prog="kfgs",
+                description="Decoupled semantic fields of 3-D Gaussians: distil, compress, segment, label, edit.",
+                args=arguments,
+            )
     except KeyboardInterrupt:
         print("interrupted; the same command goes on where it stopped", file=sys.stderr)  # noqa: T201
         return 130

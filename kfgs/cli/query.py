@@ -9,7 +9,7 @@ import tyro
 
 from .._check import check_range
 from .checks import check_alone, check_folder, open_field, open_splats
-from .say import say, training_cameras, warnings_as_notes, wrote
+from .say import say, training_cameras, wrote
 from .words import ask
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -77,8 +77,7 @@ def select(
         cameras = None if scene is None else training_cameras(field, scene, images)
         how = None if score == "auto" else score
         against = _negatives(negatives, score, known and len(label_set) > 1)
-        with warnings_as_notes():
-            found = query_field(field, label_set, query, threshold, cameras=cameras, negatives=against, score=how)
+        found = query_field(field, label_set, query, threshold, cameras=cameras, negatives=against, score=how)
         cloud = SplatFile(field.gaussians, {"score": found.scores.numpy()})
         if cameras is None:
             say("note: each Gaussian's own latent decides, which is noisy; with --scene the field's views do")

@@ -11,10 +11,11 @@ import tyro
 
 from .checks import check_alone, check_folder
 from .say import Mode, Preset, fit_config, load_classes, say, training_cameras, wrote
-from .teach import choose_teacher, scene_folder
+from .teach import choose_teacher, say_misfits, scene_folder
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
+Level = Literal["default", "s", "m", "l"]  # of LangSplat
 SceneFolder = Annotated[Path, tyro.conf.Positional]
 
 
@@ -74,6 +75,7 @@ def fit(
     fast: bool = False,
     size: tuple[int, ...] = (),
     discard_features: bool = False,
+    level: Level = "default",
     preset: Preset = "cpu",
     mode: Mode = "adc+sc",
     split: str = "train",
@@ -98,6 +100,7 @@ def fit(
         size: of the teacher's maps, see `kfgs features`.
         discard_features: delete the dense maps when the index maps are made of them; later runs with the same codebook
             options do not need them.
+        level: which masks of LangSplat's maps are read: all, or those of subparts (s), parts (m) or wholes (l).
         preset: `cpu` (minutes on two cores) or `paper` (30,000 steps).
         mode: `adc+sc` (codebook and autoencoder, 9 channels), `adc` (codebook), `decouple` (raw features).
         split: views to learn from.
@@ -132,8 +135,12 @@ def fit(
         for name, given in (("weights", weights), ("fast", fast or None), ("size", size or None)):
             check_alone(name, given, "without --teacher, whose option it is")
         folder = scene_folder(scene) / "features" if features is None else features
-        maps = FeatureFolder(folder, [loaded.stem(i) for i in views])
+        sizes = [as_taken.cameras[i].size for i in views]
+        maps = FeatureFolder(folder, [loaded.stem(i) for i in views], sizes=sizes, level=level)
+        say_misfits(folder, maps.stems, sizes, level)
     result = fit_scene(loaded, maps, out, config, report=say, progress=True, device=device)
+    if teacher is not None:
+        maps.clear()  # the samples; the stages made of them are found without
     if discard_features:
         say(f"{maps.path}: {discard_maps(maps.path) / 1e9:.2f} GB of dense maps deleted; index maps are in {out}")
     say(result.field.summary())
@@ -160,12 +167,14 @@ def segment(
         out: receives label maps, pictures and scores.json.
         split: views to segment.
         classes: JSON list of class names; SCENE/classes.json when not given.
-        text: .npy of one embedding per class in the teacher's space; SCENE/text.npy when not given.
+        text: .npy of one embedding per class in the teacher's space, or a table of `kfgs text`; SCENE/text.npy or
+            SCENE/text.safetensors when not given.
         labels: folder of true label pictures; SCENE/labels_scored or SCENE/labels when not given.
         decode: `exact` decodes every pixel as the paper does, `latent` compares latents: the same question, much faster.
         pictures: how many views get pictures.
         images: folder of the pictures, if it is not SCENE/images.
     """
+    from .._files import read_json
     from ..fields import SemanticField
     from ..pipeline import score_scene, segment_scene, true_labels, write_report
     from ..scenes import load_scene
@@ -173,6 +182,10 @@ def segment(
 
     loaded, label_set = load_scene(scene, images=images).undistorted(), load_classes(scene, classes, text)
     folder = labels or next((scene / name for name in ("labels_scored", "labels") if (scene / name).is_dir()), None)
+    listed = scene / "classes.json"
+    if labels is None and folder is not None and listed.is_file() and tuple(read_json(listed)) != label_set.names:
+        say(f"note: not scored: {folder} counts the classes of {listed}, which are others; pass --classes {listed}")
+        folder = None
     truth = {} if folder is None else true_labels(loaded, folder, split)
     if labels is not None and not truth:
         raise ValueError(
@@ -191,7 +204,7 @@ def segment(
         plot_confusion(scores.confusion, list(label_set.names), out / "confusion.png")
         written += [out / "scores.json", out / "confusion.png"]
     else:
-        say(f"note: no label pictures of split {split!r} in {scene}: nothing to score against")
+        say(f"note: no label pictures of split {split!r} to score against")
     wrote(written)
 
 

@@ -13,6 +13,7 @@ from .say import Mode, Preset, fit_config, say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
+MISFITS = 3  # maps named in notes
 SceneFolder = Annotated[Path, tyro.conf.Positional]
 
 
@@ -173,6 +174,20 @@ def look_over(scene: Any, views: list[int], folder: Path) -> None:
     report = check_feature_folder(folder, [(scene.stem(i), scene.cameras[i].size) for i in views])
     say(str(report))
     report.raise_if_bad()
+
+
+def say_misfits(folder: Path, stems: list[str], sizes: list[tuple[int, int]], level: str) -> None:
+    """Say which maps do not look as if they were of their pictures, by their headers alone; the first few."""
+    from ..teachers import check_feature_folder, read_manifest
+
+    manifest = read_manifest(folder)
+    if manifest is not None and manifest.discarded:
+        return
+    report = check_feature_folder(folder, list(zip(stems, sizes, strict=True)), values=False, level=level)
+    for name, texts in list(report.problems.items())[:MISFITS]:
+        say(f"note: {name}: {'; '.join(texts)}")
+    if len(report.problems) > MISFITS:
+        say(f"note: and {len(report.problems) - MISFITS} more; `kfgs features SCENE --check {folder}` lists them")
 
 
 def scene_folder(scene: Path) -> Path:

@@ -241,6 +241,7 @@ def fit_scene(
     run = Run(Path(folder), report)
     options: dict[str, Any] = {"progress": progress, "callback": callback}
     codebook, autoencoder = None, None
+    teacher = getattr(maps, "identity", None)
     lenses = [] if scene.lenses is None else [scene.lenses[i] for i in views]
     if lenses and not config.undistorted_features:
         maps = UndistortedMaps(maps, lenses)
@@ -264,6 +265,7 @@ def fit_scene(
         "seed": config.seed,
         "views": [scene.cameras[i].name for i in views],
         "teacher_map": list(map_shape(maps)),
+        **({"teacher": teacher} if teacher else {}),
         "seconds": {stage.name: round(stage.seconds, 3) for stage in run.stages},
         "kfgs": version("kfgs"),
     }

@@ -86,6 +86,8 @@ class FeatureFolder(Sequence[Tensor]):
         self.channels = channels
         self.reading = Reading(channels=channels, level=parse_level(level), stride=stride)
         manifest = read_manifest(self.path)
+        self.identity = manifest.teacher if manifest else None
+        """What decides the maps (`identify`), if kfgs made them; else None."""
         records = manifest.maps if manifest else {}
         gone = records if manifest and manifest.discarded else {}
         self.stems = _check_stems(self.path, [*list_maps(self.path), *gone] if stems is None else stems, stems is None)

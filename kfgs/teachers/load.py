@@ -7,39 +7,32 @@ import importlib
 import inspect
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from .protocol import Teacher, as_teacher
+from .transformers_table import TRANSFORMERS
 
 
-def _lseg(kind: str, weights: str | Path, **options: Any) -> Teacher:
-    from .lseg import load_lseg
+def _loader(name: str) -> Callable[..., Teacher]:
+    """What makes the teacher of a name from weights and options."""
+    if name == "lseg":
+        from .lseg import load_lseg
 
-    return load_lseg(weights, **options)
+        return load_lseg
+    if name == "sam":
+        from .sam import load_sam
 
-
-def _sam(kind: str, weights: str | Path, **options: Any) -> Teacher:
-    from .sam import load_sam
-
-    return load_sam(weights, **options)
-
-
-def _transformers(kind: str, weights: str | Path, **options: Any) -> Teacher:
+        return load_sam
     from .transformers_teacher import load_transformers_teacher
 
-    return load_transformers_teacher(kind, weights, **options)
-
-
-def _table() -> dict[str, Callable[..., Teacher]]:
-    from .transformers_table import TRANSFORMERS
-
-    return {"lseg": _lseg, **dict.fromkeys(TRANSFORMERS, _transformers), "sam": _sam}
+    return partial(load_transformers_teacher, name)
 
 
 def teacher_names() -> list[str]:
     """The teachers that `load_teacher` knows by name."""
-    return list(_table())
+    return ["lseg", *TRANSFORMERS, "sam"]
 
 
 def load_teacher(name: str, weights: str | Path | None = None, **options: Any) -> Teacher:
@@ -58,17 +51,27 @@ def load_teacher(name: str, weights: str | Path | None = None, **options: Any) -
     """
     if ":" in name:
         return _imported(name, weights, options)
-    table = _table()
-    if name not in table:
-        near = difflib.get_close_matches(name.lower(), table, n=1)
+    names = teacher_names()
+    if name not in names:
+        near = difflib.get_close_matches(name.lower(), names, n=1)
         raise ValueError(
-            f"teacher: expected one of {', '.join(table)}, or package.module:name of your own, got {name!r}"
+            f"teacher: expected one of {', '.join(names)}, or package.module:name of your own, got {name!r}"
             + (f"; did you mean {near[0]!r}?" if near else "; name one of them")
         )
     if weights is None:
         what = "a checkpoint file" if name in ("lseg", "sam") else "a folder of save_pretrained, or a hub id"
         raise ValueError(f"weights: expected {what} for teacher {name!r}, got none; kfgs downloads nothing by itself")
-    return table[name](name, weights, **options)
+    loader = _loader(name)
+    _check_options(name, loader, options)
+    return loader(weights, **options)
+
+
+def _check_options(name: str, loader: Callable[..., Teacher], options: dict[str, Any]) -> None:
+    known = [option for option in inspect.signature(loader).parameters if option not in ("kind", "source", "weights")]
+    for option in options:
+        if option not in known:
+            words = f"one of {', '.join(known)}" if known else "none"
+            raise ValueError(f"{option}: expected {words} as option of teacher {name!r}, got {option}; leave it out")
 
 
 def _imported(name: str, weights: str | Path | None, options: dict[str, Any]) -> Teacher:
@@ -83,7 +86,8 @@ def _imported(name: str, weights: str | Path | None, options: dict[str, Any]) ->
             f"teacher: expected package.module:name that can be imported, got {name!r} ({error}); check both names"
         ) from error
     if inspect.isclass(found):
-        return as_teacher(found(*([] if weights is None else [weights]), **options))
+        made: Any = found(*([] if weights is None else [weights]), **options)
+        return as_teacher(made)
     if weights is not None or options:
         raise ValueError(
             f"weights: expected none for {name!r}, which is made already, got {weights or ', '.join(options)}; name a class "
