@@ -3,7 +3,9 @@
 Work is counted in operations of a large float32 matrix product: what a stage takes in seconds, times the speed that such a
 product had in the same process. So the constants carry over to a machine of another speed, as far as its memory keeps up.
 They were measured by `benchmarks/plan_constants.py` on 2026-11-21, on 2 shared cores of a Xeon with AVX-512 (torch 2.13,
-420 GFLOP/s); a machine with many more cores will find times too short, since not every stage divides among them.
+420 GFLOP/s when quiet), rounded, and those of field and autoencoder raised to what whole runs of room_0 and the toy room
+took. A busy machine slows the product more than it slows stages that wait for memory, so times are foretold too long there;
+one with many more cores will find them too short, since not every stage divides among them.
 """
 
 from __future__ import annotations
