@@ -43,6 +43,14 @@ _WHERE = {
     "score_views": ".evaluation",
     "transfer_labels": ".labels",
     "FeatureFolder": ".teachers",
+    "load_teacher": ".teachers",
+    "extract_features": ".teachers",
+    "pictures_of": ".teachers",
+    "make_label_set": ".teachers",
+    "Teacher": ".teachers",
+    "RecomputedMaps": ".teachers",
+    "plan_scene": ".pipeline",
+    "check_feature_folder": ".teachers",
     "FieldConfig": ".fields",
     "GaussianParams": ".fields",
     "SemanticField": ".fields",
@@ -51,9 +59,9 @@ _WHERE = {
     "fit_scene": ".pipeline",
     "segment_scene": ".pipeline",
     "score_scene": ".pipeline",
-    "LabelSet": ".evaluation",
+    "LabelSet": ".labels",
     "evaluate_segmentation": ".evaluation",
-    "load_label_set": ".evaluation",
+    "load_label_set": ".labels",
 }
 __version__ = "0.1.0"
 __all__ = sorted(_WHERE)
@@ -63,9 +71,7 @@ if TYPE_CHECKING:
     from .cameras import Distortion as Distortion
     from .cameras import Similarity as Similarity
     from .cameras import resize_map as resize_map
-    from .evaluation import LabelSet as LabelSet
     from .evaluation import evaluate_segmentation as evaluate_segmentation
-    from .evaluation import load_label_set as load_label_set
     from .evaluation import score_views as score_views
     from .fields import FieldConfig as FieldConfig
     from .fields import GaussianParams as GaussianParams
@@ -76,16 +82,19 @@ if TYPE_CHECKING:
     from .formats import write_splats as write_splats
     from .gaussians import Gaussians as Gaussians
     from .labels import EditList as EditList
+    from .labels import LabelSet as LabelSet
     from .labels import Recolor as Recolor
     from .labels import Remove as Remove
     from .labels import Selection as Selection
     from .labels import answers as answers
+    from .labels import load_label_set as load_label_set
     from .labels import transfer_labels as transfer_labels
     from .pipeline import ColorConfig as ColorConfig
     from .pipeline import FitConfig as FitConfig
     from .pipeline import attach as attach
     from .pipeline import fit_color as fit_color
     from .pipeline import fit_scene as fit_scene
+    from .pipeline import plan_scene as plan_scene
     from .pipeline import score_scene as score_scene
     from .pipeline import segment_scene as segment_scene
     from .quant import Autoencoder as Autoencoder
@@ -104,6 +113,13 @@ if TYPE_CHECKING:
     from .splat import rasterize as rasterize
     from .splat import transform_gaussians as transform_gaussians
     from .teachers import FeatureFolder as FeatureFolder
+    from .teachers import RecomputedMaps as RecomputedMaps
+    from .teachers import Teacher as Teacher
+    from .teachers import check_feature_folder as check_feature_folder
+    from .teachers import extract_features as extract_features
+    from .teachers import load_teacher as load_teacher
+    from .teachers import make_label_set as make_label_set
+    from .teachers import pictures_of as pictures_of
 
 
 def __getattr__(name: str) -> Any:

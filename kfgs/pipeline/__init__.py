@@ -19,6 +19,7 @@ from .compare import render_color, views_of_change, write_comparison
 from .describe import describe
 from .fit import FitConfig, FitResult, fit_scene, load_history
 from .pictures import write_training_pictures
+from .plan import Plan, plan_scene
 from .stages import Run, Stage
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "ColorResult",
     "FitConfig",
     "FitResult",
+    "Plan",
     "Run",
     "Stage",
     "attach",
@@ -36,6 +38,7 @@ __all__ = [
     "label_cloud",
     "label_field",
     "load_history",
+    "plan_scene",
     "query_field",
     "read_cloud",
     "render_color",

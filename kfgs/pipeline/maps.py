@@ -19,9 +19,9 @@ from .stages import Run
 class Maps(Protocol):
     """Teacher maps on disk, one file per view, read when asked for; an all-zero feature says "nothing known".
 
-    Four more members are used where they exist: `identity`, JSON that tells which teacher made them; `digests() -> list[list[str]] | None`, what decides each map, when that is
-    known without reading the files; `shape`, (h, w, D) without reading values; and `grid(i, step, samples)`, see
-    `fit_codebook`.
+    Four more members are used where they exist: `identity`, JSON that tells which teacher made them; `digests() ->
+    list[list[str]] | None`, what decides each map, when that is known without reading the files; `shape`, (h, w, D) without
+    reading values; and `grid(i, step, samples)`, see `fit_codebook`.
     """
 
     @property
