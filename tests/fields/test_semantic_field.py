@@ -1,6 +1,7 @@
 import json
 import math
 import pickle
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -187,6 +188,12 @@ def test_summary_names_counts_and_size():
     assert "10 Gaussians, 4 of 16 channels, 4 codewords" in text
     assert f"{field('adc+sc', n=10).storage() / MIB:.2f} MB" in text
     assert "seconds: 1.5" in text
+    assert "teacher" not in text
+
+
+def test_summary_names_the_teacher():
+    known = replace(field("adc+sc", n=10), info={"teacher": {"name": "lseg", "weights": "3f2a"}})
+    assert "\n  teacher: lseg" in known.summary()
 
 
 @pytest.mark.parametrize("mode", MODES)
