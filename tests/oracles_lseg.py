@@ -2,7 +2,7 @@
 
 import torch
 from torch import nn
-from transformers import CLIPTextConfig, CLIPTextModel, DPTConfig, DPTModel
+from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection, DPTConfig, DPTModel
 from transformers.models.dpt.modeling_dpt import DPTNeck
 
 
@@ -66,6 +66,11 @@ def neck_tensors(posts, scratch):
 
 def features(state, config, x, attention="sdpa"):
     """[B, 3, S, S] -> [B, D, S / 2, S / 2], in the dtype of x; attention "eager" takes its softmax in float32 always."""
+    return network(state, config, x.dtype, attention)(x)
+
+
+def network(state, config, dtype, attention="sdpa"):
+    """What `features` computes, as a function of x, for many pictures."""
     settings = DPTConfig(
         hidden_size=config.width,
         num_hidden_layers=config.depth,
@@ -86,49 +91,59 @@ def features(state, config, x, attention="sdpa"):
     with torch.device("meta"):
         vit, neck = DPTModel(settings, add_pooling_layer=False), DPTNeck(settings)
         head = nn.Conv2d(config.fusion, config.dim, 1)
-    posts, scratch = plain(state, "pretrained.act_postprocess", x.dtype), plain(state, "scratch.", x.dtype)
-    vit.load_state_dict(
-        vit_tensors(plain(state, "pretrained.model.", x.dtype), config.depth, config.width), assign=True
-    )
+    posts, scratch = plain(state, "pretrained.act_postprocess", dtype), plain(state, "scratch.", dtype)
+    vit.load_state_dict(vit_tensors(plain(state, "pretrained.model.", dtype), config.depth, config.width), assign=True)
     neck.load_state_dict(neck_tensors(posts, scratch), assign=True)
-    head.load_state_dict(plain(state, "scratch.head1.", x.dtype), assign=True)
-    vit.to(x.dtype).eval()
+    head.load_state_dict(plain(state, "scratch.head1.", dtype), assign=True)
+    vit.to(dtype).eval()
     neck.eval()
-    with torch.no_grad():
-        hidden = vit(x, output_hidden_states=True).hidden_states
-        return head(neck([hidden[i + 1] for i in config.hooks])[-1])
+
+    def run(x):
+        with torch.no_grad():
+            hidden = vit(x, output_hidden_states=True).hidden_states
+            return head(neck([hidden[i + 1] for i in config.hooks])[-1])
+
+    return run
 
 
-def text(state, config, ids, dtype=torch.float64, attention="sdpa"):
-    """[n, context] -> [n, D]."""
-    settings = CLIPTextConfig(
+def text_tensors(found, layers):
+    """A text tower's tensors up to its last norm, in transformers' names."""
+    ours = {
+        "embeddings.token_embedding.weight": found["token_embedding.weight"],
+        "embeddings.position_embedding.weight": found["positional_embedding"],
+        **linear(found, "final_layer_norm", "ln_final"),
+    }
+    for i in range(layers):
+        block, layer = f"transformer.resblocks.{i}", f"encoder.layers.{i}"
+        ours |= thirds(found, [f"{layer}.self_attn.{part}_proj" for part in "qkv"], f"{block}.attn.in_proj_")
+        ours |= linear(found, f"{layer}.self_attn.out_proj", f"{block}.attn.out_proj")
+        ours |= linear(found, f"{layer}.layer_norm1", f"{block}.ln_1")
+        ours |= linear(found, f"{layer}.layer_norm2", f"{block}.ln_2")
+        ours |= linear(found, f"{layer}.mlp.fc1", f"{block}.mlp.c_fc")
+        ours |= linear(found, f"{layer}.mlp.fc2", f"{block}.mlp.c_proj")
+    return ours
+
+
+def text_settings(config, attention):
+    return CLIPTextConfig(
         vocab_size=config.vocabulary,
         hidden_size=config.text_width,
         intermediate_size=4 * config.text_width,
         num_hidden_layers=config.text_layers,
         num_attention_heads=config.text_heads,
         max_position_embeddings=config.context,
+        projection_dim=config.dim,
         bos_token_id=config.vocabulary - 2,
         eos_token_id=config.vocabulary - 1,
         attn_implementation=attention,
     )
-    tower = CLIPTextModel(settings).to(dtype).eval()
+
+
+def text(state, config, ids, dtype=torch.float64, attention="sdpa"):
+    """[n, context] -> [n, D]."""
+    tower = CLIPTextModel(text_settings(config, attention)).to(dtype).eval()
     found = plain(state, "clip_pretrained.", dtype)
-    ours = {
-        "embeddings.token_embedding.weight": found["token_embedding.weight"],
-        "embeddings.position_embedding.weight": found["positional_embedding"],
-        **linear(found, "final_layer_norm", "ln_final"),
-    }
-    for i in range(config.text_layers):
-        block, layer = f"transformer.resblocks.{i}", f"encoder.layers.{i}"
-        ours |= thirds(found, [f"{layer}.self_attn.{part}_proj" for part in "qkv"], f"{block}.attn.in_proj_")
-        ours |= linear(found, f"{layer}.self_attn.out_proj", f"{block}.attn.out_proj")
-        ours |= linear(found, f"{layer}.layer_norm1", f"{block}.ln_1") | linear(
-            found, f"{layer}.layer_norm2", f"{block}.ln_2"
-        )
-        ours |= linear(found, f"{layer}.mlp.fc1", f"{block}.mlp.c_fc") | linear(
-            found, f"{layer}.mlp.fc2", f"{block}.mlp.c_proj"
-        )
+    ours = text_tensors(found, config.text_layers)
     prefix = next(iter(tower.state_dict())).split("embeddings.")[0]  # "text_model." in some versions
     tower.load_state_dict({prefix + name: value for name, value in ours.items()})
     with torch.no_grad():
@@ -136,3 +151,17 @@ def text(state, config, ids, dtype=torch.float64, attention="sdpa"):
     return (
         torch.stack([row[int(end)] for row, end in zip(hidden, ids.argmax(1), strict=True)]) @ found["text_projection"]
     )
+
+
+def prompt_embeddings(state, config, prompts, tokenizer):
+    """Unit rows [n, D] float64 by transformers from the text on: its tokenizer, pooling and projection, a prompt at a time."""
+    tower = CLIPTextModelWithProjection(text_settings(config, "sdpa")).double().eval()
+    found = plain(state, "clip_pretrained.", torch.float64)
+    ours = {f"text_model.{name}": value for name, value in text_tensors(found, config.text_layers).items()}
+    tower.load_state_dict({**ours, "text_projection.weight": found["text_projection"].T})
+    rows = []
+    for prompt in prompts:
+        with torch.no_grad():
+            row = tower(input_ids=torch.tensor([tokenizer(prompt)["input_ids"]])).text_embeds[0]
+        rows.append(row / (row**2).sum().sqrt())
+    return torch.stack(rows)

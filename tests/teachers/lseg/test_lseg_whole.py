@@ -1,0 +1,117 @@
+"""LSeg from a checkpoint to features and unit rows, against a whole that shares no code with it: transformers and loops."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from oracles_bpe import hugging_face, read_merges
+from oracles_lseg import network, prompt_embeddings
+from oracles_windows import evaluate, resize
+
+import kfgs
+from kfgs.teachers.lseg import LSeg, LSegConfig, load_lseg
+from kfgs.teachers.lseg.layout import random_state
+
+TINY = LSegConfig(
+    width=32, depth=5, heads=4, window=64, position_grid=3, hooks=(0, 1, 3, 4), neck=(8, 12, 16, 20), fusion=12, dim=10,
+    text_width=32, text_layers=3, text_heads=4,
+)  # fmt: skip
+MERGES = Path(kfgs.__file__).parent / "teachers" / "data" / "clip_bpe_merges.txt.gz"
+CLOSE = 1e-5  # of the largest value: the acceptance is 1e-4
+
+# Labels of ADE20K as LSeg is asked for them, and what people type beside them.
+LABELS = [
+    "wall", "building", "sky", "floor", "tree", "ceiling", "road", "bed ", "windowpane", "grass", "cabinet", "sidewalk",
+    "person", "earth", "door", "table", "mountain", "plant", "curtain", "chair", "car", "water", "painting", "sofa",
+    "shelf", "house", "sea", "mirror", "rug", "field", "armchair", "seat", "fence", "desk", "rock", "wardrobe", "lamp",
+    "bathtub", "railing", "cushion", "base", "box", "column", "signboard", "chest of drawers", "counter", "sand", "sink",
+    "skyscraper", "fireplace", "refrigerator", "grandstand", "path", "stairs", "runway", "case", "pool table", "pillow",
+    "screen door", "stairway", "river", "bridge", "bookcase", "blind", "coffee table", "crt screen", "traffic light",
+    "other", "Door-Stuff", "wall-concrete", "the red chair by the window", "a photo of a café table, 50's style", "",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def state():
+    return random_state(TINY, torch.Generator().manual_seed(21))
+
+
+@pytest.fixture(scope="module")
+def checkpoint(state, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("lseg") / "demo_e200.ckpt"
+    torch.save({"epoch": 200, "state_dict": state, "hyper_parameters": {"backbone": "clip_vitl16_384"}}, path)
+    return path
+
+
+def picture(height: int, width: int) -> np.ndarray:  # [3, H, W] float32 in [0, 1]
+    """A photograph's kind of picture: smooth shades, edges, and some noise; not symmetric in any way."""
+    y, x = np.mgrid[:height, :width] / max(height, width)
+    shades = np.stack([y + 0.3 * x, 0.5 + 0.5 * np.sin(9 * x + 3 * y), (x - 0.2) ** 2])
+    shades += 0.4 * np.stack([x > 0.4, x + y > 0.6, y > 0.3])
+    shades += 0.1 * np.random.default_rng(height + width).standard_normal(shades.shape)
+    return np.clip(shades, 0, 1).astype(np.float32)
+
+
+def whole(state, image, scales, flip):
+    """[3, H, W] in [0, 1] -> [D, h, w] float64: brought to a long side of at most 64, transformers' DPT, one loop per step."""
+    run = network(state, TINY, torch.float64)
+    _, H, W = image.shape
+    x = image.astype(np.float64) * 2 - 1
+    if max(H, W) > 64:
+        x = resize(x, math.floor(H * 64 / max(H, W) + 0.5), math.floor(W * 64 / max(H, W) + 0.5))
+    return evaluate(x, lambda window: run(torch.from_numpy(window)[None])[0].numpy(), 64, scales, flip)
+
+
+def assert_close(found, expected):
+    assert found.shape == expected.shape
+    assert found.dtype == torch.float32
+    difference = np.abs(found.double().numpy() - expected).max() / np.abs(expected).max()
+    assert difference < CLOSE
+
+
+@pytest.mark.parametrize(
+    ("size", "expected_size"),
+    [((150, 113), (64, 48)), ((72, 128), (36, 64)), ((41, 29), (41, 29))],
+    ids=["portrait", "landscape", "small"],
+)
+def test_features_at_four_scales_with_flips_are_those_of_transformers(state, checkpoint, size, expected_size):
+    image = picture(*size)
+    found = load_lseg(checkpoint, config=TINY).encode_image(torch.from_numpy(image))
+    assert tuple(found.shape) == (10, *expected_size)
+    assert_close(found, whole(state, image, (0.75, 1.0, 1.25, 1.75), flip=True))
+
+
+@pytest.mark.parametrize("size", [(150, 113), (72, 128), (41, 29), (64, 64)])
+def test_fast_features_are_one_window_of_transformers(state, checkpoint, size):
+    image = picture(*size)
+    found = load_lseg(checkpoint, config=TINY, fast=True).encode_image(torch.from_numpy(image))
+    assert_close(found, whole(state, image, (480 / 520,), flip=False))
+
+
+def test_the_comparison_would_tell_wrong_wholes(state, checkpoint):
+    """What is nearly right is far outside of the tolerance: another weight, no flip, one scale less, colours swapped."""
+    image = picture(41, 29)
+    teacher = load_lseg(checkpoint, config=TINY)
+    found = teacher.encode_image(torch.from_numpy(image)).double().numpy()
+    mended = load_lseg(checkpoint, config=TINY)
+    mended.network.fusion[0].out.bias.data += 1e-3
+    wrong = [
+        LSeg(mended.network),
+        LSeg(teacher.network, replace(teacher.options, flip=False)),
+        LSeg(teacher.network, replace(teacher.options, scales=(0.75, 1.0, 1.25))),
+    ]
+    others = [other.encode_image(torch.from_numpy(image)) for other in wrong]
+    others.append(teacher.encode_image(torch.from_numpy(image[::-1].copy())))
+    for other in others:
+        assert np.abs(other.double().numpy() - found).max() / np.abs(found).max() > 10 * CLOSE
+
+
+def test_text_is_that_of_transformers_from_the_letters_on(state, checkpoint):
+    rows = load_lseg(checkpoint, config=TINY).encode_text(LABELS)
+    expected = prompt_embeddings(state, TINY, LABELS, hugging_face(read_merges(MERGES)))
+    assert rows.shape == (len(LABELS), 10)
+    assert float((rows.double() - expected).abs().max()) < CLOSE
+    assert float((expected @ expected.T - torch.eye(len(LABELS))).max()) < 0.9999  # no two labels are one
