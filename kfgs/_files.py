@@ -26,6 +26,11 @@ def _read_umask() -> int:
 _UMASK = _read_umask()  # once: it can only be read by setting it, for all threads
 
 
+def _make_ordinary(file: Path) -> None:
+    """Give a file the permissions of any new one: mkstemp makes private files, and so does safetensors."""
+    file.chmod(0o666 & ~_UMASK)
+
+
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Give a temporary name beside `path` to write a file to, and move it to `path` if the block succeeds."""
@@ -33,9 +38,10 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     target.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=target.suffix, dir=target.parent)
     os.close(handle)
-    os.chmod(name, 0o666 & ~_UMASK)  # mkstemp makes private files; ours are ordinary
+    _make_ordinary(Path(name))
     try:
         yield Path(name)
+        _make_ordinary(Path(name))
         os.replace(name, target)
     finally:
         Path(name).unlink(missing_ok=True)
@@ -50,6 +56,9 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     temporary.chmod(0o777 & ~_UMASK)
     try:
         yield temporary
+        for path in temporary.rglob("*"):
+            if path.is_file() and not path.is_symlink():
+                _make_ordinary(path)
         if target.exists():
             old = temporary.with_name(temporary.name + ".old")
             os.replace(target, old)

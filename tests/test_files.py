@@ -5,6 +5,8 @@ import os
 import stat
 
 import pytest
+import torch
+from safetensors.torch import save_file
 
 from kfgs import _files
 from kfgs._files import atomic_folder, atomic_path, digest_file, digest_value, read_json, write_json
@@ -58,6 +60,21 @@ def test_permissions_follow_the_umask(tmp_path, monkeypatch):
         pass
     assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == 0o640
     assert stat.S_IMODE((tmp_path / "folder").stat().st_mode) == 0o750
+
+
+def test_private_files_of_other_libraries_become_ordinary(tmp_path, monkeypatch):
+    monkeypatch.setattr(_files, "_UMASK", 0o027)
+    tensors = {"a": torch.zeros(2)}
+    with atomic_path(tmp_path / "a.safetensors") as temporary:
+        save_file(tensors, temporary)
+    with atomic_folder(tmp_path / "run") as folder:
+        (folder / "deep").mkdir()
+        save_file(tensors, folder / "deep" / "a.safetensors")
+        temporary = folder / "deep" / "private"
+        temporary.touch(mode=0o600)
+    found = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert len(found) == 3
+    assert {stat.S_IMODE(path.stat().st_mode) for path in found} == {0o640}
 
 
 def test_umask_is_that_of_the_process():
