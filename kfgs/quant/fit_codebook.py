@@ -256,7 +256,8 @@ def _samples(maps: FeatureMaps, i: int, config: CodebookConfig, dim: int | None 
         feature_map = maps[i]  # once: this may read a file
         check_shapes((f"maps[{i}]", feature_map, f"h w {dim or 'D'}"))
         features = sample_grid(feature_map, config.grid_step, samples=config.samples)
-    features = features.to(torch.promote_types(features.dtype, torch.float32))
+    # row by row, whatever memory they come in: sums over another layout differ in their last bits
+    features = features.to(torch.promote_types(features.dtype, torch.float32)).contiguous()
     norms = row_norms(features)
     if not bool(torch.isfinite(norms).all()):
         raise ValueError(f"maps[{i}]: expected finite features, got NaN or infinity; encode that image again")
