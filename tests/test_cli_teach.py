@@ -1,0 +1,402 @@
+"""The whole path of the command line, from photographs and weights to words: LSeg's own code with a tiny network."""
+
+import json
+import os
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from cases_teach import TinyLSeg, save_checkpoint, shrink_door
+from PIL import Image
+from safetensors.torch import load_file
+from small_room import make_room
+
+from kfgs.cli import main
+from kfgs.fields import SemanticField
+from kfgs.teachers.lseg import LSegConfig
+from kfgs.teachers.lseg.layout import layout
+
+HERE = Path(__file__).parent
+TEACHER = ["--teacher", "cases_teach:TinyLSeg", "--weights"]
+QUICK = ["--steps", "3", "--mode", "adc"]
+TRAIN = 10  # of the door's 12 views
+
+
+@pytest.fixture(scope="module")
+def door(shared_data, tmp_path_factory):
+    """12 real photographs of a door, as a scene that no test changes."""
+    source = shared_data / "lund_door"
+    if not source.is_dir():
+        pytest.skip(f"needs the photographs in {source}")
+    return shrink_door(source, tmp_path_factory.mktemp("door") / "scene")
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    return save_checkpoint(tmp_path_factory.mktemp("weights") / "tiny.ckpt")
+
+
+@pytest.fixture(scope="module")
+def maps(door, weights, tmp_path_factory):
+    """The door's maps, made in one go."""
+    folder = tmp_path_factory.mktemp("maps") / "features"
+    assert main(["features", str(door), *TEACHER, str(weights), "--out", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(door, maps, tmp_path_factory):
+    """A field fitted to stored maps."""
+    out = tmp_path_factory.mktemp("run")
+    assert main(["fit", str(door), "--features", str(maps), "--out", str(out), *QUICK]) == 0
+    return out
+
+
+@pytest.fixture
+def seen(tmp_path, monkeypatch):
+    """Tells how many pictures the teacher has seen since it was asked last."""
+    log = tmp_path / "seen.txt"
+    monkeypatch.setenv("TEACH_LOG", str(log))
+
+    def count() -> int:
+        number = len(log.read_text().splitlines()) if log.is_file() else 0
+        log.unlink(missing_ok=True)
+        return number
+
+    return count
+
+
+def fails(arguments, capsys) -> str:
+    """The one line that a command which cannot do its work leaves on stderr."""
+    capsys.readouterr()
+    assert main([str(argument) for argument in arguments]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert error.endswith("\n")
+    assert "Traceback" not in error
+    return error
+
+
+def stage(run: Path, name: str) -> Path:
+    (found,) = (run / "stages").glob(f"{name}-*")
+    return found
+
+
+def told(folder: Path):
+    """What features.json tells, without the times."""
+    facts = json.loads((folder / "features.json").read_text())
+    for record in facts["maps"].values():
+        assert record.pop("seconds") >= 0
+        assert record.pop("mtime_ns") > 0
+    return facts
+
+
+def command(arguments, **environment):
+    """A process of its own, in the folder of the user's module."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "kfgs", *map(str, arguments)],
+        cwd=HERE,
+        env={**os.environ, **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize(
+    ("sent", "code", "last_words"),
+    [
+        (signal.SIGKILL, -signal.SIGKILL, ""),
+        (signal.SIGINT, 130, "interrupted; the same command goes on where it stopped\n"),
+    ],
+    ids=["killed", "interrupted"],
+)
+def test_ended_in_the_middle_it_goes_on_and_ends_byte_for_byte_the_same(
+    door, weights, maps, tmp_path, sent, code, last_words
+):
+    log, out = tmp_path / "log.txt", tmp_path / "features"
+    arguments = ["features", door, *TEACHER, weights, "--out", out]
+    process = command(arguments, TEACH_LOG=str(log), TEACH_SLEEP="0.1")
+    deadline = time.monotonic() + 60
+    while not log.is_file() or log.read_text().count("\n") < 4:
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    process.send_signal(sent)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert error.endswith(last_words)
+    assert "Traceback" not in error
+    finished = list(json.loads((out / "features.json").read_text())["maps"])
+    assert 3 <= len(finished) < TRAIN
+    before = {name: (out / f"{name}.npy").stat() for name in finished}
+    log.unlink()
+
+    process = command(arguments, TEACH_LOG=str(log))
+    said, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert f"{len(finished)} maps found, {TRAIN - len(finished)} to make by lseg" in said
+    assert log.read_text().count("\n") == TRAIN - len(finished)
+    for name, was in before.items():
+        assert (out / f"{name}.npy").stat() == was  # not even written again
+    files = sorted(path.name for path in maps.iterdir())
+    assert sorted(path.name for path in out.iterdir()) == files  # and nothing half-written is left
+    for name in files:
+        if name.endswith(".npy"):
+            assert (out / name).read_bytes() == (maps / name).read_bytes(), name
+    assert told(out) == told(maps)
+
+
+def test_maps_are_lsegs_of_the_photographs(door, weights, maps):
+    teacher = TinyLSeg(weights)
+    for path in sorted(maps.glob("*.npy")):
+        photo = np.asarray(Image.open(door / "images" / f"{path.stem}.JPG"), dtype=np.float32) / 255
+        expected = teacher.encode_image(torch.from_numpy(photo).permute(2, 0, 1))
+        found = np.load(path)
+        assert found.dtype == np.float16
+        assert found.shape == (64, 43, 16)
+        np.testing.assert_allclose(found, expected.permute(1, 2, 0).half().numpy(), rtol=2e-3, atol=2e-3)
+    assert len(list(maps.glob("*.npy"))) == TRAIN
+
+
+def test_run_again_nothing_is_made_and_a_changed_picture_is_made_alone(door, weights, maps, seen, tmp_path, capsys):
+    scene, out = tmp_path / "scene", tmp_path / "maps"
+    shutil.copytree(door, scene)
+    shutil.copytree(maps, out)  # times and all
+    arguments = ["features", str(scene), *TEACHER, str(weights), "--out", str(out)]
+    assert main(arguments) == 0
+    assert seen() == 0
+    photo = scene / "images" / "DSC_0005.JPG"
+    shutil.copy(scene / "images" / "DSC_0006.JPG", photo)
+    capsys.readouterr()
+    assert main(arguments) == 0
+    assert seen() == 1
+    assert "DSC_0005: the picture has changed; making it again" in capsys.readouterr().out
+    assert (out / "DSC_0005.npy").read_bytes() == (out / "DSC_0006.npy").read_bytes()
+    (out / "DSC_0007.npy").unlink()
+    (out / "DSC_0008.npy").write_bytes((out / "DSC_0008.npy").read_bytes()[:-7])
+    assert main(arguments) == 0
+    assert seen() == 2
+    for name in ("DSC_0007.npy", "DSC_0008.npy"):
+        assert (out / name).read_bytes() == (maps / name).read_bytes()
+
+
+def test_other_weights_are_refused_unless_the_maps_are_given_up(door, maps, seen, tmp_path, capsys):
+    out, other = tmp_path / "maps", save_checkpoint(tmp_path / "other.ckpt", seed=1)
+    shutil.copytree(maps, out)
+    arguments = ["features", door, *TEACHER, other, "--out", out]
+    error = fails(arguments, capsys)
+    assert f"expected maps of the same teacher as now, got others in {out} (weights: " in error
+    assert f"(--overwrite) to give up its {TRAIN} maps" in error
+    assert seen() == 0
+    assert told(out) == told(maps)
+    assert main([*map(str, arguments), "--overwrite"]) == 0
+    assert seen() == TRAIN
+    assert (out / "DSC_0002.npy").read_bytes() != (maps / "DSC_0002.npy").read_bytes()
+
+
+def test_check_reports_maps_that_do_not_fit(door, maps, tmp_path, capsys):
+    assert main(["features", str(door), "--check", str(maps)]) == 0
+    out = tmp_path / "maps"
+    shutil.copytree(maps, out)
+    (out / "DSC_0003.npy").unlink()
+    np.save(out / "DSC_0004.npy", np.full((64, 43, 16), np.nan, np.float16))
+    np.save(out / "DSC_0005.npy", np.load(out / "DSC_0005.npy").transpose(1, 0, 2))
+    capsys.readouterr()
+    assert main(["features", str(door), "--check", str(out)]) == 1
+    said, error = capsys.readouterr()
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    for name in ("DSC_0003", "DSC_0004", "DSC_0005"):
+        assert name in said
+    assert "DSC_0006" not in said
+
+
+def test_info_tells_a_folder_of_maps(maps, weights, capsys):
+    assert main(["info", str(maps)]) == 0
+    said = capsys.readouterr().out
+    assert f"{TRAIN} feature maps by lseg" in said
+    assert "64 x 43 cells, 16 channels" in said
+    assert told(maps)["teacher"]["weights"] in said
+
+
+def test_fit_without_stored_maps_gives_the_same_codebook_index_maps_and_field(
+    door, weights, run, seen, tmp_path, capsys
+):
+    arguments = ["fit", str(door), *TEACHER, str(weights), "--out", str(tmp_path / "run"), *QUICK]
+    assert main(arguments) == 0
+    assert seen() == 2 * TRAIN  # once for the codebook's samples and once for the index maps
+    for name, file in (("codebook", "codebook"), ("index_maps", "index_maps"), ("field", "params")):
+        found, expected = (load_file(stage(one, name) / f"{file}.safetensors") for one in (tmp_path / "run", run))
+        assert found.keys() == expected.keys()
+        assert all(torch.equal(found[key], expected[key]) for key in expected), name
+    assert not list((tmp_path / "run").rglob("*.npy"))  # neither maps nor samples stay
+    fields = [SemanticField.load(one / "field") for one in (tmp_path / "run", run)]
+    assert fields[0].info["teacher"] == fields[1].info["teacher"]
+    assert main(arguments) == 0
+    assert seen() == 0
+    assert len(fields[0].codebook.codewords) > 4
+    assert "teacher: lseg" in capsys.readouterr().out
+
+
+def test_discarded_maps_serve_other_fields_and_are_missed_by_another_codebook(
+    door, weights, maps, run, seen, tmp_path, capsys
+):
+    folder, out = tmp_path / "maps", tmp_path / "run"
+    shutil.copytree(maps, folder)
+    arguments = ["fit", str(door), "--features", str(folder), "--out", str(out), "--mode", "adc"]
+    assert main([*arguments, "--steps", "3", "--discard-features"]) == 0
+    assert "of dense maps deleted" in capsys.readouterr().out
+    assert not list(folder.glob("*.npy"))
+    index = stage(out, "index_maps") / "index_maps.safetensors"
+    expected = load_file(stage(run, "index_maps") / "index_maps.safetensors")
+    assert all(torch.equal(load_file(index)[key], expected[key]) for key in expected)
+
+    assert main([*arguments, "--steps", "5", "--max-gaussians", "12000"]) == 0  # another field of the same index maps
+    said = capsys.readouterr().out
+    assert "codebook: found" in said
+    assert "index_maps: found" in said
+    assert "field: done" in said
+    assert len(list((out / "stages").glob("field-*"))) == 2
+    error = fails([*arguments, "--steps", "3", "--seed", "7"], capsys)
+    assert f"which the codebook looks at, got {TRAIN} of {TRAIN} that are gone" in error
+    assert "kfgs features" in error
+    assert main(["info", str(folder)]) == 0
+    assert f"0 of {TRAIN} maps still there" in capsys.readouterr().out
+    assert seen() == 0
+    assert main(["features", str(door), *TEACHER, str(weights), "--out", str(folder)]) == 0
+    assert seen() == TRAIN
+    assert told(folder) == told(maps)
+
+
+def test_words_of_the_same_weights_query_the_field(run, weights, tmp_path, capsys):
+    table = tmp_path / "text.safetensors"
+    assert main(["text", "wooden door,stone wall,ground", *TEACHER, str(weights), "--out", str(table)]) == 0
+    assert "3 classes, 16 channels each, by lseg, as '{}'" in capsys.readouterr().out
+    field = SemanticField.load(run / "field")
+    assert main(["select", "wooden door", str(run / "field"), "--text", str(table)]) == 0
+    first = capsys.readouterr().out
+    assert f" of {len(field)} Gaussians" in first
+    assert "2 negatives" in first
+    assert "text of another" not in first
+    teacher = ["--text", str(table), *TEACHER, str(weights)]
+    assert main(["select", "wooden door", str(run / "field"), *teacher]) == 0
+    assert capsys.readouterr().out == first  # embedded anew, it is the same
+    assert main(["select", "the old door behind the arch", str(run / "field"), *TEACHER, str(weights)]) == 0
+    assert f" of {len(field)} Gaussians" in capsys.readouterr().out
+    other = save_checkpoint(tmp_path / "other.ckpt", seed=1)
+    assert main(["select", "a door", str(run / "field"), *TEACHER, str(other)]) == 0
+    assert "got text of another" in capsys.readouterr().out
+
+
+class Run:
+    """An object whose pickle, loaded by Python's rules, calls a function."""
+
+    def __init__(self, function, argument):
+        self.call = function, (argument,)
+
+    def __reduce__(self):
+        return self.call
+
+
+def hostile(marker: Path) -> dict[str, Run]:
+    """Two ways to make a file."""
+    return {"pickle": Run(os.system, f"touch '{marker}'"), "zip": Run(Path.touch, marker)}
+
+
+def wrong_files(folder: Path, weights: Path) -> dict[str, tuple[Path, str]]:
+    """Paths that people give as LSeg's weights, and a word of what they are to be told."""
+    evil = hostile(folder / "marker")
+    made = {
+        name: folder / f"{name}.ckpt" for name in ("noise", "short", "half", "pickle", "zip", "rn101", "clip", "html")
+    }
+    made["noise"].write_bytes(np.random.default_rng(0).bytes(5000))
+    made["short"].write_bytes(weights.read_bytes()[:300])
+    made["half"].write_bytes(weights.read_bytes()[: weights.stat().st_size // 2])
+    made["pickle"].write_bytes(pickle.dumps(evil["pickle"]))
+    torch.save({"state_dict": evil["zip"]}, made["zip"])
+    torch.save(
+        {"net.pretrained.layer1.0.weight": torch.ones(1), "net.scratch.head1.bias": torch.ones(1)}, made["rn101"]
+    )
+    torch.save({"visual.conv1.weight": torch.ones(1), "ln_final.bias": torch.ones(1)}, made["clip"])
+    made["html"].write_text(
+        "<!DOCTYPE html>\n<html><head><title>Google Drive - Virus scan warning</title></head></html>"
+    )
+    (folder / "folder.ckpt").mkdir()
+    words = {
+        "noise": "got",
+        "short": "cut short",
+        "half": "cut short",
+        "pickle": "asks to run",
+        "zip": "asks to run",
+        "rn101": "clip_resnet101",
+        "clip": "CLIP alone, without LSeg's decoder",
+        "html": "HTML",
+    }
+    return {name: (made[name], word) for name, word in words.items()} | {
+        "tiny": (weights, "clip_vitl16_384"),
+        "folder": (folder / "folder.ckpt", "got a folder"),
+        "missing": (folder / "missing.ckpt", "no such file"),
+    }
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    return make_room(tmp_path_factory.mktemp("room") / "scene")
+
+
+KINDS = ["noise", "short", "half", "pickle", "zip", "rn101", "clip", "html", "tiny", "folder", "missing"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_wrong_weights_are_named_in_one_line_and_not_run(room, weights, tmp_path, capsys, kind):
+    files = wrong_files(tmp_path, weights)
+    assert sorted(files) == sorted(KINDS)
+    path, word = files[kind]
+    out = tmp_path / "features"
+    error = fails(["features", room, "--teacher", "lseg", "--weights", path, "--out", out], capsys)
+    assert str(path) in error
+    assert word in error
+    assert len(error) < 700
+    assert not (tmp_path / "marker").exists()
+    assert not out.exists()
+    table = tmp_path / "t.safetensors"
+    assert str(path) in fails(["text", "wall", "--teacher", "lseg", "--weights", path, "--out", table], capsys)
+    assert not table.exists()
+    assert not (tmp_path / "marker").exists()
+
+
+@pytest.mark.parametrize("kind", ["pickle", "zip"])
+def test_the_marker_would_have_been_made(tmp_path, kind):
+    """The pickles of the test above do what they are there for."""
+    marker = tmp_path / "marker"
+    pickle.loads(pickle.dumps(hostile(marker)[kind]))
+    assert marker.exists()
+
+
+def test_a_process_says_no_more_than_the_one_line(room, weights, tmp_path):
+    path = wrong_files(tmp_path, weights)["pickle"][0]
+    process = command(["fit", room, "--teacher", "lseg", "--weights", path, "--out", tmp_path / "run"])
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert error.startswith(f"error: {path}: ")
+    assert error.count("\n") == 1
+    assert not (tmp_path / "marker").exists()
+    assert not (tmp_path / "run" / "stages").exists()
+
+
+def test_a_missing_tensor_is_counted_and_named(room, tmp_path, capsys):
+    names = [name for name in layout(LSegConfig()) if not name.endswith("scratch.head1.bias")]
+    path = tmp_path / "a.ckpt"
+    torch.save({name: torch.zeros(1) for name in names}, path)
+    error = fails(["features", room, "--teacher", "lseg", "--weights", path, "--out", tmp_path / "o"], capsys)
+    assert f"error: {path}: " in error
+    assert "head1.bias" in error
