@@ -244,7 +244,7 @@ def _make_room(folder: Path, pictures: Sequence[Picture], identity: dict[str, ob
         if foreign and not overwrite:
             raise ValueError(
                 f"folder: expected one without maps of other programs, got {foreign[0]} and no features.json; use another "
-                "folder, or pass overwrite=True"
+                "folder, or pass overwrite=True (--overwrite)"
             )
     elif overwrite and found.teacher != identity:
         for stem in found.maps:

@@ -110,8 +110,8 @@ class MapStore:
         if found is not None and found.teacher != wanted:
             raise ValueError(
                 f"folder: expected maps of the same teacher as now, got others in {folder} "
-                f"({differences(found.teacher, wanted)}); use another folder, or pass overwrite=True to give up its "
-                f"{len(found.maps)} maps"
+                f"({differences(found.teacher, wanted)}); use another folder, or pass overwrite=True "
+                f"(--overwrite) to give up its {len(found.maps)} maps"
             )
         store = MapStore(folder, found or Manifest(wanted))
         store.missing = {stem for stem, one in store.manifest.maps.items() if not (folder / one.file).is_file()}
