@@ -413,3 +413,60 @@ def test_a_missing_tensor_is_counted_and_named(room, tmp_path, capsys):
     error = fails(["features", room, "--teacher", "lseg", "--weights", path, "--out", tmp_path / "o"], capsys)
     assert f"error: {path}: " in error
     assert "head1.bias" in error
+
+
+def test_maps_that_nothing_would_stand_for_are_not_deleted(scene, maps, tmp_path, capsys):
+    folder = tmp_path / "maps"
+    shutil.copytree(maps, folder)
+    arguments = ["fit", str(scene), "--features", str(folder), "--out", str(tmp_path / "run"), "--discard-features"]
+    error = fails([*arguments, "--mode", "decouple"], capsys)
+    assert "expected a mode that makes index maps (adc or adc+sc), got decouple" in error
+    (folder / "features.json").unlink()
+    error = fails([*arguments, "--mode", "adc"], capsys)
+    assert "expected maps that kfgs made (with features.json)" in error
+    assert len(list(folder.glob("*.npy"))) == len(list(maps.glob("*.npy")))
+    assert not (tmp_path / "run").exists()  # found out before any work
+
+
+def test_discarding_spares_the_maps_of_other_views(scene, weights, tmp_path, capsys):
+    folder = tmp_path / "maps"
+    everything = ["features", str(scene), *TEACHER, str(weights), "--out", str(folder), "--split", "all"]
+    assert main(everything) == 0
+    loaded = load_scene(scene)
+    arguments = ["fit", str(scene), "--features", str(folder), "--out", str(tmp_path / "run"), *QUICK]
+    assert main([*arguments, "--discard-features"]) == 0
+    left = {path.stem for path in folder.glob("*.npy")}
+    assert left == {loaded.stem(i) for i in range(len(loaded))} - {loaded.stem(i) for i in loaded.views("train")}
+    assert left
+    assert main(arguments) == 0
+    assert "index_maps: found" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (["--teacher", "cases_teach:TinyLSeg", "--weights", "w", "--discard-features"], "stores no dense maps"),
+        (["--teacher", "cases_teach:TinyLSeg", "--weights", "w", "--undistorted-features"], "sees the pictures as taken"),
+        (["--teacher", "cases_teach:TinyLSeg", "--weights", "w", "--level", "s"], "level: expected none beside --teacher"),
+        (["--fast"], "fast: expected none without --teacher"),
+        (["--size", "4", "5"], "size: expected none without --teacher"),
+        (["--weights", "w"], "weights: expected none without --teacher"),
+        (["--level", "s"], "level: expected none beside"),
+    ],
+)
+def test_options_without_effect_are_refused(scene, maps, given, words, tmp_path, capsys):
+    folder = [] if "--teacher" in given else ["--features", str(maps)]
+    assert words in fails(["fit", str(scene), "--out", str(tmp_path / "run"), *folder, *given], capsys)
+
+
+def test_masks_of_a_level_are_looked_over_when_asked(scene, tmp_path, capsys):
+    folder, loaded = tmp_path / "masks", load_scene(scene)
+    folder.mkdir()
+    for i in loaded.views("train"):
+        index = np.zeros((4, *loaded.cameras[i].size), np.int32)
+        index[1] = -1  # no subparts
+        np.save(folder / f"{loaded.stem(i)}_s.npy", index)
+        np.save(folder / f"{loaded.stem(i)}_f.npy", np.eye(1, 8, dtype=np.float32))
+    assert main(["features", str(scene), "--check", str(folder)]) == 0
+    assert "all-zero" in fails(["features", str(scene), "--check", str(folder), "--level", "s"], capsys)
+    assert "level: expected none without --check" in fails(["features", str(scene), "--level", "s"], capsys)

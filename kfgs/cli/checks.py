@@ -113,6 +113,11 @@ def check_alone(name: str, given: object, why: str) -> None:
         raise ValueError(f"{name}: expected none {why}, got {given}; leave it out")
 
 
+def check_no_flag(name: str, given: bool, why: str) -> None:
+    """Raise a ValueError if a flag is given that would have no effect, or an unwanted one."""
+    check_alone(name, f"--{name}" if given else None, why)
+
+
 def _check_place(name: str, target: Path, kind: str) -> None:
     if target.exists() and target.is_dir() != (kind == "a folder"):
         other = "a file" if kind == "a folder" else "a folder"

@@ -9,13 +9,12 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from .checks import check_alone, check_folder
+from .checks import check_alone, check_folder, check_no_flag
 from .say import Mode, Preset, fit_config, load_classes, say, training_cameras, wrote
-from .teach import choose_teacher, say_misfits, scene_folder
+from .teach import Level, check_discard, choose_teacher, scene_folder, stored_maps
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
-Level = Literal["default", "s", "m", "l"]  # of LangSplat
 SceneFolder = Annotated[Path, tyro.conf.Positional]
 
 
@@ -75,7 +74,7 @@ def fit(
     fast: bool = False,
     size: tuple[int, ...] = (),
     discard_features: bool = False,
-    level: Level = "default",
+    level: Level | None = None,
     preset: Preset = "cpu",
     mode: Mode = "adc+sc",
     split: str = "train",
@@ -100,7 +99,7 @@ def fit(
         size: of the teacher's maps, see `kfgs features`.
         discard_features: delete the dense maps when the index maps are made of them; later runs with the same codebook
             options do not need them.
-        level: which masks of LangSplat's maps are read: all, or those of subparts (s), parts (m) or wholes (l).
+        level: which masks of LangSplat's maps are read: `default`, or those of subparts (s), parts (m) or wholes (l).
         preset: `cpu` (minutes on two cores) or `paper` (30,000 steps).
         mode: `adc+sc` (codebook and autoencoder, 9 channels), `adc` (codebook), `decouple` (raw features).
         split: views to learn from.
@@ -113,7 +112,7 @@ def fit(
     """
     from ..pipeline import fit_scene, write_training_pictures
     from ..scenes import load_scene
-    from ..teachers import FeatureFolder, RecomputedMaps, discard_maps
+    from ..teachers import RecomputedMaps, discard_maps
 
     config = fit_config(preset, mode, seed, steps, max_gaussians, split)
     config = dataclasses.replace(config, undistorted_features=undistorted_features)
@@ -122,29 +121,31 @@ def fit(
     loaded = as_taken.undistorted()
     for note in loaded.notes:
         say(f"note: {note}")
-    views = loaded.views(split)
-    maps: Any
     if teacher is not None:
-        check_alone("features", features, "beside --teacher, whose maps are not stored")
-        check_alone("discard-features", discard_features or None, "beside --teacher, which stores no dense maps")
-        check_alone(
-            "undistorted-features", undistorted_features or None, "beside --teacher, which sees the pictures as taken"
+        for name, given in (("features", features), ("level", level)):
+            check_alone(name, given, "beside --teacher, whose maps are not stored")
+        check_no_flag("discard-features", discard_features, "beside --teacher, which stores no dense maps")
+        check_no_flag(
+            "undistorted-features", undistorted_features, "beside --teacher, which sees the pictures as taken"
         )
-        maps = RecomputedMaps(choose_teacher(teacher, weights, fast, size, device), as_taken, views, out / "teacher")
+        chosen = choose_teacher(teacher, weights, fast, size, device)
+        maps: Any = RecomputedMaps(chosen, as_taken, loaded.views(split), out / "teacher")
     else:
-        for name, given in (("weights", weights), ("fast", fast or None), ("size", size or None)):
-            check_alone(name, given, "without --teacher, whose option it is")
-        folder = scene_folder(scene) / "features" if features is None else features
-        sizes = [as_taken.cameras[i].size for i in views]
-        maps = FeatureFolder(folder, [loaded.stem(i) for i in views], sizes=sizes, level=level)
-        say_misfits(folder, maps.stems, sizes, level)
+        check_alone("weights", weights, "without --teacher, whose they are")
+        check_alone("size", size or None, "without --teacher, whose option it is")
+        check_no_flag("fast", fast, "without --teacher, whose option it is")
+        maps = stored_maps(as_taken, loaded.views(split), features or scene_folder(scene) / "features", level)
+        if discard_features:
+            check_discard(maps.path, mode)
     result = fit_scene(loaded, maps, out, config, report=say, progress=True, device=device)
     if teacher is not None:
         maps.clear()  # the samples; the stages made of them are found without
-    if discard_features:
-        say(f"{maps.path}: {discard_maps(maps.path) / 1e9:.2f} GB of dense maps deleted; index maps are in {out}")
     say(result.field.summary())
-    wrote([result.field_path, *write_training_pictures(result)])
+    written = [result.field_path, *write_training_pictures(result)]
+    if discard_features:
+        freed = discard_maps(maps.path, maps.stems)
+        say(f"{maps.path}: {freed / 1e9:.2f} GB of {len(maps)} dense maps deleted; their index maps are in {out}")
+    wrote(written)
 
 
 def segment(

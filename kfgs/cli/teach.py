@@ -13,6 +13,7 @@ from .say import Mode, Preset, fit_config, say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
+Level = Literal["default", "s", "m", "l"]  # of LangSplat: SAM's own choice of masks; subparts, parts, wholes
 MISFITS = 3  # maps named in notes
 SceneFolder = Annotated[Path, tyro.conf.Positional]
 
@@ -29,6 +30,7 @@ def features(
     device: str = "auto",
     overwrite: bool = False,
     check: Path | None = None,
+    level: Level | None = None,
 ) -> None:
     """Run a teacher over a scene's pictures, one at a time, and keep its maps; or look over maps that exist.
 
@@ -47,6 +49,7 @@ def features(
         overwrite: give up maps of another teacher, weights or options that lie there; without it they are an error.
         check: look over this folder of maps instead (Feature 3DGS, LangSplat, .npy, .safetensors), and report every file
             that does not fit.
+        level: which masks of LangSplat's maps are looked at: `default`, `s`, `m` or `l`; beside --check.
     """
     from ..scenes import load_scene
     from ..teachers import extract_features, pictures_of
@@ -59,8 +62,9 @@ def features(
         say(f"note: {note}")
     views = list(range(len(loaded))) if split == "all" else loaded.views(split)
     if check is not None:
-        look_over(loaded, views, check)
+        look_over(loaded, views, check, level)
         return
+    check_alone("level", level, "without --check; it is of LangSplat's maps")
     target = out if out is not None else scene_folder(scene) / "features"
     check_folder("out", target)
     chosen = choose_teacher(teacher, weights, fast, size, device)
@@ -167,27 +171,58 @@ def teacher_options(name: str, fast: bool, size: tuple[int, ...]) -> dict[str, A
     return options
 
 
-def look_over(scene: Any, views: list[int], folder: Path) -> None:
+def look_over(scene: Any, views: list[int], folder: Path, level: Level | None) -> None:
     """Report every map of a folder that does not fit the scene's views; a ValueError counts them."""
     from ..teachers import check_feature_folder
 
-    report = check_feature_folder(folder, [(scene.stem(i), scene.cameras[i].size) for i in views])
+    pictures = [(scene.stem(i), scene.cameras[i].size) for i in views]
+    report = check_feature_folder(folder, pictures, level=level or "default")
     say(str(report))
     report.raise_if_bad()
 
 
-def say_misfits(folder: Path, stems: list[str], sizes: list[tuple[int, int]], level: str) -> None:
-    """Say which maps do not look as if they were of their pictures, by their headers alone; the first few."""
-    from ..teachers import check_feature_folder, read_manifest
+def stored_maps(scene: Any, views: list[int], folder: Path, level: Level | None) -> Any:
+    """The maps of some views of a scene as taken; those whose headers do not look like their pictures' are named."""
+    from ..teachers import FeatureFolder, check_feature_folder, read_manifest
+    from ..teachers.langsplat import INDEX
 
+    stems, sizes = [scene.stem(i) for i in views], [scene.cameras[i].size for i in views]
+    maps = FeatureFolder(folder, stems, sizes=sizes, level=level or "default")
+    if not any(file.name.endswith(INDEX) for file in maps.files):
+        check_alone("level", level, f"beside {folder}, whose maps are not LangSplat's")
     manifest = read_manifest(folder)
     if manifest is not None and manifest.discarded:
-        return
-    report = check_feature_folder(folder, list(zip(stems, sizes, strict=True)), values=False, level=level)
+        return maps
+    pictures = list(zip(stems, sizes, strict=True))
+    report = check_feature_folder(folder, pictures, values=False, level=level or "default")
     for name, texts in list(report.problems.items())[:MISFITS]:
         say(f"note: {name}: {'; '.join(texts)}")
     if len(report.problems) > MISFITS:
-        say(f"note: and {len(report.problems) - MISFITS} more; `kfgs features SCENE --check {folder}` lists them")
+        option = "" if level is None else f" --level {level}"
+        say(
+            f"note: and {len(report.problems) - MISFITS} more; `kfgs features SCENE --check {folder}{option}` lists them"
+        )
+    return maps
+
+
+def check_discard(folder: Path, mode: Mode) -> None:
+    """Refuse to delete dense maps that nothing would stand for: before the work, not after it.
+
+    Raises:
+        ValueError: if the mode makes no index maps, or kfgs did not make the maps and could not make them again.
+    """
+    from ..teachers import read_manifest
+
+    if mode == "decouple":
+        raise ValueError(
+            "discard-features: expected a mode that makes index maps (adc or adc+sc), got decouple, which learns from the "
+            "dense maps themselves; leave it out"
+        )
+    if read_manifest(folder) is None:
+        raise ValueError(
+            f"discard-features: expected maps that kfgs made (with features.json), got {folder} without; delete maps of other "
+            "programs by hand"
+        )
 
 
 def scene_folder(scene: Path) -> Path:
@@ -198,8 +233,7 @@ def scene_folder(scene: Path) -> Path:
 def teacher_words(identity: dict[str, Any]) -> str:
     """A teacher's identity in a few words: `lseg (weights 3f2a...)`."""
     weights = identity.get("weights")
-    rest = {name: value for name, value in identity.items() if name not in ("name", "weights") and value}
+    rest = {name: value for name, value in identity.items() if name not in ("name", "weights", "config") and value}
     words = [str(identity.get("name", "unknown"))]
     words += [f"weights {str(weights)[:12]}"] if weights else []
-    words += [json.dumps(rest, sort_keys=True)] if rest else []
-    return ", ".join(words)
+    return ", ".join(words + [f"{name} {json.dumps(value, sort_keys=True)}" for name, value in rest.items()])
