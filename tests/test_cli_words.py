@@ -58,6 +58,16 @@ def test_words_of_a_file_or_between_commas(tmp_path):
     assert read_words(str(tmp_path / "a.json")) == ["wall", "chair, big"]
 
 
+def test_words_are_words_whatever_lies_in_the_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "chair").mkdir()
+    assert read_words("chair") == ["chair"]
+    many = [f"class number {i}" for i in range(400)]  # longer than any file name, and than any path
+    assert read_words(",".join(many)) == many
+    with pytest.raises(FileNotFoundError, match="no such file; expected a text file there"):
+        read_words("a" * 300 + ".txt")
+
+
 def test_text_writes_a_table_with_its_origin(tmp_path, capsys):
     out = tmp_path / "new" / "t.safetensors"
     text("wall,chair;seat", "cases_words:TEACHER", out, templates="a {}")
@@ -84,7 +94,8 @@ def test_text_writes_a_table_with_its_origin(tmp_path, capsys):
         ("wall", {"teacher": "no_such_teacher"}, "teacher: expected one of lseg"),
         ("wall", {"templates": "clip8"}, "did you mean 'clip7'"),
         (" , ", {}, "names: expected at least one word, got none"),
-        ("{tmp}", {}, "names: expected a .json or .txt file, or words between commas, got"),
+        ("", {}, "names: expected at least one word, got none in ''; write wall,floor or name a file"),
+        ("{tmp}/a.yaml", {}, "names: expected a .json or .txt file, or words between commas, got"),
         ("{tmp}/no.json", {}, "no such file; expected a JSON file"),
         ("{tmp}/no.txt", {}, "no such file; expected a text file there with a class a line"),
         ("{tmp}/a.json", {}, "names: expected a list of words like"),
@@ -94,11 +105,12 @@ def test_text_writes_a_table_with_its_origin(tmp_path, capsys):
 def test_text_names_what_is_wrong_and_writes_nothing(tmp_path, names, options, message):
     (tmp_path / "a.json").write_text('{"wall": 1}')
     (tmp_path / "a.txt").write_bytes(b"\xff\xfew\x00")
+    (tmp_path / "a.yaml").write_text("- wall")
     given = {"teacher": "cases_words:TEACHER", "out": "t.safetensors"} | options
     given["out"] = tmp_path / given["out"]
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         text(names.format(tmp=tmp_path), **given)
-    assert {path.name for path in tmp_path.iterdir()} == {"a.json", "a.txt"}
+    assert {path.name for path in tmp_path.iterdir()} == {"a.json", "a.txt", "a.yaml"}
 
 
 def test_a_table_alone_serves_select_label_and_segment(field, room, truth, names, tmp_path, capsys):
@@ -226,7 +238,10 @@ def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
     said = capsys.readouterr().out
     assert "note: classes: expected text of the field's teacher (name 'letters'), got text of another ('clip')" in said
     assert main(["select", "palm", str(field), "--text", str(table), *LETTERS]) == 0
-    assert "got text of another ('clip')" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "note: text: expected a table by the query's teacher (name 'letters'" in said
+    assert "got one by another ('clip'); their spaces do not mix: take the table's teacher for the query" in said
+    assert "field's teacher" not in said  # the query is of the field's own
 
 
 @pytest.mark.parametrize(
@@ -242,7 +257,10 @@ def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
         (["lamp", "--text", "{table}", "--score", "softmax", "--negatives", "none"], "expected classes or canonical"),
         (["lamp", "--teacher", "cases_words:MUTE"], "teacher 'mute': expected one with a text encoder"),
         (["palm", "--text", "{other}", *LETTERS], "got (16,); text of another teacher?"),
-        (["lamp", "--text", "{other}"], "embedding: expected [16], got (5,): text of another teacher?"),
+        (
+            ["lamp", "--text", "{other}"],
+            "classes: expected embeddings [C, 16] (from the field), got ({count}, 5): text of another teacher?",
+        ),
         (["lamp", "--text", "{bare}", "--negatives", "canonical"], "canonical words in the classes' table, got none"),
         (["lamp", "--text", "{tmp}/no.safetensors"], "no such file; expected a table of words there"),
     ],
@@ -256,5 +274,5 @@ def test_wrong_queries_are_named(field, names, tmp_path, capsys, arguments, mess
     given = [argument.format(tmp=tmp_path, **paths) for argument in arguments]
     assert main(["select", given[0], str(field), *given[1:]]) == 1
     error = capsys.readouterr().err
-    assert message in error
+    assert message.replace("{count}", str(len(names))) in error
     assert error.count("\n") == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -55,26 +56,17 @@ def text(
 def read_words(names: str) -> list[str]:
     """Class names out of a .json list, a .txt file with a class a line, or words between commas.
 
+    What ends in neither is words, even where a folder has the same name; a file without these endings is an error.
+
     Raises:
         FileNotFoundError: if the file is not there.
         ValueError: if it is of another kind, or holds no words.
     """
-    from .._files import read_json
-
-    path = Path(names)
     found: Any
-    if path.suffix.lower() == ".json":
-        found = read_json(path)
-    elif path.suffix.lower() == ".txt":
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such file; expected a text file there with a class a line")
-        try:
-            found = path.read_text(encoding="utf-8-sig").splitlines()
-        except UnicodeDecodeError as error:
-            raise ValueError(
-                f"{path}: expected a text file in UTF-8, but it cannot be read ({error}); save it so"
-            ) from error
-    elif path.exists():
+    kind = Path(names).suffix.lower()
+    if kind in (".json", ".txt"):
+        found = _words_of_file(names, kind)
+    elif os.path.isfile(names):  # False, not an error, for words that no file name could hold
         raise ValueError(
             f"names: expected a .json or .txt file, or words between commas, got {names}; write one of these"
         )
@@ -88,6 +80,25 @@ def read_words(names: str) -> list[str]:
     if not words:
         raise ValueError(f"names: expected at least one word, got none in {names!r}; write wall,floor or name a file")
     return words
+
+
+def _words_of_file(name: str, kind: str) -> Any:
+    """What a .json file holds, or the lines of a .txt file."""
+    from .._files import read_json
+
+    if not os.path.isfile(name):
+        what = (
+            "a JSON file there, with a list of classes" if kind == ".json" else "a text file there with a class a line"
+        )
+        raise FileNotFoundError(f"{name}: no such file; expected {what}")
+    if kind == ".json":
+        return read_json(name)
+    try:
+        return Path(name).read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise ValueError(
+            f"{name}: expected a text file in UTF-8, but it cannot be read ({error}); save it so"
+        ) from error
 
 
 def embed(teacher: str, weights: str | None, names: Sequence[str], **options: Any) -> Any:
@@ -119,8 +130,6 @@ def ask(
         teacher: name of a teacher with text.
         weights: its weights.
     """
-    from ..labels import teacher_mismatch
-
     if teacher is None:
         check_alone("weights", weights, "without --teacher, whose weights they are")
         label_set = load_classes(*sources)
@@ -136,9 +145,7 @@ def ask(
     asked = embed(teacher, weights, [query], templates=None if label_set is None else label_set.info.get("templates"))
     if label_set is None:
         return asked, asked.names[0], False
-    note = teacher_mismatch(asked.info, label_set.info)
-    if note is not None:
-        say(f"note: {note}")
+    _note_other_teacher(asked, label_set)
     name = asked.names[0]
     known = label_set.knows(name)
     if not known:
@@ -147,3 +154,20 @@ def ask(
         label_set, negatives=asked.negatives, negative_names=asked.negative_names, info=asked.info
     )
     return label_set, label_set.names[label_set.index(name)], known
+
+
+def _note_other_teacher(asked: Any, table: Any) -> None:
+    """Say where a query and the table whose classes it joins were embedded by different teachers.
+
+    Whether the query fits the field is told apart from this, by `pipeline.query_field`.
+    """
+    from ..labels.label_set import teacher_difference
+
+    found = teacher_difference(asked.info, table.info)
+    if found is not None:
+        key, query, classes = found
+        say(
+            f"note: text: expected a table by the query's teacher ({key} {query!r:.40}, from --teacher and --weights), got one "
+            f"by another ({classes!r:.40}); their spaces do not mix: take the table's teacher for the query, or pass a table "
+            "of the query's teacher as --text"
+        )

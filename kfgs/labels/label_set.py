@@ -153,16 +153,30 @@ def teacher_mismatch(field: dict[str, Any], words: dict[str, Any]) -> str | None
         field: `info` of a SemanticField.
         words: `info` of a LabelSet.
     """
-    ours, theirs = field.get("teacher"), words.get("teacher")
+    found = teacher_difference(field, words)
+    if found is None:
+        return None
+    key, ours, theirs = found
+    return (
+        f"classes: expected text of the field's teacher ({key} {ours!r:.40}), got text of another ({theirs!r:.40}); "
+        "their spaces do not mix: embed the words with the field's teacher"
+    )
+
+
+def teacher_difference(one: dict[str, Any], other: dict[str, Any]) -> tuple[str, Any, Any] | None:
+    """Whether two things come from different teachers: ("name" or "weights", the one's, the other's), or None.
+
+    Args:
+        one: `info` of a LabelSet or a SemanticField.
+        other: of another; where either does not tell its teacher, nothing is known to differ.
+    """
+    ours, theirs = one.get("teacher"), other.get("teacher")
     if not isinstance(ours, dict) or not isinstance(theirs, dict):
         return None
     for key in ("name", "weights"):
-        one, other = ours.get(key), theirs.get(key)
-        if one is not None and other is not None and one != other:
-            return (
-                f"classes: expected text of the field's teacher ({key} {one!r:.40}), got text of another ({other!r:.40}); "
-                "their spaces do not mix: embed the words with the field's teacher"
-            )
+        mine, its = ours.get(key), theirs.get(key)
+        if mine is not None and its is not None and mine != its:
+            return key, mine, its
     return None
 
 

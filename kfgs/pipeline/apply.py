@@ -25,6 +25,7 @@ from ..formats.sidecar import write_names
 from ..formats.splat_file import SCORE, SplatFile
 from ..gaussians import Gaussians
 from ..labels import LabelSet, Score, Selection, Transfer, classify, select_by_label, teacher_mismatch, transfer_labels
+from ..labels.label_set import teacher_difference
 from ..scenes import Scene
 from ..viz import FeatureColors, overlay_labels, palette, save_picture
 
@@ -84,7 +85,7 @@ def segment_scene(
             f"classes: expected at most {VOID} (label pictures hold a byte per pixel, {VOID} = none), got {len(classes)}; "
             "segment with fewer classes, or call SemanticField.segment, which has no such limit"
         )
-    warn_of_other_teacher(field, classes)
+    check_words(field, classes)
     views = scene.views(split)
     shown = {views[i] for i in np.linspace(0, len(views) - 1, min(pictures, len(views))).round().astype(int)}
     colors = feature_colors(field)
@@ -156,7 +157,7 @@ def label_field(
         cameras: views that vote on each Gaussian (`classify_by_views`; the score is the winner's share). Without them
             each Gaussian's own latent decides, as in Sec. 3.4 (the score is its cosine with the class).
     """
-    warn_of_other_teacher(field, classes)
+    check_words(field, classes)
     if cameras is None:
         labels, scores = field.classify(classes.embeddings)
     else:
@@ -195,7 +196,7 @@ def query_field(
         ValueError: if there is no such class, no negatives of that kind, or shapes disagree.
     """
     check_choice("negatives", negatives, ("classes", "canonical", "none"))
-    warn_of_other_teacher(field, classes)
+    check_words(field, classes)
     target = classes.index(name)
     against = None if negatives == "none" else _negatives(classes, target, negatives)
     return field.query(
@@ -227,11 +228,22 @@ def _negatives(classes: LabelSet, target: int, kind: Negatives) -> Tensor:  # [M
     return classes.negatives[others]
 
 
-def warn_of_other_teacher(field: SemanticField, classes: LabelSet) -> None:
-    """Warn where the words were embedded by another teacher than the field's (`labels.teacher_mismatch`)."""
-    words = teacher_mismatch(field.info, classes.info)
-    if words is not None:
-        warnings.warn(words, stacklevel=3)
+def check_words(field: SemanticField, classes: LabelSet) -> None:
+    """Refuse words that cannot be compared with a field's features, and warn where another teacher embedded them.
+
+    Raises:
+        ValueError: if they have another number of channels: the words are another teacher's.
+    """
+    if classes.dim != field.dim:
+        words = teacher_difference(field.info, classes.info)
+        told = "" if words is None else f" ({words[0]} {words[2]!r:.40} in place of {words[1]!r:.40})"
+        raise ValueError(
+            f"classes: expected embeddings [C, {field.dim}] (from the field), got {tuple(classes.embeddings.shape)}: text of "
+            f"another teacher?{told} Embed the words with the one whose features this field was fitted to"
+        )
+    mismatch = teacher_mismatch(field.info, classes.info)
+    if mismatch is not None:
+        warnings.warn(mismatch, stacklevel=3)
 
 
 def select_labelled(splats: SplatFile, name: str, threshold: float | None = None) -> Selection:

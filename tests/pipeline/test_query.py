@@ -8,7 +8,8 @@ import torch
 from kfgs.fields import SemanticField
 from kfgs.gaussians import Gaussians
 from kfgs.labels import LabelSet
-from kfgs.pipeline import label_field, query_field
+from kfgs.pipeline import label_field, query_field, segment_scene
+from kfgs.scenes import Scene
 
 ROWS = torch.eye(5)
 CLASSES = LabelSet(("wall", "chair", "stuff"), ROWS[:3], ROWS[3:], ("Stuff", "object"), {"teacher": {"name": "lseg"}})
@@ -61,3 +62,23 @@ def test_words_of_another_teacher_are_warned_of():
             ask()
     unknown = dataclasses.replace(CLASSES, info={})
     assert len(query_field(field("clip"), unknown, "wall", 0.5)) == 1  # no warning, which would be an error here
+
+
+def test_words_of_other_channels_are_refused_before_any_view_is_drawn(tmp_path, monkeypatch):
+    monkeypatch.setattr(SemanticField, "render", lambda *_: pytest.fail("a view was drawn"))
+    monkeypatch.setattr("kfgs.pipeline.apply.tqdm", lambda *_, **__: pytest.fail("the loop began"))
+    other = LabelSet(("wall", "chair"), torch.eye(2, 7), info={"teacher": {"name": "clip"}})
+    asked = (
+        lambda: segment_scene(
+            field(), Scene([], [], torch.zeros(0, 3), torch.zeros(0, 3), {"test": []}), other, tmp_path
+        ),
+        lambda: label_field(field(), other),
+        lambda: query_field(field(), other, "wall"),
+    )
+    for ask in asked:
+        with pytest.raises(
+            ValueError,
+            match=r"classes: expected embeddings \[C, 5\] \(from the field\), got \(2, 7\): text of another teacher\? "
+            r"\(name 'clip' in place of 'lseg'\) Embed the words",
+        ):
+            ask()
