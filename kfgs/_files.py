@@ -1,4 +1,4 @@
-"""Files that are either whole or absent: atomic writing, JSON, and digests of what was read.
+"""Files that are either whole or absent: atomic writing, JSON, and digests of what was read; sizes and times in words.
 
 Every file of kfgs is written beside its final name and moved there in one step, so a killed process leaves nothing
 half-written behind.
@@ -106,3 +106,19 @@ def digest_file(path: str | Path) -> str:
 def digest_value(value: Any) -> str:
     """SHA-256 of a JSON-able value (keys sorted), in hexadecimal."""
     return hashlib.sha256(json.dumps(value, sort_keys=True, allow_nan=False).encode()).hexdigest()
+
+
+def bytes_in_words(count: float | None) -> str:
+    """Bytes for people: `15.9 GB`, `0.3 MB`; `unknown` for None."""
+    if count is None:
+        return "unknown"
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
+
+
+def seconds_in_words(seconds: float | None) -> str:
+    """A duration for people: `40 s`, `12 min`, `3.3 h`; `unknown` for None."""
+    if seconds is None:
+        return "unknown"
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -9,7 +9,16 @@ import torch
 from safetensors.torch import save_file
 
 from kfgs import _files
-from kfgs._files import atomic_folder, atomic_path, digest_file, digest_value, read_json, write_json
+from kfgs._files import (
+    atomic_folder,
+    atomic_path,
+    bytes_in_words,
+    digest_file,
+    digest_value,
+    read_json,
+    seconds_in_words,
+    write_json,
+)
 
 
 def names(folder):
@@ -173,3 +182,14 @@ def test_digest_depends_on_the_value_and_not_on_the_order_of_keys():
     assert digest_value({"a": 1, "b": 2}) == digest_value({"b": 2, "a": 1})
     assert digest_value([1, 2]) != digest_value([2, 1])
     assert digest_value(1) != digest_value(1.5)
+
+
+def test_bytes_and_seconds_in_words():
+    assert [bytes_in_words(count) for count in (None, 15_925_248_000, 999e6, 340_000)] == [
+        "unknown",
+        "15.9 GB",
+        "999.0 MB",
+        "0.3 MB",
+    ]
+    times = [seconds_in_words(seconds) for seconds in (None, 40, 89, 720, 11_880)]
+    assert times == ["unknown", "40 s", "89 s", "12 min", "3.3 h"]

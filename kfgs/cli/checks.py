@@ -47,6 +47,11 @@ def check_folder(name: str, target: Path) -> None:
     _check_place(name, target, "a folder")
 
 
+def check_file(name: str, target: Path) -> None:
+    """Raise a ValueError unless `target` is a file or can become one."""
+    _check_place(name, target, "a file")
+
+
 def open_field(field: Path) -> Any:
     """Load a semantic field.
 

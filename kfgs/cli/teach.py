@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from .checks import check_alone, check_folder
+from .checks import check_alone, check_file, check_folder
 from .say import Mode, Preset, fit_config, say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -92,10 +92,13 @@ def plan(
 ) -> None:
     """Predict disk, memory and minutes of `kfgs features` and `kfgs fit`, before either starts.
 
+    Maps that `kfgs features` has made already are counted.
+
     Args:
         scene: folder with images and a COLMAP model or transforms.json.
         teacher: lseg, clip, siglip, ... as for `kfgs features`.
-        weights: folder of the teacher, whose config.json then tells its size; the released size when not given.
+        weights: as for `kfgs features`; a folder's config.json, or the name of a hub id, tells the teacher's size. When not
+            given a common size is taken, and a note says which.
         fast: as for `kfgs features`.
         size: as for `kfgs features`.
         preset: as for `kfgs fit`.
@@ -112,6 +115,8 @@ def plan(
     from ..pipeline.plan import plan_scene
     from ..scenes import load_scene
 
+    if out is not None:
+        check_file("out", out)
     config = fit_config(preset, mode, 0, steps, None, split)
     loaded = load_scene(scene, images=images)
     found = plan_scene(

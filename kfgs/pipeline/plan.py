@@ -9,12 +9,15 @@ from typing import Any
 import torch
 
 from .._check import check_choice
+from .._files import bytes_in_words, seconds_in_words
 from ..scenes import Scene
 from ..teachers.costs import TeacherCost
 from .device import training_device
 from .fit import FitConfig
 from .machine import Speed, disk_free, memory_free
-from .plan_stages import DENSE, Dense, Sizes, StagePlan, add, say_bytes, say_time
+from .plan_stages import DENSE, Dense, Sizes, StagePlan, add
+
+FEATURES = "features"  # the folder of maps, as `kfgs features` and `kfgs fit` take it
 
 
 @dataclass(frozen=True)
@@ -71,11 +74,13 @@ class Plan:
             )
         wants = []
         if self.disk_bytes > self.disk_free:
-            text = f"needs {say_bytes(self.disk_bytes)} on disk, {say_bytes(self.disk_free)} free"
+            text = f"needs {bytes_in_words(self.disk_bytes)} on disk, {bytes_in_words(self.disk_free)} free"
             wants.append(f"{text}; {self._less_disk()}")
         if self.memory_free is not None and self.peak_bytes > self.memory_free:
             stage = max(self.stages, key=lambda one: one.peak_bytes or 0).name
-            text = f"needs {say_bytes(self.peak_bytes)} of memory ({stage}), {say_bytes(self.memory_free)} free"
+            text = (
+                f"needs {bytes_in_words(self.peak_bytes)} of memory ({stage}), {bytes_in_words(self.memory_free)} free"
+            )
             wants.append(f"{text}; ask for smaller maps (--size), or end other programs")
         return "does not fit: " + "; ".join(wants) if wants else "fits"
 
@@ -84,7 +89,7 @@ class Plan:
         if self.dense != "recompute" and less is not None and less <= self.disk_free:
             fast = "--fast does not change that; " if self.forwards > 1 else ""
             return (
-                f"{fast}recompute instead of storing: {say_bytes(less)} on disk, twice the teacher's time "
+                f"{fast}recompute instead of storing: {bytes_in_words(less)} on disk, twice the teacher's time "
                 "(kfgs fit SCENE --teacher ...)"
             )
         return "ask for smaller maps (--size), or use a larger disk"
@@ -99,13 +104,13 @@ class Plan:
 
     def __str__(self) -> str:
         rows = [("stage", "what", "time", "memory", "disk")]
-        for stage in self.stages:
-            disk = say_bytes(stage.disk_bytes)
+        needs = [(one.name, one.what, one.seconds, one.peak_bytes, one.disk_bytes) for one in self.stages]
+        for name, what, seconds, peak, disk in [*needs, ("in all", "", self.seconds, self.peak_bytes, self.disk_bytes)]:
+            rows.append((name, what, seconds_in_words(seconds), bytes_in_words(peak), bytes_in_words(disk)))
+        for row, stage in enumerate(self.stages, start=1):
             if stage.kept_bytes != stage.disk_bytes:
-                disk += " (for a while)"
-            rows.append((stage.name, stage.what, say_time(stage.seconds), say_bytes(stage.peak_bytes), disk))
-        rows.append(("in all", "", say_time(self.seconds), say_bytes(self.peak_bytes), say_bytes(self.disk_bytes)))
-        rows.append(("this machine", "free", "", say_bytes(self.memory_free), say_bytes(self.disk_free)))
+                rows[row] = (*rows[row][:4], f"{rows[row][4]} (for a while)")
+        rows.append(("this machine", "free", "", bytes_in_words(self.memory_free), bytes_in_words(self.disk_free)))
         widths = [max(len(row[i]) for row in rows) for i in range(5)]
         lines = [
             f"{row[0]:<{widths[0]}}  {row[1]:<{widths[1]}}  {row[2]:>{widths[2]}}  {row[3]:>{widths[3]}}  {row[4]}".rstrip()
@@ -133,17 +138,20 @@ def plan_scene(
     Args:
         scene: its views of `config.split`, their sizes and the number of points count; no picture is read.
         teacher: a name as `load_teacher` takes it, or what is known about one (`TeacherCost.of_maps` for maps on disk).
-        weights: tells the teacher's size, see `teacher_cost`; not loaded.
+        weights: tells the teacher's size, see `teacher_cost`; not loaded, but refused where `load_teacher` would at first
+            sight (`check_weights`).
         options: the teacher's.
         config: the method's options; the paper's when not given.
         dense: what becomes of the dense maps: `keep`, `discard` once index maps are made of them, or `recompute` them
             instead of storing any.
         device: where teacher and field run, see `training_device`.
-        folder: where the run and the maps will be written; need not be there yet.
+        folder: where the run and the maps will be written; need not be there yet. Maps of this teacher that lie in its
+            `features` already are not made again, unless `dense` is `recompute`.
 
     Raises:
         ValueError: if there is no such teacher, split or device, or `dense` is not `keep` although the field learns from the
-            dense maps themselves (mode `decouple`).
+            dense maps themselves (mode `decouple`), or the weights are another model's.
+        FileNotFoundError: if the weights are not there.
     """
     check_choice("dense", dense, DENSE)
     config = config or FitConfig.paper()
@@ -152,7 +160,7 @@ def plan_scene(
             f"dense: expected 'keep' with mode 'decouple', whose field learns from the dense maps, got {dense!r}; keep them"
         )
     target = training_device(device)
-    sizes = Sizes.of(scene, teacher, weights, options or {}, config, dense)
+    sizes = Sizes.of(scene, teacher, weights, options or {}, config, dense, Path(folder) / FEATURES)
     plan = Plan(
         title=sizes.title(target),
         stages=tuple(sizes.stages(target)),
@@ -165,6 +173,5 @@ def plan_scene(
     )
     if config.mode == "decouple" or dense == "recompute" or sizes.existing:
         return plan
-    return replace(
-        plan, disk_recomputed=add([one.disk_bytes for one in replace(sizes, dense="recompute").stages(target)])
-    )
+    anew = replace(sizes, dense="recompute", made=(0,) * len(sizes.made))
+    return replace(plan, disk_recomputed=add([one.disk_bytes for one in anew.stages(target)]))

@@ -9,9 +9,11 @@ from typing import Any, Literal
 
 import torch
 
+from .._files import bytes_in_words
 from ..quant.sampling import choose_grid_step
 from ..scenes import Scene
-from ..teachers.costs import TeacherCost, teacher_cost
+from ..teachers.costs import TeacherCost, check_weights, teacher_cost
+from ..teachers.manifest import read_manifest
 from . import work
 from .fit import FitConfig
 from .machine import Speed, measure_speed
@@ -42,6 +44,8 @@ class Sizes:
     """Everything that the stages' costs follow from."""
 
     views: tuple[tuple[int, tuple[int, int], TeacherCost], ...]  # so many pictures of that size, and what each costs
+    made: tuple[int, ...]  # of how many of them the maps exist, for each of `views`
+    others: str | None  # whose maps lie where the teacher's will be written, if they are none of its
     points: int
     config: FitConfig
     dense: Dense
@@ -56,15 +60,24 @@ class Sizes:
         options: dict[str, Any],
         config: FitConfig,
         dense: Dense,
+        folder: Path,
     ) -> Sizes:
         """What a scene and options say, and how fast the machine is now; the arguments are those of `plan_scene`."""
+        if isinstance(teacher, str):
+            check_weights(teacher, weights)
 
         def cost(size: tuple[int, int]) -> TeacherCost:
             return teacher_cost(teacher, size, weights=weights, **options) if isinstance(teacher, str) else teacher
 
-        counts = Counter(scene.cameras[i].size for i in scene.views(config.split))
+        chosen = scene.views(config.split)
+        counts = Counter(scene.cameras[i].size for i in chosen)
         views = tuple((count, size, cost(size)) for size, count in counts.items())
-        return cls(views, len(scene.points), config, dense, measure_speed())
+        made, others = Counter[tuple[int, int]](), None
+        if dense != "recompute" and views[0][2].forwards != 0:
+            pictures = [(scene.stem(i), scene.cameras[i].size) for i in chosen]
+            made, others = _existing(folder, pictures, {size: one for _, size, one in views})
+        counted = tuple(made[size] for _, size, _ in views)
+        return cls(views, counted, others, len(scene.points), config, dense, measure_speed())
 
     @property
     def cost(self) -> TeacherCost:
@@ -75,6 +88,12 @@ class Sizes:
     def count(self) -> int:
         """Pictures."""
         return sum(count for count, _, _ in self.views)
+
+    @property
+    def missing(self) -> tuple[tuple[int, tuple[int, int], TeacherCost], ...]:
+        """The pictures that the teacher has not seen yet, as `views`."""
+        both = zip(self.views, self.made, strict=True)
+        return tuple((count - made, size, cost) for (count, size, cost), made in both)
 
     @property
     def known(self) -> bool:
@@ -111,6 +130,12 @@ class Sizes:
         """Of all maps on disk."""
         return _HALF * self.pixels * self.channels
 
+    @property
+    def missing_bytes(self) -> int:
+        """Of those maps that are not there yet."""
+        maps = ((count, cost.map_size) for count, _, cost in self.missing if cost.map_size)
+        return sum(_HALF * count * h * w * self.channels for count, (h, w) in maps)
+
     def _grid(self, cost: TeacherCost) -> int:
         h, w = cost.map_size or (0, 0)
         options = self.config.codebook
@@ -129,7 +154,7 @@ class Sizes:
 
     def stages(self, device: torch.device) -> list[StagePlan]:
         """All stages in their order."""
-        found = [] if self.existing else [self.features(device)]
+        found = [] if self.existing or sum(self.made) == self.count else [self.features(device)]
         if self.config.mode != "decouple":
             found += [self.codebook(), self.index_maps(device)]
         if self.config.mode == "adc+sc":
@@ -137,30 +162,31 @@ class Sizes:
         return [*found, self.field(device)]
 
     def _teacher_seconds(self, device: torch.device) -> float | None:
-        """One run over all pictures, what is written not counted."""
-        total = add([None if cost.flops is None else count * cost.flops for count, _, cost in self.views])
+        """One run over the pictures that lack a map, what is written not counted."""
+        total = add([None if cost.flops is None else count * cost.flops for count, _, cost in self.missing])
         if total is None:
             return None
+        pictures = self.count - sum(self.made)
         if device.type == "cuda":
             speed = measure_speed(device).flops * work.GPU_FEATURES_EFFICIENCY
-            return total / speed + self.count * work.PICTURE_WORK / self.speed.flops
-        return work.features_work(total, self.count, 0) / self.speed.flops
+            return total / speed + pictures * work.PICTURE_WORK / self.speed.flops
+        return work.features_work(total, pictures, 0) / self.speed.flops
 
     def features(self, device: torch.device) -> StagePlan:
-        """The teacher over all pictures, and its maps (or the codebook's samples of them) on disk."""
-        flops, forwards = self.cost.flops, self.cost.forwards
+        """The teacher over all pictures without a map, and its maps (or the codebook's samples of them) on disk."""
+        flops, forwards, left = self.cost.flops, self.cost.forwards, self.count - sum(self.made)
         if flops is None:
-            disk = self.dense_bytes if self.known and self.dense != "recompute" else None
-            return StagePlan("features", f"{self.count} pictures, cost unknown", None, None, disk, disk)
+            disk = self.missing_bytes if self.known and self.dense != "recompute" else None
+            return StagePlan("features", f"{left} pictures, cost unknown", None, None, disk, disk)
         network = f"{forwards} x {flops / forwards / 1e12:.2f} TFLOP" if forwards > 1 else f"{flops / 1e12:.2f} TFLOP"
         peak = work.BASE_BYTES + max(cost.peak_bytes or 0 for _, _, cost in self.views)
         seconds = self._teacher_seconds(device)
         if self.dense == "recompute":
             disk, kept = _HALF * self.samples * self.channels, 0
-            what = f"{self.count} pictures of {network}, samples stored"
+            what = f"{left} pictures of {network}, samples stored"
         else:
-            disk, kept = self.dense_bytes, self.dense_bytes if self.dense == "keep" else 0
-            what = f"{self.count} pictures of {network}"
+            disk, kept = self.missing_bytes, self.missing_bytes if self.dense == "keep" else 0
+            what = f"{left} pictures of {network}"
         assert seconds is not None
         seconds += disk / _HALF * work.WRITE_WORK / self.speed.flops
         return StagePlan("features", what, seconds, peak, disk, kept)
@@ -229,6 +255,12 @@ class Sizes:
     def notes(self, device: torch.device) -> list[str]:
         """What a reader should know besides the numbers."""
         found = ["times are rough, within a factor of two or so, at the speed that this machine has at the moment"]
+        if self.cost.assumed is not None:
+            found.append(f"{self.cost.name} is counted with {self.cost.assumed}; --weights tells its size")
+        if sum(self.made):
+            found.append(f"{sum(self.made)} of {self.count} maps exist and are not made again")
+        if self.others is not None:
+            found.append(self.others)
         if self.cost.flops is None:
             found.append(f"the cost of {self.cost.name!r} is unknown: no size, time or memory of its maps is foretold")
         if device.type == "cuda":
@@ -245,9 +277,37 @@ class Sizes:
                 "the codebook looks at every feature of these maps: keeping them takes no more disk, and half the time"
             )
         if self.dense == "keep" and self.config.mode != "decouple":
-            left = f"the {say_bytes(self.dense_bytes)} of maps can be deleted once there are index maps"
+            left = f"the {bytes_in_words(self.dense_bytes)} of maps can be deleted once there are index maps"
             found.append(f"{left} (kfgs fit --discard-features)")
         return found
+
+
+def _existing(
+    folder: Path, pictures: list[tuple[str, tuple[int, int]]], costs: dict[tuple[int, int], TeacherCost]
+) -> tuple[Counter[tuple[int, int]], str | None]:
+    """Of how many (stem, size) there is a map of the teacher in a folder, by size; and a note if they are another's.
+
+    Only the teacher's name and the maps' shapes are compared: its weights are not read to plan.
+    """
+    made, manifest = Counter[tuple[int, int]](), read_manifest(folder)
+    name = next(iter(costs.values())).name
+    if manifest is None or not manifest.maps or ":" in name:  # what a teacher of one's own calls itself is not known
+        return made, None
+    whose = manifest.teacher.get("name")
+    if whose != name:
+        return made, _say_others(folder, f"by {whose!r}")
+    for stem, size in pictures:
+        record, cost = manifest.maps.get(stem), costs[size]
+        if record is None or not (folder / record.file).is_file():
+            continue
+        if cost.map_size is not None and tuple(record.shape) != (*cost.map_size, cost.channels):
+            return Counter(), _say_others(folder, f"of another shape, {tuple(record.shape)}")
+        made[size] += 1
+    return made, None
+
+
+def _say_others(folder: Path, which: str) -> str:
+    return f"{folder} holds maps {which}; `kfgs features` asks for --out with another folder, or --overwrite"
 
 
 def add(values: list[Any]) -> Any:
@@ -258,19 +318,3 @@ def add(values: list[Any]) -> Any:
 def say_size(size: tuple[int, int] | None) -> str:
     """(h, w) for people."""
     return "unknown size" if size is None else f"{size[0]}x{size[1]}"
-
-
-def say_bytes(count: float | None) -> str:
-    """Bytes for people."""
-    if count is None:
-        return "unknown"
-    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
-
-
-def say_time(seconds: float | None) -> str:
-    """Seconds for people."""
-    if seconds is None:
-        return "unknown"
-    if seconds < 60:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.1f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

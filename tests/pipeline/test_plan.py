@@ -17,6 +17,7 @@ from kfgs.pipeline.work import gaussian_counts, render_pixels
 from kfgs.scenes import Scene, load_scene
 from kfgs.teachers import FeatureFolder
 from kfgs.teachers.costs import TeacherCost
+from kfgs.teachers.manifest import Manifest, MapRecord
 
 GB = 1e9
 
@@ -117,6 +118,64 @@ def test_maps_that_exist_need_no_teacher(big):
     plan = plan_scene(scene(), teacher=TeacherCost.of_maps("folder", (90, 120, 512)), config=FitConfig.cpu())
     assert plan.stages[0].name == "codebook"
     assert plan.disk_bytes < 0.1 * GB
+
+
+def manifest(folder, teacher, shapes):
+    """A folder of maps as `extract_features` leaves it, of which only the records count here."""
+    folder.mkdir()
+    records = {}
+    for stem, shape in shapes.items():
+        (folder / f"{stem}.npy").write_bytes(b"map")
+        records[stem] = MapRecord(f"{stem}.npy", shape, 3, 1, "0" * 64, f"{stem}.png", "0" * 64, 1.0)
+    Manifest({"name": teacher}, records).save(folder)
+
+
+def test_maps_that_the_teacher_has_made_are_not_made_again(big, tmp_path):
+    none = plan_scene(scene(), folder=tmp_path)
+    manifest(tmp_path / "features", "lseg", {str(i): (360, 480, 512) for i in range(60)})
+    some = plan_scene(scene(), folder=tmp_path)
+    assert "60 of 90 maps exist and are not made again" in str(some)
+    made, both = stages(some)["features"], stages(none)["features"]
+    assert made.disk_bytes == 30 * 360 * 480 * 512 * 2 == both.disk_bytes / 3
+    assert made.seconds == pytest.approx(both.seconds / 3)
+    assert "30 pictures of" in made.what
+    assert stages(some)["codebook"] == stages(none)["codebook"]
+    assert some.disk_recomputed == none.disk_recomputed
+    anew = plan_scene(scene(), folder=tmp_path, dense="recompute")  # which keeps none
+    assert stages(anew)["features"].seconds > 2 * made.seconds
+    (tmp_path / "features" / "0.npy").unlink()
+    assert "59 of 90 maps exist" in str(plan_scene(scene(), folder=tmp_path))
+    assert plan_scene(scene(59), folder=tmp_path).stages[0].name == "features"  # one lacks its map
+    (tmp_path / "features" / "0.npy").write_bytes(b"map")
+    assert plan_scene(scene(60), folder=tmp_path).stages[0].name == "codebook"
+
+
+def test_maps_of_others_do_not_count(big, tmp_path):
+    manifest(tmp_path / "features", "lseg", {"0": (360, 480, 512), "1": (90, 120, 512)})
+    told = f"{tmp_path / 'features'} holds maps of another shape, (90, 120, 512); `kfgs features` asks for --out"
+    all_of_them = stages(plan_scene(scene()))["features"]
+    plan = plan_scene(scene(), folder=tmp_path)
+    assert told in str(plan)
+    assert stages(plan)["features"] == all_of_them
+    assert f"{tmp_path / 'features'} holds maps by 'lseg'; " in str(
+        plan_scene(scene(), teacher="clip", folder=tmp_path)
+    )
+    assert "holds maps" not in str(plan_scene(scene(), teacher="mine:encode", folder=tmp_path))
+
+
+def test_an_assumed_size_is_told(big):
+    assert "clip is counted with 12 blocks of 768 channels, patches of 16, since no weights are named" in str(
+        plan_scene(scene(), teacher="clip")
+    )
+    assert "counted with" not in str(plan_scene(scene(), teacher="clip", weights="openai/clip-vit-large-patch14"))
+    assert "counted with" not in str(plan_scene(scene()))
+
+
+def test_weights_that_cannot_be_loaded_are_refused(big, tmp_path):
+    with pytest.raises(
+        FileNotFoundError, match=r"no\.ckpt: expected a checkpoint file of teacher 'lseg', got no such file"
+    ):
+        plan_scene(scene(2), weights=tmp_path / "no.ckpt")
 
 
 def test_views_of_two_sizes_are_added_up(big):

@@ -11,11 +11,13 @@ from kfgs.teachers.costs import (
     SAM_SIZES,
     TeacherCost,
     VitSizes,
+    check_weights,
     known_costs,
     lseg_flops,
     sam_flops,
     teacher_cost,
 )
+from kfgs.teachers.vit_sizes import vit_sizes
 
 
 def counted(make, *inputs):
@@ -138,10 +140,71 @@ def test_a_map_of_patches_follows_size_and_aspect():
         ("dinov2", "facebook/dinov2-giant", 1536),
         ("dinov3", "facebook/dinov3-vit7b16-pretrain-lvd1689m", 4096),
         ("tipsv2", "google/tipsv2-l14", 1024),
+        ("openclip", "laion/CLIP-ViT-g-14-laion2B-s34B-b88K", 1024),
+        ("openclip", "laion/CLIP-ViT-bigG-14-laion2B-39B-b160k", 1280),
+        ("openclip", "laion/CLIP-ViT-H-14-laion2B-s32B-b79K", 1024),
+        ("openclip", "laion/CLIP-ViT-L-14-laion2B-s32B-b82K", 768),
+        ("clip", "/large/huge-patch14/clip-vit-base-patch16", 512),  # only the last part names the model
+        ("openclip", "/large/CLIP-ViT-B-32/open_clip_pytorch_model.bin", 512),
+        ("siglip", "/models/so400m/siglip-base-patch16-224", 768),
+        ("radio", "nvidia/C-RADIOv3-B", 768),
+        ("radio", "/data/base-l/C-RADIOv3-H", 1280),
     ],
 )
 def test_the_name_of_the_weights_tells_the_size(kind, weights, channels):
-    assert teacher_cost(kind, (448, 448), weights=weights).channels == channels
+    cost = teacher_cost(kind, (448, 448), weights=weights)
+    assert cost.channels == channels
+    assert (cost.assumed is None) == (weights is not None)
+
+
+def test_clip_of_other_widths_and_patches():
+    sizes, assumed = vit_sizes("openclip", "laion/CLIP-ViT-g-14-laion2B-s34B-b88K")
+    assert ((sizes.width, sizes.depth, sizes.mlp, sizes.patch), assumed) == ((1408, 40, 6144, 14), False)
+    # OpenCLIP's ViT-g-14 has 1.01 G weights in its image tower, its bigG 1.84 G.
+    assert sizes.parameters == pytest.approx(1.01e9, rel=0.02)
+    assert vit_sizes("openclip", "CLIP-ViT-bigG-14-laion2B")[0].parameters == pytest.approx(1.84e9, rel=0.02)
+    assert vit_sizes("openclip", "/x/CLIP-ViT-B-32/open_clip_model.safetensors")[0].patch == 32
+
+
+def test_a_size_that_nothing_tells_is_called_assumed():
+    unknown = teacher_cost("openclip", (448, 448), weights="somebody/clip-vit-tiny-patch14")
+    assert unknown.assumed == "12 blocks of 768 channels, patches of 16, since 'clip-vit-tiny-patch14' tells no size"
+    assert teacher_cost("dinov2", (448, 448)).assumed.endswith("since no weights are named")
+    assert teacher_cost("sam", (448, 448)).assumed == "12 blocks of 768 channels, since no weights are named"
+    assert teacher_cost("sam", (448, 448), weights="/vit_h/sam.pth").assumed.endswith("since 'sam.pth' tells no size")
+    assert teacher_cost("sam", (448, 448), weights="/vit_h/sam_vit_b_01ec64.pth").assumed is None
+    assert teacher_cost("sam", (448, 448), weights="/mobile/sam_vit_b_01ec64.pth").flops is not None
+    assert teacher_cost("lseg", (448, 448)).assumed is None  # there is one size
+
+
+def test_weights_that_loading_would_refuse_are_refused(tmp_path):
+    with pytest.raises(
+        FileNotFoundError, match=r"expected a checkpoint file of teacher 'lseg', got a folder; check its"
+    ):
+        check_weights("lseg", tmp_path)
+    with pytest.raises(
+        FileNotFoundError, match=r"teacher 'sam', or one of vit_b, vit_l, vit_h to plan for, got no such f"
+    ):
+        check_weights("sam", tmp_path / "sam_vit_h.pth")
+    with pytest.raises(FileNotFoundError, match=r"expected a folder as save_pretrained .* got a folder without config"):
+        check_weights("clip", tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"a path where nothing lies; check its name"):
+        check_weights("dinov2", tmp_path / "none")
+    (tmp_path / "config.json").write_text(json.dumps({"model_type": "dinov2"}))
+    with pytest.raises(ValueError, match=r"expected a model of type 'clip' .* load it as teacher 'dinov2'"):
+        check_weights("clip", tmp_path)
+    check_weights("dinov2", tmp_path)
+    (tmp_path / "open_clip_model.safetensors").write_bytes(b"")
+    for name, weights in (
+        ("lseg", tmp_path / "config.json"),  # a file; what it holds is not looked at
+        ("sam", "vit_h"),
+        ("clip", "openai/clip-vit-base-patch16"),
+        ("openclip", tmp_path),
+        ("mine:encode", "w"),
+        ("lseg", None),
+        ("clip", None),
+    ):
+        check_weights(name, weights)
 
 
 def test_a_local_folder_tells_its_own_size(tmp_path):
