@@ -13,10 +13,21 @@ from tqdm import tqdm
 
 from .._files import digest_file
 from ..scenes import Scene, read_image
-from .layouts import LAYOUTS, layout_of, write_npy_map
-from .manifest import Manifest, MapRecord, read_manifest
-from .map_store import MapStore, check_space, duration, encode_half, gigabytes, locked, map_file, plain_identity, sweep
-from .protocol import Teacher, identify
+from .layouts import LAYOUTS, OWN, layout_of, write_npy_map
+from .manifest import MANIFEST, Manifest, MapRecord, read_manifest
+from .map_store import (
+    MapStore,
+    check_space,
+    doubt_file,
+    duration,
+    encode_half,
+    gigabytes,
+    locked,
+    map_file,
+    plain_identity,
+    sweep,
+)
+from .protocol import Teacher, as_teacher, identify
 
 
 @dataclass(frozen=True)
@@ -43,7 +54,7 @@ def pictures_of(scene: Scene, views: Sequence[int] | None = None) -> list[Pictur
 
 
 def extract_features(
-    teacher: Teacher,
+    teacher: Teacher | Callable[[Tensor], Tensor],
     pictures: Sequence[Picture],
     folder: str | Path,
     *,
@@ -57,12 +68,16 @@ def extract_features(
     which is written after every picture. A map is made again if it is gone or damaged, or if its picture has changed.
     One picture and its map are in memory at a time.
 
+    Where there is a `features.json`, a `<stem>.npy` that it does not tell of is taken for what a killed process left, and
+    is written over without asking; keep maps of other programs in folders of their own.
+
     Args:
-        teacher: sees each picture, [3, H, W] RGB in [0, 1].
+        teacher: sees each picture, [3, H, W] RGB in [0, 1]; a teacher, or a function to [D, h, w] (see `as_teacher`).
         pictures: see `pictures_of`.
         folder: for the maps; made if there is none.
         overwrite: give up the maps of another teacher (or other weights, or options) that lie there, and maps of these
-            names that kfgs did not write. Maps of the same teacher are kept all the same.
+            names that other programs wrote (until all are written over, `FeatureFolder` refuses those that are left).
+            Maps of the same teacher are kept all the same.
         progress: show a progress bar, with the time left.
         report: receives a line about what is to be done, and one per map that is made again.
 
@@ -70,13 +85,13 @@ def extract_features(
         The manifest: a record per map, also of pictures that this call was not asked for.
 
     Raises:
-        TypeError: if the teacher returns no tensor, or its identity is no JSON.
+        TypeError: if `teacher` is none, it returns no tensor, or its identity is no JSON.
         ValueError: if there are no pictures, two have one stem, a map is not finite in float16 or has another number of
             channels than the others, or another size than that of a picture of equal size; if the folder holds maps of
             another teacher, or is being written to by another process.
         OSError: if the folder cannot be written to, or the maps will not fit on the disk.
     """
-    folder = Path(folder)
+    folder, teacher = Path(folder), as_teacher(teacher)
     check_pictures(pictures, folder)
     with locked(folder):
         identity = plain_identity(identify(teacher))
@@ -103,39 +118,75 @@ def extract_features(
         return store.manifest
 
 
-def discard_maps(folder: str | Path) -> int:
-    """Delete the maps of a folder that `extract_features` filled, once index maps have been made of them.
+def discard_maps(folder: str | Path, stems: Sequence[str] | None = None) -> int:
+    """Delete maps of a folder that `extract_features` filled, once index maps have been made of them.
 
     The manifest stays, so that finished stages of a run are still found; `extract_features` makes the maps again.
+
+    Args:
+        folder: of the maps.
+        stems: of the views whose maps are to go; all maps of the folder if None.
 
     Returns:
         Bytes that were freed.
 
     Raises:
-        ValueError: if the folder has no manifest, is in use, or holds a map that has changed since it was written; then
-            nothing is deleted.
+        ValueError, TypeError: as `check_discardable`, or if the folder is in use; then nothing is deleted.
     """
     folder = Path(folder)
+    _manifest_of(folder)  # before there is a lock file in a folder of other programs
+    with locked(folder):
+        manifest, files = _discardable(folder, stems)
+        replace(manifest, discarded=True).save(folder)  # first, so that a killed call can be repeated
+        freed = sum(path.stat().st_size for path in files)
+        for path in files:
+            path.unlink()
+    return freed
+
+
+def check_discardable(folder: str | Path, stems: Sequence[str] | None = None) -> None:
+    """Do nothing if `discard_maps` could delete these maps: to be asked before the work that is to make them superfluous.
+
+    Files are only read if they were copied or touched since.
+
+    Raises:
+        ValueError: if the folder has no manifest, or one that does not tell of a view, or of another file than is there.
+        TypeError: if `stems` is a text.
+    """
+    _discardable(Path(folder), stems)
+
+
+def _discardable(folder: Path, stems: Sequence[str] | None) -> tuple[Manifest, list[Path]]:
+    """The manifest, and the files of these views' maps that are there."""
+    manifest = _manifest_of(folder)
+    if isinstance(stems, str):
+        raise TypeError(f"stems: expected a list of image stems, got the text {stems!r}; put it into a list")
+    wanted = list(manifest.maps) if stems is None else list(dict.fromkeys(stems))
+    unknown = [stem for stem in wanted if stem not in manifest.maps]
+    if unknown:
+        raise ValueError(
+            f"stems: expected views whose maps kfgs made, got {unknown[0]!r}, which {folder / MANIFEST} does not tell of "
+            f"({len(unknown)} of {len(wanted)}); delete such maps by hand"
+        )
+    files = []
+    for stem in wanted:
+        record, path = manifest.maps[stem], map_file(folder, stem)
+        if path != folder / record.file or (path.is_file() and doubt_file(path, record) is not None):
+            raise ValueError(
+                f"folder: expected maps as they were written, got another file in {folder / record.file}; move it away"
+            )
+        files += [path] if path.is_file() else []
+    return manifest, files
+
+
+def _manifest_of(folder: Path) -> Manifest:
     manifest = read_manifest(folder)
     if manifest is None:
         raise ValueError(
             f"folder: expected maps that kfgs made (with features.json), got none in {folder}; maps of other programs "
             "cannot be made again by kfgs: delete them by hand"
         )
-    with locked(folder):
-        manifest = read_manifest(folder) or manifest
-        files = [folder / record.file for record in manifest.maps.values() if (folder / record.file).is_file()]
-        for stem, record in manifest.maps.items():
-            path = map_file(folder, stem)
-            if path != folder / record.file or (path.is_file() and path.stat().st_size != record.bytes):
-                raise ValueError(
-                    f"folder: expected maps as they were written, got another file in {folder / record.file}; move it away"
-                )
-        replace(manifest, discarded=True).save(folder)  # first, so that a killed call can be repeated
-        freed = sum(path.stat().st_size for path in files)
-        for path in files:
-            path.unlink()
-    return freed
+    return manifest
 
 
 class _Maker:
@@ -227,12 +278,12 @@ def check_pictures(pictures: Sequence[Picture], folder: Path) -> None:
 def _make_room(folder: Path, pictures: Sequence[Picture], identity: dict[str, object], *, overwrite: bool) -> None:
     """Refuse maps that are not ours, or give them up if that was asked for."""
     found = read_manifest(folder)
-    ours = next(i for i, layout in enumerate(LAYOUTS) if layout.suffix == ".npy")
+    own = {map_file(folder, picture.stem) for picture in pictures} | (found.files(folder) if found else set())
     shadows = (
         file
         for picture in pictures
-        for layout in LAYOUTS[:ours]
-        if (file := folder / f"{picture.stem}{layout.suffix}").is_file() and layout_of(file) is layout
+        for layout in LAYOUTS[: LAYOUTS.index(OWN)]
+        if (file := folder / f"{picture.stem}{layout.suffix}").is_file() and layout_of(file, own) is layout
     )
     if (first := next(shadows, None)) is not None:
         raise ValueError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import overload
@@ -26,7 +26,7 @@ from .layouts import (
     partner_of,
     read_block,
 )
-from .manifest import MapRecord, read_manifest
+from .manifest import MANIFEST, MapRecord, read_manifest
 from .stems import explain_missing, find_maps, list_maps
 
 
@@ -38,6 +38,8 @@ class FeatureFolder(Sequence[Tensor]):
     `<stem>.safetensors` (an array [h, w, D]; one of [D, h, w] is recognised by `channels` or the picture's aspect). Half,
     single or double precision. The stem may be followed by the picture's ending, and a picture in a subfolder has its
     map in the same subfolder; if no view has a map there, the last part of its name is looked for in all subfolders.
+    A folder that kfgs filled (it holds `features.json`) is read as kfgs filled it: maps of other programs among them,
+    or what a killed process left, are refused.
 
     No map is kept in memory, so the maps of a scene need not fit. Every map must have the same size; all-zero features
     are allowed, and mean "nothing known here". Maps that kfgs wrote, and deleted once index maps had been made of them
@@ -55,8 +57,9 @@ class FeatureFolder(Sequence[Tensor]):
     Raises:
         NotADirectoryError: if `path` is no folder.
         FileNotFoundError: if views have no map; the message names them. When a map is read: if it was discarded.
-        ValueError: if `stems` is empty or repeats one, or several files may be meant. When a map is read: if it is not a
-            finite map of floats of the size of the first, or cannot be read at all; the message names the file.
+        ValueError: if `stems` is empty or repeats one, several files may be meant, or `features.json` is damaged or does
+            not tell of a view's file. When a map is read: if it is not a finite map of floats of the size of
+            the first, or cannot be read at all; the message names the file.
         TypeError: when a map is read: if the file holds something else than one tensor.
 
     Example:
@@ -89,13 +92,17 @@ class FeatureFolder(Sequence[Tensor]):
         self.identity = manifest.teacher if manifest else None
         """What decides the maps (`identify`), if kfgs made them; else None."""
         records = manifest.maps if manifest else {}
-        gone = records if manifest and manifest.discarded else {}
-        self.stems = _check_stems(self.path, [*list_maps(self.path), *gone] if stems is None else stems, stems is None)
+        gone = manifest.gone(self.path) if manifest else {}
+        self._own = manifest.files(self.path) if manifest else frozenset()
+        listed = [*list_maps(self.path, own=self._own), *gone] if stems is None else stems
+        self.stems = _check_stems(self.path, listed, stems is None)
         if sizes is not None and len(sizes) != len(self.stems):
             raise ValueError(f"sizes: expected {len(self.stems)} (one per view), got {len(sizes)}; give one for each")
         self.sizes = None if sizes is None else list(sizes)
         self._records = [records.get(stem) for stem in self.stems]
-        self.files = _find_files(self.path, self.stems, gone)
+        self.files = _find_files(self.path, self.stems, gone, self._own)
+        if manifest is not None:
+            _check_recorded(self.path, self.files, self._own)
         self._shape: tuple[int, int, int] | None = None
 
     def __len__(self) -> int:
@@ -159,7 +166,7 @@ class FeatureFolder(Sequence[Tensor]):
         It is known where `features.json` tells of this very file, or of one that was discarded. LangSplat's maps are
         digested here, both files together; the level and the stride are part of the name.
         """
-        langsplat = [file.is_file() and layout_of(file) is LANGSPLAT for file in self.files]
+        langsplat = [file.is_file() and layout_of(file, self._own) is LANGSPLAT for file in self.files]
         result = []
         for i, file in enumerate(self.files):
             record = self._record(i)
@@ -192,7 +199,8 @@ class FeatureFolder(Sequence[Tensor]):
                 "since; make it again with `kfgs features`"
             )
         reading = replace(self.reading, size=self.sizes[i] if self.sizes else None)
-        return open_map(file, reading if record is None else replace(reading, channels=record.shape[2]))
+        known = reading if record is None else replace(reading, channels=record.shape[2])
+        return open_map(file, known, self._own)
 
     def _checked(self, i: int) -> StoredMap:
         """View i's map, if it has the size of the first."""
@@ -245,12 +253,12 @@ def _check_stems(folder: Path, stems: Sequence[str], listed: bool) -> list[str]:
     return found
 
 
-def _find_files(folder: Path, stems: list[str], gone: dict[str, MapRecord]) -> list[Path]:
+def _find_files(folder: Path, stems: list[str], gone: dict[str, Path], own: Collection[Path]) -> list[Path]:
     """Each view's file; the one it was, where the map has been discarded."""
-    found = find_maps(folder, stems)
+    rest = [stem for stem in stems if stem not in gone]
+    present = dict(zip(rest, find_maps(folder, rest, own), strict=True))
+    found = [[gone[stem]] if stem in gone else present[stem] for stem in stems]
     for stem, files in zip(stems, found, strict=True):
-        if not files and stem in gone:
-            files.append(folder / gone[stem].file)
         if len(files) > 1:
             names = ", ".join(str(file.relative_to(folder)) for file in files[:3])
             raise ValueError(
@@ -260,3 +268,14 @@ def _find_files(folder: Path, stems: list[str], gone: dict[str, MapRecord]) -> l
     if missing:
         raise FileNotFoundError(f"{folder}: {explain_missing(folder, stems, missing)}")
     return [files[0] for files in found]
+
+
+def _check_recorded(folder: Path, files: list[Path], own: Collection[Path]) -> None:
+    """Refuse maps that the folder's manifest does not tell of: its teacher need not have made them."""
+    others = [file for file in files if file not in own]
+    if others:
+        raise ValueError(
+            f"{others[0]}: expected a map that {MANIFEST} tells of, as kfgs filled this folder, got one without a record "
+            f"({len(others)} of {len(files)} views); run `kfgs features` again, which makes these maps, or move maps of "
+            "other programs to a folder of their own"
+        )

@@ -6,7 +6,7 @@ import math
 import pickle
 import warnings
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -82,11 +82,16 @@ def _open_torch(file: Path, _: Reading) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about the pickle's protocol; what matters is raised
         try:
-            return torch.load(file, map_location="cpu", mmap=mapped, weights_only=True)
+            found = torch.load(file, map_location="cpu", mmap=mapped, weights_only=True)
         except pickle.UnpicklingError as error:  # its own text is a page about torch 2.6
             code = "global" in str(error).lower() or "class" in str(error).lower()
             words = "it holds objects beside tensors, which are not run" if code else "not a tensor that torch saved"
             raise ValueError(words) from error
+    if not isinstance(found, Tensor) or found.layout != torch.strided:
+        return found
+    if found.numel() * found.element_size() > found.untyped_storage().nbytes():  # a few bytes could fill the memory
+        raise ValueError("its values are repeated by strides; save the tensor contiguous")
+    return found.detach()  # saved by a training run, it may ask for gradients
 
 
 def _open_numpy(file: Path, _: Reading) -> Any:
@@ -107,20 +112,33 @@ def _open_langsplat(file: Path, reading: Reading) -> Any:
 
 FEATURE_3DGS = Layout("_fmap_CxHxW.pt", "D h w", True, _open_torch)  # LSeg's in half, SAM's in single precision
 LANGSPLAT = Layout(INDEX, "h w D", True, _open_langsplat, partner=ROWS)
+OWN = Layout(".npy", "h w D", False, _open_numpy)  # kfgs's, also of other programs
 LAYOUTS = (  # the first that a view has is read
     FEATURE_3DGS,
     LANGSPLAT,
-    Layout(".npy", "h w D", False, _open_numpy),  # kfgs's own
+    OWN,
     Layout(".safetensors", "h w D", False, _open_safetensors),
 )
 
 
-def layout_of(file: Path) -> Layout | None:
-    """The first layout whose suffix the file's name ends in, and whose partner lies beside it; None if there is none."""
+def layout_of(file: Path, own: Container[Path] = ()) -> Layout | None:
+    """The first layout whose suffix the file's name ends in, and whose partner lies beside it; None if there is none.
+
+    Args:
+        file: the map.
+        own: maps that kfgs wrote, by its manifest: they are `OWN`, and no partners, whatever their pictures are called.
+    """
+    if file in own:
+        return OWN
     for layout in LAYOUTS:
-        if file.name.endswith(layout.suffix) and (not layout.partner or partner_of(file, layout).is_file()):
+        if file.name.endswith(layout.suffix) and (not layout.partner or _has_partner(file, layout, own)):
             return layout
     return None
+
+
+def _has_partner(file: Path, layout: Layout, own: Container[Path]) -> bool:
+    partner = partner_of(file, layout)
+    return partner not in own and partner.is_file()
 
 
 def partner_of(file: Path, layout: Layout) -> Path:
@@ -128,14 +146,23 @@ def partner_of(file: Path, layout: Layout) -> Path:
     return file.with_name(file.name.removesuffix(layout.suffix) + layout.partner)
 
 
-def open_map(file: Path, reading: Reading = Reading()) -> StoredMap:  # [h, w, D]
+def open_map(
+    file: Path,
+    reading: Reading = Reading(),
+    own: Container[Path] = (),
+) -> StoredMap:  # [h, w, D]
     """A file's map, mapped into memory rather than read; its kind, its number of axes and their order are checked.
+
+    Args:
+        file: the map.
+        reading: how it is to be read.
+        own: maps that kfgs wrote, see `layout_of`.
 
     Raises:
         ValueError: if the file cannot be read, or is no map of floats, or the order of its axes is in doubt.
         TypeError: if it holds something else than one tensor.
     """
-    layout = layout_of(file)
+    layout = layout_of(file, own)
     if layout is None:
         endings = ", ".join(layout.suffix for layout in LAYOUTS)
         raise ValueError(f"{file}: expected a name that ends in one of {endings}, got {file.name!r}; rename the map")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from dataclasses import field as default
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from .._files import read_json, write_json
@@ -27,6 +28,18 @@ class MapRecord:
     seconds: float  # that the teacher took
 
 
+_KINDS: dict[str, type | tuple[type, ...]] = {  # in JSON
+    "file": str,
+    "shape": list,
+    "bytes": int,
+    "mtime_ns": int,
+    "digest": str,
+    "image": str,
+    "image_digest": str,
+    "seconds": (int, float),
+}
+
+
 @dataclass(frozen=True)
 class Manifest:
     """The maps of one teacher, by the stem of their picture. Maps may have been deleted since (`discarded`)."""
@@ -34,6 +47,15 @@ class Manifest:
     teacher: dict[str, Any]  # teachers.identify
     maps: dict[str, MapRecord] = default(default_factory=dict)
     discarded: bool = False  # the maps were deleted on purpose, once index maps had been made of them
+
+    def files(self, folder: Path) -> frozenset[Path]:
+        """The maps that are recorded, which a folder of this manifest holds, or held."""
+        return frozenset(folder / record.file for record in self.maps.values())
+
+    def gone(self, folder: Path) -> dict[str, Path]:
+        """By stem, where the maps were that have been discarded."""
+        files = {stem: folder / record.file for stem, record in self.maps.items()} if self.discarded else {}
+        return {stem: file for stem, file in files.items() if not file.is_file()}
 
     def save(self, folder: Path) -> None:
         """Write `features.json`, atomically."""
@@ -54,9 +76,35 @@ def read_manifest(folder: str | Path) -> Manifest | None:
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise ValueError(f"{path}: expected format {FORMAT!r}, got something else; {hint}")
     try:
-        records = {
-            stem: MapRecord(**{**record, "shape": tuple(record["shape"])}) for stem, record in found["maps"].items()
-        }
-        return Manifest(dict(found["teacher"]), records, bool(found["discarded"]))
-    except (KeyError, TypeError, AttributeError) as error:
+        kinds = {"teacher": dict, "maps": dict, "discarded": bool}
+        teacher, maps, discarded = (_entry(found, name, kind) for name, kind in kinds.items())
+        return Manifest(teacher, {stem: _read_record(stem, entry) for stem, entry in maps.items()}, discarded)
+    except ValueError as error:
         raise ValueError(f"{path}: expected a manifest of kfgs, but it is damaged ({error}); {hint}") from error
+
+
+def _read_record(stem: str, found: Any) -> MapRecord:
+    """One map's record out of JSON; a ValueError tells what in it cannot be."""
+    if not isinstance(found, dict):
+        raise ValueError(f"{stem}: a record is a {type(found).__name__}")
+    try:
+        values = {name: _entry(found, name, kind) for name, kind in _KINDS.items()}
+    except ValueError as error:
+        raise ValueError(f"{stem}: {error}") from error
+    file, shape = PurePosixPath(values["file"]), values["shape"]
+    if not file.name or file.is_absolute() or ".." in file.parts or "\0" in str(file):
+        raise ValueError(f"{stem}: file {str(file)[:80]!r} is no name within the folder")
+    if len(shape) != 3 or not all(type(size) is int and size > 0 for size in shape):
+        raise ValueError(f"{stem}: shape {str(shape)[:80]} is not three positive whole numbers")
+    if min(values["bytes"], values["seconds"]) < 0 or not math.isfinite(values["seconds"]):
+        raise ValueError(f"{stem}: bytes and seconds cannot be {values['bytes']} and {values['seconds']}")
+    return MapRecord(**{**values, "shape": tuple(shape)})
+
+
+def _entry(found: dict[str, Any], name: str, kind: type | tuple[type, ...]) -> Any:
+    if name not in found:
+        raise ValueError(f"{name} is missing")
+    value = found[name]
+    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+        raise ValueError(f"{name} is a {type(value).__name__}")
+    return value

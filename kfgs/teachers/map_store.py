@@ -72,6 +72,7 @@ def encode_half(teacher: Teacher, picture: Tensor, path: Path) -> Tensor:  # [H,
             finite &= torch.isfinite(rows.sum(dtype=torch.float32))
         if not bool(finite):
             _refuse(teacher.name, features, path)
+        _check_underflow(teacher.name, features, half, path)
     return half.cpu()
 
 
@@ -87,6 +88,26 @@ def _refuse(name: str, features: Tensor, path: Path) -> None:
         f"teacher {name!r}: expected features below 65504 (they are stored as float16) for {path}, got values up to "
         f"{largest:g}; scale them, or bring the rows to unit length"
     )
+
+
+def _check_underflow(
+    name: str,
+    features: Tensor,  # [D, h, w]
+    half: Tensor,  # [h, w, D] float16
+    path: Path,
+) -> None:
+    """Refuse features that are something, but nothing (all-zero: unknown) once they are rounded."""
+    if not bool((half[..., 0] == 0).any()):  # one channel of many tells of nearly every map that none is all-zero
+        return
+    lost = 0
+    for start in range(0, half.shape[0], ROW_BLOCK):
+        i, j = (~half[start : start + ROW_BLOCK].any(-1)).nonzero(as_tuple=True)
+        lost += int(features[:, start + i, j].any(0).sum())
+    if lost:
+        raise ValueError(
+            f"teacher {name!r}: expected features above 6e-8 (they are stored as float16) for {path}, got {lost} that "
+            "become all-zero; scale them, or bring the rows to unit length"
+        )
 
 
 @dataclass
@@ -129,14 +150,10 @@ class MapStore:
         if stem in self.missing:
             return "its map was discarded" if self.manifest.discarded else "its map is gone"
         path = self.folder / record.file
-        info = path.stat()
-        if info.st_size != record.bytes:
-            return f"its map has {info.st_size} bytes instead of {record.bytes}"
-        if info.st_mtime_ns == record.mtime_ns:
-            return None
-        if digest_file(path) != record.digest:
-            return "its map has changed"
-        self._keep(stem, replace(record, mtime_ns=info.st_mtime_ns))  # the same bytes: copied, or touched
+        if (doubt := doubt_file(path, record)) is not None:
+            return f"its map {doubt}"
+        if (mtime_ns := path.stat().st_mtime_ns) != record.mtime_ns:
+            self._keep(stem, replace(record, mtime_ns=mtime_ns))  # the same bytes: copied, or touched
         return None
 
     def add(self, stem: str, file: Path, **about: Any) -> MapRecord:
@@ -153,6 +170,14 @@ class MapStore:
         # as long as one of the discarded maps is gone, the others' records speak for it
         self.manifest = replace(self.manifest, maps=maps, discarded=self.manifest.discarded and bool(self.missing))
         self.manifest.save(self.folder)
+
+
+def doubt_file(path: Path, record: MapRecord) -> str | None:
+    """Why a file that is there is not the map that was recorded, in words; None if it is, maybe copied or touched."""
+    info = path.stat()
+    if info.st_size != record.bytes:
+        return f"has {info.st_size} bytes instead of {record.bytes}"
+    return "has changed" if info.st_mtime_ns != record.mtime_ns and digest_file(path) != record.digest else None
 
 
 def plain_identity(identity: Mapping[str, Any]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from ..scenes import Scene
 from .cache import check_pictures, discard_maps, pictures_of
 from .manifest import MANIFEST, read_manifest
 from .map_store import MapStore, encode_half, locked, map_file, plain_identity, sweep
-from .protocol import Teacher, identify
+from .protocol import Teacher, as_teacher, identify
 
 
 class RecomputedMaps(Sequence[Tensor]):
@@ -29,13 +29,13 @@ class RecomputedMaps(Sequence[Tensor]):
     per picture: once for the samples and once for the index maps.
 
     Args:
-        teacher: sees each picture, [3, H, W] RGB in [0, 1].
+        teacher: sees each picture, [3, H, W] RGB in [0, 1]; a teacher, or a function to [D, h, w] (see `as_teacher`).
         scene: whose pictures; the teacher sees them as they lie on disk, see `pictures_of`.
         views: which of its views, in the order of the maps.
         store: folder for the samples; made when the first is written. What a killed process left there is used.
 
     Raises:
-        TypeError: if the teacher's identity is no JSON.
+        TypeError: if `teacher` is none, or its identity is no JSON.
         ValueError: if there are no views.
         FileNotFoundError: if a picture is missing.
     """
@@ -43,10 +43,16 @@ class RecomputedMaps(Sequence[Tensor]):
     recomputed = True
     """A look at a map costs a run of the teacher: training on raw maps (`decouple`) is out of the question."""
 
-    def __init__(self, teacher: Teacher, scene: Scene, views: Sequence[int], store: str | Path) -> None:
-        self.teacher, self.pictures, self.store = teacher, pictures_of(scene, views), Path(store)
+    def __init__(
+        self,
+        teacher: Teacher | Callable[[Tensor], Tensor],
+        scene: Scene,
+        views: Sequence[int],
+        store: str | Path,
+    ) -> None:
+        self.teacher, self.pictures, self.store = as_teacher(teacher), pictures_of(scene, views), Path(store)
         check_pictures(self.pictures, self.store)
-        self.identity = plain_identity(identify(teacher))
+        self.identity = plain_identity(identify(self.teacher))
         self._image_digests: dict[int, str] = {}
         self._sampled: dict[tuple[int, str], Path] = {}  # samples that were found good in this process
         self._shape: tuple[int, int, int] | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from .._check import check_whole
 from ..quant import EPS, row_norms
 from .langsplat import parse_level
 from .layouts import FEATURE_3DGS, ROW_BLOCK, Reading, StoredMap, count_bad, fits_aspect, open_map, read_block
-from .manifest import read_manifest
+from .manifest import MANIFEST, Manifest, read_manifest
 from .stems import explain_missing, find_maps, list_maps, three
 
 HOLES = 0.5  # share of all-zero features from which a map is worth a note
@@ -91,8 +91,10 @@ def check_feature_folder(
     """Look at the map of every view, and report all that does not fit at once.
 
     A problem is: no map, or several; a file that cannot be read or holds no map of floats; other channels than expected;
-    another size than most maps have; an aspect that is not the picture's, up to one cell; NaN or infinite values; a map
-    of nothing but zeros. A note is: double precision, many all-zero features, maps of no view, discarded maps.
+    another size than most maps have, or one that looks transposed beside the picture; NaN or infinite values; a map of
+    nothing but zeros; a map that kfgs did not write among its own. A note is: maps of one size whose aspect is not the
+    pictures', up to one cell, as encoders of a fixed grid make them; double precision, many all-zero features, maps of no
+    view, discarded maps.
 
     One map is looked at at a time, a few rows in memory.
 
@@ -106,7 +108,7 @@ def check_feature_folder(
 
     Raises:
         NotADirectoryError: if `folder` is no folder.
-        ValueError: if there is no picture.
+        ValueError: if there is no picture, or `features.json` is damaged.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -116,14 +118,17 @@ def check_feature_folder(
     if stride is not None:
         check_whole("stride", stride, 1)
     found, stems = _Findings(), [stem for stem, _ in pictures]
-    files = _present(root, stems, found)
+    manifest = read_manifest(root)
+    own = manifest.files(root) if manifest else frozenset()
+    files = _present(root, stems, manifest, found)
     reading = {
         stem: Reading(channels, (int(size[0]), int(size[1])), parse_level(level), stride) for stem, size in pictures
     }
     shapes: dict[str, tuple[int, int, int]] = {}
     kinds: Counter[str] = Counter()
     for stem, file in files.items():
-        name, stored = file.relative_to(root).as_posix(), _open(file, reading[stem], root, found)
+        name = file.relative_to(root).as_posix()
+        stored = _open(file, reading[stem], root, own, found)
         if stored is None:
             continue
         h, w, D = map(int, stored.shape)
@@ -135,21 +140,28 @@ def check_feature_folder(
             _look_at_values(name, stored, found)
     common = Counter(shapes.values()).most_common(1)[0][0] if shapes else None
     for stem, shape in shapes.items():
-        size = reading[stem].size or (1, 1)
-        for text in _misfits(shape, common or shape, size, channels):
+        for text in _misfits(shape, common or shape, reading[stem].size or (1, 1), channels):
             found.problem(files[stem].relative_to(root).as_posix(), text)
+    stretched = [stem for stem, shape in shapes.items() if _is_stretched(shape, common, reading[stem].size)]
+    if stretched and common:
+        found.note(
+            "",
+            f"maps of another aspect than their pictures: {len(stretched)} of {len(shapes)} ({three(stretched)}), all of "
+            f"{common[0]} x {common[1]} cells; each is taken to cover its whole picture",
+        )
     used = sum(file.stat().st_size for file in files.values())
     kind = kinds.most_common(1)[0][0] if kinds else ""
     return FeatureReport(root, len(pictures), common, kind, used, found.problems, found.notes)
 
 
-def _present(root: Path, stems: list[str], found: _Findings) -> dict[str, Path]:
+def _present(root: Path, stems: list[str], manifest: Manifest | None, found: _Findings) -> dict[str, Path]:
     """The one file of each view that has one; what is missing, doubtful or superfluous goes into the findings."""
-    manifest = read_manifest(root)
-    gone = manifest.maps if manifest and manifest.discarded else {}
-    maps = dict(zip(stems, find_maps(root, stems), strict=True))
-    discarded = [stem for stem in stems if not maps[stem] and stem in gone]
-    missing = [stem for stem in stems if not maps[stem] and stem not in gone]
+    own = manifest.files(root) if manifest else frozenset()
+    gone = manifest.gone(root) if manifest else {}
+    discarded = [stem for stem in stems if stem in gone]
+    rest = [stem for stem in stems if stem not in gone]
+    maps = dict(zip(rest, find_maps(root, rest, own), strict=True))
+    missing = [stem for stem, files in maps.items() if not files]
     for stem in missing:
         found.problem(stem + FEATURE_3DGS.suffix, "missing, and no other layout of this view either")
     if len(missing) == len(stems):
@@ -161,15 +173,19 @@ def _present(root: Path, stems: list[str], found: _Findings) -> dict[str, Path]:
     if discarded:
         found.note("", f"maps that were discarded once index maps had been made: {len(discarded)} of {len(stems)}")
     chosen = {stem: files[0] for stem, files in maps.items() if len(files) == 1}
-    others = sorted(set(list_maps(root)) - set(stems)) if chosen else []
+    for file in chosen.values():
+        if manifest is not None and file not in own:
+            text = f"{MANIFEST} does not tell of it: of another program, or of a process that was killed"
+            found.problem(file.relative_to(root).as_posix(), text)
+    others = sorted(set(list_maps(root, own=own)) - set(stems)) if chosen else []
     if others:
         found.note("", f"maps of none of these views: {len(others)} ({three(others)})")
     return chosen
 
 
-def _open(file: Path, reading: Reading, root: Path, found: _Findings) -> StoredMap | None:
+def _open(file: Path, reading: Reading, root: Path, own: Collection[Path], found: _Findings) -> StoredMap | None:
     try:
-        return open_map(file, reading)
+        return open_map(file, reading, own)
     except (ValueError, TypeError) as error:
         found.problem(file.relative_to(root).as_posix(), str(error).removeprefix(f"{file}: "))
         return None
@@ -180,13 +196,22 @@ def _misfits(
 ) -> Iterator[str]:
     """What is wrong with a map's sizes, beside those of most maps and of its picture (H, W)."""
     (h, w, D), (H, W) = shape, size
+    fits = fits_aspect((h, w), size)
     if (common[2] if channels is None else channels) != D:
         yield f"expected {common[2] if channels is None else channels} channels, got {D}"
     if (h, w) != common[:2]:
         yield f"expected {common[0]} x {common[1]} cells as most maps have, got {h} x {w}"
-    if not fits_aspect((h, w), size):
+    if not fits and (fits_aspect((w, h), size) or (h, w) != common[:2]):
         hint = " (transposed?)" if fits_aspect((w, h), size) else ""
         yield f"expected the aspect of a picture of {H} x {W} pixels, got {h} x {w} cells{hint}"
+
+
+def _is_stretched(
+    shape: tuple[int, int, int], common: tuple[int, int, int] | None, size: tuple[int, int] | None
+) -> bool:
+    """Whether a map has the cells of most maps, though neither as it is nor transposed the aspect of its picture."""
+    (h, w), one = shape[:2], size or (1, 1)
+    return common is not None and (h, w) == common[:2] and not fits_aspect((h, w), one) and not fits_aspect((w, h), one)
 
 
 def _look_at_values(name: str, stored: StoredMap, found: _Findings) -> None:

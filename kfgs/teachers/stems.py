@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from pathlib import Path, PurePosixPath
 
 from ..scenes.scene import IMAGE_SUFFIXES
 from .layouts import FEATURE_3DGS, LANGSPLAT, LAYOUTS, layout_of
 
 
-def list_maps(folder: Path, *, deep: bool = False) -> dict[str, list[Path]]:
+def list_maps(folder: Path, *, deep: bool = False, own: Container[Path] = ()) -> dict[str, list[Path]]:
     """The maps of a folder by stem; of several files of one stem the one to be read comes first.
 
     A file may also be named by the whole name of the picture (`rgb_1.png.npy`); the stem is `rgb_1` all the same.
@@ -20,35 +20,37 @@ def list_maps(folder: Path, *, deep: bool = False) -> dict[str, list[Path]]:
         folder: where to look; hidden files are left out.
         deep: look into its subfolders too (hidden ones left out, links not followed); a stem then names the subfolder
             as well.
+        own: maps that kfgs wrote, see `layouts.layout_of`.
     """
     found: dict[str, list[Path]] = {}
     for here, folders, names in os.walk(folder):
         folders[:] = sorted(name for name in folders if deep and not name.startswith("."))
         for name in sorted(names):
             file = Path(here) / name
-            layout = None if name.startswith(".") else layout_of(file)
-            if layout is None or _is_partner(file):
+            layout = None if name.startswith(".") else layout_of(file, own)
+            if layout is None or _is_partner(file, own):
                 continue
             stem = file.relative_to(folder).as_posix().removesuffix(layout.suffix)
             ending = PurePosixPath(stem).suffix
-            if ending.lower() in IMAGE_SUFFIXES and PurePosixPath(stem).stem:
+            if file not in own and ending.lower() in IMAGE_SUFFIXES and PurePosixPath(stem).stem:
                 stem = stem.removesuffix(ending)
             found.setdefault(stem, []).append(file)
     for files in found.values():
-        files.sort(key=_rank)
+        files.sort(key=lambda file: _rank(file, own))
     return found
 
 
-def find_maps(folder: Path, stems: Sequence[str]) -> list[list[Path]]:
+def find_maps(folder: Path, stems: Sequence[str], own: Container[Path] = ()) -> list[list[Path]]:
     """Each view's map: no file where there is none, several where it cannot be told which one is meant.
 
     A view's map lies in the folder under the picture's stem, in subfolders as the picture does. If no view has one
     there, maps are looked for by the last part of the stem, in the folder and all its subfolders.
+    Maps in `own` are kfgs's, see `layouts.layout_of`.
     """
-    found = [_direct(folder, stem) for stem in stems]
+    found = [_direct(folder, stem, own) for stem in stems]
     if all(found):
         return found
-    present = list_maps(folder, deep=True)
+    present = list_maps(folder, deep=True, own=own)
     found = [files or present.get(stem, [])[:1] for files, stem in zip(found, stems, strict=True)]
     if any(found):
         return found
@@ -77,20 +79,21 @@ def three(names: list[str]) -> str:
     return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
 
 
-def _direct(folder: Path, stem: str) -> list[Path]:
+def _direct(folder: Path, stem: str, own: Container[Path]) -> list[Path]:
     for layout in LAYOUTS:
         file = folder / f"{stem}{layout.suffix}"
-        if file.is_file() and layout_of(file) is layout:
+        if file.is_file() and layout_of(file, own) is layout:
             return [file]
     return []
 
 
-def _is_partner(file: Path) -> bool:
+def _is_partner(file: Path, own: Container[Path]) -> bool:
     """Whether it is the second file of a map that is kept in two."""
     first = file.with_name(file.name.removesuffix(LANGSPLAT.partner) + LANGSPLAT.suffix)
-    return file.name.endswith(LANGSPLAT.partner) and first.is_file()
+    ours = file in own or first in own
+    return not ours and file.name.endswith(LANGSPLAT.partner) and first.is_file()
 
 
-def _rank(file: Path) -> tuple[int, str]:
-    layout = layout_of(file)
+def _rank(file: Path, own: Container[Path]) -> tuple[int, str]:
+    layout = layout_of(file, own)
     return (LAYOUTS.index(layout) if layout else len(LAYOUTS)), file.name

@@ -15,7 +15,8 @@ import torch
 from PIL import Image
 
 import kfgs
-from kfgs.teachers.cache import Picture, discard_maps, extract_features
+from kfgs.teachers.cache import Picture, check_discardable, discard_maps, extract_features
+from kfgs.teachers.folder import FeatureFolder
 from kfgs.teachers.manifest import read_manifest
 from kfgs.teachers.map_store import LOCK, duration
 
@@ -239,15 +240,116 @@ def test_only_what_kfgs_wrote_is_discarded(pictures, tmp_path):
         discard_maps(folder)
     assert len(contents(folder)) == 3
     (tmp_path / "outside.npy").write_bytes(b"mine")
-    about = json.loads((folder / "features.json").read_text())
-    about["maps"] = {"a": about["maps"]["a"] | {"file": "../outside.npy", "bytes": 4}}
-    (folder / "features.json").write_text(json.dumps(about))
-    with pytest.raises(ValueError, match=r"got another file in .*outside.npy"):
-        discard_maps(folder)
+    whole = (folder / "features.json").read_text()
+    for name, said in (("../outside.npy", "no name within the folder"), ("b.npy", r"got another file in .*b\.npy")):
+        about = json.loads(whole)
+        about["maps"] = {"a": about["maps"]["a"] | {"file": name, "bytes": 4}}
+        (folder / "features.json").write_text(json.dumps(about))
+        with pytest.raises(ValueError, match=said):
+            discard_maps(folder)
     assert (tmp_path / "outside.npy").exists()
+    assert len(contents(folder)) == 3
     (tmp_path / "other").mkdir()
     with pytest.raises(ValueError, match=r"expected maps that kfgs made \(with features.json\), got none in .*other"):
         discard_maps(tmp_path / "other")
+    assert list((tmp_path / "other").iterdir()) == []  # no lock either
+
+
+def test_a_map_of_the_same_length_that_changed_stops_the_deletion_and_a_copied_one_does_not(pictures, tmp_path):
+    folder = tmp_path / "maps"
+    extract_features(Counting(), pictures, folder)
+    whole = contents(folder)
+    (folder / "b.npy").write_bytes(whole["b.npy"][:-1] + b"\x01")
+    for refuse in (discard_maps, check_discardable):
+        with pytest.raises(ValueError, match=r"as they were written, got another file in .*b.npy; move it away"):
+            refuse(folder)
+    assert len(contents(folder)) == 3
+    (folder / "b.npy").write_bytes(whole["b.npy"])
+    os.utime(folder / "b.npy", (1, 1))
+    check_discardable(folder)
+    assert len(contents(folder)) == 3
+    assert discard_maps(folder) == sum(map(len, whole.values()))
+
+
+def test_only_the_maps_of_the_views_that_are_named_are_discarded(pictures, tmp_path):
+    folder = tmp_path / "maps"
+    extract_features(Counting(), pictures, folder)
+    whole = contents(folder)
+    before = FeatureFolder(folder, STEMS).digests()
+    (folder / "b.npy").write_bytes(b"changed")  # a view that is not asked about
+    assert discard_maps(folder, ["a", "sub/c", "a"]) == len(whole["a.npy"]) + len(whole["sub/c.npy"])
+    (folder / "b.npy").write_bytes(whole["b.npy"])
+    assert contents(folder) == {"b.npy": whole["b.npy"]}
+    extract_features(Counting(), pictures[1:2], folder)  # takes note that b is as it was
+    maps = FeatureFolder(folder, STEMS)
+    assert maps.digests() == before
+    assert maps.shape == (3, 4, 5)
+    assert np.array_equal(maps[1].numpy(), np.load(folder / "b.npy"))
+    with pytest.raises(FileNotFoundError, match=r"a\.npy: .* discarded once"):
+        _ = maps[0]
+    assert discard_maps(folder, ["a"]) == 0
+    again, lines = Counting(), []
+    manifest = extract_features(again, pictures, folder, report=lines.append)
+    assert contents(folder) == whole
+    assert (len(again.calls), manifest.discarded) == (2, False)
+    assert lines[1:] == [f"features: {stem}: its map was discarded; making it again" for stem in ("a", "sub/c")]
+
+
+def test_views_without_a_record_are_named_before_any_is_deleted(pictures, tmp_path):
+    folder = tmp_path / "maps"
+    extract_features(Counting(), pictures, folder)
+    for ask in (discard_maps, check_discardable):
+        with pytest.raises(ValueError, match=r"stems: expected views .*, got 'x', which .*features.json .* \(1 of 2\)"):
+            ask(folder, ["a", "x"])
+        with pytest.raises(TypeError, match="stems: expected a list of image stems, got the text 'ab'"):
+            ask(folder, "ab")
+        with pytest.raises(ValueError, match=r"expected maps that kfgs made \(with features.json\), got none"):
+            ask(tmp_path / "images", ["a"])
+    assert len(contents(folder)) == 3
+    assert discard_maps(folder, []) == 0
+    assert len(contents(folder)) == 3
+
+
+def test_foreign_maps_that_were_given_up_do_not_pass_for_ours_when_the_call_dies(pictures, tmp_path):
+    folder = tmp_path / "maps"
+    folder.mkdir()
+    for stem in ("a", "b"):
+        np.save(folder / f"{stem}.npy", np.full((3, 4, 5), 7, np.float16))
+
+    def dies(image):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        extract_features(_Broken(dies), pictures, folder, overwrite=True)  # at the second
+    assert np.load(folder / "b.npy").max() == 7
+    with pytest.raises(ValueError, match=r"b\.npy: expected a map that features.json tells of"):
+        FeatureFolder(folder, ["a", "b"])
+    extract_features(Counting(), pictures, folder)
+    assert FeatureFolder(folder, ["a", "b"])[1].max() < 7
+
+
+def test_pictures_called_like_langsplats_files(pictures, tmp_path):
+    named = [Picture(stem, pictures[i % 3].path) for i, stem in enumerate(("x_s", "x_f", "x", "y_f", "y"))]
+    folder = tmp_path / "maps"
+    extract_features(Counting(), named, folder)
+    again = Counting()
+    extract_features(again, [*named, Picture("y_s", pictures[0].path)], folder)
+    assert len(again.calls) == 1
+    stems = ["x", "x_f", "x_s", "y", "y_f", "y_s"]
+    assert FeatureFolder(folder, stems).digests() == FeatureFolder(folder).digests()
+    assert [file.name for file in FeatureFolder(folder, stems).files] == [f"{stem}.npy" for stem in stems]
+
+
+def test_a_function_is_a_teacher_and_other_things_are_none(pictures, tmp_path):
+    def thumbnail(image):
+        return image[:, ::2, ::2]
+
+    manifest = extract_features(thumbnail, pictures, tmp_path / "maps")
+    assert manifest.teacher["name"] == "thumbnail"
+    assert manifest.maps["a"].shape == (3, 4, 3)
+    with pytest.raises(TypeError, match="teacher: expected an object with name, .*, got str"):
+        extract_features("lseg", pictures, tmp_path / "other")
+    assert not (tmp_path / "other").exists()
 
 
 class _Broken(Counting):
@@ -268,6 +370,10 @@ class _Broken(Counting):
             r"finite features for .*b.png, got 12 NaN or infinite",
         ),
         (lambda f: f * 0 + 70_000, r"below 65504 .*float16\) for .*b.png, got values up to 70000; scale them"),
+        (
+            lambda f: f.index_fill(1, torch.tensor([2]), 1e-9),
+            r"above 6e-8 .*float16\) for .*b.png, got 4 that become all-zero; scale them",
+        ),
         (lambda f: f[:3], r"expected 5 channels for .*b.png as in a.npy, got 3; use one teacher"),
         (lambda f: f[:, 1:], r"\(h, w, D\) = \(3, 4, 5\) for .*b.png as for other pictures of 6 x 8, got \(2, 4, 5\)"),
         (lambda f: f[None], r"expected floats \[D, h, w\] for one picture, got torch.float32 \(1, 5, 3, 4\)"),
@@ -362,3 +468,11 @@ def test_a_bar_shows_each_picture_and_the_time_left(pictures, tmp_path, capsys):
     assert "3/3" in shown
     assert "sub/c, about 0 s left" in shown
     assert [duration(s) for s in (40, 720, 11_880)] == ["40 s", "12 min", "3.3 h"]
+
+
+def test_features_that_are_all_zero_stay_so_and_small_ones_are_kept(pictures, tmp_path):
+    teacher = _Broken(lambda f: f.index_fill(2, torch.tensor([1]), 0) * 1e-6 + f.index_fill(0, torch.arange(5), 0))
+    extract_features(teacher, pictures, tmp_path / "maps")
+    found = np.load(tmp_path / "maps" / "b.npy")
+    assert not found[:, 1].any()
+    assert found[:, [0, 2, 3]].any(-1).all()

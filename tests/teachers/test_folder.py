@@ -300,8 +300,6 @@ def test_digests_come_from_the_manifest_of_these_very_files(tmp_path):
     Manifest({"name": "t"}, records).save(tmp_path)
     want = [[f"{stem}.npy", digest_file(tmp_path / f"{stem}.npy")] for stem in ("b", "a")]
     assert FeatureFolder(tmp_path, ["b", "a"]).digests() == want
-    Manifest({"name": "t"}, {"a": records["a"]}).save(tmp_path)
-    assert FeatureFolder(tmp_path, ["b", "a"]).digests() is None  # b is not recorded
     Manifest({"name": "t"}, {**records, "b": replace(records["b"], mtime_ns=1)}).save(tmp_path)
     assert FeatureFolder(tmp_path, ["b", "a"]).digests() is None  # b was written since
     (tmp_path / "features.json").unlink()
@@ -374,3 +372,54 @@ def test_masks_of_three_things_make_a_codebook_of_three(tmp_path):
     assert np.abs(fit.codebook.unit.numpy() @ things.T).max(axis=1).tolist() == pytest.approx([1.0] * 3, abs=1e-3)
     masked = sum(int((np.load(tmp_path / f"view_{i}_s.npy")[2] >= 0).sum()) for i in range(4))
     assert int(fit.usage.sum()) == masked
+
+
+def test_a_map_among_kfgss_own_that_the_manifest_does_not_tell_of_is_refused(tmp_path):
+    records = {stem: own_map(tmp_path, stem, features(i)) for i, stem in enumerate(("a", "b"))}
+    Manifest({"name": "t"}, {"a": records["a"]}).save(tmp_path)
+    said = r"b\.npy: expected a map that features\.json tells of, .* without a record \(1 of 2 views\); run `kfgs features`"
+    for stems in (["a", "b"], ["b", "a"], None):
+        with pytest.raises(ValueError, match=said):
+            FeatureFolder(tmp_path, stems)
+    assert torch.equal(FeatureFolder(tmp_path, ["a"])[0], features(0).half().float())  # nobody asked for b
+    save_pt(tmp_path, "a", features(2).permute(2, 0, 1))  # read before .npy
+    with pytest.raises(ValueError, match=r"a_fmap_CxHxW\.pt: expected a map that features\.json tells of"):
+        FeatureFolder(tmp_path, ["a"])
+
+
+def test_pictures_called_like_langsplats_files_are_read_as_kfgs_wrote_them(tmp_path):
+    stems = ["x", "x_f", "x_s", "y_s", "y_f", "z.png"]
+    records = {stem: own_map(tmp_path, stem, features(i)) for i, stem in enumerate(stems)}
+    Manifest({"name": "t"}, records).save(tmp_path)
+    for maps in (FeatureFolder(tmp_path, stems), FeatureFolder(tmp_path)):
+        assert sorted(maps.stems) == sorted(stems)
+        for i, stem in enumerate(maps.stems):
+            assert torch.equal(maps[i], features(stems.index(stem)).half().float())
+        assert maps.digests() == [[f"{stem}.npy", records[stem].digest] for stem in maps.stems]
+
+
+def test_a_discarded_map_is_not_looked_for_elsewhere(tmp_path):
+    record = own_map(tmp_path, "a", features(0))
+    (tmp_path / "old").mkdir()
+    (tmp_path / "a.npy").rename(tmp_path / "old" / "a.npy")
+    Manifest({"name": "t"}, {"a": record}, discarded=True).save(tmp_path)
+    assert FeatureFolder(tmp_path, ["a"]).files == [tmp_path / "a.npy"]
+
+
+def test_a_map_saved_by_a_training_run_needs_no_gradient(tmp_path):
+    want = features(0)
+    save_pt(tmp_path, "a", want.permute(2, 0, 1).contiguous().requires_grad_())
+    save_pt(tmp_path, "b", torch.nn.Parameter(want.permute(2, 0, 1).contiguous()))
+    maps = FeatureFolder(tmp_path, ["a", "b"])
+    for i in range(2):
+        assert torch.equal(maps[i], want)
+        assert not maps[i].requires_grad
+        assert torch.equal(maps.grid(i, (2, 2), 1), want[1::2, 1::2].reshape(-1, 8))
+
+
+def test_a_map_that_repeats_a_few_bytes_is_refused(tmp_path):
+    save_pt(tmp_path, "a", torch.ones(1, 1, 1).expand(100_000, 100_000, 10_000))  # 4 bytes on disk, 400 TB read
+    assert (tmp_path / "a_fmap_CxHxW.pt").stat().st_size < 4000
+    said = r"a_fmap_CxHxW\.pt: expected a feature map, .*its values are repeated by strides; save the tensor contiguous"
+    with pytest.raises(ValueError, match=said):
+        FeatureFolder(tmp_path, ["a"])[0]

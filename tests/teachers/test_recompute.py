@@ -167,3 +167,17 @@ def test_the_teacher_sees_pictures_as_they_lie_on_disk(scene):
     assert [p.path for p in pictures_of(lensless, [1])] == [scene.image_paths[1]]
     assert [p.stem for p in pictures_of(scene)] == [f"view_{i}" for i in range(VIEWS)]
     assert pictures_of(scene)[1].read().shape == (16, 20, 3)
+
+
+def test_a_function_is_a_teacher_and_other_things_are_none(scene, tmp_path):
+    def thumbnail(image):
+        return image[:, ::2, ::2]
+
+    maps = RecomputedMaps(thumbnail, scene, [0, 1], tmp_path / "store")
+    pictures = pictures_of(scene)
+    assert torch.equal(maps[1], pictures[1].read()[::2, ::2].half().float())
+    assert maps.identity["name"] == "thumbnail"
+    with pytest.raises(
+        TypeError, match="teacher: expected an object with name, encode_image and encode_text, .*, got str"
+    ):
+        RecomputedMaps("lseg", scene, [0], tmp_path / "store")

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from kfgs.teachers import FeatureFolder, Manifest, save_feature_map
+from kfgs.teachers import FeatureFolder, Manifest
 from kfgs.teachers.manifest import MapRecord
 from kfgs.teachers.report import check_feature_folder
 
@@ -79,10 +79,37 @@ def test_channels_that_are_known_count_more_than_most_maps(folder):
     assert [texts for texts in report.problems.values()] == [["expected 512 channels, got 16"]] * 3
 
 
-def test_aspect_that_no_map_has(folder):
+def test_an_aspect_that_all_maps_share_is_a_note(folder):
     report = check_feature_folder(folder, pictures("a", "b", "c", size=(60, 150)))
-    assert report.problems["a.npy"] == ["expected the aspect of a picture of 60 x 150 pixels, got 6 x 8 cells"]
-    assert len(report.problems) == 3
+    assert report.ok
+    assert report.notes == {
+        "": [
+            "maps of another aspect than their pictures: 3 of 3 (a, b, c), all of 6 x 8 cells; each is taken to cover its "
+            "whole picture"
+        ]
+    }
+
+
+def test_a_square_grid_over_pictures_of_any_aspect_is_a_note(tmp_path):
+    for i, stem in enumerate("abc"):
+        np.save(tmp_path / f"{stem}.npy", features(i, (8, 8, 16)).numpy())
+    views = [("a", (60, 80)), ("b", (80, 60)), ("c", (70, 70))]
+    report = check_feature_folder(tmp_path, views)
+    assert report.ok
+    assert "2 of 3 (a, b), all of 8 x 8 cells" in report.notes[""][0]
+    np.save(tmp_path / "b.npy", features(1, (9, 9, 16)).numpy())  # one that differs is a problem
+    assert check_feature_folder(tmp_path, views).problems == {
+        "b.npy": [
+            "expected 8 x 8 cells as most maps have, got 9 x 9",
+            "expected the aspect of a picture of 80 x 60 pixels, got 9 x 9 cells",
+        ]
+    }
+
+
+def test_maps_that_are_all_transposed_are_a_problem(folder):
+    report = check_feature_folder(folder, pictures("a", "b", "c", size=(80, 60)))
+    text = "expected the aspect of a picture of 80 x 60 pixels, got 6 x 8 cells (transposed?)"
+    assert report.problems == {f"{stem}.npy": [text] for stem in "abc"}
 
 
 def test_channels_first_by_the_picture_is_no_problem(folder):
@@ -136,12 +163,29 @@ def test_several_files_of_one_view(folder):
 
 
 def test_discarded_maps_are_a_note(tmp_path):
-    save_feature_map(tmp_path, "a", features(0))
-    record = MapRecord("b.npy", (6, 8, 16), 1, 1, "0" * 64, "b.png", "0" * 64, 0.1)
-    Manifest({"name": "t"}, {"b": record}, discarded=True).save(tmp_path)
+    np.save(tmp_path / "a.npy", features(0).numpy())
+    records = {
+        stem: MapRecord(f"{stem}.npy", (6, 8, 16), 1, 1, "0" * 64, f"{stem}.png", "0" * 64, 0.1) for stem in ("a", "b")
+    }
+    Manifest({"name": "t"}, records, discarded=True).save(tmp_path)
     report = check_feature_folder(tmp_path, pictures("a", "b"))
     assert report.ok
     assert report.notes == {"": ["maps that were discarded once index maps had been made: 1 of 2"]}
+
+
+def test_a_map_without_a_record_among_kfgss_own_is_a_problem(tmp_path):
+    for i, stem in enumerate(("a_s", "a_f", "b")):
+        np.save(tmp_path / f"{stem}.npy", features(i).numpy())
+    records = {
+        stem: MapRecord(f"{stem}.npy", (6, 8, 16), 1, 1, "0" * 64, f"{stem}.png", "0" * 64, 0.1)
+        for stem in ("a_s", "a_f")
+    }
+    Manifest({"name": "t"}, records).save(tmp_path)
+    report = check_feature_folder(tmp_path, pictures("a_s", "a_f", "b"))
+    text = "features.json does not tell of it: of another program, or of a process that was killed"
+    assert report.problems == {"b.npy": [text]}
+    with pytest.raises(ValueError, match=r"b\.npy: expected a map that features\.json tells of"):
+        FeatureFolder(tmp_path, ["a_s", "a_f", "b"])
 
 
 def test_bad_arguments(tmp_path):

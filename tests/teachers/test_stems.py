@@ -31,3 +31,11 @@ def test_the_stem_itself_goes_before_the_whole_name(tmp_path):
     touch(tmp_path, "a.png.npy", "a.npy", "b.jpg.npy", "b.png.npy")
     found = find_maps(tmp_path, ["a", "b"])
     assert [names(tmp_path, files) for files in found] == [["a.npy"], ["b.jpg.npy"]]
+
+
+def test_what_kfgs_wrote_is_a_map_whatever_the_picture_is_called(tmp_path):
+    touch(tmp_path, "a_s.npy", "a_f.npy", "b_s.npy", "b_f.npy", "c_s.npy", "c_f.npy", "d.png.npy")
+    own = {tmp_path / name for name in ("a_s.npy", "a_f.npy", "b_f.npy", "d.png.npy")}
+    assert sorted(list_maps(tmp_path, own=own)) == ["a_f", "a_s", "b_f", "b_s", "c", "d.png"]
+    found = find_maps(tmp_path, ["a_s", "a_f", "a", "b_s", "c"], own)
+    assert [names(tmp_path, files) for files in found] == [["a_s.npy"], ["a_f.npy"], [], ["b_s.npy"], ["c_s.npy"]]

@@ -1,0 +1,83 @@
+import json
+import re
+
+import pytest
+
+from kfgs.teachers.folder import FeatureFolder
+from kfgs.teachers.manifest import Manifest, MapRecord, read_manifest
+
+RECORD = MapRecord("sub/a.npy", (3, 4, 5), 248, 17, "d" * 64, "a.png", "e" * 64, 0.25)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    Manifest({"name": "t", "options": {"size": [3, 4]}}, {"sub/a": RECORD}, discarded=True).save(tmp_path)
+    return tmp_path
+
+
+def change(folder, **values) -> None:
+    """Put other values into the one record, or into the manifest."""
+    about = json.loads((folder / "features.json").read_text())
+    for name, value in values.items():
+        (about if name in about else about["maps"]["sub/a"])[name] = value
+    (folder / "features.json").write_text(json.dumps(about))
+
+
+def test_what_is_saved_comes_back(folder):
+    found = read_manifest(folder)
+    assert found == Manifest({"name": "t", "options": {"size": [3, 4]}}, {"sub/a": RECORD}, discarded=True)
+    assert found.files(folder) == {folder / "sub" / "a.npy"}
+    assert found.gone(folder) == {"sub/a": folder / "sub" / "a.npy"}
+    (folder / "sub").mkdir()
+    (folder / "sub" / "a.npy").touch()
+    assert found.gone(folder) == {}
+    assert read_manifest(folder / "sub") is None
+    change(folder, seconds=1)  # a whole number is a number
+    assert read_manifest(folder).maps["sub/a"].seconds == 1
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"file": 5}, "sub/a: file is a int"),
+        ({"file": "../../etc/passwd"}, "sub/a: file '../../etc/passwd' is no name within the folder"),
+        ({"file": "/etc/passwd"}, "sub/a: file '/etc/passwd' is no name within the folder"),
+        ({"file": ""}, "sub/a: file '.' is no name within the folder"),
+        ({"file": "a\0b"}, "is no name within the folder"),
+        ({"shape": [1]}, "sub/a: shape [1] is not three positive whole numbers"),
+        ({"shape": ["a", 2, 3]}, "sub/a: shape ['a', 2, 3] is not three"),
+        ({"shape": [True, 2, 3]}, "sub/a: shape [True, 2, 3] is not three"),
+        ({"shape": [1, 0, 3]}, "sub/a: shape [1, 0, 3] is not three"),
+        ({"shape": [1.0, 2, 3]}, "sub/a: shape [1.0, 2, 3] is not three"),
+        ({"shape": "abc"}, "sub/a: shape is a str"),
+        ({"bytes": "x"}, "sub/a: bytes is a str"),
+        ({"bytes": True}, "sub/a: bytes is a bool"),
+        ({"bytes": -1}, "sub/a: bytes and seconds cannot be -1 and 0.25"),
+        ({"mtime_ns": None}, "sub/a: mtime_ns is a NoneType"),
+        ({"digest": 7}, "sub/a: digest is a int"),
+        ({"image": []}, "sub/a: image is a list"),
+        ({"image_digest": 7}, "sub/a: image_digest is a int"),
+        ({"seconds": float("nan")}, "sub/a: bytes and seconds cannot be 248 and nan"),
+        ({"maps": {"a": []}}, "a: a record is a list"),
+        ({"maps": {"a": {}}}, "a: file is missing"),
+        ({"maps": []}, "maps is a list"),
+        ({"teacher": [["a", 1]]}, "teacher is a list"),
+        ({"discarded": 1}, "discarded is a int"),
+    ],
+)
+def test_what_kfgs_never_wrote_is_refused_in_a_line_that_names_the_file(folder, values, words):
+    change(folder, **values)
+    for read in (read_manifest, FeatureFolder):
+        with pytest.raises(ValueError, match=re.escape(words)) as caught:
+            read(folder)
+        text = str(caught.value)
+        assert text.startswith(f"{folder / 'features.json'}: expected a manifest of kfgs, but it is damaged (")
+        assert text.endswith("delete it to use the maps without it, or make them again with `kfgs features`")
+        assert "\n" not in text
+
+
+@pytest.mark.parametrize("text", ["[]", "{}", '{"format": "kfgs-features/9"}'])
+def test_another_format_is_named(tmp_path, text):
+    (tmp_path / "features.json").write_text(text)
+    with pytest.raises(ValueError, match=r"features\.json: expected format 'kfgs-features/1', got something else"):
+        read_manifest(tmp_path)
