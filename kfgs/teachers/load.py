@@ -6,12 +6,18 @@ import difflib
 import importlib
 import inspect
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
+from .identity import code_identity, plain_options, weights_identity
 from .protocol import Teacher, as_teacher
+from .transformers_source import one_line
 from .transformers_table import TRANSFORMERS
 
 
@@ -40,14 +46,17 @@ def load_teacher(name: str, weights: str | Path | None = None, **options: Any) -
 
     Args:
         name: one of `teacher_names()`, or `package.module:name` of your own: a teacher, a function from [3, H, W] to
-            [D, h, w], or a class, which is called with `weights` (if given) and the options.
+            [D, h, w], or a class, which is called with `weights` (if given) and the options. It is looked for in the
+            folder in which the command runs, too, while it is imported and made. One without an `identity` of its own
+            gets one of source, code, weights and options, so that a cache notices when they change; see
+            `identity.code_identity` for what is not noticed.
         weights: a checkpoint file (lseg, sam), or a folder as `save_pretrained` writes it or a hub id (all others).
         options: of the kind: see `load_lseg`, `load_sam`, `load_transformers_teacher`.
 
     Raises:
         ValueError: if there is no such teacher or option, or the weights are another's; the message says whose.
         FileNotFoundError: if the weights are not there.
-        ImportError: if a package is missing.
+        ImportError: if a package is missing, or there but broken.
     """
     if ":" in name:
         return _imported(name, weights, options)
@@ -76,21 +85,117 @@ def _check_options(name: str, loader: Callable[..., Teacher], options: dict[str,
 
 def _imported(name: str, weights: str | Path | None, options: dict[str, Any]) -> Teacher:
     """The teacher that `package.module:name` stands for; the folder in which the command runs counts."""
-    module_name, _, attribute = name.partition(":")
-    if "" not in sys.path:
-        sys.path.insert(0, "")
-    try:
-        found = getattr(importlib.import_module(module_name), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
+    with _working_folder():
+        found = _find(name)
+        if inspect.isclass(found):
+            given = [] if weights is None else [weights]
+            _check_signature(name, found, given, options)
+            found = found(*given, **options)
+        elif weights is not None or options:
+            raise ValueError(
+                f"weights: expected none for {name!r}, which is made already, got {weights or ', '.join(options)}; name a "
+                "class that takes them instead"
+            )
+    if not isinstance(found, Teacher) and not callable(found):
         raise ValueError(
-            f"teacher: expected package.module:name that can be imported, got {name!r} ({error}); check both names"
-        ) from error
-    if inspect.isclass(found):
-        made: Any = found(*([] if weights is None else [weights]), **options)
-        return as_teacher(made)
-    if weights is not None or options:
-        raise ValueError(
-            f"weights: expected none for {name!r}, which is made already, got {weights or ', '.join(options)}; name a class "
-            "that takes them instead"
+            f"teacher: expected a teacher, a class of teachers or a function from [3, H, W] to [D, h, w], got "
+            f"{type(found).__name__} behind {name!r}, which lacks name, encode_image or encode_text; see "
+            "kfgs.teachers.Teacher"
         )
-    return as_teacher(found)
+    if isinstance(getattr(found, "identity", None), dict):
+        return as_teacher(found)
+    return OwnTeacher(as_teacher(found), name, code_identity(found)["code"], weights, options)
+
+
+def _find(name: str) -> Any:
+    """What lies behind `package.module:name`."""
+    module_name, _, attribute = name.partition(":")
+    try:
+        importlib.invalidate_caches()
+        return getattr(importlib.import_module(module_name), attribute)
+    except (Exception, SystemExit) as error:  # a module may raise anything, or end like a script
+        raise ValueError(
+            f"teacher: expected package.module:name that can be imported, got {name!r} ({one_line(error)}); check both "
+            "names, and that `import` of the module works"
+        ) from error
+
+
+def _check_signature(name: str, made: Callable[..., Any], given: list[Any], options: dict[str, Any]) -> None:
+    """Raise a ValueError if a class does not take weights and options; what it raises itself is its own matter."""
+    try:
+        signature = inspect.signature(made)
+    except (TypeError, ValueError):  # a class of C has none
+        return
+    try:
+        signature.bind(*given, **options)
+    except TypeError as error:
+        got = ", ".join([*(["weights"] if given else []), *options]) or "nothing"
+        raise ValueError(
+            f"weights, options: expected what {name!r} takes, {signature}, got {got} ({error}); pass just those"
+        ) from error
+
+
+@contextmanager
+def _working_folder() -> Iterator[None]:
+    """While open, modules are also looked for in the folder in which the command runs."""
+    if "" in sys.path:
+        yield
+        return
+    sys.path.insert(0, "")
+    try:
+        yield
+    finally:
+        if "" in sys.path:  # what the module itself added stays
+            sys.path.remove("")
+
+
+class OwnTeacher:
+    """A teacher of a user's own that brings no identity, with one of what can be known; made by `load_teacher`.
+
+    Args:
+        teacher: does the work; its other attributes are seen through this one.
+        source: "package.module:name", as it was asked for.
+        code: digest of its code; see `code_identity` for what that does not notice.
+        weights: what it was made with; the digest of the file or folder is taken when the identity is first asked for.
+        options: what it was made with.
+    """
+
+    def __init__(
+        self, teacher: Teacher, source: str, code: str, weights: str | Path | None, options: dict[str, Any]
+    ) -> None:
+        self._teacher, self._weights = teacher, weights
+        self._known = {"source": source, "code": code, "options": plain_options(options)}
+        self._digest: str | None = None
+
+    @property
+    def name(self) -> str:
+        """The teacher's own name."""
+        return self._teacher.name
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """JSON: name, source, a digest of the code, options, and weights as SHA-256 (None: it was made without)."""
+        if self._digest is None:
+            self._digest = weights_identity(self._weights)
+        return {"name": str(self.name), **self._known, "weights": self._digest}
+
+    def to(self, device: torch.device | str) -> OwnTeacher:
+        """Move the teacher to a device, if it can be moved."""
+        move = getattr(self._teacher, "to", None)
+        if move is not None:
+            moved = move(device)
+            self._teacher = moved if isinstance(moved, Teacher) else self._teacher
+        return self
+
+    def encode_image(self, image: Tensor) -> Tensor:  # [3, H, W] -> [D, h, w]
+        """What the teacher returns."""
+        return self._teacher.encode_image(image)
+
+    def encode_text(self, prompts: Sequence[str]) -> Tensor:  # -> [n, D]
+        """What the teacher returns."""
+        return self._teacher.encode_text(prompts)
+
+    def __getattr__(self, name: str) -> Any:  # only what is not found here
+        if name.startswith("_"):  # while it is copied or unpickled there is no teacher yet
+            raise AttributeError(name)
+        return getattr(self._teacher, name)

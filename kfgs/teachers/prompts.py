@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from .._check import check_shapes
 from ..labels.label_set import LabelSet
 from ..labels.relevancy import CANONICAL
 from ..quant.codebook import EPS, row_norms, unit_rows
-from .protocol import Teacher, identify
+from .protocol import Teacher, as_teacher, identify
 
 CHUNK = 64  # prompts encoded at once: 60 MB of activations in CLIP ViT-L's text tower
 _CLIP7 = (
@@ -33,7 +33,7 @@ TEMPLATES: dict[str, tuple[str, ...]] = {
 
 
 def embed_labels(
-    teacher: Teacher,
+    teacher: Teacher | Callable[[Tensor], Tensor],
     names: Sequence[str],
     *,
     templates: str | Sequence[str] | None = None,
@@ -45,7 +45,7 @@ def embed_labels(
     spaces in prompts. A word that comes twice counts once.
 
     Args:
-        teacher: with a text encoder.
+        teacher: with a text encoder; what `as_teacher` takes, but a mere function of pictures knows no text.
         names: C class names.
         templates: a name of `TEMPLATES`, one template, or several; `{}` stands for the word. When not given what suits the
             teacher, if it says so (its `templates`); else bare words, as LSeg takes them.
@@ -54,8 +54,10 @@ def embed_labels(
     Raises:
         ValueError: if there is no name, one is empty or comes twice, synonyms are of no class, a template has no `{}`, or
             the encoder's rows are not finite.
+        TypeError: if `teacher` is none, or `names` is one text.
         NotImplementedError: if the teacher has no text encoder.
     """
+    teacher = as_teacher(teacher)
     words = _words(names, synonyms)
     patterns = _templates_of(teacher, templates)
     prompts = [[pattern.replace("{}", word) for word in one for pattern in patterns] for one in words.values()]
@@ -73,7 +75,7 @@ def embed_labels(
 
 
 def make_label_set(
-    teacher: Teacher,
+    teacher: Teacher | Callable[[Tensor], Tensor],
     names: Sequence[str],
     *,
     templates: str | Sequence[str] | None = None,
@@ -91,8 +93,10 @@ def make_label_set(
 
     Raises:
         ValueError: as `embed_labels`.
+        TypeError: as `embed_labels`.
         NotImplementedError: if the teacher has no text encoder.
     """
+    teacher = as_teacher(teacher)
     words = _words(names, synonyms)
     rows = embed_labels(teacher, names, templates=templates, synonyms=synonyms)
     against = tuple(negatives or ())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -9,6 +10,9 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes
+from .identity import code_identity
+
+_ROUNDING = 1e-4  # by which a resampled picture may leave [0, 1]
 
 
 @runtime_checkable
@@ -62,7 +66,8 @@ class CallableTeacher:
         text: n prompts -> [n, D]; rows are brought to unit length. None: the teacher knows no text.
         name: a short name; the function's own when not given.
         identity: JSON that tells what decides the features beside the name, such as a digest of the weights: a cache is
-            made again when it changes.
+            made again when it changes. When not given, where `images` lies and a digest of its code, which notices
+            neither globals and closures nor a model's weights; see `identity.code_identity`.
 
     Example:
         >>> import torch
@@ -85,7 +90,7 @@ class CallableTeacher:
             )
         self._images, self._text = images, text
         self.name = name or getattr(images, "__name__", type(images).__name__).strip("<>")
-        self._identity = dict(identity or {})
+        self._identity = code_identity(images) if identity is None else dict(identity)
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -106,13 +111,15 @@ class CallableTeacher:
 
         Raises:
             NotImplementedError: if there is none.
-            ValueError: if it does not return one row per prompt.
+            TypeError: if `prompts` is one text, or holds something else than texts.
+            ValueError: if there are no prompts, or it does not return one row per prompt.
         """
         if self._text is None:
             raise NotImplementedError(
                 f"teacher {self.name!r}: expected one with a text encoder, got one without; pass text=..., or embed the "
                 "prompts elsewhere and give the rows to LabelSet"
             )
+        check_prompts(prompts)
         rows = self._text(list(prompts))
         check_shapes((f"text of {self.name}", rows, (len(prompts), "D")))
         return torch.nn.functional.normalize(rows.float(), dim=1)
@@ -122,8 +129,12 @@ def as_teacher(source: Teacher | Callable[[Tensor], Tensor]) -> Teacher:
     """A teacher as it is, or a function from [3, H, W] to [D, h, w] as a teacher without text.
 
     Raises:
-        TypeError: if it is neither.
+        TypeError: if it is neither, or a class of which nothing was made yet.
     """
+    if inspect.isclass(source):
+        raise TypeError(
+            f"teacher: expected an object or a function, got the class {source.__name__}; make one: {source.__name__}(...)"
+        )
     if isinstance(source, Teacher):
         return source
     if callable(source):
@@ -144,16 +155,69 @@ def check_features(name: str, features: Any) -> Tensor:  # -> [D, h, w]
     """What a teacher returned for one picture, if it is a map of floats.
 
     Raises:
-        TypeError: if it is no tensor.
+        TypeError: if it is no tensor, or one without values in memory (sparse, nested, on the meta device).
         ValueError: if it has other axes, no cell, or no floats.
     """
     if not isinstance(features, Tensor):
+        hint = "torch.from_numpy(...)" if hasattr(features, "__array__") else "the features alone"
         raise TypeError(
-            f"teacher {name!r}: expected a tensor [D, h, w], got a {type(features).__name__}; return the features alone"
+            f"teacher {name!r}: expected a tensor [D, h, w], got a {type(features).__name__}; return {hint}"
         )
+    _check_dense(f"teacher {name!r}", features, "[D, h, w]")
     if features.ndim != 3 or 0 in features.shape or not features.is_floating_point():
         raise ValueError(
             f"teacher {name!r}: expected floats [D, h, w] for one picture, got {features.dtype} "
             f"{tuple(features.shape)}; leave out the batch axis"
         )
     return features
+
+
+def check_picture(image: Any) -> None:
+    """Raise unless `image` is a picture: [3, H, W], at least one pixel, finite floats in [0, 1]; it reads the values.
+
+    Raises:
+        TypeError: if it is no tensor with values in memory, or holds no floats.
+        ValueError: if it has another shape, or a value is not finite or not in [0, 1] (but for rounding, 1e-4).
+    """
+    if not isinstance(image, Tensor):
+        hint = "torch.from_numpy" if hasattr(image, "__array__") else "torch.as_tensor"
+        raise TypeError(f"image: expected a tensor [3, H, W], got {type(image).__name__}; use {hint}")
+    _check_dense("image", image, "[3, H, W]")
+    check_shapes(("image", image, "3 H W"))
+    if not image.is_floating_point():
+        raise TypeError(f"image: expected floats in [0, 1], got {image.dtype}; divide bytes by 255")
+    if 0 in image.shape:
+        raise ValueError(f"image: expected at least one pixel, got {tuple(image.shape)}; leave empty pictures out")
+    low, high = (float(value) for value in image.detach().aminmax())  # NaN if there is one
+    if not (low >= -_ROUNDING and high <= 1 + _ROUNDING):
+        raise ValueError(
+            f"image: expected finite values in [0, 1], got {low:g} to {high:g}; divide bytes by 255, and undo any "
+            "other normalisation"
+        )
+
+
+def check_prompts(prompts: Any) -> None:
+    """Raise unless `prompts` is a list of texts, at least one.
+
+    Raises:
+        TypeError: if it is one text or no list, or holds something else than texts.
+        ValueError: if there are none.
+    """
+    if isinstance(prompts, str):
+        raise TypeError(f"prompts: expected a list of texts, got the text {prompts!r}; put it into a list")
+    if not isinstance(prompts, Sequence):
+        raise TypeError(f"prompts: expected a list of texts, got {type(prompts).__name__}; put them into a list")
+    if not all(isinstance(prompt, str) for prompt in prompts):
+        other = next(prompt for prompt in prompts if not isinstance(prompt, str))
+        raise TypeError(f"prompts: expected texts, got {type(other).__name__} {other!r:.80}; use str")
+    if len(prompts) == 0:
+        raise ValueError("prompts: expected at least one text, got none; name what to look for")
+
+
+def _check_dense(name: str, tensor: Tensor, shape: str) -> None:
+    """Raise a TypeError if a tensor's values do not lie in memory, each at its place."""
+    nested, meta = tensor.is_nested, tensor.device.type == "meta"
+    if nested or meta or tensor.layout != torch.strided:
+        kind = "nested tensor" if nested else "tensor on the meta device" if meta else f"tensor of {tensor.layout}"
+        hint = "give it a device with memory" if meta else "bring it to the ordinary layout, as to_dense() does"
+        raise TypeError(f"{name}: expected a dense tensor {shape}, got a {kind}; {hint}")

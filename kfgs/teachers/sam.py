@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from .checkpoint import read_checkpoint, weights_digest
-from .transformers_teacher import check_picture, resize_picture
+from .protocol import check_picture
+from .transformers_teacher import resize_picture
 
 _SIDE = 1024  # pixels of the square that the encoder sees
 _GRID = 64  # cells of its map
@@ -82,8 +83,8 @@ class SamTeacher:
         """One feature per cell, not normalised.
 
         Raises:
-            TypeError: if the picture is not floating-point.
-            ValueError: if it is not [3, H, W].
+            TypeError: if `image` is no tensor of floats.
+            ValueError: if it is not a finite picture [3, H, W] in [0, 1].
         """
         check_picture(image)
         weight = next(self.encoder.parameters())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 
 from .._files import read_json
-from .transformers_source import explained, one_line, quiet, refuse_gaps, require_transformers
+from .transformers_source import explained, find_class, one_line, quiet, refuse_gaps, require_transformers
 
 _CONFIG = "open_clip_config.json"
 _WEIGHTS = ("open_clip_model.safetensors", "open_clip_pytorch_model.safetensors", "open_clip_pytorch_model.bin")
@@ -37,6 +38,7 @@ def find_openclip(kind: str, source: Path | str, *, local_only: bool) -> Path | 
     """The weights in OpenCLIP's layout that `source` holds, or is; None if it has none, or is complete without them.
 
     Raises:
+        ImportError: if it is a hub id, and transformers is missing or broken.
         ValueError: if a hub id has them, but they do not come.
     """
     if isinstance(source, str):
@@ -75,20 +77,24 @@ def load_openclip(file: Path, *, activation: str) -> Any:
     64 channels per head (more in ViT-H, g and bigG) and the `activation` given: gelu, or quick_gelu as OpenAI trained.
 
     Raises:
-        ValueError: if the file is no CLIP of plain vision and text transformers, or is damaged; the message says what.
+        ImportError: if transformers is missing or broken.
+        ValueError: if the file is no CLIP of plain vision and text transformers, is OpenAI's TorchScript archive, or is
+            damaged; the message says what.
     """
     from .checkpoint import read_checkpoint
 
     transformers = require_transformers()
+    config_class, model_class = (find_class(transformers, name, "clip") for name in ("CLIPConfig", "CLIPModel"))
+    _refuse_torchscript(file)
     state = _unwrapped(read_checkpoint(file))
     known = read_json(file.with_name(_CONFIG)) if file.with_name(_CONFIG).is_file() else {}
     settings = known.get("model_cfg", {}) if isinstance(known, dict) else {}
     _refuse_others(file, state, settings)
     try:
-        config = _config_of(transformers, state, settings, activation)
+        config = _config_of(config_class, state, settings, activation)
         mapped = _mapped(state)
         with quiet(transformers):
-            model, info = transformers.CLIPModel.from_pretrained(
+            model, info = model_class.from_pretrained(
                 None, config=config, state_dict=mapped, dtype=torch.float32, output_loading_info=True
             )
     except Exception as error:  # shapes that do not fit, sizes of no model: transformers has its own errors for those
@@ -107,6 +113,23 @@ def _unwrapped(state: dict[str, Tensor]) -> dict[str, Tensor]:
         name: tensor.float() for name, tensor in state.items() if tensor.is_floating_point()
     }  # not the text's mask
     return {name.removeprefix("module."): tensor for name, tensor in floats.items()}
+
+
+def _refuse_torchscript(file: Path) -> None:
+    """Raise a ValueError that says what to use instead, if the file is as OpenAI publishes CLIP."""
+    if not zipfile.is_zipfile(file):
+        return
+    try:
+        with zipfile.ZipFile(file) as archive:
+            script = any(re.fullmatch(r"[^/]+/(constants\.pkl|code/.*)", name) for name in archive.namelist())
+    except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError):
+        return  # damaged: `read_checkpoint` says how
+    if script:
+        raise ValueError(
+            f"{file}: expected the tensors of a CLIP, got a TorchScript archive as OpenAI publishes it, which is a "
+            "program and is not run; use the hub id openai/clip-vit-base-patch16 (the weights of ViT-B-16.pt) or its like, "
+            "a folder of that, or a file of OpenCLIP"
+        )
 
 
 def _refuse_others(file: Path, state: dict[str, Tensor], settings: dict[str, Any]) -> None:
@@ -129,7 +152,7 @@ def _refuse_others(file: Path, state: dict[str, Tensor], settings: dict[str, Any
     )
 
 
-def _config_of(transformers: Any, state: dict[str, Tensor], settings: dict[str, Any], activation: str) -> Any:
+def _config_of(config_class: Any, state: dict[str, Tensor], settings: dict[str, Any], activation: str) -> Any:
     vision, text = settings.get("vision_cfg", {}), settings.get("text_cfg", {})
     width, _, patch, _ = state["visual.conv1.weight"].shape
     cells = round((state["visual.positional_embedding"].shape[0] - 1) ** 0.5)
@@ -137,7 +160,7 @@ def _config_of(transformers: Any, state: dict[str, Tensor], settings: dict[str, 
     vocabulary = state["token_embedding.weight"].shape[0]
     act = ("quick_gelu" if settings.get("quick_gelu") else "gelu") if settings else activation
     image_heads = width // int(vision.get("head_width", _HEAD_WIDTHS.get(width, 64)))
-    return transformers.CLIPConfig(
+    return config_class(
         projection_dim=state["text_projection"].shape[1],
         vision_config={
             "hidden_size": width,

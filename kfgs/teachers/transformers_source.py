@@ -25,23 +25,49 @@ def require_transformers() -> Any:
     transformers fail with a message about something else, so it is looked at first.
 
     Raises:
-        ImportError: if transformers is missing, or torchvision is broken.
+        ImportError: if transformers is missing, or it or torchvision is there but broken.
     """
-    if importlib.util.find_spec("torchvision") is not None:
-        try:
+    try:
+        if importlib.util.find_spec("torchvision") is not None:
             importlib.import_module("torchvision")
-        except Exception as error:  # RuntimeError: operator torchvision::nms does not exist, OSError, ...
-            raise ImportError(
-                f"torchvision: expected none, or the build that belongs to torch {torch.__version__}, got one that is "
-                f"installed but does not import ({one_line(error)}), and transformers fails with it; run "
-                "`pip uninstall torchvision` (kfgs does not need it), or install the build of this torch"
-            ) from error
+    except Exception as error:  # RuntimeError: operator torchvision::nms does not exist, OSError, ...
+        raise ImportError(
+            f"torchvision: expected none, or the build that belongs to torch {torch.__version__}, got one that is "
+            f"installed but does not import ({one_line(error)}), and transformers fails with it; run "
+            "`pip uninstall torchvision` (kfgs does not need it), or install the build of this torch"
+        ) from error
     try:
         return importlib.import_module("transformers")
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise ImportError(
             f"transformers: expected it for the teachers {', '.join(TRANSFORMERS)}, but it cannot be imported "
             f'({one_line(error)}); install it with `pip install "kfgs[hf]"`'
+        ) from error
+    except Exception as error:  # one that does not go with what else is installed may raise anything
+        raise ImportError(
+            f"transformers: expected it for the teachers {', '.join(TRANSFORMERS)}, got one that is installed but does not "
+            f'import ({one_line(error)}); run `pip install --upgrade --force-reinstall "kfgs[hf]"`'
+        ) from error
+
+
+def find_class(transformers: Any, name: str, kind: str) -> Any:
+    """A class of transformers, which imports what it needs at this moment.
+
+    Raises:
+        ImportError: if this version has none of that name, or it does not import.
+    """
+    try:
+        return getattr(transformers, name)
+    except AttributeError as error:
+        version = getattr(transformers, "__version__", "one without a version")
+        raise ImportError(
+            f"transformers: expected a version with {name} for teacher {kind!r}, got {version}; run "
+            "`pip install --upgrade transformers`"
+        ) from error
+    except Exception as error:
+        raise ImportError(
+            f"transformers: expected {name} for teacher {kind!r}, got one that does not import ({one_line(error)}); run "
+            '`pip install --upgrade --force-reinstall "kfgs[hf]"`'
         ) from error
 
 
@@ -68,6 +94,7 @@ def read_config(kind: str, source: Path | str, *, local_only: bool) -> tuple[str
     Raises:
         FileNotFoundError: if the folder has none.
         ValueError: if it is of another model, cannot be read, or the hub cannot be reached.
+        ImportError: if it is on the hub, and transformers is missing or broken.
     """
     if isinstance(source, Path):
         file = source / "config.json"
@@ -100,16 +127,12 @@ def load_model(kind: str, source: Path | str, model_type: str, commit: str | Non
     """The model in float32, with every weight out of the files and none left as it was drawn.
 
     Raises:
+        ImportError: if transformers is missing, broken, or too old for this model.
         ValueError: if the weights are missing, damaged, or do not fit the config.
     """
     transformers = require_transformers()
     name = TRANSFORMERS[kind].models[model_type][0]
-    model_class = getattr(transformers, name, None)
-    if model_class is None:
-        raise ImportError(
-            f"transformers: expected a version with {name} for teacher {kind!r}, got {transformers.__version__}; run "
-            "`pip install --upgrade transformers`"
-        )
+    model_class = find_class(transformers, name, kind)
     with explained(kind, source), quiet(transformers):
         model, info = model_class.from_pretrained(
             source,
@@ -126,6 +149,7 @@ def load_tokenizer_of(kind: str, source: Path | str, commit: str | None, *, loca
     """The tokenizer beside the weights.
 
     Raises:
+        ImportError: if transformers, or a package that the tokenizer needs, is missing or broken.
         ValueError: if there is none, or it cannot be read.
     """
     transformers = require_transformers()
@@ -196,6 +220,6 @@ def _revision(commit: str | None) -> dict[str, str]:
 
 
 def one_line(error: BaseException) -> str:
-    """The first line of an error, with its type and at most 160 characters."""
+    """The first line of an error, with its type before it and at most 200 characters of its own."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0][:200] if lines else ''}".rstrip(": ")

@@ -11,7 +11,8 @@ from kornia.enhance import normalize as normalize_picture
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
-from .._check import check_choice, check_shapes, check_whole
+from .._check import check_choice, check_whole
+from .protocol import check_picture, check_prompts
 from .transformers_openclip import find_openclip, load_openclip
 from .transformers_patches import Patches, patch_size
 from .transformers_source import find_source, load_model, load_tokenizer_of, read_config, weights_of
@@ -34,7 +35,9 @@ def load_transformers_teacher(
     Args:
         kind: a name of the table: clip, openclip, siglip, siglip2, tipsv2, dinov2, dinov3, radio.
         source: a folder as `save_pretrained` writes it, or a hub id `owner/name`, which is downloaded since it was asked
-            for by name. clip and openclip also take a file or a folder in OpenCLIP's own layout.
+            for by name. clip and openclip also take a file or a folder in OpenCLIP's own layout, but not the .pt files
+            of OpenAI (ViT-B-16.pt), which are TorchScript, that is programs: the same weights are
+            `openai/clip-vit-base-patch16` on the hub.
         size: longer side, in pixels, that pictures are resized to before they are cut into patches; None: their own. A
             map has one cell per patch, so that a larger picture gives a finer map.
         residual: clip, openclip: keep the residual connection and the MLP of the last block beside its values (as in
@@ -42,7 +45,8 @@ def load_transformers_teacher(
         local_only: take a hub id from the local cache alone.
 
     Raises:
-        ImportError: if transformers is missing (`pip install "kfgs[hf]"`) or a broken torchvision is in its way.
+        ImportError: if transformers is missing (`pip install "kfgs[hf]"`), broken or too old, or a broken torchvision is in
+            its way.
         FileNotFoundError: if there are no weights.
         ValueError: if the options do not suit the kind, or the weights are of another model, damaged or incomplete.
     """
@@ -117,8 +121,8 @@ class TransformersTeacher:
         """One feature per patch, not normalised.
 
         Raises:
-            TypeError: if the picture is not floating-point.
-            ValueError: if it is not [3, H, W].
+            TypeError: if `image` is no tensor of floats.
+            ValueError: if it is not a finite picture [3, H, W] in [0, 1].
         """
         check_picture(image)
         weight = next(self.model.parameters())
@@ -140,8 +144,9 @@ class TransformersTeacher:
 
         Raises:
             NotImplementedError: if the model has no text tower in the space of its patches.
-            TypeError: if `prompts` is a single text.
-            ValueError: if a prompt is too long, or there is no tokenizer beside the weights.
+            TypeError: if `prompts` is one text, or holds something else than texts.
+            ValueError: if there are none, one is too long, or there is no tokenizer beside the weights.
+            ImportError: if a package that the tokenizer needs is missing.
         """
         rule = self.row.text
         if rule is None or self._tokenize is None:
@@ -150,21 +155,14 @@ class TransformersTeacher:
                 f"teacher {self.name!r}: expected one with a text encoder, got one that sees only pictures; use "
                 f"{', '.join(able)} or lseg for words, or query it by examples"
             )
-        if isinstance(prompts, str):
-            raise TypeError(f"prompts: expected a list of texts, got the text {prompts!r}; put it into a list")
+        check_prompts(prompts)
         device = next(self.model.parameters()).device
         rows = []
         for start in range(0, len(prompts), _CHUNK):
             ids, mask = self._tokenize(list(prompts[start : start + _CHUNK]))
             named = {"attention_mask": mask.to(device)} if rule.mask else {}
             rows.append(self.model.get_text_features(input_ids=ids.to(device), **named).pooler_output.float())
-        return normalize(torch.cat(rows), dim=1) if rows else torch.zeros(0, self._text_channels(), device=device)
-
-    def _text_channels(self) -> int:
-        config = self.model.config
-        text = config.text_config
-        found = getattr(config, "projection_dim", None) or getattr(text, "projection_size", None) or text.hidden_size
-        return int(found)
+        return normalize(torch.cat(rows), dim=1)
 
 
 def fit_patches(size: tuple[int, int], patch: tuple[int, int], longest: int | None) -> tuple[int, int]:
@@ -179,13 +177,6 @@ def fit_patches(size: tuple[int, int], patch: tuple[int, int], longest: int | No
     scale = 1.0 if longest is None else longest / max(size)
     height, width = (max(1, int(side * scale / cell + 0.5)) * cell for side, cell in zip(size, patch, strict=True))
     return height, width
-
-
-def check_picture(image: Tensor) -> None:
-    """Raise unless `image` is a picture [3, H, W] of floats (TypeError for another kind, ValueError for a shape)."""
-    check_shapes(("image", image, (3, "H", "W")))
-    if not image.is_floating_point():
-        raise TypeError(f"image: expected floats in [0, 1], got {image.dtype}; divide bytes by 255")
 
 
 def resize_picture(image: Tensor, size: tuple[int, int]) -> Tensor:  # [3, H, W] -> [3, *size]

@@ -1,10 +1,26 @@
+import copy
+import hashlib
+import json
+import pickle
 import sys
 
 import pytest
 import torch
 
-from kfgs.teachers import Teacher
+from kfgs.teachers import Teacher, embed_labels, identify
 from kfgs.teachers.load import load_teacher, teacher_names
+
+CLASS = (
+    "import torch\n"
+    "class Scaled:\n"
+    "    name = 'scaled'\n"
+    "    def __init__(self, weights=None, factor=1.0):\n"
+    "        self.factor = factor\n"
+    "    def encode_image(self, image):\n"
+    "        return image * self.factor\n"
+    "    def encode_text(self, prompts):\n"
+    "        return torch.eye(3)[: len(prompts)]\n"
+)
 
 
 @pytest.fixture
@@ -39,9 +55,125 @@ def test_a_class_is_called_with_weights_and_options(own):
     assert float(teacher.encode_image(torch.ones(3, 1, 1)).sum()) == 6
 
 
+@pytest.fixture
+def write(tmp_path, monkeypatch):
+    """Writes the module `mine` into the folder in which the command runs, and forgets the one that was imported."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # two texts of one second and size would share a .pyc
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
+
+    def to(text):
+        (tmp_path / "mine.py").write_text(text)
+        sys.modules.pop("mine", None)
+
+    yield to
+    sys.modules.pop("mine", None)
+
+
+def test_identity_holds_source_weights_options_and_code(write, tmp_path):
+    write(CLASS)
+    (tmp_path / "w.pt").write_bytes(b"one")
+    teacher = load_teacher("mine:Scaled", "w.pt", factor=2.0)
+    found = identify(teacher)
+    assert isinstance(teacher, Teacher)
+    assert set(found) == {"name", "source", "code", "weights", "options"}
+    assert (found["name"], found["source"], found["options"]) == ("scaled", "mine:Scaled", {"factor": 2.0})
+    assert found["weights"] == hashlib.sha256(b"one").hexdigest()
+    assert json.loads(json.dumps(found)) == pickle.loads(pickle.dumps(found)) == found
+    assert identify(load_teacher("mine:Scaled", "w.pt", factor=2.0)) == found
+    assert identify(load_teacher("mine:Scaled", "w.pt", factor=3.0)) == {**found, "options": {"factor": 3.0}}
+    (tmp_path / "w.pt").write_bytes(b"two")
+    assert identify(load_teacher("mine:Scaled", "w.pt", factor=2.0))["weights"] == hashlib.sha256(b"two").hexdigest()
+    assert identify(load_teacher("mine:Scaled"))["weights"] is None
+    write(CLASS.replace("* self", "+ self"))
+    assert identify(load_teacher("mine:Scaled", "w.pt"))["code"] != found["code"]
+
+
+def test_identity_of_a_function_of_a_module(write):
+    text = "def one(image):\n    return image[:, ::2]\ndef two(image):\n    return image[:, ::4]\nlast = lambda x: x\n"
+    write(text)
+    one, two = (identify(load_teacher(f"mine:{name}")) for name in ("one", "two"))
+    assert one["source"] == "mine:one"
+    assert one["code"] != two["code"]
+    write(text.replace("::2", "::8"))
+    assert identify(load_teacher("mine:one"))["code"] != one["code"]
+    assert identify(load_teacher("mine:last"))["source"] == "mine:last"
+
+
+def test_identity_that_an_object_brings_is_its_own(write):
+    write(CLASS.replace("    name = 'scaled'\n", "    name, identity = 'scaled', {'version': 3}\n"))
+    teacher = load_teacher("mine:Scaled")
+    assert identify(teacher) == {"version": 3}
+    assert type(teacher).__name__ == "Scaled"
+
+
+def test_a_teacher_with_an_identity_stays_what_it_is(write):
+    moving = (
+        "    templates = 'siglip'\n    def to(self, device):\n        self.device = str(device)\n        return self\n"
+    )
+    write(CLASS + moving)
+    teacher = load_teacher("mine:Scaled", factor=2.0)
+    assert teacher.to("meta") is teacher
+    assert teacher.device == "meta"
+    assert float(teacher.encode_image(torch.ones(3, 1, 1)).sum()) == 6
+    assert embed_labels(teacher, ["wall"]).shape == (1, 3)
+    assert teacher.templates == "siglip"
+    assert copy.copy(teacher).factor == 2.0
+    with pytest.raises(AttributeError, match="absent"):
+        _ = teacher.absent
+    write(CLASS)
+    still = load_teacher("mine:Scaled")
+    assert still.to("cpu") is still  # one that cannot be moved
+
+
+def test_modules_are_found_beside_the_command_but_the_path_stays(write):
+    write("import sys\nsys.path.append('/mine')\n" + CLASS)
+    before = list(sys.path)
+    load_teacher("mine:Scaled")
+    assert sys.path == [*before, "/mine"]
+    write("raise KeyError('x')")
+    with pytest.raises(ValueError, match="KeyError"):
+        load_teacher("mine:Scaled")
+    assert sys.path == [*before, "/mine"]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("def f(:\n", r"got 'mine:f' \(SyntaxError: .*mine.py, line 1"),
+        ("raise RuntimeError('no GPU\\nat all')\n", r"\(RuntimeError: no GPU\); check both names, and that"),
+        ("import sys\nsys.exit(3)\n", r"\(SystemExit: 3\)"),
+        ("import absent_package\n", r"No module named 'absent_package'"),
+        (
+            "f = 3\n",
+            r"got int behind 'mine:f', which lacks name, encode_image or encode_text; see kfgs.teachers.Teacher",
+        ),
+    ],
+)
+def test_a_module_that_does_not_work_is_named_in_one_line(write, text, words):
+    write(text)
+    with pytest.raises(ValueError, match=words) as error:
+        load_teacher("mine:f")
+    assert "\n" not in str(error.value)
+
+
+def test_a_class_that_does_not_take_the_options_is_named(write):
+    write(CLASS.replace("weights=None, factor=1.0", "factor"))
+    with pytest.raises(
+        ValueError, match=r"weights, options: expected what 'mine:Scaled' takes, \(factor\), got nothing \(miss"
+    ):
+        load_teacher("mine:Scaled")
+    words = r"takes, \(factor\), got weights, factor \(multiple values for argument 'factor'\); pass just those"
+    with pytest.raises(ValueError, match=words):
+        load_teacher("mine:Scaled", "w.pt", factor=2)
+    with pytest.raises(ValueError, match=r"got size \("):
+        load_teacher("mine:Scaled", size=2)
+
+
 def test_what_cannot_be_imported_is_refused(own):
-    with pytest.raises(ValueError, match="expected package.module:name that can be imported, got 'nowhere:x'"):
-        load_teacher("nowhere:x")
+    for name in ("nowhere:x", ":x", ".own_teachers:thumbnail", "own_teachers:", "own_teachers:a:b"):
+        with pytest.raises(ValueError, match=f"expected package.module:name that can be imported, got '{name}'"):
+            load_teacher(name)
     with pytest.raises(ValueError, match="own_teachers:absent"):
         load_teacher("own_teachers:absent")
     with pytest.raises(ValueError, match="which is made already, got w.pt"):

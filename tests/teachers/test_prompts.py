@@ -130,5 +130,12 @@ def test_wrong_rows_are_named():
         embed_labels(teacher(lambda prompts: torch.tensor([opposite[word] for word in prompts])), ["up;down"])
     with pytest.raises(NotImplementedError, match="teacher 'mute': expected one with a text encoder"):
         embed_labels(MUTE, ["wall"])
+    for make in (embed_labels, make_label_set):  # a mere function of pictures is a teacher, too, but without text
+        with pytest.raises(
+            NotImplementedError, match="teacher 'lambda': expected one with a text encoder, got one with"
+        ):
+            make(lambda image: image, ["wall"])
+        with pytest.raises(TypeError, match="teacher: expected an object with name, encode_image and encode_text"):
+            make("lseg", ["wall"])
     with pytest.raises(TypeError, match="names: expected a list of class names, got the text 'wall'"):
         embed_labels(TEACHER, "wall")

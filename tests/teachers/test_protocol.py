@@ -1,7 +1,11 @@
+import json
+
+import numpy as np
 import pytest
 import torch
 
 from kfgs.teachers import CallableTeacher, Teacher, as_teacher, identify
+from kfgs.teachers.protocol import check_picture, check_prompts
 
 
 class Colour:
@@ -53,6 +57,17 @@ def test_text_of_a_function_comes_as_unit_rows():
         (torch.zeros(1, 3, 2, 2), ValueError, "leave out the batch axis"),
         (torch.zeros(3, 2, 0), ValueError, "expected floats"),
         (torch.zeros(3, 2, 2, dtype=torch.int64), ValueError, "got torch.int64"),
+        (np.zeros((3, 2, 2)), TypeError, r"got a ndarray; return torch.from_numpy\(...\)"),
+        (
+            torch.zeros(3, 2, 2).to_sparse(),
+            TypeError,
+            r"dense tensor \[D, h, w\], got a tensor of torch.sparse_coo; bring it",
+        ),
+        (
+            torch.zeros(3, 2, 2, device="meta"),
+            TypeError,
+            "got a tensor on the meta device; give it a device with memory",
+        ),
     ],
 )
 def test_what_is_no_map_is_refused(returned, error, words):
@@ -63,6 +78,8 @@ def test_what_is_no_map_is_refused(returned, error, words):
 def test_what_is_neither_object_nor_function_is_refused():
     with pytest.raises(TypeError, match="got int"):
         as_teacher(3)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"got the class Colour; make one: Colour\(...\)"):
+        as_teacher(Colour)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="images: expected a function"):
         CallableTeacher("lseg")  # type: ignore[arg-type]
 
@@ -70,3 +87,70 @@ def test_what_is_neither_object_nor_function_is_refused():
 def test_identity_is_the_name_and_what_is_known_beside_it():
     assert identify(Colour()) == {"name": "colour"}
     assert identify(CallableTeacher(halve, identity={"weights": "abc"})) == {"name": "halve", "weights": "abc"}
+
+
+def test_functions_are_told_apart_by_place_and_code():
+    one, two = (identify(as_teacher(f)) for f in (lambda image: image, lambda image: 1 - image))
+    assert one["name"] == two["name"] == "lambda"
+    assert one["source"] == f"{__name__}:{test_functions_are_told_apart_by_place_and_code.__name__}.<locals>.<lambda>"
+    assert one["code"] != two["code"]
+    assert identify(as_teacher(halve)) == identify(CallableTeacher(halve))
+    assert json.loads(json.dumps(one)) == one
+
+
+@pytest.mark.filterwarnings("ignore:The PyTorch API of nested tensors:UserWarning")
+def test_nested_tensors_are_refused():
+    nested = torch.nested.nested_tensor([torch.zeros(2, 2), torch.zeros(3, 2)])
+    for layout in (nested, torch.nested.nested_tensor(list(nested.unbind()), layout=torch.jagged)):
+        with pytest.raises(TypeError, match="got a nested tensor; bring it to the ordinary layout"):
+            as_teacher(lambda image, layout=layout: layout).encode_image(torch.zeros(3, 4, 4))
+        with pytest.raises(TypeError, match=r"image: expected a dense tensor \[3, H, W\], got a nested tensor"):
+            check_picture(layout)
+
+
+@pytest.mark.parametrize(
+    ("image", "error", "words"),
+    [
+        (np.zeros((3, 8, 9)), TypeError, r"image: expected a tensor \[3, H, W\], got ndarray; use torch.from_numpy"),
+        ([[0.0]], TypeError, "got list; use torch.as_tensor"),
+        (torch.zeros(3, 8, 9).to_sparse(), TypeError, "got a tensor of torch.sparse_coo"),
+        (torch.zeros(3, 8, 9, device="meta"), TypeError, "got a tensor on the meta device"),
+        (torch.zeros(8, 9, 3), ValueError, r"image: expected \[3, H, W\], got \(8, 9, 3\)"),
+        (torch.zeros(3, 8, 9, dtype=torch.uint8), TypeError, r"image: expected floats in \[0, 1\], got torch.uint8"),
+        (torch.zeros(3, 8, 9, dtype=torch.complex64), TypeError, "got torch.complex64"),
+        (torch.zeros(3, 0, 9), ValueError, "expected at least one pixel"),
+        (torch.full((3, 8, 9), 1.001), ValueError, r"expected finite values in \[0, 1\], got 1.001 to 1.001"),
+        (torch.tensor([0.0, torch.nan] * 3).reshape(3, 1, 2), ValueError, "got nan to nan"),
+    ],
+)
+def test_what_is_no_picture_is_refused(image, error, words):
+    with pytest.raises(error, match=words):
+        check_picture(image)
+
+
+def test_pictures_may_leave_their_range_by_rounding():
+    for dtype in (torch.float16, torch.float32, torch.float64):
+        check_picture(torch.tensor([-5e-5, 1.0], dtype=dtype).expand(3, 4, 2).requires_grad_())
+    check_picture(torch.full((3, 1, 1), 1.00009))
+
+
+@pytest.mark.parametrize(
+    ("prompts", "error", "words"),
+    [
+        ("wall", TypeError, "prompts: expected a list of texts, got the text 'wall'; put it into a list"),
+        ([], ValueError, "prompts: expected at least one text, got none; name what to look for"),
+        (["wall", 3], TypeError, "prompts: expected texts, got int 3; use str"),
+        ({"wall"}, TypeError, "prompts: expected a list of texts, got set; put them into a list"),
+        ((word for word in ["wall"]), TypeError, "got generator"),
+    ],
+)
+def test_what_are_no_prompts_is_refused(prompts, error, words):
+    with pytest.raises(error, match=words):
+        check_prompts(prompts)
+
+
+def test_text_of_a_function_is_asked_for_with_a_list():
+    teacher = CallableTeacher(halve, lambda prompts: torch.ones(len(prompts), 3))
+    with pytest.raises(TypeError, match="got the text 'wall'"):
+        teacher.encode_text("wall")
+    assert teacher.encode_text(("wall",)).shape == (1, 3)

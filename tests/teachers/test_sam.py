@@ -89,6 +89,11 @@ def test_pictures_of_bytes_are_refused(teacher):
         teacher.encode_image(torch.zeros(3, 8, 8, dtype=torch.uint8))
 
 
+def test_pictures_that_are_not_finite_are_refused(teacher):
+    with pytest.raises(ValueError, match=r"image: expected finite values in \[0, 1\], got nan to nan"):
+        teacher.encode_image(torch.full((3, 8, 8), torch.nan))
+
+
 def test_mobile_sam_is_recognised(tmp_path):
     torch.manual_seed(1)
     model = Sam.from_config(SamConfig("mobile_sam")).eval()

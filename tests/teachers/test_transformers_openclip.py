@@ -1,6 +1,7 @@
 """CLIP in OpenCLIP's layout, against a small CLIP written with OpenCLIP's structure."""
 
 import json
+import zipfile
 
 import pytest
 import torch
@@ -160,6 +161,17 @@ def test_other_models_are_named(tmp_path, keys, words):
         ValueError, match=f"expected a CLIP of two plain transformers in OpenCLIP's layout, got .*{words}"
     ):
         load_transformers_teacher("openclip", folder)
+
+
+def test_torchscript_of_openai_is_refused_with_what_to_use(tmp_path):
+    file = tmp_path / "ViT-B-16.pt"
+    with zipfile.ZipFile(file, "w") as archive:  # what torch.jit.save writes, without its deprecation warning
+        archive.writestr("ViT-B-16/constants.pkl", b"\x80\x02).")
+        archive.writestr("ViT-B-16/data.pkl", b"\x80\x02}.")
+        archive.writestr("ViT-B-16/code/__torch__/multimodal/model.py", "class Multimodal(Module): ...")
+    words = "got a TorchScript archive as OpenAI publishes it, .* use the hub id openai/clip-vit-base-patch16"
+    with pytest.raises(ValueError, match=words):
+        load_transformers_teacher("clip", file)
 
 
 def test_weights_that_do_not_fit_together_or_are_missing_are_refused(clip, tmp_path):

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
@@ -17,6 +18,7 @@ from tiny_transformers import write_teacher  # noqa: E402
 
 import kfgs  # noqa: E402
 from kfgs.teachers.transformers_patches import last_patches  # noqa: E402
+from kfgs.teachers.transformers_source import one_line as first_line  # noqa: E402
 from kfgs.teachers.transformers_table import TRANSFORMERS  # noqa: E402
 from kfgs.teachers.transformers_teacher import load_transformers_teacher  # noqa: E402
 
@@ -147,6 +149,42 @@ def test_missing_package_names_the_line_to_install_it(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(ImportError, match=r'transformers: expected it .* install it with `pip install "kfgs\[hf\]"`'):
         load_transformers_teacher("clip", folder)
+
+
+@pytest.mark.parametrize(
+    "error", ["RuntimeError('operator is\\nnot there')", "OSError('libcudart.so')", "ImportError('cycle')"]
+)
+def test_package_that_does_not_import_is_named(folder, tmp_path, monkeypatch, error):
+    (tmp_path / "site" / "transformers").mkdir(parents=True)
+    (tmp_path / "site" / "transformers" / "__init__.py").write_text(f"raise {error}\n")
+    for name in [name for name in sys.modules if name.partition(".")[0] == "transformers"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    kind = error.partition("(")[0]
+    with pytest.raises(
+        ImportError, match=rf"got one that is installed but does not import \({kind}: .*--force-reins"
+    ) as got:
+        load_transformers_teacher("clip", folder)
+    assert one_line(got)
+
+
+def test_class_that_does_not_import_is_named(folder, tmp_path, monkeypatch):
+    class Lazy(ModuleType):  # as transformers is: a class is imported when it is looked at
+        def __getattr__(self, name):
+            if name == "CLIPModel":
+                raise RuntimeError(f"Failed to import {name}\nbecause of the following error")
+            raise AttributeError(name)
+
+    monkeypatch.setitem(sys.modules, "transformers", Lazy("transformers"))
+    words = r"transformers: expected CLIPModel for teacher 'clip', got one that does not import \(RuntimeError: Failed"
+    with pytest.raises(ImportError, match=words) as error:
+        load_transformers_teacher("clip", folder)
+    assert one_line(error)
+
+
+def test_error_is_cut_to_one_line_of_200_characters():
+    assert first_line(ValueError("a" * 300 + "\nb")) == "ValueError: " + "a" * 200
+    assert first_line(KeyError()) == "KeyError"
 
 
 def test_old_transformers_is_named(tmp_path, monkeypatch):

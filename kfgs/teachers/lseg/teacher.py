@@ -12,9 +12,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..._check import check_shapes
 from ..bpe import load_tokenizer
 from ..checkpoint import read_checkpoint, weights_digest
+from ..protocol import check_picture, check_prompts
 from .keys import network_from_state, text_from_state
 from .network import LSegConfig, LSegNetwork
 from .options import LSegOptions
@@ -22,7 +22,6 @@ from .text import ClipText
 from .windows import multi_scale_features
 
 _CHUNK = 64  # prompts at a time
-_ROUNDING = 1e-4  # by which a resampled picture may leave [0, 1]
 
 Tokenize = Callable[[list[str]], Tensor]  # n prompts -> [n, 77] int64
 
@@ -86,10 +85,10 @@ class LSeg(nn.Module):
         evaluated in windows; see `windows.multi_scale_features`.
 
         Raises:
-            TypeError: if `image` is no tensor.
-            ValueError: if it is not a finite picture [3, H, W] of floats in [0, 1].
+            TypeError: if `image` is no tensor of floats.
+            ValueError: if it is not a finite picture [3, H, W] in [0, 1].
         """
-        _check_image(image)
+        check_picture(image)
         window = self.network.config.window
         size = self.options.map_size(image.shape[1], image.shape[2], window=window)
         picture = image.to(self.device, torch.float32) * 2 - 1
@@ -109,7 +108,7 @@ class LSeg(nn.Module):
             NotImplementedError: if the teacher was made without text.
             FileNotFoundError: if the vocabulary of CLIP's tokenizer is not found.
         """
-        _check_prompts(prompts)
+        check_prompts(prompts)
         if self.text is None:
             self._bring_text()
         assert self.text is not None
@@ -202,29 +201,3 @@ def _load_text(weights: str | Path, bpe: str | Path | None, config: LSegConfig) 
 def _plain(values: LSegOptions | LSegConfig) -> dict[str, Any]:
     """Fields as JSON has them: lists for tuples, so that a manifest read again is equal."""
     return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(values).items()}
-
-
-def _check_image(image: Tensor) -> None:
-    if not isinstance(image, Tensor):
-        raise TypeError(f"image: expected a tensor [3, H, W], got {type(image).__name__}; use torch.as_tensor")
-    check_shapes(("image", image, "3 H W"))
-    if not image.is_floating_point():
-        raise ValueError(f"image: expected floats in [0, 1], got {image.dtype}; divide bytes by 255")
-    if 0 in image.shape:
-        raise ValueError(f"image: expected at least one pixel, got {tuple(image.shape)}; leave empty pictures out")
-    low, high = (float(value) for value in image.aminmax())  # NaN if there is one
-    if not (low >= -_ROUNDING and high <= 1 + _ROUNDING):
-        raise ValueError(
-            f"image: expected finite values in [0, 1], got {low:g} to {high:g}; divide bytes by 255, and undo any "
-            "other normalisation"
-        )
-
-
-def _check_prompts(prompts: Sequence[str]) -> None:
-    if isinstance(prompts, str):
-        raise TypeError(f"prompts: expected a list of texts, got the text {prompts!r}; put it into a list")
-    if not all(isinstance(prompt, str) for prompt in prompts):
-        other = next(prompt for prompt in prompts if not isinstance(prompt, str))
-        raise TypeError(f"prompts: expected texts, got {type(other).__name__} {other!r}; use str")
-    if len(prompts) == 0:
-        raise ValueError("prompts: expected at least one text, got none; name what to look for")

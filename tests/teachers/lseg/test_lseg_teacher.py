@@ -241,7 +241,7 @@ def test_file_that_is_not_there(tmp_path: Path) -> None:
         ([[0.0]], TypeError, r"image: expected a tensor \[3, H, W\], got list; use torch.as_tensor"),
         (torch.zeros(8, 9, 3), ValueError, r"image: expected \[3, H, W\], got \(8, 9, 3\)"),
         (torch.zeros(1, 3, 8, 9), ValueError, r"image: expected \[3, H, W\], got \(1, 3, 8, 9\)"),
-        (torch.zeros(3, 8, 9, dtype=torch.uint8), ValueError, "floats in .0, 1., got torch.uint8; divide bytes by 255"),
+        (torch.zeros(3, 8, 9, dtype=torch.uint8), TypeError, "floats in .0, 1., got torch.uint8; divide bytes by 255"),
         (torch.zeros(3, 0, 9), ValueError, r"image: expected at least one pixel, got \(3, 0, 9\); leave empty"),
         (torch.full((3, 8, 9), 255.0), ValueError, r"finite values in \[0, 1\], got 255 to 255; divide bytes by 255"),
         (torch.full((3, 8, 9), -0.5), ValueError, r"finite values in \[0, 1\], got -0.5 to -0.5"),
