@@ -24,7 +24,7 @@ from ..scenes.align import Alignment, align_by_cameras
 from ..scenes.frames import frames_agree
 from ..scenes.register import align_clouds
 from ..splat.transform import transform_gaussians
-from .apply import label_field
+from .apply import check_words, label_field
 
 By = Literal["distance", "views"]
 WAYS: tuple[By, ...] = ("distance", "views")
@@ -89,7 +89,8 @@ def attach(
         method: which label wins where distance decides, see `transfer_labels`; "nearest" is the paper's.
 
     Raises:
-        ValueError: if `by` or `method` is unknown, cameras are missing, the splat is empty, or (SceneError) no similarity fits.
+        ValueError: if `by` or `method` is unknown, cameras are missing, the splat is empty, the words have another D than
+            the field, or (SceneError) no similarity fits.
         TypeError: if `frame` is neither.
 
     Note:
@@ -109,6 +110,7 @@ def attach(
     for name, needed in (('by="views"', by == "views"), ("frame", not isinstance(frame, Similarity | None))):
         if needed and not cameras:
             raise ValueError(f"cameras: expected views in the field's frame (for {name}), got none; pass them as well")
+    check_words(field, classes)
     similarity, alignment, said = _common_frame(field, splats, cameras, frame)
     carry = partial(transfer_labels, distance=distance, method=method)
     if by == "distance":

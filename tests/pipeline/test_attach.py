@@ -87,6 +87,12 @@ def accuracy(labels, splats):
     return float((labels == true_labels(splats.gaussians.means)).float().mean())
 
 
+def test_words_of_another_teacher_are_refused_before_any_work():
+    words = LabelSet(CLASSES.names, torch.eye(5)[:3])
+    with pytest.raises(ValueError, match=r"expected embeddings \[C, 4\] .* text of another teacher"):
+        attach(a_field(50), a_splat(50), words)
+
+
 def test_distance_in_one_frame():
     splats = a_splat()
     attached = attach(a_field(), splats, CLASSES)
