@@ -87,6 +87,8 @@ def _open_torch(file: Path, _: Reading) -> Any:
             code = "global" in str(error).lower() or "class" in str(error).lower()
             words = "it holds objects beside tensors, which are not run" if code else "not a tensor that torch saved"
             raise ValueError(words) from error
+    if isinstance(found, Tensor) and (found.is_nested or found.is_meta):
+        raise ValueError("it is nested, or has no values; save one dense tensor")
     if not isinstance(found, Tensor) or found.layout != torch.strided:
         return found
     if found.numel() * found.element_size() > found.untyped_storage().nbytes():  # a few bytes could fill the memory
@@ -95,7 +97,8 @@ def _open_torch(file: Path, _: Reading) -> Any:
 
 
 def _open_numpy(file: Path, _: Reading) -> Any:
-    return np.load(file, mmap_mode="r", allow_pickle=False)
+    with np.errstate(over="ignore"):  # a header may ask for any size; one beyond the file's is refused
+        return np.load(file, mmap_mode="r", allow_pickle=False)
 
 
 def _open_safetensors(file: Path, _: Reading) -> Any:
@@ -176,9 +179,8 @@ def open_map(
         return found
     axes = "[" + layout.axes.replace(" ", ", ") + "]"
     if not isinstance(found, np.ndarray) and not (isinstance(found, Tensor) and found.layout == torch.strided):
-        raise TypeError(
-            f"{file}: expected one dense tensor {axes}, got a {type(found).__name__}; save the tensor alone"
-        )
+        kind = f"{found.layout} tensor" if isinstance(found, Tensor) else type(found).__name__
+        raise TypeError(f"{file}: expected one dense tensor {axes}, got a {kind}; save the tensor alone")
     if not (found.is_floating_point() if isinstance(found, Tensor) else found.dtype.kind == "f"):
         raise ValueError(f"{file}: expected floating-point features, got {found.dtype}; encode it again")
     if found.ndim != 3 or 0 in found.shape:

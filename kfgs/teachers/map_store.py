@@ -97,12 +97,13 @@ def _check_underflow(
     path: Path,
 ) -> None:
     """Refuse features that are something, but nothing (all-zero: unknown) once they are rounded."""
-    if not bool((half[..., 0] == 0).any()):  # one channel of many tells of nearly every map that none is all-zero
-        return
+    probe = slice(None, None, max(half.shape[2] // 8, 1))  # a few channels rule out nearly all cells
     lost = 0
     for start in range(0, half.shape[0], ROW_BLOCK):
-        i, j = (~half[start : start + ROW_BLOCK].any(-1)).nonzero(as_tuple=True)
-        lost += int(features[:, start + i, j].any(0).sum())
+        rows = half[start : start + ROW_BLOCK]
+        i, j = (rows[..., probe] == 0).all(-1).nonzero(as_tuple=True)
+        zero = ~rows[i, j].any(-1)
+        lost += int(features[:, start + i[zero], j[zero]].any(0).sum())
     if lost:
         raise ValueError(
             f"teacher {name!r}: expected features above 6e-8 (they are stored as float16) for {path}, got {lost} that "

@@ -139,10 +139,12 @@ def check_feature_folder(
         if values:
             _look_at_values(name, stored, found)
     common = Counter(shapes.values()).most_common(1)[0][0] if shapes else None
+    stretched = []
     for stem, shape in shapes.items():
-        for text in _misfits(shape, common or shape, reading[stem].size or (1, 1), channels):
+        size = reading[stem].size or (1, 1)
+        for text in _misfits(shape, common or shape, size, channels):
             found.problem(files[stem].relative_to(root).as_posix(), text)
-    stretched = [stem for stem, shape in shapes.items() if _is_stretched(shape, common, reading[stem].size)]
+        stretched += [stem] if _is_stretched(shape, common or shape, size) else []
     if stretched and common:
         found.note(
             "",
@@ -196,22 +198,27 @@ def _misfits(
 ) -> Iterator[str]:
     """What is wrong with a map's sizes, beside those of most maps and of its picture (H, W)."""
     (h, w, D), (H, W) = shape, size
-    fits = fits_aspect((h, w), size)
     if (common[2] if channels is None else channels) != D:
         yield f"expected {common[2] if channels is None else channels} channels, got {D}"
     if (h, w) != common[:2]:
         yield f"expected {common[0]} x {common[1]} cells as most maps have, got {h} x {w}"
-    if not fits and (fits_aspect((w, h), size) or (h, w) != common[:2]):
-        hint = " (transposed?)" if fits_aspect((w, h), size) else ""
+    if not fits_aspect((h, w), size) and not _is_stretched(shape, common, size):
+        hint = f" ({_turned(shape, size)})" if _turned(shape, size) else ""
         yield f"expected the aspect of a picture of {H} x {W} pixels, got {h} x {w} cells{hint}"
 
 
-def _is_stretched(
-    shape: tuple[int, int, int], common: tuple[int, int, int] | None, size: tuple[int, int] | None
-) -> bool:
-    """Whether a map has the cells of most maps, though neither as it is nor transposed the aspect of its picture."""
-    (h, w), one = shape[:2], size or (1, 1)
-    return common is not None and (h, w) == common[:2] and not fits_aspect((h, w), one) and not fits_aspect((w, h), one)
+def _turned(shape: tuple[int, int, int], size: tuple[int, int]) -> str:
+    """What another order of its axes would explain about a map that does not have the aspect of its picture (H, W)."""
+    h, w, D = shape
+    if fits_aspect((w, h), size):
+        return "transposed?"
+    # [h, w, D] that is taken for [D, h, w], or the other way round
+    return f"axes of {D} channels in another order?" if fits_aspect((D, h), size) or fits_aspect((w, D), size) else ""
+
+
+def _is_stretched(shape: tuple[int, int, int], common: tuple[int, int, int], size: tuple[int, int]) -> bool:
+    """Whether a map has the cells of most maps, though in no order of its axes the aspect of its picture (H, W)."""
+    return shape[:2] == common[:2] and not fits_aspect(shape[:2], size) and not _turned(shape, size)
 
 
 def _look_at_values(name: str, stored: StoredMap, found: _Findings) -> None:

@@ -129,9 +129,19 @@ def test_a_file_that_is_no_tensor_is_refused(tmp_path):
     save_pt(tmp_path, "a", {"features": features(0)})
     with pytest.raises(TypeError, match="expected one dense tensor .*, got a dict"):
         FeatureFolder(tmp_path, ["a"])[0]
+    save_pt(tmp_path, "s", features(0).to_sparse())
+    with pytest.raises(
+        TypeError, match=r"s_fmap_CxHxW\.pt: expected one dense tensor .*, got a torch\.sparse_coo tensor"
+    ):
+        FeatureFolder(tmp_path, ["s"])[0]
     save_pt(tmp_path, "b", features(0).long())
     with pytest.raises(ValueError, match=r"floating-point features, got torch\.int64"):
         FeatureFolder(tmp_path, ["b"])[0]
+    save_pt(tmp_path, "m", torch.empty(8, 3, 4, device="meta"))
+    save_pt(tmp_path, "n", torch.nested.nested_tensor([torch.ones(3, 4), torch.ones(2, 4)], layout=torch.jagged))
+    for stem in ("m", "n"):
+        with pytest.raises(ValueError, match=rf"{stem}_fmap_CxHxW\.pt: expected a feature map, but it cannot be read"):
+            FeatureFolder(tmp_path, [stem])[0]
     np.save(tmp_path / "c.npy", np.ones((3, 4), np.float32))
     with pytest.raises(ValueError, match=r"c\.npy: expected a map \[h, w, D\], got \(3, 4\)"):
         FeatureFolder(tmp_path, ["c"])[0]
@@ -145,9 +155,13 @@ def test_damaged_and_hostile_files_are_named(tmp_path):
     (tmp_path / "code_fmap_CxHxW.pt").write_bytes(pickle.dumps(pytest.raises))
     (tmp_path / "empty.npy").write_bytes(b"")
     np.save(tmp_path / "object.npy", np.array([object()]), allow_pickle=True)
-    for stem in ("cut", "junk", "code", "empty", "object"):
+    header = b"{'descr':'<f4','fortran_order':False,'shape':(99999999999,9999999999,99999999)}".ljust(118)
+    (tmp_path / "huge.npy").write_bytes(b"\x93NUMPY\x01\x00v\x00" + header)
+    for stem in ("cut", "junk", "code", "empty", "object", "huge"):
         with pytest.raises(ValueError, match=rf"{stem}.*: expected a feature map, but it cannot be read"):
             FeatureFolder(tmp_path, [stem])[0]
+    with pytest.raises(ValueError, match="mmap length is greater than file size"):
+        FeatureFolder(tmp_path, ["huge"])[0]
 
 
 def save_masks(folder, stem: str, size: tuple[int, int] = (6, 8), seed: int = 0):

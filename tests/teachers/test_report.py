@@ -112,6 +112,16 @@ def test_maps_that_are_all_transposed_are_a_problem(folder):
     assert report.problems == {f"{stem}.npy": [text] for stem in "abc"}
 
 
+def test_maps_that_are_all_channels_last_where_they_are_to_be_first_are_a_problem(tmp_path):
+    for i, stem in enumerate("ab"):
+        torch.save(features(i, (12, 16, 512)), tmp_path / f"{stem}_fmap_CxHxW.pt")
+    report = check_feature_folder(tmp_path, pictures("a", "b", size=(48, 64)))
+    text = (
+        "expected the aspect of a picture of 48 x 64 pixels, got 16 x 512 cells (axes of 12 channels in another order?)"
+    )
+    assert report.problems == {f"{stem}_fmap_CxHxW.pt": [text] for stem in "ab"}
+
+
 def test_channels_first_by_the_picture_is_no_problem(folder):
     np.save(folder / "b.npy", features(1).permute(2, 0, 1).numpy())
     assert check_feature_folder(folder, pictures("a", "b", "c")).ok
