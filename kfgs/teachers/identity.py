@@ -97,7 +97,11 @@ def _describe_class(source: type) -> list[Any]:
         if base.__module__ != source.__module__:
             continue
         for name, member in sorted(vars(base).items()):
-            methods: list[Any] = [member.fget, member.fset] if isinstance(member, property) else [member]
+            methods: list[Any] = [member]
+            if isinstance(member, property):
+                methods = [member.fget, member.fset]
+            elif isinstance(member, functools.cached_property):
+                methods = [member.func]
             for method in methods:
                 code = getattr(inspect.unwrap(getattr(method, "__func__", method)), "__code__", None)
                 if isinstance(code, types.CodeType):

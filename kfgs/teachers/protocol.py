@@ -21,7 +21,8 @@ class Teacher(Protocol):
 
     Any object with these three members is a teacher; nothing needs to be inherited. `isinstance` checks that the
     members exist, not their signatures. Two more are used where they exist: `identity`, JSON that tells what decides its
-    features (see `identify`), and `to(device)`.
+    features (see `identify`; without one, a cache cannot tell other weights of the same name, but for a teacher that
+    `load_teacher` made, which gets one), and `to(device)`.
 
     **Convention**: pictures and features have the channels first here, as encoders have them; kfgs's own maps, and those
     on disk, have them last ([h, w, D]).

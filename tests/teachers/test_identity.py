@@ -65,6 +65,9 @@ def test_functions_are_seen_through_decorators_partials_and_within_functions():
     text = "class f:\n    cell = {}\n    @property\n    def a(self): return {}\n    @staticmethod\n    def b(x): return x + {}\n"
     codes = {code(text.format(*numbers)) for numbers in ((1, 1, 1), (2, 1, 1), (1, 2, 1), (1, 1, 2))}
     assert len(codes) == 4
+    text = "class f:\n    @cached\n    def a(self): return {}"
+    codes = {code(text.format(number), cached=functools.cached_property) for number in (1, 2)}
+    assert len(codes) == 2
     base = written("class base:\n    def a(self): return 1", "base")
     changed = written("class base:\n    def a(self): return 2", "base")
     child = "class f(base):\n    def b(self): return 1"
