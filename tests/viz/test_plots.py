@@ -5,7 +5,8 @@ import pytest
 import torch
 from PIL import Image
 
-from kfgs.viz import plot_codebook_history, plot_confusion, plot_training, plots
+from kfgs.viz import palette, plot_codebook_history, plot_confusion, plot_training, plots
+from kfgs.viz.plots import plot_iou
 
 HISTORY = [{"epoch": i, "size": 8 + 2 * i, "loss": 1 / (i + 1), "coverage": i / 9, "note": "text"} for i in range(10)]
 
@@ -59,6 +60,43 @@ def test_classes_that_never_occur_are_left_out(tmp_path, figures):
     assert [tick.get_text() for tick in figures[0].axes[0].get_xticklabels()] == ["b", "d"]
 
 
+def test_misses_are_a_last_column_and_count_in_their_row(tmp_path, figures):
+    matrix, misses = torch.tensor([[3, 1, 0], [0, 0, 0], [0, 0, 0]]), torch.tensor([4, 0, 5])
+    plot_confusion(matrix, ["wall", "rug", "lamp"], tmp_path / "a.png", misses=misses)
+    axes = figures[0].axes[0]
+    np.testing.assert_allclose(axes.images[0].get_array(), [[37.5, 12.5, 0, 50], [0, 0, 0, 0], [0, 0, 0, 100]])
+    assert [tick.get_text() for tick in axes.get_xticklabels()] == ["wall", "rug", "lamp", "none"]
+    plot_confusion(matrix, ["wall", "rug", "lamp"], tmp_path / "b.png", misses=torch.zeros(3))
+    assert figures[1].axes[0].images[0].get_array().shape == (2, 2)
+
+
+def test_iou_bars_are_sorted_and_coloured_by_class(tmp_path, figures):
+    iou = torch.tensor([0.5, float("nan"), 0.9, 0.25])
+    theirs = torch.tensor([0.4, 0.1, float("nan"), 0.6])
+    plot_iou(iou, ["a", "b", "c", "d"], tmp_path / "iou.png", reference=theirs, reference_name="teacher")
+    axes = figures[0].axes[0]
+    np.testing.assert_allclose([bar.get_width() for bar in axes.patches], [90, 50, 25])
+    assert [tick.get_text() for tick in axes.get_yticklabels()] == ["c", "a", "d"]
+    assert axes.get_ylim()[0] > axes.get_ylim()[1]  # the best on top
+    colors = palette(np.array([2, 0, 3])) / 255
+    np.testing.assert_allclose([bar.get_facecolor()[:3] for bar in axes.patches], colors)
+    np.testing.assert_allclose(axes.lines[-1].get_xdata(), 55, rtol=1e-6)  # (90 + 50 + 25) / 3
+    np.testing.assert_allclose(np.ma.getdata(axes.collections[0].get_offsets()), [(np.nan, 0), (40, 1), (60, 2)])
+    entries = [text.get_text() for text in figures[0].legends[0].get_texts()]
+    assert entries == ["mIoU 55.0", "teacher (mIoU 36.7)"]
+    assert "do not occur: 1 of 4" in axes.get_xlabel()
+    assert len(np.unique(picture(tmp_path / "iou.png").reshape(-1, 3), axis=0)) > 20
+
+
+def test_counts_start_at_zero_with_room_above(tmp_path, figures):
+    rows = [{"step": i, "loss": 1.0, "count": 18_000 + i, "pruned": 0} for i in range(5)]
+    plot_training(rows, tmp_path / "a.png")
+    _, count, pruned = figures[0].axes
+    assert count.get_ylim() == (0, pytest.approx(1.06 * 18_004))
+    assert pruned.get_ylim() == (0, pytest.approx(1.06))  # not from -0.05 to 0.05
+    assert all(float(tick).is_integer() for tick in pruned.get_yticks())
+
+
 def test_global_state_of_matplotlib_is_untouched(tmp_path):
     before = sys.modules.get("matplotlib.pyplot")
     plot_training(HISTORY, tmp_path / "a.png")
@@ -74,6 +112,16 @@ def test_wrong_input_is_named(tmp_path):
         plot_confusion(torch.zeros(2, 3), ["a", "b"], tmp_path / "a.png")
     with pytest.raises(ValueError, match="names: expected 2 class names"):
         plot_confusion(torch.zeros(2, 2), ["a"], tmp_path / "a.png")
+    with pytest.raises(ValueError, match=r"misses: expected \[C\] with C = 2 \(from matrix\)"):
+        plot_confusion(torch.zeros(2, 2), ["a", "b"], tmp_path / "a.png", misses=torch.zeros(3))
+    with pytest.raises(ValueError, match=r"names: expected 2 class names \(from iou\), got 1; pass one name"):
+        plot_iou(torch.zeros(2), ["a"], tmp_path / "a.png")
+    with pytest.raises(ValueError, match=r"iou: expected fractions in \[0, 1\] or NaN, got 76.6; divide"):
+        plot_iou(torch.tensor([76.6]), ["a"], tmp_path / "a.png")
+    with pytest.raises(ValueError, match=r"reference: expected \[C\] with C = 1"):
+        plot_iou(torch.zeros(1), ["a"], tmp_path / "a.png", reference=torch.zeros(2))
+    with pytest.raises(ValueError, match="iou: expected a class that occurs, got 1 NaN"):
+        plot_iou(torch.tensor([torch.nan]), ["a"], tmp_path / "a.png")
     with pytest.raises(ValueError, match=r"ends in .png, got 'a.pdf'"):
         plot_training(HISTORY, tmp_path / "a.pdf")
     assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,108 @@
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from kfgs.viz import palette, reports
+from kfgs.viz.reports import codebook_rows, plot_codebook_growth, plot_codebook_report
+
+WORDS = torch.eye(3)
+NAMES = ["wall", "chair", "lamp"]
+BOOK = torch.tensor([[0.0, 3, 4], [5, 0, 0], [0, 2, 0], [3, 4, 0], [0, 1, 1], [0.6, 0, 0.8]])  # classes 2 0 1 1 1 2
+USAGE = torch.tensor([7, 90, 0, 40, 1000, 8])
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    drawn = []
+    save = reports._save
+    monkeypatch.setattr(reports, "_save", lambda figure, path: (drawn.append(figure), save(figure, path))[1])
+    return drawn
+
+
+def history(sizes):
+    return [{"epoch": i, "size": k, "added": k // 2, "pruned": i, "coverage": 0.1 * i} for i, k in enumerate(sizes)]
+
+
+def test_rows_are_by_class_then_by_usage():
+    rows = codebook_rows(BOOK, WORDS, usage=USAGE, words=2)
+    assert rows.codewords.tolist() == [1, 4, 3, 2, 5, 0]
+    assert rows.labels.tolist() == [0, 1, 1, 1, 2, 2]
+    assert codebook_rows(BOOK, WORDS).codewords.tolist() == [1, 2, 3, 4, 0, 5]
+    unit = BOOK.double() / BOOK.double().norm(dim=1, keepdim=True)
+    order = rows.codewords
+    torch.testing.assert_close(rows.similarity, (unit @ unit.T)[order][:, order])
+
+
+def test_words_are_the_nearest_classes_best_first():
+    rows = codebook_rows(BOOK, WORDS, words=2)
+    zero = rows.words[rows.codewords.tolist().index(0)]
+    assert [label for label, _ in zero] == [2, 1]
+    np.testing.assert_allclose([value for _, value in zero], [0.8, 0.6], rtol=1e-6)
+    assert all(len(words) == 3 for words in codebook_rows(BOOK, WORDS, words=9).words)  # there are no more classes
+
+
+def test_large_codebook_shows_its_most_used_rows(monkeypatch, tmp_path, figures):
+    monkeypatch.setattr(reports, "SHOWN", 4)
+    assert sorted(codebook_rows(BOOK, WORDS, usage=USAGE).codewords.tolist()) == [1, 3, 4, 5]
+    assert sorted(codebook_rows(BOOK, WORDS).codewords.tolist()) == [0, 1, 2, 3]
+    plot_codebook_report(BOOK, NAMES, WORDS, tmp_path / "a.png", usage=USAGE)
+    assert figures[0].get_suptitle() == "Codebook: 6 codewords, the most used 4 shown"
+
+
+def test_report_draws_what_the_rows_hold(tmp_path, figures):
+    plot_codebook_report(BOOK, NAMES, WORDS, tmp_path / "report.png", usage=USAGE, history=history([3, 6]), words=2)
+    rows = codebook_rows(BOOK, WORDS, usage=USAGE, words=2)
+    upper, lower = figures[0].subfigs
+    matrix, usage, words = upper.axes[:3]
+    np.testing.assert_allclose(matrix.images[0].get_array(), rows.similarity)
+    assert [tick.get_text() for tick in matrix.get_xticklabels()] == NAMES
+    np.testing.assert_allclose(matrix.get_xticks(), [0, 2, 4.5])  # the middle of each class
+    ends = [bar.get_x() + bar.get_width() for bar in usage.patches]
+    assert ends == [90, 1000, 40, 0.5, 8, 7]
+    assert [text.get_text() for text in usage.texts] == ["unused"]
+    np.testing.assert_allclose([bar.get_facecolor()[:3] for bar in usage.patches], palette(rows.labels) / 255)
+    texts = [text.get_text() for text in words.texts]
+    assert texts[0::3] == ["1", "4", "3", "2", "5", "0"]
+    assert texts[2::3][-1] == "lamp 0.80, chair 0.60"
+    assert [axes.get_title() for axes in lower.axes] == ["size K", "codewords added and pruned (dashed)", "coverage"]
+    picture = np.asarray(Image.open(tmp_path / "report.png").convert("RGB"))
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
+
+
+def test_report_without_usage_and_history_has_two_panels(tmp_path, figures):
+    plot_codebook_report(BOOK[:1], NAMES, WORDS, tmp_path / "a.png")
+    titles = [axes.get_title(loc=loc) for axes in figures[0].subfigs[0].axes for loc in ("center", "left")]
+    assert [title for title in titles if title] == [
+        "similarity of codewords, by class",
+        "codeword: nearest words (cosine)",
+    ]
+
+
+def test_growth_has_a_curve_per_scene(tmp_path, figures):
+    scenes = {"room 0": history([3, 6, 9]), "office 3": history([4, 4])}
+    plot_codebook_growth(scenes, tmp_path / "growth.png")
+    size, turnover, coverage = figures[0].axes
+    np.testing.assert_allclose(size.lines[0].get_xydata(), [(0, 3), (1, 6), (2, 9)])
+    np.testing.assert_allclose(size.lines[1].get_xydata(), [(0, 4), (1, 4)])
+    assert [line.get_linestyle() for line in turnover.lines] == ["-", "--", "-", "--"]  # added, pruned of each
+    assert size.get_ylim()[0] == turnover.get_ylim()[0] == coverage.get_ylim()[0] == 0
+    assert [text.get_text() for text in figures[0].legends[0].get_texts()] == ["room 0", "office 3"]
+    assert len({tuple(line.get_color()) for line in size.lines}) == 2
+
+
+def test_wrong_input_is_named(tmp_path):
+    path = tmp_path / "a.png"
+    with pytest.raises(ValueError, match=r"embeddings: expected \[C, D\] with D = 3 \(from codewords\)"):
+        plot_codebook_report(BOOK, NAMES, WORDS[:, :2], path)
+    with pytest.raises(ValueError, match=r"names: expected 3 class names \(from embeddings\), got 1"):
+        plot_codebook_report(BOOK, ["wall"], WORDS, path)
+    with pytest.raises(ValueError, match=r"usage: expected \[K\] with K = 6"):
+        plot_codebook_report(BOOK, NAMES, WORDS, path, usage=USAGE[:2])
+    with pytest.raises(ValueError, match="words: expected a number"):
+        codebook_rows(BOOK, WORDS, words=0)
+    with pytest.raises(ValueError, match="histories: expected at least one scene"):
+        plot_codebook_growth({}, path)
+    with pytest.raises(ValueError, match=r"histories\['a'\]: expected rows with epoch and size"):
+        plot_codebook_growth({"a": [{"loss": 1.0}]}, path)
+    assert list(tmp_path.iterdir()) == []
