@@ -200,9 +200,9 @@ def _draw_growth(axes: np.ndarray[Any, Any], histories: Mapping[str, Sequence[Ro
     drawn: list[list[float]] = [[], [], []]
     for i, (name, history) in enumerate(histories.items()):
         if not any(_is_number(row.get("size")) for row in history):
+            argument = f"histories[{name!r}]" if name else "history"
             raise ValueError(
-                f"histories[{name!r}]: expected rows with epoch and size, got {list(history)[:1]}; "
-                "pass CodebookFit.history"
+                f"{argument}: expected rows with epoch and size, got {list(history)[:1]}; pass CodebookFit.history"
             )
         color = LINES[i] if len(histories) <= len(LINES) else palette(np.array(i)) / 255
         for panel, key in ((0, "size"), (1, "added"), (1, "pruned"), (2, "coverage")):

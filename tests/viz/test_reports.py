@@ -105,4 +105,6 @@ def test_wrong_input_is_named(tmp_path):
         plot_codebook_growth({}, path)
     with pytest.raises(ValueError, match=r"histories\['a'\]: expected rows with epoch and size"):
         plot_codebook_growth({"a": [{"loss": 1.0}]}, path)
+    with pytest.raises(ValueError, match="history: expected rows with epoch and size"):
+        plot_codebook_report(BOOK, NAMES, WORDS, path, history=[{"loss": 1.0}])
     assert list(tmp_path.iterdir()) == []
