@@ -1,0 +1,146 @@
+"""What an animation shows: pictures of clouds from any camera, drawn by kfgs's own rasteriser.
+
+Not by pyvista: the rasteriser needs neither a display nor OpenGL, and its pictures are those that scores are taken from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from .._check import check_choice
+from ..cameras import Camera
+from ..gaussians import Gaussians
+from ..labels.color import parse_color
+from ..splat import rasterize
+from .pairs import picture_grid
+from .palette import palette
+from .pictures import FeatureColors, as_bytes, legend_strip
+
+Array = np.ndarray[Any, Any]
+Show = Callable[[Camera], Any]
+"""Anything that makes a picture [H, W, 3] (uint8, or floats in [0, 1]) of the size of the camera it is given."""
+
+ColorBy = Literal["label", "rgb", "feature"]
+
+
+def show_cloud(
+    gaussians: Gaussians,
+    *,
+    color_by: ColorBy | None = None,
+    feature_colors: FeatureColors | None = None,
+    background: str | Sequence[float] = "white",
+) -> Show:
+    """A function that draws a cloud from any camera, the picture that `rasterize` makes of it.
+
+    Labels and features become one colour per Gaussian, and the colours are composited (Eq. 3 with three channels):
+    at borders they blend. `rgb` is the harmonics' colour, which depends on the direction.
+
+    Args:
+        gaussians: what to draw; on any device.
+        color_by: `label` (the palette), `rgb` or `feature` (through `feature_colors`); None: labels if there are any,
+            else rgb.
+        feature_colors: the scene's projection of features to colours.
+        background: a colour by name or three numbers in [0, 1].
+
+    Returns:
+        camera -> [H, W, 3] uint8.
+
+    Raises:
+        ValueError: if there is nothing to draw, or what to colour by is missing.
+    """
+    if color_by is None:
+        color_by = "label" if gaussians.labels is not None else "rgb"
+    check_choice("color_by", color_by, ("label", "rgb", "feature"))
+    if len(gaussians) == 0:
+        raise ValueError("gaussians: expected at least one Gaussian to draw, got none; widen the selection")
+    painted = _paint(gaussians.detach(), color_by, feature_colors)
+    paper = torch.tensor(parse_color(background, "background")).to(gaussians.means)
+
+    def show(camera: Camera) -> Array:
+        with torch.no_grad():
+            drawn = rasterize(painted, camera.to(painted.means), background=paper)
+        return as_bytes(drawn.map)
+
+    return show
+
+
+def _paint(gaussians: Gaussians, color_by: ColorBy, feature_colors: FeatureColors | None) -> Gaussians:
+    """The cloud with colours as its features, or with nothing but its harmonics."""
+    if color_by == "rgb":
+        if gaussians.sh is None:
+            raise ValueError(
+                "gaussians.sh: expected harmonics to colour by, got None; colour by labels, or pass a colour field"
+            )
+        return gaussians.replace(features=None)
+    if color_by == "label":
+        if gaussians.labels is None:
+            raise ValueError(
+                "gaussians.labels: expected labels to colour by, got None; label them or choose another color_by"
+            )
+        colors = palette(gaussians.labels)
+    else:
+        if gaussians.features is None or feature_colors is None:
+            missing = "gaussians.features" if gaussians.features is None else "feature_colors"
+            raise ValueError(
+                f"{missing}: expected it to colour by features, got None; fit FeatureColors once per scene"
+            )
+        colors = feature_colors(gaussians.features)
+    return gaussians.replace(features=torch.from_numpy(colors).to(gaussians.means) / 255, sh=None)
+
+
+def draw_frame(
+    shows: Mapping[str, Show],
+    camera: Camera,
+    strip: Array | None = None,  # [h, w, 3] uint8
+) -> Array:  # [h, w, 3] uint8
+    """One frame: each picture under its title, side by side; a single one without a title stays bare."""
+    pictures = []
+    for title, show in shows.items():
+        picture = as_bytes(show(camera))
+        if picture.shape != (camera.height, camera.width, 3):
+            raise ValueError(
+                f"shows[{title!r}]: expected pictures [{camera.height}, {camera.width}, 3] (from the camera), got "
+                f"{picture.shape}; draw at the camera's size, without a legend"
+            )
+        pictures.append(picture)
+    frame = pictures[0] if list(shows) == [""] else picture_grid([pictures], list(shows))
+    return frame if strip is None else np.concatenate([frame, strip[:, : frame.shape[1]]])
+
+
+def as_shows(shows: Gaussians | Show | Mapping[str, Gaussians | Show]) -> dict[str, Show]:
+    """Titles and what draws under them; one thing alone has the title ""."""
+    named = shows if isinstance(shows, Mapping) else {"": shows}
+    if not named:
+        raise ValueError("shows: expected at least one thing to show, got none; pass Gaussians or a function")
+    made: dict[str, Show] = {}
+    for title, thing in named.items():
+        if isinstance(thing, Gaussians):
+            made[title] = show_cloud(thing)
+        elif callable(thing):
+            made[title] = thing
+        else:
+            raise TypeError(
+                f"shows[{title!r}]: expected Gaussians or a function of a camera, got {type(thing).__name__}; "
+                "make one with show_cloud"
+            )
+    return made
+
+
+def legend_under(
+    shows: Gaussians | Show | Mapping[str, Gaussians | Show],
+    names: Sequence[str],
+    width: int,
+) -> Array:  # [h, width, 3] uint8
+    """One legend for every frame: the classes of all labelled clouds shown, whether in sight or not."""
+    things = list(shows.values()) if isinstance(shows, Mapping) else [shows]
+    labels = [thing.labels.cpu() for thing in things if isinstance(thing, Gaussians) and thing.labels is not None]
+    if not labels:
+        raise ValueError(
+            "names: expected labelled Gaussians among what is shown, got none; leave names out, and draw the legend in "
+            "your own pictures"
+        )
+    return legend_strip(torch.cat(labels).unique(), names, width)
