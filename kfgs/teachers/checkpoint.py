@@ -7,6 +7,7 @@ a checked view of the memory-mapped file.
 
 from __future__ import annotations
 
+import errno
 import io
 import mmap
 import re
@@ -24,7 +25,7 @@ from torch import Tensor
 from .._files import digest_file
 from .file_kinds import describe_kind, describe_text
 from .pickles import BrokenPickleError, Global, Inert, UnsafePickleError, read_pickle
-from .torch_pickles import BUILDERS, Entry, Storage, Storages, one_line, view_entry
+from .torch_pickles import BUILDERS, Entry, Storage, Storages, Views, one_line
 
 _EXPECTED = "expected a checkpoint (.ckpt, .pt, .pth or .safetensors)"
 _AGAIN = "download it again or name another file"
@@ -40,8 +41,8 @@ def read_checkpoint(path: str | Path) -> dict[str, Tensor]:
     `model`, `module`, `net`, `network` or `params`, in this order. What is no tensor is left out.
 
     **Memory**: tensors are views of the file, mapped privately: pages are read when looked at, writing to a tensor does
-    not change the file. The exceptions are tensors of the old format, which are copied when they are not aligned. The
-    file may be deleted or replaced by another of its name, but not be written over while the tensors are in use.
+    not change the file. The exceptions are storages that are not aligned (in the old format), each of which is copied
+    once. The file may be deleted or replaced by another of its name, but not be written over while the tensors are in use.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -49,15 +50,29 @@ def read_checkpoint(path: str | Path) -> dict[str, Tensor]:
             is one line that says what the file is.
     """
     path = Path(path)
-    if path.is_dir():
-        raise ValueError(f"{path}: {_EXPECTED}, got a folder; name the file of weights in it")
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: {_EXPECTED}, got no such file; check its name")
-    with path.open("rb") as file:
-        head = file.read(1024)
-    kind = describe_kind(head, path.stat().st_size)
-    if kind is not None:
-        raise _refusal(path, kind)
+    with _readable(path):
+        with path.open("rb") as file:
+            head = file.read(1024)
+        kind = describe_kind(head, path.stat().st_size)
+        if kind is not None:
+            raise _refusal(path, kind)
+        return _read(path, head)
+
+
+def weights_digest(path: str | Path) -> str:
+    """SHA-256 of a checkpoint's file, in hexadecimal: what identifies the weights.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is a folder, or cannot be read.
+    """
+    path = Path(path)
+    with _readable(path):
+        return digest_file(path)
+
+
+def _read(path: Path, head: bytes) -> dict[str, Tensor]:
+    """Read by content."""
     try:
         if _is_safetensors(head):
             return _read_safetensors(path)
@@ -75,15 +90,23 @@ def read_checkpoint(path: str | Path) -> dict[str, Tensor]:
         ) from error
 
 
-def weights_digest(path: str | Path) -> str:
-    """SHA-256 of a checkpoint's file, in hexadecimal: what identifies the weights.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-    """
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"{path}: {_EXPECTED}, got no such file; check its name")
-    return digest_file(path)
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Raise unless there is such a file; what the system refuses inside becomes a line that names it."""
+    try:
+        if path.is_dir():
+            raise ValueError(f"{path}: {_EXPECTED}, got a folder; name the file of weights in it")
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: {_EXPECTED}, got no such file; check its name")
+        yield
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise FileNotFoundError(f"{path}: {_EXPECTED}, got a name too long for a file; check it") from error
+        raise ValueError(
+            f"{path}: {_EXPECTED}, got one that cannot be read ({error.strerror}); check the file"
+        ) from error
 
 
 def _read_zip(path: Path, data: mmap.mmap, head: bytes) -> dict[str, Tensor]:
@@ -158,18 +181,19 @@ def _read_legacy(path: Path, data: mmap.mmap, head: bytes) -> dict[str, Tensor]:
 
 def _tensors(path: Path, found: Any, extent: Callable[[Storage], tuple[int, int]]) -> dict[str, Tensor]:
     """The tensors of an unpickled object's state dict, or words about what it is instead."""
-    state = _find_state(found)
+    state = _find_state(found, set())
     if state is None:
         raise _refusal(path, f"a file of {_kind_of(found)}, without a state dict (names to tensors)")
     # mapped privately: a page is copied when it is written to
     file: Any = torch.UntypedStorage.from_file(str(path), False, path.stat().st_size)
+    views = Views(file)
     tensors = {}
     for name, entry in state.items():
         if _is_odd_tensor(entry):
             raise _refusal(path, f"one whose entry {one_line(name)} is no plain dense tensor ({one_line(entry.name)})")
         if isinstance(entry, Entry):
             try:
-                tensors[name] = view_entry(entry, file, *extent(entry.storage))
+                tensors[name] = views.tensor(entry, *extent(entry.storage))
             except BrokenPickleError as error:
                 raise _refusal(path, f"one whose tensor {one_line(name)} {error}: damaged") from error
     return tensors
@@ -180,11 +204,12 @@ def _is_odd_tensor(value: Any) -> bool:
     return isinstance(value, Inert) and value.name.startswith(("torch._utils.", "torch._tensor."))
 
 
-def _find_state(found: Any, depth: int = 0) -> dict[str, Any] | None:
-    """The dict that holds tensors, itself or under one of the usual keys."""
-    if type(found) is not dict or depth > 3:
+def _find_state(found: Any, seen: set[int], depth: int = 0) -> dict[str, Any] | None:
+    """The dict that holds tensors, itself or under one of the usual keys; each is looked into once."""
+    if type(found) is not dict or depth > 3 or id(found) in seen:
         return None
-    inner = (_find_state(found.get(key), depth + 1) for key in _STATES)
+    seen.add(id(found))
+    inner = (_find_state(found.get(key), seen, depth + 1) for key in _STATES)
     own = found if any(isinstance(value, Entry) or _is_odd_tensor(value) for value in found.values()) else None
     return next((state for state in inner if state is not None), own)
 
@@ -205,7 +230,7 @@ def _read_safetensors(path: Path) -> dict[str, Tensor]:
 
     try:
         tensors: dict[str, Tensor] = load_file(path, device="cpu")
-    except (SafetensorError, ValueError, KeyError) as error:
+    except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
         why = one_line(str(error), 100)
         raise _refusal(path, f"a .safetensors file that is damaged or cut short ({why})") from error
     if not tensors:

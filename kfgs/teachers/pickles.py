@@ -3,33 +3,24 @@
 `pickle.Unpickler` runs what a file names, and restricting `find_class` still leaves object construction, `__setstate__`
 and memory to the file. Here `pickletools` splits the bytes into opcodes and ~60 of them are carried out on plain lists,
 tuples and dicts. A global is only a name; calling one gives whatever the caller's table `builders` has for that name, or
-else an `Inert` object, on which everything has no effect. All memory used is in proportion to the bytes read.
+else an `Inert` object, on which everything has no effect. Memory and time are in proportion to the bytes read, about 100
+bytes for each: an opcode makes one small object, and what a memoised object could multiply is counted or bounded (the
+lists that calls copy, their arguments, the lengths of names and keys).
 """
 
 from __future__ import annotations
 
 import pickletools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
+
+from .pickle_names import attributes_of, is_getattr, is_unsafe, is_unsafe_attribute, is_way
 
 
 def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
-
-# What attacks ask for and settings never hold. A file that names them is refused; anything else unknown is inert.
-_UNSAFE_MODULES = _words(
-    "os posix nt subprocess sys pty runpy shutil socket webbrowser importlib imp ctypes _ctypes cffi code codeop pdb bdb "
-    "timeit profile cProfile asyncio multiprocessing _thread pickle _pickle marshal types urllib urllib2 http ftplib "
-    "smtplib ssl requests pip ensurepip venv io _io operator _operator pkgutil zipimport doctest commands popen2"
-)
-_UNSAFE_BUILTINS = _words(
-    "eval exec execfile compile open file __import__ getattr setattr delattr globals locals vars input raw_input "
-    "breakpoint apply"
-)
-_UNSAFE_INSIDE = _words("os posix nt sys subprocess importlib builtins __builtins__ __globals__")
-_HARMLESS = frozenset({"types.SimpleNamespace", "io.BytesIO", "_io.BytesIO"})
 
 _LITERALS = _words(
     "INT BININT BININT1 BININT2 LONG LONG1 LONG4 STRING BINSTRING SHORT_BINSTRING BINBYTES SHORT_BINBYTES BINBYTES8 "
@@ -42,11 +33,14 @@ _FRESH: dict[str, Callable[[], Any]] = {
     "EMPTY_LIST": list,
     "EMPTY_TUPLE": tuple,
     "EMPTY_DICT": dict,
-    "EMPTY_SET": lambda: Inert("builtins.set"),  # no element is hashed: a nested tuple would overflow C's stack
+    "EMPTY_SET": lambda: _SET,  # no element is hashed: a nested tuple would overflow C's stack
 }
 _STEPS = (
     10_000_000  # about 300,000 tensors; bounds the time, and the memory that one-byte opcodes ask for (60 bytes each)
 )
+_NAME = 256  # characters of a global's name: two memoised texts of any length would be joined again and again
+_KEY = 4096  # characters of a dict's key: equal keys that are two objects are compared again and again
+_ARGUMENTS = 64  # of a call that a builder answers; torch's have 7
 _WITHOUT_RESULT = _words("MARK POP POP_MARK ADDITEMS APPEND APPENDS SETITEM SETITEMS BUILD")
 
 
@@ -70,18 +64,21 @@ class ByteSource(Protocol):
         ...
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Global:
     """A name that a pickle wants imported, such as `collections.OrderedDict`; nothing is."""
 
     name: str
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Inert:
     """Stands for an object that was not made; `name` is that of its class or function."""
 
     name: str
+
+
+_SET: Inert = Inert("builtins.set")
 
 
 def read_pickle(
@@ -91,8 +88,8 @@ def read_pickle(
 ) -> Any:
     """The value of the pickle that starts at the position of `source`, which is left behind its last byte.
 
-    The result is made of None, bool, int, float, str, bytes, list, tuple, dict (items with other keys than str are left
-    out), `Global`, `Inert`, and what `builders` and `persistent` return.
+    The result is made of None, bool, int, float, str, bytes, list, tuple, dict (items with other keys than str, or longer
+    ones than 4,096 characters, are left out), `Global`, `Inert`, and what `builders` and `persistent` return.
 
     Args:
         source: where the bytes come from.
@@ -100,8 +97,8 @@ def read_pickle(
         persistent: turns a persistent id (torch: a storage) into a value; must check it too.
 
     Raises:
-        UnsafePickleError: if a dangerous global is named anywhere before the end, called or not.
-        BrokenPickleError: if this is no pickle, or arguments do not fit `builders`.
+        UnsafePickleError: if a dangerous global is named anywhere before the end, called or not, or reached by `getattr`.
+        BrokenPickleError: if this is no pickle, arguments do not fit `builders`, or it would grow out of proportion.
     """
     machine = _Machine(builders, persistent)
     try:
@@ -120,16 +117,6 @@ def read_pickle(
     raise BrokenPickleError("it has no end")
 
 
-def is_unsafe(name: str) -> bool:
-    """Whether a global is one that only an attack asks for: `posix.system`, `builtins.eval`, `torch.os.system`."""
-    module, *rest = name.split(".")
-    if not rest or name in _HARMLESS:
-        return False
-    if module in ("builtins", "__builtin__"):
-        return not _UNSAFE_BUILTINS.isdisjoint(rest)
-    return module in _UNSAFE_MODULES or not _UNSAFE_INSIDE.isdisjoint(rest[:-1])
-
-
 class _Machine:
     """The stack, the marks and the memo of one pickle."""
 
@@ -138,9 +125,11 @@ class _Machine:
         self.stack: list[Any] = []
         self.marked: list[list[Any]] = []  # stacks below each mark
         self.memo: dict[int, Any] = {}  # no list: a file may put at index 2^32
+        self.done = self.copied = 0  # opcodes, and elements of lists that calls got
 
     def step(self, name: str, argument: Any) -> None:
         """Carry out one opcode."""
+        self.done += 1
         if name in _LITERALS:
             self.stack.append(argument)
         elif name in _FRESH:
@@ -228,15 +217,24 @@ class _Machine:
             self.stack[-1].update(string_items(pairs))
 
     def _global(self, argument: str) -> Global:  # "module name", as pickletools joins them
-        name = argument.replace(" ", ".", 1)
-        if is_unsafe(name):
-            raise UnsafePickleError(name)
+        module, _, path = argument.partition(" ")
+        name = f"{module}.{path}" if path else module
+        inside = path.rpartition(".")[0]  # of a dotted path: what lies on the way
+        return self._named(name, is_unsafe(name) or is_unsafe_attribute(inside))
+
+    def _named(self, name: str, unsafe: bool) -> Global:
+        if unsafe:
+            raise UnsafePickleError(name[:_NAME])
+        if len(name) > _NAME:
+            raise BrokenPickleError(f"it names a global by more than {_NAME} characters")
         return Global(name)
 
     def _stack_global(self, _: Any) -> Global:
         name, module = self.stack.pop(), self.stack.pop()
         if type(name) is not str or type(module) is not str:
             raise BrokenPickleError("it names a global by something else than text")
+        if len(name) + len(module) > _NAME:
+            raise BrokenPickleError(f"it names a global by more than {_NAME} characters")
         return self._global(f"{module} {name}")
 
     def _ext1(self, code: int) -> Global:
@@ -246,9 +244,36 @@ class _Machine:
 
     def _call(self, function: Any, arguments: Any) -> Any:
         name = function.name if isinstance(function, Global) else "an inert object"
+        if type(arguments) not in (list, tuple):  # a named tuple, which is inert
+            arguments = ()
         if name in self.builders:
+            self._charge(arguments)
             return self.builders[name](*arguments)
+        self._follow(name, arguments)
+        if is_getattr(name) and len(arguments) > 1 and isinstance(arguments[0], Global):
+            reached = f"{arguments[0].name}.{arguments[1]}"  # a nested class, most likely
+            return self._named(reached, is_unsafe(reached))
         return Inert(name)
+
+    def _charge(self, arguments: Sequence[Any]) -> None:
+        """Refuse what makes more of its lists than it has opcodes: one memoised list, given to many calls."""
+        if len(arguments) > _ARGUMENTS:
+            raise BrokenPickleError(f"it calls something with more than {_ARGUMENTS} arguments")
+        self.copied += sum(len(argument) for argument in arguments if type(argument) is list)
+        if self.copied > self.done:
+            raise BrokenPickleError("it copies one list many times, which no state dict does")
+
+    def _follow(self, name: str, arguments: Sequence[Any]) -> None:
+        """Refuse the ways around names: an attribute that is dangerous or computed, `getattr` given to another function."""
+        for attribute in attributes_of(name, arguments):
+            if type(attribute) is not str:
+                raise UnsafePickleError(f"{name} of a name that it computes")
+            if len(attribute) > _NAME or is_unsafe_attribute(attribute):
+                owner = arguments[0].name + "." if is_getattr(name) and isinstance(arguments[0], Global | Inert) else ""
+                raise UnsafePickleError(f"{owner}{attribute[:_NAME]}")
+        for argument in arguments[:_ARGUMENTS]:
+            if isinstance(argument, Global) and is_way(argument.name):
+                raise UnsafePickleError(argument.name)
 
     def _reduce(self, _: Any) -> Any:
         arguments, function = self.stack.pop(), self.stack.pop()
@@ -278,8 +303,8 @@ class _Machine:
 
 
 def string_items(pairs: Any) -> dict[str, Any]:
-    """A dict of those `(key, value)` pairs whose key is text; other keys are not even hashed."""
-    return {key: value for key, value in pairs if type(key) is str}
+    """A dict of those `(key, value)` pairs whose key is text of ordinary length; other keys are not even hashed."""
+    return {key: value for key, value in pairs if type(key) is str and len(key) <= _KEY}
 
 
 def _pairs(items: list[Any]) -> list[tuple[Any, Any]]:

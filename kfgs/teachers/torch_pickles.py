@@ -28,7 +28,11 @@ _DTYPES = {
 }
 
 
-@dataclass(frozen=True)
+_DIMS = 64  # torch's own limit
+_KEY = 256  # characters of a storage's key, which are digits
+
+
+@dataclass(frozen=True, slots=True)
 class Storage:
     """Numbers in a row in the file; `offset` elements are skipped (the views of torch before 0.4)."""
 
@@ -38,7 +42,7 @@ class Storage:
     offset: int = 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Entry:
     """A tensor as its pickle describes it, not checked yet."""
 
@@ -57,7 +61,7 @@ def _rebuild_tensor(storage: Any, offset: Any, size: Any, stride: Any, *more: An
         or not _are_counts(stride)
     ):
         raise BrokenPickleError("a tensor of it has no storage, or sizes that are no whole numbers from 0")
-    if len(size) != len(stride) or len(size) > 64:
+    if len(size) != len(stride):
         raise BrokenPickleError(f"a tensor of it has {len(size)} sizes and {len(stride)} strides")
     if more[2:] and more[2]:  # bits "conjugate" and "negative"
         return Inert("torch._utils._rebuild_tensor_v2 with metadata")
@@ -84,7 +88,10 @@ BUILDERS: dict[str, Callable[..., Any]] = {
 
 
 def _are_counts(values: Any) -> bool:
-    return type(values) is tuple and all(type(value) is int and 0 <= value < 2**48 for value in values)
+    """Whether this is a tuple, no longer than a tensor has axes, of whole numbers from 0."""
+    if type(values) is not tuple or len(values) > _DIMS:
+        return False
+    return all(type(value) is int and 0 <= value < 2**48 for value in values)
 
 
 class Storages:
@@ -99,7 +106,7 @@ class Storages:
             raise BrokenPickleError("it refers to something else than a storage")
         _, kind, name, _, numel = key[:5]
         dtype = _DTYPES.get(kind.name.rpartition(".")[2]) if isinstance(kind, Global) else None
-        if dtype is None or type(name) is not str or not _are_counts((numel,)):
+        if dtype is None or type(name) is not str or len(name) > _KEY or not _are_counts((numel,)):
             raise BrokenPickleError(f"it has a storage of unknown type {one_line(getattr(kind, 'name', type(kind)))}")
         whole = self.by_key.setdefault(name, Storage(name, dtype, numel))
         if len(key) == 5 or key[5] is None:
@@ -110,32 +117,52 @@ class Storages:
         return Storage(name, whole.dtype, view[2], view[1])
 
 
-def view_entry(entry: Entry, file: torch.UntypedStorage, first: int, length: int) -> Tensor:
-    """The tensor that `entry` describes, a view of `file` whose storage has `length` bytes from byte `first`.
+class Views:
+    """Tensors as views of a memory-mapped file.
 
-    It is copied only if its first byte does not lie as its type asks for.
-
-    Raises:
-        BrokenPickleError: if it reaches beyond its storage, or has more values than that (an expanded tensor, which a few
-            bytes make as large as you like).
+    Storages whose first byte does not lie as their type asks for are copied, each once: tensors that share one go on
+    sharing. The copies together are never larger than the file.
     """
-    storage, itemsize = entry.storage, entry.storage.dtype.itemsize
-    count, last = 1, entry.offset
-    for size, stride in zip(entry.size, entry.stride, strict=True):
-        count *= size
-        last += (size - 1) * stride
-    held = max(length // itemsize - storage.offset, 0)
-    if storage.numel > held or count > storage.numel or (count and last >= storage.numel):
-        raise BrokenPickleError(f"of size {list(entry.size)[:8]} does not fit into the {held} values of its storage")
-    if not count:
-        try:
-            return torch.empty(entry.size, dtype=storage.dtype)
-        except RuntimeError as error:  # 0 x 2^40 x 2^40
-            raise BrokenPickleError(f"has an impossible size {list(entry.size)[:8]}") from error
-    first += storage.offset * itemsize
-    part = file[first : first + storage.numel * itemsize]
-    part = part if first % itemsize == 0 else part.clone()
-    return torch.empty(0, dtype=storage.dtype).set_(part, entry.offset, entry.size, entry.stride)
+
+    def __init__(self, file: torch.UntypedStorage) -> None:
+        self.file = file
+        self.copies: dict[tuple[int, int], torch.UntypedStorage] = {}  # by first byte and length
+        self.copied = 0  # bytes
+
+    def tensor(self, entry: Entry, first: int, length: int) -> Tensor:
+        """The tensor that `entry` describes, whose storage has `length` bytes of the file from byte `first`.
+
+        Raises:
+            BrokenPickleError: if it reaches beyond its storage, or has more values than that (an expanded tensor, which a
+                few bytes make as large as you like), or if storages that must be copied overlap.
+        """
+        storage, itemsize = entry.storage, entry.storage.dtype.itemsize
+        count, last = 1, entry.offset
+        for size, stride in zip(entry.size, entry.stride, strict=True):
+            count *= size
+            last += (size - 1) * stride
+        held = max(length // itemsize - storage.offset, 0)
+        if storage.numel > held or count > storage.numel or (count and last >= storage.numel):
+            raise BrokenPickleError(
+                f"of size {list(entry.size)[:8]} does not fit into the {held} values of its storage"
+            )
+        if not count:
+            try:
+                return torch.empty(entry.size, dtype=storage.dtype)
+            except RuntimeError as error:  # 0 x 2^40 x 2^40
+                raise BrokenPickleError(f"has an impossible size {list(entry.size)[:8]}") from error
+        source, start = (self.file, first) if first % itemsize == 0 else (self._copy(first, length), 0)
+        start += storage.offset * itemsize
+        part = source[start : start + storage.numel * itemsize]
+        return torch.empty(0, dtype=storage.dtype).set_(part, entry.offset, entry.size, entry.stride)
+
+    def _copy(self, first: int, length: int) -> torch.UntypedStorage:
+        if (first, length) not in self.copies:
+            self.copied += length
+            if self.copied > self.file.nbytes():
+                raise BrokenPickleError("lies in a storage that overlaps others")
+            self.copies[first, length] = self.file[first : first + length].clone()
+        return self.copies[first, length]
 
 
 def one_line(text: object, length: int = 60) -> str:

@@ -5,6 +5,7 @@ import os
 import pickle
 import pickletools
 import struct
+import time
 import zipfile
 from pathlib import Path
 
@@ -150,7 +151,16 @@ def attacks(marker: Path) -> dict[str, tuple[bytes, str]]:
         "newobj": (b"\x80\x02cos\nsystem\n(S'" + text + b"'\nt\x81.", "os.system"),
         "eval": (pickle.dumps(Call(eval, shown)), "builtins.eval"),
         "exec": (pickle.dumps(Call(exec, shown), 2), "__builtin__.eval|__builtin__.exec|builtins.exec"),
-        "getattr chain": (pickle.dumps(Call(getattr, Call(__import__, "os"), "system")), "builtins.getattr"),
+        "getattr chain": (
+            b"cbuiltins\ngetattr\n(cbuiltins\n__import__\n(S'os'\ntRS'system'\ntR(S'" + text + b"'\ntR.",
+            "builtins.__import__",
+        ),
+        "getattr of a module": (
+            b"cbuiltins\ngetattr\n(cbuiltins\ngetattr\n(ctorch\nserialization\nS'os'\ntRS'system'\ntR(S'"
+            + text
+            + b"'\ntR.",
+            "torch.serialization.os",
+        ),
         "nested in an allowed call": (
             pickle.dumps(Call(collections.OrderedDict, [["a", Call(os.system, command)]])),
             "posix.system",
@@ -192,11 +202,21 @@ def test_the_attacks_do_run_elsewhere(tmp_path: Path) -> None:
     """So that the test above cannot pass because its pickles are broken."""
     ran = 0
     for name, (body, _) in attacks(tmp_path / "ran").items():
-        if name in ("os.system", "os.system as os", "inst", "obj", "eval", "nested in an allowed call", "setstate"):
+        if name in (
+            "os.system",
+            "os.system as os",
+            "inst",
+            "obj",
+            "eval",
+            "nested in an allowed call",
+            "setstate",
+            "getattr chain",
+            "getattr of a module",
+        ):
             (tmp_path / "ran").unlink(missing_ok=True)
             pickle.loads(body)
             ran += (tmp_path / "ran").exists()
-    assert ran == 7
+    assert ran == 9
 
 
 def contained(body: bytes, container: str) -> bytes:
@@ -478,8 +498,53 @@ def test_no_file_and_folder(tmp_path: Path) -> None:
         read_checkpoint(tmp_path / "a.ckpt")
     with pytest.raises(FileNotFoundError, match=r"a\.ckpt: expected a checkpoint .* got no such file"):
         weights_digest(tmp_path / "a.ckpt")
-    with pytest.raises(ValueError, match="got a folder; name the file of weights in it"):
-        read_checkpoint(tmp_path)
+    for read in (read_checkpoint, weights_digest):
+        with pytest.raises(ValueError, match="got a folder; name the file of weights in it"):
+            read(tmp_path)
+
+
+@pytest.mark.parametrize("read", [read_checkpoint, weights_digest])
+def test_what_the_system_refuses_is_one_line(tmp_path: Path, read) -> None:
+    with pytest.raises(
+        FileNotFoundError, match=r"x: expected a checkpoint .* got a name too long for a file; check it"
+    ):
+        read(tmp_path / ("x" * 256))
+    with pytest.raises(
+        ValueError, match=r"^/proc/self/mem: expected .* got one that cannot be read \(.+\); check the file"
+    ):
+        read("/proc/self/mem")
+
+
+def test_a_dict_in_itself_many_times_is_looked_into_once(tmp_path: Path) -> None:
+    """A dict under all seven usual keys of itself, with a million other items, would be looked through 2,801 times."""
+    keys = ("state_dict", "model_state_dict", "model", "module", "net", "network", "params")
+    value: dict = {str(i): i for i in range(20_000)}
+    value |= dict.fromkeys(keys, value)
+    torch.save(value, tmp_path / "a.pt")
+    start = time.process_time()
+    with pytest.raises(ValueError, match="without a state dict"):
+        read_checkpoint(tmp_path / "a.pt")
+    assert time.process_time() - start < 2  # 0.1 s; 5 s with each look
+
+
+def test_a_misaligned_storage_is_copied_once_and_shared(tmp_path: Path) -> None:
+    rebuild = "ctorch._utils\n_rebuild_tensor_v2\n({}I{}\n(I1\nt(I1\ntI00\n(dtR"
+    values = np.arange(1 << 18, dtype=np.float32)
+    items = "".join(f"S'{i}'\n{rebuild.format(FLOATS.format(values.size), i)}s" for i in range(300))
+    for padding in range(1, 5):
+        body = f"(d{items}".encode() + b"I1\n0" + b"N0" * padding + b"."
+        (tmp_path / "a.pt").write_bytes(
+            zip_of({"x/data.pkl": body, "x" * padding + "/data/0": b"", "x/data/0": values.tobytes()})
+        )
+        with zipfile.ZipFile(tmp_path / "a.pt") as archive:
+            first = archive.getinfo("x/data/0").header_offset + 30 + len("x/data/0")
+        if first % 4:
+            break
+    assert first % 4
+    found = read_checkpoint(tmp_path / "a.pt")
+    assert [int(found[str(i)]) for i in range(300)] == list(range(300))
+    assert {found[str(i)].data_ptr() - 4 * i for i in range(300)} == {found["0"].data_ptr()}
+    assert found["0"].data_ptr() % 4 == 0
 
 
 def test_names_from_the_file_cannot_write_to_the_terminal(tmp_path: Path) -> None:

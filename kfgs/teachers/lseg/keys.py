@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ..torch_pickles import one_line
 from .network import LSegConfig, LSegNetwork
 from .recognise import recognise
 from .text import ClipText
@@ -68,7 +69,8 @@ def network_from_state(state: Mapping[str, Tensor], config: LSegConfig, *, sourc
         source: the file's name, for messages.
 
     Raises:
-        ValueError: if tensors are missing, unknown or of another shape; it says so where the file is of another network.
+        ValueError: if tensors are missing, unknown, of another shape or no floats; it says of what other network
+            the file seems to be.
     """
     state = _stripped(state)
     with torch.device("meta"):
@@ -127,20 +129,25 @@ def _shapes(module: nn.Module, names: Mapping[str, str]) -> dict[str, tuple[int,
 
 
 def _check(state: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]], source: str) -> None:
-    """Raise unless the state holds tensors of these names and shapes, and beside them only what is known to be unused."""
+    """Raise unless the state holds float tensors of these names and shapes, and beside them only what is known as unused."""
     missing = [f"{name} {shape}" for name, shape in shapes.items() if name not in state]
-    unknown = [f"{name} {tuple(value.shape)}" for name, value in state.items() if not _known(name, shapes)]
+    unknown = [f"{one_line(name)} {tuple(value.shape)}" for name, value in state.items() if not _known(name, shapes)]
     other = [
         f"{name}: expected {shape}, got {tuple(state[name].shape)}"
         for name, shape in shapes.items()
         if name in state and tuple(state[name].shape) != shape
+    ]
+    other += [
+        f"{name}: expected floating point, got {state[name].dtype}"
+        for name in shapes
+        if name in state and not state[name].is_floating_point()
     ]
     if not (missing or unknown or other):
         return
     what = recognise(state)
     hint = "pass that file"
     if what is None:
-        lists = ((missing, "missing"), (unknown, "unknown"), (other, "of another shape"))
+        lists = ((missing, "missing"), (unknown, "unknown"), (other, "of another shape or type"))
         parts = [f"{len(names)} {kind} ({_first(names)})" for names, kind in lists if names]
         what, hint = f"{len(state)} tensors, {', '.join(parts)}", "use the file as its authors published it"
     raise ValueError(f"{source}: expected {_EXPECTED}, got {what}; {hint}")

@@ -29,13 +29,18 @@ def recognise(state: Mapping[str, Tensor]) -> str | None:  # names without "net.
     return next((what for prefixes, what in _BY_PREFIX if any(name.startswith(prefixes) for name in names)), None)
 
 
+def _size(value: Tensor | None, axis: int) -> int | None:
+    """A tensor's size along an axis, if it has such."""
+    return value.shape[axis] if value is not None and -value.ndim <= axis < value.ndim else None
+
+
 def _other_lseg(state: Mapping[str, Tensor]) -> str | None:
     patches, head = state.get("pretrained.model.patch_embed.proj.weight"), state.get("scratch.head1.weight")
     positions = state.get("pretrained.model.pos_embed")
-    if positions is not None and positions.shape[-1] == 768:
-        size = 32 if patches is None or patches.shape[-1] == 32 else patches.shape[-1]
+    if _size(positions, -1) == 768:
+        size = 16 if _size(patches, -1) == 16 else 32
         return f"LSeg of backbone clip_vitb{size}_384 (768 channels)"
-    if head is not None and head.shape[0] == 768:
+    if _size(head, 0) == 768:
         return "LSeg of backbone clipRN50x16_vitl16_384 (features of 768 channels)"
     if head is None and any(name.startswith("scratch.output_conv.") for name in state):
         return "a DPT for depth or closed classes, without LSeg's head"

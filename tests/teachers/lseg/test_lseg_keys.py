@@ -126,7 +126,7 @@ def test_missing_unknown_and_misshapen_tensors_are_counted_and_named(state):
         "2 missing (pretrained.model.blocks.2.attn.qkv.weight (96, 32); scratch.head1.weight (24, 16, 1, 1))" in message
     )
     assert "1 unknown (scratch.extra (2,))" in message
-    assert "1 of another shape (pretrained.model.pos_embed: expected (1, 10, 32), got (1, 17, 32))" in message
+    assert "1 of another shape or type (pretrained.model.pos_embed: expected (1, 10, 32), got (1, 17, 32))" in message
     assert message.endswith("use the file as its authors published it")
     assert "\n" not in message
 
@@ -157,6 +157,15 @@ def named(*names, shape=(4,)):
         (named("net.clip_pretrained.logit_scale"), "got no tensors of its image network; pass that file"),
         (named("net.pretrained.layer1.0.weight", "net.scratch.head1.weight"), "got LSeg of backbone clip_resnet101"),
         (named("net.pretrained.model.pos_embed", shape=(1, 145, 768)), "got LSeg of backbone clip_vitb32_384"),
+        (
+            named("pretrained.model.pos_embed", "scratch.head1.weight", "scratch.output_conv.x", shape=()),
+            r"got 3 tensors, \d+ missing .*, 1 unknown .*, 2 of another shape or type \(.*, got \(\)",
+        ),
+        (
+            named("pretrained.model.pos_embed", "pretrained.model.patch_embed.proj.weight", shape=(0, 2, 1, 7, 768)),
+            "got LSeg of backbone clip_vitb32_384",
+        ),
+        (named("a\nb"), r"1 unknown \(a\\nb \(4,\)\)"),
         (named("scratch.head1.weight", shape=(768, 256, 1, 1)), "got LSeg of backbone clipRN50x16_vitl16_384"),
         (named("pretrained.model.cls_token", "scratch.output_conv.0.weight"), "got a DPT for depth or closed classes"),
         (named("visual.conv1.weight", "positional_embedding"), "got CLIP alone, without LSeg's decoder"),
@@ -180,3 +189,17 @@ def test_positions_by_another_rule_would_be_noticed(state, x, monkeypatch):
         patch.setattr(functional, "interpolate", lambda x, **options: original(x, **{**options, "align_corners": True}))
         network = network_from_state(state, TINY, source="a")
     assert (network(x) - expected).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.bool, torch.complex64])
+def test_numbers_that_are_no_floats_are_refused(state, dtype):
+    state[HEAD] = state[HEAD].to(dtype)
+    expected = f"1 of another shape or type .scratch.head1.weight: expected floating point, got {dtype}"
+    with pytest.raises(ValueError, match=expected):
+        network_from_state(state, TINY, source="a")
+
+
+def test_all_of_it_without_axes_is_one_line(state):
+    with pytest.raises(ValueError, match=r"a: expected .* of another shape or type \(") as caught:
+        network_from_state({name: torch.tensor(0.0) for name in state}, TINY, source="a")
+    assert "\n" not in str(caught.value)
