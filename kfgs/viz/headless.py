@@ -9,6 +9,7 @@ import sys
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from .._check import check_range
+from ..splat.engines import available_engines
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -99,12 +100,22 @@ def make_plotter(
     check_range("width", width, 1)
     hidden = not has_display() if off_screen is None else off_screen
     require()
+    load_compilers()
     import pyvista as pv
 
     options: dict[str, Any] = {"shape": shape} if shape != (1, 1) else {}
     plotter = pv.Plotter(off_screen=hidden, window_size=(width, height), **options)
     plotter.set_background(background)
     return plotter
+
+
+def load_compilers() -> None:
+    """Load the rasteriser's engines before the first window, which brings an LLVM of its own.
+
+    Mesa's software driver loads LLVM; where pycolmap or others have prepared the ground, numba's or triton's LLVM loaded
+    after it ends Python with a segfault (look at a scene, then rasterise it). Loaded before it, all get along.
+    """
+    available_engines("cpu")  # imports them to find out
 
 
 def require() -> None:

@@ -22,6 +22,7 @@ from kfgs.viz import (
     make_plotter,
     palette,
 )
+from kfgs.viz.clouds import CloudOptions
 
 C0 = 0.28209479177387814
 
@@ -134,7 +135,9 @@ def test_look_through_puts_points_on_their_pixels(plotter):
         mean = torch.rand(1, 3, generator=torch.Generator().manual_seed(seed)) * 1.2 - 0.6
         xy, _, visible = project_points(camera, mean.double())
         assert visible.all()
-        actor = add_cloud(plotter, one.replace(means=mean, labels=torch.tensor([3])), point_size=5)
+        actor = add_cloud(
+            plotter, one.replace(means=mean, labels=torch.tensor([3])), options=CloudOptions(point_size=5)
+        )
         look_through(plotter, camera)
         rows, columns = np.nonzero(plotter.screenshot(return_img=True).any(axis=-1))
         np.testing.assert_allclose([columns.mean() + 0.5, rows.mean() + 0.5], xy[0], atol=0.75)  # a raster step

@@ -1,0 +1,108 @@
+"""Which colour each Gaussian of a cloud gets: by class, colour, latent, score or opacity."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .._check import check_choice, check_range, check_shapes
+from ..gaussians import Gaussians
+from ..splat.sh import evaluate_sh, sh0_to_rgb
+from .palette import UNLABELLED, palette
+from .pictures import FeatureColors, as_bytes
+
+Array = np.ndarray[Any, Any]
+ColorBy = Literal["label", "rgb", "view", "opacity", "feature"]
+COLORMAP = "cividis"  # grows evenly brighter, and reads the same for colour-blind eyes
+
+
+class CloudColors(NamedTuple):
+    """Colours, and what they stand for."""
+
+    rgb: Array  # [N, 3] uint8
+    name: str  # of what is shown
+    values: Array | None  # [N] the numbers shown, where there is one for each Gaussian
+    clim: tuple[float, float] | None  # the numbers of the darkest and the brightest colour; None: not a scale
+
+
+def cloud_colors(
+    gaussians: Gaussians,
+    color_by: ColorBy | Tensor | Array,
+    feature_colors: FeatureColors | None = None,
+    clim: tuple[float, float] | None = None,
+) -> CloudColors:
+    """Colour a cloud as `add_cloud` does, which explains the arguments.
+
+    Raises:
+        ValueError: if what to colour by is missing, or of another size.
+        TypeError: if an array is neither of integers nor of floats.
+    """
+    if isinstance(color_by, str):
+        check_choice("color_by", color_by, get_args(ColorBy))
+        return _named(gaussians, color_by, feature_colors, clim)
+    values = _numpy(color_by) if isinstance(color_by, Tensor) else np.asarray(color_by)
+    if values.ndim == 2:
+        check_shapes(("gaussians", gaussians.opacities, "N"), ("color_by", values, "N 3"))
+        return CloudColors(as_bytes(values), "rgb", None, None)
+    check_shapes(("gaussians", gaussians.opacities, "N"), ("color_by", values, "N"))
+    if np.issubdtype(values.dtype, np.floating):
+        return _scale("score", values, clim)
+    if not np.issubdtype(values.dtype, np.integer):
+        raise TypeError(
+            f"color_by: expected labels (integers) or scores (floats), got {values.dtype}; convert it first"
+        )
+    return CloudColors(palette(values), "label", values.astype(np.int64), None)
+
+
+def seen_from(gaussians: Gaussians, center: Array) -> Array:  # center: [3] -> [N, 3] uint8
+    """The colours of `sh` as a camera at `center` sees them, as the rasteriser evaluates them."""
+    assert gaussians.sh is not None
+    place = torch.as_tensor(center, dtype=gaussians.means.dtype, device=gaussians.means.device)
+    with torch.no_grad():
+        return as_bytes(evaluate_sh(gaussians.sh, gaussians.means - place))
+
+
+def _named(
+    gaussians: Gaussians, color_by: str, feature_colors: FeatureColors | None, clim: tuple[float, float] | None
+) -> CloudColors:
+    if color_by == "label":
+        if gaussians.labels is None:
+            raise ValueError(
+                "gaussians.labels: expected labels to colour by, got None; label them or choose another color_by"
+            )
+        return CloudColors(palette(gaussians.labels), "label", _numpy(gaussians.labels).astype(np.int64), None)
+    if color_by in ("rgb", "view"):
+        if gaussians.sh is None:
+            raise ValueError("gaussians.sh: expected harmonics to colour by, got None; a semantic field has no colour")
+        return CloudColors(as_bytes(sh0_to_rgb(gaussians.sh[:, 0].detach())), "rgb", None, None)
+    if color_by == "feature":
+        if gaussians.features is None or feature_colors is None:
+            missing = "gaussians.features" if gaussians.features is None else "feature_colors"
+            raise ValueError(
+                f"{missing}: expected it to colour by features, got None; fit FeatureColors once per scene"
+            )
+        return CloudColors(feature_colors(gaussians.features), "feature", None, None)
+    return _scale("opacity", _numpy(gaussians.opacities), clim or (0.0, 1.0))
+
+
+def _scale(name: str, values: Array, clim: tuple[float, float] | None) -> CloudColors:
+    """Colours of a scale; what is not finite is grey."""
+    from matplotlib import colormaps
+
+    finite = np.isfinite(values)
+    if clim is None:
+        low, high = (float(values[finite].min()), float(values[finite].max())) if finite.any() else (0.0, 1.0)
+        clim = (low, high) if high > low else (low - 0.5, high + 0.5)  # one value: in the middle
+    check_range("clim[0]", clim[0], -np.inf, closed=(False, False))
+    check_range("clim[1]", clim[1], clim[0], closed=(False, False))
+    unit = np.where(finite, (values - clim[0]) / (clim[1] - clim[0]), 0.0)
+    rgb: Array = colormaps[COLORMAP](unit, bytes=True)[:, :3]
+    return CloudColors(np.where(finite[:, None], rgb, np.array(UNLABELLED, np.uint8)), name, values, clim)
+
+
+def _numpy(values: Tensor) -> Array:
+    array: Array = values.detach().cpu().numpy()
+    return array

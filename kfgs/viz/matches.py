@@ -1,0 +1,218 @@
+"""The transfer of labels by distance (Sec. 3.4) as a picture: who gave a label to whom, and who got none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .._check import check_choice, check_range, check_shapes, check_whole
+from ..gaussians import Gaussians
+from ..labels import Transfer
+from .frusta import evenly
+from .legends import add_legend
+from .palette import PALETTE, palette
+from .plots import _figure, _save
+
+if TYPE_CHECKING:
+    import pyvista as pv
+
+Array = np.ndarray[Any, Any]
+LINES = 2000  # more transfer lines than this hide what they show
+MATCHED, AMBIGUOUS, ORPHANED = 0, 1, 2
+STATE_NAMES = ("matched", "ambiguous", "orphaned")
+STATE_COLORS = (4, 0, 6)  # Okabe and Ito's blue, orange and reddish purple in `PALETTE`
+BINS = 80
+
+
+class Matches(NamedTuple):
+    """The actors of one picture of a transfer."""
+
+    points: pv.Actor  # the destinations
+    lines: pv.Actor | None  # to their sources; None where nothing was labelled
+    legend: Any
+
+
+def match_states(transfer: Transfer) -> Array:  # [N] int64
+    """What became of each destination: 0 matched, 1 ambiguous (labelled, but its sources disagree), 2 orphaned (no label).
+
+    Sources disagree where the label's share among those looked at is below 1. With "vote" and "mahalanobis" a share may
+    round to 1 although a source of next to no weight has another label, which `transfer.ambiguous` counts.
+    """
+    labelled = _numpy(transfer.labels) >= 0
+    disagree = labelled & (_numpy(transfer.shares) < 1)
+    return np.where(labelled, np.where(disagree, AMBIGUOUS, MATCHED), ORPHANED)
+
+
+def add_matches(
+    plotter: pv.Plotter,
+    src: Gaussians,
+    dst: Gaussians,
+    transfer: Transfer,
+    *,
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    sample: int = LINES,
+    point_size: float = 3.0,
+    line_width: float = 1.5,
+) -> Matches:
+    """Draw the destinations as matched, ambiguous or orphaned points, lines to their sources, and how many of each.
+
+    Draw the sources with `add_cloud`. Lines are as short as lambda: `shift` takes the destinations aside.
+
+    Args:
+        plotter: where to draw.
+        src: the Gaussians that labels came from.
+        dst: the Gaussians that received them.
+        transfer: what `transfer_labels` returned for these two.
+        shift: added to the destinations' positions, world units.
+        sample: at most so many lines, evenly chosen over the labelled destinations; the legend says how many.
+        point_size: in pixels.
+        line_width: in pixels.
+
+    Returns:
+        The actors. Points carry `state` (0, 1, 2 as in `match_states`), `label`, `distance` and `rgb`; lines as in
+        `add_transfer`.
+
+    Raises:
+        ValueError: if the transfer belongs to other clouds.
+    """
+    check_shapes(("dst.means", dst.means, "N 3"), ("transfer.labels", transfer.labels, "N"))
+    moved = dst.replace(means=dst.means + torch.as_tensor(shift).to(dst.means))
+    states = match_states(transfer)
+    import pyvista as pv
+
+    points = pv.PolyData(_numpy(moved.means).astype(np.float32))
+    points["state"], points["label"] = states, _numpy(transfer.labels)
+    points["distance"] = _numpy(transfer.distances)
+    points["rgb"] = _state_colors(states)
+    dots = plotter.add_mesh(points, style="points", scalars="rgb", rgb=True, point_size=point_size, lighting=False)
+    lines = None
+    if (states != ORPHANED).any():
+        lines = add_transfer(plotter, src, moved, transfer, color_by="state", sample=sample, line_width=line_width)
+    return Matches(dots, lines, add_legend(plotter, *_state_legend(states, sample)))
+
+
+def add_transfer(
+    plotter: pv.Plotter,
+    src: Gaussians,
+    dst: Gaussians,
+    transfer: Transfer,
+    *,
+    color_by: Literal["label", "state"] = "label",
+    sample: int = LINES,
+    line_width: float = 1.5,
+) -> pv.Actor:
+    """Draw where labels came from: a line from each labelled destination to the source that gave the label.
+
+    Lines are as short as lambda; to see them, move one cloud aside (`dst.replace(means=dst.means + shift)`) before
+    drawing it and its lines. Cells carry `label`, `state`, `source`, `destination`, `distance` and `rgb`.
+
+    Args:
+        plotter: where to draw.
+        src: the Gaussians that labels came from.
+        dst: the Gaussians that received them.
+        transfer: what `transfer_labels` returned for these two.
+        color_by: the palette of labels, or whether sources agree (see `match_states`).
+        sample: at most so many lines, evenly spaced over the labelled destinations.
+        line_width: in pixels.
+
+    Raises:
+        ValueError: if the transfer belongs to other clouds, or nothing was labelled.
+    """
+    check_choice("color_by", color_by, ("label", "state"))
+    check_shapes(("dst.means", dst.means, "N 3"), ("transfer.labels", transfer.labels, "N"))
+    check_whole("sample", sample, 1)
+    labelled = np.flatnonzero(_numpy(transfer.labels) >= 0)
+    if labelled.size == 0:
+        raise ValueError(
+            f"transfer: expected labelled Gaussians to draw, got none within {transfer.distance:g}; raise the distance"
+        )
+    chosen = labelled[evenly(labelled.size, sample)]
+    sources = _numpy(transfer.sources)[chosen]
+    if sources.max() >= len(src):
+        raise ValueError(
+            f"transfer: expected sources below {len(src)} (from src), got {sources.max()}; pass its own clouds"
+        )
+    import pyvista as pv
+
+    ends = np.stack([_numpy(dst.means)[chosen], _numpy(src.means)[sources]], axis=1).reshape(-1, 3)
+    labels, states = _numpy(transfer.labels)[chosen], match_states(transfer)[chosen]
+    lines = pv.line_segments_from_points(ends.astype(np.float32))
+    lines.cell_data["label"], lines.cell_data["state"] = labels, states
+    lines.cell_data["source"], lines.cell_data["destination"] = sources, chosen
+    lines.cell_data["distance"] = _numpy(transfer.distances)[chosen]
+    lines.cell_data["rgb"] = palette(labels) if color_by == "label" else _state_colors(states)
+    return plotter.add_mesh(lines, scalars="rgb", rgb=True, line_width=line_width, lighting=False)
+
+
+def plot_distances(
+    distances: Tensor | Array,  # [N] world units; infinite: no source in range
+    distance: float,
+    path: str | Path,
+) -> None:
+    """Draw how far destinations are from their sources, with lambda marked, on a logarithmic axis.
+
+    To see what lies beyond lambda too, pass the distances of a transfer with a larger one. Distances of 0 are drawn in
+    the lowest bin.
+
+    Args:
+        distances: `Transfer.distances`.
+        distance: lambda, world units.
+        path: a .png file.
+
+    Raises:
+        ValueError: if there are no distances, one is negative or not a number, or lambda is not positive.
+    """
+    values = _numpy(distances) if isinstance(distances, Tensor) else np.asarray(distances)
+    check_shapes(("distances", values, "N"))
+    check_range("distance", distance, 0, closed=(False, False))
+    if values.size == 0 or not (values >= 0).all():
+        raise ValueError(
+            f"distances: expected at least one, none negative or NaN, got {values.size} with "
+            f"{int((~(values >= 0)).sum())} such; pass Transfer.distances"
+        )
+    found = values[np.isfinite(values)].astype(np.float64)
+    positive = found[found > 0]
+    low = min(float(np.percentile(positive, 0.5)) if positive.size else distance, distance / 10)
+    high = max(float(found.max()) if found.size else distance, 2 * distance)
+    edges = np.geomspace(low, high * (1 + 1e-9), BINS + 1)
+    counts, _ = np.histogram(np.clip(found, low, high), edges)
+    figure = _figure(7.0, 4.0)
+    axes = figure.add_subplot()
+    near = edges[:-1] < distance
+    widths = np.diff(edges)
+    for part, color in ((near, PALETTE[STATE_COLORS[MATCHED]]), (~near, PALETTE[STATE_COLORS[ORPHANED]])):
+        axes.bar(edges[:-1][part], counts[part], widths[part], align="edge", color=tuple(color / 255))
+    axes.axvline(distance, color="black", linewidth=1.5, label=f"lambda = {distance:.4g}")
+    axes.set(xscale="log", xlabel="distance to the source (world units)", ylabel="destinations")
+    closer = 100 * float((values < distance).mean())
+    axes.set_title(
+        f"{closer:.1f} % closer than lambda; {values.size - found.size:,} of {values.size:,} without a source"
+    )
+    axes.legend(frameon=False)
+    axes.grid(alpha=0.3)
+    _save(figure, path)
+
+
+def _state_colors(states: Array) -> Array:  # [N] -> [N, 3] uint8
+    return palette(np.array(STATE_COLORS)[states])
+
+
+def _state_legend(states: Array, sample: int) -> tuple[Array, list[str]]:
+    """Labels and names for `add_legend`: the colours of states are those of three labels."""
+    counts = np.bincount(states, minlength=len(STATE_NAMES))
+    names = [""] * (max(STATE_COLORS) + 1)
+    for color, name, count in zip(STATE_COLORS, STATE_NAMES, counts, strict=True):
+        names[color] = f"{name} {count:,}"
+    labelled = int(counts[MATCHED] + counts[AMBIGUOUS])
+    if labelled > sample:
+        names[STATE_COLORS[MATCHED]] += f" ({sample:,} of {labelled:,} lines)"
+    return np.array(STATE_COLORS)[counts > 0], names
+
+
+def _numpy(values: Tensor) -> Array:
+    array: Array = values.detach().cpu().numpy()
+    return array
