@@ -60,7 +60,7 @@ def _rebuild_tensor(storage: Any, offset: Any, size: Any, stride: Any, *more: An
         or not _are_counts(size)
         or not _are_counts(stride)
     ):
-        raise BrokenPickleError("a tensor of it has no storage, or sizes that are no whole numbers from 0")
+        raise BrokenPickleError("a tensor of it has no storage, or sizes that are no whole numbers from 0 (64 at most)")
     if len(size) != len(stride):
         raise BrokenPickleError(f"a tensor of it has {len(size)} sizes and {len(stride)} strides")
     if more[2:] and more[2]:  # bits "conjugate" and "negative"

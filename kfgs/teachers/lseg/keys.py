@@ -139,8 +139,8 @@ def _check(state: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]], s
     ]
     other += [
         f"{name}: expected floating point, got {state[name].dtype}"
-        for name in shapes
-        if name in state and not state[name].is_floating_point()
+        for name, shape in shapes.items()
+        if name in state and tuple(state[name].shape) == shape and not state[name].is_floating_point()
     ]
     if not (missing or unknown or other):
         return

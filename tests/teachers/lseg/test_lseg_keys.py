@@ -200,6 +200,8 @@ def test_numbers_that_are_no_floats_are_refused(state, dtype):
 
 
 def test_all_of_it_without_axes_is_one_line(state):
-    with pytest.raises(ValueError, match=r"a: expected .* of another shape or type \(") as caught:
-        network_from_state({name: torch.tensor(0.0) for name in state}, TINY, source="a")
+    image = {name: torch.tensor(0) for name in state if "clip_pretrained" not in name and "num_batches" not in name}
+    count = len(image) - sum("refinenet4.resConfUnit1" in n or "model.norm." in n or "model.head." in n for n in image)
+    with pytest.raises(ValueError, match=rf"a: expected .*, {count} of another shape or type \(") as caught:
+        network_from_state(image, TINY, source="a")
     assert "\n" not in str(caught.value)
