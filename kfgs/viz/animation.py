@@ -16,8 +16,8 @@ from .._check import check_range
 from .._files import atomic_path
 from ..cameras import Camera
 from ..gaussians import Gaussians
-from .frames import Show, as_shows, draw_frame, legend_under
 from .pictures import as_bytes
+from .shows import Show, as_shows, draw_frame, legend_under
 
 Array = np.ndarray[Any, Any]
 Progress = Callable[[int, int], object]

@@ -16,11 +16,12 @@ from .._check import check_whole
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from .animation import Progress, save_animation
-from .frames import Show
+from .shows import Show
 
 Array = np.ndarray[Any, Any]
 SAME = 1e-9  # of the walk: two views in a row that are closer than this, in place and direction, are one
 KEYS = 40  # of a long walk: enough to follow it, too few to tremble with the hand
+STANDING = 1e-6  # of the coordinates: cameras on one tripod differ by the rounding of float32
 AROUND = 3  # keys of the other end before the start and after the end of a closed walk: the splines feel no further
 
 
@@ -107,7 +108,9 @@ def _poses(keys: Sequence[Camera]) -> tuple[Array, Rotation]:  # [k, 3], k rotat
 
 def _steps(places: Array, turns: Rotation) -> Array:  # [k - 1]
     """Time from each key to the next: hypot(distance / extent, angle / pi)."""
-    extent = float(np.linalg.norm(np.ptp(places, axis=0))) or 1.0
+    extent = float(np.linalg.norm(np.ptp(places, axis=0)))
+    if extent <= STANDING * np.abs(places).max():
+        extent = 1.0
     angles = (turns[1:] * turns[:-1].inv()).magnitude()
     return np.hypot(np.linalg.norm(np.diff(places, axis=0), axis=1) / extent, angles / np.pi)
 

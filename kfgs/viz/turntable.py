@@ -17,7 +17,7 @@ from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..scenes.points import robust_bounds
 from .animation import Progress, save_animation
-from .frames import Show
+from .shows import Show
 
 Array = np.ndarray[Any, Any]
 LEVEL = 0.05  # of all: less spread of the pictures' x axes than this, in their second direction, leaves "up" open
