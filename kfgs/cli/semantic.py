@@ -136,7 +136,7 @@ def fit(
         check_no_flag("fast", fast, "without --teacher, whose option it is")
         maps = stored_maps(as_taken, loaded.views(split), features or scene_folder(scene) / "features", level)
         if discard_features:
-            check_discard(maps.path, mode)
+            check_discard(maps, mode)
     result = fit_scene(loaded, maps, out, config, report=say, progress=True, device=device)
     if teacher is not None:
         maps.clear()  # the samples; the stages made of them are found without

@@ -188,16 +188,13 @@ def look_over(scene: Any, views: list[int], folder: Path, level: Level | None) -
 
 def stored_maps(scene: Any, views: list[int], folder: Path, level: Level | None) -> Any:
     """The maps of some views of a scene as taken; those whose headers do not look like their pictures' are named."""
-    from ..teachers import FeatureFolder, check_feature_folder, read_manifest
+    from ..teachers import FeatureFolder, check_feature_folder
     from ..teachers.langsplat import INDEX
 
     stems, sizes = [scene.stem(i) for i in views], [scene.cameras[i].size for i in views]
     maps = FeatureFolder(folder, stems, sizes=sizes, level=level or "default")
     if not any(file.name.endswith(INDEX) for file in maps.files):
         check_alone("level", level, f"beside {folder}, whose maps are not LangSplat's")
-    manifest = read_manifest(folder)
-    if manifest is not None and manifest.discarded:
-        return maps
     pictures = list(zip(stems, sizes, strict=True))
     report = check_feature_folder(folder, pictures, values=False, level=level or "default")
     for name, texts in list(report.problems.items())[:MISFITS]:
@@ -210,24 +207,20 @@ def stored_maps(scene: Any, views: list[int], folder: Path, level: Level | None)
     return maps
 
 
-def check_discard(folder: Path, mode: Mode) -> None:
+def check_discard(maps: Any, mode: Mode) -> None:
     """Refuse to delete dense maps that nothing would stand for: before the work, not after it.
 
     Raises:
-        ValueError: if the mode makes no index maps, or kfgs did not make the maps and could not make them again.
+        ValueError: if the mode makes no index maps, or kfgs did not make the maps as they are and could not make them again.
     """
-    from ..teachers import read_manifest
+    from ..teachers import check_discardable
 
     if mode == "decouple":
         raise ValueError(
             "discard-features: expected a mode that makes index maps (adc or adc+sc), got decouple, which learns from the "
             "dense maps themselves; leave it out"
         )
-    if read_manifest(folder) is None:
-        raise ValueError(
-            f"discard-features: expected maps that kfgs made (with features.json), got {folder} without; delete maps of other "
-            "programs by hand"
-        )
+    check_discardable(maps.path, maps.stems)
 
 
 def scene_folder(scene: Path) -> Path:
@@ -237,8 +230,10 @@ def scene_folder(scene: Path) -> Path:
 
 def teacher_words(identity: dict[str, Any]) -> str:
     """A teacher's identity in a few words: `lseg (weights 3f2a...)`."""
-    weights = identity.get("weights")
-    rest = {name: value for name, value in identity.items() if name not in ("name", "weights", "config") and value}
+    weights, options = identity.get("weights"), identity.get("options")
     words = [str(identity.get("name", "unknown"))]
     words += [f"weights {str(weights)[:12]}"] if weights else []
-    return ", ".join(words + [f"{name} {json.dumps(value, sort_keys=True)}" for name, value in rest.items()])
+    words += (
+        [f"{name} {json.dumps(value)}" for name, value in sorted(options.items())] if isinstance(options, dict) else []
+    )
+    return ", ".join(words)

@@ -1,7 +1,7 @@
 """Where dense features come from: encoders, and folders of maps that one has written."""
 
 from .bpe import Tokenizer, load_tokenizer
-from .cache import Picture, discard_maps, extract_features, pictures_of
+from .cache import Picture, check_discardable, discard_maps, extract_features, pictures_of
 from .checkpoint import read_checkpoint, weights_digest
 from .costs import TeacherCost, teacher_cost
 from .folder import FeatureFolder, save_feature_map
@@ -36,6 +36,7 @@ __all__ = [
     "Tokenizer",
     "TransformersTeacher",
     "as_teacher",
+    "check_discardable",
     "check_feature_folder",
     "discard_maps",
     "embed_labels",

@@ -11,7 +11,7 @@ from statistics import median
 from torch import Tensor
 from tqdm import tqdm
 
-from .._files import digest_file
+from .._files import bytes_in_words, digest_file, seconds_in_words
 from ..scenes import Scene, read_image
 from .layouts import LAYOUTS, OWN, layout_of, write_npy_map
 from .manifest import MANIFEST, Manifest, MapRecord, read_manifest
@@ -19,9 +19,7 @@ from .map_store import (
     MapStore,
     check_space,
     doubt_file,
-    duration,
     encode_half,
-    gigabytes,
     locked,
     map_file,
     plain_identity,
@@ -254,11 +252,15 @@ class _Maker:
         """What is found and what is to be done, in a line."""
         text = f"features: {found} maps found, {self.left} to make by {self.teacher.name}"
         known = self.left and self.channels is not None
-        return text + (f" ({gigabytes(self.left * self.channels.bytes)}, {self.time_left()})" if known else "")  # type: ignore[union-attr]
+        return text + (f" ({bytes_in_words(self.left * self.channels.bytes)}, {self.time_left()})" if known else "")  # type: ignore[union-attr]
 
     def time_left(self) -> str:
         """How long the maps to be made will take, going by the last ten."""
-        return f"about {duration(self.left * median(self.seconds))} left" if self.seconds else "time left not known yet"
+        return (
+            f"about {seconds_in_words(self.left * median(self.seconds))} left"
+            if self.seconds
+            else "time left not known yet"
+        )
 
 
 def check_pictures(pictures: Sequence[Picture], folder: Path) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._files import digest_file
+from .._files import bytes_in_words, digest_file
 from .manifest import MANIFEST, Manifest, MapRecord, read_manifest
 from .protocol import Teacher, check_features
 
@@ -242,18 +242,6 @@ def check_space(folder: Path, needed: int, maps: int) -> None:
     free = shutil.disk_usage(folder).free
     if needed > free:
         raise OSError(
-            f"folder: expected {gigabytes(needed)} free for {maps} maps, got {gigabytes(free)} where {folder} lies; free "
-            "some, take another disk, or make the maps anew when they are needed (RecomputedMaps)"
+            f"folder: expected {bytes_in_words(needed)} free for {maps} maps, got {bytes_in_words(free)} where {folder} lies; "
+            "free some, take another disk, or make the maps anew when they are needed (RecomputedMaps)"
         )
-
-
-def gigabytes(count: float) -> str:
-    """Bytes for people."""
-    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
-
-
-def duration(seconds: float) -> str:
-    """Seconds for people: `40 s`, `12 min`, `3.3 h`."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
