@@ -1,27 +1,12 @@
 import pytest
 import torch
+from cases_lseg import TINY
 from torch.nn import functional
 
 from kfgs.teachers.lseg.keys import network_from_state, text_from_state
 from kfgs.teachers.lseg.layout import random_state
 from kfgs.teachers.lseg.network import LSegConfig
 
-TINY = LSegConfig(
-    width=32,
-    depth=4,
-    heads=4,
-    position_grid=3,
-    window=64,
-    hooks=(0, 1, 2, 3),
-    neck=(8, 12, 16, 20),
-    fusion=16,
-    dim=24,
-    text_width=32,
-    text_layers=2,
-    text_heads=4,
-    context=9,
-    vocabulary=60,
-)
 HEAD = "net.scratch.head1.weight"
 POSITIONS = "net.pretrained.model.pos_embed"
 IN_PROJECTION = "net.clip_pretrained.transformer.resblocks.1.attn.in_proj_weight"

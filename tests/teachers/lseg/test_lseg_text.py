@@ -1,3 +1,6 @@
+from dataclasses import replace
+
+import cases_lseg
 import oracles_lseg
 import pytest
 import torch
@@ -5,24 +8,8 @@ from torch.nn import functional
 
 from kfgs.teachers.lseg.keys import text_from_state
 from kfgs.teachers.lseg.layout import random_state
-from kfgs.teachers.lseg.network import LSegConfig
 
-TINY = LSegConfig(
-    width=32,
-    depth=4,
-    heads=4,
-    position_grid=3,
-    window=64,
-    hooks=(0, 1, 2, 3),
-    neck=(8, 12, 16, 20),
-    fusion=16,
-    dim=24,
-    text_width=32,
-    text_layers=3,
-    text_heads=4,
-    context=9,
-    vocabulary=60,
-)
+TINY = replace(cases_lseg.TINY, text_layers=3)
 IDS = torch.tensor(
     [[58, 3, 59, 0, 0, 0, 0, 0, 0], [58, 7, 41, 5, 20, 33, 2, 59, 0], [58, 59, 59, 59, 59, 59, 59, 59, 59]]
 )
