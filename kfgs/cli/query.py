@@ -55,8 +55,7 @@ def select(
         weights: the teacher's checkpoint file (lseg), or folder or hub id (the others).
         images: folder of the scene's pictures, if it is not SCENE/images.
     """
-    from .._files import write_json
-    from ..formats import SplatFile, write_splats
+    from ..formats import SplatFile
     from ..labels import answers
     from ..pipeline import query_field
     from ..pipeline.apply import select_labelled
@@ -97,10 +96,18 @@ def select(
             raise ValueError(
                 f"query: expected Gaussians to save, got none of {query!r}; lower the threshold or drop --out"
             )
-        parts = [thing.to_json() for thing in things]
-        facts = {"query": query, "threshold": found.threshold, "how": found.how, "count": len(found), "parts": parts}
-        write_json(out / "selection.json", facts)
-        wrote([out / "selection.json", *write_splats(out / "selection.ply", cloud.select(found.mask)).paths])
+        wrote(_save(out, query, cloud, found, things))
+
+
+def _save(out: Path, query: str, cloud: Any, found: Any, things: list[Any]) -> list[Path]:
+    """Write a selection as numbers (JSON) and as Gaussians (PLY)."""
+    from .._files import write_json
+    from ..formats import write_splats
+
+    parts = [thing.to_json() for thing in things]
+    facts = {"query": query, "threshold": found.threshold, "how": found.how, "count": len(found), "parts": parts}
+    write_json(out / "selection.json", facts)
+    return [out / "selection.json", *write_splats(out / "selection.ply", cloud.select(found.mask)).paths]
 
 
 def _negatives(negatives: Negatives, score: Score, others: bool) -> Any:
