@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from .._check import check_range
+from .._check import check_range, check_whole
 from .._files import atomic_path
 from ..cameras import Camera
 from ..gaussians import Gaussians
@@ -75,6 +75,14 @@ def save_animation(
                 progress(done, len(cameras))
 
     return _write(path, frames(), fps, strip)
+
+
+def check_size(size: tuple[int, int]) -> None:
+    """Raise a ValueError unless `size` is (height, width) in whole pixels."""
+    if not isinstance(size, Sequence) or len(size) != 2:
+        raise ValueError(f"size: expected (height, width), got {size!r}; pass two whole numbers of pixels")
+    for axis, pixels in zip(("height", "width"), size, strict=True):
+        check_whole(f"size ({axis})", pixels, 1)
 
 
 def _blank(camera: Camera) -> Array:

@@ -15,7 +15,7 @@ from torch import Tensor
 from .._check import check_whole
 from ..cameras import Camera
 from ..gaussians import Gaussians
-from .animation import Progress, save_animation
+from .animation import Progress, check_size, save_animation
 from .shows import Show
 
 Array = np.ndarray[Any, Any]
@@ -56,8 +56,8 @@ def flythrough_cameras(
     """
     check_whole("frames", frames, 2)
     check_whole("every", every, 1)
-    for axis, pixels in zip(("height", "width"), size or (1, 1), strict=True):
-        check_whole(f"size ({axis})", pixels, 1)
+    if size is not None:
+        check_size(size)
     keys = _keys(cameras, every, closed)
     height, width = size or cameras[0].size
     keys = [key.resized(height, width) for key in keys]

@@ -125,7 +125,7 @@ def _scene(plotter: pv.Plotter, serializers: Any) -> bytes:
     window = plotter.render_window
     state = serializers.serialize(None, window, serializers.reference_id(window), context, 1)
     for renderer in plotter.renderers:
-        _turn_about_middle(state, serializers.reference_id(renderer.GetActiveCamera()), renderer)
+        _turn_about_midst(state, serializers.reference_id(renderer.GetActiveCamera()), renderer)
     arrays = {
         entry["hash"]: {**entry, "content": context.get_cached_data_array(entry["hash"], False)}
         for entry in serializers.extract_array_hash(state)
@@ -136,23 +136,28 @@ def _scene(plotter: pv.Plotter, serializers: Any) -> bytes:
     return packed.getvalue()
 
 
-def _turn_about_middle(state: dict[str, Any], camera_id: str, renderer: Any) -> None:
-    """Give a serialised camera its view angle, which is not serialised, and a focal point level with the scene's middle.
+def _turn_about_midst(state: dict[str, Any], camera_id: str, renderer: Any) -> None:
+    """Give a serialised camera its view angle, which is not serialised, and a focal point in the midst of what it sees.
 
-    Dragging turns about the focal point; `look_through` leaves it one unit before the camera.
+    Dragging turns about the focal point; `look_through` leaves it one unit before the camera. Here it lies straight
+    ahead, at the median depth of the points in front: a few far ones do not move it.
     """
     view = renderer.GetActiveCamera()
     position, forward = np.array(view.GetPosition()), np.array(view.GetDirectionOfProjection())
-    box = np.array(renderer.ComputeVisiblePropBounds()).reshape(3, 2)
-    depth = float((box.mean(axis=1) - position) @ forward)
-    if not depth > 0:  # the middle lies behind, or there is none
-        depth = float(view.GetDistance())
+    meshes = [getattr(getattr(actor, "mapper", None), "dataset", None) for actor in _visible(renderer)]
+    depths = [(np.asarray(mesh.points) - position) @ forward for mesh in meshes if mesh is not None]
+    ahead = np.concatenate([np.zeros(0), *(depth[depth > 0] for depth in depths)])
+    depth = float(np.median(ahead)) if len(ahead) else float(view.GetDistance())
     for part in _parts(state):
         if part["id"] == camera_id:
             part["properties"] |= {
                 "viewAngle": view.GetViewAngle(),
                 "focalPoint": (position + depth * forward).tolist(),
             }
+
+
+def _visible(renderer: Any) -> list[Any]:
+    return [actor for actor in renderer.actors.values() if actor.GetVisibility()]
 
 
 def _parts(state: dict[str, Any]) -> Iterator[dict[str, Any]]:

@@ -77,6 +77,7 @@ def _as_actor(cloud: pv.PolyData, rows: Array, instead: Instead) -> Any:
         mesh["rgb"] = rgb[np.asarray(mesh["index"])]
     mapper = pv.DataSetMapper(mesh)
     mapper.set_scalars(mesh["rgb"], "rgb", rgb=True)
+    mapper.Update()
     actor = pv.Actor(mapper=mapper)
     if instead == "points":
         actor.prop.style, actor.prop.point_size, actor.prop.lighting = "points", POINT_SIZE, False

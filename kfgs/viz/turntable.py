@@ -16,7 +16,7 @@ from .._check import check_range, check_shapes, check_whole
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..scenes.points import robust_bounds
-from .animation import Progress, save_animation
+from .animation import Progress, check_size, save_animation
 from .shows import Show
 
 Array = np.ndarray[Any, Any]
@@ -41,12 +41,12 @@ class Orbit:
     zoom: float = 1.0
     """At 1 the sphere around the scene's robust box fits the picture; 2 halves the distance."""
     cut: float = 0.0
-    """Share of the way from the sphere's front to its middle that is not drawn: opens a room whose walls hide it."""
+    """Share of the way from the sphere's front to its middle that is not drawn: opens a room whose walls hide it.
+    A lid is better left out of the cloud: `gaussians.select(gaussians.labels != ceiling)`."""
 
     def __post_init__(self) -> None:
         check_whole("frames", self.frames, 1)
-        for axis, size in zip(("height", "width"), self.size, strict=True):
-            check_whole(f"size ({axis})", size, 1)
+        check_size(self.size)
         check_range("elevation_degrees", self.elevation_degrees, -90, 90, closed=(False, False))
         check_range("start_degrees", self.start_degrees, float("-inf"))
         check_range("fov_degrees", self.fov_degrees, 0, 180, closed=(False, False))

@@ -50,7 +50,6 @@ def test_gaussians_are_exchanged_for_a_while_and_come_back(plotter):
         assert not actor.GetVisibility()
         assert plotter.renderer.GetActors().GetNumberOfItems() == 3
         stand_in = plotter.renderer.GetActors().GetLastActor()
-        stand_in.mapper.Update()
         np.testing.assert_array_equal(
             np.sort(stand_in.mapper.dataset.points, axis=0), np.sort(gaussians.means[kept], axis=0)
         )
@@ -124,6 +123,10 @@ def test_the_box_holds_legend_and_note_and_nothing_that_is_read_as_html():
 def test_a_page_carries_the_scene_and_says_what_became_of_gaussians(plotter, tmp_path, instead):
     gaussians = some_gaussians()
     add_cloud(plotter, gaussians, style="gaussians")
+    plotter.screenshot(return_img=True)  # places the camera
+    plotter.camera.focal_point = np.array(plotter.camera.position) + plotter.camera.direction  # as look_through does
+    plotter.renderer.ResetCameraClippingRange()
+    plotter.render()
     before = plotter.screenshot(return_img=True)
     names = ["wall", "sofa", "rug", "lamp"]
     page = save_page(tmp_path / "room.html", plotter, instead=instead, limit=9, labels=gaussians.labels, names=names)
@@ -146,6 +149,10 @@ def test_a_page_carries_the_scene_and_says_what_became_of_gaussians(plotter, tmp
             assert (color == palette(gaussians.labels[i])).all()
     (camera,) = find(scene["scene"], "vtkOpenGLCamera")
     assert camera["viewAngle"] == pytest.approx(plotter.camera.view_angle)
+    ahead = np.array(plotter.camera.focal_point) - plotter.camera.position
+    step = np.array(camera["focalPoint"]) - plotter.camera.position
+    forward = ahead / np.linalg.norm(ahead)
+    np.testing.assert_allclose(step, forward * np.median((points - plotter.camera.position) @ forward), rtol=1e-4)
     np.testing.assert_array_equal(plotter.screenshot(return_img=True), before)
 
 

@@ -121,6 +121,7 @@ def test_what_cannot_be_gone_round_is_refused(points, up, message):
     [
         ({"frames": 0}, "frames: expected a number"),
         ({"size": (0, 4)}, r"size \(height\): expected"),
+        ({"size": (4, 4, 3)}, r"size: expected \(height, width\), got \(4, 4, 3\)"),
         ({"elevation_degrees": 90}, "elevation_degrees: expected"),
         ({"fov_degrees": 180}, "fov_degrees: expected"),
         ({"zoom": 0}, "zoom: expected"),
