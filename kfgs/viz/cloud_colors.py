@@ -94,13 +94,23 @@ def _scale(name: str, values: Array, clim: tuple[float, float] | None) -> CloudC
 
     finite = np.isfinite(values)
     if clim is None:
-        low, high = (float(values[finite].min()), float(values[finite].max())) if finite.any() else (0.0, 1.0)
-        clim = (low, high) if high > low else (low - 0.5, high + 0.5)  # one value: in the middle
+        clim = _middle_range(values[finite])
     check_range("clim[0]", clim[0], -np.inf, closed=(False, False))
     check_range("clim[1]", clim[1], clim[0], closed=(False, False))
     unit = np.where(finite, (values - clim[0]) / (clim[1] - clim[0]), 0.0)
     rgb: Array = colormaps[COLORMAP](unit, bytes=True)[:, :3]
     return CloudColors(np.where(finite[:, None], rgb, np.array(UNLABELLED, np.uint8)), name, values, clim)
+
+
+def _middle_range(values: Array) -> tuple[float, float]:
+    """The 1st to the 99th percentile, as in `FeatureColors`; all values where these are one; around a single value."""
+    if values.size == 0:
+        return 0.0, 1.0
+    for outer in (1, 0):
+        low, high = (float(end) for end in np.percentile(values, [outer, 100 - outer]))
+        if high > low:
+            return low, high
+    return low - 0.5, high + 0.5
 
 
 def _numpy(values: Tensor) -> Array:

@@ -21,6 +21,7 @@ from .frusta import add_cameras as add_cameras
 from .gaussian_actor import Moving, as_gaussians
 from .legends import add_legend as add_legend
 from .matches import add_transfer as add_transfer
+from .meshes import draw_mesh
 from .pictures import FeatureColors
 
 if TYPE_CHECKING:
@@ -38,8 +39,10 @@ class CloudOptions:
     """Of everything drawn, in (0, 1]; it multiplies the opacities of Gaussians."""
     point_size: float = 4.0
     """Of points, in pixels."""
-    deviations: float = 1.5
+    deviations: float = 1.0
     """Half axes of ellipsoids, in standard deviations."""
+    faint: float = 0.5
+    """Gaussians of at most this opacity have no ellipsoid, in [0, 1): a surface would hide what they let through."""
     sort: bool = True
     """Draw Gaussians back to front (exact). Without it their order is averaged: five times faster, less right."""
     moving: Moving = "auto"
@@ -49,6 +52,7 @@ class CloudOptions:
     def __post_init__(self) -> None:
         check_range("opacity", self.opacity, 0, 1, closed=(False, True))
         check_range("point_size", self.point_size, 0, closed=(False, False))
+        check_range("faint", self.faint, 0, 1, closed=(True, False))
         check_range("deviations", self.deviations, 0, closed=(False, False))
         check_choice("moving", self.moving, get_args(Moving))
 
@@ -78,7 +82,7 @@ def add_cloud(
         style: `points` is quick and can be exported to HTML; `gaussians` is VTK's EWA splatting, the picture that kfgs's
             own rasteriser makes; `ellipsoids` are closed surfaces, for at most 100,000.
         feature_colors: the scene's projection of features to colours.
-        clim: scores of the darkest and the brightest colour; None: the lowest and the highest score (opacity: 0, 1).
+        clim: scores of the darkest and the brightest colour; None: their 1st and 99th percentile (opacity: 0, 1).
         options: sizes, opacity, order.
 
     Raises:
@@ -101,18 +105,19 @@ def add_cloud(
     import pyvista as pv
 
     if style == "ellipsoids":
-        cloud = ellipsoids(gaussians, options.deviations)
+        cloud = _surfaces(gaussians, options)
     else:
         cloud = pv.PolyData(_numpy(gaussians.means).astype(np.float32))
         cloud["index"] = np.arange(len(gaussians))
     _fill(cloud, gaussians, colors)
     if style == "points":
-        return plotter.add_mesh(
+        return draw_mesh(
+        plotter,
             cloud, style="points", scalars="rgb", rgb=True, point_size=options.point_size, lighting=False,
             opacity=options.opacity,
         )  # fmt: skip
     if style == "ellipsoids":
-        actor = plotter.add_mesh(cloud, scalars="rgb", rgb=True, ambient=0.45, diffuse=0.6, opacity=options.opacity)
+        actor = draw_mesh(plotter, cloud, scalars="rgb", rgb=True, ambient=0.45, diffuse=0.6, opacity=options.opacity)
         actor.prop.interpolation = "Phong"
         return actor
     quats = _numpy(gaussians.quats).astype(np.float64)
@@ -137,7 +142,7 @@ def recolor_cloud(
         ValueError: if there are not as many as Gaussians, or they are not uint8.
     """
     cloud: Any = actor.mapper.dataset
-    count = int(np.max(cloud["index"])) + 1
+    count = int(cloud.field_data["count"][0])
     check_shapes(("colors", colors, ("N", 3)))
     if len(colors) != count or colors.dtype != np.uint8:
         raise ValueError(
@@ -145,6 +150,18 @@ def recolor_cloud(
             "use palette(labels)"
         )
     cloud.point_data["rgb"] = colors[np.asarray(cloud["index"])]
+
+
+def _surfaces(gaussians: Gaussians, options: CloudOptions) -> pv.PolyData:
+    """Ellipsoids of those that are not faint; `index` counts all."""
+    opaque = (gaussians.opacities.detach() > options.faint).nonzero()[:, 0]
+    if len(opaque) == 0:
+        raise ValueError(
+            f"gaussians: expected at least one of opacity above {options.faint:g}, got none; lower options.faint"
+        )
+    mesh = ellipsoids(gaussians.select(opaque), options.deviations)
+    mesh["index"] = _numpy(opaque)[np.asarray(mesh["index"])]
+    return mesh
 
 
 def _fill(cloud: pv.PolyData, gaussians: Gaussians, colors: CloudColors) -> None:
@@ -156,6 +173,7 @@ def _fill(cloud: pv.PolyData, gaussians: Gaussians, colors: CloudColors) -> None
     if colors.values is not None and colors.name != "opacity":
         cloud[colors.name] = colors.values[index]
     cloud["rgb"] = colors.rgb[index]
+    cloud.field_data["count"] = np.array([len(gaussians)])
     if colors.clim is not None:
         cloud.field_data["clim"] = np.asarray(colors.clim, dtype=np.float64)
 

@@ -13,7 +13,7 @@ from ..gaussians import Gaussians
 if TYPE_CHECKING:
     import pyvista as pv
 
-FINE = 20_000  # up to so many have 80 faces each, more have 20
+FACES = ((5_000, 2), (20_000, 1))  # up to so many have 320 faces each, or 80; more have 20
 MOST = 100_000  # 2 million faces: 1.2 s a frame in software
 
 
@@ -34,7 +34,7 @@ def ellipsoids(gaussians: Gaussians, deviations: float) -> pv.PolyData:
         )
     import pyvista as pv
 
-    ball = pv.Icosphere(nsub=1 if count <= FINE else 0)
+    ball = pv.Icosphere(nsub=next((times for most, times in FACES if count <= most), 0))
     corners, faces = np.array(ball.points, dtype=np.float32), np.array(ball.regular_faces)
     corners /= np.linalg.norm(corners, axis=1, keepdims=True)
     with torch.no_grad():

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from .._check import check_range, check_shapes, check_whole
 from ..cameras import Camera, resize_map
+from .meshes import draw_mesh
 from .pictures import as_bytes
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def add_cameras(
     segments = np.concatenate([_frustum(cameras[i], depth) for i in chosen])  # [10 C, 2, 3]
     mesh = pv.line_segments_from_points(segments.reshape(-1, 3))
     mesh.cell_data["camera"] = np.repeat(chosen, 10)
-    return plotter.add_mesh(mesh, color=color, line_width=line_width, lighting=False)
+    return draw_mesh(plotter, mesh, color=color, line_width=line_width, lighting=False)
 
 
 def add_camera_images(
@@ -110,7 +111,7 @@ def add_camera_images(
     )
     mesh.active_texture_coordinates = np.array(places, dtype=np.float32)
     mesh.cell_data["camera"] = chosen
-    return plotter.add_mesh(mesh, texture=pv.numpy_to_texture(atlas), lighting=False, opacity=opacity)
+    return draw_mesh(plotter, mesh, texture=pv.numpy_to_texture(atlas), lighting=False, opacity=opacity)
 
 
 def evenly(count: int, most: int | None) -> Array:  # [min(count, most)] int64

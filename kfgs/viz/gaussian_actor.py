@@ -10,6 +10,7 @@ import numpy as np
 
 from ..splat.engines import ALPHA_MAX, ALPHA_MIN
 from ..splat.project import FIELD_OF_VIEW_MARGIN
+from .meshes import draw_mesh
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -66,7 +67,7 @@ def as_gaussians(
             "auto": points if a frame of Gaussians takes longer than 0.1 s.
         colors_from: `rgb` in the order of `index`, given where the camera stands [3]; None: it does not change.
     """
-    actor = plotter.add_mesh(cloud, style="points_gaussian", scalars="rgb", rgb=True, emissive=False, lighting=False)
+    actor = draw_mesh(plotter, cloud, style="points_gaussian", scalars="rgb", rgb=True, emissive=False, lighting=False)
     mapper = actor.mapper
     mapper.SetScaleArray("scale")
     mapper.SetRotationArray("quat")

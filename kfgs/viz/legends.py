@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from .cloud_colors import COLORMAP
-from .pictures import LEGEND_INK, legend_column
+from .pictures import LEGEND_INK, LEGEND_PAPER, legend_column
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -75,15 +75,19 @@ def add_scalar_bar(plotter: pv.Plotter, cloud: pv.Actor, title: str = "score") -
     bar.SetNumberOfLabels(5)
     bar.SetLabelFormat("{:.3g}")
     bar.SetUnconstrainedFontSize(True)
-    ink = letters(plotter)
     for text, size in ((bar.GetTitleTextProperty(), 16), (bar.GetLabelTextProperty(), 14)):
-        text.SetColor(*ink)
+        text.SetColor(*(part / 255 for part in LEGEND_INK))
         text.SetFontSize(size)
         text.SetItalic(False)
         text.SetBold(False)
         text.SetShadow(False)
-    bar.SetPosition(0.86, 0.15)
-    bar.SetWidth(0.1)
+    bar.SetMaximumNumberOfColors(256)
+    bar.SetVerticalTitleSeparation(10)
+    bar.SetTextPad(4)
+    bar.SetDrawBackground(True)
+    bar.GetBackgroundProperty().SetColor(*(part / 255 for part in LEGEND_PAPER))
+    bar.SetPosition(0.83, 0.15)
+    bar.SetWidth(0.15)
     bar.SetHeight(0.7)
     plotter.add_actor(bar, reset_camera=False, pickable=False)
     return bar

@@ -14,6 +14,7 @@ from ..gaussians import Gaussians
 from ..labels import Transfer
 from .frusta import evenly
 from .legends import add_legend
+from .meshes import draw_mesh
 from .palette import PALETTE, palette
 from .plots import _figure, _save
 
@@ -88,7 +89,7 @@ def add_matches(
     points["state"], points["label"] = states, _numpy(transfer.labels)
     points["distance"] = _numpy(transfer.distances)
     points["rgb"] = _state_colors(states)
-    dots = plotter.add_mesh(points, style="points", scalars="rgb", rgb=True, point_size=point_size, lighting=False)
+    dots = draw_mesh(plotter, points, style="points", scalars="rgb", rgb=True, point_size=point_size, lighting=False)
     lines = None
     if (states != ORPHANED).any():
         lines = add_transfer(plotter, src, moved, transfer, color_by="state", sample=sample, line_width=line_width)
@@ -145,7 +146,7 @@ def add_transfer(
     lines.cell_data["source"], lines.cell_data["destination"] = sources, chosen
     lines.cell_data["distance"] = _numpy(transfer.distances)[chosen]
     lines.cell_data["rgb"] = palette(labels) if color_by == "label" else _state_colors(states)
-    return plotter.add_mesh(lines, scalars="rgb", rgb=True, line_width=line_width, lighting=False)
+    return draw_mesh(plotter, lines, scalars="rgb", rgb=True, line_width=line_width, lighting=False)
 
 
 def plot_distances(
@@ -209,7 +210,8 @@ def _state_legend(states: Array, sample: int) -> tuple[Array, list[str]]:
         names[color] = f"{name} {count:,}"
     labelled = int(counts[MATCHED] + counts[AMBIGUOUS])
     if labelled > sample:
-        names[STATE_COLORS[MATCHED]] += f" ({sample:,} of {labelled:,} lines)"
+        for state in (MATCHED, AMBIGUOUS):
+            names[STATE_COLORS[state]] += f" (1 line for {labelled / sample:.3g})"
     return np.array(STATE_COLORS)[counts > 0], names
 
 

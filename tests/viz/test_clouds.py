@@ -1,67 +1,32 @@
-import math
-
 import numpy as np
 import pytest
 import torch
+from cases_viz import data, some_camera, some_gaussians, some_plotter
 
 from kfgs.cameras import Camera, project_points
 from kfgs.cameras.camera import Distortion
-from kfgs.gaussians import Gaussians
 from kfgs.labels import transfer_labels
-from kfgs.splat.rasterize import rasterize
+from kfgs.splat.covariance import covariance_3d
 from kfgs.viz import (
     FeatureColors,
     add_cameras,
     add_cloud,
     add_legend,
     add_transfer,
-    available,
-    headless,
     legend_column,
     look_through,
-    make_plotter,
     palette,
 )
-from kfgs.viz.clouds import CloudOptions
+from kfgs.viz.clouds import CloudOptions, recolor_cloud
+from kfgs.viz.legends import add_scalar_bar
 
 C0 = 0.28209479177387814
 
 
-def some_gaussians(n=60, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    rand = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
-    return Gaussians(
-        means=rand(n, 3) * 2 - 1,
-        quats=torch.randn(n, 4, generator=generator) * 3,
-        scales=rand(n, 3) * 0.2 + 0.03,
-        opacities=rand(n) * 0.8 + 0.1,
-        features=rand(n, 4),
-        sh=(rand(n, 1, 3) - 0.5) / C0,
-        labels=torch.arange(n) % 6 - 1,
-    )
-
-
-def some_camera(height=120, width=160):
-    """Off-centre, with two focal lengths, turned about all axes."""
-    viewmat = torch.eye(4, dtype=torch.float64)
-    spin = torch.tensor([[0, -0.3, 0.2], [0.3, 0, -0.1], [-0.2, 0.1, 0]], dtype=torch.float64)
-    viewmat[:3, :3] = torch.linalg.matrix_exp(spin)
-    viewmat[2, 3] = 4
-    K = torch.tensor([[150, 0, 85], [0, 165, 55], [0, 0, 1]], dtype=torch.float64)
-    return Camera(viewmat, K, width, height)
-
-
 @pytest.fixture
 def plotter():
-    if not available():
-        pytest.skip(headless.probe().reason)
-    plotter = make_plotter(120, 160, background="black", off_screen=True)
-    yield plotter
-    plotter.close()
-
-
-def data(actor):
-    return actor.mapper.dataset
+    with some_plotter() as plotter:
+        yield plotter
 
 
 def test_points_carry_their_data(plotter):
@@ -103,14 +68,93 @@ def test_what_is_missing_is_named(plotter):
         add_cloud(plotter, gaussians, color_by="colour")
 
 
-def test_viewer_agrees_with_the_rasteriser(plotter):
-    gaussians, camera = some_gaussians(), some_camera()
-    add_cloud(plotter, gaussians, color_by="rgb", style="gaussians")
-    look_through(plotter, camera)
-    seen = plotter.screenshot(return_img=True) / 255
-    expected = rasterize(gaussians.replace(features=None), camera.to(torch.float32)).map.clamp(0, 1).numpy()
-    assert expected.max() > 0.3
-    assert -10 * math.log10(((seen - expected) ** 2).mean()) > 45  # measured: 52 dB
+def test_scores_and_arrays_become_colours(plotter):
+    gaussians = some_gaussians(5)
+    scores = torch.tensor([0.0, 0.5, 1.0, 7.0, float("nan")])
+    cloud = data(add_cloud(plotter, gaussians, color_by=scores, clim=(0, 1)))
+    dark, middle, bright, above, nan = cloud["rgb"].astype(int)
+    assert (dark.tolist(), bright.tolist(), nan.tolist()) == ([0, 34, 77], [253, 231, 55], [128, 128, 128])  # cividis
+    assert dark.sum() < middle.sum() < bright.sum()
+    np.testing.assert_array_equal(above, bright)
+    np.testing.assert_array_equal(cloud["score"], scores)
+    assert cloud.field_data["clim"].tolist() == [0, 1]
+    labels = np.array([3, -1, 0, 2, 2])
+    cloud = data(add_cloud(plotter, gaussians, color_by=labels))
+    np.testing.assert_array_equal(cloud["rgb"], palette(labels))
+    np.testing.assert_array_equal(cloud["label"], labels)  # those shown
+    colors = np.arange(15, dtype=np.uint8).reshape(5, 3)
+    np.testing.assert_array_equal(data(add_cloud(plotter, gaussians, color_by=colors))["rgb"], colors)
+
+
+def test_range_of_scores_leaves_the_outermost_out(plotter):
+    gaussians = some_gaussians(1000)
+    scores = torch.linspace(0, 1, 1000)
+    scores[0], scores[-1] = -50, 50
+    clim = data(add_cloud(plotter, gaussians, color_by=scores)).field_data["clim"]
+    np.testing.assert_allclose(clim, [0.01, 0.99], atol=2e-3)
+    rare = torch.zeros(1000)
+    rare[3] = 2
+    assert data(add_cloud(plotter, gaussians, color_by=rare)).field_data["clim"].tolist() == [0, 2]
+    assert data(add_cloud(plotter, gaussians, color_by=torch.ones(1000))).field_data["clim"].tolist() == [0.5, 1.5]
+    nothing = data(add_cloud(plotter, gaussians, color_by=torch.full((1000,), float("nan"))))
+    assert (nothing["rgb"] == 128).all()
+
+
+def test_wrong_values_to_colour_by_are_named(plotter):
+    gaussians = some_gaussians()
+    with pytest.raises(ValueError, match=r"color_by: expected \[N\] with N = 60"):
+        add_cloud(plotter, gaussians, color_by=torch.zeros(59))
+    with pytest.raises(TypeError, match="color_by: expected labels .* or scores .*got bool"):
+        add_cloud(plotter, gaussians, color_by=torch.zeros(60, dtype=torch.bool))
+    with pytest.raises(ValueError, match=r"clim\[1\]: expected a number in \(1, inf"):
+        add_cloud(plotter, gaussians, color_by=torch.zeros(60), clim=(1.0, 1.0))
+    with pytest.raises(ValueError, match="color_by: expected 'rgb' for style 'points', got 'view'"):
+        add_cloud(plotter, gaussians, color_by="view")
+    for name, value in (("opacity", 0), ("faint", 1), ("deviations", 0), ("point_size", -1)):
+        with pytest.raises(ValueError, match=f"{name}: expected a number in"):
+            CloudOptions(**{name: value})
+    with pytest.raises(ValueError, match="moving: expected one of"):
+        CloudOptions(moving="never")
+
+
+def test_scalar_bar_shows_the_colours_of_its_scale(plotter):
+    cloud = add_cloud(plotter, some_gaussians(), color_by="opacity")
+    cloud.SetVisibility(False)
+    bar = add_scalar_bar(plotter, cloud, "opacity")
+    assert bar.GetTitle() == "opacity"
+    assert bar.GetLookupTable().GetRange() == (0, 1)
+    picture = plotter.screenshot(return_img=True).reshape(-1, 3)
+    for color in ((0, 34, 77), (255, 255, 255)):  # the lowest score, and the paper behind the letters
+        assert (np.abs(picture.astype(int) - color).max(axis=1) < 4).any()
+    with pytest.raises(ValueError, match="cloud: expected one coloured by scores or opacity"):
+        add_scalar_bar(plotter, add_cloud(plotter, some_gaussians()))
+
+
+def test_ellipsoids_are_the_gaussians_surfaces(plotter):
+    gaussians = some_gaussians()
+    actor = add_cloud(plotter, gaussians, style="ellipsoids", options=CloudOptions(deviations=2, faint=0.6))
+    mesh = data(actor)
+    opaque = np.flatnonzero(gaussians.opacities.numpy() > 0.6)
+    np.testing.assert_array_equal(np.unique(mesh["index"]), opaque)
+    inverse = torch.linalg.inv(covariance_3d(gaussians.quats, gaussians.scales).double()).numpy()
+    offset = mesh.points - gaussians.means.numpy()[mesh["index"]]
+    pull = np.einsum("nij,nj->ni", inverse[mesh["index"]], offset)
+    np.testing.assert_allclose((pull * offset).sum(axis=1), 4, rtol=1e-3)  # two standard deviations everywhere
+    normals = pull / np.linalg.norm(pull, axis=1, keepdims=True)
+    np.testing.assert_allclose(mesh.point_data.active_normals, normals, atol=1e-3)
+    np.testing.assert_array_equal(mesh["rgb"], palette(gaussians.labels)[mesh["index"]])
+    look_through(plotter, some_camera())
+    assert (plotter.screenshot(return_img=True).reshape(-1, 3).any(axis=1)).mean() > 0.05
+    recolor_cloud(actor, np.full((60, 3), 7, np.uint8))
+    assert (mesh["rgb"] == 7).all()
+
+
+def test_too_many_or_too_faint_ellipsoids_are_refused(plotter, monkeypatch):
+    with pytest.raises(ValueError, match="expected at least one of opacity above 0.95, got none; lower options.faint"):
+        add_cloud(plotter, some_gaussians(), style="ellipsoids", options=CloudOptions(faint=0.95))
+    monkeypatch.setattr("kfgs.viz.ellipsoids.MOST", 10)
+    with pytest.raises(ValueError, match="gaussians: expected at most 10 to draw as ellipsoids, got"):
+        add_cloud(plotter, some_gaussians(), style="ellipsoids")
 
 
 def test_gaussians_are_sorted_back_to_front_with_their_data(plotter):
@@ -151,34 +195,6 @@ def test_look_through_refuses_a_distorting_lens(plotter):
         look_through(plotter, bent)
 
 
-def test_transfer_lines_join_destination_and_source(plotter):
-    src, dst = some_gaussians(80, 1), some_gaussians(50, 2)
-    transfer = transfer_labels(src.means, src.labels, dst.means, 0.3)
-    assert 10 < transfer.labelled < 50
-    lines = data(add_transfer(plotter, src, dst, transfer))
-    assert lines.n_cells == transfer.labelled
-    ends = lines.points.reshape(-1, 2, 3)
-    np.testing.assert_allclose(ends[:, 0], dst.means[lines["destination"]])
-    np.testing.assert_allclose(ends[:, 1], src.means[lines["source"]])
-    np.testing.assert_allclose(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1), lines["distance"], atol=1e-6)
-    np.testing.assert_array_equal(lines["label"], src.labels[lines["source"]])
-    np.testing.assert_array_equal(lines["rgb"], palette(lines["label"]))
-    few = data(add_transfer(plotter, src, dst, transfer, sample=7))
-    assert few.n_cells == 7
-    assert len(set(few["destination"])) == 7
-
-
-def test_wrong_transfers_are_named(plotter):
-    src, dst = some_gaussians(80, 1), some_gaussians(50, 2)
-    transfer = transfer_labels(src.means, src.labels, dst.means, 0.3)
-    with pytest.raises(ValueError, match=r"transfer.labels: expected \[N\] with N = 80"):
-        add_transfer(plotter, src, src, transfer)
-    with pytest.raises(ValueError, match="transfer: expected sources below 2"):
-        add_transfer(plotter, src.select(torch.arange(2)), dst, transfer)
-    with pytest.raises(ValueError, match="got none within 1e-09; raise the distance"):
-        add_transfer(plotter, src, dst, transfer_labels(src.means, src.labels, dst.means, 1e-9))
-
-
 def test_legend_is_drawn_as_it_is_in_the_lower_left_corner(plotter):
     labels, names = torch.tensor([2, -1, 0, 2]), ["wall", "floor", "rug"]
     add_legend(plotter, labels, names)
@@ -189,36 +205,6 @@ def test_legend_is_drawn_as_it_is_in_the_lower_left_corner(plotter):
     assert not picture[: 120 - 10 - height].any()
     with pytest.raises(ValueError, match="names: expected a name for every label up to 5"):
         add_legend(plotter, np.array([5]), ["wall"])
-
-
-def test_frusta_open_like_their_cameras(plotter):
-    camera = some_camera()
-    mesh = data(add_cameras(plotter, [camera, camera], size=0.5))
-    assert mesh["camera"].tolist() == [0] * 10 + [1] * 10
-    ends = torch.from_numpy(np.array(mesh.points)).double().reshape(20, 2, 3)
-    np.testing.assert_allclose(ends[:4, 0], camera.center.expand(4, 3), atol=1e-6)
-    in_camera = ends[:4, 1] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    np.testing.assert_allclose(in_camera[:, 2], 0.5, atol=1e-6)
-    pixels = in_camera @ camera.K.T / in_camera[:, 2:]
-    np.testing.assert_allclose(pixels[:, :2], [(0, 0), (160, 0), (160, 120), (0, 120)], atol=1e-4)
-    ridge = ends[8, 1] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    assert (ridge @ camera.K.T / ridge[2])[1] < 0  # the roof is above the picture
-
-
-def test_size_of_frusta_follows_the_cameras(plotter):
-    camera = some_camera()
-    moved = camera.viewmat.clone()
-    moved[:3, 3] += 10 * moved[:3, 0]
-    far = Camera(moved, camera.K, 160, 120)
-    extent = (far.center - camera.center).abs().max()
-    mesh = data(add_cameras(plotter, [camera, far]))
-    ends = np.array(mesh.points).reshape(20, 2, 3)
-    forward = camera.viewmat[2, :3].numpy()
-    np.testing.assert_allclose((ends[0, 1] - ends[0, 0]) @ forward, 0.05 * extent, rtol=1e-5)
-    with pytest.raises(ValueError, match="cameras: expected at least one camera"):
-        add_cameras(plotter, [])
-    with pytest.raises(ValueError, match=r"size: expected a number in \(0"):
-        add_cameras(plotter, [camera], size=0.0)
 
 
 def test_scene_of_everything_is_not_blank(plotter):

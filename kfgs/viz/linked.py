@@ -1,0 +1,90 @@
+"""The semantic and the colour cloud side by side under one camera: what one says, the other shows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .._check import check_whole
+from ..cameras import Camera
+from ..gaussians import Gaussians
+from .cloud_colors import ColorBy
+from .clouds import Style, add_cloud
+from .headless import make_plotter
+from .legends import add_legend, letters
+from .through import look_through
+
+if TYPE_CHECKING:
+    import pyvista as pv
+
+FAR = 99.0  # percentile of distances from the middle within which the first view looks: floaters stay outside
+TITLES = {"label": "classes", "rgb": "colours", "view": "colours", "opacity": "opacity"}
+
+
+def linked_clouds(
+    semantic: Gaussians,
+    color: Gaussians,
+    *,
+    names: Sequence[str] | None = None,
+    color_by: tuple[ColorBy, ColorBy] = ("label", "rgb"),
+    style: Style = "gaussians",
+    camera: Camera | None = None,
+    height: int = 600,
+    off_screen: bool | None = None,
+) -> pv.Plotter:
+    """Show the semantic cloud on the left and the colour cloud on the right; turning one turns the other.
+
+    Args:
+        semantic: labelled Gaussians.
+        color: Gaussians with `sh`, in the same frame; with labels (`transfer_labels`), they can be shown too.
+        names: of the classes; the legend lists those present. None: no legend.
+        color_by: what colours stand for, left and right: `label`, `rgb`, `view` or `opacity`.
+        style: of both clouds.
+        camera: to look through, with its proportions; None: both views see everything but floaters.
+        height: of the window, pixels.
+        off_screen: as in `make_plotter`.
+
+    Returns:
+        The plotter, its left subplot active: call `.show()`, or add to it first.
+
+    Raises:
+        ValueError: if a cloud is empty or lacks what it is coloured by, a label has no name, or the lens distorts.
+        RuntimeError: if nothing can be drawn here.
+    """
+    check_whole("height", height, 1)
+    wide = 4 / 3 if camera is None else camera.width / camera.height
+    plotter = make_plotter(height, 2 * round(height * wide), shape=(1, 2), off_screen=off_screen)
+    try:
+        for column, (cloud, by) in enumerate(zip((semantic, color), color_by, strict=True)):
+            plotter.subplot(0, column)
+            add_cloud(plotter, cloud, color_by=by, style=style)
+            plotter.add_text(TITLES.get(by, by), position="upper_edge", font_size=10, color=letters(plotter))
+            if names is not None and by == "label" and cloud.labels is not None:
+                add_legend(plotter, cloud.labels, names)
+        plotter.subplot(0, 0)
+        plotter.link_views()
+        if camera is not None:
+            look_through(plotter, camera)
+            plotter.renderers[1].camera_set = True
+        else:
+            _look_at(plotter, semantic)
+    except BaseException:
+        plotter.close()
+        raise
+    return plotter
+
+
+def _look_at(plotter: pv.Plotter, gaussians: Gaussians) -> None:
+    """An isometric view of all but the outermost hundredth."""
+    means = gaussians.means.detach().cpu().double().numpy()
+    middle = np.median(means, axis=0)
+    distance = np.linalg.norm(means - middle, axis=1)
+    kept = means[distance <= np.percentile(distance, FAR)]
+    bounds = np.stack([kept.min(axis=0), kept.max(axis=0)], axis=1).reshape(-1)
+    plotter.view_isometric()
+    plotter.renderer.ResetCamera(*bounds)
+    for renderer in plotter.renderers:
+        renderer.camera_set = True
+        renderer.ResetCameraClippingRange()

@@ -1,0 +1,64 @@
+import numpy as np
+import pytest
+from cases_viz import some_camera, some_gaussians
+
+from kfgs.viz import available, headless, legend_column, palette
+from kfgs.viz.linked import linked_clouds
+
+
+@pytest.fixture(autouse=True)
+def driver():
+    if not available():
+        pytest.skip(headless.probe().reason)
+
+
+NAMES = [f"class {i}" for i in range(5)]
+
+
+def test_both_clouds_are_seen_by_the_same_camera():
+    gaussians, camera = some_gaussians(), some_camera(240, 320)
+    plotter = linked_clouds(gaussians, gaussians, names=NAMES, camera=camera, height=240, off_screen=True)
+    try:
+        assert plotter.renderers[0].camera is plotter.renderers[1].camera
+        picture = plotter.screenshot(return_img=True)
+        assert picture.shape == (240, 640, 3)
+        legend = legend_column(gaussians.labels, NAMES)
+        height, width, _ = legend.shape
+        np.testing.assert_array_equal(picture[230 - height : 230, 10 : 10 + width], legend)
+        plotter.camera.azimuth += 90
+        plotter.render()
+        moved = plotter.screenshot(return_img=True)
+        for half in (slice(160, 320), slice(320, 640)):
+            assert (moved[:, half] != picture[:, half]).any(axis=2).mean() > 0.2
+    finally:
+        plotter.close()
+
+
+def test_first_view_leaves_floaters_out():
+    gaussians = some_gaussians(300)
+    means = gaussians.means.clone()
+    means[0] = 1000.0
+    plotter = linked_clouds(
+        gaussians.replace(means=means),
+        gaussians,
+        color_by=("label", "opacity"),
+        style="points",
+        height=120,
+        off_screen=True,
+    )
+    try:
+        picture = plotter.screenshot(return_img=True)
+        for half in (picture[:, :160], picture[:, 160:]):
+            assert (half[20:] < 250).any(axis=2).mean() > 0.05
+        present = {tuple(color) for color in np.unique(picture[:, :160].reshape(-1, 3), axis=0)}
+        assert len(present & {tuple(color) for color in palette(np.arange(5))}) == 5
+    finally:
+        plotter.close()
+
+
+def test_a_missing_label_closes_the_window_and_says_so():
+    gaussians = some_gaussians()
+    with pytest.raises(ValueError, match=r"gaussians\.labels: expected labels to colour by, got None"):
+        linked_clouds(gaussians.replace(labels=None), gaussians, off_screen=True)
+    with pytest.raises(ValueError, match="height: expected a number in"):
+        linked_clouds(gaussians, gaussians, height=0)

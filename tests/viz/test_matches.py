@@ -1,0 +1,126 @@
+import numpy as np
+import pytest
+import torch
+from cases_viz import data, some_gaussians, some_plotter
+from matplotlib.axes import Axes
+
+from kfgs.labels import transfer_labels
+from kfgs.viz import add_transfer, palette
+from kfgs.viz.matches import add_matches, match_states, plot_distances
+
+
+@pytest.fixture
+def plotter():
+    with some_plotter() as plotter:
+        yield plotter
+
+
+def test_transfer_lines_join_destination_and_source(plotter):
+    src, dst = some_gaussians(80, 1), some_gaussians(50, 2)
+    transfer = transfer_labels(src.means, src.labels, dst.means, 0.3)
+    assert 10 < transfer.labelled < 50
+    lines = data(add_transfer(plotter, src, dst, transfer))
+    assert lines.n_cells == transfer.labelled
+    ends = lines.points.reshape(-1, 2, 3)
+    np.testing.assert_allclose(ends[:, 0], dst.means[lines["destination"]])
+    np.testing.assert_allclose(ends[:, 1], src.means[lines["source"]])
+    np.testing.assert_allclose(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1), lines["distance"], atol=1e-6)
+    np.testing.assert_array_equal(lines["label"], src.labels[lines["source"]])
+    np.testing.assert_array_equal(lines["rgb"], palette(lines["label"]))
+    few = data(add_transfer(plotter, src, dst, transfer, sample=7))
+    assert few.n_cells == 7
+    assert len(set(few["destination"])) == 7
+
+
+def test_wrong_transfers_are_named(plotter):
+    src, dst = some_gaussians(80, 1), some_gaussians(50, 2)
+    transfer = transfer_labels(src.means, src.labels, dst.means, 0.3)
+    with pytest.raises(ValueError, match=r"transfer.labels: expected \[N\] with N = 80"):
+        add_transfer(plotter, src, src, transfer)
+    with pytest.raises(ValueError, match="transfer: expected sources below 2"):
+        add_transfer(plotter, src.select(torch.arange(2)), dst, transfer)
+    with pytest.raises(ValueError, match="got none within 1e-09; raise the distance"):
+        add_transfer(plotter, src, dst, transfer_labels(src.means, src.labels, dst.means, 1e-9))
+
+
+def line_of_five():
+    """Sources of two classes on a line; destinations between them and far away."""
+    place = lambda xs: torch.tensor([[x, 0.0, 0.0] for x in xs])  # noqa: E731
+    src = some_gaussians(4).replace(means=place([0.0, 1.0, 2.0, 3.0]), labels=torch.tensor([0, 0, 1, -1]))
+    dst = some_gaussians(5).replace(means=place([0.1, 1.4, 2.2, 3.5, 9.0]), labels=None)
+    return src, dst, transfer_labels(src.means, src.labels, dst.means, 0.8)
+
+
+def test_states_follow_the_rule():
+    _, _, transfer = line_of_five()
+    # 1.4 has class 0 at 0.4 and class 1 at 0.6; 3.5 has only an unlabelled source within 0.8
+    assert match_states(transfer).tolist() == [0, 1, 0, 2, 2]
+    src, dst = some_gaussians(80, 1), some_gaussians(50, 2)
+    transfer = transfer_labels(src.means, src.labels, dst.means, 0.3)
+    counts = np.bincount(match_states(transfer), minlength=3)
+    assert counts.tolist() == [transfer.labelled - transfer.ambiguous, transfer.ambiguous, transfer.orphaned]
+    assert counts.min() > 0
+
+
+def test_matches_are_told_apart_and_moved_aside(plotter):
+    src, dst, transfer = line_of_five()
+    matches = add_matches(plotter, src, dst, transfer, shift=(0, 0, 2))
+    points, lines = data(matches.points), data(matches.lines)
+    np.testing.assert_allclose(points.points, dst.means + torch.tensor([0, 0, 2.0]))
+    assert points["state"].tolist() == [0, 1, 0, 2, 2]
+    assert points["rgb"].tolist() == palette(np.array([4, 0, 4, 6, 6])).tolist()
+    assert lines["destination"].tolist() == [0, 1, 2]
+    assert lines["state"].tolist() == [0, 1, 0]
+    np.testing.assert_array_equal(lines["rgb"], points["rgb"][:3])
+    np.testing.assert_allclose(lines.points[::2, 2], 2)
+    np.testing.assert_allclose(lines.points[1::2], src.means[transfer.sources[:3]])
+    plotter.reset_camera()
+    assert len(np.unique(plotter.screenshot(return_img=True).reshape(-1, 3), axis=0)) > 4
+
+
+def test_without_any_match_there_are_only_points(plotter):
+    src, dst, _ = line_of_five()
+    matches = add_matches(plotter, src, dst, transfer_labels(src.means, src.labels, dst.means, 1e-9))
+    assert matches.lines is None
+    assert data(matches.points)["state"].tolist() == [2] * 5
+
+
+def test_legend_counts_states_and_says_how_many_lines_are_drawn(monkeypatch, plotter):
+    seen = []
+    monkeypatch.setattr("kfgs.viz.matches.add_legend", lambda plotter, labels, names: seen.append((labels, names)))
+    src, dst, transfer = line_of_five()
+    add_matches(plotter, src, dst, transfer)
+    add_matches(plotter, src, dst, transfer, sample=2)
+    assert [[names[i] for i in labels] for labels, names in seen] == [
+        ["matched 2", "ambiguous 1", "orphaned 2"],
+        ["matched 2 (1 line for 1.5)", "ambiguous 1 (1 line for 1.5)", "orphaned 2"],
+    ]
+
+
+def test_histogram_counts_every_distance_and_marks_lambda(tmp_path, monkeypatch):
+    bars, lines = [], []
+    real_bar, real_line = Axes.bar, Axes.axvline
+    monkeypatch.setattr(
+        Axes, "bar", lambda self, x, h, *a, **k: (bars.append((x, h)), real_bar(self, x, h, *a, **k))[1]
+    )
+    monkeypatch.setattr(Axes, "axvline", lambda self, x, **k: (lines.append(x), real_line(self, x, **k))[1])
+    distances = torch.cat([torch.logspace(-3, 0, 300), torch.zeros(2), torch.full((5,), float("inf"))])
+    plot_distances(distances, 0.1, tmp_path / "distances.png")
+    assert lines == [0.1]
+    (near_x, near), (far_x, far) = bars
+    assert near.sum() + far.sum() == 302
+    assert near_x.max() < 0.1 <= far_x.min()
+    assert abs(near.sum() - 202) <= 8  # but for the bin that holds lambda
+    from PIL import Image
+
+    picture = np.asarray(Image.open(tmp_path / "distances.png").convert("RGB")).reshape(-1, 3)
+    for color in palette(np.array([4, 6])):
+        assert (picture == color).all(axis=1).sum() > 500
+
+
+def test_wrong_distances_are_named(tmp_path):
+    for values in ([], [0.1, -0.1], [float("nan")]):
+        with pytest.raises(ValueError, match="distances: expected at least one, none negative or NaN"):
+            plot_distances(np.array(values), 0.1, tmp_path / "a.png")
+    with pytest.raises(ValueError, match=r"distance: expected a number in \(0"):
+        plot_distances(np.ones(3), 0.0, tmp_path / "a.png")
