@@ -187,5 +187,11 @@ def _furnish(page: str, title: str, note: str, legend: str) -> str:
     if not (note or legend):
         return page
     box = f'<div id="kfgs" style="{STYLE}">\n{legend}\n<div>{html.escape(note)}</div>\n</div>\n'
-    head, _, tail = page.rpartition("</body>")
-    return f"{head}{box}</body>{tail}"
+    # The viewer empties the body when it starts, so the box hangs on the root element. "<\\/": no end of the script.
+    text = json.dumps(box).replace("</", "<\\/")
+    script = (
+        '<script>addEventListener("DOMContentLoaded", () => '
+        f'document.documentElement.insertAdjacentHTML("beforeend", {text}));</script>\n'
+    )
+    head, _, tail = page.partition("</head>")
+    return f"{head}{script}</head>{tail}"

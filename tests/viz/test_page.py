@@ -3,18 +3,22 @@ import importlib.util
 import io
 import json
 import re
+import shutil
+import subprocess
 import sys
 import zipfile
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from kfgs.gaussians import Gaussians
 from kfgs.viz import add_cloud, available, headless, make_plotter, palette
 from kfgs.viz.page import _furnish, _legend, save_page
 from kfgs.viz.stand_ins import half_surfaces, strongest, without_gaussians
 
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 EMPTY = "<html><head><title>viewer\nof others</title></head><body>\n<script>'</body>'</script>\n</body></html>"
 
 
@@ -107,15 +111,37 @@ def test_the_box_holds_legend_and_note_and_nothing_that_is_read_as_html():
     page = _furnish(EMPTY, "a & b", "5 Gaussians < 6", legend)
     assert "<title>a &amp; b</title>" in page
     assert "viewer" not in page
-    script, box = page.split("'</body>'")
+    given, body = page.split("</head>")
+    assert body == EMPTY.split("<title>viewer\nof others</title></head>")[1]
+    (text,) = re.findall(r'insertAdjacentHTML\("beforeend", (".*")\)', given)
+    assert "</" not in text  # which would end the script
+    box = json.loads(text)
     assert 'id="kfgs"' in box
-    assert 'id="kfgs"' not in script
     assert "5 Gaussians &lt; 6" in box
     for name, label, there in (("&lt;b&gt;sofa", 1, True), ("lamp", 3, True), ("none", -1, True), ("wall", 0, False)):
         red, green, blue = palette(np.array(label))
         assert (f"rgb({red},{green},{blue})" in box) == there
         assert (f">{name}<" in box.replace("</span>", ">")) == there
-    assert 'id="kfgs"' not in _furnish(EMPTY, "t", "", "")
+    assert 'id=\\"kfgs' not in _furnish(EMPTY, "t", "", "")
+
+
+@pytest.mark.skipif(BROWSER is None, reason="needs chromium")
+@pytest.mark.skipif(importlib.util.find_spec("trame_vtk") is None, reason="needs trame-vtk")
+def test_a_browser_shows_scene_legend_and_note(plotter, tmp_path):
+    add_cloud(plotter, some_gaussians(), style="gaussians")
+    plotter.camera_position = "xy"
+    page = save_page(tmp_path / "room.html", plotter, labels=torch.arange(4), names=["wall", "sofa", "rug", "lamp"])
+    picture = tmp_path / "seen.png"
+    flags = "--headless --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --disable-gpu-sandbox"
+    look = [BROWSER, *flags.split(), f"--user-data-dir={tmp_path}/profile", "--window-size=400,300"]
+    look += ["--virtual-time-budget=8000", f"--screenshot={picture}", page.path.as_uri()]
+    subprocess.run(look, check=True, capture_output=True, timeout=90)
+    seen = np.asarray(Image.open(picture).convert("RGB")).reshape(-1, 3)
+    colors = {tuple(color) for color in seen}
+    assert len(colors) > 20  # letters and edges, beside the flat ones
+    for label in range(4):
+        exact = (seen == palette(np.array(label))).all(axis=1)
+        assert exact.sum() > 100  # the legend's square has about 100 pixels, a point of the cloud more
 
 
 @pytest.mark.skipif(importlib.util.find_spec("trame_vtk") is None, reason="needs trame-vtk")
