@@ -14,6 +14,7 @@ import numpy as np
 from torch import Tensor
 
 from .._check import check_choice, check_range, check_shapes
+from ..cameras.camera import NEAR
 from ..gaussians import Gaussians
 from .cloud_colors import CloudColors, ColorBy, cloud_colors, seen_from
 from .ellipsoids import ellipsoids
@@ -43,10 +44,12 @@ class CloudOptions:
     """Half axes of ellipsoids, in standard deviations."""
     faint: float = 0.5
     """Gaussians of at most this opacity have no ellipsoid, in [0, 1): a surface would hide what they let through."""
+    near: float = NEAR
+    """Gaussians up to this depth, in world units, are not drawn, as `Camera.near`; a haze before the view otherwise."""
     sort: bool = True
     """Draw Gaussians back to front (exact). Without it their order is averaged: five times faster, less right."""
     moving: Moving = "auto"
-    """What stands for Gaussians while the mouse moves the camera: "points" (at most 100,000, evenly chosen), "gaussians",
+    """What stands for Gaussians while the mouse moves the camera: "points" (at most 50,000, evenly chosen), "gaussians",
     or "auto": points where a frame of Gaussians takes longer than 0.1 s, as in software from some 20,000 on."""
 
     def __post_init__(self) -> None:
@@ -54,6 +57,7 @@ class CloudOptions:
         check_range("point_size", self.point_size, 0, closed=(False, False))
         check_range("faint", self.faint, 0, 1, closed=(True, False))
         check_range("deviations", self.deviations, 0, closed=(False, False))
+        check_range("near", self.near, 0)
         check_choice("moving", self.moving, get_args(Moving))
 
 
@@ -125,7 +129,7 @@ def add_cloud(
     cloud["scale"] = _numpy(gaussians.scales).astype(np.float32)
     cloud["quat"] = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
     follow = partial(seen_from, gaussians) if by_view else None
-    return as_gaussians(plotter, cloud, sort=options.sort, moving=options.moving, colors_from=follow)
+    return as_gaussians(plotter, cloud, sort=options.sort, moving=options.moving, near=options.near, colors_from=follow)
 
 
 def recolor_cloud(

@@ -97,3 +97,19 @@ def test_plotter_has_the_asked_size_and_subplots():
         assert plotter.screenshot(return_img=True).shape == (60, 90, 3)
     finally:
         plotter.close()
+
+
+def test_rasterising_after_a_picture_does_not_crash():
+    """With pycolmap loaded, an LLVM (numba's) loaded after that of Mesa's driver ended Python with a segfault."""
+    if not available():
+        pytest.skip(headless.probe().reason)
+    program = """
+import pycolmap
+from kfgs.viz import make_plotter
+plotter = make_plotter(8, 8, off_screen=True)
+plotter.screenshot(return_img=True)
+import llvmlite.binding
+plotter.close()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
