@@ -60,7 +60,8 @@ def linked_clouds(
         for column, (cloud, by) in enumerate(zip((semantic, color), color_by, strict=True)):
             plotter.subplot(0, column)
             add_cloud(plotter, cloud, color_by=by, style=style)
-            plotter.add_text(TITLES.get(by, by), position="upper_edge", font_size=10, color=letters(plotter))
+            title = f"{('semantic', 'colour')[column]} field: {TITLES.get(by, by)}"
+            plotter.add_text(title, position="upper_edge", font_size=10, color=letters(plotter))
             if names is not None and by == "label" and cloud.labels is not None:
                 add_legend(plotter, cloud.labels, names)
         plotter.subplot(0, 0)

@@ -211,7 +211,7 @@ def _state_legend(states: Array, sample: int) -> tuple[Array, list[str]]:
     labelled = int(counts[MATCHED] + counts[AMBIGUOUS])
     if labelled > sample:
         for state in (MATCHED, AMBIGUOUS):
-            names[STATE_COLORS[state]] += f" (1 line for {labelled / sample:.3g})"
+            names[STATE_COLORS[state]] += f" (1 line in {labelled / sample:.3g})"
     return np.array(STATE_COLORS)[counts > 0], names
 
 

@@ -93,7 +93,7 @@ def test_legend_counts_states_and_says_how_many_lines_are_drawn(monkeypatch, plo
     add_matches(plotter, src, dst, transfer, sample=2)
     assert [[names[i] for i in labels] for labels, names in seen] == [
         ["matched 2", "ambiguous 1", "orphaned 2"],
-        ["matched 2 (1 line for 1.5)", "ambiguous 1 (1 line for 1.5)", "orphaned 2"],
+        ["matched 2 (1 line in 1.5)", "ambiguous 1 (1 line in 1.5)", "orphaned 2"],
     ]
 
 
