@@ -179,7 +179,7 @@ def segment(
     from ..fields import SemanticField
     from ..pipeline import score_scene, segment_scene, true_labels, write_report
     from ..scenes import load_scene
-    from ..viz import plot_confusion
+    from ..viz import plot_confusion, plot_iou
 
     loaded, label_set = load_scene(scene, images=images).undistorted(), load_classes(scene, classes, text)
     folder = labels or next((scene / name for name in ("labels_scored", "labels") if (scene / name).is_dir()), None)
@@ -202,8 +202,9 @@ def segment(
         scores = score_scene(found, truth, label_set)
         say(str(scores))
         write_report(out / "scores.json", segmentation=scores, truth=str(folder), field=str(field), decode=decode)
-        plot_confusion(scores.confusion, list(label_set.names), out / "confusion.png")
-        written += [out / "scores.json", out / "confusion.png"]
+        plot_confusion(scores.confusion, list(label_set.names), out / "confusion.png", misses=scores.misses)
+        plot_iou(scores.iou, list(label_set.names), out / "iou.png")
+        written += [out / name for name in ("scores.json", "confusion.png", "iou.png")]
     else:
         say(f"note: no label pictures of split {split!r} to score against")
     wrote(written)

@@ -49,6 +49,7 @@ class SegmentationReport:
 
     names: tuple[str, ...]
     confusion: Tensor  # [C, C] int64, rows = truth
+    misses: Tensor  # [C] int64, pixels of each true class that no class was predicted for
     iou: Tensor  # [C], NaN where a class occurs in neither
     miou: Score
     accuracy: Score
@@ -69,6 +70,7 @@ class SegmentationReport:
             "accuracy": self.accuracy.value,
             "iou": dict(zip(self.names, iou, strict=True)),
             "confusion": self.confusion.tolist(),
+            "misses": self.misses.tolist(),
         }
 
 
@@ -108,6 +110,7 @@ def evaluate_segmentation(
     return SegmentationReport(
         names=names,
         confusion=pooled.matrix,
+        misses=pooled.misses,
         iou=pooled.iou(),
         miou=Score("mIoU", pooled.miou(), PROTOCOL),
         accuracy=Score("accuracy", pooled.accuracy(), PROTOCOL),

@@ -1,28 +1,71 @@
-"""Pictures: one palette, label overlays, feature colours, plots, and pyvista clouds with or without a display."""
+"""Pictures: one palette, flat and in space; plots, pyvista clouds with or without a display, films and pages."""
 
-from .clouds import add_cameras, add_cloud, add_legend, add_transfer
+from .animation import save_animation, save_frames
+from .boxes import add_boxes, add_names, add_selections
+from .clouds import CloudOptions, add_cloud, recolor_cloud
+from .flythrough import flythrough_cameras, save_flythrough
+from .frusta import add_camera_images, add_cameras
 from .headless import available, make_plotter
+from .legends import add_legend, add_scalar_bar
+from .linked import linked_clouds
+from .matches import Matches, add_matches, add_transfer, match_states, plot_distances
+from .page import Page, save_page
+from .pairs import picture_grid
 from .palette import PALETTE, palette
 from .pictures import FeatureColors, legend_column, legend_strip, overlay_labels, save_picture
-from .plots import plot_codebook_history, plot_confusion, plot_training
+from .plots import plot_codebook_history, plot_confusion, plot_iou, plot_training
+from .quality import plot_quality_storage
+from .reports import CodebookRows, codebook_rows, plot_codebook_growth, plot_codebook_report
+from .shows import show_cloud
 from .through import look_through
+from .turntable import Orbit, estimate_up, orbit_cameras, save_turntable
 
 __all__ = [
     "PALETTE",
+    "CloudOptions",
+    "CodebookRows",
     "FeatureColors",
+    "Matches",
+    "Orbit",
+    "Page",
+    "add_boxes",
+    "add_camera_images",
     "add_cameras",
     "add_cloud",
     "add_legend",
+    "add_matches",
+    "add_names",
+    "add_scalar_bar",
+    "add_selections",
     "add_transfer",
     "available",
+    "codebook_rows",
+    "estimate_up",
+    "flythrough_cameras",
     "legend_column",
     "legend_strip",
+    "linked_clouds",
     "look_through",
     "make_plotter",
+    "match_states",
+    "orbit_cameras",
     "overlay_labels",
     "palette",
+    "picture_grid",
+    "plot_codebook_growth",
     "plot_codebook_history",
+    "plot_codebook_report",
     "plot_confusion",
+    "plot_distances",
+    "plot_iou",
+    "plot_quality_storage",
     "plot_training",
+    "recolor_cloud",
+    "save_animation",
+    "save_flythrough",
+    "save_frames",
+    "save_page",
     "save_picture",
+    "save_turntable",
+    "show_cloud",
 ]

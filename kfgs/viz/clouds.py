@@ -18,10 +18,7 @@ from ..cameras.camera import NEAR
 from ..gaussians import Gaussians
 from .cloud_colors import CloudColors, ColorBy, cloud_colors, seen_from
 from .ellipsoids import ellipsoids
-from .frusta import add_cameras as add_cameras
 from .gaussian_actor import Moving, as_gaussians
-from .legends import add_legend as add_legend
-from .matches import add_transfer as add_transfer
 from .meshes import draw_mesh
 from .pictures import FeatureColors
 

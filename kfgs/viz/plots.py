@@ -112,7 +112,7 @@ def plot_iou(
     said to be. Equal classes stay in class order.
 
     Args:
-        iou: for instance `ConfusionMatrix.iou()` or `SegmentationScores.iou`.
+        iou: for instance `ConfusionMatrix.iou()` or `SegmentationReport.iou`.
         names: class names.
         path: a .png file.
         reference: what to compare with, marked on each bar: the 2-D teacher's own IoU, or another method's.
