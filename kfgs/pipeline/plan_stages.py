@@ -63,13 +63,15 @@ class Sizes:
         folder: Path,
     ) -> Sizes:
         """What a scene and options say, and how fast the machine is now; the arguments are those of `plan_scene`."""
+        chosen = scene.views(config.split)
         if isinstance(teacher, str):
             check_weights(teacher, weights)
+            if ":" in teacher and dense != "recompute":
+                teacher = _own_maps(teacher, folder, [scene.stem(i) for i in chosen]) or teacher
 
         def cost(size: tuple[int, int]) -> TeacherCost:
             return teacher_cost(teacher, size, weights=weights, **options) if isinstance(teacher, str) else teacher
 
-        chosen = scene.views(config.split)
         counts = Counter(scene.cameras[i].size for i in chosen)
         views = tuple((count, size, cost(size)) for size, count in counts.items())
         made, others = Counter[tuple[int, int]](), None
@@ -304,6 +306,16 @@ def _existing(
             return Counter(), _say_others(folder, f"of another shape, {tuple(record.shape)}")
         made[size] += 1
     return made, None
+
+
+def _own_maps(teacher: str, folder: Path, stems: list[str]) -> TeacherCost | None:
+    """The cost of a teacher of one's own (`package.module:name`) that has made every map already: none; else None."""
+    manifest = read_manifest(folder)
+    if manifest is None or manifest.teacher.get("source") != teacher:
+        return None
+    records = [manifest.maps.get(stem) for stem in stems]
+    there = [record for record in records if record is not None and (folder / record.file).is_file()]
+    return TeacherCost.of_maps(teacher, there[0].shape) if len(there) == len(stems) else None
 
 
 def _say_others(folder: Path, which: str) -> str:

@@ -10,20 +10,23 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from .._files import digest_file, digest_value
 
 _DIGITS = 16  # of a digest of code: 64 bits
 _PLAIN = (bool, int, float, complex, str, bytes, type(None), type(Ellipsis))
+_NESTED = (tuple, list, slice, set, frozenset, dict, torch.dtype, torch.device)
 
 
 def code_identity(source: Any) -> dict[str, str]:
     """Where a function (or a class, or an object's class) lies, and a digest of its code.
 
     The digest is of the compiled code: instructions with their names and constants, and plain default arguments; of a
-    class, of all methods and plain attributes that it and its bases in the same module have. Comments, line numbers and
-    docstrings do not count. **Not noticed** are the values of globals and closures, the attributes of an object, and
-    changes in the functions that are called: who relies on those gives an `identity` of their own. Another minor version
-    of Python compiles to other code, and counts as a change.
+    class, of all methods and plain attributes (also in tuples, lists, dicts) that it and its bases in the same module
+    have. Comments, line numbers and docstrings do not count. **Not noticed** are the values of globals and closures, the
+    attributes of an object, nested classes, and changes in the functions that are called: who relies on those gives an
+    `identity` of their own. Another minor version of Python compiles to other code, and counts as a change.
 
     Returns:
         `source`, "package.module:name", and `code`, hexadecimal digits.
@@ -106,7 +109,7 @@ def _describe_class(source: type) -> list[Any]:
                 code = getattr(inspect.unwrap(getattr(method, "__func__", method)), "__code__", None)
                 if isinstance(code, types.CodeType):
                     found.append([base.__qualname__, name, _describe(method)])
-                elif isinstance(method, _PLAIN) and not name.startswith("__"):
+                elif isinstance(method, (*_PLAIN, *_NESTED)) and not name.startswith("__"):
                     found.append([base.__qualname__, name, _constant(method)])
     return found
 
@@ -124,6 +127,10 @@ def _constant(value: Any) -> Any:
         return [_constant(one) for one in value]
     if isinstance(value, slice):
         return ["slice", *(_constant(one) for one in (value.start, value.stop, value.step))]
-    if isinstance(value, frozenset):  # in no order, and another one in each process
+    if isinstance(value, set | frozenset):  # in no order, and another one in each process
         return ["set", *sorted(repr(one) for one in value)]
+    if isinstance(value, dict):
+        return ["dict", *([repr(key), _constant(one)] for key, one in value.items())]
+    if isinstance(value, torch.dtype | torch.device):
+        return repr(value)
     return repr(value) if isinstance(value, _PLAIN) else type(value).__qualname__

@@ -120,14 +120,14 @@ def test_maps_that_exist_need_no_teacher(big):
     assert plan.disk_bytes < 0.1 * GB
 
 
-def manifest(folder, teacher, shapes):
+def manifest(folder, teacher, shapes, **more):
     """A folder of maps as `extract_features` leaves it, of which only the records count here."""
     folder.mkdir()
     records = {}
     for stem, shape in shapes.items():
         (folder / f"{stem}.npy").write_bytes(b"map")
         records[stem] = MapRecord(f"{stem}.npy", shape, 3, 1, "0" * 64, f"{stem}.png", "0" * 64, 1.0)
-    Manifest({"name": teacher}, records).save(folder)
+    Manifest({"name": teacher, **more}, records).save(folder)
 
 
 def test_maps_that_the_teacher_has_made_are_not_made_again(big, tmp_path):
@@ -148,6 +148,15 @@ def test_maps_that_the_teacher_has_made_are_not_made_again(big, tmp_path):
     assert plan_scene(scene(59), folder=tmp_path).stages[0].name == "features"  # one lacks its map
     (tmp_path / "features" / "0.npy").write_bytes(b"map")
     assert plan_scene(scene(60), folder=tmp_path).stages[0].name == "codebook"
+
+
+def test_all_maps_of_a_teacher_of_ones_own_are_known(big, tmp_path):
+    shapes = {str(i): (90, 120, 512) for i in range(60)}
+    manifest(tmp_path / "features", "mine", shapes, source="mine:Teacher")
+    assert plan_scene(scene(60), teacher="mine:Teacher", folder=tmp_path).stages[0].name == "codebook"
+    for others in ({"teacher": "mine:Other"}, {"teacher": "mine:Teacher", "dense": "recompute"}):
+        assert plan_scene(scene(60), folder=tmp_path, **others).stages[0].name == "features"
+    assert plan_scene(scene(61), teacher="mine:Teacher", folder=tmp_path).stages[0].name == "features"
 
 
 def test_maps_of_others_do_not_count(big, tmp_path):

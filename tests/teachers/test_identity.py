@@ -65,6 +65,10 @@ def test_functions_are_seen_through_decorators_partials_and_within_functions():
     text = "class f:\n    cell = {}\n    @property\n    def a(self): return {}\n    @staticmethod\n    def b(x): return x + {}\n"
     codes = {code(text.format(*numbers)) for numbers in ((1, 1, 1), (2, 1, 1), (1, 2, 1), (1, 1, 2))}
     assert len(codes) == 4
+    text = "class f:\n    mean = {}\n    kind = {}\n    sizes = {{'a': {}}}"
+    kinds = ("torch.float16", "torch.float32")
+    codes = {code(text.format(*v)) for v in (((1, 2), kinds[0], [1]), ((1, 3), kinds[0], [1]), ((1, 2), kinds[1], [1]))}
+    assert len(codes | {code(text.format((1, 2), kinds[0], [2]))}) == 4
     text = "class f:\n    @cached\n    def a(self): return {}"
     codes = {code(text.format(number), cached=functools.cached_property) for number in (1, 2)}
     assert len(codes) == 2
