@@ -26,6 +26,7 @@ from .map_store import (
     sweep,
 )
 from .protocol import Teacher, as_teacher, identify
+from .torch_pickles import one_line
 
 
 @dataclass(frozen=True)
@@ -235,7 +236,7 @@ class _Maker:
         if others is not None and others.shape[2] != shape[2]:
             raise ValueError(
                 f"teacher {self.teacher.name!r}: expected {others.shape[2]} channels for {picture.path} as in "
-                f"{others.file}, got {shape[2]}; use one teacher with the same options for all pictures"
+                f"{one_line(others.file, 200)}, got {shape[2]}; use one teacher with the same options for all pictures"
             )
         expected = self.shapes.setdefault(size, shape)
         if expected != shape:

@@ -47,7 +47,8 @@ class FeatureFolder(Sequence[Tensor]):
 
     Args:
         path: the folder.
-        stems: image names without their ending, in the order wanted; all maps of the folder, sorted, if None.
+        stems: image names without their ending, in the order wanted; if None all maps of the folder, sorted, and all that
+            `features.json` tells of, which may lie in subfolders or have been discarded.
         channels: D that is expected, for instance that of the text embeddings; taken from the first map if None.
         sizes: (H, W) of each view's picture, which tells [h, w, D] from [D, h, w] where nothing else does.
         level: of LangSplat's masks: 0 to 3, or `default`, `s`, `m`, `l`.
@@ -94,7 +95,7 @@ class FeatureFolder(Sequence[Tensor]):
         records = manifest.maps if manifest else {}
         gone = manifest.gone(self.path) if manifest else {}
         self._own = manifest.files(self.path) if manifest else frozenset()
-        listed = [*list_maps(self.path, own=self._own), *gone] if stems is None else stems
+        listed = [*list_maps(self.path, own=self._own), *records] if stems is None else stems
         self.stems = _check_stems(self.path, listed, stems is None)
         if sizes is not None and len(sizes) != len(self.stems):
             raise ValueError(f"sizes: expected {len(self.stems)} (one per view), got {len(sizes)}; give one for each")
@@ -164,8 +165,10 @@ class FeatureFolder(Sequence[Tensor]):
         """[file name, SHA-256] of each view's map as far as it is known without reading the maps, else None.
 
         It is known where `features.json` tells of this very file, or of one that was discarded. LangSplat's maps are
-        digested here, both files together; the level and the stride are part of the name.
+        digested here, both files together; the level and the stride are part of the name. Where a map is LangSplat's or
+        gone, nobody else can tell all of them, so the others that are not known are digested here as well.
         """
+        gone = any(not file.is_file() for file in self.files)
         langsplat = [file.is_file() and layout_of(file, self._own) is LANGSPLAT for file in self.files]
         result = []
         for i, file in enumerate(self.files):
@@ -175,7 +178,7 @@ class FeatureFolder(Sequence[Tensor]):
                 result.append([f"{file.name} level {self.reading.level} stride {self.reading.stride or 'auto'}", both])
             elif record is not None:
                 result.append([file.name, record.digest])
-            elif any(langsplat):
+            elif gone or any(langsplat):
                 result.append([file.name, digest_file(file)])
             else:
                 return None
@@ -276,6 +279,6 @@ def _check_recorded(folder: Path, files: list[Path], own: Collection[Path]) -> N
     if others:
         raise ValueError(
             f"{others[0]}: expected a map that {MANIFEST} tells of, as kfgs filled this folder, got one without a record "
-            f"({len(others)} of {len(files)} views); run `kfgs features` again, which makes these maps, or move maps of "
-            "other programs to a folder of their own"
+            f"({len(others)} of {len(files)} views); move it away if another program made it, then run `kfgs features` "
+            "again, which makes these maps (it would write over one that is there)"
         )

@@ -9,9 +9,12 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from .._files import read_json, write_json
+from .torch_pickles import one_line
 
 MANIFEST = "features.json"
 FORMAT = "kfgs-features/1"
+LARGEST = 2**63 - 1  # of a number in a record: file systems and tensors know none beyond it
+LEVELS = 100  # of dicts and lists within a teacher's identity, which needs about three
 
 
 @dataclass(frozen=True)
@@ -71,13 +74,20 @@ def read_manifest(folder: str | Path) -> Manifest | None:
     path = Path(folder) / MANIFEST
     if not path.is_file():
         return None
-    found = read_json(path)
-    hint = "delete it to use the maps without it, or make them again with `kfgs features`"
+    hint = "delete it to use the maps without it, or delete it and run `kfgs features` with --overwrite, which makes them again"
+    try:
+        found = read_json(path)
+    except ValueError as error:
+        raise ValueError(f"{error}; {hint}") from error
+    except RecursionError as error:
+        raise ValueError(f"{path}: expected a manifest of kfgs, but it is nested too deeply; {hint}") from error
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise ValueError(f"{path}: expected format {FORMAT!r}, got something else; {hint}")
     try:
         kinds = {"teacher": dict, "maps": dict, "discarded": bool}
         teacher, maps, discarded = (_entry(found, name, kind) for name, kind in kinds.items())
+        if not _is_plain(teacher, LEVELS):
+            raise ValueError("teacher holds NaN or infinity, or is nested too deeply")
         return Manifest(teacher, {stem: _read_record(stem, entry) for stem, entry in maps.items()}, discarded)
     except ValueError as error:
         raise ValueError(f"{path}: expected a manifest of kfgs, but it is damaged ({error}); {hint}") from error
@@ -86,19 +96,31 @@ def read_manifest(folder: str | Path) -> Manifest | None:
 def _read_record(stem: str, found: Any) -> MapRecord:
     """One map's record out of JSON; a ValueError tells what in it cannot be."""
     if not isinstance(found, dict):
-        raise ValueError(f"{stem}: a record is a {type(found).__name__}")
+        raise ValueError(f"{one_line(stem)}: a record is a {type(found).__name__}")
     try:
         values = {name: _entry(found, name, kind) for name, kind in _KINDS.items()}
     except ValueError as error:
-        raise ValueError(f"{stem}: {error}") from error
+        raise ValueError(f"{one_line(stem)}: {error}") from error
     file, shape = PurePosixPath(values["file"]), values["shape"]
     if not file.name or file.is_absolute() or ".." in file.parts or "\0" in str(file):
-        raise ValueError(f"{stem}: file {str(file)[:80]!r} is no name within the folder")
-    if len(shape) != 3 or not all(type(size) is int and size > 0 for size in shape):
-        raise ValueError(f"{stem}: shape {str(shape)[:80]} is not three positive whole numbers")
-    if min(values["bytes"], values["seconds"]) < 0 or not math.isfinite(values["seconds"]):
-        raise ValueError(f"{stem}: bytes and seconds cannot be {values['bytes']} and {values['seconds']}")
+        raise ValueError(f"{one_line(stem)}: file {str(file)[:80]!r} is no name within the folder")
+    if len(shape) != 3 or not all(type(size) is int and 0 < size <= LARGEST for size in shape):
+        raise ValueError(f"{one_line(stem)}: shape {str(shape)[:80]} is not three positive whole numbers")
+    if not all(0 <= values[name] <= LARGEST for name in ("bytes", "seconds")):  # NaN fails every comparison
+        numbers = f"{str(values['bytes'])[:30]} and {str(values['seconds'])[:30]}"
+        raise ValueError(f"{one_line(stem)}: bytes and seconds cannot be {numbers}")
     return MapRecord(**{**values, "shape": tuple(shape)})
+
+
+def _is_plain(value: Any, levels: int) -> bool:
+    """Whether a value out of JSON can be written back: finite numbers, and not nested deeper than `levels`."""
+    if isinstance(value, float):
+        return math.isfinite(value)
+    if not isinstance(value, dict | list):
+        return True
+    return levels > 0 and all(
+        _is_plain(one, levels - 1) for one in (value.values() if isinstance(value, dict) else value)
+    )
 
 
 def _entry(found: dict[str, Any], name: str, kind: type | tuple[type, ...]) -> Any:

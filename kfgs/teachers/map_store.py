@@ -16,6 +16,7 @@ from torch import Tensor
 from .._files import bytes_in_words, digest_file
 from .manifest import MANIFEST, Manifest, MapRecord, read_manifest
 from .protocol import Teacher, check_features
+from .torch_pickles import one_line
 
 try:
     import fcntl
@@ -199,7 +200,8 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
     """What two identities do not agree in: `weights: 'a81f...' there, '77c0...' now`."""
 
     def short(value: Any) -> str:
-        text = json.dumps(value) if not isinstance(value, str) else value
+        # one is out of a file, so nothing in it is shown raw; JSON is escaped already
+        text = one_line(value, 1000) if isinstance(value, str) else json.dumps(value)
         return text if len(text) <= 40 else text[:12] + "..."
 
     parts = []
@@ -209,7 +211,7 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
             parts.append(differences(a, b))
         elif a != b:
             there, now = (short(side[key]) if key in side else "none" for side in (old, new))
-            parts.append(f"{key}: {there} there, {now} now")
+            parts.append(f"{one_line(key)}: {there} there, {now} now")
     return "; ".join(parts)
 
 

@@ -10,8 +10,9 @@ from pathlib import Path
 from .._check import check_whole
 from ..quant import EPS, row_norms
 from .langsplat import parse_level
-from .layouts import FEATURE_3DGS, ROW_BLOCK, Reading, StoredMap, count_bad, fits_aspect, open_map, read_block
+from .layouts import FEATURE_3DGS, OWN, ROW_BLOCK, Reading, StoredMap, count_bad, fits_aspect, open_map, read_block
 from .manifest import MANIFEST, Manifest, read_manifest
+from .map_store import doubt_file
 from .stems import explain_missing, find_maps, list_maps, three
 
 HOLES = 0.5  # share of all-zero features from which a map is worth a note
@@ -94,7 +95,7 @@ def check_feature_folder(
     another size than most maps have, or one that looks transposed beside the picture; NaN or infinite values; a map of
     nothing but zeros; a map that kfgs did not write among its own. A note is: maps of one size whose aspect is not the
     pictures', up to one cell, as encoders of a fixed grid make them; double precision, many all-zero features, maps of no
-    view, discarded maps.
+    view, discarded maps, maps of kfgs that changed since they were written.
 
     One map is looked at at a time, a few rows in memory.
 
@@ -102,7 +103,8 @@ def check_feature_folder(
         folder: folder of maps, in any layout that `FeatureFolder` reads.
         pictures: stem and (height, width) of each view's picture.
         channels: D that is expected, if it is known.
-        values: False looks at the shape and the kind only, in milliseconds, and reads no value.
+        values: False looks at the shape and the kind only, in milliseconds, and reads no value; a map that may have been
+            copied rather than changed is not told from one that was.
         level: of LangSplat's masks, as for `FeatureFolder`.
         stride: of LangSplat's masks, as for `FeatureFolder`.
 
@@ -121,6 +123,8 @@ def check_feature_folder(
     manifest = read_manifest(root)
     own = manifest.files(root) if manifest else frozenset()
     files = _present(root, stems, manifest, found)
+    if manifest is not None:
+        _look_at_records(root, files, manifest, found, values=values)
     reading = {
         stem: Reading(channels, (int(size[0]), int(size[1])), parse_level(level), stride) for stem, size in pictures
     }
@@ -165,7 +169,10 @@ def _present(root: Path, stems: list[str], manifest: Manifest | None, found: _Fi
     maps = dict(zip(rest, find_maps(root, rest, own), strict=True))
     missing = [stem for stem, files in maps.items() if not files]
     for stem in missing:
-        found.problem(stem + FEATURE_3DGS.suffix, "missing, and no other layout of this view either")
+        if manifest is None:
+            found.problem(stem + FEATURE_3DGS.suffix, "missing, and no other layout of this view either")
+        else:
+            found.problem(stem + OWN.suffix, "missing; `kfgs features` with the --split of this view makes it")
     if len(missing) == len(stems):
         found.note("", explain_missing(root, stems, missing))
     for stem, files in maps.items():
@@ -183,6 +190,23 @@ def _present(root: Path, stems: list[str], manifest: Manifest | None, found: _Fi
     if others:
         found.note("", f"maps of none of these views: {len(others)} ({three(others)})")
     return chosen
+
+
+def _look_at_records(root: Path, files: dict[str, Path], manifest: Manifest, found: _Findings, *, values: bool) -> None:
+    """Note the maps that are not as they were written; a file is read only if it has the size, but not the time."""
+    touched = []
+    for stem, file in files.items():
+        record = manifest.maps.get(stem)
+        if record is None or file != root / record.file:
+            continue
+        info = file.stat()
+        if info.st_size == record.bytes and not values:
+            touched += [stem] if info.st_mtime_ns != record.mtime_ns else []
+        elif doubt_file(file, record) is not None:
+            found.note(record.file, "has changed since it was written; `kfgs features` makes it again")
+    if touched:
+        text = f"maps copied or changed since they were written: {len(touched)} of {len(files)} ({three(touched)})"
+        found.note("", text)
 
 
 def _open(file: Path, reading: Reading, root: Path, own: Collection[Path], found: _Findings) -> StoredMap | None:

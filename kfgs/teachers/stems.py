@@ -8,7 +8,8 @@ from collections.abc import Container, Sequence
 from pathlib import Path, PurePosixPath
 
 from ..scenes.scene import IMAGE_SUFFIXES
-from .layouts import FEATURE_3DGS, LANGSPLAT, LAYOUTS, layout_of
+from .layouts import FEATURE_3DGS, LANGSPLAT, LAYOUTS, OWN, layout_of
+from .manifest import MANIFEST
 
 
 def list_maps(folder: Path, *, deep: bool = False, own: Container[Path] = ()) -> dict[str, list[Path]]:
@@ -63,8 +64,16 @@ def find_maps(folder: Path, stems: Sequence[str], own: Container[Path] = ()) -> 
 
 def explain_missing(folder: Path, stems: Sequence[str], missing: Sequence[str]) -> str:
     """What to say when views have no map: which, and how the maps that are there are called."""
-    named = ", ".join(stem + FEATURE_3DGS.suffix for stem in missing[:5]) + (", ..." if len(missing) > 5 else "")
-    text = f"expected a feature map for each of {len(stems)} views, {len(missing)} missing: {named} (or .npy)"
+    ours = (folder / MANIFEST).is_file()
+    suffix = OWN.suffix if ours else FEATURE_3DGS.suffix
+    named = ", ".join(stem + suffix for stem in missing[:5]) + (", ..." if len(missing) > 5 else "")
+    text = f"expected a feature map for each of {len(stems)} views, {len(missing)} missing: {named}"
+    if ours:  # the maps are called as the pictures were, so it is views that are missing, not names that differ
+        return (
+            f"{text}; make them with `kfgs features ... --split all --out {folder}` (or the split of these views), or leave "
+            "them out of `stems`"
+        )
+    text += " (or .npy)"
     others = [stem for stem in list_maps(folder, deep=True) if stem not in set(stems)]
     if len(missing) == len(stems) and others:
         return (

@@ -17,7 +17,7 @@ from PIL import Image
 import kfgs
 from kfgs.teachers.cache import Picture, check_discardable, discard_maps, extract_features
 from kfgs.teachers.folder import FeatureFolder
-from kfgs.teachers.manifest import read_manifest
+from kfgs.teachers.manifest import Manifest, read_manifest
 from kfgs.teachers.map_store import LOCK
 
 STEMS = ["a", "b", "sub/c"]
@@ -326,6 +326,20 @@ def test_foreign_maps_that_were_given_up_do_not_pass_for_ours_when_the_call_dies
         FeatureFolder(folder, ["a", "b"])
     extract_features(Counting(), pictures, folder)
     assert FeatureFolder(folder, ["a", "b"])[1].max() < 7
+
+
+def test_what_a_manifest_says_of_its_teacher_is_shown_in_one_line(pictures, tmp_path):
+    folder = tmp_path / "maps"
+    evil = {"name": "a\n\x1b[31mOK", "k\ney": {"deep": ["b\n\x07"]}, "weights": "\r" + "x" * 100}
+    folder.mkdir()
+    Manifest(evil).save(folder)
+    with pytest.raises(ValueError, match="expected maps of the same teacher as now") as caught:
+        extract_features(Counting(), pictures, folder)
+    text = str(caught.value)
+    assert text.isprintable()
+    assert r"name: a\n\x1b[31mOK there, counting now" in text
+    assert r"k\ney: " in text
+    assert r"weights: \rxxxxxxxxxx... there, w1 now" in text
 
 
 def test_pictures_called_like_langsplats_files(pictures, tmp_path):

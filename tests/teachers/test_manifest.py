@@ -15,6 +15,16 @@ def folder(tmp_path):
     return tmp_path
 
 
+WAY_OUT = "delete it to use the maps without it, or delete it and run `kfgs features` with --overwrite, which makes them again"
+
+
+def nested(levels: int) -> dict:
+    found: dict = {}
+    for _ in range(levels):
+        found = {"a": found}
+    return found
+
+
 def change(folder, **values) -> None:
     """Put other values into the one record, or into the manifest."""
     about = json.loads((folder / "features.json").read_text())
@@ -63,6 +73,12 @@ def test_what_is_saved_comes_back(folder):
         ({"maps": []}, "maps is a list"),
         ({"teacher": [["a", 1]]}, "teacher is a list"),
         ({"discarded": 1}, "discarded is a int"),
+        ({"seconds": 10**400}, "sub/a: bytes and seconds cannot be 248 and 100000"),
+        ({"bytes": 10**400}, "sub/a: bytes and seconds cannot be 100000"),
+        ({"shape": [10**400, 2, 3]}, "sub/a: shape [100000"),
+        ({"maps": {"a\n\x1b[31m": []}}, r"a\n\x1b[31m: a record is a list"),
+        ({"teacher": {"name": "t", "options": {"scale": float("inf")}}}, "teacher holds NaN or infinity"),
+        ({"teacher": nested(100)}, "or is nested too deeply"),
     ],
 )
 def test_what_kfgs_never_wrote_is_refused_in_a_line_that_names_the_file(folder, values, words):
@@ -72,8 +88,9 @@ def test_what_kfgs_never_wrote_is_refused_in_a_line_that_names_the_file(folder, 
             read(folder)
         text = str(caught.value)
         assert text.startswith(f"{folder / 'features.json'}: expected a manifest of kfgs, but it is damaged (")
-        assert text.endswith("delete it to use the maps without it, or make them again with `kfgs features`")
-        assert "\n" not in text
+        assert text.endswith(f"; {WAY_OUT}")
+        assert text.isprintable()  # no line ends, no control characters
+        assert len(text) < 500 + len(str(folder))
 
 
 @pytest.mark.parametrize("text", ["[]", "{}", '{"format": "kfgs-features/9"}'])
@@ -81,3 +98,27 @@ def test_another_format_is_named(tmp_path, text):
     (tmp_path / "features.json").write_text(text)
     with pytest.raises(ValueError, match=r"features\.json: expected format 'kfgs-features/1', got something else"):
         read_manifest(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", "expected a JSON file, but it cannot be parsed (Expecting property name"),
+        ("[" * 100_000 + "]" * 100_000, "expected a manifest of kfgs, but it is nested too deeply"),
+        ('{"seconds": ' + "1" * 5000 + "}", "expected a JSON file, but it cannot be parsed (Exceeds the limit"),
+    ],
+)
+def test_what_is_no_json_says_the_way_out(tmp_path, text, words):
+    (tmp_path / "features.json").write_text(text)
+    with pytest.raises(ValueError, match=re.escape(words)) as caught:
+        read_manifest(tmp_path)
+    assert str(caught.value).startswith(f"{tmp_path / 'features.json'}: expected a ")
+    assert str(caught.value).endswith(f"; {WAY_OUT}")
+
+
+def test_an_identity_that_is_deep_but_sane_is_kept(folder):
+    change(folder, teacher=nested(99))
+    found = read_manifest(folder)
+    assert found.teacher == nested(99)
+    found.save(folder)
+    assert read_manifest(folder) == found

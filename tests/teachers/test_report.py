@@ -1,7 +1,10 @@
+import os
+
 import numpy as np
 import pytest
 import torch
 
+from kfgs._files import digest_file
 from kfgs.teachers import FeatureFolder, Manifest
 from kfgs.teachers.manifest import MapRecord
 from kfgs.teachers.report import check_feature_folder
@@ -11,6 +14,14 @@ SIZE = (60, 80)  # of the pictures; maps are 6 x 8
 
 def features(seed: int, size: tuple[int, int, int] = (6, 8, 16)) -> torch.Tensor:  # [h, w, D]
     return torch.randn(size, generator=torch.Generator().manual_seed(seed))
+
+
+def record_of(folder, stem: str) -> MapRecord:
+    """What the manifest says about a map as it lies there."""
+    file = folder / f"{stem}.npy"
+    info = file.stat()
+    digest = digest_file(file)
+    return MapRecord(file.name, (6, 8, 16), info.st_size, info.st_mtime_ns, digest, f"{stem}.png", "0" * 64, 0.1)
 
 
 def pictures(*stems: str, size: tuple[int, int] = SIZE) -> list[tuple[str, tuple[int, int]]]:
@@ -175,12 +186,39 @@ def test_several_files_of_one_view(folder):
 def test_discarded_maps_are_a_note(tmp_path):
     np.save(tmp_path / "a.npy", features(0).numpy())
     records = {
-        stem: MapRecord(f"{stem}.npy", (6, 8, 16), 1, 1, "0" * 64, f"{stem}.png", "0" * 64, 0.1) for stem in ("a", "b")
+        "a": record_of(tmp_path, "a"),
+        "b": MapRecord("b.npy", (6, 8, 16), 1, 1, "0" * 64, "b.png", "0" * 64, 0.1),
     }
     Manifest({"name": "t"}, records, discarded=True).save(tmp_path)
     report = check_feature_folder(tmp_path, pictures("a", "b"))
     assert report.ok
     assert report.notes == {"": ["maps that were discarded once index maps had been made: 1 of 2"]}
+
+
+def test_a_map_that_changed_since_kfgs_wrote_it_is_a_note(folder):
+    Manifest({"name": "t"}, {stem: record_of(folder, stem) for stem in "abc"}).save(folder)
+    assert check_feature_folder(folder, pictures("a", "b", "c")).notes == {}
+    os.utime(folder / "a.npy", ns=(1, 1))  # the same bytes, as in a copy
+    np.save(folder / "b.npy", features(7).numpy().astype(np.float16))  # as many others
+    os.utime(folder / "b.npy", ns=(1, 1))
+    np.save(folder / "c.npy", features(2).numpy())  # single precision
+    changed = ["has changed since it was written; `kfgs features` makes it again"]
+    report = check_feature_folder(folder, pictures("a", "b", "c"))
+    assert report.ok
+    assert report.notes == {"b.npy": changed, "c.npy": changed}
+    report = check_feature_folder(folder, pictures("a", "b", "c"), values=False)  # reads neither
+    assert report.notes == {"": ["maps copied or changed since they were written: 2 of 3 (a, b)"], "c.npy": changed}
+
+
+def test_a_view_that_kfgs_made_no_map_of_is_sent_to_its_command(folder):
+    Manifest({"name": "t"}, {stem: record_of(folder, stem) for stem in "abc"}).save(folder)
+    report = check_feature_folder(folder, pictures("a", "d"))
+    assert report.problems == {"d.npy": ["missing; `kfgs features` with the --split of this view makes it"]}
+    report = check_feature_folder(folder, pictures("d", "e"))
+    assert report.notes[""] == [
+        f"expected a feature map for each of 2 views, 2 missing: d.npy, e.npy; make them with `kfgs features ... --split all "
+        f"--out {folder}` (or the split of these views), or leave them out of `stems`"
+    ]
 
 
 def test_a_map_without_a_record_among_kfgss_own_is_a_problem(tmp_path):

@@ -1,4 +1,5 @@
-from kfgs.teachers.stems import find_maps, list_maps
+from kfgs.teachers.manifest import Manifest
+from kfgs.teachers.stems import explain_missing, find_maps, list_maps
 
 
 def touch(folder, *names: str) -> None:
@@ -39,3 +40,14 @@ def test_what_kfgs_wrote_is_a_map_whatever_the_picture_is_called(tmp_path):
     assert sorted(list_maps(tmp_path, own=own)) == ["a_f", "a_s", "b_f", "b_s", "c", "d.png"]
     found = find_maps(tmp_path, ["a_s", "a_f", "a", "b_s", "c"], own)
     assert [names(tmp_path, files) for files in found] == [["a_s.npy"], ["a_f.npy"], [], ["b_s.npy"], ["c_s.npy"]]
+
+
+def test_what_to_do_about_missing_maps_depends_on_who_makes_them(tmp_path):
+    touch(tmp_path, "x.npy")
+    assert explain_missing(tmp_path, ["a"], ["a"]).endswith("but the pictures a: rename the maps by their pictures")
+    Manifest({"name": "t"}).save(tmp_path)
+    text = explain_missing(tmp_path, ["a"], ["a"])
+    assert text.startswith(
+        "expected a feature map for each of 1 views, 1 missing: a.npy; make them with `kfgs features ... "
+    )
+    assert f"--split all --out {tmp_path}`" in text
