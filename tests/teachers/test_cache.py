@@ -407,6 +407,17 @@ def test_a_resumed_run_checks_sizes_against_the_maps_that_are_there(pictures, tm
         extract_features(changed, pictures, tmp_path / "maps")
 
 
+def test_a_map_that_is_named_after_its_record_is_shown_in_one_line(pictures, tmp_path):
+    folder = tmp_path / "maps"
+    named = Picture("a\n\x1b[31m", pictures[0].path)  # a name that Linux allows
+    extract_features(Counting(dim=5), [named], folder)
+    with pytest.raises(
+        ValueError, match=r"expected 5 channels for .*b\.png as in a\\n\\x1b\[31m\.npy, got 4"
+    ) as caught:
+        extract_features(Counting(dim=4), [pictures[1]], folder)
+    assert str(caught.value).isprintable()
+
+
 def test_pictures_of_other_sizes_may_have_maps_of_other_sizes(pictures, tmp_path):
     paint(pictures[1].path, 7, (10, 12))
     manifest = extract_features(Counting(), pictures, tmp_path / "maps")
