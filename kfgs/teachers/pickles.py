@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from .pickle_names import attributes_of, is_getattr, is_unsafe, is_unsafe_attribute, is_way
+from .pickle_names import attributes_of, is_getattr, is_getter, is_unsafe, is_unsafe_attribute, is_way
 
 
 def _words(text: str) -> frozenset[str]:
@@ -97,7 +97,8 @@ def read_pickle(
         persistent: turns a persistent id (torch: a storage) into a value; must check it too.
 
     Raises:
-        UnsafePickleError: if a dangerous global is named anywhere before the end, called or not, or reached by `getattr`.
+        UnsafePickleError: if a dangerous global is named anywhere before the end, called or not, or reached by `getattr`;
+            or if `getattr` itself is anything but called (an argument, an item, a state).
         BrokenPickleError: if this is no pickle, arguments do not fit `builders`, or it would grow out of proportion.
     """
     machine = _Machine(builders, persistent)
@@ -150,7 +151,11 @@ class _Machine:
 
     def _pop_marked(self) -> list[Any]:
         items, self.stack = self.stack, self.marked.pop()
-        return items
+        return _held(items)
+
+    def _pop_held(self) -> Any:
+        """The top of the stack, as part of something else."""
+        return _held([self.stack.pop()])[0]
 
     def _mark(self, _: Any) -> None:
         self.marked.append(self.stack)
@@ -175,14 +180,14 @@ class _Machine:
         return tuple(self._pop_marked())
 
     def _tuple1(self, _: Any) -> tuple[Any, ...]:
-        return (self.stack.pop(),)
+        return (self._pop_held(),)
 
     def _tuple2(self, _: Any) -> tuple[Any, ...]:
-        b, a = self.stack.pop(), self.stack.pop()
+        b, a = self._pop_held(), self._pop_held()
         return a, b
 
     def _tuple3(self, _: Any) -> tuple[Any, ...]:
-        c, b, a = self.stack.pop(), self.stack.pop(), self.stack.pop()
+        c, b, a = self._pop_held(), self._pop_held(), self._pop_held()
         return a, b, c
 
     def _dict(self, _: Any) -> dict[str, Any]:
@@ -196,7 +201,7 @@ class _Machine:
         self._pop_marked()
 
     def _append(self, _: Any) -> None:
-        self._extend([self.stack.pop()])
+        self._extend([self._pop_held()])
 
     def _appends(self, _: Any) -> None:
         self._extend(self._pop_marked())
@@ -206,7 +211,7 @@ class _Machine:
             self.stack[-1].extend(items)
 
     def _setitem(self, _: Any) -> None:
-        value, key = self.stack.pop(), self.stack.pop()
+        value, key = self._pop_held(), self._pop_held()
         self._update([(key, value)])
 
     def _setitems(self, _: Any) -> None:
@@ -244,15 +249,14 @@ class _Machine:
 
     def _call(self, function: Any, arguments: Any) -> Any:
         name = function.name if isinstance(function, Global) else "an inert object"
-        if type(arguments) not in (list, tuple):  # a named tuple, which is inert
-            arguments = ()
+        listed = arguments if type(arguments) in (list, tuple) else ()  # a named tuple is inert
         if name in self.builders:
-            self._charge(arguments)
-            return self.builders[name](*arguments)
-        self._follow(name, arguments)
-        if is_getattr(name) and len(arguments) > 1 and isinstance(arguments[0], Global):
-            reached = f"{arguments[0].name}.{arguments[1]}"  # a nested class, most likely
-            return self._named(reached, is_unsafe(reached))
+            self._charge(listed)
+            return self.builders[name](*listed)
+        if isinstance(function, Global) and is_way(name):
+            return self._follow(name, listed)
+        if not isinstance(function, Global):
+            _check_inert_call(function, listed)
         return Inert(name)
 
     def _charge(self, arguments: Sequence[Any]) -> None:
@@ -263,17 +267,21 @@ class _Machine:
         if self.copied > self.done:
             raise BrokenPickleError("it copies one list many times, which no state dict does")
 
-    def _follow(self, name: str, arguments: Sequence[Any]) -> None:
-        """Refuse the ways around names: an attribute that is dangerous or computed, `getattr` given to another function."""
-        for attribute in attributes_of(name, arguments):
+    def _follow(self, name: str, arguments: Sequence[Any]) -> Any:
+        """The result of `getattr` or `attrgetter`, refused if an attribute is dangerous or computed."""
+        attributes = attributes_of(name, arguments)
+        if not attributes or len(arguments) > _ARGUMENTS:
+            raise UnsafePickleError(f"{name} of a name that it hides")
+        for attribute in attributes:
             if type(attribute) is not str:
                 raise UnsafePickleError(f"{name} of a name that it computes")
             if len(attribute) > _NAME or is_unsafe_attribute(attribute):
                 owner = arguments[0].name + "." if is_getattr(name) and isinstance(arguments[0], Global | Inert) else ""
                 raise UnsafePickleError(f"{owner}{attribute[:_NAME]}")
-        for argument in arguments[:_ARGUMENTS]:
-            if isinstance(argument, Global) and is_way(argument.name):
-                raise UnsafePickleError(argument.name)
+        if is_getattr(name) and isinstance(arguments[0], Global):
+            reached = f"{arguments[0].name}.{arguments[1]}"  # a nested class, most likely
+            return self._named(reached, is_unsafe(reached))
+        return Inert(name)
 
     def _reduce(self, _: Any) -> Any:
         arguments, function = self.stack.pop(), self.stack.pop()
@@ -282,24 +290,43 @@ class _Machine:
     _newobj = _reduce
 
     def _newobj_ex(self, _: Any) -> Any:
-        self.stack.pop()  # keyword arguments
+        self._pop_held()  # keyword arguments
         return self._reduce(None)
 
     def _obj(self, _: Any) -> Any:
-        function, *arguments = self._pop_marked()
-        return self._call(function, arguments)
+        (function, *arguments), self.stack = self.stack, self.marked.pop()
+        return self._call(function, _held(arguments))
 
     def _inst(self, argument: str) -> Any:
         return self._call(self._global(argument), self._pop_marked())
 
     def _build(self, _: Any) -> None:
-        self.stack.pop()  # the state of an object that was not made, or attributes of a dict (`_metadata`)
+        self._pop_held()  # the state of an object that was not made, or attributes of a dict (`_metadata`)
 
     def _persid(self, argument: str) -> Any:
         return self.persistent(argument)
 
     def _binpersid(self, _: Any) -> Any:
-        return self.persistent(self.stack.pop())
+        return self.persistent(self._pop_held())
+
+
+def _held(values: list[Any]) -> list[Any]:
+    """`values`, which become part of something else: refused if `getattr` is one, since another would call it unseen."""
+    for value in values:
+        if type(value) is Global and is_way(value.name):
+            raise UnsafePickleError(value.name)
+    return values
+
+
+def _check_inert_call(function: Any, arguments: Sequence[Any]) -> None:
+    """Refuse to fetch items with a getter, and to give a dangerous name to what was not made (a `partial` of getattr)."""
+    if isinstance(function, Inert) and is_getter(function.name):
+        raise UnsafePickleError(f"{function.name}, called")
+    if len(arguments) > _ARGUMENTS:
+        raise BrokenPickleError(f"it calls something with more than {_ARGUMENTS} arguments")
+    for argument in arguments:
+        if type(argument) is str and len(argument) <= _NAME and is_unsafe_attribute(argument):
+            raise UnsafePickleError(argument)
 
 
 def string_items(pairs: Any) -> dict[str, Any]:

@@ -143,8 +143,10 @@ class Views:
             last += (size - 1) * stride
         held = max(length // itemsize - storage.offset, 0)
         if storage.numel > held or count > storage.numel or (count and last >= storage.numel):
+            inside = storage.numel <= held and last < storage.numel
+            why = " (its values are repeated by strides; save it contiguous)" if inside else ""
             raise BrokenPickleError(
-                f"of size {list(entry.size)[:8]} does not fit into the {held} values of its storage"
+                f"of size {list(entry.size)[:8]} does not fit into the {held} values of its storage{why}"
             )
         if not count:
             try:

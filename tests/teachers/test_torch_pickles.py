@@ -51,3 +51,15 @@ def test_the_key_of_a_storage_is_short() -> None:
     assert Storages()(key(256)).numel == 4
     with pytest.raises(BrokenPickleError, match="storage of unknown type"):
         Storages()(key(257))
+
+
+@pytest.mark.parametrize(("size", "stride"), [((5, 2), (1, 0)), ((3, 3), (1, 1))])
+def test_repeated_values_are_named(size: tuple[int, int], stride: tuple[int, int]) -> None:
+    """An expanded tensor is honest, and not damaged: the user can save it otherwise."""
+    with pytest.raises(BrokenPickleError, match="its values are repeated by strides; save it contiguous"):
+        Views(make_file(0)).tensor(Entry(FLOATS, 0, size, stride), 0, 20)
+
+
+def test_values_beyond_the_storage_are_not_called_repeated() -> None:
+    with pytest.raises(BrokenPickleError, match="does not fit into the 5 values of its storage$"):
+        Views(make_file(0)).tensor(Entry(FLOATS, 0, (6,), (1,)), 0, 20)
