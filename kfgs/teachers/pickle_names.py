@@ -6,7 +6,6 @@ that runs commands, code or files, and one that is only a way to other names (`g
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
@@ -101,7 +100,8 @@ def is_unsafe_attribute(path: str) -> bool:
 
 def _bare(path: str) -> list[str]:
     """The words of a dotted name without underscores in front."""
-    return re.sub(r"(^|\.)_+", r"\1", path).split(".")
+    words = path.split(".")
+    return [word.lstrip("_") for word in words] if "_" in path else words
 
 
 def is_getattr(name: str) -> bool:

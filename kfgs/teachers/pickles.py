@@ -39,6 +39,7 @@ _STEPS = (
     10_000_000  # about 300,000 tensors; bounds the time, and the memory that one-byte opcodes ask for (60 bytes each)
 )
 _NAME = 256  # characters of a global's name: two memoised texts of any length would be joined again and again
+_WORDS = 32  # of a global's name, each of which is looked up; Python's own have less than 10
 _KEY = 4096  # characters of a dict's key: equal keys that are two objects are compared again and again
 _ARGUMENTS = 64  # of a call that a builder answers; torch's have 7
 _WITHOUT_RESULT = _words("MARK POP POP_MARK ADDITEMS APPEND APPENDS SETITEM SETITEMS BUILD")
@@ -224,6 +225,8 @@ class _Machine:
     def _global(self, argument: str) -> Global:  # "module name", as pickletools joins them
         module, _, path = argument.partition(" ")
         name = f"{module}.{path}" if path else module
+        if name.count(".") >= _WORDS:
+            raise BrokenPickleError(f"it names a global by more than {_WORDS} words")
         inside = path.rpartition(".")[0]  # of a dotted path: what lies on the way
         return self._named(name, is_unsafe(name) or is_unsafe_attribute(inside))
 
@@ -253,10 +256,14 @@ class _Machine:
         if name in self.builders:
             self._charge(listed)
             return self.builders[name](*listed)
-        if isinstance(function, Global) and is_way(name):
+        if isinstance(function, Global) and not is_way(name):
+            return Inert(name)
+        self.copied += len(listed)  # each is looked at
+        if self.copied > self.done:
+            raise BrokenPickleError("it gives the same arguments many times, which no state dict does")
+        if isinstance(function, Global):
             return self._follow(name, listed)
-        if not isinstance(function, Global):
-            _check_inert_call(function, listed)
+        _check_inert_call(function, listed)
         return Inert(name)
 
     def _charge(self, arguments: Sequence[Any]) -> None:

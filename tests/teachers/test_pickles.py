@@ -109,6 +109,13 @@ def test_the_name_of_a_global_is_short() -> None:
         read_pickle(io.BytesIO(b"c" + b"a" * 300 + b"\nb\n."), {})
 
 
+def test_names_of_many_words_are_refused() -> None:
+    """Each word is looked up, and five bytes name a global again."""
+    assert read_pickle(io.BytesIO(b"c" + b"a." * 30 + b"a\nb\n."), {}).name == "a." * 31 + "b"
+    with pytest.raises(BrokenPickleError, match="names a global by more than 32 words"):
+        read_pickle(io.BytesIO(b"c" + b"a." * 31 + b"a\nb\n."), {})
+
+
 def test_long_keys_are_left_out() -> None:
     value = {"k" * 4096: 1, "k" * 4097: 2}
     assert read_pickle(io.BytesIO(pickle.dumps(value)), {}) == {"k" * 4096: 1}
@@ -123,3 +130,11 @@ def test_memory_is_in_proportion_to_the_bytes() -> None:
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert peak < 90 * len(many), many[:1]
+
+
+@pytest.mark.parametrize("function", [b"coperator\nattrgetter\n", b"cfunctools\npartial\n)R"])
+def test_one_memoised_tuple_is_not_looked_through_again_and_again(function: bytes) -> None:
+    """Attributes and arguments are compared with the dangerous names: 64 of them would be, for each three bytes."""
+    body = function + b"p0\n0(" + b"Va\n" * 60 + b"tp1\n0" + b"g0\ng1\nR0" * 10 + b"N."
+    with pytest.raises(BrokenPickleError, match="gives the same arguments many times"):
+        read_pickle(io.BytesIO(body), {})
