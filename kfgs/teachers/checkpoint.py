@@ -195,7 +195,10 @@ def _tensors(path: Path, found: Any, extent: Callable[[Storage], tuple[int, int]
             try:
                 tensors[name] = views.tensor(entry, *extent(entry.storage))
             except BrokenPickleError as error:
-                raise _refusal(path, f"one whose tensor {one_line(name)} {error}: damaged") from error
+                got = f"one whose tensor {one_line(name)} {error}"
+                if "save it contiguous" in got:
+                    raise ValueError(f"{path}: {_EXPECTED}, got {got}") from error
+                raise _refusal(path, f"{got}: damaged") from error
     return tensors
 
 
