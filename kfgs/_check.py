@@ -85,3 +85,15 @@ def check_whole(name: str, value: float, low: int, high: float = float("inf")) -
     if not isinstance(value, numbers.Integral) or isinstance(value, bool):
         raise ValueError(f"{name}: expected a whole number, got {value!r}; pass an int")
     check_range(name, int(value), low, high)
+
+
+def one_line(text: object, length: int = 60) -> str:
+    """A name out of an untrusted file for a message: one line, no control characters, not long."""
+    shown = ascii(str(text))[1:-1]
+    return shown if len(shown) <= length else shown[:length] + "..."
+
+
+def error_line(error: BaseException) -> str:
+    """The first line of an error, with its type before it and at most 200 characters of its own."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0][:200] if lines else ''}".rstrip(": ")

@@ -5,14 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from cases_color import make_field, make_splat
+from cases_teach import TINY, save_checkpoint
 from small_room import CONFIG, make_room
 
 import kfgs
 from kfgs import load_label_set, read_splats
-from kfgs.teachers.lseg import LSegConfig
-from kfgs.teachers.lseg.layout import random_state
 
 README = Path(kfgs.__file__).parents[1] / "README.md"
 
@@ -51,14 +49,12 @@ def test_examples_run_one_after_the_other(examples, desk, monkeypatch):
 
 
 def test_the_example_of_a_teacher_runs_with_a_tiny_lseg(examples, tmp_path, monkeypatch):
-    sizes = {"width": 32, "depth": 4, "heads": 4, "position_grid": 3, "window": 64, "hooks": (0, 1, 2, 3)}
-    tiny = LSegConfig(**sizes, neck=(8, 8, 16, 16), fusion=8, dim=16, text_width=16, text_layers=2, text_heads=2)
     make_room(tmp_path / "scene")
     monkeypatch.chdir(tmp_path)
-    torch.save({"state_dict": random_state(tiny, torch.Generator().manual_seed(0))}, "demo_e200.ckpt")
+    save_checkpoint(Path("demo_e200.ckpt"))
     teaching = examples[0]
     assert teaching.count("fast=True") == 1
-    known = {"TINY": tiny}
+    known = {"TINY": TINY}
     exec(teaching.replace("fast=True", "fast=True, config=TINY"), known)
     maps = sorted(Path("features").glob("*.npy"))
     assert len(maps) == len(known["scene"].splits["train"])

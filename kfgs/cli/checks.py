@@ -113,14 +113,11 @@ def choose_views(scene: Any, names: Sequence[str]) -> Any:
 
 
 def check_alone(name: str, given: object, why: str) -> None:
-    """Raise a ValueError if an option is given that would have no effect."""
-    if given is not None and given is not True:
-        raise ValueError(f"{name}: expected none {why}, got {given}; leave it out")
-
-
-def check_no_flag(name: str, given: bool, why: str) -> None:
-    """Raise a ValueError if a flag is given that would have no effect, or an unwanted one."""
-    check_alone(name, f"--{name}" if given else None, why)
+    """Raise a ValueError if an option is given that would have no effect; None, or False of a flag: it is not."""
+    if given is None or given is False:
+        return
+    shown = f"--{name}" if given is True else given
+    raise ValueError(f"{name}: expected none {why}, got {shown}; leave it out")
 
 
 def _check_place(name: str, target: Path, kind: str) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from .checks import check_alone, check_folder, check_no_flag
+from .checks import check_alone, check_folder
 from .say import Mode, Preset, fit_config, load_classes, say, training_cameras, wrote
 from .teach import Level, check_discard, choose_teacher, scene_folder, stored_maps
 
@@ -124,16 +124,14 @@ def fit(
     if teacher is not None:
         for name, given in (("features", features), ("level", level)):
             check_alone(name, given, "beside --teacher, whose maps are not stored")
-        check_no_flag("discard-features", discard_features, "beside --teacher, which stores no dense maps")
-        check_no_flag(
-            "undistorted-features", undistorted_features, "beside --teacher, which sees the pictures as taken"
-        )
+        check_alone("discard-features", discard_features, "beside --teacher, which stores no dense maps")
+        check_alone("undistorted-features", undistorted_features, "beside --teacher, which sees the pictures as taken")
         chosen = choose_teacher(teacher, weights, fast, size, device)
         maps: Any = RecomputedMaps(chosen, as_taken, loaded.views(split), out / "teacher")
     else:
         check_alone("weights", weights, "without --teacher, whose they are")
         check_alone("size", size or None, "without --teacher, whose option it is")
-        check_no_flag("fast", fast, "without --teacher, whose option it is")
+        check_alone("fast", fast, "without --teacher, whose option it is")
         maps = stored_maps(as_taken, loaded.views(split), features or scene_folder(scene) / "features", level)
         if discard_features:
             check_discard(maps, mode)

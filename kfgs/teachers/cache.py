@@ -11,6 +11,7 @@ from statistics import median
 from torch import Tensor
 from tqdm import tqdm
 
+from .._check import one_line
 from .._files import bytes_in_words, digest_file, seconds_in_words
 from ..scenes import Scene, read_image
 from .layouts import LAYOUTS, OWN, layout_of, write_npy_map
@@ -26,7 +27,6 @@ from .map_store import (
     sweep,
 )
 from .protocol import Teacher, as_teacher, identify
-from .torch_pickles import one_line
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._check import one_line
 from .._files import digest_file
 from .file_kinds import describe_kind, describe_text
 from .pickles import BrokenPickleError, Global, Inert, UnsafePickleError, read_pickle
-from .torch_pickles import BUILDERS, Entry, Storage, Storages, Views, one_line
+from .torch_pickles import BUILDERS, Entry, Storage, Storages, Views
 
 _EXPECTED = "expected a checkpoint (.ckpt, .pt, .pth or .safetensors)"
 _AGAIN = "download it again or name another file"

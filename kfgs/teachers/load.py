@@ -15,9 +15,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._check import error_line
 from .identity import code_identity, plain_options, weights_identity
 from .protocol import Teacher, as_teacher
-from .transformers_source import one_line
 from .transformers_table import TRANSFORMERS
 
 
@@ -115,7 +115,7 @@ def _find(name: str) -> Any:
         return getattr(importlib.import_module(module_name), attribute)
     except (Exception, SystemExit) as error:  # a module may raise anything, or end like a script
         raise ValueError(
-            f"teacher: expected package.module:name that can be imported, got {name!r} ({one_line(error)}); check both "
+            f"teacher: expected package.module:name that can be imported, got {name!r} ({error_line(error)}); check both "
             "names, and that `import` of the module works"
         ) from error
 

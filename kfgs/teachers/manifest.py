@@ -8,8 +8,8 @@ from dataclasses import field as default
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from .._check import one_line
 from .._files import read_json, write_json
-from .torch_pickles import one_line
 
 MANIFEST = "features.json"
 FORMAT = "kfgs-features/1"

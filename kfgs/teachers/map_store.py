@@ -13,10 +13,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._check import one_line
 from .._files import bytes_in_words, digest_file
 from .manifest import MANIFEST, Manifest, MapRecord, read_manifest
 from .protocol import Teacher, check_features
-from .torch_pickles import one_line
 
 try:
     import fcntl

@@ -12,9 +12,8 @@ from .._check import check_shapes
 from ..labels.label_set import LabelSet
 from ..labels.relevancy import CANONICAL
 from ..quant.codebook import EPS, row_norms, unit_rows
-from .protocol import Teacher, as_teacher, identify
+from .protocol import PROMPTS_AT_ONCE, Teacher, as_teacher, identify
 
-CHUNK = 64  # prompts encoded at once: 60 MB of activations in CLIP ViT-L's text tower
 _CLIP7 = (
     "itap of a {}.",
     "a bad photo of the {}.",
@@ -162,8 +161,8 @@ def _encode(teacher: Teacher, prompts: list[str]) -> Tensor:  # [n, D] float32, 
     """The prompts' rows, a chunk at a time."""
     parts = []
     with torch.no_grad():
-        for start in range(0, len(prompts), CHUNK):
-            chunk = prompts[start : start + CHUNK]
+        for start in range(0, len(prompts), PROMPTS_AT_ONCE):
+            chunk = prompts[start : start + PROMPTS_AT_ONCE]
             rows = teacher.encode_text(chunk)
             check_shapes((f"text of {teacher.name}", rows, (len(chunk), "D")))
             norms = row_norms(rows.float())

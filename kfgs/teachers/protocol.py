@@ -14,6 +14,8 @@ from .identity import code_identity
 
 _ROUNDING = 1e-4  # by which a resampled picture may leave [0, 1]
 
+PROMPTS_AT_ONCE = 64  # 60 MB of activations in CLIP ViT-L's text tower
+
 
 @runtime_checkable
 class Teacher(Protocol):

@@ -15,7 +15,7 @@ from .._files import atomic_path, digest_file, digest_value
 from ..quant.sampling import SAMPLES, sample_grid
 from ..scenes import Scene
 from .cache import check_pictures, discard_maps, pictures_of
-from .manifest import MANIFEST, read_manifest
+from .manifest import MANIFEST, Manifest, read_manifest
 from .map_store import MapStore, encode_half, locked, map_file, plain_identity, sweep
 from .protocol import Teacher, as_teacher, identify
 
@@ -129,16 +129,17 @@ class RecomputedMaps(Sequence[Tensor]):
             discard_maps(folder)
         self._sampled.clear()
 
-    def _folders(self) -> list[Path]:
-        """The folders of samples of this teacher, whatever their grid."""
+    def _folders(self) -> dict[Path, Manifest]:
+        """The folders of samples of this teacher, whatever their grid, and what they say."""
         found = {path.parent: read_manifest(path.parent) for path in sorted(self.store.glob(f"samples-*/{MANIFEST}"))}
         mine = {**self.identity, "grid": None}
-        return [folder for folder, one in found.items() if one is not None and {**one.teacher, "grid": None} == mine]
+        return {
+            folder: one for folder, one in found.items() if one is not None and {**one.teacher, "grid": None} == mine
+        }
 
     def _recorded_shape(self) -> tuple[int, int, int] | None:
-        for folder in self._folders():
-            manifest = read_manifest(folder)
-            record = None if manifest is None else manifest.maps.get(self.pictures[0].stem)
+        for manifest in self._folders().values():
+            record = manifest.maps.get(self.pictures[0].stem)
             if record is not None and record.image_digest == self._image_digest(0):
                 return record.shape
         return None

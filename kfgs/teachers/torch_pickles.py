@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._check import one_line
 from .pickles import BrokenPickleError, Global, Inert, string_items
 
 _DTYPES = {
@@ -165,9 +166,3 @@ class Views:
                 raise BrokenPickleError("lies in a storage that overlaps others")
             self.copies[first, length] = self.file[first : first + length].clone()
         return self.copies[first, length]
-
-
-def one_line(text: object, length: int = 60) -> str:
-    """A name out of an untrusted file for a message: one line, no control characters, not long."""
-    shown = ascii(str(text))[1:-1]
-    return shown if len(shown) <= length else shown[:length] + "..."

@@ -10,8 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._check import error_line
 from .._files import read_json
-from .transformers_source import explained, find_class, one_line, quiet, refuse_gaps, require_transformers
+from .transformers_source import explained, find_class, quiet, refuse_gaps, require_transformers
 
 _CONFIG = "open_clip_config.json"
 _WEIGHTS = ("open_clip_model.safetensors", "open_clip_pytorch_model.safetensors", "open_clip_pytorch_model.bin")
@@ -98,7 +99,7 @@ def load_openclip(file: Path, *, activation: str) -> Any:
                 None, config=config, state_dict=mapped, dtype=torch.float32, output_loading_info=True
             )
     except Exception as error:  # shapes that do not fit, sizes of no model: transformers has its own errors for those
-        first = one_line(error)
+        first = error_line(error)
         raise ValueError(
             f"{file}: expected a CLIP in OpenCLIP's layout, but its weights do not fit together ({first}); use the file "
             "and the config of one model"

@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 
+from .._check import error_line
 from .._files import digest_file, digest_value, read_json
 from .transformers_table import TRANSFORMERS
 
@@ -33,7 +34,7 @@ def require_transformers() -> Any:
     except Exception as error:  # RuntimeError: operator torchvision::nms does not exist, OSError, ...
         raise ImportError(
             f"torchvision: expected none, or the build that belongs to torch {torch.__version__}, got one that is "
-            f"installed but does not import ({one_line(error)}), and transformers fails with it; run "
+            f"installed but does not import ({error_line(error)}), and transformers fails with it; run "
             "`pip uninstall torchvision` (kfgs does not need it), or install the build of this torch"
         ) from error
     try:
@@ -41,12 +42,12 @@ def require_transformers() -> Any:
     except ModuleNotFoundError as error:
         raise ImportError(
             f"transformers: expected it for the teachers {', '.join(TRANSFORMERS)}, but it cannot be imported "
-            f'({one_line(error)}); install it with `pip install "kfgs[hf]"`'
+            f'({error_line(error)}); install it with `pip install "kfgs[hf]"`'
         ) from error
     except Exception as error:  # one that does not go with what else is installed may raise anything
         raise ImportError(
             f"transformers: expected it for the teachers {', '.join(TRANSFORMERS)}, got one that is installed but does not "
-            f'import ({one_line(error)}); run `pip install --upgrade --force-reinstall "kfgs[hf]"`'
+            f'import ({error_line(error)}); run `pip install --upgrade --force-reinstall "kfgs[hf]"`'
         ) from error
 
 
@@ -66,7 +67,7 @@ def find_class(transformers: Any, name: str, kind: str) -> Any:
         ) from error
     except Exception as error:
         raise ImportError(
-            f"transformers: expected {name} for teacher {kind!r}, got one that does not import ({one_line(error)}); run "
+            f"transformers: expected {name} for teacher {kind!r}, got one that does not import ({error_line(error)}); run "
             '`pip install --upgrade --force-reinstall "kfgs[hf]"`'
         ) from error
 
@@ -203,7 +204,7 @@ def explained(kind: str, source: Path | str, what: str = "weights") -> Iterator[
         yield
     except ImportError as error:  # sentencepiece, for instance
         raise ImportError(
-            f"{source}: expected {what} of teacher {kind!r}, but a package is missing ({one_line(error)}); install it"
+            f"{source}: expected {what} of teacher {kind!r}, but a package is missing ({error_line(error)}); install it"
         ) from error
     except Exception as error:
         if isinstance(source, Path):
@@ -212,14 +213,8 @@ def explained(kind: str, source: Path | str, what: str = "weights") -> Iterator[
         else:
             hint = "download the folder and pass its path"
             message = f"expected {what} of teacher {kind!r}, could not reach them on the hub (nor is it a local folder)"
-        raise ValueError(f"{source}: {message} ({one_line(error)}); {hint}") from error
+        raise ValueError(f"{source}: {message} ({error_line(error)}); {hint}") from error
 
 
 def _revision(commit: str | None) -> dict[str, str]:
     return {} if commit is None else {"revision": commit}
-
-
-def one_line(error: BaseException) -> str:
-    """The first line of an error, with its type before it and at most 200 characters of its own."""
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0][:200] if lines else ''}".rstrip(": ")

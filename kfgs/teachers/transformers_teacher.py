@@ -12,14 +12,12 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
 from .._check import check_choice, check_whole
-from .protocol import check_picture, check_prompts
+from .protocol import PROMPTS_AT_ONCE, check_picture, check_prompts
 from .transformers_openclip import find_openclip, load_openclip
 from .transformers_patches import Patches, patch_size
 from .transformers_source import find_source, load_model, load_tokenizer_of, read_config, weights_of
 from .transformers_table import TRANSFORMERS, TeacherRow
 from .transformers_text import CLIP_VOCABULARY, Tokenize, bpe_tokenize, has_tokenizer, hub_tokenize
-
-_CHUNK = 64  # prompts at a time
 
 
 def load_transformers_teacher(
@@ -158,8 +156,8 @@ class TransformersTeacher:
         check_prompts(prompts)
         device = next(self.model.parameters()).device
         rows = []
-        for start in range(0, len(prompts), _CHUNK):
-            ids, mask = self._tokenize(list(prompts[start : start + _CHUNK]))
+        for start in range(0, len(prompts), PROMPTS_AT_ONCE):
+            ids, mask = self._tokenize(list(prompts[start : start + PROMPTS_AT_ONCE]))
             named = {"attention_mask": mask.to(device)} if rule.mask else {}
             rows.append(self.model.get_text_features(input_ids=ids.to(device), **named).pooler_output.float())
         return normalize(torch.cat(rows), dim=1)

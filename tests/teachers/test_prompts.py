@@ -6,7 +6,8 @@ from oracles_words import ensemble
 
 from kfgs.labels import CANONICAL, LabelSet, load_label_set
 from kfgs.teachers import CallableTeacher
-from kfgs.teachers.prompts import CHUNK, TEMPLATES, embed_labels, make_label_set
+from kfgs.teachers.prompts import TEMPLATES, embed_labels, make_label_set
+from kfgs.teachers.protocol import PROMPTS_AT_ONCE
 
 
 def one(prompt):
@@ -58,11 +59,11 @@ def test_prompts_go_to_the_teacher_in_chunks_each_once():
         seen.append(list(prompts))
         return letters(prompts)
 
-    names = [f"thing {i}" for i in range(CHUNK + 10)]
+    names = [f"thing {i}" for i in range(PROMPTS_AT_ONCE + 10)]
     synonyms = {name: ["shared word"] for name in names}
     found = embed_labels(CallableTeacher(lambda image: image, text), names, synonyms=synonyms)
     asked = [prompt for part in seen for prompt in part]
-    assert max(map(len, seen)) == CHUNK
+    assert max(map(len, seen)) == PROMPTS_AT_ONCE
     assert len(asked) == len(set(asked)) == len(names) + 1
     np.testing.assert_allclose(found[70], ensemble(one, ["thing 70", "shared word"], ["{}"]), rtol=0, atol=2e-6)
 

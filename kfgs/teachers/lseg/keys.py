@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..torch_pickles import one_line
+from ..._check import one_line
 from .network import LSegConfig, LSegNetwork
 from .recognise import recognise
 from .text import ClipText

@@ -14,14 +14,12 @@ from torch.nn import functional
 
 from ..bpe import load_tokenizer
 from ..checkpoint import read_checkpoint, weights_digest
-from ..protocol import check_picture, check_prompts
+from ..protocol import PROMPTS_AT_ONCE, check_picture, check_prompts
 from .keys import network_from_state, text_from_state
 from .network import LSegConfig, LSegNetwork
 from .options import LSegOptions
 from .text import ClipText
 from .windows import multi_scale_features
-
-_CHUNK = 64  # prompts at a time
 
 Tokenize = Callable[[list[str]], Tensor]  # n prompts -> [n, 77] int64
 
@@ -114,7 +112,7 @@ class LSeg(nn.Module):
         assert self.text is not None
         assert self._tokenizer is not None
         ids = self._tokenizer(list(prompts)).to(self.device)  # [n, 77]
-        rows = torch.cat([self.text(part) for part in ids.split(_CHUNK)])
+        rows = torch.cat([self.text(part) for part in ids.split(PROMPTS_AT_ONCE)])
         return functional.normalize(rows.float(), dim=1)
 
     def _bring_text(self) -> None:
