@@ -415,6 +415,19 @@ def test_a_missing_tensor_is_counted_and_named(room, tmp_path, capsys):
     assert "head1.bias" in error
 
 
+def test_what_a_manifest_says_is_told_in_one_line_each(maps, tmp_path, capsys):
+    folder = tmp_path / "maps"
+    shutil.copytree(maps, folder)
+    facts = json.loads((folder / "features.json").read_text())
+    facts["teacher"] = {"name": "x\x1b[31mPWN\nwrote:\n  fake"}
+    (folder / "features.json").write_text(json.dumps(facts))
+    assert main(["info", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert "\x1b" not in said
+    assert "\nwrote:" not in said
+    assert r"x\x1b[31mPWN\nwrote:" in said
+
+
 def test_maps_that_nothing_would_stand_for_are_not_deleted(scene, maps, tmp_path, capsys):
     folder = tmp_path / "maps"
     shutil.copytree(maps, folder)

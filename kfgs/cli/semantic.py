@@ -110,6 +110,7 @@ def fit(
         undistorted_features: the teacher saw undistorted pictures already, so its maps need no lens removed.
         device: where the field is trained: `auto` (a GPU if there is one), `cpu` or `cuda`.
     """
+    from .._files import bytes_in_words
     from ..pipeline import fit_scene, write_training_pictures
     from ..scenes import load_scene
     from ..teachers import RecomputedMaps, discard_maps
@@ -142,7 +143,7 @@ def fit(
     written = [result.field_path, *write_training_pictures(result)]
     if discard_features:
         freed = discard_maps(maps.path, maps.stems)
-        say(f"{maps.path}: {freed / 1e9:.2f} GB of {len(maps)} dense maps deleted; their index maps are in {out}")
+        say(f"{maps.path}: {bytes_in_words(freed)} of {len(maps)} dense maps deleted; their index maps are in {out}")
     wrote(written)
 
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from .._check import one_line
 from .checks import check_alone, check_file, check_folder
 from .say import Mode, Preset, fit_config, say, wrote
 
@@ -231,8 +232,8 @@ def scene_folder(scene: Path) -> Path:
 def teacher_words(identity: dict[str, Any]) -> str:
     """A teacher's identity in a few words: `lseg (weights 3f2a...)`."""
     weights, options = identity.get("weights"), identity.get("options")
-    words = [str(identity.get("name", "unknown"))]
-    words += [f"weights {str(weights)[:12]}"] if weights else []
+    words = [one_line(identity.get("name", "unknown"))]
+    words += [f"weights {one_line(weights)[:12]}"] if weights else []
     words += (
         [f"{name} {json.dumps(value)}" for name, value in sorted(options.items())] if isinstance(options, dict) else []
     )

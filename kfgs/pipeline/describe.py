@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .._files import read_json
+from .._check import one_line
+from .._files import bytes_in_words, read_json
 from ..fields import SemanticField
 from ..formats import SplatFile, find_format, read_splats
 from ..formats.ply import read_ply
@@ -60,12 +61,12 @@ def _describe_maps(path: Path) -> str:
     shapes = sorted({record.shape for record in records})
     there = sum((path / record.file).is_file() for record in records)
     lines = [
-        f"{path}: {len(records)} feature maps by {manifest.teacher.get('name', 'an unknown teacher')}",
+        f"{path}: {len(records)} feature maps by {one_line(manifest.teacher.get('name', 'an unknown teacher'))}",
         *(f"  {h} x {w} cells, {D} channels" for h, w, D in shapes),
-        f"  {sum(record.bytes for record in records) / 1e9:.2f} GB in half precision"
+        f"  {bytes_in_words(sum(record.bytes for record in records))} in half precision"
         + (f", {there} of {len(records)} maps still there" if there < len(records) else ""),
         f"  teacher's time: {sum(record.seconds for record in records):.0f} s",
-        *(f"  {name}: {value}" for name, value in manifest.teacher.items() if name != "name"),
+        *(f"  {one_line(name)}: {one_line(value, 200)}" for name, value in manifest.teacher.items() if name != "name"),
     ]
     return "\n".join(lines)
 
