@@ -27,6 +27,8 @@ _WHERE = {
     "SceneError": ".scenes",
     "load_scene": ".scenes",
     "run_sfm": ".scenes",
+    "ToyConfig": ".scenes",
+    "make_toy_room": ".scenes",
     "Similarity": ".cameras",
     "SplatFile": ".formats",
     "read_splats": ".formats",
@@ -106,7 +108,9 @@ if TYPE_CHECKING:
     from .quant import quantize_maps as quantize_maps
     from .scenes import Scene as Scene
     from .scenes import SceneError as SceneError
+    from .scenes import ToyConfig as ToyConfig
     from .scenes import load_scene as load_scene
+    from .scenes import make_toy_room as make_toy_room
     from .scenes import run_sfm as run_sfm
     from .splat import Rendering as Rendering
     from .splat import available_engines as available_engines

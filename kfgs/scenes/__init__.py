@@ -13,6 +13,7 @@ from .register import align_clouds
 from .scene import Scene, read_image
 from .sfm import SfmConfig, SfmReport, run_sfm
 from .splits import make_split, read_split, split_every
+from .toy import ToyConfig, make_toy_room
 from .transforms import load_transforms
 from .undistort import undistort_scene
 
@@ -25,6 +26,7 @@ __all__ = [
     "SceneError",
     "SfmConfig",
     "SfmReport",
+    "ToyConfig",
     "align_by_cameras",
     "align_clouds",
     "check_model",
@@ -35,6 +37,7 @@ __all__ = [
     "load_scene",
     "load_transforms",
     "make_split",
+    "make_toy_room",
     "natural_key",
     "read_image",
     "read_split",
