@@ -1,0 +1,325 @@
+"""The state of an exploration: a question, gamma and lambda, what is shown and hidden, what is picked. Nothing is drawn here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+
+from ..._check import check_choice, check_range, check_whole
+from ...cameras import Camera
+from ...gaussians import Gaussians
+from ...labels import Selection
+from ..palette import palette
+from .carried import SPAN, Array, Carried
+from .meaning import Asked, Meaning
+from .pick import Sight, neighbours_of, views_seeing
+from .picked import Picked, Side
+from .saved import save_parts
+from .side_colors import SideColors
+
+Show = Literal["labels", "rgb", "score", "latents"]
+NEIGHBOURS = 8
+
+
+class Exploration:
+    """What one looks at, and how: the verbs change it, the other methods say what to draw.
+
+    A colour Gaussian has the label of the nearest labelled semantic Gaussian, where that is strictly closer than lambda
+    (Sec. 3.4); it is selected where that one is. Which one it is, is found once, so moving lambda or gamma costs
+    milliseconds.
+
+    Args:
+        meaning: what the semantic cloud can be asked.
+        color: the colour cloud, in the same frame; None: the semantic side alone.
+        cameras: views that tell who sees a picked Gaussian, without distortion.
+        distance: lambda, world units; None: from the clouds' spacing (`labels.default_distance`).
+
+    Raises:
+        ValueError: if a cloud is empty, a position is not finite, or lambda is not positive.
+    """
+
+    def __init__(
+        self,
+        meaning: Meaning,
+        color: Gaussians | None = None,
+        *,
+        cameras: Sequence[Camera] = (),
+        distance: float | None = None,
+    ) -> None:
+        if meaning.gaussians.labels is None:
+            raise ValueError(
+                "meaning.gaussians.labels: expected labels [N], got None; use FieldMeaning or SplatMeaning"
+            )
+        clouds: dict[Side, Gaussians] = {"semantic": meaning.gaussians}
+        if color is not None:
+            clouds["color"] = color
+        for name, cloud in clouds.items():
+            if len(cloud) == 0:
+                raise ValueError(f"{name}: expected at least one Gaussian, got none; choose another file")
+        self.meaning = meaning
+        self.cameras = tuple(cameras)
+        self.sides: tuple[Side, ...] = tuple(clouds)
+        self._clouds = clouds
+        self._carried = None if color is None else Carried(meaning.gaussians, color)
+        self._own_labels = _numpy(meaning.gaussians.labels).astype(np.int64)
+        self._colors = SideColors(clouds, self._carried)
+        self.shows: tuple[Show, ...] = ("labels", *self._colors.shows, "score")
+        self.show: Show = "labels"
+        self.asked: Asked | None = None
+        self.gamma: float | None = None
+        self.gamma_how = ""
+        self.hidden: frozenset[int] = frozenset()
+        suggested = 1.0 if self._carried is None else self._carried.suggested
+        self.distance, self.distance_how = suggested, "no colour side" if self._carried is None else self._carried.how
+        if distance is not None:
+            self.set_distance(distance)
+        self.distance_range = min(suggested / SPAN, self.distance), max(suggested * SPAN, self.distance)
+        self._mark: tuple[Side, int] | None = None
+        self._seen: dict[tuple[Side, int], tuple[list[tuple[int, float]], list[Sight]]] = {}
+
+    @property
+    def gamma_range(self) -> tuple[float, float]:
+        """The least and the largest gamma that make a difference; 0 and 1 without a question."""
+        return (0.0, 1.0) if self.asked is None else (self.asked.low, self.asked.high)
+
+    @property
+    def picked(self) -> Picked | None:
+        """The Gaussian pointed at, as it is under the question and lambda of now; None once it is hidden."""
+        if self._mark is None or not self.drawn(self._mark[0])[self._mark[1]]:
+            return None
+        return self._describe(*self._mark)
+
+    def ask(self, words: str | None) -> Asked | None:
+        """Ask for a class or a phrase, with the gamma that the answer suggests; None or "" drops the question.
+
+        Raises:
+            ValueError: for words that cannot be answered; the question of before stays.
+        """
+        if words is None or not words.strip():
+            self.asked, self.gamma, self.gamma_how = None, None, ""
+            return None
+        self.asked = self.meaning.ask(words)
+        self.gamma, self.gamma_how = self.asked.selection.threshold, self.asked.selection.how
+        return self.asked
+
+    def set_gamma(self, gamma: float) -> None:
+        """Select what scores above gamma.
+
+        Raises:
+            ValueError: if nothing is asked, or gamma is out of `gamma_range`.
+        """
+        if self.asked is None:
+            raise ValueError(f"gamma: expected a question that it applies to, got none (gamma {gamma!r}); ask first")
+        low, high = self.gamma_range
+        slack = 1e-6 * max(high - low, abs(low), abs(high))  # a slider rounds to float32
+        check_range("gamma", gamma, low - slack, high + slack)
+        self.gamma, self.gamma_how = min(max(float(gamma), low), high), "given"
+
+    def set_distance(self, distance: float) -> None:
+        """Let labels travel to what is strictly closer than this lambda, in world units.
+
+        Raises:
+            ValueError: if it is not positive.
+        """
+        check_range("distance", distance, 0, closed=(False, False))
+        self.distance, self.distance_how = float(distance), "given"
+
+    def set_show(self, show: Show) -> None:
+        """Choose what the colours stand for.
+
+        Raises:
+            ValueError: if it is unknown, or these clouds do not have it.
+        """
+        check_choice("show", show, get_args(Show))
+        if show not in self.shows:
+            lacking = "harmonics (sh)" if show == "rgb" else "features"
+            raise ValueError(
+                f"show: expected one of {', '.join(self.shows)} (no cloud has {lacking}), got {show!r}; choose one of these"
+            )
+        self.show = show
+
+    def set_hidden(self, labels: Iterable[int]) -> None:
+        """Draw no Gaussian of these labels; -1 hides those without a class.
+
+        Raises:
+            ValueError: if one is no label of this scene.
+        """
+        wanted = list(labels)
+        for label in wanted:
+            check_whole("labels", label, -1, len(self.meaning.names) - 1)
+        self.hidden = frozenset(int(label) for label in wanted)
+
+    def cloud(self, side: Side) -> Gaussians:
+        """The Gaussians of a side.
+
+        Raises:
+            ValueError: if there is no such side.
+        """
+        check_choice("side", side, self.sides)
+        return self._clouds[side]
+
+    def labels(self, side: Side) -> Array:  # [N] int64
+        """The class of each Gaussian of a side, -1 = none."""
+        self.cloud(side)
+        return self._own_labels if self._carried is None or side == "semantic" else self._take(self._own_labels, -1)
+
+    def selected(self, side: Side) -> Array:  # [N] bool
+        """Which Gaussians of a side answer the question, hidden or not; none without a question."""
+        cloud = self.cloud(side)
+        if self.asked is None or self.gamma is None:
+            return np.zeros(len(cloud), dtype=bool)
+        own = _numpy((self.asked.selection.scores > self.gamma) & self.asked.valid)
+        return own if side == "semantic" else self._take(own, False)
+
+    def drawn(self, side: Side) -> Array:  # [N] bool
+        """Which Gaussians of a side are of no hidden class."""
+        labels = self.labels(side)
+        return ~np.isin(labels, list(self.hidden)) if self.hidden else np.ones(len(labels), dtype=bool)
+
+    def scores(self, side: Side) -> Array:  # [N] float64
+        """The score of the question, without one that of each label; NaN where nothing is known."""
+        self.cloud(side)
+        if self.asked is None:
+            values, known = self.meaning.scores, self._own_labels >= 0
+        else:
+            values, known = self.asked.selection.scores, _numpy(self.asked.valid)
+        own = np.where(known, _numpy(values).astype(np.float64), np.nan)
+        return own if side == "semantic" else self._take(own, np.nan)
+
+    @property
+    def clim(self) -> tuple[float, float]:
+        """The scores of the darkest and the brightest colour, the same on both sides."""
+        if self.asked is not None:
+            return self.gamma_range
+        own = self.scores("semantic")
+        own = own[np.isfinite(own)]
+        return (float(own.min()), float(own.max())) if own.size and own.min() < own.max() else (0.0, 1.0)
+
+    def colors(self, side: Side) -> Array:  # [N, 3] uint8
+        """The colours of a side for what is shown; grey where nothing is known."""
+        cloud = self.cloud(side)
+        if self.show == "labels":
+            return palette(self.labels(side))
+        if self.show == "score":
+            return self._colors.of_scores(self.scores(side), self.clim)
+        if self.show == "rgb":
+            return self._colors.rgb(side)
+        return self._colors.latents(side, np.ones(len(cloud), bool) if self._carried is None else self._within(side))
+
+    def pick(self, side: Side, index: int) -> Picked:
+        """Point at a Gaussian.
+
+        Raises:
+            ValueError: if there is no such side or Gaussian.
+        """
+        check_whole("index", index, 0, len(self.cloud(side)) - 1)
+        self._mark = side, int(index)
+        return self._describe(*self._mark)
+
+    def drop_pick(self) -> None:
+        """Point at nothing."""
+        self._mark = None
+
+    def facts(self) -> dict[str, Any]:
+        """The state in numbers and words, as JSON."""
+        facts: dict[str, Any] = {
+            "words": None if self.asked is None else self.asked.words,
+            "gamma": self.gamma,
+            "gamma_how": self.gamma_how,
+            "by": self.meaning.by,
+        }
+        for side in self.sides:
+            labels, selected = self.labels(side), self.selected(side)
+            counts = np.bincount(labels + 1, minlength=len(self.meaning.names) + 1)
+            facts[side] = {
+                "total": len(labels),
+                "selected": int(selected.sum()),
+                "classes": [[name, int(count)] for name, count in zip(self.meaning.names, counts[1:], strict=True)],
+                "none": int(counts[0]),
+            }
+        if self._carried is not None:
+            facts |= {"lambda": self.distance, "lambda_how": self.distance_how}
+            facts["color"]["orphaned"] = facts["color"]["none"]
+        return facts
+
+    def lines(self) -> list[str]:
+        """The state for a person."""
+        facts = self.facts()
+        lines = []
+        if self.asked is not None:
+            lines.append(f"{self.asked.words!r}: score > {self.gamma:.3g} ({self.gamma_how})")
+        for side in self.sides:
+            chosen = f"{facts[side]['selected']} of " if self.asked is not None else ""
+            lines.append(f"{side}: {chosen}{facts[side]['total']} Gaussians")
+        if self._carried is not None:
+            lines.append(f"lambda {self.distance:.3g} ({self.distance_how}), {facts['color']['orphaned']} out of reach")
+        return lines
+
+    def save_selection(self, folder: str | Path) -> list[Path]:
+        """Write what is selected: numbers as selection.json, the Gaussians of each side as selection_<side>.ply.
+
+        The parts of the selection are listed, the largest first, with the view that shows each best where there are
+        cameras. Selected Gaussians are written whether hidden or not. All files appear or none; a side in which nothing is
+        selected has no file.
+
+        Raises:
+            ValueError: if nothing is selected on any side.
+        """
+        return save_parts(self, Path(folder))
+
+    def selection(self, side: Side) -> Selection:
+        """What is selected on a side, with scores (0 where nothing is known), gamma and how.
+
+        Raises:
+            ValueError: if nothing is asked.
+        """
+        if self.asked is None:
+            raise ValueError("selection: expected a question, got none; ask for something first")
+        scores = torch.from_numpy(np.nan_to_num(self.scores(side), nan=0.0))
+        mask = torch.from_numpy(self.selected(side))
+        return Selection(mask, scores, self.gamma, self.gamma_how)
+
+    def _within(self, side: Side) -> Array:  # [N] bool
+        if side == "semantic" or self._carried is None:
+            return np.ones(len(self.cloud(side)), dtype=bool)
+        return self._carried.within(self.distance)
+
+    def _take(self, values: Array, nothing: Any) -> Array:
+        """Carry values of the semantic Gaussians to the colour side; `nothing` where none is in reach."""
+        assert self._carried is not None
+        return np.where(self._carried.within(self.distance), values[self._carried.source], nothing)
+
+    def _describe(self, side: Side, index: int) -> Picked:
+        cloud, labels, key = self.cloud(side), self.labels(side), (side, index)
+        if key not in self._seen:
+            near = [(int(i), float(d)) for i, d in zip(*neighbours_of(cloud.means, index, NEIGHBOURS), strict=True)]
+            self._seen[key] = near, views_seeing(cloud, index, self.cameras)
+        near, views = self._seen[key]
+        score = float(self.scores(side)[index])
+        source = -1 if side == "semantic" or self._carried is None else int(self._carried.source[index])
+        x, y, z = cloud.means[index].tolist()
+        return Picked(
+            side=side,
+            index=index,
+            name=self._name(labels[index]),
+            label=int(labels[index]),
+            score=score if np.isfinite(score) else None,
+            position=(x, y, z),
+            opacity=float(cloud.opacities[index]),
+            source=source if source >= 0 else None,
+            distance=float(self._carried.far[index]) if self._carried is not None and source >= 0 else None,
+            neighbours=[(i, d, self._name(labels[i])) for i, d in near],
+            views=views,
+        )
+
+    def _name(self, label: int) -> str | None:
+        return self.meaning.names[label] if label >= 0 else None
+
+
+def _numpy(values: Any) -> Array:
+    array: Array = values.detach().cpu().numpy()
+    return array

@@ -1,0 +1,248 @@
+"""What a semantic cloud can be asked: a field by text (Sec. 3.4), a labelled splat by class."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...cameras import Camera
+from ...formats import SplatFile
+from ...formats.splat_file import SCORE
+from ...gaussians import Gaussians
+from ...labels import (
+    LabelSet,
+    Selection,
+    class_index,
+    class_indices,
+    select_by_label,
+    select_by_query,
+    select_by_similarity,
+    teacher_mismatch,
+)
+from ...quant.codebook import EPS, row_norms
+from ..frusta import evenly
+from .evidence import Evidence, gather_evidence
+
+if TYPE_CHECKING:
+    from ...fields import SemanticField
+
+MOST_VIEWS = 30  # room_0 is labelled alike by 30 views and by all: more views cost time alone
+UNIT = (0.0, 1.0)
+
+
+class Asked(NamedTuple):
+    """A question and its answer: a score for each Gaussian, and the gamma that it suggests."""
+
+    words: str  # as asked; a class's own spelling where it is one
+    selection: Selection  # threshold: the gamma it suggests
+    low: float  # the least gamma that makes a difference: 0 of a relevancy, else the least score
+    high: float  # the largest: 1, or the largest score
+    known: bool  # one of the classes
+    valid: Tensor  # [N] bool, whether anything is known of a Gaussian; the others are never selected
+
+
+class Meaning(Protocol):
+    """What a semantic cloud can be asked."""
+
+    gaussians: Gaussians
+    """With labels, [N] int64, -1 = none; features [N, d] or None."""
+    names: tuple[str, ...]
+    """Of the classes, in label order."""
+    scores: Tensor
+    """[N] of the labels."""
+    by: str
+    """One line: how labels and scores came about."""
+    phrases: bool
+    """Whether anything but a class can be asked."""
+
+    def ask(self, words: str) -> Asked:
+        """The answer to a class's name or, where `phrases`, to any words.
+
+        Raises:
+            ValueError: for words that cannot be answered; near names are offered.
+        """
+        ...
+
+
+class FieldMeaning:
+    """A semantic field asked by text, as `SemanticField.query` answers it.
+
+    A class is told from the other classes, anything else from the canonical negatives (`classes.negatives`): the score is
+    a relevancy, gamma 0.5. Where there are none it is the cosine, and gamma is read off the scores. With cameras, one pass
+    over at most 30 of them, evenly chosen, answers all later questions at once (of a field without codebook: all classes).
+
+    Args:
+        field: a finished field.
+        classes: names and embeddings in the teacher's space.
+        cameras: views that label and score each Gaussian, in the field's frame, without distortion; those that the field
+            was trained on are the natural choice. Without any each Gaussian's own latent decides, as in the paper.
+        embed: the teacher's text encoder, words -> [D]; without it only classes can be asked.
+
+    Raises:
+        ValueError: if the embeddings have another number of channels than the field's features.
+
+    Note:
+        Warns where the classes were embedded by another teacher than the field's, as far as both are known.
+    """
+
+    def __init__(
+        self,
+        field: SemanticField,
+        classes: LabelSet,
+        *,
+        cameras: Sequence[Camera] = (),
+        embed: Callable[[str], Tensor] | None = None,
+    ) -> None:
+        if classes.dim != field.dim:
+            raise ValueError(
+                f"classes: expected embeddings [C, {field.dim}] (from the field), got {tuple(classes.embeddings.shape)}: "
+                "text of another teacher? Embed the words with the one whose features this field was fitted to"
+            )
+        mismatch = teacher_mismatch(field.info, classes.info)
+        if mismatch is not None:
+            warnings.warn(mismatch, stacklevel=2)
+        self.names = classes.names
+        self.phrases = embed is not None
+        self._field, self._classes, self._embed = field, classes, embed
+        self._views = [cameras[i] for i in evenly(len(cameras), MOST_VIEWS)] if cameras else []
+        self._evidence: Evidence | None = None
+        self._features: Tensor | None = None  # [N, D] without cameras, decoded once
+        self._answers: dict[str, Asked] = {}
+        labels, self.scores = self._label()
+        self.gaussians = field.gaussians.replace(labels=labels)
+        self.by = f"votes of {len(self._views)} views" if self._views else "each Gaussian's own latent (Sec. 3.4)"
+
+    def ask(self, words: str) -> Asked:
+        """The answer to a class's name or, with an encoder, to any words; the second time it is at hand.
+
+        Raises:
+            ValueError: for a word that is no class where there is no encoder (near names are offered), or an encoder of
+                another teacher.
+        """
+        words = words.strip()
+        known = self._classes.knows(words)
+        if known:
+            words = self.names[class_index(words, self.names)]
+        if words not in self._answers:
+            target, negatives = self._class(words) if known else self._phrase(words)
+            self._answers[words] = self._answer(words, target, negatives, known)
+        return self._answers[words]
+
+    def _label(self) -> tuple[Tensor, Tensor]:  # [N] int64, [N]
+        embeddings = self._classes.embeddings
+        if not self._views:
+            return self._field.classify(embeddings)
+        if self._field.codebook is None:
+            return self._field.classify_by_views(embeddings, self._views)[:2]
+        self._evidence = gather_evidence(self._field, self._views)
+        return self._evidence.vote(embeddings)
+
+    def _class(self, name: str) -> tuple[Tensor, Tensor | None]:  # [D], [M, D]
+        """A class's embedding and the other classes', or the canonical words' where it is the only class."""
+        index = class_index(name, self.names)
+        others = self._classes.embeddings[torch.arange(len(self.names)) != index]
+        return self._classes.embeddings[index], others if len(others) else self._canonical(name)
+
+    def _phrase(self, words: str) -> tuple[Tensor, Tensor | None]:  # [D], [M, D]
+        if self._embed is None or not words:
+            class_indices(words, self.names)  # says which classes there are, and which are near
+        assert self._embed is not None
+        target = torch.as_tensor(self._embed(words)).detach()
+        if tuple(target.shape) != (self._field.dim,):
+            raise ValueError(
+                f"embed: expected [{self._field.dim}] (from the field) for {words!r}, got {tuple(target.shape)}; "
+                "pass the text encoder of the teacher whose features this field was fitted to"
+            )
+        return target.to(self._classes.embeddings), self._canonical(words)
+
+    def _canonical(self, words: str) -> Tensor | None:  # [M, D]
+        """The canonical negatives, less the words themselves."""
+        kept = [i for i, word in enumerate(self._classes.negative_names) if word.casefold() != words.casefold()]
+        return None if self._classes.negatives is None or not kept else self._classes.negatives[kept]
+
+    def _answer(self, words: str, target: Tensor, negatives: Tensor | None, known: bool) -> Asked:
+        if not self._views:
+            if self._features is None:
+                self._features = self._field.quantized()
+            found = select_by_query(self._features, target, None, negatives)
+            return _asked(words, found, row_norms(self._features) > EPS, negatives is not None, known)
+        if self._evidence is None:
+            found = self._field.query(target, negatives=negatives, cameras=self._views)
+            return _asked(words, found, torch.ones_like(found.mask), negatives is not None, known)
+        rows = target[None] if negatives is None else torch.cat([target[None], negatives])
+        averages, valid = self._evidence.averages(rows), self._evidence.weights > 0
+        found = select_by_similarity(averages[:, 0], None if negatives is None else averages[:, 1:], None, valid)
+        return _asked(words, found, valid, negatives is not None, known)
+
+
+class SplatMeaning:
+    """A labelled splat asked by class: its Gaussians of that class, with the file's score where there is one, else 1.
+
+    Args:
+        splats: with labels; classes without a name are called "class 3".
+
+    Raises:
+        ValueError: if the splat carries no labels.
+    """
+
+    phrases = False
+
+    def __init__(self, splats: SplatFile) -> None:
+        labels = splats.gaussians.labels
+        if labels is None:
+            raise ValueError(
+                "splats.gaussians.labels: expected labels [N] to ask for, got None; label the splat first, with `kfgs attach` "
+                "or transfer_labels, or pass a field"
+            )
+        self.gaussians = splats.gaussians
+        count = max(len(splats.classes), int(labels.max()) + 1 if len(labels) else 0)
+        self.names = splats.classes + tuple(f"class {i}" for i in range(len(splats.classes), count))
+        self.by = "the file's classes"
+        score = splats.extra.get(SCORE)
+        self.scores = _file_scores(self.gaussians, score)
+        if score is not None:
+            self.by += " and scores"
+        self._answers: dict[str, Asked] = {}
+
+    def ask(self, words: str) -> Asked:
+        """The Gaussians of a class; gamma is suggested below all of their scores, so all are selected.
+
+        Raises:
+            ValueError: if there is no such class (near names are offered).
+        """
+        words = self.names[class_indices(words.strip(), self.names)[0]]
+        if words not in self._answers:
+            member = select_by_label(self.gaussians, words, self.names).mask
+            scores = torch.where(member, self.scores, 0)
+            own = scores[member]
+            low, high = (float(own.min()), float(own.max())) if len(own) else UNIT
+            if low > 0 and high <= 1:
+                low, high = UNIT
+            else:
+                low -= 0.01 * max(high - low, 1e-3)  # strictly below the least score
+            found = Selection(member & (scores > low), scores, low, "all of the class")
+            self._answers[words] = Asked(words, found, low, high, True, member)
+        return self._answers[words]
+
+
+def _file_scores(gaussians: Gaussians, score: np.ndarray | None) -> Tensor:  # type: ignore[type-arg]  # [N]
+    """A file's scores; those that are not finite count as the least of the others."""
+    if score is None:
+        return torch.ones_like(gaussians.opacities)
+    values = torch.from_numpy(np.asarray(score)).to(gaussians.means)
+    finite = torch.isfinite(values)
+    return torch.where(finite, values, values[finite].min() if bool(finite.any()) else torch.ones_like(values[:1]))
+
+
+def _asked(words: str, found: Selection, valid: Tensor, relevant: bool, known: bool) -> Asked:
+    """With the range in which a gamma makes a difference."""
+    if relevant or not bool(valid.any()):
+        return Asked(words, found, *UNIT, known, valid)
+    own = found.scores[valid]
+    gamma = float(found.threshold or 0.0)
+    return Asked(words, found, min(gamma, float(own.min())), max(gamma, float(own.max())), known, valid)

@@ -1,0 +1,152 @@
+"""Which Gaussian is under a pixel, which views see one, and which are near it: computed from the Gaussians themselves.
+
+Not by VTK's picker, which knows points: this answers for what is drawn by w = T alpha (Eq. 3), whatever the style.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..._check import check_range, check_shapes, check_whole
+from ...cameras import Camera
+from ...gaussians import Gaussians
+from ...splat import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, project
+from ...splat.project import FIELD_OF_VIEW_MARGIN
+
+LOW_PASS = 0.3  # pixels^2, as `project` has it
+BACKGROUND = 0.05  # a pixel that less than this is drawn over shows the background
+LEAST_WEIGHT = 0.01  # of a view that sees a Gaussian
+
+
+class Sight(NamedTuple):
+    """A view that sees a Gaussian."""
+
+    name: str  # the camera's
+    index: int  # its place among the cameras asked
+    weight: float  # w = T alpha of the Gaussian at its own projected centre, in (0.01, 0.99]
+
+
+def gaussian_at(
+    gaussians: Gaussians,
+    camera: Camera,
+    x: float,
+    y: float,
+    mask: Tensor | None = None,  # [N] bool
+) -> int | None:
+    """The Gaussian that shows most at a pixel: the one with the largest rendering weight w = T alpha there (Eq. 3).
+
+    **Convention**: pixels, x to the right and y down; the centre of the first pixel is (0.5, 0.5).
+
+    Args:
+        gaussians: the cloud.
+        camera: the view, without distortion.
+        x: column.
+        y: row.
+        mask: which Gaussians are drawn; None: all. The others neither show nor hide anything.
+
+    Returns:
+        Its index, of equal weights the nearest one's; None where less than 5 % of the pixel is covered (background), or
+        the pixel is outside of the picture.
+
+    Raises:
+        ValueError: if shapes disagree, a number is not finite, or the camera has distortion.
+    """
+    check_shapes(("gaussians.means", gaussians.means, "N 3"), ("mask", mask, "N"))
+    for name, value in (("x", x), ("y", y)):
+        check_range(name, value, float("-inf"), closed=(False, False))
+    if not (0 <= x < camera.width and 0 <= y < camera.height):
+        return None
+    with torch.no_grad():
+        index, weights = _weights_at(gaussians, camera, x, y, mask)
+    if float(weights.sum()) < BACKGROUND:
+        return None
+    return int(index[weights.argmax()])
+
+
+def views_seeing(gaussians: Gaussians, index: int, cameras: Sequence[Camera]) -> list[Sight]:
+    """The views in which a Gaussian shows at its own centre with a weight T alpha above 0.01, the best first.
+
+    Args:
+        gaussians: the whole cloud: what stands in front hides.
+        index: which Gaussian.
+        cameras: views without distortion; of equal ones the first come first.
+
+    Raises:
+        ValueError: if there is no such Gaussian, or a camera has distortion.
+    """
+    check_whole("index", index, 0, len(gaussians) - 1)
+    sights = []
+    with torch.no_grad():
+        for number, camera in enumerate(cameras):
+            own = project(gaussians.select(torch.tensor([index], device=gaussians.means.device)), camera)
+            if len(own.index) == 0:
+                continue
+            x, y = own.means2d[0].tolist()
+            if not (0 <= x < camera.width and 0 <= y < camera.height):
+                continue
+            found, weights = _weights_at(gaussians, camera, x, y, None)
+            weight = float(weights[found == index].sum())
+            if weight > LEAST_WEIGHT:
+                sights.append(Sight(camera.name, number, weight))
+    return sorted(sights, key=lambda sight: -sight.weight)
+
+
+def neighbours_of(
+    means: Tensor,  # [N, 3]
+    index: int,
+    count: int = 8,
+) -> tuple[Tensor, Tensor]:  # [n] int64, [n]
+    """The nearest other Gaussians by the distance of their means, nearest first, and these distances in world units.
+
+    Raises:
+        ValueError: if there is no such Gaussian, or `count` is not positive.
+    """
+    check_shapes(("means", means, "N 3"))
+    check_whole("index", index, 0, len(means) - 1)
+    check_whole("count", count, 1)
+    distances = torch.linalg.vector_norm(means.detach().double() - means[index].detach().double(), dim=1)
+    distances[index] = torch.inf
+    near = distances.topk(min(count, len(means) - 1), largest=False)
+    return near.indices, near.values
+
+
+def _weights_at(
+    gaussians: Gaussians, camera: Camera, x: float, y: float, mask: Tensor | None
+) -> tuple[Tensor, Tensor]:  # [m] int64, [m]
+    """The weights of the Gaussians composited at a place, front to back, as the engines' contract has it (its point 2)."""
+    index = _near_ray(gaussians, camera, x, y)
+    if mask is not None:
+        index = index[mask[index].to(index.device)]
+    seen = project(gaussians.select(index), camera)
+    dx, dy = (torch.tensor([x, y]).to(seen.means2d) - seen.means2d).unbind(1)
+    a, b, c = seen.conics.unbind(1)
+    alphas = (seen.opacities * torch.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))).clamp_max(ALPHA_MAX)
+    order = seen.depths.argsort(stable=True)  # by depth, then by index
+    order = order[alphas[order] >= ALPHA_MIN]
+    alphas = alphas[order]
+    after = torch.cumprod(1 - alphas, dim=0)
+    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
+    drawn = after >= TRANSMITTANCE_MIN  # falls, so all of the first ones
+    return index[seen.index[order]][drawn], (alphas * before)[drawn]
+
+
+def _near_ray(gaussians: Gaussians, camera: Camera, x: float, y: float) -> Tensor:  # [m] int64
+    """The Gaussians that can reach a place in the picture: a bound without rotations, as that of `project`."""
+    camera = camera.to(gaussians.means)
+    K, E = camera.K, camera.viewmat
+    px, py, z = (gaussians.means @ E[:3, :3].T + E[:3, 3]).unbind(1)
+    fx, fy, cx, cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    reach = 2 * torch.log(gaussians.opacities / ALPHA_MIN).clamp_min(0)
+    largest = gaussians.scales.amax(dim=1)
+    near = (z > camera.near) & (gaussians.opacities >= ALPHA_MIN)
+    for p, f, c, place, size in ((px, fx, cx, x, camera.width), (py, fy, cy, y, camera.height)):
+        tangent = p / z
+        middle, half = (size / 2 - c) / f, FIELD_OF_VIEW_MARGIN * size / 2 / f
+        slope = 1 + tangent.clamp(middle - half, middle + half).square()  # |row of J|^2 (z / f)^2
+        variance = (f / z * largest).square() * slope + LOW_PASS
+        near &= (f * tangent + c - place).square() <= 1.01 * reach * variance + 1e-3
+    return near.nonzero()[:, 0]
