@@ -1,0 +1,198 @@
+"""Execute the notebooks: percent sources in, .ipynb with outputs out, and a word about whatever is wrong with one.
+
+    python notebooks/run.py [N ...] [--out notebooks/built] [--pictures DIR]
+
+Each `N_name.py` becomes a notebook (jupytext) and runs from its first cell to its last (nbclient) in a fresh kernel of
+this Python, in the sources' own folder. It is refused if a cell fails, if anything is written to stderr (warnings are),
+if the executed file is larger than 1 MB, or if it shows no picture. What failed leaves no file behind.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import os
+import re
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jupytext
+import nbformat
+from jupyter_client.kernelspec import KernelSpecManager
+from jupyter_client.manager import AsyncKernelManager
+from nbclient import NotebookClient
+from nbclient.exceptions import CellControlSignal, CellExecutionError, DeadKernelError
+
+HERE = Path(__file__).resolve().parent
+LARGEST = 1_000_000  # bytes of an executed notebook: what a repository's web page still shows
+SECONDS = 600  # for one cell: six times what a whole notebook may take on two idle cores
+SUFFIXES = {"image/png": ".png", "image/jpeg": ".jpg", "image/gif": ".gif"}
+COLORS = re.compile(r"\x1b\[[0-9;]*m")  # of a terminal, in tracebacks
+
+
+@dataclass
+class Outcome:
+    """What came of one notebook."""
+
+    source: Path
+    seconds: float = 0.0
+    size: int = 0  # bytes of the executed file
+    pictures: dict[str, bytes] = field(default_factory=dict)  # file name to content, in order of appearance
+    problems: list[str] = field(default_factory=list)
+
+
+def find_sources(folder: Path, numbers: Sequence[int] = ()) -> list[Path]:
+    """The notebooks' sources in order of their numbers, all or those asked for.
+
+    Raises:
+        ValueError: if there is none of a number.
+    """
+    found = {int(path.name.split("_")[0]): path for path in folder.glob("[0-9]*_*.py")}
+    missing = [number for number in numbers if number not in found]
+    if missing or not found:
+        what = ", ".join(map(str, missing)) or "nothing"
+        raise ValueError(f"N: expected one of {sorted(found)} (from {folder}), got {what}; give a notebook's number")
+    return [found[number] for number in sorted(set(numbers) or found)]
+
+
+def run_notebook(source: Path, out: Path, *, largest: int = LARGEST, seconds: int = SECONDS) -> Outcome:
+    """Execute one source and write `out/<stem>.ipynb`, unless a cell fails: then no file of that name is left."""
+    outcome, target = Outcome(source), out / f"{source.stem}.ipynb"
+    target.unlink(missing_ok=True)  # else an older run's would pass for this one's
+    notebook = jupytext.read(source, fmt="py:percent")
+    notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    start = time.perf_counter()
+    failure = _execute(notebook, source.parent, seconds)
+    outcome.seconds = time.perf_counter() - start
+    outcome.problems = [failure] if failure else []
+    outcome.problems += list(_noise(notebook))
+    _drop_copies(notebook)
+    outcome.pictures = _pictures(notebook, source.stem)
+    if not failure:
+        text = nbformat.writes(notebook)
+        outcome.size = len(text.encode())
+        if outcome.size > largest:
+            outcome.problems.append(f"{outcome.size:,} bytes, more than {largest:,}: make its pictures smaller")
+        if not outcome.pictures:
+            outcome.problems.append("no picture: a notebook is for looking")
+        _write_whole(target, text.encode())
+    return outcome
+
+
+def _execute(notebook: Any, folder: Path, seconds: int) -> str:
+    """Run all cells, filling in their outputs; what went wrong, or nothing."""
+    at: list[int] = []
+
+    def note(cell: Any, cell_index: int, **_: Any) -> None:
+        at.append(cell_index)
+
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as home:  # nobody's start-up files, nobody's history
+        manager = AsyncKernelManager(
+            kernel_name="python3",
+            kernel_spec_manager=KernelSpecManager(kernel_dirs=[]),  # python3 then is the Python that runs this
+            transport="ipc" if os.name == "posix" else "tcp",  # others on the machine cannot listen
+            connection_file=f"{home}/kernel.json",
+        )
+        resources = {"metadata": {"path": str(folder)}}
+        client = NotebookClient(notebook, km=manager, timeout=seconds, resources=resources, on_cell_start=note)
+        quiet = {"IPYTHONDIR": home, "PYDEVD_DISABLE_FILE_VALIDATION": "1"}
+        try:
+            client.execute(env=os.environ | quiet)
+        except CellExecutionError as error:
+            return (
+                f"cell {_number(notebook, at[-1])} fails: {error.ename}: {error.evalue}\n{_traceback(notebook, at[-1])}"
+            )
+        except CellControlSignal as error:  # out of time
+            return f"cell {_number(notebook, at[-1])} does not end: {error}"
+        except DeadKernelError:
+            where = f"cell {_number(notebook, at[-1])}" if at else "the start"
+            return f"{where} ends Python: a crash, or out of memory"
+    return ""
+
+
+def _number(notebook: Any, index: int) -> str:
+    """Which cell, as a reader counts: the code cells from 1, and how it begins."""
+    number = sum(cell.cell_type == "code" for cell in notebook.cells[: index + 1])
+    lines = [line for line in notebook.cells[index].source.splitlines() if line.strip()]
+    return f"{number} ({lines[0] if lines else 'empty'})"
+
+
+def _traceback(notebook: Any, index: int) -> str:
+    told = [output for output in notebook.cells[index].outputs if output.output_type == "error"]
+    return COLORS.sub("", "\n".join(line for output in told for line in output.traceback)).strip()
+
+
+def _noise(notebook: Any) -> Iterator[str]:
+    """What each cell wrote to stderr."""
+    for index, cell in enumerate(notebook.cells):
+        outputs = cell.get("outputs", [])
+        text = "".join(output.text for output in outputs if output.get("name") == "stderr").strip()
+        if text:
+            yield f"cell {_number(notebook, index)} writes to stderr: {COLORS.sub('', text)}"
+
+
+def _drop_copies(notebook: Any) -> None:
+    """Keep the smallest where a picture comes in several formats, as Pillow's do (PNG and JPEG)."""
+    for cell in notebook.cells:
+        for output in cell.get("outputs", []):
+            data = output.get("data", {})
+            kinds = sorted((kind for kind in SUFFIXES if kind in data), key=lambda kind: len(data[kind]))
+            for kind in kinds[1:]:
+                del data[kind]
+
+
+def _pictures(notebook: Any, stem: str) -> dict[str, bytes]:
+    """Every picture shown, named by the cell that shows it."""
+    found: dict[str, bytes] = {}
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    for number, cell in enumerate(code, start=1):
+        for output in cell.outputs:
+            for kind in SUFFIXES.keys() & output.get("data", {}).keys():
+                name = f"{stem}_{number:02d}_{len(found) + 1:02d}{SUFFIXES[kind]}"
+                found[name] = base64.b64decode(output.data[kind])
+    return found
+
+
+def _write_whole(path: Path, content: bytes) -> None:
+    """Write beside the final name and move: a killed run leaves no half of a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        beside.write_bytes(content)
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def main(arguments: Sequence[str] | None = None, say: Callable[[str], None] = print) -> int:
+    """The command line; 1 if a notebook has a problem."""
+    parser = argparse.ArgumentParser(description="Execute the notebooks and say what is wrong with any of them.")
+    parser.add_argument("numbers", metavar="N", type=int, nargs="*", help="which notebooks (default: all, in order)")
+    parser.add_argument("--out", type=Path, default=HERE / "built", help="folder for the executed .ipynb files")
+    parser.add_argument("--pictures", type=Path, help="also write every picture shown into this folder")
+    parser.add_argument("--sources", type=Path, default=HERE, help="folder of the percent sources")
+    options = parser.parse_args(arguments)
+    try:
+        sources = find_sources(options.sources.resolve(), options.numbers)
+    except ValueError as error:
+        parser.error(str(error))
+    bad = 0
+    for source in sources:
+        outcome = run_notebook(source, options.out)
+        facts = f"{outcome.seconds:6.1f} s  {outcome.size / 1000:5.0f} kB  {len(outcome.pictures):2d} pictures"
+        say(f"{source.stem:40s} {facts}  {'PROBLEM' if outcome.problems else 'ok'}")
+        for problem in outcome.problems:
+            say("    " + problem.replace("\n", "\n    "))
+        for name, content in outcome.pictures.items() if options.pictures else ():
+            _write_whole(options.pictures / name, content)
+        bad += bool(outcome.problems)
+    return int(bad > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
