@@ -15,6 +15,7 @@ from ...gaussians import Gaussians
 from ...labels import Selection
 from ..palette import palette
 from .carried import SPAN, Array, Carried
+from .facts import facts_of, lines_of
 from .meaning import Asked, Meaning
 from .pick import Sight, neighbours_of, views_seeing
 from .picked import Picked, Side
@@ -60,6 +61,12 @@ class Exploration:
         for name, cloud in clouds.items():
             if len(cloud) == 0:
                 raise ValueError(f"{name}: expected at least one Gaussian, got none; choose another file")
+        for camera in cameras:
+            if camera.distortion is not None:
+                raise ValueError(
+                    f"cameras: expected views without distortion, got {camera.distortion.model} ({camera.name!r}); pass "
+                    "those of scene.undistorted()"
+                )
         self.meaning = meaning
         self.cameras = tuple(cameras)
         self.sides: tuple[Side, ...] = tuple(clouds)
@@ -79,7 +86,7 @@ class Exploration:
             self.set_distance(distance)
         self.distance_range = min(suggested / SPAN, self.distance), max(suggested * SPAN, self.distance)
         self._mark: tuple[Side, int] | None = None
-        self._seen: dict[tuple[Side, int], tuple[list[tuple[int, float]], list[Sight]]] = {}
+        self._surroundings: dict[tuple[Side, int], tuple[list[tuple[int, float]], list[Sight]]] = {}
 
     @property
     def gamma_range(self) -> tuple[float, float]:
@@ -89,7 +96,7 @@ class Exploration:
     @property
     def picked(self) -> Picked | None:
         """The Gaussian pointed at, as it is under the question and lambda of now; None once it is hidden."""
-        if self._mark is None or not self.drawn(self._mark[0])[self._mark[1]]:
+        if self._mark is None or self._label(*self._mark) in self.hidden:
             return None
         return self._describe(*self._mark)
 
@@ -201,14 +208,14 @@ class Exploration:
 
     def colors(self, side: Side) -> Array:  # [N, 3] uint8
         """The colours of a side for what is shown; grey where nothing is known."""
-        cloud = self.cloud(side)
+        self.cloud(side)
         if self.show == "labels":
             return palette(self.labels(side))
         if self.show == "score":
             return self._colors.of_scores(self.scores(side), self.clim)
         if self.show == "rgb":
             return self._colors.rgb(side)
-        return self._colors.latents(side, np.ones(len(cloud), bool) if self._carried is None else self._within(side))
+        return self._colors.latents(side, self.distance)
 
     def pick(self, side: Side, index: int) -> Picked:
         """Point at a Gaussian.
@@ -225,39 +232,12 @@ class Exploration:
         self._mark = None
 
     def facts(self) -> dict[str, Any]:
-        """The state in numbers and words, as JSON."""
-        facts: dict[str, Any] = {
-            "words": None if self.asked is None else self.asked.words,
-            "gamma": self.gamma,
-            "gamma_how": self.gamma_how,
-            "by": self.meaning.by,
-        }
-        for side in self.sides:
-            labels, selected = self.labels(side), self.selected(side)
-            counts = np.bincount(labels + 1, minlength=len(self.meaning.names) + 1)
-            facts[side] = {
-                "total": len(labels),
-                "selected": int(selected.sum()),
-                "classes": [[name, int(count)] for name, count in zip(self.meaning.names, counts[1:], strict=True)],
-                "none": int(counts[0]),
-            }
-        if self._carried is not None:
-            facts |= {"lambda": self.distance, "lambda_how": self.distance_how}
-            facts["color"]["orphaned"] = facts["color"]["none"]
-        return facts
+        """The state in numbers and words, as JSON: question, gamma, lambda, and of each side how many are what."""
+        return facts_of(self)
 
     def lines(self) -> list[str]:
-        """The state for a person."""
-        facts = self.facts()
-        lines = []
-        if self.asked is not None:
-            lines.append(f"{self.asked.words!r}: score > {self.gamma:.3g} ({self.gamma_how})")
-        for side in self.sides:
-            chosen = f"{facts[side]['selected']} of " if self.asked is not None else ""
-            lines.append(f"{side}: {chosen}{facts[side]['total']} Gaussians")
-        if self._carried is not None:
-            lines.append(f"lambda {self.distance:.3g} ({self.distance_how}), {facts['color']['orphaned']} out of reach")
-        return lines
+        """The state for a person, in a few lines."""
+        return lines_of(self)
 
     def save_selection(self, folder: str | Path) -> list[Path]:
         """Write what is selected: numbers as selection.json, the Gaussians of each side as selection_<side>.ply.
@@ -283,36 +263,52 @@ class Exploration:
         mask = torch.from_numpy(self.selected(side))
         return Selection(mask, scores, self.gamma, self.gamma_how)
 
-    def _within(self, side: Side) -> Array:  # [N] bool
-        if side == "semantic" or self._carried is None:
-            return np.ones(len(self.cloud(side)), dtype=bool)
-        return self._carried.within(self.distance)
-
     def _take(self, values: Array, nothing: Any) -> Array:
         """Carry values of the semantic Gaussians to the colour side; `nothing` where none is in reach."""
         assert self._carried is not None
         return np.where(self._carried.within(self.distance), values[self._carried.source], nothing)
 
+    def _label(self, side: Side, index: int) -> int:
+        """The class of one Gaussian."""
+        if side == "semantic" or self._carried is None:
+            return int(self._own_labels[index])
+        source = self._source(side, index)
+        return -1 if source is None else int(self._own_labels[source])
+
+    def _source(self, side: Side, index: int) -> int | None:
+        """The semantic Gaussian that speaks for one of a side, if one does."""
+        if side == "semantic" or self._carried is None:
+            return index
+        return int(self._carried.source[index]) if self._carried.far[index] < self.distance else None
+
+    def _score(self, side: Side, index: int) -> float | None:
+        """The score of one Gaussian, as `scores` has it."""
+        source = self._source(side, index)
+        if source is None:
+            return None
+        if self.asked is None:
+            return float(self.meaning.scores[source]) if self._own_labels[source] >= 0 else None
+        return float(self.asked.selection.scores[source]) if bool(self.asked.valid[source]) else None
+
     def _describe(self, side: Side, index: int) -> Picked:
-        cloud, labels, key = self.cloud(side), self.labels(side), (side, index)
-        if key not in self._seen:
+        cloud, label, key = self._clouds[side], self._label(side, index), (side, index)
+        if key not in self._surroundings:
             near = [(int(i), float(d)) for i, d in zip(*neighbours_of(cloud.means, index, NEIGHBOURS), strict=True)]
-            self._seen[key] = near, views_seeing(cloud, index, self.cameras)
-        near, views = self._seen[key]
-        score = float(self.scores(side)[index])
-        source = -1 if side == "semantic" or self._carried is None else int(self._carried.source[index])
+            self._surroundings[key] = near, views_seeing(cloud, index, self.cameras)
+        near, views = self._surroundings[key]
+        nearest = -1 if side == "semantic" or self._carried is None else int(self._carried.source[index])
         x, y, z = cloud.means[index].tolist()
         return Picked(
             side=side,
             index=index,
-            name=self._name(labels[index]),
-            label=int(labels[index]),
-            score=score if np.isfinite(score) else None,
+            name=self._name(label),
+            label=label,
+            score=self._score(side, index),
             position=(x, y, z),
             opacity=float(cloud.opacities[index]),
-            source=source if source >= 0 else None,
-            distance=float(self._carried.far[index]) if self._carried is not None and source >= 0 else None,
-            neighbours=[(i, d, self._name(labels[i])) for i, d in near],
+            source=nearest if nearest >= 0 else None,
+            distance=float(self._carried.far[index]) if self._carried is not None and nearest >= 0 else None,
+            neighbours=[(i, d, self._name(self._label(side, i))) for i, d in near],
             views=views,
         )
 

@@ -20,13 +20,11 @@ from ...labels import (
     class_index,
     class_indices,
     select_by_label,
-    select_by_query,
     select_by_similarity,
     teacher_mismatch,
 )
-from ...quant.codebook import EPS, row_norms
 from ..frusta import evenly
-from .evidence import Evidence, gather_evidence
+from .evidence import Evidence, OwnFeatures, SeenCodewords, SeenFeatures
 
 if TYPE_CHECKING:
     from ...fields import SemanticField
@@ -110,10 +108,9 @@ class FieldMeaning:
         self.phrases = embed is not None
         self._field, self._classes, self._embed = field, classes, embed
         self._views = [cameras[i] for i in evenly(len(cameras), MOST_VIEWS)] if cameras else []
-        self._evidence: Evidence | None = None
-        self._features: Tensor | None = None  # [N, D] without cameras, decoded once
+        self._evidence = self._gather()
         self._answers: dict[str, Asked] = {}
-        labels, self.scores = self._label()
+        labels, self.scores = self._evidence.labels(classes.embeddings)
         self.gaussians = field.gaussians.replace(labels=labels)
         self.by = f"votes of {len(self._views)} views" if self._views else "each Gaussian's own latent (Sec. 3.4)"
 
@@ -133,14 +130,14 @@ class FieldMeaning:
             self._answers[words] = self._answer(words, target, negatives, known)
         return self._answers[words]
 
-    def _label(self) -> tuple[Tensor, Tensor]:  # [N] int64, [N]
-        embeddings = self._classes.embeddings
+    def _gather(self) -> Evidence:
         if not self._views:
-            return self._field.classify(embeddings)
-        if self._field.codebook is None:
-            return self._field.classify_by_views(embeddings, self._views)[:2]
-        self._evidence = gather_evidence(self._field, self._views)
-        return self._evidence.vote(embeddings)
+            return OwnFeatures.of(self._field)
+        if self._field.codebook is not None:
+            return SeenCodewords.of(self._field, self._views)
+        classes = self._classes
+        others = classes.embeddings[:0] if classes.negatives is None else classes.negatives.to(classes.embeddings)
+        return SeenFeatures(self._field, self._views, classes.embeddings, others)
 
     def _class(self, name: str) -> tuple[Tensor, Tensor | None]:  # [D], [M, D]
         """A class's embedding and the other classes', or the canonical words' where it is the only class."""
@@ -150,7 +147,11 @@ class FieldMeaning:
 
     def _phrase(self, words: str) -> tuple[Tensor, Tensor | None]:  # [D], [M, D]
         if self._embed is None or not words:
-            class_indices(words, self.names)  # says which classes there are, and which are near
+            try:
+                class_indices(words, self.names)
+            except ValueError as error:  # says which classes there are, and which are near
+                more = "" if self.phrases else "; other words need the teacher's text encoder (embed)"
+                raise ValueError(f"{error}{more}") from None
         assert self._embed is not None
         target = torch.as_tensor(self._embed(words)).detach()
         if tuple(target.shape) != (self._field.dim,):
@@ -166,17 +167,9 @@ class FieldMeaning:
         return None if self._classes.negatives is None or not kept else self._classes.negatives[kept]
 
     def _answer(self, words: str, target: Tensor, negatives: Tensor | None, known: bool) -> Asked:
-        if not self._views:
-            if self._features is None:
-                self._features = self._field.quantized()
-            found = select_by_query(self._features, target, None, negatives)
-            return _asked(words, found, row_norms(self._features) > EPS, negatives is not None, known)
-        if self._evidence is None:
-            found = self._field.query(target, negatives=negatives, cameras=self._views)
-            return _asked(words, found, torch.ones_like(found.mask), negatives is not None, known)
-        rows = target[None] if negatives is None else torch.cat([target[None], negatives])
-        averages, valid = self._evidence.averages(rows), self._evidence.weights > 0
-        found = select_by_similarity(averages[:, 0], None if negatives is None else averages[:, 1:], None, valid)
+        rows = target[None] if negatives is None else torch.cat([target[None], negatives.to(target)])
+        cosines, valid = self._evidence.cosines(rows)
+        found = select_by_similarity(cosines[:, 0], None if negatives is None else cosines[:, 1:], None, valid)
         return _asked(words, found, valid, negatives is not None, known)
 
 

@@ -6,7 +6,7 @@ Not by VTK's picker, which knows points: this answers for what is drawn by w = T
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -22,7 +22,8 @@ BACKGROUND = 0.05  # a pixel that less than this is drawn over shows the backgro
 LEAST_WEIGHT = 0.01  # of a view that sees a Gaussian
 
 
-class Sight(NamedTuple):
+@dataclass(frozen=True)
+class Sight:
     """A view that sees a Gaussian."""
 
     name: str  # the camera's
@@ -61,7 +62,7 @@ def gaussian_at(
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         return None
     with torch.no_grad():
-        index, weights = _weights_at(gaussians, camera, x, y, mask)
+        index, weights = _weights_at(gaussians, _bounds(gaussians), camera, (x, y), mask)
     if float(weights.sum()) < BACKGROUND:
         return None
     return int(index[weights.argmax()])
@@ -81,6 +82,7 @@ def views_seeing(gaussians: Gaussians, index: int, cameras: Sequence[Camera]) ->
     check_whole("index", index, 0, len(gaussians) - 1)
     sights = []
     with torch.no_grad():
+        bounds = _bounds(gaussians)
         for number, camera in enumerate(cameras):
             own = project(gaussians.select(torch.tensor([index], device=gaussians.means.device)), camera)
             if len(own.index) == 0:
@@ -88,7 +90,7 @@ def views_seeing(gaussians: Gaussians, index: int, cameras: Sequence[Camera]) ->
             x, y = own.means2d[0].tolist()
             if not (0 <= x < camera.width and 0 <= y < camera.height):
                 continue
-            found, weights = _weights_at(gaussians, camera, x, y, None)
+            found, weights = _weights_at(gaussians, bounds, camera, (x, y))
             weight = float(weights[found == index].sum())
             if weight > LEAST_WEIGHT:
                 sights.append(Sight(camera.name, number, weight))
@@ -114,15 +116,24 @@ def neighbours_of(
     return near.indices, near.values
 
 
+def _bounds(gaussians: Gaussians) -> tuple[Tensor, Tensor]:  # [N], [N]
+    """What bounds a footprint in any view: d^T C d where alpha falls to 1/255, and the largest variance."""
+    return 2 * torch.log(gaussians.opacities / ALPHA_MIN), gaussians.scales.amax(dim=1).square()
+
+
 def _weights_at(
-    gaussians: Gaussians, camera: Camera, x: float, y: float, mask: Tensor | None
+    gaussians: Gaussians,
+    bounds: tuple[Tensor, Tensor],
+    camera: Camera,
+    place: tuple[float, float],  # (x, y)
+    mask: Tensor | None = None,  # [N] bool
 ) -> tuple[Tensor, Tensor]:  # [m] int64, [m]
     """The weights of the Gaussians composited at a place, front to back, as the engines' contract has it (its point 2)."""
-    index = _near_ray(gaussians, camera, x, y)
+    index = _near_ray(gaussians, bounds, camera, place)
     if mask is not None:
-        index = index[mask[index].to(index.device)]
+        index = index[mask.to(index.device)[index]]
     seen = project(gaussians.select(index), camera)
-    dx, dy = (torch.tensor([x, y]).to(seen.means2d) - seen.means2d).unbind(1)
+    dx, dy = (torch.tensor(place).to(seen.means2d) - seen.means2d).unbind(1)
     a, b, c = seen.conics.unbind(1)
     alphas = (seen.opacities * torch.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))).clamp_max(ALPHA_MAX)
     order = seen.depths.argsort(stable=True)  # by depth, then by index
@@ -130,23 +141,24 @@ def _weights_at(
     alphas = alphas[order]
     after = torch.cumprod(1 - alphas, dim=0)
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
-    drawn = after >= TRANSMITTANCE_MIN  # falls, so all of the first ones
+    drawn = after >= TRANSMITTANCE_MIN  # it falls, so these are the first ones
     return index[seen.index[order]][drawn], (alphas * before)[drawn]
 
 
-def _near_ray(gaussians: Gaussians, camera: Camera, x: float, y: float) -> Tensor:  # [m] int64
-    """The Gaussians that can reach a place in the picture: a bound without rotations, as that of `project`."""
+def _near_ray(
+    gaussians: Gaussians, bounds: tuple[Tensor, Tensor], camera: Camera, place: tuple[float, float]
+) -> Tensor:  # [m] int64, ascending
+    """The Gaussians that can reach a place in the picture: a bound that knows no rotations, as that of `project`."""
     camera = camera.to(gaussians.means)
-    K, E = camera.K, camera.viewmat
-    px, py, z = (gaussians.means @ E[:3, :3].T + E[:3, 3]).unbind(1)
-    fx, fy, cx, cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-    reach = 2 * torch.log(gaussians.opacities / ALPHA_MIN).clamp_min(0)
-    largest = gaussians.scales.amax(dim=1)
-    near = (z > camera.near) & (gaussians.opacities >= ALPHA_MIN)
-    for p, f, c, place, size in ((px, fx, cx, x, camera.width), (py, fy, cy, y, camera.height)):
-        tangent = p / z
+    reach, largest = bounds
+    points = gaussians.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    z = points[:, 2]
+    near = (z > camera.near) & (reach >= 0)
+    for axis, size in enumerate((camera.width, camera.height)):
+        f, c = float(camera.K[axis, axis]), float(camera.K[axis, 2])
+        tangent = points[:, axis] / z
         middle, half = (size / 2 - c) / f, FIELD_OF_VIEW_MARGIN * size / 2 / f
-        slope = 1 + tangent.clamp(middle - half, middle + half).square()  # |row of J|^2 (z / f)^2
-        variance = (f / z * largest).square() * slope + LOW_PASS
-        near &= (f * tangent + c - place).square() <= 1.01 * reach * variance + 1e-3
+        slope = 1 + tangent.clamp(middle - half, middle + half).square()  # of row `axis` of J, squared, times (z / f)^2
+        variance = largest * slope * (f / z).square() + LOW_PASS
+        near &= (f * tangent + (c - place[axis])).square() <= 1.01 * reach * variance + 1e-3  # a bound after rounding
     return near.nonzero()[:, 0]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Literal
 
 from .pick import Sight
 
@@ -10,7 +11,8 @@ Side = Literal["semantic", "color"]
 SHOWN = 4  # views and neighbours named in a line
 
 
-class Picked(NamedTuple):
+@dataclass(frozen=True)
+class Picked:
     """One Gaussian of one side."""
 
     side: Side

@@ -46,8 +46,8 @@ class SideColors:
                 self._rgb[side] = self.rgb(other)[tree.query(_points(own), workers=-1)[1]]
         return self._rgb[side]
 
-    def latents(self, side: Side, known: Array) -> Array:  # known: [N] bool -> [N, 3] uint8
-        """One projection of the latents for the scene; grey where one was never learnt, or none is in reach."""
+    def latents(self, side: Side, distance: float) -> Array:  # [N, 3] uint8
+        """One projection of the latents for the scene; grey where one was never learnt, or none is in reach of lambda."""
         features = self._clouds["semantic"].features
         assert features is not None
         if self._latents is None:
@@ -58,7 +58,7 @@ class SideColors:
                 self._latents[learnt.cpu().numpy()] = FeatureColors.fit(rows)(rows)
         if side == "semantic" or self._carried is None:
             return self._latents
-        return np.where(known[:, None], self._latents[self._carried.source], GREY)
+        return np.where(self._carried.within(distance)[:, None], self._latents[self._carried.source], GREY)
 
     @staticmethod
     def of_scores(scores: Array, clim: tuple[float, float]) -> Array:  # [N] -> [N, 3] uint8
