@@ -102,7 +102,7 @@ def _execute(notebook: Any, folder: Path, seconds: int) -> str:
         client = NotebookClient(notebook, km=manager, timeout=seconds, resources=resources, on_cell_start=note)
         quiet = {"IPYTHONDIR": home, "PYDEVD_DISABLE_FILE_VALIDATION": "1"}
         try:
-            client.execute(env=os.environ | quiet)
+            client.execute(env=os.environ | quiet, cleanup_kc=True)
         except CellExecutionError as error:
             return (
                 f"cell {_number(notebook, at[-1])} fails: {error.ename}: {error.evalue}\n{_traceback(notebook, at[-1])}"
@@ -158,6 +158,14 @@ def _pictures(notebook: Any, stem: str) -> dict[str, bytes]:
     return found
 
 
+def _write_pictures(folder: Path, stem: str, pictures: dict[str, bytes]) -> None:
+    """One notebook's pictures as files; those of its last run go."""
+    for old in folder.glob(f"{stem}_[0-9][0-9]_[0-9][0-9].*"):
+        old.unlink()
+    for name, content in pictures.items():
+        _write_whole(folder / name, content)
+
+
 def _write_whole(path: Path, content: bytes) -> None:
     """Write beside the final name and move: a killed run leaves no half of a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -188,8 +196,8 @@ def main(arguments: Sequence[str] | None = None, say: Callable[[str], None] = pr
         say(f"{source.stem:40s} {facts}  {'PROBLEM' if outcome.problems else 'ok'}")
         for problem in outcome.problems:
             say("    " + problem.replace("\n", "\n    "))
-        for name, content in outcome.pictures.items() if options.pictures else ():
-            _write_whole(options.pictures / name, content)
+        if options.pictures:
+            _write_pictures(options.pictures, source.stem, outcome.pictures)
         bad += bool(outcome.problems)
     return int(bad > 0)
 

@@ -1,0 +1,185 @@
+# %% [markdown]
+# # 1. A scene and its cameras
+#
+# What goes in: photographs, the cameras that took them, and a sparse cloud of points. You will see the cameras standing
+# in the room with their pictures, points projected into a picture and a picture seen again in space, which views are held
+# out for testing, and a lens removed.
+#
+# About 30 seconds on a CPU, most of it to make the toy room the first time. Needs nothing but `pip install "kfgs[notebook]"`.
+
+# %%
+# Your own data: a folder with images/ and a COLMAP model (sparse/0), or with a transforms.json.
+import os
+from pathlib import Path
+
+from kfgs import load_scene
+from kfgs.scenes import ToyConfig, make_toy_room
+
+data = Path(os.environ.get("KFGS_NOTEBOOK_DATA", "data"))
+folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))  # yours: folder = Path("my/scene")
+
+# %% [markdown]
+# ## What a scene holds
+#
+# Cameras, image files, points with their colours, and named splits. Pictures are read when asked for, one at a time, so
+# a scene of thousands costs nothing to open. Units are those of the file; the room's are metres.
+
+# %%
+scene = load_scene(folder)
+camera = scene.cameras[0]
+print(scene)
+print(
+    f"view 0: {camera.name}, {camera.width} x {camera.height} pixels, fx {camera.K[0, 0]:.1f}, fy {camera.K[1, 1]:.1f}"
+)
+print(f"it stands at {[round(x, 2) for x in camera.center.tolist()]}; extent of the cameras {scene.extent:.2f}")
+print("notes:", *scene.notes or ["none"])
+
+# %%
+from PIL import Image
+
+from kfgs.viz import picture_grid
+
+shown = scene.views("train")[:: max(1, len(scene.views("train")) // 8)][:8]
+Image.fromarray(picture_grid([[scene.image(i) for i in shown[:4]], [scene.image(i) for i in shown[4:]]]))
+
+# %% [markdown]
+# ## Cameras in space
+#
+# Each camera is a pyramid with its true opening, its picture on the image plane, and a small roof on the picture's upper
+# edge. Structure from motion leaves points far outside of a scene; `robust_bounds` says where the bulk of the cloud is.
+# The lid of the room is taken off here, to look in.
+
+# %%
+import pyvista as pv
+
+from kfgs.scenes import robust_bounds
+from kfgs.viz import Orbit, add_camera_images, add_cameras, estimate_up, look_through, make_plotter, orbit_cameras
+
+pv.set_jupyter_backend("static")  # "trame" lets you turn the scene: pip install "pyvista[jupyter]"
+
+bounds = robust_bounds(scene.points)
+up = estimate_up(scene.cameras).to(scene.points)
+height = scene.points @ up
+inside = bounds.inside & (height < height[bounds.inside].quantile(0.8))
+orbit = orbit_cameras(scene.points[inside], Orbit(frames=8, size=(540, 720), elevation_degrees=40, zoom=1.25), up=up)
+
+plotter = make_plotter(540, 720)
+plotter.add_points(
+    scene.points[inside].numpy(), scalars=scene.colors[inside].numpy(), rgb=True, point_size=3, lighting=False
+)
+add_cameras(plotter, scene.cameras, size=0.3 * scene.extent, most=7)
+add_camera_images(plotter, scene.cameras, scene.image, size=0.3 * scene.extent, most=7)
+look_through(plotter, orbit[1])
+plotter.show()
+
+# %% [markdown]
+# ## Points into a picture
+#
+# `project_points` takes world points to pixels (x, y) and says which of them the camera can see. The first pixel's centre
+# is (0.5, 0.5), as in COLMAP. kornia's `PinholeCamera` says the same: the largest difference is printed in pixels.
+
+# %%
+import torch
+from kornia.geometry.camera import PinholeCamera
+
+from kfgs.cameras import project_points
+
+pixels, depths, seen = project_points(camera, scene.points)
+
+K = torch.eye(4)
+K[:3, :3] = camera.K
+kornia_camera = PinholeCamera(
+    K[None], camera.viewmat[None].float(), torch.tensor([camera.height]), torch.tensor([camera.width])
+)
+theirs = kornia_camera.project(scene.points[seen])
+print(
+    f"{int(seen.sum()):,} of {len(seen):,} points project into the picture; kornia's camera differs by at most "
+    f"{float((theirs - pixels[seen]).abs().max()):.1e} pixels"
+)
+
+# %%
+import matplotlib.pyplot as plt
+from matplotlib_inline.backend_inline import set_matplotlib_formats
+
+set_matplotlib_formats("jpeg")  # a photograph is a fifth of its size as PNG
+
+figure, axes = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
+axes.imshow(scene.image(0).mean(-1), cmap="gray", vmin=-0.5, extent=(0, camera.width, camera.height, 0))
+drawn = seen & bounds.inside
+dots = axes.scatter(*pixels[drawn].T, c=depths[drawn], s=2, cmap="plasma_r")
+figure.colorbar(dots, label="depth (world units)", shrink=0.8)
+axes.set(title=camera.name, xlim=(0, camera.width), ylim=(camera.height, 0))
+plt.show()
+
+# %% [markdown]
+# The other way round: the cloud in pyvista, looked at through the same camera, beside the photograph. Where they agree,
+# poses, axes and principal point are read as they were meant. Points have no surface, so what is behind shines through.
+
+# %%
+plotter = make_plotter(camera.height, camera.width, off_screen=True)
+plotter.add_points(scene.points.numpy(), scalars=scene.colors.numpy(), rgb=True, point_size=4, lighting=False)
+look_through(plotter, camera)
+through = plotter.screenshot(return_img=True)
+plotter.close()
+Image.fromarray(picture_grid([[scene.image(0), through]], ["photograph", "points through its camera"]))
+
+# %% [markdown]
+# ## Which views are held out
+#
+# Training never sees the test views (orange). A `split.json` in the folder is used where there is one; any other rule is
+# one call, here every eighth view as in Mip-NeRF 360.
+
+# %%
+from kfgs.scenes import make_split
+
+plotter = make_plotter(480, 720)
+plotter.add_points(
+    scene.points[inside].numpy(),
+    scalars=scene.colors[inside].numpy(),
+    rgb=True,
+    point_size=2,
+    opacity=0.4,
+    lighting=False,
+)
+for split, color in {"train": "#0072b2", "test": "#d55e00"}.items():
+    add_cameras(plotter, scene.select(split).cameras, size=0.15 * scene.extent, color=color, line_width=3)
+plotter.add_legend([["train", "#0072b2"], ["test", "#d55e00"]], face="rectangle", bcolor="white", size=(0.15, 0.12))
+above = orbit_cameras(scene.points[inside], Orbit(frames=1, size=(480, 720), elevation_degrees=75, zoom=1.3), up=up)
+look_through(plotter, above[0])
+plotter.show()
+print({name: len(views) for name, views in make_split(len(scene), "holdout8").items()})
+
+# %% [markdown]
+# ## A lens removed
+#
+# Gaussians are drawn by a pinhole, so a lens has to go first: `scene.undistorted()` removes it from every picture on the
+# way in, and `scene.mask(i)` says which pixels were recorded. The room's pictures come from a pinhole. To have something
+# to remove, kornia gives view 0 a barrel lens; `undistort` then takes it away again.
+
+# %%
+from dataclasses import replace
+
+from kornia.geometry import create_meshgrid, remap, undistort_points
+
+from kfgs.cameras import Distortion, undistort
+from kfgs.metrics import psnr
+
+lens = replace(camera, distortion=Distortion("brown_conrady", (-0.25, 0.06, 0.0, 0.0)))
+K0 = camera.intrinsics_at_integer_centers[None].float()  # kornia's grid counts pixel centres from 0
+grid = create_meshgrid(camera.height, camera.width, normalized_coordinates=False)
+sources = undistort_points(grid.reshape(1, -1, 2), K0, torch.tensor([lens.distortion.coefficients])).reshape(grid.shape)
+photo = scene.image(0)
+bent = remap(photo.permute(2, 0, 1)[None], sources[..., 0], sources[..., 1], align_corners=True)[0].permute(1, 2, 0)
+
+straight, pinhole, recorded = undistort(bent, lens)
+print(
+    f"undistorted: {psnr(straight[recorded][None], photo[recorded][None]):.1f} dB where recorded ({recorded.float().mean():.0%})"
+)
+Image.fromarray(
+    picture_grid(
+        [[photo, bent, straight * recorded[..., None]]], ["pinhole", "barrel lens (k1 = -0.25)", "undistorted"]
+    )
+)
+
+# %% [markdown]
+# Next: [2_splat_a_feature_map](2_splat_a_feature_map.py) puts features on Gaussians and draws them.
