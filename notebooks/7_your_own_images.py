@@ -1,0 +1,273 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # 7. Your own images
+#
+# From bare pictures to answers: cameras by structure from motion, a teacher that you write yourself, a semantic field,
+# then *where is the green plant?* You will see what each step makes of the pictures before it.
+#
+# About a minute on two CPU cores, no weights, no network. The pictures of the toy room stand for yours; nothing but its
+# pictures is used, neither its cameras nor its labels.
+
+# %%
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from kornia.color import rgb_to_lab
+from matplotlib import colormaps
+from matplotlib.colors import XKCD_COLORS, to_rgb
+from PIL import Image
+from torch.nn.functional import avg_pool2d, normalize
+
+from kfgs import (
+    AutoencoderConfig,
+    FeatureFolder,
+    FieldConfig,
+    FitConfig,
+    ToyConfig,
+    answers,
+    extract_features,
+    fit_scene,
+    load_scene,
+    make_label_set,
+    make_toy_room,
+    pictures_of,
+    plan_scene,
+    resize_map,
+    run_sfm,
+)
+from kfgs.labels import select_where
+from kfgs.scenes import list_images, read_image
+from kfgs.teachers import CallableTeacher, TeacherCost
+from kfgs.viz import (
+    FeatureColors,
+    Orbit,
+    add_camera_images,
+    add_cameras,
+    add_cloud,
+    add_legend,
+    add_selections,
+    estimate_up,
+    legend_strip,
+    look_through,
+    make_plotter,
+    orbit_cameras,
+    overlay_labels,
+    picture_grid,
+)
+
+data = Path(os.environ.get("KFGS_NOTEBOOK_DATA", "data"))
+
+# Your own data: a folder of photos that overlap (JPEG, PNG, ...), and a folder for what is made of them. 30 to 150 photos
+# of one camera at one zoom are enough for a room; walk around, do not just turn.
+photos = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6)) / "images"
+out = data / "own"
+
+# %% [markdown]
+# ## Pictures
+
+# %%
+names = list_images(photos)
+shown = [read_image(photos / name) for name in names[:: max(1, len(names) // 6)][:6]]
+Image.fromarray(picture_grid([shown[:3], shown[3:]]))
+
+# %% [markdown]
+# ## Cameras
+#
+# COLMAP's structure from motion, in-process, on the CPU. The line to read is the number of *registered* pictures; those
+# that found no place are named, and a scene that falls into pieces is refused with advice. The lens that COLMAP fitted
+# is removed from pictures and maps alike.
+
+# %%
+if not (out / "sparse" / "0").is_dir():
+    print(run_sfm(photos, out))
+scene = load_scene(out, images=photos).undistorted()
+train, test = scene.views("train"), scene.views("test")
+cameras = [scene.cameras[i] for i in train]
+scene
+
+# %% [markdown]
+# Look before you fit: are the pictures where you stood? A world from photographs has no scale and no *up* of its own;
+# `estimate_up` reads the latter from how the camera was held.
+
+# %%
+up = estimate_up(scene.cameras)
+outside = orbit_cameras(scene.points, Orbit(frames=8, size=(420, 640), elevation_degrees=40, zoom=1.4), up=up)[1]
+plotter = make_plotter(*outside.size, off_screen=True)
+plotter.add_points(scene.points.numpy(), scalars=scene.colors.numpy(), rgb=True, point_size=3)
+add_cameras(plotter, scene.cameras, size=0.5)
+add_camera_images(plotter, scene.cameras, scene.image, size=0.5, most=10)
+look_through(plotter, outside)
+Image.fromarray(plotter.screenshot(return_img=True))
+
+# %% [markdown]
+# ## A teacher of your own
+#
+# Any function from a picture [3, H, W] to a map [D, h, w] can be distilled. This one knows **colours and nothing else**:
+# a feature says which of 216 reference colours are near a pixel in CIELAB, averaged over a small window. Words
+# get the same features, through the 949 colour names of XKCD's survey; of a phrase it hears only the colours
+# (in *forest green plant*, "plant" is for you). A toy in its knowledge, but a real teacher in every other respect.
+
+# %%
+NAMED = {name.removeprefix("xkcd:"): to_rgb(name) for name in XKCD_COLORS}
+SPREAD = torch.tensor([25.0, 12.0, 12.0])  # of L, a, b: how unlike two colours may be and still be felt as near
+STEPS = torch.linspace(0, 1, 6)
+REFERENCE = rgb_to_lab(torch.cartesian_prod(STEPS, STEPS, STEPS).T[None, :, :, None])[0, :, :, 0].T / SPREAD
+
+
+def nearness(image):  # [3, H, W] -> [216, H, W]
+    lab = rgb_to_lab(image[None])[0].movedim(0, -1) / SPREAD
+    return (-torch.cdist(lab, REFERENCE).square() / 2).exp().movedim(-1, 0)
+
+
+def see(image):  # [3, H, W] -> [216, H / 2, W / 2]
+    return avg_pool2d(nearness(avg_pool2d(image, 2)), 5, stride=1, padding=2, count_include_pad=False)
+
+
+def hear(prompts):  # n phrases -> [n, 216]
+    rows = []
+    for prompt in prompts:
+        words, colors = prompt.lower().split(), []
+        while words:  # the longest colour name that starts here, else the next word
+            found = [n for n in (3, 2, 1) if " ".join(words[:n]) in NAMED]
+            colors += [NAMED[" ".join(words[: found[0]])]] if found else []
+            words = words[found[0] if found else 1 :]
+        if not colors:
+            raise ValueError(f"{prompt!r}: expected a colour, such as 'slate blue', in what this teacher is asked")
+        rows.append(normalize(nearness(torch.tensor(colors).T[:, :, None])[:, :, 0], dim=0).mean(dim=1))
+    return torch.stack(rows)
+
+
+teacher = CallableTeacher(see, hear, name="colour words")
+
+# %% [markdown]
+# With weights at hand, one line takes its place, and nothing below changes:
+#
+# ```python
+# teacher = load_teacher("lseg", "demo_e200.ckpt", fast=True)              # the paper's teacher
+# teacher = load_teacher("clip", "openai/clip-vit-large-patch14")          # extra `hf`; a folder or a hub id
+# ```
+#
+# Always look at one map first: in false colours, and as the cosine with one phrase (yellow is near).
+
+# %%
+photo = scene.image(test[0])
+seen = resize_map(teacher.encode_image(photo.movedim(-1, 0)).movedim(0, -1), photo.shape[:2])  # [H, W, 216]
+likeness = normalize(seen, dim=-1) @ teacher.encode_text(["dark forest green"])[0]
+pictures = [photo, FeatureColors.fit(seen.flatten(0, 1))(seen), colormaps["cividis"](likeness.numpy())[..., :3]]
+Image.fromarray(picture_grid([pictures], ["photo", "features", "dark forest green"]))
+
+# %% [markdown]
+# ## What it will cost
+#
+# Before anything long starts: minutes, memory and disk of each stage, on this machine at this moment. Ask with
+# `teacher="lseg"` to see what the paper's would take. `FitConfig.paper()` is the paper's schedule (30,000 steps); this is
+# the one for a CPU, shorter still. Structure from motion gives few points, so the field may grow at a lower gradient.
+
+# %%
+field = replace(FieldConfig.cpu().with_steps(1_000), densify_gradient=1e-4, max_gaussians=30_000)
+config = replace(FitConfig.cpu(), autoencoder=AutoencoderConfig(steps=1_000), field=field)
+map_size = tuple(teacher.encode_image(photo.movedim(-1, 0)).movedim(0, -1).shape)
+print(plan_scene(scene, teacher=TeacherCost.of_maps("colour words", map_size), config=config, folder=out))
+
+# %% [markdown]
+# ## Features, then the field
+#
+# Maps are written one picture at a time, and a killed run goes on where it stopped; so does the fit. Each stage is found
+# again when nothing it depends on has changed: run this notebook twice, and the second time takes seconds.
+
+# %%
+manifest = extract_features(teacher, pictures_of(scene, train), out / "features")
+maps = FeatureFolder(out / "features", [scene.stem(i) for i in train])
+fitted = fit_scene(scene, maps, out / "run", config, report=print)
+semantic = fitted.field
+print(semantic.summary())
+
+# %% [markdown]
+# ## Segment pictures that it never saw
+#
+# Name what is there, one phrase per class. Views of the test split took no part in the fit.
+
+# %%
+phrases = [
+    "dark forest green plant", "dark grey blue sofa", "reddish brown chair", "greyish brown table", "dark brown cabinet",
+    "pinkish grey wall", "cloudy blue wall", "greenish grey wall", "medium grey ceiling", "dusty red rug", "cocoa floor",
+]  # fmt: skip
+classes = make_label_set(teacher, phrases, negatives=None)
+rows = []
+for i in test[:2]:
+    photo, labels = scene.image(i), semantic.segment(scene.cameras[i], classes.embeddings)
+    rows.append([photo, overlay_labels(photo, labels, alpha=0.8)])
+sheet = Image.fromarray(picture_grid(rows, ["unseen picture", "segmented"]))
+legend = Image.fromarray(legend_strip(torch.arange(len(phrases)), phrases, sheet.width))
+both = Image.new("RGB", (sheet.width, sheet.height + legend.height))
+both.paste(sheet)
+both.paste(legend, (0, sheet.height))
+both
+
+# %% [markdown]
+# ## Ask
+#
+# A query is told from the other classes (its relevancy), scored by the views, and cut at a gamma that is chosen from the
+# scores and said. `answers` counts the connected parts: how many, where, how large, seen best from where. Sizes are in
+# the units of the reconstruction.
+
+# %%
+question = "dark forest green plant"
+others = [row for row, phrase in enumerate(phrases) if phrase != question]
+embedding = teacher.encode_text([question])[0]
+found = semantic.query(embedding, negatives=classes.embeddings[others], cameras=cameras)
+plants = answers(semantic.gaussians, found, cameras)
+print(found)
+for plant in plants:
+    print(" ", plant)
+
+# %% [markdown]
+# ## Look
+#
+# The answers among the Gaussians, each in its oriented box, from the camera that sees the largest of them best.
+
+# %%
+best = cameras[plants[0].best_view.index] if plants else cameras[0]
+selections = {
+    f"plant {n}": select_where(torch.isin(torch.arange(len(semantic)), plant.indices))
+    for n, plant in enumerate(plants, start=1)
+}
+plotter = make_plotter(2 * best.height, 2 * best.width, off_screen=True)
+add_selections(plotter, semantic.gaussians, selections, style="gaussians", up=tuple(up.tolist()))
+look_through(plotter, best)
+view = plotter.screenshot(return_img=True)
+photo = scene.image(train[plants[0].best_view.index] if plants else train[0])
+Image.fromarray(picture_grid([[resize_map(photo, view.shape[:2]), view]], ["picture", "answers"]))
+
+# %% [markdown]
+# And all classes at once, by the votes of the views.
+
+# %%
+votes = semantic.classify_by_views(classes.embeddings, cameras)
+labelled = semantic.gaussians.replace(labels=votes.labels)
+plotter = make_plotter(480, 640, off_screen=True)
+add_cloud(plotter, labelled, style="gaussians")
+add_legend(plotter, labelled.labels, phrases)
+look_through(plotter, best)
+Image.fromarray(plotter.screenshot(return_img=True))
+
+# %% [markdown]
+# ## Further
+#
+# - `semantic` is saved in `data/own/run/field`; `SemanticField.load` brings it back, `kfgs query` and `kfgs view` ask it
+#   from a shell.
+# - `fit_color(scene, out / "run", ColorConfig.quick())` adds colours to edit: notebook 5.
+# - `kfgs sfm`, `kfgs plan`, `kfgs features`, `kfgs fit` are these cells as commands.
