@@ -1,0 +1,286 @@
+"""The explorer in a desktop window: a panel of controls beside the clouds, keys, and the mouse."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..._check import error_line
+from ..headless import has_display
+from .pane import PanelPane
+from .panel import PanelView, Slider, Spot
+from .query_line import QueryLine
+
+if TYPE_CHECKING:
+    from .explorer import Explorer
+
+FIRST = 100.0  # priority of our observers: before pyvista's and VTK's own, which they can stop
+STILL = 3  # pixels: a click may move this far before it is a drag
+BUSY = 0.15  # seconds: where the clouds take longer to draw, they follow a dragged slider half of the time
+STYLES = ("gaussians", "points")
+ACTIONS = ("save picture", "save selection", "reset view")
+KEYS = ("/ ask: Tab, Enter, Esc; 1-4 colours; r view", "p picture; s selection; q close; click picks")
+
+
+def open_window(explorer: Explorer) -> None:
+    """Show an explorer in a window, until the user closes it.
+
+    Right of the clouds lies a panel: the question (press "/" or click it, Tab completes a class, Enter asks, Escape
+    drops), sliders for gamma and (logarithmic) lambda, what colours stand for, saving, and the classes. A click on a cloud
+    that does not turn it picks the Gaussian there. What goes wrong is said in the panel. VTK's and pyvista's own keys are
+    off, but for q.
+
+    Args:
+        explorer: one that draws into a window. The window is gone afterwards; what was asked and picked stays.
+
+    Raises:
+        RuntimeError: if there is no display, or the explorer draws off-screen.
+    """
+    if not has_display():
+        raise RuntimeError(
+            "explorer: expected a display to open a window on, got none (neither DISPLAY nor WAYLAND_DISPLAY is set); use "
+            "serve(explorer) for the browser, or explorer.screenshot(path)"
+        )
+    if explorer.plotter.off_screen:
+        raise RuntimeError(
+            "explorer: expected one that draws into a window, got one that draws off-screen; make it with off_screen=False"
+        )
+    Desktop(explorer)
+    explorer.plotter.show(title="kfgs")
+
+
+class Desktop:
+    """Turns the events of an explorer's window into its verbs, and says in a panel what they did."""
+
+    def __init__(self, explorer: Explorer) -> None:
+        self.explorer = explorer
+        self.line: QueryLine | None = None  # while a question is typed
+        self.note = self.error = ""
+        self.scroll = 0
+        self._drag: tuple[Slider, Spot] | None = None
+        self._handle: float | None = None  # the dragged slider's value, where the clouds may not have followed
+        self._pressed: tuple[int, int] | None = None  # on a cloud
+        self._applied = self._took = 0.0  # when the clouds followed a slider, and how long that took
+        self._labels = self._present()
+        self.pane = PanelPane(explorer.plotter, self.view)
+        interactor = explorer.plotter.iren.interactor
+        self._tags = {
+            event: interactor.AddObserver(event, handler, FIRST)
+            for event, handler in {
+                "KeyPressEvent": self._on_key,
+                "CharEvent": self._on_character,
+                "LeftButtonPressEvent": self._on_press,
+                "MouseMoveEvent": self._on_move,
+                "LeftButtonReleaseEvent": self._on_panel_release,
+                "MiddleButtonPressEvent": self._on_other_button,
+                "RightButtonPressEvent": self._on_other_button,
+                "MouseWheelForwardEvent": self._on_wheel,
+                "MouseWheelBackwardEvent": self._on_wheel,
+            }.items()
+        }
+        # while a cloud turns, events reach the interactor's style alone
+        explorer.plotter.iren.add_observer("LeftButtonReleaseEvent", self._on_cloud_release)
+        explorer.listen(self._on_change)
+
+    def view(self) -> PanelView:
+        """What the panel has to say now."""
+        state, line = self.explorer.state, self.line
+        asked = "" if state.asked is None else state.asked.words
+        return PanelView(
+            question=asked if line is None else line.text,
+            hint="" if line is None else line.hint,
+            typing=line is not None,
+            sliders=self._sliders(),
+            choices=(("show", state.shows, state.show), ("style", STYLES, self.explorer.style)),
+            actions=ACTIONS,
+            classes=[(label, "no class" if label < 0 else state.meaning.names[label]) for label in self._labels],
+            hidden=state.hidden,
+            scroll=self.scroll,
+            lines=self.explorer.lines(),
+            note=self.note,
+            error=self.error,
+            keys=KEYS,
+        )
+
+    def _sliders(self) -> list[Slider]:
+        state = self.explorer.state
+        gamma, distance = state.gamma, state.distance
+        if self._drag is not None and self._handle is not None:
+            gamma, distance = (self._handle, distance) if self._drag[0].name == "gamma" else (gamma, self._handle)
+        sliders = [Slider("gamma", gamma, *state.gamma_range)]
+        if len(state.sides) > 1:
+            sliders.append(Slider("lambda", distance, *state.distance_range, logarithmic=True))
+        return sliders
+
+    def _present(self) -> list[int]:
+        """The labels in this scene, -1 last."""
+        found = {int(label) for label in np.unique(self.explorer.state.labels("semantic"))}
+        if len(self.explorer.state.sides) > 1:
+            found |= {-1}  # whether a colour Gaussian has none depends on lambda
+        return sorted(found - {-1}) + [-1] * (-1 in found)
+
+    # ---- verbs
+
+    def call(self, verb: Callable[[], str | None]) -> None:
+        """Call a verb, and say what it did or what went wrong, which VTK's event loop would swallow."""
+        self.note = self.error = ""
+        try:
+            self.note = verb() or ""
+        except Exception as error:  # the window stays, whatever it is
+            self.error = error_line(error)
+        self.pane.refresh()
+
+    def ask(self, words: str | None) -> None:
+        """Ask, which may take seconds for a phrase; None drops the question."""
+        self.line = None
+        if words:
+            self.note, self.error = f"asking for {words!r} ...", ""
+            self.pane.refresh()
+        self.call(lambda: self.explorer.ask(words) and None)
+
+    def act(self, kind: str, value: Any) -> None:
+        """Do what a button, a class or the question stands for."""
+        explorer = self.explorer
+        if kind == "question":
+            self.line = QueryLine(explorer.state.meaning.names)
+            self.pane.refresh()
+        elif kind == "show":
+            self.call(lambda: explorer.set_show(value))
+        elif kind == "style":
+            self.call(lambda: explorer.set_style(value))
+        elif kind == "name":
+            self.ask(explorer.state.meaning.names[value])
+        elif kind == "box":
+            self.call(lambda: explorer.set_hidden(explorer.state.hidden ^ {value}))
+        elif kind == "all":
+            self.call(lambda: explorer.set_hidden(() if value else self._labels))
+        elif value == "save picture":
+            self.call(self._save_picture)
+        elif value == "save selection":
+            self.call(self._save_selection)
+        else:
+            self.call(explorer.reset_view)
+
+    def _save_picture(self) -> str:
+        with self.pane.away():
+            return f"saved {self.explorer.save_picture()}"
+
+    def _save_selection(self) -> str:
+        paths = self.explorer.save_selection()
+        return f"saved {', '.join(path.name for path in paths)} in {paths[0].parent}"
+
+    def _slide(self, x: float, finally_: bool) -> None:
+        """Move the dragged handle; the clouds follow at once where they are quick, and in the end."""
+        assert self._drag is not None
+        slider, spot = self._drag
+        left, _, right, _ = spot.box
+        self._handle = value = slider.at((x - left) / (right - 1 - left))
+        began = perf_counter()
+        if not (finally_ or self._took <= BUSY or began - self._applied > self._took):
+            self.pane.refresh()
+            return
+        verb = self.explorer.set_gamma if slider.name == "gamma" else self.explorer.set_distance
+        if finally_:
+            self._drag = self._handle = None
+        self.call(lambda: verb(value))
+        self._applied = perf_counter()
+        self._took = self._applied - began
+
+    def _on_change(self) -> None:
+        """A verb was called, by this window or by a program."""
+        self.pane.refresh()
+
+    # ---- keys
+
+    def _on_key(self, interactor: Any, event: str) -> None:
+        key, character = str(interactor.GetKeySym() or ""), str(interactor.GetKeyCode() or "")
+        if self.line is None and key == "q":
+            return  # pyvista's and VTK's own: close
+        self._stop(interactor, event)
+        if self.line is None:
+            self._command(key, character)
+        elif interactor.GetControlKey():
+            return
+        else:
+            verdict = self.line.press(key, character)
+            if verdict == "ask":
+                self.ask(self.line.text)
+            else:
+                self.line = self.line if verdict == "typing" else None
+                self.pane.refresh()
+
+    def _on_character(self, interactor: Any, event: str) -> None:
+        """VTK's own keys, such as e for exit and w for wires, wait for this event."""
+        if self.line is not None or interactor.GetKeySym() != "q":
+            self._stop(interactor, event)
+
+    def _command(self, key: str, character: str) -> None:
+        """A key while nothing is typed."""
+        shows = self.explorer.state.shows
+        if character == "/" or key in ("slash", "KP_Divide"):
+            self.act("question", None)
+        elif key == "Escape":
+            self.ask(None)
+        elif character in ("1", "2", "3", "4") and int(character) <= len(shows):
+            self.act("show", shows[int(character) - 1])
+        elif key in ("p", "s", "r"):
+            self.act("do", ACTIONS["psr".index(key)])
+
+    # ---- mouse
+
+    def _where(self, interactor: Any) -> tuple[int, int]:
+        """The mouse, with y from the top."""
+        x, y = interactor.GetEventPosition()
+        return x, int(self.explorer.plotter.render_window.GetSize()[1]) - 1 - y
+
+    def _on_press(self, interactor: Any, event: str) -> None:
+        place = self._where(interactor)
+        inside, spot, x = self.pane.find(*place)
+        if self.line is not None and (spot is None or spot.kind != "question"):
+            self.line = None
+            self.pane.refresh()
+        self._pressed = None if inside else place
+        if not inside:
+            return
+        self._stop(interactor, event)
+        if spot is None:
+            return
+        if spot.kind == "slider":
+            self._drag = next(slider for slider in self._sliders() if slider.name == spot.value), spot
+            self._slide(x, False)
+        elif spot.kind != "question" or self.line is None:
+            self.act(spot.kind, spot.value)
+
+    def _on_move(self, interactor: Any, event: str) -> None:
+        if self._drag is not None:
+            self._stop(interactor, event)
+            self._slide(self.pane.find(*self._where(interactor))[2], False)
+
+    def _on_panel_release(self, interactor: Any, event: str) -> None:
+        if self._drag is not None:
+            self._stop(interactor, event)
+            self._slide(self.pane.find(*self._where(interactor))[2], True)
+
+    def _on_cloud_release(self, *_: Any) -> None:
+        pressed, self._pressed = self._pressed, None
+        place = self._where(self.explorer.plotter.iren.interactor)
+        if pressed is not None and max(abs(a - b) for a, b in zip(pressed, place, strict=True)) <= STILL:
+            self.call(lambda: None if self.explorer.pick(*place) is not None else "nothing there to pick")
+
+    def _on_other_button(self, interactor: Any, event: str) -> None:
+        if self.pane.find(*self._where(interactor))[0]:
+            self._stop(interactor, event)
+
+    def _on_wheel(self, interactor: Any, event: str) -> None:
+        if self.pane.find(*self._where(interactor))[0]:
+            self._stop(interactor, event)
+            step = -1 if event == "MouseWheelForwardEvent" else 1
+            self.scroll = min(max(self.scroll + step, 0), self.pane.panel.last_scroll)
+            self.pane.refresh()
+
+    def _stop(self, interactor: Any, event: str) -> None:
+        """Nobody after us hears of this event."""
+        interactor.GetCommand(self._tags[event]).SetAbortFlag(True)

@@ -1,0 +1,102 @@
+"""A panel beside a plotter's subplots: it keeps its width when the window changes, and is drawn without the clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .panel import WIDTH, Panel, PanelView, Spot, draw_panel
+
+if TYPE_CHECKING:
+    import pyvista as pv
+
+Array = np.ndarray[Any, Any]
+LEAST = 200  # pixels that the subplots keep, however narrow the window
+
+
+class PanelPane:
+    """Makes room on the right of a plotter's subplots, which keep their proportions, for a panel.
+
+    Args:
+        plotter: its window is made wider by the panel.
+        view: asked for what the panel says whenever that is drawn anew.
+    """
+
+    def __init__(self, plotter: pv.Plotter, view: Callable[[], PanelView]) -> None:
+        from vtkmodules.vtkRenderingCore import vtkActor2D, vtkImageMapper, vtkRenderer
+
+        self.plotter, self.view = plotter, view
+        self.panel = Panel(np.zeros((0, 0, 3), np.uint8), [], 0)
+        self._viewports = [tuple(renderer.GetViewport()) for renderer in plotter.renderers]
+        self._size: tuple[int, int] | None = None
+        self._left, self._stale, self._away = 0, True, False
+        self._mapper = vtkImageMapper()
+        self._mapper.SetColorWindow(255)  # bytes as they are
+        self._mapper.SetColorLevel(127.5)
+        actor = vtkActor2D()
+        actor.SetMapper(self._mapper)
+        self._renderer = vtkRenderer()
+        self._renderer.AddActor(actor)
+        self._renderer.InteractiveOff()
+        width, height = plotter.window_size
+        plotter.render_window.AddRenderer(self._renderer)
+        plotter.window_size = [width + WIDTH, height]
+        self._observer = plotter.render_window.AddObserver("StartEvent", self._before_frame)
+
+    def find(self, x: float, y: float) -> tuple[bool, Spot | None, float]:
+        """Whether a point of the window (y from the top) is in the panel, what lies there, and x in the panel."""
+        inside = not self._away and x >= self._left
+        return inside, self.panel.find(x - self._left, y) if inside else None, x - self._left
+
+    def refresh(self) -> None:
+        """Draw the panel again and leave the clouds as they are: 20 ms instead of a frame of Gaussians."""
+        self._stale = True
+        window = self.plotter.render_window
+        if window is None or self._size is None:  # closed, or not yet open: the first frame draws it
+            return
+        clouds = [renderer for renderer in self.plotter.renderers if renderer.GetDraw()]
+        for renderer in clouds:
+            renderer.DrawOff()
+        try:
+            window.Render()
+        finally:
+            for renderer in clouds:
+                renderer.DrawOn()
+
+    @contextmanager
+    def away(self) -> Iterator[None]:
+        """The subplots fill the window, as for a picture of them."""
+        self._away, self._size = True, None
+        try:
+            yield
+        finally:
+            self._away, self._size = False, None
+            self.plotter.render()
+
+    def _before_frame(self, *_: Any) -> None:
+        """Follow the window's size, and paint what has changed."""
+        width, height = self.plotter.render_window.GetSize()
+        if (width, height) != self._size:
+            self._size, self._stale = (width, height), True
+            self._left = width if self._away else max(width - WIDTH, min(LEAST, width))
+            for renderer, (left, low, right, high) in zip(self.plotter.renderers, self._viewports, strict=True):
+                renderer.SetViewport(left * self._left / width, low, right * self._left / width, high)
+            self._renderer.SetViewport(self._left / width, 0, 1, 1)
+            self._renderer.SetDraw(not self._away and self._left < width)
+        if self._stale and not self._away:
+            self._stale = False
+            self.panel = draw_panel(self.view(), height)
+            self._mapper.SetInputData(_as_image(self.panel.picture))
+
+
+def _as_image(picture: Array) -> Any:  # [H, W, 3] uint8
+    import pyvista as pv
+
+    height, width, _ = picture.shape
+    image = pv.ImageData(dimensions=(width, height, 1))
+    image.point_data["rgb"] = picture[::-1].reshape(-1, 3)  # VTK counts rows from below
+    image.set_active_scalars("rgb")
+    return image
