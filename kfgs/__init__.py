@@ -64,6 +64,7 @@ _WHERE = {
     "LabelSet": ".labels",
     "evaluate_segmentation": ".evaluation",
     "load_label_set": ".labels",
+    "explore": ".viz",
 }
 __version__ = "0.1.0"
 __all__ = sorted(_WHERE)
@@ -124,6 +125,7 @@ if TYPE_CHECKING:
     from .teachers import load_teacher as load_teacher
     from .teachers import make_label_set as make_label_set
     from .teachers import pictures_of as pictures_of
+    from .viz import explore as explore
 
 
 def __getattr__(name: str) -> Any:

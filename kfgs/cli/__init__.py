@@ -1,5 +1,5 @@
 """The command line: `kfgs demo | sfm | plan | features | text | fit | segment | label | info | color | attach |
-select | edit | convert`.
+select | edit | convert | view`.
 
 Every command names the files it wrote, shows progress on long work, and ends with 0 (done), 1 (bad input, with one
 message that says what to do), 2 (wrong usage), 130 (interrupted; the same command goes on where it stopped) or 141
@@ -15,6 +15,7 @@ from typing import Any
 import tyro
 
 from .color import attach, color, convert, edit
+from .look import view
 from .query import select
 from .say import warnings_as_notes
 from .semantic import demo, fit, info, label, segment, sfm
@@ -23,7 +24,23 @@ from .words import text
 
 COMMANDS: dict[str, Any] = {
     command.__name__: command
-    for command in (demo, sfm, plan, features, text, fit, segment, label, info, color, attach, select, edit, convert)
+    for command in (
+        demo,
+        sfm,
+        plan,
+        features,
+        text,
+        fit,
+        segment,
+        label,
+        info,
+        color,
+        attach,
+        select,
+        edit,
+        convert,
+        view,
+    )
 }
 
 

@@ -145,7 +145,7 @@ def ask(
     asked = embed(teacher, weights, [query], templates=None if label_set is None else label_set.info.get("templates"))
     if label_set is None:
         return asked, asked.names[0], False
-    _note_other_teacher(asked, label_set)
+    note_other_teacher(asked, label_set)
     name = asked.names[0]
     known = label_set.knows(name)
     if not known:
@@ -156,7 +156,7 @@ def ask(
     return label_set, label_set.names[label_set.index(name)], known
 
 
-def _note_other_teacher(asked: Any, table: Any) -> None:
+def note_other_teacher(asked: Any, table: Any) -> None:
     """Say where a query and the table whose classes it joins were embedded by different teachers.
 
     Whether the query fits the field is told apart from this, by `pipeline.query_field`.

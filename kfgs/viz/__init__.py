@@ -3,6 +3,7 @@
 from .animation import save_animation, save_frames
 from .boxes import add_boxes, add_names, add_selections
 from .clouds import CloudOptions, add_cloud, recolor_cloud
+from .explorer import ExploreOptions, Explorer, explore
 from .flythrough import flythrough_cameras, save_flythrough
 from .frusta import add_camera_images, add_cameras
 from .headless import available, make_plotter
@@ -24,6 +25,8 @@ __all__ = [
     "PALETTE",
     "CloudOptions",
     "CodebookRows",
+    "ExploreOptions",
+    "Explorer",
     "FeatureColors",
     "Matches",
     "Orbit",
@@ -41,6 +44,7 @@ __all__ = [
     "available",
     "codebook_rows",
     "estimate_up",
+    "explore",
     "flythrough_cameras",
     "legend_column",
     "legend_strip",

@@ -1,1 +1,32 @@
 """The explorer: both clouds side by side, asked in words, in a window, a browser or a notebook."""
+
+from .desktop import open_window
+from .exploration import Exploration, Show
+from .explore import explore
+from .explorer import ExploreOptions, Explorer
+from .meaning import Asked, FieldMeaning, Meaning, SplatMeaning
+from .notebook import show_in_notebook
+from .pick import Sight, gaussian_at, neighbours_of, views_seeing
+from .picked import Picked, Side
+from .web import serve
+
+__all__ = [
+    "Asked",
+    "Exploration",
+    "ExploreOptions",
+    "Explorer",
+    "FieldMeaning",
+    "Meaning",
+    "Picked",
+    "Show",
+    "Side",
+    "Sight",
+    "SplatMeaning",
+    "explore",
+    "gaussian_at",
+    "neighbours_of",
+    "open_window",
+    "serve",
+    "show_in_notebook",
+    "views_seeing",
+]
