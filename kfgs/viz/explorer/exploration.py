@@ -242,8 +242,8 @@ class Exploration:
     def save_selection(self, folder: str | Path) -> list[Path]:
         """Write what is selected: numbers as selection.json, the Gaussians of each side as selection_<side>.ply.
 
-        The parts of the selection are listed, the largest first, with the view that shows each best where there are
-        cameras. Selected Gaussians are written whether hidden or not. All files appear or none; a side in which nothing is
+        The connected parts of the selection are listed, the 16 largest at most, with the view among at most 30 of the
+        cameras, evenly chosen, that shows each best. Selected Gaussians are written whether hidden or not. All files appear or none; a side in which nothing is
         selected has no file.
 
         Raises:

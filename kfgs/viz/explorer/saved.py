@@ -14,6 +14,10 @@ from ..._files import write_json
 from ...formats import SplatFile, write_splats
 from ...formats.splat_file import SCORE
 from ...labels import answers
+from ..frusta import evenly
+
+MOST_PARTS = 16  # listed: as many as `answers` draws in one rendering of a view
+MOST_VIEWS = 30  # compared, evenly chosen
 
 if TYPE_CHECKING:
     from .exploration import Exploration
@@ -47,8 +51,16 @@ def save_parts(state: Exploration, folder: Path) -> list[Path]:
 
 
 def _parts(state: Exploration, side: Side) -> list[dict[str, Any]]:
-    found = answers(state.cloud(side), state.selection(side), state.cameras or None)
-    return [part.to_json() for part in found]
+    """The connected parts, each with the view that shows it best: a place among all cameras of the exploration."""
+    places = evenly(len(state.cameras), MOST_VIEWS).tolist() if state.cameras else []
+    views = [state.cameras[place] for place in places]
+    parts = [
+        part.to_json() for part in answers(state.cloud(side), state.selection(side), views or None, most=MOST_PARTS)
+    ]
+    for part in parts:
+        if part["best_view"] is not None:
+            part["best_view"]["index"] = places[part["best_view"]["index"]]
+    return parts
 
 
 def _splats(state: Exploration, side: Side) -> SplatFile:

@@ -1,0 +1,104 @@
+"""A small field, classes and views to ask, and clouds whose positions tie, for the tests of the explorer."""
+
+from functools import cache
+
+import torch
+
+from kfgs.cameras import Camera
+from kfgs.fields import SemanticField
+from kfgs.formats import SplatFile
+from kfgs.gaussians import Gaussians
+from kfgs.labels import LabelSet
+from kfgs.quant.autoencoder import Autoencoder
+from kfgs.quant.codebook import Codebook
+
+DIM, WORDS = 16, 12
+NAMES = ("wall", "chair", "table", "office chair")
+MODES = ("decouple", "adc", "adc+sc")
+
+
+@cache
+def codebook():
+    """Twelve codewords of different lengths, nearly orthogonal."""
+    generator = torch.Generator().manual_seed(1)
+    rows = torch.eye(WORDS, DIM) + 0.2 * torch.rand(WORDS, DIM, generator=generator)
+    return Codebook(rows * torch.linspace(0.5, 2, WORDS)[:, None])
+
+
+@cache
+def autoencoder():
+    """Written down, not fitted: the first twelve channels and back."""
+    into, out = torch.eye(WORDS, DIM), torch.eye(DIM, WORDS)
+    return Autoencoder(
+        encoder=((into, torch.zeros(WORDS)),),
+        decoder=((out, torch.zeros(DIM)), (torch.eye(DIM), torch.zeros(DIM))),
+        low=0.0,
+        high=1.0,
+    )
+
+
+def field(mode="adc+sc", n=80, seed=0):
+    """Gaussians that overlap, near codewords; two that were never learnt, one that no view shows."""
+    generator = torch.Generator().manual_seed(seed)
+    rand = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
+    features = codebook().codewords[torch.arange(n) % WORDS] + 0.05 * rand(n, DIM)
+    if mode == "adc+sc":
+        with torch.no_grad():
+            features = autoencoder().encode(features)
+    features[:2] = 0
+    means = torch.stack([rand(n) * 4 - 2, rand(n) * 2 - 1, rand(n) * 2 + 4], dim=1)
+    means[2] = torch.tensor([0.0, 50.0, 5.0])
+    gaussians = Gaussians(
+        means=means,
+        quats=torch.randn(n, 4, generator=generator),
+        scales=rand(n, 3) * 0.1 + 0.05,
+        opacities=rand(n) * 0.5 + 0.45,
+        features=features,
+    )
+    book = None if mode == "decouple" else codebook()
+    return SemanticField(gaussians, book, autoencoder() if mode == "adc+sc" else None)
+
+
+def classes(count=4, negatives=True):
+    """Classes like a codeword each, and two canonical words."""
+    rows = codebook().codewords[:count] + 0.1
+    others = codebook().codewords[[5, 6]] if negatives else None
+    return LabelSet(NAMES[:count], rows, others, ("object", "stuff") if negatives else ())
+
+
+def cameras(count=3):
+    made = []
+    for i in range(count):
+        viewmat = torch.eye(4)
+        viewmat[0, 3] = 0.3 * (i - (count - 1) / 2)
+        K = torch.tensor([[40.0, 0, 21], [0, 44, 13], [0, 0, 1]])
+        made.append(Camera(viewmat, K, 40, 28, f"view_{i}"))
+    return made
+
+
+def cloud(means, labels=None, **changes):
+    """Small balls at the given places."""
+    means = torch.as_tensor(means, dtype=torch.float32)
+    n = len(means)
+    return Gaussians(
+        means=means,
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        scales=torch.full((n, 3), 0.05),
+        opacities=torch.full((n,), 0.9),
+        labels=None if labels is None else torch.as_tensor(labels, dtype=torch.int64),
+    ).replace(**changes)
+
+
+def grid_clouds(seed=0, sources=150, targets=400):
+    """Semantic and colour Gaussians on whole numbers, so that distances tie and several share a place."""
+    generator = torch.Generator().manual_seed(seed)
+    semantic = torch.randint(0, 7, (sources, 3), generator=generator).float()
+    color = torch.randint(-2, 9, (targets, 3), generator=generator).float()
+    labels = torch.randint(-1, 4, (sources,), generator=generator)
+    features = torch.rand(sources, 5, generator=generator)
+    sh = torch.rand(targets, 1, 3, generator=generator) - 0.5
+    return cloud(semantic, labels, features=features), cloud(color, sh=sh)
+
+
+def splat_file(gaussians, score=None):
+    return SplatFile(gaussians, {} if score is None else {"score": score}, NAMES)
