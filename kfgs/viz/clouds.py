@@ -132,15 +132,17 @@ def add_cloud(
 def recolor_cloud(
     actor: pv.Actor,
     colors: Array,  # [N, 3] uint8
+    opacities: Array | None = None,  # [N] in [0, 1]
 ) -> None:
-    """Exchange the colours of a cloud that `add_cloud` drew; the next frame shows them.
+    """Exchange the colours of a cloud that `add_cloud` drew, or colours and opacities; the next frame shows them.
 
     Args:
         actor: what `add_cloud` returned. One coloured by `view` takes its own colours again when the camera moves.
         colors: in the order of the Gaussians, whatever the order of drawing.
+        opacities: likewise, of a cloud with `style="gaussians"`, which are drawn with them; None: as they are.
 
     Raises:
-        ValueError: if there are not as many as Gaussians, or they are not uint8.
+        ValueError: if there are not as many as Gaussians, or they are not uint8; if opacities are out of [0, 1].
     """
     cloud: Any = actor.mapper.dataset
     count = int(cloud.field_data["count"][0])
@@ -150,7 +152,15 @@ def recolor_cloud(
             f"colors: expected uint8 [{count}, 3] (from actor), got {colors.dtype} {tuple(colors.shape)}; "
             "use palette(labels)"
         )
-    cloud.point_data["rgb"] = colors[np.asarray(cloud["index"])]
+    index = np.asarray(cloud["index"])
+    if opacities is not None:
+        check_shapes(("colors", colors, "N 3"), ("opacities", opacities, "N"))
+        if not ((opacities >= 0) & (opacities <= 1)).all():  # NaN fails
+            raise ValueError(
+                f"opacities: expected numbers in [0, 1], got {opacities.min():g} to {opacities.max():g}; clip them first"
+            )
+        cloud.point_data["opacity"] = opacities.astype(np.float32)[index]
+    cloud.point_data["rgb"] = colors[index]
 
 
 def _surfaces(gaussians: Gaussians, options: CloudOptions) -> pv.PolyData:

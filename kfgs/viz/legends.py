@@ -50,18 +50,18 @@ def add_legend(
     return actor
 
 
-def add_scalar_bar(plotter: pv.Plotter, cloud: pv.Actor, title: str = "score") -> Any:
+def add_scalar_bar(plotter: pv.Plotter, cloud: pv.Actor | tuple[float, float], title: str = "score") -> Any:
     """Say which colour stands for which number, in a bar on the right of the active subplot.
 
     Args:
         plotter: where the cloud is.
-        cloud: what `add_cloud` returned for scores or opacities.
+        cloud: what `add_cloud` returned for scores or opacities; or the numbers of the darkest and the brightest colour.
         title: over the bar.
 
     Raises:
         ValueError: if the cloud's colours stand for no numbers.
     """
-    clim = cloud.mapper.dataset.field_data.get("clim")
+    clim = cloud if isinstance(cloud, tuple) else cloud.mapper.dataset.field_data.get("clim")
     if clim is None:
         raise ValueError(
             "cloud: expected one coloured by scores or opacity, got one without a scale; use add_legend for labels"

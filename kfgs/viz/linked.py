@@ -61,7 +61,7 @@ def linked_clouds(
             plotter.subplot(0, column)
             add_cloud(plotter, cloud, color_by=by, style=style)
             title = f"{('semantic', 'colour')[column]} field: {TITLES.get(by, by)}"
-            plotter.add_text(title, position="upper_edge", font_size=10, color=letters(plotter))
+            add_title(plotter, title)
             if names is not None and by == "label" and cloud.labels is not None:
                 add_legend(plotter, cloud.labels, names)
         plotter.subplot(0, 0)
@@ -70,15 +70,20 @@ def linked_clouds(
             look_through(plotter, camera)
             plotter.renderers[1].camera_set = True
         else:
-            _look_at(plotter, semantic)
+            look_over(plotter, semantic)
     except BaseException:
         plotter.close()
         raise
     return plotter
 
 
-def _look_at(plotter: pv.Plotter, gaussians: Gaussians) -> None:
-    """An isometric view of all but the outermost hundredth."""
+def add_title(plotter: pv.Plotter, title: str) -> pv.CornerAnnotation:
+    """Write what the active subplot shows over it, in letters that can be read on its background."""
+    return plotter.add_text(title, position="upper_edge", font_size=10, color=letters(plotter))
+
+
+def look_over(plotter: pv.Plotter, gaussians: Gaussians) -> None:
+    """An isometric view of all but the outermost hundredth, for all linked subplots."""
     means = gaussians.means.detach().cpu().double().numpy()
     middle = np.median(means, axis=0)
     distance = np.linalg.norm(means - middle, axis=1)

@@ -1,11 +1,15 @@
-"""Look at a plotter's scene through a posed camera, as the camera saw it."""
+"""Look at a plotter's scene through a posed camera, as the camera saw it, and the way back."""
 
 from __future__ import annotations
 
-from math import atan, degrees
+from math import atan, degrees, radians, tan
 from typing import TYPE_CHECKING
 
+import numpy as np
+import torch
+
 from ..cameras import Camera
+from ..cameras.camera import NEAR
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -35,3 +39,36 @@ def look_through(plotter: pv.Plotter, camera: Camera) -> None:
     view.SetUseExplicitAspectRatio(True)
     plotter.camera_set = True  # or the first render would move the camera to see everything
     plotter.renderer.ResetCameraClippingRange()
+
+
+def camera_of(plotter: pv.Plotter, subplot: tuple[int, int] = (0, 0), *, near: float = NEAR) -> Camera:
+    """The posed camera through which a subplot is looked at: `look_through` backwards, for the picture as it is now.
+
+    Args:
+        plotter: its window may have any size.
+        subplot: (row, column).
+        near: of the camera, world units: VTK's own near plane only fits the depths that it stores.
+
+    Returns:
+        A pinhole camera (float64) with the size of the subplot, in pixels.
+
+    Raises:
+        ValueError: if the subplot looks along parallel rays.
+    """
+    renderer = plotter.renderers[plotter.renderers.loc_to_index(subplot)]
+    view = renderer.GetActiveCamera()
+    if view.GetParallelProjection():
+        raise ValueError(
+            "plotter: expected a perspective view, got a parallel projection, which no pinhole camera has; call "
+            "plotter.disable_parallel_projection()"
+        )
+    width, height = renderer.GetSize()
+    matrix = view.GetViewTransformMatrix()
+    E = np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])
+    E[1:3] *= -1  # VTK's y points up and z backward
+    aspect = view.GetExplicitAspectRatio() if view.GetUseExplicitAspectRatio() else width / height
+    fy = height / 2 / tan(radians(view.GetViewAngle()) / 2)
+    fx = width / aspect * fy / height
+    x, y = view.GetWindowCenter()
+    K = [[fx, 0.0, (1 - x) * width / 2], [0.0, fy, (1 + y) * height / 2], [0.0, 0.0, 1.0]]
+    return Camera(torch.from_numpy(E), torch.tensor(K, dtype=torch.float64), width, height, near=near)

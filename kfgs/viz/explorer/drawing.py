@@ -1,0 +1,130 @@
+"""One side of the explorer on the screen: its cloud as Gaussians or as points, what is selected, and what is picked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from ...cameras.camera import NEAR
+from ...gaussians import Gaussians
+from ..clouds import CloudOptions, add_cloud, recolor_cloud
+from ..linked import add_title
+from ..meshes import draw_mesh
+from ..stand_ins import FAINT
+from .mark import Mark
+
+if TYPE_CHECKING:
+    import pyvista as pv
+
+Array = np.ndarray[Any, Any]
+Drawn = Literal["gaussians", "points"]
+
+POINT_SIZE = 3.0  # pixels
+REST_POINTS = 30_000  # of what is not selected, evenly chosen: so many leave the selection visible behind them
+REST_ALPHA = 0.12  # of such a point
+
+
+class Pane:
+    """A subplot with one cloud, whose colours, selection and style can be exchanged.
+
+    Args:
+        plotter: where to draw.
+        column: of the subplot.
+        cloud: what is drawn, at least one Gaussian.
+        near: depth up to which Gaussians are not drawn, world units.
+    """
+
+    def __init__(self, plotter: pv.Plotter, column: int, cloud: Gaussians, near: float = NEAR) -> None:
+        self.plotter, self.column, self.cloud, self.near = plotter, column, cloud, near
+        self.renderer: Any = plotter.renderers[column]
+        self.visible = np.ones(len(cloud), dtype=bool)  # [N] drawn and not faint
+        self._opacities: Array = cloud.opacities.detach().cpu().numpy()
+        self._means: Array = cloud.means.detach().cpu().numpy().astype(np.float32)
+        self._gaussians: Any = None
+        self._points: list[Any] | None = None  # what is clearly seen, and the rest
+        self._title: Any = None
+        self._notes: list[Any] = []
+        self._mark = Mark(self.renderer)
+
+    def draw(
+        self,
+        style: Drawn,
+        colors: Array,  # [N, 3] uint8
+        drawn: Array,  # [N] bool
+        selected: Array | None,  # [N] bool
+        rest: float,
+    ) -> None:
+        """Show the Gaussians that are drawn; with a selection, the others of them are faint.
+
+        Args:
+            style: `gaussians`, the picture of kfgs's own rasteriser, or `points`.
+            colors: of all N.
+            drawn: which are drawn at all.
+            selected: which are clearly seen; None: all.
+            rest: factor on the opacity of the others.
+        """
+        strong = drawn if selected is None else drawn & selected
+        self.visible = strong if style == "gaussians" else strong & (self._opacities > FAINT["points"])
+        self.plotter.subplot(0, self.column)
+        if style == "gaussians":
+            self._draw_gaussians(colors, strong, drawn, rest)
+        else:
+            self._draw_points(colors, drawn & ~strong)
+        if self._gaussians is not None:
+            self._gaussians.SetVisibility(style == "gaussians")
+        for actor in self._points or ():
+            actor.SetVisibility(style == "points" and int(actor.mapper.dataset.field_data["shown"][0]) > 0)
+
+    def say(self, title: str, notes: Sequence[Callable[[pv.Plotter], Any]] = ()) -> None:
+        """Write a title; `notes` add a legend or a bar to the plotter's active subplot and return its actor."""
+        self.plotter.subplot(0, self.column)
+        for actor in [self._title, *self._notes]:
+            if actor is not None:
+                self.plotter.remove_actor(actor, render=False)
+        self._title = add_title(self.plotter, title)
+        self._notes = [add(self.plotter) for add in notes]
+
+    def mark(self, place: tuple[float, float, float] | None) -> None:
+        """Draw a ring around a place in the world; None: no ring."""
+        self._mark.move(place)
+
+    def within(self, x: float, y: float) -> tuple[float, float] | None:
+        """A place of the window (y from its top) in this subplot's pixels; None: it is in another."""
+        width, height = self.renderer.GetSize()
+        left, bottom = self.renderer.GetOrigin()
+        x, y = x - left, y - (self.plotter.render_window.GetSize()[1] - bottom - height)
+        return (x, y) if 0 <= x < width and 0 <= y < height else None
+
+    def _draw_gaussians(self, colors: Array, strong: Array, drawn: Array, rest: float) -> None:
+        if self._gaussians is None:
+            options = CloudOptions(near=self.near)
+            self._gaussians = add_cloud(self.plotter, self.cloud, color_by=colors, style="gaussians", options=options)
+        factor = np.where(strong, 1.0, np.where(drawn, rest, 0.0))
+        recolor_cloud(self._gaussians, colors, np.clip(self._opacities * factor, 0, 1))
+
+    def _draw_points(self, colors: Array, faint: Array) -> None:
+        others = np.flatnonzero(faint & (self._opacities > FAINT["points"]))
+        others = others[np.linspace(0, len(others) - 1, min(len(others), REST_POINTS)).round().astype(np.int64)]
+        parts = [self._part(rows, colors) for rows in (np.flatnonzero(self.visible), others)]
+        if self._points is None:
+            self._points = [
+                draw_mesh(self.plotter, part, style="points", scalars="rgb", rgb=True, point_size=POINT_SIZE,
+                          lighting=False, opacity=alpha, reset_camera=False)
+                for part, alpha in zip(parts, (1.0, REST_ALPHA), strict=True)
+            ]  # fmt: skip
+            return
+        for actor, part in zip(self._points, parts, strict=True):
+            actor.mapper.dataset.shallow_copy(part)
+
+    def _part(self, rows: Array, colors: Array) -> pv.PolyData:
+        """Points for some Gaussians; `shown` in the field data says how many (pyvista draws no empty mesh)."""
+        import pyvista as pv
+
+        kept = rows if len(rows) else np.zeros(1, dtype=np.int64)
+        part = pv.PolyData(self._means[kept])
+        part["index"], part["rgb"] = kept, colors[kept]
+        part.field_data["shown"] = np.array([len(rows)])
+        part.set_active_scalars("rgb")
+        return part

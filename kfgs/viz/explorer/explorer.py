@@ -1,0 +1,327 @@
+"""The explorer: one state, one drawing, and the verbs that a window, a page or a notebook calls."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+import torch
+from PIL import Image
+
+from ..._check import check_choice, check_range, check_whole
+from ...cameras import Camera
+from ...cameras.camera import NEAR
+from ...labels import class_indices
+from ..headless import make_plotter
+from ..legends import add_legend, add_scalar_bar
+from ..linked import look_over
+from ..pictures import save_picture
+from ..through import camera_of, look_through
+from .drawing import Drawn, Pane
+from .exploration import Exploration, Show
+from .meaning import Asked
+from .pick import gaussian_at
+from .picked import Picked, Side
+
+if TYPE_CHECKING:
+    import pyvista as pv
+
+Array = np.ndarray[Any, Any]
+Style = Literal["auto", "gaussians", "points"]
+
+NAMES: dict[Side, str] = {"semantic": "semantic field", "color": "colour field"}
+WORDS: dict[Show, str] = {"labels": "classes", "rgb": "colours", "score": "scores", "latents": "latents"}
+SLOW = 2.0  # seconds a frame from which "auto" draws points
+
+
+@dataclass(frozen=True)
+class ExploreOptions:
+    """How the explorer draws, and where it saves."""
+
+    height: int = 600
+    """Of the window, pixels."""
+    width: int = 1200
+    """Of the window with both panes, pixels; of one pane alone, half of it."""
+    style: Style = "auto"
+    """`gaussians` (what kfgs's own rasteriser draws), `points`, or `auto`: points where a frame takes over 2 s."""
+    rest: float = 0.04
+    """Factor on the opacity of what is not selected, in [0, 1)."""
+    background: str = "white"
+    """A colour that pyvista knows."""
+    out: Path = Path("kfgs_view")
+    """A folder for pictures and selections."""
+
+    def __post_init__(self) -> None:
+        check_whole("height", self.height, 1)
+        check_whole("width", self.width, 2)
+        check_choice("style", self.style, get_args(Style))
+        check_range("rest", self.rest, 0, 1, closed=(True, False))
+        object.__setattr__(self, "out", Path(self.out))
+
+
+class Explorer:
+    """Both clouds side by side, and verbs that change what is asked, shown and picked.
+
+    Each verb changes `state`, draws, and then calls the listeners. Nothing opens by itself: `plotter` draws with and
+    without a display.
+
+    Args:
+        exploration: the state.
+        options: size, style, where files are saved.
+        camera: to look through first; None: everything but floaters is seen.
+        off_screen: draw without a window; None: only where there is no display.
+
+    Raises:
+        ValueError: if the camera's lens distorts, or an option is out of range.
+        RuntimeError: if nothing can be drawn here.
+    """
+
+    def __init__(
+        self,
+        exploration: Exploration,
+        options: ExploreOptions = ExploreOptions(),
+        *,
+        camera: Camera | None = None,
+        off_screen: bool | None = None,
+    ) -> None:
+        self.state, self.options = exploration, options
+        self._camera, self._closed = camera, False
+        self._listeners: list[Callable[[], None]] = []
+        views = exploration.cameras if camera is None else (camera,)
+        self._near = views[0].near if views else NEAR
+        count = len(exploration.sides)
+        self.plotter: pv.Plotter = make_plotter(
+            options.height, options.width * count // 2, shape=(1, count), off_screen=off_screen,
+            background=options.background,
+        )  # fmt: skip
+        try:
+            self.panes = [
+                Pane(self.plotter, column, exploration.cloud(side), self._near)
+                for column, side in enumerate(exploration.sides)
+            ]
+            self.plotter.link_views()
+            self.reset_view()
+            self._style: Drawn = "points" if options.style == "points" else "gaussians"
+            self._draw()
+            if options.style == "auto":
+                self._choose_style()
+        except BaseException:
+            self.close()
+            raise
+
+    def ask(self, words: str | None) -> Asked | None:
+        """Ask for a class or a phrase; what answers lights up, the rest is faint. None or "" drops the question.
+
+        Raises:
+            ValueError: for words that cannot be answered; the question of before stays.
+        """
+        asked = self.state.ask(words)
+        self._changed()
+        return asked
+
+    def set_gamma(self, gamma: float) -> None:
+        """Select what scores above gamma.
+
+        Raises:
+            ValueError: if nothing is asked, or gamma is out of range.
+        """
+        self.state.set_gamma(gamma)
+        self._changed()
+
+    def set_distance(self, distance: float) -> None:
+        """Let labels travel to colour Gaussians closer than this lambda, world units.
+
+        Raises:
+            ValueError: if it is not positive.
+        """
+        self.state.set_distance(distance)
+        self._changed()
+
+    def set_show(self, show: Show) -> None:
+        """Choose what the colours stand for.
+
+        Raises:
+            ValueError: if it is unknown, or these clouds do not have it.
+        """
+        self.state.set_show(show)
+        self._changed()
+
+    def set_hidden(self, labels: Iterable[int | str]) -> None:
+        """Hide classes, by label (-1: what has none) or by name; all others are drawn.
+
+        Raises:
+            ValueError: if there is no such class.
+        """
+        names = self.state.meaning.names
+        hidden: list[int] = []
+        for label in labels:
+            hidden += class_indices(label, names) if isinstance(label, str) else [label]
+        self.state.set_hidden(hidden)
+        self._changed()
+
+    def set_style(self, style: Style) -> None:
+        """Draw Gaussians or points; `auto`: points if a frame of Gaussians takes over 2 s.
+
+        Raises:
+            ValueError: if it is unknown.
+        """
+        check_choice("style", style, get_args(Style))
+        self._style = "points" if style == "points" else "gaussians"
+        self._changed()
+        if style == "auto":
+            self._choose_style()
+
+    @property
+    def style(self) -> Drawn:
+        """How the clouds are drawn now."""
+        return self._style
+
+    def pick(self, x: float, y: float) -> Picked | None:
+        """Point at what is seen at a place of the window; None (and no mark) where that is the background.
+
+        Args:
+            x: pixels from the window's left edge.
+            y: pixels from its top.
+        """
+        picked = None
+        for side, pane in zip(self.state.sides, self.panes, strict=True):
+            place = pane.within(x, y)
+            if place is not None:
+                camera = camera_of(self.plotter, (0, pane.column), near=self._near)
+                index = gaussian_at(pane.cloud, camera, *place, torch.from_numpy(pane.visible))
+                picked = None if index is None else self.state.pick(side, index)
+        if picked is None:
+            self.state.drop_pick()
+        self._changed()
+        return picked
+
+    def look_from(self, camera: Camera) -> None:
+        """Look through a posed camera: all that it sees, in its own proportions.
+
+        Raises:
+            ValueError: if its lens distorts.
+        """
+        width, height = self.panes[0].renderer.GetSize()
+        self.plotter.subplot(0, 0)
+        look_through(self.plotter, _fitted(camera, height, width))
+        if np.isclose(float(camera.K[0, 0]), float(camera.K[1, 1]), rtol=1e-6):
+            self.plotter.camera.SetUseExplicitAspectRatio(False)  # the window may be resized
+        self._moved()
+
+    def reset_view(self) -> None:
+        """Look from where the first view was."""
+        if self._camera is not None:
+            self.look_from(self._camera)
+            return
+        self.plotter.subplot(0, 0)
+        self.plotter.camera.SetUseExplicitAspectRatio(False)
+        self.plotter.camera.SetWindowCenter(0, 0)
+        look_over(self.plotter, self.state.cloud("semantic"))
+        self._moved()
+
+    def screenshot(self, path: str | Path | None = None) -> Array:  # [H, W, 3] uint8
+        """The picture of now; with a path also as a PNG file."""
+        picture: Array = np.array(self.plotter.screenshot(return_img=True))[..., :3]
+        if path is not None:
+            save_picture(path, picture)
+        return picture
+
+    def save_picture(self) -> Path:
+        """Write the picture of now as the next numbered file of `options.out`."""
+        path = self._next("picture", ".png")
+        self.screenshot(path)
+        return path
+
+    def save_selection(self) -> list[Path]:
+        """Write numbers and Gaussians of what is selected into the next numbered folder of `options.out`.
+
+        Raises:
+            ValueError: if nothing is selected.
+        """
+        return self.state.save_selection(self._next("selection", ""))
+
+    def lines(self) -> list[str]:
+        """What there is to say, for a person: the question, gamma, lambda, counts, what is picked."""
+        picked = self.state.picked
+        return self.state.lines() + ([] if picked is None else picked.lines())
+
+    def listen(self, callback: Callable[[], None]) -> None:
+        """Have a function called after each change."""
+        self._listeners.append(callback)
+
+    def close(self) -> None:
+        """Free the window; a second time does nothing."""
+        if not self._closed:
+            self._closed = True
+            self.plotter.close()
+
+    def __enter__(self) -> Explorer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _repr_png_(self) -> bytes:
+        stream = io.BytesIO()
+        Image.fromarray(self.screenshot()).save(stream, format="PNG")
+        return stream.getvalue()
+
+    def _changed(self) -> None:
+        self._draw()
+        self.plotter.render()  # nothing before the plotter was shown
+        for callback in self._listeners:
+            callback()
+
+    def _moved(self) -> None:
+        for pane in self.panes:
+            pane.renderer.camera_set = True  # or the first render would move it to see everything
+            pane.renderer.ResetCameraClippingRange()
+        self.plotter.render()
+
+    def _draw(self) -> None:
+        """Bring what is drawn up to the state."""
+        state, picked = self.state, self.state.picked
+        for side, pane in zip(state.sides, self.panes, strict=True):
+            selected = None if state.asked is None else state.selected(side)
+            pane.draw(self._style, state.colors(side), state.drawn(side), selected, self.options.rest)
+            pane.mark(None if picked is None else picked.position)
+            words = "" if state.asked is None else f" {state.asked.words!r}"
+            pane.say(f"{NAMES[side]}: {WORDS[state.show]}{words}", self._notes(pane))
+
+    def _notes(self, pane: Pane) -> list[Callable[[pv.Plotter], Any]]:
+        """The legend on the left, or the bar on the right."""
+        state = self.state
+        if state.show == "labels" and pane is self.panes[0]:
+            present = np.concatenate([np.unique(state.labels(side)[state.drawn(side)]) for side in state.sides])
+            return [partial(add_legend, labels=present, names=state.meaning.names)] if len(present) else []
+        if state.show == "score" and pane is self.panes[-1]:
+            return [partial(add_scalar_bar, cloud=state.clim)]
+        return []
+
+    def _choose_style(self) -> None:
+        began = perf_counter()
+        self.screenshot()
+        if perf_counter() - began > SLOW:
+            self._style = "points"
+            self._changed()
+
+    def _next(self, stem: str, suffix: str) -> Path:
+        taken = {path.stem for path in self.options.out.glob(f"{stem}_*")}
+        number = next(i for i in range(1, len(taken) + 2) if f"{stem}_{i:03d}" not in taken)
+        return self.options.out / f"{stem}_{number:03d}{suffix}"
+
+
+def _fitted(camera: Camera, height: int, width: int) -> Camera:
+    """A camera in whose picture lies all of another's, in the middle and undistorted."""
+    scale = min(height / camera.height, width / camera.width)
+    K = camera.K.detach().double().cpu().clone()
+    K[:2] *= scale
+    K[0, 2] += (width - scale * camera.width) / 2
+    K[1, 2] += (height - scale * camera.height) / 2
+    return Camera(camera.viewmat.detach().double().cpu(), K, width, height, camera.name, camera.distortion, camera.near)
