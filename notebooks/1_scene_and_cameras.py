@@ -61,7 +61,7 @@ bounds = robust_bounds(scene.points)
 up = estimate_up(scene.cameras).to(scene.points)
 height = scene.points @ up
 inside = bounds.inside & (height < height[bounds.inside].quantile(0.8))
-orbit = orbit_cameras(scene.points[inside], Orbit(frames=8, size=(540, 720), elevation_degrees=40, zoom=1.25), up=up)
+orbit = orbit_cameras(scene.points[inside], Orbit(frames=8, size=(540, 720), elevation_degrees=40, zoom=1.12), up=up)
 
 plotter = make_plotter(540, 720)
 plotter.add_points(

@@ -47,8 +47,8 @@ pinhole = Camera(torch.eye(4), torch.tensor([[200.0, 0, 120], [0, 200.0, 80], [0
 
 plotter = make_plotter(360, 640)
 add_cloud(plotter, four, color_by=four.features, style="ellipsoids")
-add_cameras(plotter, [pinhole], size=1.0, line_width=2)
-plotter.camera_position = [(-2.6, -2.2, -2.2), (0.1, 0.2, 1.8), (0, -1, 0)]
+add_cameras(plotter, [pinhole], size=0.8, line_width=2)
+plotter.camera_position = [(-4.2, -1.9, -0.6), (0.0, 0.1, 1.7), (0, -1, 0)]
 plotter.show()
 
 # %% [markdown]
@@ -70,7 +70,8 @@ tiles = bin_tiles(projected, pinhole.width, pinhole.height)
 
 figure, axes = plt.subplots(figsize=(7.5, 5), layout="constrained")
 y, x = torch.meshgrid(torch.arange(160) + 0.5, torch.arange(240) + 0.5, indexing="ij")
-for (u, v), (a, b, c), opacity, i in zip(projected.means2d, projected.conics, projected.opacities, projected.index):
+drawn = zip(projected.means2d, projected.conics, projected.opacities, projected.index, strict=True)
+for (u, v), (a, b, c), opacity, i in drawn:
     alpha = opacity * torch.exp(-0.5 * (a * (x - u) ** 2 + 2 * b * (x - u) * (y - v) + c * (y - v) ** 2))
     axes.contour(x, y, alpha, levels=[ALPHA_MIN, float(opacity) * 0.61], colors=[four.features[i].tolist()])
 for tile, count in enumerate(tiles.offsets.diff().tolist()):
@@ -98,11 +99,8 @@ nearest_first = four.means[:, 2].argsort()
 steps = [rasterize(four.select(nearest_first[:count]), pinhole).map for count in range(1, 5)]
 maps4, alpha4 = composite(*projected[:2], projected.opacities, four.features[projected.index], tiles)
 print(f"project, bin, composite against rasterize: largest difference {float((maps4 - steps[-1]).abs().max()):.0e}")
-titles = ["the nearest", "two", "three"], ["all four", "opacity", "1 - opacity"]
-grey = [value[..., None].expand(-1, -1, 3) for value in (alpha4, 1 - alpha4)]
-Image.fromarray(
-    picture_grid([steps[:3], [steps[3], *grey]], ["1 | 4 Gaussians", "2 | opacity", "3 | what shines through"])
-)
+opacity = alpha4[..., None].expand(-1, -1, 3)
+Image.fromarray(picture_grid([[*steps, opacity]], ["the nearest", "two", "three", "all four", "opacity"]))
 
 # %% [markdown]
 # ## A teacher's map
@@ -142,6 +140,7 @@ from kfgs.splat import accumulate_pixels
 
 h, w, D = maps.shape
 cloud = GaussianParams.from_points(scene.points, colors=scene.colors, sh_degree=0, initial_opacity=0.8).activated()
+cloud = cloud.replace(scales=0.6 * cloud.scales)  # narrower than the gaps: less blur, a few holes
 sums, weights = torch.zeros(len(cloud), D), torch.zeros(len(cloud))
 for i in range(1, len(maps)):
     view = scene.cameras[train[i]].resized(h, w)
@@ -160,10 +159,12 @@ rendering = rasterize(semantic, held)
 cosine = feature_cosine(resize_map(rendering.map, (h, w)), maps[0])
 print(f"{tuple(rendering.map.shape)} rendered; cosine with the teacher on the view kept apart {float(cosine):.3f}")
 pictures = [
-    [scene.image(train[0]), to_picture(maps[0], train[0])],
-    [to_picture(rendering.map, train[0]), rendering.alpha[..., None].expand(-1, -1, 3)],
+    scene.image(train[0]),
+    to_picture(maps[0], train[0]),
+    to_picture(rendering.map, train[0]),
+    rendering.alpha[..., None].expand(-1, -1, 3),
 ]
-Image.fromarray(picture_grid(pictures, ["photograph | rendered features", "the teacher | opacity"]))
+Image.fromarray(picture_grid([pictures], ["photograph", "the teacher", "rendered features", "opacity"]))
 
 # %% [markdown]
 # ## Engines
