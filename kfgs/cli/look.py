@@ -69,6 +69,7 @@ def view(
     """
     from ..viz.explorer import Exploration, ExploreOptions, Explorer
     from ..viz.explorer.explore import check_place, find_place
+    from ..viz.headless import require
 
     check_folder("out", out)
     check_whole("port", port, 0, 65535)
@@ -80,7 +81,11 @@ def view(
     if place != "browser":
         for name, given, usual in (("host", host, "127.0.0.1"), ("port", port, 0)):
             check_alone(name, None if given == usual else given, "without --where browser, whose page listens there")
-    check_place(place)
+    try:
+        check_place(place)
+        require()
+    except RuntimeError as error:  # nothing to open, or nothing draws here
+        raise ValueError(str(error)) from error
     say("reading")
     meaning, cameras = _meaning(source, (scene, classes, text), teacher, weights, images)
     cloud = None if color is None else open_splats("color", color).gaussians

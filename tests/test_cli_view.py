@@ -1,0 +1,146 @@
+"""`kfgs view` without a display: its picture, and what it says of wrong input before anything is drawn."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from cases_color import surface
+from cases_words import TEACHER
+from PIL import Image
+from small_room import make_room
+
+from kfgs.cli import main
+from kfgs.fields import SemanticField
+from kfgs.formats import SplatFile, write_splats
+from kfgs.scenes import load_scene
+from kfgs.splat import rgb_to_sh0
+from kfgs.teachers.prompts import make_label_set
+from kfgs.viz import available, headless, palette
+
+LETTERS = ["--teacher", "cases_words:TEACHER"]
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    return make_room(tmp_path_factory.mktemp("view") / "scene")
+
+
+@pytest.fixture(scope="module")
+def files(room, tmp_path_factory):
+    """A field (the room's surface with its classes' text), the same as a labelled splat, and a colour splat."""
+    cloud, truth = surface(room)
+    names, folder = json.loads((room / "classes.json").read_text()), tmp_path_factory.mktemp("files")
+    scene = load_scene(room)
+    table = make_label_set(TEACHER, names)
+    table.save(folder / "text.safetensors")
+    info = {"views": [scene.cameras[i].name for i in scene.views("train")], "teacher": TEACHER.identity}
+    SemanticField(cloud.replace(features=table.embeddings[truth]), info=info).save(folder / "field")
+    write_splats(folder / "labelled.ply", SplatFile(cloud.replace(labels=truth), classes=tuple(names)))
+    colored = cloud.replace(sh=rgb_to_sh0(torch.full((len(cloud), 3), 0.5))[:, None], labels=None)
+    write_splats(folder / "color.ply", SplatFile(colored))
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def no_display(monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+
+
+def drawn(arguments, capsys):
+    if not available():
+        pytest.skip("no OpenGL here")
+    code = main(["view", *map(str, arguments)])
+    said = capsys.readouterr()
+    assert (code, said.err) == (0, "")
+    return said.out
+
+
+def count(folder, truth, name):
+    return int((truth == json.loads((folder / "classes.json").read_text()).index(name)).sum())
+
+
+def test_a_question_lights_up_on_both_sides(room, files, tmp_path, capsys):
+    truth = surface(room)[1]
+    name = json.loads((room / "classes.json").read_text())[int(truth.mode().values)]
+    words = ["--text", files / "text.safetensors", "--color", files / "color.ply", "--distance", 1e-3]
+    said = drawn([files / "field", *words, "--ask", name, "--where", "picture", "--out", tmp_path / "out"], capsys)
+    n, total = count(room, truth, name), len(truth)
+    assert f"semantic: {n} of {total} Gaussians" in said.replace(",", "")
+    assert f"color: {n} of {total} Gaussians" in said.replace(",", "")  # every colour Gaussian lies on its source
+    picture = np.asarray(Image.open(tmp_path / "out" / "view.png").convert("RGB")).astype(int)
+    color = palette(truth.mode().values[None])[0].astype(int)
+    near = np.abs(picture - color).max(axis=2) < 12
+    half = picture.shape[1] // 2
+    assert near[:, :half].sum() > 200
+    assert near[:, half:].sum() > 200
+
+
+def test_a_labelled_splat_is_asked_by_class(room, files, tmp_path, capsys):
+    name = json.loads((room / "classes.json").read_text())[0]
+    said = drawn([files / "labelled.ply", "--ask", name, "--where", "picture", "--out", tmp_path], capsys)
+    truth = surface(room)[1]
+    assert f"{count(room, truth, name)} of {len(truth)} Gaussians" in said.replace(",", "")
+
+
+def test_any_phrase_with_a_teacher(files, tmp_path, capsys):
+    said = drawn(
+        [files / "field", "--text", files / "text.safetensors", *LETTERS, "--ask", "zebra crossing", "--where", "picture",
+         "--out", tmp_path],
+        capsys,
+    )  # fmt: skip
+    assert "'zebra crossing': score > " in said
+
+
+def test_clouds_in_different_frames_are_noted(files, tmp_path, capsys):
+    said = drawn(
+        [files / "labelled.ply", "--color", files / "color.ply", "--where", "picture", "--out", tmp_path],
+        capsys,
+    )
+    assert "another frame" not in said
+    from kfgs.formats import read_splats
+
+    splats = read_splats(files / "color.ply")
+    moved = splats.gaussians.replace(means=splats.gaussians.means + 1000)
+    write_splats(tmp_path / "far.ply", splats.replace(gaussians=moved))
+    arguments = ["--color", tmp_path / "far.ply", "--distance", 0.1, "--where", "picture", "--out", tmp_path]
+    said = drawn([files / "labelled.ply", *arguments], capsys)
+    assert "note: only 0 of" in said
+    assert "another frame? `kfgs attach` checks and aligns" in said
+
+
+def test_no_driver_is_told_before_anything_is_read(files, monkeypatch, capsys):
+    monkeypatch.setattr(headless, "probe", lambda: headless.Probe(False, "the trial picture crashed"))
+    assert main(["view", str(files / "field"), "--where", "picture"]) == 1
+    said = capsys.readouterr()
+    assert "3-D pictures cannot be drawn here: expected a working OpenGL, but the trial picture crashed" in said.err
+    assert said.out == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["FIELD", "--where", "window"], "where: expected a display for 'window', got none"),
+        (["FIELD", "--where", "picture", "--host", "0.0.0.0"], "host: expected none without --where browser"),
+        (["FIELD", "--where", "picture", "--port", "80"], "port: expected none without --where browser"),
+        (["FIELD", "--port", "70000"], "port: expected a number in [0, 65535], got 70000"),
+        (["FIELD", "--where", "picture"], "classes, text: expected class names"),
+        (["FIELD", "--where", "picture", "--distance", "0"], "distance: expected"),
+        (["FIELD", "--where", "picture", "--images", "x"], "images: expected none without --scene"),
+        (["FIELD", "--text", "TABLE", "--where", "picture", "--weights", "x"], "weights: expected none without --teacher"),
+        (["FIELD", "--text", "TABLE", "--where", "picture", "--ask", "wal"], "wal"),
+        (["SPLAT", "--text", "TABLE", "--where", "picture"], "text: expected none beside a splat"),
+        (["COLOR", "--where", "picture"], "source: expected a splat with classes"),
+        (["nowhere", "--where", "picture"], "field: expected the folder that `kfgs fit` wrote"),
+        (["FIELD", "--text", "TABLE", "--color", "FIELD", "--where", "picture"], "color: expected a splat file"),
+    ],
+)  # fmt: skip
+def test_wrong_input_is_told(files, tmp_path, capsys, arguments, message):
+    where = {"FIELD": "field", "SPLAT": "labelled.ply", "COLOR": "color.ply", "TABLE": "text.safetensors"}
+    given = [str(files / where[word]) if word in where else word for word in arguments]
+    assert main(["view", *given, "--out", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
