@@ -36,7 +36,9 @@ class Picked:
             f"at ({place}), opacity {self.opacity:.2f}",
         ]
         if self.source is not None:
-            lines.append(f"label from semantic Gaussian {self.source}, {self.distance:.3g} away")
+            said = "label from" if self.label >= 0 else "nearest labelled"
+            reach = "" if self.label >= 0 else ": out of reach"
+            lines.append(f"{said} semantic Gaussian {self.source}, {self.distance:.3g} away{reach}")
         if self.neighbours:
             near = [f"{name or 'none'} {distance:.2g}" for _, distance, name in self.neighbours[:SHOWN]]
             lines.append(f"near it: {', '.join(near)}")

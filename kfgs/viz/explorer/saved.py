@@ -32,8 +32,8 @@ def save_parts(state: Exploration, folder: Path) -> list[Path]:
             "no question is asked" if state.asked is None else f"score > {state.gamma:.4g} for {state.asked.words!r}"
         )
         raise ValueError(f"selection: expected at least one Gaussian, got none ({words}); ask first, or lower gamma")
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".selection.", dir=folder) as name:
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".selection.", dir=folder.parent) as name:
         made = Path(name)
         facts: dict[str, Any] = state.facts()
         facts["parts"] = {side: _parts(state, side) for side in chosen}
@@ -41,6 +41,7 @@ def save_parts(state: Exploration, folder: Path) -> list[Path]:
         for side in chosen:
             write_splats(made / f"selection_{side}.ply", _splats(state, side))
         paths = [folder / path.name for path in sorted(made.iterdir())]
+        folder.mkdir(exist_ok=True)
         for side in state.sides:  # of an older selection
             for path in folder.glob(f"selection_{side}.ply*"):
                 if path not in paths:
