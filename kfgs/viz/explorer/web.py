@@ -1,0 +1,226 @@
+"""The explorer in a browser: a server on this machine, whose page only those open who have its link."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import importlib.util
+import logging
+import os
+import secrets
+import socket
+import sys
+import webbrowser
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+from ..._check import check_whole, error_line
+from .web_guard import is_loopback, make_guard
+from .web_page import ExplorerPage
+
+if TYPE_CHECKING:
+    from .explorer import Explorer
+
+MODULES = ("trame", "trame_vtk", "aiohttp")
+
+
+def require_web() -> None:
+    """Refuse early where the page cannot be served.
+
+    Raises:
+        ImportError: with the install line, if the extra `web` is missing.
+    """
+    missing = [name for name in MODULES if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ImportError(
+            f"where: expected the extra 'web' for a page in the browser, got no {', '.join(missing)}; "
+            'pip install "kfgs[web]"'
+        )
+
+
+def serve(
+    explorer: Explorer,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    open_browser: bool = True,
+    *,
+    say: Callable[[str], object] | None = None,
+) -> None:
+    """Show an explorer in the browser until Ctrl-C. Closing the tab ends nothing: its link opens the page again.
+
+    The page listens on this machine only, and its link holds a secret: other pages in the same browser, other people who
+    reach the port, and other machines' names are refused. Several tabs show the same state. It saves into the explorer's
+    own folder (`ExploreOptions.out`) under names of its own.
+
+    Args:
+        explorer: what to look at, with a plotter that is off the screen.
+        host: address to listen on. Any other than this machine's own lets everyone who reaches it and has the link look,
+            and save pictures and selections here; nothing on the way is encrypted.
+        port: of the page; 0: a free one.
+        open_browser: open the link in the default browser.
+        say: told the link, line by line; None: lines on standard error.
+
+    Raises:
+        ImportError: if the extra `web` is missing.
+        ValueError: if the address is not one of this machine, or the port is taken.
+        RuntimeError: if an event loop runs already, as in a notebook.
+    """
+    require_web()
+    check_whole("port", port, 0, 65535)
+    if _loop_runs():
+        raise RuntimeError(
+            "serve: expected no running event loop, got one, as in a notebook; use show_in_notebook or where='notebook'"
+        )
+    with contextlib.suppress(KeyboardInterrupt):
+        asyncio.run(_serve(explorer, host, port, open_browser, say or _to_stderr))
+
+
+async def _serve(explorer: Explorer, host: str, port: int, open_browser: bool, say: Callable[[str], object]) -> None:
+    async with Listening(explorer, host, port) as listening:
+        say(f"the explorer is open at {listening.url}")
+        if not is_loopback(host):
+            say(
+                f"note: it listens on {host}: everyone who reaches it and has the link can look, and save pictures and "
+                f"selections into {explorer.options.out}; nothing on the way is encrypted"
+            )
+        say("Ctrl-C ends it; closing the tab does not")
+        if open_browser:
+            webbrowser.open(listening.url)
+        await listening.ended()
+
+
+class Listening:
+    """A page that is served while this context lasts, in the event loop that runs.
+
+    Args:
+        explorer: what to look at.
+        host: address to listen on.
+        port: 0 for a free one.
+
+    Raises:
+        ValueError: on entering, if the address is not one of this machine, or the port is taken.
+    """
+
+    def __init__(self, explorer: Explorer, host: str, port: int) -> None:
+        self.secret = secrets.token_urlsafe(24)
+        self._explorer, self._host, self._port = explorer, host, port
+        self._name = f"kfgs-{secrets.token_hex(8)}"
+        self._tasks: list[asyncio.Task[Any]] = []
+        self._quiet = contextlib.ExitStack()
+
+    async def __aenter__(self) -> Listening:
+        from trame.app import get_server
+        from trame_client import module
+        from trame_client.module import vue3
+
+        self._server = server = get_server(self._name, client_type="vue3")
+        self.page = ExplorerPage(self._explorer, server)
+        server.enable_module(module)
+        # everything lies below /secret/, the websocket too, so reloading the page keeps what lets it in
+        server.serve = {f"{self.secret}/{place}": folder for place, folder in server.serve.items()}
+        server.serve[self.secret] = vue3.www
+        server.controller.on_server_bind.add(self._guard)
+        with _own_arguments(f"--ws-endpoint={self.secret}/ws"):
+            serving = server.start(
+                exec_mode="coroutine", host=self._host, port=self._port, open_browser=False, show_connection_info=False,
+                disable_logging=True, backend="aiohttp", thread=True, timeout=0,
+            )  # fmt: skip
+        ready = server.ready
+        task = asyncio.ensure_future(serving)
+        await asyncio.wait([task, ready], return_when=asyncio.FIRST_COMPLETED)
+        if task.done():
+            self._forget()
+            raise _refused(self._host, self._port, task.exception())
+        self._tasks = [task, asyncio.ensure_future(self.page.work())]
+        self._quiet.enter_context(_closed_tabs())
+        return self
+
+    @property
+    def url(self) -> str:
+        """The link of the page, with its secret."""
+        name = socket.gethostname() if self._host in ("0.0.0.0", "::") else self._host
+        name = f"[{name}]" if ":" in name else name
+        return f"http://{name}:{self._port or self._server.port}/{self.secret}/index.html"
+
+    async def ended(self) -> None:
+        """Wait until the server stops."""
+        await asyncio.wait(self._tasks[:1])  # a plain await would hand a cancellation on to wslink, which stumbles
+
+    async def __aexit__(self, *_: object) -> None:
+        serving, work = self._tasks
+        work.cancel()
+        await asyncio.wait([work])
+        if not serving.done():
+            await self._server.stop()
+            await serving
+        self._quiet.close()
+        self._forget()
+
+    def _guard(self, wslink: Any, **_: Any) -> None:
+        wslink.app.middlewares.append(make_guard(self.secret, self._host))
+
+    def _forget(self) -> None:
+        """Trame keeps every server for ever, by name."""
+        from trame.app.core import AVAILABLE_SERVERS
+        from trame_vtk.modules.vtk import HELPERS_PER_SERVER
+
+        AVAILABLE_SERVERS.pop(self._name, None)
+        HELPERS_PER_SERVER.pop(self._name, None)
+
+
+@contextlib.contextmanager
+def _own_arguments(arguments: str) -> Iterator[None]:
+    """Trame reads the command line of the program; here it reads ours instead."""
+    before = os.environ.get("TRAME_ARGS")
+    os.environ["TRAME_ARGS"] = arguments
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["TRAME_ARGS"]
+        else:
+            os.environ["TRAME_ARGS"] = before
+
+
+@contextlib.contextmanager
+def _closed_tabs() -> Iterator[None]:
+    """A tab that is closed while a picture is on its way to it is nothing to tell of; wslink and asyncio would."""
+    loop, logger = asyncio.get_running_loop(), logging.getLogger("wslink.protocol")
+    before = loop.get_exception_handler()
+
+    def handle(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        if not isinstance(context.get("exception"), ConnectionError):
+            (before or type(loop).default_exception_handler)(loop, context)  # type: ignore[operator]
+
+    def filter_(_: logging.LogRecord) -> bool:
+        return not isinstance(sys.exc_info()[1], ConnectionError)
+
+    loop.set_exception_handler(handle)
+    logger.addFilter(filter_)
+    try:
+        yield
+    finally:
+        logger.removeFilter(filter_)
+        loop.set_exception_handler(before)
+
+
+def _refused(host: str, port: int, error: BaseException | None) -> BaseException:
+    if isinstance(error, OSError):
+        return ValueError(
+            f"host, port: expected an address of this machine and a port that is free, got {host!r} and {port} "
+            f"({error_line(error)}); choose another, or port 0"
+        )
+    return error or RuntimeError("serve: expected a server that runs, got one that ended at once; set another port")
+
+
+def _loop_runs() -> bool:
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        return False
+    return True
+
+
+def _to_stderr(line: str) -> None:
+    sys.stderr.write(line + "\n")
+    sys.stderr.flush()

@@ -1,0 +1,295 @@
+"""The explorer's page: what it shows, and what its buttons, sliders and clicks do. It only calls the explorer's verbs."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import isfinite, log
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+from ..._check import error_line
+from ..palette import palette
+
+if TYPE_CHECKING:
+    from .explorer import Explorer
+
+FILES = Path(__file__).with_name("page")
+TITLES = {
+    "labels": "classes",
+    "rgb": "colours",
+    "score": "score",
+    "latents": "latents",
+    "auto": "automatic",
+    "gaussians": "Gaussians",
+    "points": "points",
+}
+CLOUDS = 'class="clouds" role="application" tabindex="-1" aria-label="both clouds: drag to turn, click to pick"'
+# a click is a left press and release within 3 pixels of the page; where, as shares of the clouds' width and height
+PRESS = '@pointerdown.capture="$event.currentTarget.press = [$event.clientX, $event.clientY, $event.button]"'
+CLICK = (
+    '@pointerup.capture="$event.button === 0 && $event.currentTarget.press && $event.currentTarget.press[2] === 0'
+    " && Math.hypot($event.clientX - $event.currentTarget.press[0], $event.clientY - $event.currentTarget.press[1]) <= 3"
+    " && trigger('pick', [($event.clientX - $event.currentTarget.getBoundingClientRect().left)"
+    " / $event.currentTarget.getBoundingClientRect().width,"
+    " ($event.clientY - $event.currentTarget.getBoundingClientRect().top)"
+    ' / $event.currentTarget.getBoundingClientRect().height])"'
+)
+STEP = 5e-4  # half a step of the sliders, which go from 0 to 1
+LONGEST = 200  # characters of a question
+
+log_ = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class _Drawing:
+    """An action that draws by itself."""
+
+    action: Callable[[], object]
+
+    def __call__(self) -> object:
+        return self.action()
+
+
+class ExplorerPage:
+    """An explorer in a browser.
+
+    Events of the browser are put into a queue and done one after the other; of a slider only the latest position is, so
+    dragging does not outrun the drawing. Whatever changes the explorer, a cell of a notebook too, changes the page.
+
+    Args:
+        explorer: what is looked at.
+        server: a trame server of its own, not yet started.
+    """
+
+    def __init__(self, explorer: Explorer, server: Any) -> None:
+        self.explorer, self.server = explorer, server
+        self._waiting: dict[str, Callable[[], object]] = {}
+        self._wake = asyncio.Event()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._asked: str | None = None
+        self._acting = False
+        self._saved = self._error = ""
+        self._fill()
+        self.view = self._lay_out()
+        for name in ("ask", "set_number", "set_show", "set_style", "hide", "hide_all", "pick"):
+            server.trigger(name)(getattr(self, f"_on_{name}"))
+        for name in ("save_picture", "save_selection", "reset_view"):
+            server.trigger(name)(getattr(self, f"_on_{name}"))
+        server.state.change("gamma_at")(self._on_gamma)
+        server.state.change("distance_at")(self._on_distance)
+        explorer.listen(self._changed)
+
+    async def work(self) -> None:
+        """Do what the browser asks for, until cancelled."""
+        self._loop = asyncio.get_running_loop()
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            if self._waiting:
+                await self._tell_working(True)
+            while self._waiting:
+                self._do(self._waiting.pop(next(iter(self._waiting))))
+            self._show()
+            await self._tell_working(False)
+
+    def _do(self, action: Callable[[], object]) -> None:
+        self._error = ""
+        plotter = self.explorer.plotter
+        # `_show` draws, once, unless a picture is needed before: to save it, or to see how long it takes
+        self._acting, plotter.suppress_rendering = True, not isinstance(action, _Drawing)
+        try:
+            action()
+        except ValueError as error:
+            self._error = str(error)
+        except Exception as error:  # a page that stops answering would tell less
+            log_.exception("the explorer's page could not do what was asked")
+            self._error = error_line(error)
+        finally:
+            self._acting, plotter.suppress_rendering = False, False
+
+    async def _tell_working(self, working: bool) -> None:
+        with self.server.state as state:
+            state.working = working
+        await asyncio.sleep(0)  # what was published is sent
+
+    def _queue(self, key: str, action: Callable[[], object]) -> None:
+        self._waiting.pop(key, None)
+        self._waiting[key] = action
+        self._wake.set()
+
+    def _changed(self) -> None:
+        """The explorer has changed, by a cell of a notebook or by another page."""
+        if not self._acting and self._loop is not None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._wake.set)
+
+    # What the browser sends. It may be anything: verbs check values, words are only words, and no path is among them.
+
+    def _on_ask(self, words: object) -> None:
+        self._queue("ask", lambda: self.explorer.ask(str(words)[:LONGEST].strip() or None))
+
+    def _on_set_number(self, name: object, text: object) -> None:
+        verb = {"gamma": self.explorer.set_gamma, "distance": self.explorer.set_distance}[str(name)]
+        self._queue(str(name), lambda: verb(_number(str(name), text)))
+
+    def _on_set_show(self, value: object) -> None:
+        self._queue("show", lambda: self.explorer.set_show(value))  # type: ignore[arg-type]
+
+    def _on_set_style(self, value: object) -> None:
+        self._queue("style", _Drawing(lambda: self.explorer.set_style(value)))  # type: ignore[arg-type]
+
+    def _on_hide(self, label: object, hidden: object) -> None:
+        def action() -> None:
+            others = self.explorer.state.hidden - {label}
+            self.explorer.set_hidden(sorted(others | {label} if hidden else others))  # type: ignore[type-var]
+
+        self._queue(f"hide {label!r}", action)
+
+    def _on_hide_all(self, hidden: object) -> None:
+        labels = [item["label"] for item in self._classes()] if hidden else []
+        self._queue("hide", lambda: self.explorer.set_hidden(labels))
+
+    def _on_pick(self, across: object, down: object) -> None:
+        def action() -> None:
+            width, height = self.explorer.plotter.render_window.GetSize()
+            self.explorer.pick(_share(across) * width, _share(down) * height)
+
+        self._queue("pick", action)
+
+    def _on_save_picture(self) -> None:
+        self._queue("picture", _Drawing(lambda: self._say_saved([self.explorer.save_picture()])))
+
+    def _on_save_selection(self) -> None:
+        self._queue("selection", lambda: self._say_saved(self.explorer.save_selection()))
+
+    def _on_reset_view(self) -> None:
+        self._queue("view", self.explorer.reset_view)
+
+    def _on_gamma(self, gamma_at: object, **_: object) -> None:
+        low, high = self.explorer.state.gamma_range
+        if self.explorer.state.gamma is not None and _differs(gamma_at, self._gamma_at()):
+            self._queue("gamma", lambda: self.explorer.set_gamma(low + _share(gamma_at) * (high - low)))
+
+    def _on_distance(self, distance_at: object, **_: object) -> None:
+        low, high = self.explorer.state.distance_range
+        if _differs(distance_at, self._distance_at()):
+            self._queue("distance", lambda: self.explorer.set_distance(low * (high / low) ** _share(distance_at)))
+
+    # What the page shows.
+
+    def _fill(self) -> None:
+        """What does not change, and first values of what does."""
+        from .explorer import Style
+
+        state = self.explorer.state
+        self.server.state.update({
+            "trame__title": "kfgs explorer",
+            "query": "",
+            "hint": state.meaning.names[0] if state.meaning.names else "",
+            "has_color": "color" in state.sides,
+            "shows": [{"value": value, "title": TITLES.get(value, value)} for value in state.shows],
+            "styles": [{"value": value, "title": TITLES.get(value, value)} for value in get_args(Style)],
+            "working": False,
+            "gamma_at": 0.0,
+            "distance_at": self._distance_at(),
+        })  # fmt: skip
+        self._write()
+
+    def _write(self) -> None:
+        state, page = self.explorer.state, self.server.state
+        asked = None if state.asked is None else state.asked.words
+        if asked != self._asked:
+            self._asked, page.query = asked, asked or ""
+        page.update({
+            "asked": asked or "",
+            "error": self._error,
+            "gamma": "" if state.gamma is None else float(f"{state.gamma:.4g}"),
+            "distance": float(f"{state.distance:.4g}"),
+            "show": state.show,
+            "style": self.explorer.style,
+            "lines": state.lines(),
+            "picked": [] if state.picked is None else state.picked.lines(),
+            "classes": self._classes(),
+            "saved": self._saved,
+        })  # fmt: skip
+        for name, here in (("gamma_at", self._gamma_at()), ("distance_at", self._distance_at())):
+            if _differs(page[name], here):  # an own position that is close enough stays under the hand
+                page[name] = here
+
+    def _classes(self) -> list[dict[str, Any]]:
+        state = self.explorer.state
+        counts = state.facts()["semantic"]
+        rows = [(label, name, count) for label, (name, count) in enumerate(counts["classes"])]
+        if counts["none"]:
+            rows.append((-1, "no class", counts["none"]))
+        colors = palette(_labels([label for label, _, _ in rows]))
+        return [
+            {
+                "label": label,
+                "name": name,
+                "count": f"{count:,}",
+                "color": "#{:02x}{:02x}{:02x}".format(*color),
+                "shown": label not in state.hidden,
+            }
+            for (label, name, count), color in zip(rows, colors.tolist(), strict=True)
+        ]
+
+    def _show(self) -> None:
+        """Send what changed: numbers, then the picture."""
+        with self.server.state:
+            self._write()
+        self.view.update()
+
+    def _say_saved(self, paths: list[Path]) -> None:
+        self._saved = "saved " + ", ".join(str(path) for path in paths)
+
+    def _gamma_at(self) -> float:
+        low, high = self.explorer.state.gamma_range
+        gamma = self.explorer.state.gamma
+        return 0.0 if gamma is None or high <= low else min(max((gamma - low) / (high - low), 0.0), 1.0)
+
+    def _distance_at(self) -> float:
+        low, high = self.explorer.state.distance_range
+        return min(max(log(self.explorer.state.distance / low) / log(high / low), 0.0), 1.0)
+
+    def _lay_out(self) -> Any:
+        """The template (`page/page.html`) and the view of the clouds. Names of a scene travel as data, never as template."""
+        from trame.ui.html import DivLayout
+        from trame.widgets import html
+        from trame_vtk.widgets.vtk import VtkRemoteView
+
+        self.server.enable_module({"serve": {"kfgs_page": str(FILES)}, "styles": ["kfgs_page/page.css"]})
+        with DivLayout(self.server, classes="kfgs") as layout:
+            layout.root.add_child((FILES / "page.html").read_text(encoding="utf-8"))
+            with html.Div(raw_attrs=[CLOUDS, PRESS, CLICK]):
+                view = VtkRemoteView(
+                    self.explorer.plotter.render_window, interactive_quality=80, interactive_ratio=1, still_quality=95
+                )
+        return view
+
+
+def _labels(values: list[int]) -> Any:
+    import numpy as np
+
+    return np.asarray(values, dtype=np.int64)
+
+
+def _differs(at: object, here: float) -> bool:
+    return not isinstance(at, (int, float)) or not abs(at - here) <= STEP
+
+
+def _share(value: object) -> float:
+    """A position between 0 and 1 from the browser."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not isfinite(value):
+        raise ValueError(f"position: expected a number between 0 and 1, got {str(value)[:40]!r}; reload the page")
+    return min(max(float(value), 0.0), 1.0)
+
+
+def _number(name: str, text: object) -> float:
+    """What was typed into a field for numbers."""
+    try:
+        return float(str(text)[:40].replace(",", "."))
+    except ValueError:
+        raise ValueError(f"{name}: expected a number, got {str(text)[:40]!r}; write it as 0.05") from None
