@@ -45,10 +45,10 @@ four = Gaussians(
 )
 pinhole = Camera(torch.eye(4), torch.tensor([[200.0, 0, 120], [0, 200.0, 80], [0, 0, 1]]), width=240, height=160)
 
-plotter = make_plotter(360, 640)
+plotter = make_plotter(320, 560)
 add_cloud(plotter, four, color_by=four.features, style="ellipsoids")
 add_cameras(plotter, [pinhole], size=0.8, line_width=2)
-plotter.camera_position = [(-4.2, -1.9, -0.6), (0.0, 0.1, 1.7), (0, -1, 0)]
+plotter.camera_position = [(3.4, -1.6, -0.5), (0.05, 0.1, 1.75), (0, -1, 0)]
 plotter.show()
 
 # %% [markdown]
@@ -140,7 +140,7 @@ from kfgs.splat import accumulate_pixels
 
 h, w, D = maps.shape
 cloud = GaussianParams.from_points(scene.points, colors=scene.colors, sh_degree=0, initial_opacity=0.8).activated()
-cloud = cloud.replace(scales=0.6 * cloud.scales)  # narrower than the gaps: less blur, a few holes
+cloud = cloud.replace(scales=0.8 * cloud.scales)  # a little narrower: less blur, a few holes
 sums, weights = torch.zeros(len(cloud), D), torch.zeros(len(cloud))
 for i in range(1, len(maps)):
     view = scene.cameras[train[i]].resized(h, w)

@@ -40,8 +40,8 @@ from kfgs import CodebookConfig, fit_codebook
 from kfgs.viz import plot_codebook_growth
 
 fits = {}
-for alpha in (0.9, 0.8, 0.7):
-    config = CodebookConfig(epochs=8, step_every=2, joins_per_image=1, expand_below=alpha)
+for alpha in (0.9, 0.75, 0.7):
+    config = CodebookConfig(epochs=6, step_every=2, joins_per_image=1, expand_below=alpha)
     fits[f"alpha = {alpha}"] = fit_codebook(maps, config)
 plot_codebook_growth({name: fit.history for name, fit in fits.items()}, pictures / "growth.png")
 Shown(pictures / "growth.png", width=900)
@@ -60,9 +60,10 @@ codebook = fit.codebook
 # %% [markdown]
 # ## What the codewords mean
 #
-# Rows are codewords, ordered by the nearest word. Those of one class are alike, those of different classes are not. The
-# bars count the features of each, on a logarithmic axis; small ones are often borders between two things, which show as
-# two words with nearly the same cosine.
+# Rows are codewords, ordered by their nearest word. Bars count the features of each, on a logarithmic axis: most words
+# have one codeword that nearly all of their features belong to. The small ones beside it are borders between two things;
+# their two nearest words have nearly the same cosine. No two are much alike, since a feature joins only where nothing in
+# the book is similar to it.
 
 # %%
 from kfgs.viz import plot_codebook_report
@@ -73,14 +74,15 @@ Shown(pictures / "codebook.png", width=900)
 # %% [markdown]
 # ## Index maps
 #
-# `quantize_maps` leaves one number per pixel (M in Eq. 5). Below each picture the teacher's map, then the codewords that
-# stand for it, in the same colours, then the class of each codeword: noise is gone, borders stay.
+# `quantize_maps` leaves one number per pixel (M in Eq. 5). Beside each picture the teacher's map, then the codewords that
+# stand for it, in the same colours, then the class of each codeword, coloured as above: noise is gone, borders stay.
 
 # %%
 import torch
 from PIL import Image
 
 from kfgs import quantize_maps, resize_map
+from kfgs.cameras import resize_labels
 from kfgs.labels import label_codewords
 from kfgs.viz import FeatureColors, palette, picture_grid
 
@@ -89,12 +91,13 @@ colors = FeatureColors.fit(codebook.codewords)
 classes = label_codewords(codebook.codewords, words.embeddings).labels
 
 rows = []
-for i in (0, len(maps) // 3, 2 * len(maps) // 3):
-    index = torch.from_numpy(index_maps[i]).long()  # a hole, where the teacher says nothing, would be K
-    photo = resize_map(scene.image(train[i]), index.shape, antialias=True)
-    rows.append([photo, colors(maps[i]), colors(codebook.codewords[index]), palette(classes[index])])
-sheet = Image.fromarray(picture_grid(list(zip(*rows, strict=True))))
-sheet.resize((2 * sheet.width, 2 * sheet.height), Image.Resampling.NEAREST)
+for i in (0, 2 * len(maps) // 3):
+    photo = scene.image(train[i])
+    teacher = colors(resize_map(maps[i], photo.shape[:2]))
+    index = resize_labels(torch.from_numpy(index_maps[i]).long(), photo.shape[:2])  # K where the teacher says nothing
+    index = index.clamp_max(codebook.size - 1)
+    rows.append([photo, teacher, colors(codebook.codewords)[index], palette(classes)[index]])
+Image.fromarray(picture_grid(rows, ["photograph", "the teacher", "its codewords", "their classes"]))
 
 # %% [markdown]
 # How similar a pixel's feature is to its codeword, over the first maps: the codebook's error is the teacher's noise.
@@ -115,7 +118,7 @@ plt.show()
 #
 # The scene's autoencoder (Eq. 10) learns nothing but these codewords. What counts is that a decoded latent is still
 # nearest to its own codeword, so that no meaning is lost: `recovered` is the share of codewords for which this holds.
-# The paper's 5,000 steps bring the cosines closer to 1; 1,000 are enough to tell these codewords apart.
+# The paper takes 5,000 steps; 1,000 are enough for these codewords.
 
 # %%
 from kfgs import AutoencoderConfig, fit_autoencoder

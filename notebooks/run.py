@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import jupytext
 import nbformat
@@ -67,10 +67,11 @@ def run_notebook(source: Path, out: Path, *, largest: int = LARGEST, seconds: in
     notebook = jupytext.read(source, fmt="py:percent")
     notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
     start = time.perf_counter()
-    failure = _execute(notebook, source.parent, seconds)
+    failure, below = _execute(notebook, source.parent, seconds)
     outcome.seconds = time.perf_counter() - start
     outcome.problems = [failure] if failure else []
     outcome.problems += list(_noise(notebook))
+    outcome.problems += [f"the kernel writes to stderr: {below}"] if below else []
     _drop_copies(notebook)
     outcome.pictures = _pictures(notebook, source.stem)
     if not failure:
@@ -84,34 +85,41 @@ def run_notebook(source: Path, out: Path, *, largest: int = LARGEST, seconds: in
     return outcome
 
 
-def _execute(notebook: Any, folder: Path, seconds: int) -> str:
-    """Run all cells, filling in their outputs; what went wrong, or nothing."""
+def _execute(notebook: Any, folder: Path, seconds: int) -> tuple[str, str]:
+    """Run all cells, filling in their outputs; what went wrong, and what came on stderr from below Python."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as home:
+        below = Path(home, "stderr.txt")
+        with below.open("w", encoding="utf-8") as log:
+            failure = _execute_in(notebook, folder, seconds, home=home, stderr=log)
+        return failure, COLORS.sub("", below.read_text(encoding="utf-8", errors="replace")).strip()
+
+
+def _execute_in(notebook: Any, folder: Path, seconds: int, *, home: str, stderr: TextIO) -> str:
+    """What went wrong, or nothing. `home` keeps away the user's start-up files and history."""
     at: list[int] = []
 
     def note(cell: Any, cell_index: int, **_: Any) -> None:
         at.append(cell_index)
 
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as home:  # nobody's start-up files, nobody's history
-        manager = AsyncKernelManager(
-            kernel_name="python3",
-            kernel_spec_manager=KernelSpecManager(kernel_dirs=[]),  # python3 then is the Python that runs this
-            transport="ipc" if os.name == "posix" else "tcp",  # others on the machine cannot listen
-            connection_file=f"{home}/kernel.json",
-        )
-        resources = {"metadata": {"path": str(folder)}}
-        client = NotebookClient(notebook, km=manager, timeout=seconds, resources=resources, on_cell_start=note)
-        quiet = {"IPYTHONDIR": home, "PYDEVD_DISABLE_FILE_VALIDATION": "1"}
-        try:
-            client.execute(env=os.environ | quiet, cleanup_kc=True)
-        except CellExecutionError as error:
-            return (
-                f"cell {_number(notebook, at[-1])} fails: {error.ename}: {error.evalue}\n{_traceback(notebook, at[-1])}"
-            )
-        except CellControlSignal as error:  # out of time
-            return f"cell {_number(notebook, at[-1])} does not end: {error}"
-        except DeadKernelError:
-            where = f"cell {_number(notebook, at[-1])}" if at else "the start"
-            return f"{where} ends Python: a crash, or out of memory"
+    manager = AsyncKernelManager(
+        kernel_name="python3",
+        kernel_spec_manager=KernelSpecManager(kernel_dirs=[]),  # python3 then is the Python that runs this
+        transport="ipc" if os.name == "posix" else "tcp",  # others on the machine cannot listen
+        connection_file=f"{home}/kernel.json",
+    )
+    resources = {"metadata": {"path": str(folder)}}
+    client = NotebookClient(notebook, km=manager, timeout=seconds, resources=resources, on_cell_start=note)
+    environment = os.environ | {"IPYTHONDIR": home, "PYDEVD_DISABLE_FILE_VALIDATION": "1"}
+    try:
+        client.execute(env=environment, stderr=stderr, cleanup_kc=True)
+    except CellExecutionError as error:
+        where = _number(notebook, at[-1])
+        return f"cell {where} fails: {error.ename}: {error.evalue}\n{_traceback(notebook, at[-1])}"
+    except CellControlSignal as error:  # out of time
+        return f"cell {_number(notebook, at[-1])} does not end: {error}"
+    except DeadKernelError:
+        where = f"cell {_number(notebook, at[-1])}" if at else "the start"
+        return f"{where} ends Python: a crash, or out of memory"
     return ""
 
 

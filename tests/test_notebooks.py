@@ -1,0 +1,180 @@
+"""The notebooks as sources, without running them, and run.py on tiny notebooks made here."""
+
+import ast
+import importlib
+import importlib.util
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+jupytext = pytest.importorskip("jupytext", reason='the notebooks need: pip install "kfgs[notebook]"')
+pytest.importorskip("nbclient", reason='the notebooks need: pip install "kfgs[notebook]"')
+pytest.importorskip("ipykernel", reason='the notebooks need: pip install "kfgs[notebook]"')
+
+NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
+if not (NOTEBOOKS / "run.py").is_file():  # a source distribution comes without them
+    pytest.skip(f"no folder {NOTEBOOKS}", allow_module_level=True)
+SOURCES = sorted(NOTEBOOKS.glob("[0-9]*_*.py"))
+OWN_DATA = "your own data"
+IMPORTS = (ast.Import, ast.ImportFrom)
+
+
+@pytest.fixture(scope="module")
+def runner():
+    spec = importlib.util.spec_from_file_location("notebooks_run", NOTEBOOKS / "run.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look there
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules[spec.name]
+
+
+@pytest.fixture(params=SOURCES, ids=lambda path: path.stem)
+def source(request):
+    return request.param
+
+
+def code_cells(source):
+    return [cell.source for cell in jupytext.read(source, fmt="py:percent").cells if cell.cell_type == "code"]
+
+
+def test_they_are_numbered_from_1():
+    assert [int(path.name.split("_")[0]) for path in SOURCES] == list(range(1, len(SOURCES) + 1))
+
+
+def test_the_first_cell_says_what_and_how_long(source):
+    first = jupytext.read(source, fmt="py:percent").cells[0]
+    assert first.cell_type == "markdown"
+    assert re.match(rf"# {source.name.split('_')[0]}\b", first.source)
+    assert re.search(r"\b(seconds|minutes?|\d+ s)\b", first.source)
+    assert "CPU" in first.source
+
+
+def test_one_cell_is_for_your_own_data_and_it_is_among_the_first(source):
+    """Its first line, a comment, says so; only imports may come before it."""
+    cells = code_cells(source)
+    [meant] = [i for i, cell in enumerate(cells) if cell.startswith("#") and OWN_DATA in cell.splitlines()[0].lower()]
+    for cell in cells[:meant]:
+        assert all(isinstance(node, IMPORTS) for node in ast.parse(cell).body)
+
+
+def test_cells_are_short_plain_python(source):
+    cells = jupytext.read(source, fmt="py:percent").cells
+    for cell in cells:
+        assert not cell.get("outputs"), "sources have no outputs"
+        assert "data:image/" not in cell.source
+        if cell.cell_type == "code":
+            body = ast.parse(cell.source).body  # no %magic, no !shell
+            lines = [node.end_lineno - node.lineno + 1 for node in body if not isinstance(node, IMPORTS)]
+            assert sum(lines) <= 30
+    assert "sys.path" not in source.read_text(encoding="utf-8")
+
+
+def imported(tree):
+    """(module, name or None) of every import."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, None) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0
+            yield from ((node.module, alias.name) for alias in node.names)
+
+
+def test_only_public_names_of_kfgs_are_used(source):
+    tree = ast.parse(source.read_text(encoding="utf-8"))
+    ours = [(module, name) for module, name in imported(tree) if module.split(".")[0] == "kfgs"]
+    assert ours
+    for module, name in ours:
+        parts = [*module.split("."), *([name] if name else [])]
+        assert not any(part.startswith("_") for part in parts), f"{module}.{name} is private"
+        if name:
+            assert hasattr(importlib.import_module(module), name), f"{module} has no {name}"
+    others = {module for module, _ in imported(tree)} & {path.stem for path in NOTEBOOKS.glob("*.py")}
+    assert not others, "a notebook stands alone"
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute):
+            assert not node.attr.startswith("_") or node.attr.startswith("__"), f"{node.attr} is private"
+
+
+def test_the_readme_lists_them_all():
+    text = (NOTEBOOKS / "README.md").read_text(encoding="utf-8")
+    for path in SOURCES:
+        assert f"]({path.name})" in text
+
+
+def test_links_between_notebooks_lead_somewhere(source):
+    for cell in jupytext.read(source, fmt="py:percent").cells:
+        if cell.cell_type == "markdown":
+            for target in [part.split(")")[0].strip() for part in cell.source.split("](")[1:]]:
+                assert target.startswith("http") or (NOTEBOOKS / target).exists(), f"no {target}"
+
+
+PICTURE = "from PIL import Image\n\nImage.new('RGB', (8, 8), (255, 0, 0))"
+
+
+def write_source(folder, *cells, name="1_tiny.py"):
+    text = "# %% [markdown]\n# # 1. Tiny\n\n" + "\n\n".join(f"# %%\n{cell}" for cell in cells) + "\n"
+    (folder / name).write_text(text, encoding="utf-8")
+    return folder / name
+
+
+def test_a_good_notebook_is_written_with_its_outputs(runner, tmp_path, capsys):
+    write_source(tmp_path, "from pathlib import Path\nimport sys\nprint(Path.cwd().name, sys.executable)", PICTURE)
+    out, pictures = tmp_path / "built", tmp_path / "pictures"
+    assert runner.main(["--sources", str(tmp_path), "--out", str(out), "--pictures", str(pictures)]) == 0
+    told = capsys.readouterr().out
+    assert "1_tiny" in told
+    assert "1 pictures  ok" in told
+    cells = json.loads((out / "1_tiny.ipynb").read_text())["cells"]
+    assert "".join(cells[1]["outputs"][0]["text"]).split() == [tmp_path.name, sys.executable]
+    [shown] = cells[2]["outputs"]
+    assert len([kind for kind in shown["data"] if kind.startswith("image/")]) == 1  # Pillow gives PNG and JPEG
+    [picture] = pictures.iterdir()
+    assert picture.name.startswith("1_tiny_02_01.")
+    assert picture.read_bytes()[:4] in (b"\x89PNG", b"\xff\xd8\xff\xe0")
+
+
+def test_a_failing_cell_is_named_and_leaves_no_file(runner, tmp_path):
+    source, out = write_source(tmp_path, PICTURE, "seven = 7\n1 / (seven - 7)", "print('never')"), tmp_path / "built"
+    out.mkdir()
+    (out / "1_tiny.ipynb").write_text("an older run's")
+    outcome = runner.run_notebook(source, out)
+    [problem] = outcome.problems
+    assert problem.startswith("cell 2 (seven = 7) fails: ZeroDivisionError: division by zero")
+    assert "1 / (seven - 7)" in problem
+    assert list(out.iterdir()) == []
+
+
+def test_noise_size_and_missing_pictures_are_problems(runner, tmp_path):
+    noisy = "import warnings\nwarnings.warn('this is old', DeprecationWarning)"
+    source = write_source(tmp_path, noisy, "import os\nos.write(2, b'from C code')", "print('x' * 2000)")
+    outcome = runner.run_notebook(source, tmp_path / "built", largest=2000)
+    told = "\n".join(outcome.problems)
+    assert "cell 1 (import warnings) writes to stderr: " in told
+    assert "this is old" in told
+    assert "from C code" in told
+    assert "bytes, more than 2,000" in told
+    assert "no picture" in told
+    assert (tmp_path / "built" / "1_tiny.ipynb").stat().st_size == outcome.size
+
+
+def test_a_cell_that_ends_python_or_never_ends_is_reported(runner, tmp_path):
+    outcome = runner.run_notebook(write_source(tmp_path, "import os", "os._exit(139)"), tmp_path / "built")
+    assert outcome.problems[0].startswith("cell 2 (os._exit(139)) ends Python")
+    sleeper = write_source(tmp_path, "import time\ntime.sleep(60)")
+    outcome = runner.run_notebook(sleeper, tmp_path / "built", seconds=1)
+    assert outcome.problems[0].startswith("cell 1 (import time) does not end")
+    assert not list(tmp_path.glob("built/*"))
+
+
+def test_unknown_numbers_are_refused(runner, tmp_path, capsys):
+    write_source(tmp_path, "1")
+    assert [path.name for path in runner.find_sources(tmp_path)] == ["1_tiny.py"]
+    with pytest.raises(ValueError, match=r"N: expected one of \[1\] .*got 4; give a notebook's number"):
+        runner.find_sources(tmp_path, [1, 4])
+    with pytest.raises(SystemExit):
+        runner.main(["4", "--sources", str(tmp_path)])
+    assert "expected one of [1]" in capsys.readouterr().err
