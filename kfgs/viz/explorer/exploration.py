@@ -13,17 +13,16 @@ from ..._check import check_choice, check_range, check_whole
 from ...cameras import Camera
 from ...gaussians import Gaussians
 from ...labels import Selection
+from ...labels.transfer_distance import positions
 from ..palette import palette
 from .carried import SPAN, Array, Carried
 from .facts import facts_of, lines_of
 from .meaning import Asked, Meaning
-from .pick import Sight, neighbours_of, views_seeing
-from .picked import Picked, Side
+from .picked import Describe, Picked, Side
 from .saved import save_parts
 from .side_colors import SideColors
 
 Show = Literal["labels", "rgb", "score", "latents"]
-NEIGHBOURS = 8
 
 
 class Exploration:
@@ -36,7 +35,7 @@ class Exploration:
     Args:
         meaning: what the semantic cloud can be asked.
         color: the colour cloud, in the same frame; None: the semantic side alone.
-        cameras: views that tell who sees a picked Gaussian, without distortion.
+        cameras: views that tell who sees a picked Gaussian, without distortion; of many 60, evenly chosen.
         distance: lambda, world units; None: from the clouds' spacing (`labels.default_distance`).
 
     Raises:
@@ -61,6 +60,7 @@ class Exploration:
         for name, cloud in clouds.items():
             if len(cloud) == 0:
                 raise ValueError(f"{name}: expected at least one Gaussian, got none; choose another file")
+        positions("meaning.gaussians.means", meaning.gaussians.means)
         for camera in cameras:
             if camera.distortion is not None:
                 raise ValueError(
@@ -86,7 +86,7 @@ class Exploration:
             self.set_distance(distance)
         self.distance_range = min(suggested / SPAN, self.distance), max(suggested * SPAN, self.distance)
         self._mark: tuple[Side, int] | None = None
-        self._surroundings: dict[tuple[Side, int], tuple[list[tuple[int, float]], list[Sight]]] = {}
+        self._describe = Describe(meaning, clouds, self._carried, self.cameras)
 
     @property
     def gamma_range(self) -> tuple[float, float]:
@@ -96,9 +96,10 @@ class Exploration:
     @property
     def picked(self) -> Picked | None:
         """The Gaussian pointed at, as it is under the question and lambda of now; None once it is hidden."""
-        if self._mark is None or self._label(*self._mark) in self.hidden:
+        if self._mark is None:
             return None
-        return self._describe(*self._mark)
+        picked = self._describe(*self._mark, self.asked, self.distance)
+        return None if picked.label in self.hidden else picked
 
     def ask(self, words: str | None) -> Asked | None:
         """Ask for a class or a phrase, with the gamma that the answer suggests; None or "" drops the question.
@@ -212,7 +213,7 @@ class Exploration:
         if self.show == "labels":
             return palette(self.labels(side))
         if self.show == "score":
-            return self._colors.of_scores(self.scores(side), self.clim)
+            return self._colors.of_scores(side, self.scores(side), self.clim)
         if self.show == "rgb":
             return self._colors.rgb(side)
         return self._colors.latents(side, self.distance)
@@ -225,7 +226,7 @@ class Exploration:
         """
         check_whole("index", index, 0, len(self.cloud(side)) - 1)
         self._mark = side, int(index)
-        return self._describe(*self._mark)
+        return self._describe(*self._mark, self.asked, self.distance)
 
     def drop_pick(self) -> None:
         """Point at nothing."""
@@ -243,8 +244,8 @@ class Exploration:
         """Write what is selected: numbers as selection.json, the Gaussians of each side as selection_<side>.ply.
 
         The connected parts of the selection are listed, the 16 largest at most, with the view among at most 30 of the
-        cameras, evenly chosen, that shows each best. Selected Gaussians are written whether hidden or not. All files appear or none; a side in which nothing is
-        selected has no file.
+        cameras, evenly chosen, that shows each best. Selected Gaussians are written whether hidden or not. All files
+        appear or none; a side in which nothing is selected has no file.
 
         Raises:
             ValueError: if nothing is selected on any side.
@@ -267,53 +268,6 @@ class Exploration:
         """Carry values of the semantic Gaussians to the colour side; `nothing` where none is in reach."""
         assert self._carried is not None
         return np.where(self._carried.within(self.distance), values[self._carried.source], nothing)
-
-    def _label(self, side: Side, index: int) -> int:
-        """The class of one Gaussian."""
-        if side == "semantic" or self._carried is None:
-            return int(self._own_labels[index])
-        source = self._source(side, index)
-        return -1 if source is None else int(self._own_labels[source])
-
-    def _source(self, side: Side, index: int) -> int | None:
-        """The semantic Gaussian that speaks for one of a side, if one does."""
-        if side == "semantic" or self._carried is None:
-            return index
-        return int(self._carried.source[index]) if self._carried.far[index] < self.distance else None
-
-    def _score(self, side: Side, index: int) -> float | None:
-        """The score of one Gaussian, as `scores` has it."""
-        source = self._source(side, index)
-        if source is None:
-            return None
-        if self.asked is None:
-            return float(self.meaning.scores[source]) if self._own_labels[source] >= 0 else None
-        return float(self.asked.selection.scores[source]) if bool(self.asked.valid[source]) else None
-
-    def _describe(self, side: Side, index: int) -> Picked:
-        cloud, label, key = self._clouds[side], self._label(side, index), (side, index)
-        if key not in self._surroundings:
-            near = [(int(i), float(d)) for i, d in zip(*neighbours_of(cloud.means, index, NEIGHBOURS), strict=True)]
-            self._surroundings[key] = near, views_seeing(cloud, index, self.cameras)
-        near, views = self._surroundings[key]
-        nearest = -1 if side == "semantic" or self._carried is None else int(self._carried.source[index])
-        x, y, z = cloud.means[index].tolist()
-        return Picked(
-            side=side,
-            index=index,
-            name=self._name(label),
-            label=label,
-            score=self._score(side, index),
-            position=(x, y, z),
-            opacity=float(cloud.opacities[index]),
-            source=nearest if nearest >= 0 else None,
-            distance=float(self._carried.far[index]) if self._carried is not None and nearest >= 0 else None,
-            neighbours=[(i, d, self._name(self._label(side, i))) for i, d in near],
-            views=views,
-        )
-
-    def _name(self, label: int) -> str | None:
-        return self.meaning.names[label] if label >= 0 else None
 
 
 def _numpy(values: Any) -> Array:

@@ -238,4 +238,5 @@ def _asked(words: str, found: Selection, valid: Tensor, relevant: bool, known: b
         return Asked(words, found, *UNIT, known, valid)
     own = found.scores[valid]
     gamma = float(found.threshold or 0.0)
-    return Asked(words, found, min(gamma, float(own.min())), max(gamma, float(own.max())), known, valid)
+    low, high = min(gamma, float(own.min())), max(gamma, float(own.max()))
+    return Asked(words, found, low, high if high > low else low + 1e-3, known, valid)

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
 
 from ...gaussians import Gaussians
@@ -60,13 +59,9 @@ class SideColors:
             return self._latents
         return np.where(self._carried.within(distance)[:, None], self._latents[self._carried.source], GREY)
 
-    @staticmethod
-    def of_scores(scores: Array, clim: tuple[float, float]) -> Array:  # [N] -> [N, 3] uint8
+    def of_scores(self, side: Side, scores: Array, clim: tuple[float, float]) -> Array:  # [N] -> [N, 3] uint8
         """The colour map of scores; NaN is grey."""
-        n = len(scores)
-        blank = torch.zeros(n)
-        bare = Gaussians(blank[:, None].expand(n, 3), blank[:, None].expand(n, 4), blank[:, None].expand(n, 3), blank)
-        return cloud_colors(bare, scores, clim=clim).rgb
+        return cloud_colors(self._clouds[side], scores, clim=clim).rgb
 
 
 def _points(cloud: Gaussians) -> Array:  # [N, 3] float64

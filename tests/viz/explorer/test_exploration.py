@@ -13,6 +13,7 @@ from kfgs.formats import read_splats
 from kfgs.labels import answers, transfer_labels
 from kfgs.splat import rgb_to_sh0
 from kfgs.viz import FeatureColors, palette
+from kfgs.viz.explorer import picked as picked_module
 from kfgs.viz.explorer import saved
 from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.meaning import FieldMeaning, SplatMeaning
@@ -256,6 +257,9 @@ def test_clouds_that_cannot_be_explored():
     hole = cloud(LINE).replace(means=torch.full((4, 3), torch.nan))
     with pytest.raises(ValueError, match="color.means: expected finite positions, got NaN or infinity in row 0"):
         Exploration(SplatMeaning(splat_file(cloud(LINE, [0] * 4))), hole)
+    labelled = hole.replace(labels=torch.zeros(4, dtype=torch.int64))
+    with pytest.raises(ValueError, match="meaning.gaussians.means: expected finite positions, got NaN or infinity in"):
+        Exploration(SplatMeaning(splat_file(labelled)))
     unlabelled = SplatMeaning(splat_file(cloud(LINE, [0] * 4)))
     unlabelled.gaussians = cloud(LINE)
     with pytest.raises(
@@ -280,6 +284,13 @@ def test_a_picked_gaussian_says_what_is_known_of_it():
     assert lines[1] == "at (2.500, 0.000, 5.000), opacity 0.90"
     assert lines[2] == "label from semantic Gaussian 1, 0.5 away"
     assert lines[3].startswith("near it: none 1.5, chair 2.2")
+
+
+def test_of_many_views_some_are_asked_who_sees_it(monkeypatch):
+    monkeypatch.setattr(picked_module, "MOST_VIEWS", 2)
+    views = cameras(9)
+    made = line(cameras=views)
+    assert sorted((s.index, s.name) for s in made.pick("semantic", 0).views) == [(0, "view_0"), (8, "view_8")]
 
 
 def test_a_pick_follows_the_question_and_lambda():

@@ -143,6 +143,14 @@ def test_classes_of_another_teacher():
         FieldMeaning(ours, replace(classes(), info={"teacher": {"name": "clip"}}))
 
 
+def test_scores_that_are_all_the_same_still_have_a_range():
+    same = field("decouple")
+    alike = SemanticField(same.gaussians.replace(features=torch.ones(80, DIM)))
+    asked = FieldMeaning(alike, classes(1, negatives=False)).ask("wall")
+    assert asked.low < asked.high
+    assert asked.low <= asked.selection.threshold <= asked.high
+
+
 LABELS = [1, 1, 3, -1, 0]
 LINE = [[float(i), 0, 0] for i in range(5)]
 
