@@ -8,7 +8,7 @@
 # About 30 seconds on a CPU, most of it to make the toy room the first time. Needs nothing but `pip install "kfgs[notebook]"`.
 
 # %%
-# Your own data: a folder with images/ and a COLMAP model (sparse/0), or with a transforms.json.
+# Your own data: a folder with images/ and a COLMAP model in sparse/0. (A transforms.json opens as well, but brings no points.)
 import os
 from pathlib import Path
 
@@ -25,7 +25,8 @@ folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))  
 # a scene of thousands costs nothing to open. Units are those of the file; the room's are metres.
 
 # %%
-scene = load_scene(folder)
+recorded = load_scene(folder)
+scene = recorded.undistorted()  # the last part shows what this does
 camera = scene.cameras[0]
 print(scene)
 print(
@@ -55,7 +56,7 @@ import pyvista as pv
 from kfgs.scenes import robust_bounds
 from kfgs.viz import Orbit, add_camera_images, add_cameras, estimate_up, look_through, make_plotter, orbit_cameras
 
-pv.set_jupyter_backend("static")  # "trame" lets you turn the scene: pip install "pyvista[jupyter]"
+pv.set_jupyter_backend("static")  # "server" lets you turn the scene: pip install "pyvista[jupyter]"
 
 bounds = robust_bounds(scene.points)
 up = estimate_up(scene.cameras).to(scene.points)
@@ -153,8 +154,8 @@ print({name: len(views) for name, views in make_split(len(scene), "holdout8").it
 # ## A lens removed
 #
 # Gaussians are drawn by a pinhole, so a lens has to go first: `scene.undistorted()` removes it from every picture on the
-# way in, and `scene.mask(i)` says which pixels were recorded. The room's pictures come from a pinhole. To have something
-# to remove, kornia gives view 0 a barrel lens; `undistort` then takes it away again.
+# way in, and `scene.mask(i)` says which pixels were recorded. The room's pictures come from a pinhole; to have something
+# to remove, kornia gives view 0 a barrel lens, and `undistort` takes it away again.
 
 # %%
 from dataclasses import replace
@@ -164,22 +165,20 @@ from kornia.geometry import create_meshgrid, remap, undistort_points
 from kfgs.cameras import Distortion, undistort
 from kfgs.metrics import psnr
 
-lens = replace(camera, distortion=Distortion("brown_conrady", (-0.25, 0.06, 0.0, 0.0)))
-K0 = camera.intrinsics_at_integer_centers[None].float()  # kornia's grid counts pixel centres from 0
-grid = create_meshgrid(camera.height, camera.width, normalized_coordinates=False)
-sources = undistort_points(grid.reshape(1, -1, 2), K0, torch.tensor([lens.distortion.coefficients])).reshape(grid.shape)
-photo = scene.image(0)
-bent = remap(photo.permute(2, 0, 1)[None], sources[..., 0], sources[..., 1], align_corners=True)[0].permute(1, 2, 0)
+photo, bent, lens = scene.image(0), recorded.image(0), recorded.cameras[0]
+if not recorded.distorted:
+    lens = replace(camera, distortion=Distortion("brown_conrady", (-0.25, 0.06, 0.0, 0.0)))
+    k = torch.tensor([lens.distortion.coefficients])
+    K = camera.intrinsics_at_integer_centers[None].float()  # kornia's grid counts pixel centres from 0
+    grid = create_meshgrid(camera.height, camera.width, normalized_coordinates=False)
+    x, y = undistort_points(grid.reshape(1, -1, 2), K, k).reshape(grid.shape).unbind(-1)
+    bent = remap(photo.permute(2, 0, 1)[None], x, y, align_corners=True)[0].permute(1, 2, 0)
 
-straight, pinhole, recorded = undistort(bent, lens)
-print(
-    f"undistorted: {psnr(straight[recorded][None], photo[recorded][None]):.1f} dB where recorded ({recorded.float().mean():.0%})"
-)
-Image.fromarray(
-    picture_grid(
-        [[photo, bent, straight * recorded[..., None]]], ["pinhole", "barrel lens (k1 = -0.25)", "undistorted"]
-    )
-)
+straight, pinhole, known = undistort(bent, lens)
+print(lens.distortion)
+quality = psnr(straight[known][None], photo[known][None])
+print(f"undistorted: {quality:.1f} dB from the pinhole's picture; {known.float().mean():.0%} of the pixels recorded")
+Image.fromarray(picture_grid([[photo, bent, straight]], ["pinhole", "through the lens", "undistorted"]))
 
 # %% [markdown]
 # Next: [2_splat_a_feature_map](2_splat_a_feature_map.py) puts features on Gaussians and draws them.

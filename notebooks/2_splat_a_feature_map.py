@@ -34,7 +34,7 @@ import torch
 from kfgs import Camera, Gaussians
 from kfgs.viz import add_cameras, add_cloud, make_plotter
 
-pv.set_jupyter_backend("static")  # "trame" lets you turn the scene: pip install "pyvista[jupyter]"
+pv.set_jupyter_backend("static")  # "server" lets you turn the scene: pip install "pyvista[jupyter]"
 
 four = Gaussians(
     means=torch.tensor([[-0.55, 0.1, 2.4], [0.1, -0.1, 3.0], [0.65, 0.25, 3.6], [0.2, 0.5, 2.2]]),

@@ -93,7 +93,7 @@ classes = label_codewords(codebook.codewords, words.embeddings).labels
 rows = []
 for i in (0, 2 * len(maps) // 3):
     photo = scene.image(train[i])
-    teacher = colors(resize_map(maps[i], photo.shape[:2]))
+    teacher = resize_map(torch.from_numpy(colors(maps[i])) / 255, photo.shape[:2])
     index = resize_labels(torch.from_numpy(index_maps[i]).long(), photo.shape[:2])  # K where the teacher says nothing
     index = index.clamp_max(codebook.size - 1)
     rows.append([photo, teacher, colors(codebook.codewords)[index], palette(classes)[index]])
