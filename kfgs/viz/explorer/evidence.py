@@ -97,12 +97,12 @@ class SeenCodewords:
             weights = torch.zeros(len(field)).to(field.features)
             for camera in cameras:
                 rendering = field.render(camera)
-                pixels = rendering.map.flatten(0, 1)
+                parts = rendering.map.flatten(0, 1).split(CHUNK)
                 if centres is None:
-                    shown = torch.cat([field.codebook.quantize(part) for part in pixels.split(CHUNK)])
+                    found = [field.codebook.quantize(part) for part in parts]
                 else:
-                    shown = nearest_codeword(pixels, centres.to(pixels))
-                shown = shown.view(camera.size).masked_fill(rendering.alpha <= 0, -1)
+                    found = [nearest_codeword(part, centres.to(part)) for part in parts]
+                shown = torch.cat(found).view(camera.size).masked_fill(rendering.alpha <= 0, -1)
                 for index, columns, total, weight in _walks(field.gaussians, camera, shown):
                     sums[:, columns] = sums[:, columns].index_add_(0, index, total)
                     weights.index_add_(0, index, weight)
@@ -185,11 +185,12 @@ def _walks(
     tiles = bin_tiles(projected, camera.width, camera.height)
     shape = projected.means2d, projected.conics, projected.opacities
     at_once = max(8, SIGNAL // (camera.width * camera.height))
-    present = shown.unique()
-    present = present[present >= 0]
+    present = shown[shown >= 0].unique()
     for start in range(0, len(present), at_once):
         columns = present[start : start + at_once]
-        signal = (shown[..., None] == columns).to(projected.means2d)
+        column = torch.searchsorted(columns, shown).clamp_max(len(columns) - 1)
+        signal = torch.zeros(*shown.shape, len(columns)).to(projected.means2d)
+        signal.scatter_(-1, column[..., None], (columns[column] == shown)[..., None].to(signal))
         total, weight = accumulate_pixels(*shape, signal, tiles)
         yield projected.index, columns, total, weight if start == 0 else torch.zeros_like(weight)
 
