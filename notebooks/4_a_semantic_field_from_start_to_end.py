@@ -1,24 +1,12 @@
-# ---
-# jupyter:
-#   jupytext:
-#     text_representation:
-#       extension: .py
-#       format_name: percent
-#   kernelspec:
-#     display_name: Python 3
-#     language: python
-#     name: python3
-# ---
-
 # %% [markdown]
-# # 4 - A semantic field from start to end
+# # 4. A semantic field from start to end
 #
 # A teacher has said, per picture and noisily, what is where. Here its maps become a few thousand labelled Gaussians that
 # answer from any viewpoint, and you will see that **they are better than the teacher they learnt from**: what each stage of
 # the pipeline leaves, how training goes, unseen views beside truth and teacher, scores, sizes, save and load.
 #
-# **Time**: about a minute on two CPU cores the first time (20 s of it to make the room), 10 s afterwards.
-# **Needs**: nothing; the room, its photographs and a simulated teacher are made by kfgs.
+# About a minute on two CPU cores the first time (20 seconds of it to make the room), 10 seconds afterwards. Needs nothing but
+# `pip install "kfgs[notebook]"`: the room, its photographs and a simulated teacher are made by kfgs.
 
 # %%
 # Your own data: a scene (COLMAP, transforms.json, ...), a teacher's maps of its views, the classes with their text
@@ -29,10 +17,9 @@ from pathlib import Path
 from kfgs.scenes import ToyConfig, make_toy_room
 
 data = Path(os.environ.get("KFGS_NOTEBOOK_DATA", "data"))
-folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))  # or Path("my_scene")
-features = folder / "features"  # `kfgs features my_scene --teacher lseg ...` writes such a folder
-names, text = folder / "classes.json", folder / "text.npy"
-labels = folder / "labels"
+folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))  # yours: folder = Path("my/scene")
+features = folder / "features"  # `kfgs features my/scene --teacher lseg ...` writes such a folder
+names, text, labels = folder / "classes.json", folder / "text.npy", folder / "labels"
 run, pictures = data / "run", data / "pictures"
 
 # %%
