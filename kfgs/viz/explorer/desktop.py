@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -34,7 +35,7 @@ def open_window(explorer: Explorer) -> None:
     off, but for q.
 
     Args:
-        explorer: one that draws into a window. The window is gone afterwards; what was asked and picked stays.
+        explorer: one that draws into a window. Afterwards it draws off-screen, with what was asked and picked.
 
     Raises:
         RuntimeError: if there is no display, or the explorer draws off-screen.
@@ -48,8 +49,11 @@ def open_window(explorer: Explorer) -> None:
         raise RuntimeError(
             "explorer: expected one that draws into a window, got one that draws off-screen; make it with off_screen=False"
         )
-    Desktop(explorer)
-    explorer.plotter.show(title="kfgs")
+    desktop = Desktop(explorer)
+    with warnings.catch_warnings():  # where the system destroys the window with its button, pyvista closes the plotter
+        warnings.filterwarnings("ignore", ".*auto_close. ignored", UserWarning)
+        explorer.plotter.show(title="kfgs", auto_close=False)
+    desktop.leave()
 
 
 class Desktop:
@@ -64,6 +68,7 @@ class Desktop:
         self._handle: float | None = None  # the dragged slider's value, where the clouds may not have followed
         self._pressed: tuple[int, int] | None = None  # on a cloud
         self._applied = self._took = 0.0  # when the clouds followed a slider, and how long that took
+        self._calling = False
         self._labels = self._present()
         self.pane = PanelPane(explorer.plotter, self.view)
         interactor = explorer.plotter.iren.interactor
@@ -84,6 +89,19 @@ class Desktop:
         # while a cloud turns, events reach the interactor's style alone
         explorer.plotter.iren.add_observer("LeftButtonReleaseEvent", self._on_cloud_release)
         explorer.listen(self._on_change)
+
+    def leave(self) -> None:
+        """Close the window and let the explorer draw off-screen, as large as before, without the panel."""
+        plotter = self.explorer.plotter
+        if plotter.render_window is None:  # the system has destroyed the window
+            return
+        for tag in self._tags.values():
+            plotter.iren.interactor.RemoveObserver(tag)
+        plotter.render_window.Finalize()
+        plotter.render_window.SetShowWindow(False)
+        plotter.render_window.SetUseOffScreenBuffers(True)
+        plotter.off_screen = True
+        self.pane.remove()
 
     def view(self) -> PanelView:
         """What the panel has to say now."""
@@ -127,10 +145,13 @@ class Desktop:
     def call(self, verb: Callable[[], str | None]) -> None:
         """Call a verb, and say what it did or what went wrong, which VTK's event loop would swallow."""
         self.note = self.error = ""
+        self._calling = True
         try:
             self.note = verb() or ""
         except Exception as error:  # the window stays, whatever it is
             self.error = error_line(error)
+        finally:
+            self._calling = False
         self.pane.refresh()
 
     def ask(self, words: str | None) -> None:
@@ -190,8 +211,9 @@ class Desktop:
         self._took = self._applied - began
 
     def _on_change(self) -> None:
-        """A verb was called, by this window or by a program."""
-        self.pane.refresh()
+        """A verb was called, by this window, which refreshes the panel afterwards, or by a program."""
+        if not self._calling:
+            self.pane.refresh()
 
     # ---- keys
 

@@ -30,9 +30,12 @@ class PanelPane:
 
         self.plotter, self.view = plotter, view
         self.panel = Panel(np.zeros((0, 0, 3), np.uint8), [], 0)
-        self._viewports = [tuple(renderer.GetViewport()) for renderer in plotter.renderers]
+        window = plotter.render_window
+        everything = [window.GetRenderers().GetItemAsObject(i) for i in range(window.GetRenderers().GetNumberOfItems())]
+        self._viewports = [(renderer, renderer.GetViewport()) for renderer in everything]  # lines between subplots, too
         self._size: tuple[int, int] | None = None
         self._left, self._stale, self._away = 0, True, False
+        self._removed = False
         self._mapper = vtkImageMapper()
         self._mapper.SetColorWindow(255)  # bytes as they are
         self._mapper.SetColorLevel(127.5)
@@ -42,9 +45,22 @@ class PanelPane:
         self._renderer.AddActor(actor)
         self._renderer.InteractiveOff()
         width, height = plotter.window_size
-        plotter.render_window.AddRenderer(self._renderer)
+        window.AddRenderer(self._renderer)
         plotter.window_size = [width + WIDTH, height]
-        self._observer = plotter.render_window.AddObserver("StartEvent", self._before_frame)
+        self._observer = window.AddObserver("StartEvent", self._before_frame)
+
+    def remove(self) -> None:
+        """Give the room back to the subplots; afterwards nothing here draws. A second time does nothing."""
+        window = self.plotter.render_window
+        if window is None or self._removed:
+            return
+        self._removed = True
+        window.RemoveObserver(self._observer)
+        window.RemoveRenderer(self._renderer)
+        for renderer, viewport in self._viewports:
+            renderer.SetViewport(*viewport)
+        width, height = self.plotter.window_size
+        self.plotter.window_size = [max(width - WIDTH, min(LEAST, width)), height]
 
     def find(self, x: float, y: float) -> tuple[bool, Spot | None, float]:
         """Whether a point of the window (y from the top) is in the panel, what lies there, and x in the panel."""
@@ -55,7 +71,7 @@ class PanelPane:
         """Draw the panel again and leave the clouds as they are: 20 ms instead of a frame of Gaussians."""
         self._stale = True
         window = self.plotter.render_window
-        if window is None or self._size is None:  # closed, or not yet open: the first frame draws it
+        if window is None or self._removed or self._size is None:  # closed, or not yet open: the first frame draws it
             return
         clouds = [renderer for renderer in self.plotter.renderers if renderer.GetDraw()]
         for renderer in clouds:
@@ -69,12 +85,16 @@ class PanelPane:
     @contextmanager
     def away(self) -> Iterator[None]:
         """The subplots fill the window, as for a picture of them."""
-        self._away, self._size = True, None
+        self._move(away=True)
         try:
             yield
         finally:
-            self._away, self._size = False, None
-            self.plotter.render()
+            self._move(away=False)
+
+    def _move(self, away: bool) -> None:
+        self._away, self._size = away, None
+        if self.plotter.render_window is not None:
+            self.plotter.render_window.Render()  # pyvista's pictures of a window are of its last frame
 
     def _before_frame(self, *_: Any) -> None:
         """Follow the window's size, and paint what has changed."""
@@ -82,7 +102,7 @@ class PanelPane:
         if (width, height) != self._size:
             self._size, self._stale = (width, height), True
             self._left = width if self._away else max(width - WIDTH, min(LEAST, width))
-            for renderer, (left, low, right, high) in zip(self.plotter.renderers, self._viewports, strict=True):
+            for renderer, (left, low, right, high) in self._viewports:
                 renderer.SetViewport(left * self._left / width, low, right * self._left / width, high)
             self._renderer.SetViewport(self._left / width, 0, 1, 1)
             self._renderer.SetDraw(not self._away and self._left < width)
