@@ -5,7 +5,7 @@
 # in the room with their pictures, points projected into a picture and a picture seen again in space, which views are held
 # out for testing, and a lens removed.
 #
-# About 30 seconds on a CPU, most of it to make the toy room the first time. Needs nothing but `pip install "kfgs[notebook]"`.
+# About 10 seconds on a CPU (20 more to make the toy room the first time). Needs nothing but `pip install "kfgs[notebook]"`.
 
 # %%
 # Your own data: a folder with images/ and a COLMAP model in sparse/0. (A transforms.json opens as well, but brings no points.)

@@ -5,7 +5,7 @@
 # 20,000 of them carry a teacher's 512 channels and are drawn from a view they have not seen. At the end: how much faster
 # the engines are than the plain equations, and that pyvista shows the same picture as the rasteriser.
 #
-# About 40 seconds on a CPU (20 more to make the toy room the first time). Needs `pip install "kfgs[notebook]"`.
+# About 15 seconds on a CPU (20 more to make the toy room the first time). Needs `pip install "kfgs[notebook]"`.
 
 # %%
 # Your own data: a scene, and a folder with a feature map of each training view, as `kfgs features` writes it.

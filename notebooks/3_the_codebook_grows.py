@@ -6,7 +6,7 @@
 # a codeword from 512 channels to 9. You will see the growth (as in Figure 6), the codewords with their nearest words, the
 # index maps beside the teacher's, and what is left in bytes.
 #
-# About 50 seconds on a CPU (20 more to make the toy room the first time). Needs `pip install "kfgs[notebook]"`.
+# About 25 seconds on a CPU (20 more to make the toy room the first time). Needs `pip install "kfgs[notebook]"`.
 
 # %%
 # Your own data: a scene, its feature maps as `kfgs features` writes them, and the teacher's words (`kfgs text`).
