@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from ..._check import error_line
 from ..palette import palette
+from .web_picture import Pictures, make_delivery
 
 if TYPE_CHECKING:
     from .explorer import Explorer
@@ -71,9 +72,11 @@ class ExplorerPage:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._asked: str | None = None
         self._acting = False
-        self._saved = self._error = ""
+        self._saved = self._error = self._pointed = ""
         self._fill()
+        self.pictures = Pictures(explorer.plotter)
         self.view = self._lay_out()
+        server.add_protocol_to_configure(lambda protocol: protocol.registerLinkProtocol(make_delivery(self.pictures)))
         for name in ("ask", "set_number", "set_show", "set_style", "hide", "hide_all", "pick"):
             server.trigger(name)(getattr(self, f"_on_{name}"))
         for name in ("save_picture", "save_selection", "reset_view"):
@@ -154,7 +157,8 @@ class ExplorerPage:
     def _on_pick(self, across: object, down: object) -> None:
         def action() -> None:
             width, height = self.explorer.plotter.render_window.GetSize()
-            self.explorer.pick(_share(across) * width, _share(down) * height)
+            found = self.explorer.pick(_share(across) * width, _share(down) * height)
+            self._pointed = "" if found is not None else "Nothing is drawn there."
 
         self._queue("pick", action)
 
@@ -212,6 +216,7 @@ class ExplorerPage:
             "lines": state.lines(),
             "picked": [] if state.picked is None else state.picked.lines(),
             "classes": self._classes(),
+            "pointed": self._pointed,
             "saved": self._saved,
         })  # fmt: skip
         for name, here in (("gamma_at", self._gamma_at()), ("distance_at", self._distance_at())):
@@ -240,6 +245,7 @@ class ExplorerPage:
         """Send what changed: numbers, then the picture."""
         with self.server.state:
             self._write()
+        self.pictures.changes += 1
         self.view.update()
 
     def _say_saved(self, paths: list[Path]) -> None:

@@ -1,0 +1,134 @@
+"""The picture of the clouds on its way to the browser: drawn once for each change, however often it is asked for."""
+
+from __future__ import annotations
+
+import io
+from time import perf_counter
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from ..gaussian_actor import STILL
+
+if TYPE_CHECKING:
+    import pyvista as pv
+
+Array = np.ndarray[Any, Any]
+LEAST = 10  # pixels: a tab in the background has no size
+
+
+class Frame(NamedTuple):
+    """A picture and what it shows."""
+
+    key: tuple[Any, ...]
+    still: bool  # not drawn in the midst of a movement, when points may stand for Gaussians
+    number: int
+    picture: Array  # [H, W, 3] uint8
+
+
+class Camera(NamedTuple):
+    """What a view of VTK's depends on; its time stamp also counts clipping planes."""
+
+    position: tuple[float, ...]
+    focal_point: tuple[float, ...]
+    up: tuple[float, ...]
+    lens: tuple[float, ...]
+
+    @classmethod
+    def of(cls, renderer: Any) -> Camera:
+        """Of a renderer's active camera."""
+        camera = renderer.GetActiveCamera()
+        lens = (
+            camera.GetViewAngle(),
+            camera.GetParallelScale(),
+            camera.GetParallelProjection(),
+            *camera.GetWindowCenter(),
+        )
+        return cls(camera.GetPosition(), camera.GetFocalPoint(), camera.GetViewUp(), lens)
+
+
+class Pictures:
+    """The latest picture of a plotter.
+
+    VTK's own web application draws twice for each picture: it encodes in another thread, sends the picture of before, and
+    draws again to fetch the new one.
+    """
+
+    def __init__(self, plotter: pv.Plotter) -> None:
+        self.plotter, self.changes = plotter, 0
+        self.frame: Frame | None = None
+
+    def now(self) -> Frame:
+        """The picture of now; drawn if anything has changed since the last, or that one was made while moving."""
+        window: Any = self.plotter.render_window
+        still = window.GetDesiredUpdateRate() < STILL
+        views = [(Camera.of(renderer), renderer.GetViewProps().GetMTime()) for renderer in self.plotter.renderers]
+        key = (self.changes, tuple(window.GetSize()), *views)
+        last = self.frame
+        if last is None or last.key != key or (still and not last.still):
+            self.frame = Frame(key, still, 1 if last is None else last.number + 1, _draw(window))
+        assert self.frame is not None
+        return self.frame
+
+
+def _draw(window: Any) -> Array:  # [H, W, 3] uint8
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkCommonCore import vtkUnsignedCharArray
+
+    window.Render()
+    width, height = window.GetSize()
+    pixels = vtkUnsignedCharArray()
+    window.GetPixelData(0, 0, width - 1, height - 1, 0, pixels, 0)  # of the back buffer, the left eye
+    return np.ascontiguousarray(vtk_to_numpy(pixels).reshape(height, width, 3)[::-1])
+
+
+def make_delivery(pictures: Pictures) -> Any:
+    """The protocol that sends pictures, in the place of trame-vtk's own."""
+    from trame_vtk.modules.vtk.protocols import vtkWebPublishImageDelivery
+    from wslink import register
+
+    class Delivery(vtkWebPublishImageDelivery):  # type: ignore[misc]
+        def __init__(self) -> None:
+            super().__init__(decode=False)
+            self.asked_for = False  # by someone who may have none yet
+
+        @register("viewport.image.push")
+        def image_push(self, options: Any) -> None:
+            self.asked_for = True
+            super().image_push(options)
+
+        @register("viewport.image.push.observer.add")
+        def add_render_observer(self, view_id: Any) -> Any:
+            self.asked_for = True
+            return super().add_render_observer(view_id)
+
+        def still_render(self, options: dict[str, Any]) -> dict[str, Any]:
+            began = perf_counter()
+            window: Any = pictures.plotter.render_window
+            width, height = options.get("size", window.GetSize())
+            if min(width, height) > LEAST and [width, height] != list(window.GetSize()):
+                window.SetSize(width, height)
+            frame = pictures.now()
+            fresh = self.asked_for or frame.number != options.get("mtime")
+            self.asked_for = False
+            data = _jpeg(frame.picture, options.get("quality", 100)) if fresh else None
+            return {
+                "image": data,
+                "memsize": len(data or b""),
+                "size": [frame.picture.shape[1], frame.picture.shape[0]],
+                "mtime": frame.number,
+                "stale": False,
+                "format": "jpeg",
+                "global_id": str(self.get_global_id(window)),
+                "localTime": options.get("localTime", 0),
+                "workTime": round(1000 * (perf_counter() - began)),
+            }
+
+    return Delivery()
+
+
+def _jpeg(picture: Array, quality: int) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "JPEG", quality=min(max(int(quality), 1), 95))
+    return file.getvalue()
