@@ -35,7 +35,7 @@ class Exploration:
     Args:
         meaning: what the semantic cloud can be asked.
         color: the colour cloud, in the same frame; None: the semantic side alone.
-        cameras: views that tell who sees a picked Gaussian, without distortion; of many 60, evenly chosen.
+        cameras: views that tell who sees a picked Gaussian, without distortion; of many 30, evenly chosen.
         distance: lambda, world units; None: from the clouds' spacing (`labels.default_distance`).
 
     Raises:
