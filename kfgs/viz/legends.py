@@ -6,17 +6,21 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from .cloud_colors import COLORMAP
 from .pictures import LEGEND_INK, LEGEND_PAPER, legend_column
+from .pinned import MARGIN, pin_picture
 
 if TYPE_CHECKING:
     import pyvista as pv
 
 Array = np.ndarray[Any, Any]
-LEGEND_MARGIN = 10  # pixels from the corner
 DARK = 0.5  # of a background on which letters are white
+LETTERS = 14  # pixels, in windows up to 770 pixels high; larger ones have larger letters, to be read from as far
+SMALLEST = 9  # pixels: the least that can be read
+BAR = 0.6  # of the subplot's height
 
 
 def add_legend(
@@ -26,37 +30,33 @@ def add_legend(
 ) -> Any:
     """List the classes present, by name and colour, in the lower left corner of the active subplot.
 
-    A small picture instead of pyvista's legend, which writes each name in its own colour: yellow on white.
+    A small picture instead of pyvista's legend, which writes each name in its own colour: yellow on white. Where the
+    subplot is too low for all classes, letters become smaller, down to 9 pixels, then there are several columns.
 
     Raises:
         ValueError: if a label has no name.
     """
-    picture = legend_column(labels, names)
-    import pyvista as pv
-    from vtkmodules.vtkRenderingCore import vtkActor2D, vtkImageMapper
+    present = np.unique(labels.cpu().numpy() if isinstance(labels, Tensor) else np.asarray(labels))
+    legend_column(present, names)  # refuses at once what the first frame would refuse
 
-    height, width, _ = picture.shape
-    image = pv.ImageData(dimensions=(width, height, 1))
-    image.point_data["rgb"] = picture[::-1].reshape(-1, 3)  # VTK counts rows from below
-    image.set_active_scalars("rgb")
-    mapper = vtkImageMapper()
-    mapper.SetInputData(image)
-    mapper.SetColorWindow(255)
-    mapper.SetColorLevel(127.5)
-    actor = vtkActor2D()
-    actor.SetMapper(mapper)
-    actor.SetPosition(LEGEND_MARGIN, LEGEND_MARGIN)
-    plotter.add_actor(actor, reset_camera=False, pickable=False)
-    return actor
+    def draw(height: int, width: int) -> Array:
+        room = height - 2 * MARGIN
+        for size in range(letter_size(height), SMALLEST, -1):
+            picture = legend_column(present, names, size)
+            if len(picture) <= room:
+                return picture
+        return legend_column(present, names, SMALLEST, height=room)
+
+    return pin_picture(plotter, draw)
 
 
 def add_scalar_bar(plotter: pv.Plotter, cloud: pv.Actor | tuple[float, float], title: str = "score") -> Any:
-    """Say which colour stands for which number, in a bar on the right of the active subplot.
+    """Say which colour stands for which number, in a bar in the lower right corner of the active subplot.
 
     Args:
         plotter: where the cloud is.
         cloud: what `add_cloud` returned for scores or opacities; or the numbers of the darkest and the brightest colour.
-        title: over the bar.
+        title: over the bar; broken into lines where it is wider than a fifth of the subplot.
 
     Raises:
         ValueError: if the cloud's colours stand for no numbers.
@@ -66,31 +66,59 @@ def add_scalar_bar(plotter: pv.Plotter, cloud: pv.Actor | tuple[float, float], t
         raise ValueError(
             "cloud: expected one coloured by scores or opacity, got one without a scale; use add_legend for labels"
         )
-    import pyvista as pv
-    from vtkmodules.vtkRenderingAnnotation import vtkScalarBarActor
+    low, high = (float(end) for end in clim)
+    return pin_picture(plotter, lambda height, width: bar_picture((low, high), title, height, width), "right")
 
-    bar = vtkScalarBarActor()
-    bar.SetLookupTable(pv.LookupTable(COLORMAP, scalar_range=tuple(float(end) for end in clim)))
-    bar.SetTitle(title)
-    bar.SetNumberOfLabels(5)
-    bar.SetLabelFormat("{:.3g}")
-    bar.SetUnconstrainedFontSize(True)
-    for text, size in ((bar.GetTitleTextProperty(), 16), (bar.GetLabelTextProperty(), 14)):
-        text.SetColor(*(part / 255 for part in LEGEND_INK))
-        text.SetFontSize(size)
-        text.SetItalic(False)
-        text.SetBold(False)
-        text.SetShadow(False)
-    bar.SetMaximumNumberOfColors(256)
-    bar.SetVerticalTitleSeparation(10)
-    bar.SetTextPad(4)
-    bar.SetDrawBackground(True)
-    bar.GetBackgroundProperty().SetColor(*(part / 255 for part in LEGEND_PAPER))
-    bar.SetPosition(0.83, 0.15)
-    bar.SetWidth(0.15)
-    bar.SetHeight(0.7)
-    plotter.add_actor(bar, reset_camera=False, pickable=False)
-    return bar
+
+def bar_picture(
+    clim: tuple[float, float],
+    title: str,
+    height: int,
+    width: int,
+) -> Array:  # [h, w, 3] uint8
+    """A bar of the colours from `clim[0]` (below) to `clim[1]`, with round numbers beside it and a title over it.
+
+    Args:
+        clim: the numbers of the darkest and the brightest colour.
+        title: broken into lines.
+        height: of the subplot, pixels.
+        width: of the subplot, pixels.
+    """
+    from matplotlib import colormaps
+
+    size = min(letter_size(height), max(SMALLEST, height // 16))
+    font, gap, line = ImageFont.load_default(size=size), size // 2, round(size * 1.5)
+    heading = _broken(title, font, max(width / 5, 8 * size))
+    ticks = round_numbers(*clim)
+    length = max(int(BAR * height) - line * len(heading), 4 * line)
+    texts = [*heading, *(" " * 8 + f"{tick:g}" for tick in ticks)]
+    across = 2 * gap + max(round(font.getlength(text)) for text in texts)
+    paper = Image.new("RGB", (max(across, 4 * size), length + line * len(heading) + 2 * gap + size), LEGEND_PAPER)
+    draw = ImageDraw.Draw(paper)
+    for row, text in enumerate(heading):
+        draw.text((gap, gap + row * line), text, fill=LEGEND_INK, font=font)
+    top, right = gap + len(heading) * line + size // 2, gap + round(1.4 * size)
+    colors = colormaps[COLORMAP](np.linspace(1, 0, length), bytes=True)[:, None, :3]
+    paper.paste(Image.fromarray(np.repeat(colors, right - gap, axis=1)), (gap, top))
+    for tick in ticks:
+        y = top + (clim[1] - tick) / (clim[1] - clim[0]) * (length - 1)
+        draw.line((right, y, right + size // 4, y), fill=LEGEND_INK)
+        draw.text((right + gap, y), f"{tick:g}", fill=LEGEND_INK, font=font, anchor="lm")
+    return np.asarray(paper)
+
+
+def round_numbers(low: float, high: float) -> list[float]:
+    """From three to six evenly spaced round numbers from `low` to `high`, ascending."""
+    from matplotlib.ticker import MaxNLocator
+
+    slack = 1e-9 * (high - low)
+    ticks = MaxNLocator(nbins=5, min_n_ticks=3).tick_values(low, high)
+    return [float(tick) + 0.0 for tick in ticks if low - slack <= tick <= high + slack]
+
+
+def letter_size(height: int) -> int:
+    """Pixels of letters in a subplot of this height."""
+    return max(LETTERS, round(height / 55))
 
 
 def letters(plotter: pv.Plotter) -> tuple[float, float, float]:
@@ -98,3 +126,15 @@ def letters(plotter: pv.Plotter) -> tuple[float, float, float]:
     dark = np.mean(plotter.renderer.GetBackground()) < DARK
     ink = (255, 255, 255) if dark else LEGEND_INK
     return (ink[0] / 255, ink[1] / 255, ink[2] / 255)
+
+
+def _broken(text: str, font: Any, width: float) -> list[str]:
+    """Words in lines no wider than `width` pixels, but for single words that are."""
+    lines: list[str] = []
+    for word in text.split():
+        longer = f"{lines[-1]} {word}" if lines else word
+        if lines and font.getlength(longer) <= width:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    return lines

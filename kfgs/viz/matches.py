@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     import pyvista as pv
 
 Array = np.ndarray[Any, Any]
-LINES = 2000  # more transfer lines than this hide what they show
+LINES = 500  # more transfer lines than this hide what they show
 MATCHED, AMBIGUOUS, ORPHANED = 0, 1, 2
 STATE_NAMES = ("matched", "ambiguous", "orphaned")
-STATE_COLORS = (4, 0, 6)  # Okabe and Ito's blue, orange and reddish purple in `PALETTE`
+STATE_COLORS = (1, 5, 7)  # in `PALETTE`: sky blue, which recedes, vermillion and deep blue; far apart for every eye
 BINS = 80
 
 
@@ -57,7 +57,7 @@ def add_matches(
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
     sample: int = LINES,
     point_size: float = 3.0,
-    line_width: float = 1.5,
+    line_width: float = 1.0,
 ) -> Matches:
     """Draw the destinations as matched, ambiguous or orphaned points, lines to their sources, and how many of each.
 
@@ -104,7 +104,7 @@ def add_transfer(
     *,
     color_by: Literal["label", "state"] = "label",
     sample: int = LINES,
-    line_width: float = 1.5,
+    line_width: float = 1.0,
 ) -> pv.Actor:
     """Draw where labels came from: a line from each labelled destination to the source that gave the label.
 

@@ -74,31 +74,46 @@ def legend_column(
     labels: Tensor | Array,  # any shape, int
     names: Sequence[str],
     size: int = 14,
+    *,
+    height: int | None = None,
 ) -> Array:  # [h, w, 3] uint8
     """A column that lists the classes present, one per line, with letters of `size` pixels.
+
+    Args:
+        labels: the classes present are listed.
+        names: class names by index.
+        size: of the letters, pixels.
+        height: begin another column where one would be higher than this many pixels; None: never.
 
     Raises:
         ValueError: if a label has no name.
     """
-    return _draw_legend(labels, names, None, size)
+    return _draw_legend(labels, names, None, size, height)
 
 
-def _draw_legend(labels: Tensor | Array, names: Sequence[str], width: int | None, size: int) -> Array:
-    """Entries from left to right, wrapped at `width`; without a width one per line, and as wide as the longest."""
+def _draw_legend(
+    labels: Tensor | Array, names: Sequence[str], width: int | None, size: int, height: int | None = None
+) -> Array:
+    """Entries from left to right, wrapped at `width`; without a width one per line, in columns up to `height`."""
     present = [int(label) for label in np.unique(_array(labels))]
     check_names(present, names)
     font = ImageFont.load_default(size=size)
     gap, line = size // 2, round(size * 1.6)
-    x, y, right, places = gap, gap, gap, []
+    x, y, right, bottom, left, places = gap, gap, gap, gap, gap, []
     for label in present:
         text = "none" if label < 0 else names[label]
         length = size + gap + round(font.getlength(text)) + 2 * gap
-        if x > gap and (width is None or x + length > width):
-            x, y = gap, y + line
+        if places and width is None and height is not None and y + line + gap // 2 > height:
+            left, y = right, gap
+            x = left
+        if x > left and (width is None or x + length > width):
+            x, y = left, y + line
         places.append((x, y, label, text))
         x += length
-        right = max(right, x)
-    strip = Image.new("RGB", (width or right, y + line + gap // 2), LEGEND_PAPER)
+        right, bottom = max(right, x), max(bottom, y)
+        if width is None:
+            x, y = left, y + line
+    strip = Image.new("RGB", (width or right, bottom + line + gap // 2), LEGEND_PAPER)
     draw = ImageDraw.Draw(strip)
     for x, y, label, text in places:
         color = tuple(int(v) for v in palette(np.array(label)))

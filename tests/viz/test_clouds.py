@@ -13,12 +13,10 @@ from kfgs.viz import (
     add_cloud,
     add_legend,
     add_transfer,
-    legend_column,
     look_through,
     palette,
 )
 from kfgs.viz.clouds import CloudOptions, recolor_cloud
-from kfgs.viz.legends import add_scalar_bar
 
 C0 = 0.28209479177387814
 
@@ -117,19 +115,6 @@ def test_wrong_values_to_colour_by_are_named(plotter):
         CloudOptions(moving="never")
 
 
-def test_scalar_bar_shows_the_colours_of_its_scale(plotter):
-    cloud = add_cloud(plotter, some_gaussians(), color_by="opacity")
-    cloud.SetVisibility(False)
-    bar = add_scalar_bar(plotter, cloud, "opacity")
-    assert bar.GetTitle() == "opacity"
-    assert bar.GetLookupTable().GetRange() == (0, 1)
-    picture = plotter.screenshot(return_img=True).reshape(-1, 3)
-    for color in ((0, 34, 77), (255, 255, 255)):  # the lowest score, and the paper behind the letters
-        assert (np.abs(picture.astype(int) - color).max(axis=1) < 4).any()
-    with pytest.raises(ValueError, match="cloud: expected one coloured by scores or opacity"):
-        add_scalar_bar(plotter, add_cloud(plotter, some_gaussians()))
-
-
 def test_ellipsoids_are_the_gaussians_surfaces(plotter):
     gaussians = some_gaussians()
     actor = add_cloud(plotter, gaussians, style="ellipsoids", options=CloudOptions(deviations=2, faint=0.6))
@@ -193,18 +178,6 @@ def test_look_through_refuses_a_distorting_lens(plotter):
     bent = Camera(camera.viewmat, camera.K, 160, 120, distortion=Distortion("brown_conrady", (0.1, 0, 0, 0)))
     with pytest.raises(ValueError, match="camera: expected a pinhole camera"):
         look_through(plotter, bent)
-
-
-def test_legend_is_drawn_as_it_is_in_the_lower_left_corner(plotter):
-    labels, names = torch.tensor([2, -1, 0, 2]), ["wall", "floor", "rug"]
-    add_legend(plotter, labels, names)
-    expected = legend_column(labels, names)
-    height, width, _ = expected.shape
-    picture = plotter.screenshot(return_img=True)
-    np.testing.assert_array_equal(picture[120 - 10 - height : 120 - 10, 10 : 10 + width], expected)
-    assert not picture[: 120 - 10 - height].any()
-    with pytest.raises(ValueError, match="names: expected a name for every label up to 5"):
-        add_legend(plotter, np.array([5]), ["wall"])
 
 
 def test_scene_of_everything_is_not_blank(plotter):

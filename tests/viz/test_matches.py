@@ -3,10 +3,11 @@ import pytest
 import torch
 from cases_viz import data, some_gaussians, some_plotter
 from matplotlib.axes import Axes
+from oracles_palette import worst_distance
 
 from kfgs.labels import transfer_labels
 from kfgs.viz import add_transfer, palette
-from kfgs.viz.matches import add_matches, match_states, plot_distances
+from kfgs.viz.matches import STATE_COLORS, add_matches, match_states, plot_distances
 
 
 @pytest.fixture
@@ -68,7 +69,7 @@ def test_matches_are_told_apart_and_moved_aside(plotter):
     points, lines = data(matches.points), data(matches.lines)
     np.testing.assert_allclose(points.points, dst.means + torch.tensor([0, 0, 2.0]))
     assert points["state"].tolist() == [0, 1, 0, 2, 2]
-    assert points["rgb"].tolist() == palette(np.array([4, 0, 4, 6, 6])).tolist()
+    assert points["rgb"].tolist() == palette(np.array([1, 5, 1, 7, 7])).tolist()
     assert lines["destination"].tolist() == [0, 1, 2]
     assert lines["state"].tolist() == [0, 1, 0]
     np.testing.assert_array_equal(lines["rgb"], points["rgb"][:3])
@@ -76,6 +77,14 @@ def test_matches_are_told_apart_and_moved_aside(plotter):
     np.testing.assert_allclose(lines.points[1::2], src.means[transfer.sources[:3]])
     plotter.reset_camera()
     assert len(np.unique(plotter.screenshot(return_img=True).reshape(-1, 3), axis=0)) > 4
+
+
+def test_states_look_unlike_to_colour_blind_eyes_too():
+    colors = palette(np.array(STATE_COLORS))
+    apart = worst_distance(colors, np.concatenate([colors, [[255, 255, 255]]]))
+    assert apart[:, :3][~np.eye(3, dtype=bool)].min() > 70
+    assert apart[:, 3].min() > 40  # from paper
+    assert list(STATE_COLORS) == sorted(STATE_COLORS)  # the legend lists them in this order
 
 
 def test_without_any_match_there_are_only_points(plotter):
@@ -114,7 +123,7 @@ def test_histogram_counts_every_distance_and_marks_lambda(tmp_path, monkeypatch)
     from PIL import Image
 
     picture = np.asarray(Image.open(tmp_path / "distances.png").convert("RGB")).reshape(-1, 3)
-    for color in palette(np.array([4, 6])):
+    for color in palette(np.array([1, 7])):
         assert (picture == color).all(axis=1).sum() > 500
 
 
