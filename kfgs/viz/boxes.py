@@ -11,6 +11,7 @@ import torch
 from .._check import check_range, check_shapes
 from ..gaussians import Gaussians
 from ..labels import OrientedBox, Selection
+from .cloud_colors import cloud_colors
 from .clouds import CloudOptions, Style, add_cloud
 from .legends import letters
 from .meshes import draw_mesh
@@ -19,7 +20,9 @@ from .palette import palette
 if TYPE_CHECKING:
     import pyvista as pv
 
-LETTERS = 18  # pixels
+LETTERS = 16  # pixels
+BRIGHTNESS = np.array([0.2126, 0.7152, 0.0722])  # of red, green and blue, ITU-R BT.709
+GRAYS = (70, 225)  # of black and of white: paler than what was selected
 EDGES = ((0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7))
 """Pairs of `OrientedBox.corners` that differ along one axis: the third, the second, the first."""
 
@@ -96,8 +99,9 @@ def add_names(
     centers = corners.mean(axis=1)
     tops = centers + np.outer(height - centers @ direction / (direction @ direction), direction)
     return plotter.add_point_labels(
-        tops, list(names), shape=None, show_points=False, always_visible=True, font_size=LETTERS,
-        text_color=letters(plotter), bold=True, pickable=False, reset_camera=False,
+        tops, list(names), shape="rounded_rect", shape_color=plotter.renderer.background_color, shape_opacity=0.6, margin=2,
+        show_points=False, always_visible=True, font_size=LETTERS, text_color=letters(plotter), bold=True, pickable=False,
+        reset_camera=False,
     )  # fmt: skip
 
 
@@ -120,7 +124,7 @@ def add_selections(
         gaussians: the cloud that the selections are of.
         selections: by name, in the order of their colours.
         style: as in `add_cloud`.
-        rest: draw what nobody selected too, in grey.
+        rest: draw what nobody selected too, in grey; where the cloud has colours, in the greys of their brightness.
         up: where the world's up is; names are there.
         options: as in `add_cloud`.
 
@@ -143,5 +147,18 @@ def add_selections(
         boxes.append(OrientedBox.around(gaussians.means.detach().cpu()[mask]))
     labels = labels.to(gaussians.means.device)
     shown = gaussians.replace(labels=labels)
-    cloud = add_cloud(plotter, shown if rest else shown.select(labels >= 0), style=style, options=options)
+    if not rest:
+        shown = shown.select(labels >= 0)
+    cloud = add_cloud(plotter, shown, color_by=_colors(shown), style=style, options=options)
     return Selections(cloud, add_boxes(plotter, boxes), add_names(plotter, boxes, list(selections), up=up))
+
+
+def _colors(gaussians: Gaussians) -> Array:  # [N, 3] uint8
+    """The palette's colours; what has no label keeps the brightness of its own colour, if it has one."""
+    assert gaussians.labels is not None
+    colors = palette(gaussians.labels)
+    if gaussians.sh is None:
+        return colors
+    gray = GRAYS[0] + (GRAYS[1] - GRAYS[0]) / 255 * (cloud_colors(gaussians, "rgb").rgb @ BRIGHTNESS)
+    none = gaussians.labels.cpu().numpy() < 0
+    return np.where(none[:, None], np.rint(gray)[:, None], colors).astype(np.uint8)

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from .cloud_colors import COLORMAP
-from .pictures import LEGEND_INK, LEGEND_PAPER, legend_column
+from .pictures import LEGEND_INK, LEGEND_PAPER, check_names, legend_column
 from .pinned import MARGIN, pin_picture
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def add_legend(
         ValueError: if a label has no name.
     """
     present = np.unique(labels.cpu().numpy() if isinstance(labels, Tensor) else np.asarray(labels))
-    legend_column(present, names)  # refuses at once what the first frame would refuse
+    check_names(present.tolist(), names)  # at once, and not in the midst of a frame
 
     def draw(height: int, width: int) -> Array:
         room = height - 2 * MARGIN

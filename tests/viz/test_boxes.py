@@ -64,6 +64,19 @@ def test_selections_have_colours_and_boxes_of_their_own(plotter):
     assert data(alone.cloud).n_points == len(low) + len(high)
 
 
+def test_what_nobody_selected_keeps_the_brightness_of_its_colour(plotter):
+    gaussians = some_gaussians()
+    some = select_where(gaussians.means[:, 0] < 0, "left")
+    rgb = data(add_selections(plotter, gaussians, {"left": some}).cloud)["rgb"]
+    np.testing.assert_array_equal(rgb[some.mask], np.tile(palette(np.array([0])), (len(some), 1)))
+    rest = rgb[~some.mask.numpy()].astype(int)
+    assert (rest == rest[:, :1]).all()
+    own = (gaussians.sh[:, 0] * 0.28209479177387814 + 0.5).clamp(0, 1)[~some.mask].double().numpy()
+    np.testing.assert_allclose(rest[:, 0], 70 + 155 * own @ [0.2126, 0.7152, 0.0722], atol=1)
+    plain = data(add_selections(plotter, gaussians.replace(sh=None), {"left": some}).cloud)["rgb"]
+    assert (plain[~some.mask.numpy()] == 128).all()
+
+
 def test_what_cannot_be_boxed_is_named(plotter):
     gaussians = some_gaussians()
     box = OrientedBox.between([0] * 3, [1] * 3)
