@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import pyvista as pv
 
 WINDOW_VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
+WITHOUT_DISPLAY = {WINDOW_VARIABLE: "vtkEGLRenderWindow", "PYVISTA_OFF_SCREEN": "true"}
 DEBIAN_PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri"
 PROBE_SECONDS = 120  # a first start of VTK from a cold disk takes tens of seconds
 PROBE = """
@@ -26,6 +27,7 @@ picture = plotter.screenshot(return_img=True)
 plotter.close()
 assert picture.shape == (8, 8, 3) and tuple(picture[0, 0]) == (255, 0, 0), picture
 """
+_ours: set[str] = set()  # variables set here, not by the user
 
 
 class Probe(NamedTuple):
@@ -36,13 +38,24 @@ class Probe(NamedTuple):
 
 
 def prepare() -> None:
-    """Choose VTK's EGL window when there is no display, before the first window is made.
+    """Where there is no display, choose VTK's EGL window and pyvista's off-screen plotters, before the first is made.
 
-    Sets `VTK_DEFAULT_OPENGL_WINDOW=vtkEGLRenderWindow` in this process on Linux, and only where neither DISPLAY nor
-    WAYLAND_DISPLAY is set; a value that is already there is left alone.
+    Sets `VTK_DEFAULT_OPENGL_WINDOW=vtkEGLRenderWindow` and `PYVISTA_OFF_SCREEN=true` in this process on Linux, and only
+    where neither DISPLAY nor WAYLAND_DISPLAY is set; values that are already there are left alone. Where a display has
+    come since (a virtual one, started by the program), the choice is taken back. Without it, VTK tries X first and
+    complains on stderr.
+
+    Importing `kfgs.viz` does this, for plotters that `make_plotter` does not make.
     """
-    if sys.platform.startswith("linux") and not has_display():
-        os.environ.setdefault(WINDOW_VARIABLE, "vtkEGLRenderWindow")
+    if not sys.platform.startswith("linux"):
+        return
+    if not has_display():
+        for name in WITHOUT_DISPLAY.keys() - os.environ.keys():
+            os.environ[name] = WITHOUT_DISPLAY[name]
+            _ours.add(name)
+        return
+    while _ours:
+        os.environ.pop(_ours.pop(), None)
 
 
 def has_display() -> bool:
@@ -99,6 +112,7 @@ def make_plotter(
     check_range("height", height, 1)
     check_range("width", width, 1)
     hidden = not has_display() if off_screen is None else off_screen
+    prepare()
     require()
     load_compilers()
     import pyvista as pv
@@ -109,11 +123,13 @@ def make_plotter(
     return plotter
 
 
+@functools.cache
 def load_compilers() -> None:
-    """Load the rasteriser's engines before the first window, which brings an LLVM of its own.
+    """Load the rasteriser's engines before the first window is drawn, which brings an LLVM of its own.
 
     Mesa's software driver loads LLVM; where pycolmap or others have prepared the ground, numba's or triton's LLVM loaded
-    after it ends Python with a segfault (look at a scene, then rasterise it). Loaded before it, all get along.
+    after it ends Python with a segfault (look at a scene, then rasterise it). Loaded before it, all get along. For plotters
+    that are not made here, `kfgs.splat.engines.table` loads the engines with their own symbols.
     """
     available_engines("cpu")  # imports them to find out
 
@@ -126,3 +142,6 @@ def require() -> None:
             f"3-D pictures cannot be drawn here: expected a working OpenGL, but {found.reason}; "
             f"on Debian or Ubuntu run: apt-get install {DEBIAN_PACKAGES}"
         )
+
+
+prepare()  # before a plotter of the user's own is made

@@ -6,7 +6,7 @@ import pytest
 
 from kfgs.viz import available, headless, make_plotter
 
-VARIABLES = ("DISPLAY", "WAYLAND_DISPLAY", headless.WINDOW_VARIABLE)
+VARIABLES = ("DISPLAY", "WAYLAND_DISPLAY", *headless.WITHOUT_DISPLAY)
 
 
 @pytest.fixture
@@ -16,6 +16,7 @@ def bare(monkeypatch):
         monkeypatch.setenv(name, "to be restored")
         monkeypatch.delenv(name)
     monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(headless, "_ours", set())
     headless.probe.cache_clear()
     yield monkeypatch
     headless.probe.cache_clear()
@@ -28,7 +29,7 @@ def test_egl_is_chosen_only_without_any_display(bare):
         bare.delenv(headless.WINDOW_VARIABLE, raising=False)
         bare.setenv(name, ":0")
         headless.prepare()
-        assert headless.WINDOW_VARIABLE not in os.environ
+        assert not headless.WITHOUT_DISPLAY.keys() & os.environ.keys()
         bare.delenv(name)
 
 
@@ -36,6 +37,17 @@ def test_a_window_chosen_by_the_user_stays(bare):
     bare.setenv(headless.WINDOW_VARIABLE, "vtkOSOpenGLRenderWindow")
     headless.prepare()
     assert os.environ[headless.WINDOW_VARIABLE] == "vtkOSOpenGLRenderWindow"
+    bare.setenv("DISPLAY", ":0")
+    headless.prepare()
+    assert os.environ[headless.WINDOW_VARIABLE] == "vtkOSOpenGLRenderWindow"
+
+
+def test_the_choice_is_taken_back_when_a_display_comes(bare):
+    headless.prepare()
+    assert {name: os.environ[name] for name in headless.WITHOUT_DISPLAY} == headless.WITHOUT_DISPLAY
+    bare.setenv("DISPLAY", ":99")
+    headless.prepare()
+    assert not headless.WITHOUT_DISPLAY.keys() & os.environ.keys()
 
 
 def test_other_systems_are_left_alone(bare):
@@ -113,3 +125,91 @@ plotter.close()
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+BARE = {key: value for key, value in os.environ.items() if key not in VARIABLES}
+CLOUD = """
+import torch
+from kfgs.gaussians import Gaussians
+gaussians = Gaussians(torch.rand(9, 3), torch.ones(9, 4), torch.full((9, 3), 0.1), torch.full((9,), 0.5),
+    labels=torch.arange(9) % 3)
+"""
+
+
+def run_bare(program, **environment):
+    """In a Python of its own, as on a machine without a display that nobody has prepared."""
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-c", program], capture_output=True, text=True, check=False, timeout=120,
+        env=BARE | environment,
+    )  # fmt: skip
+
+
+def test_without_a_display_nothing_is_printed_and_show_returns():
+    if not available():
+        pytest.skip(headless.probe().reason)
+    program = f"""
+from kfgs.viz import linked_clouds
+{CLOUD}
+plotter = linked_clouds(gaussians, gaussians, color_by=("label", "opacity"), height=60)
+assert plotter.screenshot(return_img=True).std() > 0
+plotter.show()
+print("shown")
+"""
+    done = run_bare(program)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "shown\n", "")
+
+
+def test_a_plotter_of_the_users_own_is_silent_and_does_not_keep_one_from_rasterising():
+    """pycolmap and Mesa's LLVM are there before numba's and triton's, which ended in a segfault."""
+    if not available():
+        pytest.skip(headless.probe().reason)
+    program = f"""
+import pycolmap
+from kfgs.viz import add_cloud
+import pyvista
+{CLOUD}
+plotter = pyvista.Plotter(window_size=(64, 48))
+add_cloud(plotter, gaussians, style="gaussians")
+assert plotter.screenshot(return_img=True).std() > 0
+import sys
+assert not {{"numba", "triton"}} & set(sys.modules), "too early to tell anything"
+from kfgs.splat.engines import available_engines
+print(*available_engines("cpu"))
+plotter.show()
+"""
+    done = run_bare(program)
+    assert (done.returncode, done.stderr) == (0, ""), done.stderr
+    assert "reference" in done.stdout
+
+
+def test_a_missing_driver_is_told_by_every_entry():
+    """libglvnd finds no vendor's EGL: VTK alone would end Python, or warn and draw nothing."""
+    if not sys.platform.startswith("linux"):
+        pytest.skip("drivers are hidden by variables of Linux's EGL")
+    program = f"""
+import numpy
+from kfgs.formats import SplatFile
+from kfgs.viz import available, linked_clouds, make_plotter
+from kfgs.viz.explorer import explore
+from kfgs.viz.explorer.exploration import Exploration
+from kfgs.viz.explorer.explorer import Explorer
+from kfgs.viz.explorer.meaning import SplatMeaning
+{CLOUD}
+splats = SplatFile(gaussians, {{}}, ("a", "b", "c"))
+assert not available()
+for entry in (
+    make_plotter,
+    lambda: linked_clouds(gaussians, gaussians),
+    lambda: Explorer(Exploration(SplatMeaning(splats))),
+    lambda: explore(splats),
+    lambda: explore(splats, where="picture"),
+):
+    try:
+        entry()
+    except RuntimeError as error:
+        print("install libegl1 libegl-mesa0 libgl1-mesa-dri" in str(error), "cannot be drawn here" in str(error))
+"""
+    hidden = {name: "/nonexistent" for name in ("__EGL_VENDOR_LIBRARY_FILENAMES", "LIBGL_DRIVERS_PATH")}
+    done = run_bare(program, **hidden)
+    assert (done.returncode, done.stderr) == (0, ""), done.stderr
+    assert done.stdout == "True True\n" * 5

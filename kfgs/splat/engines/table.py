@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
@@ -48,12 +53,34 @@ def load(name: str) -> ModuleType:
     """
     entry = _ENGINES[name]
     try:
-        return import_module(entry.module)
+        with _own_symbols():
+            return import_module(entry.module)
     except ImportError as error:
         raise ImportError(
             f"engine: expected {entry.needs} for engine {name!r}, but it cannot be imported ({error}); "
             f"install it with `{entry.install}`, or choose one of {available_engines()}"
         ) from error
+
+
+@contextmanager
+def _own_symbols() -> Iterator[None]:
+    """Import compiled modules so that they find their own functions before those of others with the same names.
+
+    triton and numba each bring an LLVM. Where a picture was drawn before (pyvista on Mesa's software driver) and pycolmap
+    is loaded, Mesa's LLVM is what the dynamic linker offers first, and Python ends with a segfault in it. Only then: with
+    this flag a module does not see an allocator that was loaded before all others (LD_PRELOAD), either.
+    """
+    flag = getattr(os, "RTLD_DEEPBIND", 0)  # glibc's
+    maps = Path("/proc/self/maps")
+    if not flag or not maps.is_file() or "libLLVM" not in maps.read_text(errors="replace"):
+        yield
+        return
+    flags = sys.getdlopenflags()
+    sys.setdlopenflags(flags | flag)
+    try:
+        yield
+    finally:
+        sys.setdlopenflags(flags)
 
 
 def choose(engine: str, device: str, dtype: torch.dtype) -> str:
