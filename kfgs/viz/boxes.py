@@ -20,6 +20,7 @@ from .palette import palette
 if TYPE_CHECKING:
     import pyvista as pv
 
+Array = np.ndarray[Any, Any]
 LETTERS = 16  # pixels
 BRIGHTNESS = np.array([0.2126, 0.7152, 0.0722])  # of red, green and blue, ITU-R BT.709
 GRAYS = (70, 225)  # of black and of white: paler than what was selected
