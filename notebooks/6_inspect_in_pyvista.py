@@ -58,6 +58,7 @@ from kfgs import (
     transfer_labels,
     viz,
 )
+from kfgs.labels import select_where
 from kfgs.metrics import psnr
 
 # %% [markdown]
@@ -172,8 +173,11 @@ Image.fromarray(viz.picture_grid([[drawn, ours, 10 * apart]], ["pyvista", "kfgs.
 # Pyramids with the true opening, each picture on its image plane, a roof on its upper edge.
 
 # %%
+up = viz.estimate_up(cameras).float()
 inside = semantic.select(semantic.labels != classes.index("ceiling"))
-outside = viz.orbit_cameras(inside.means, viz.Orbit(frames=8, size=(420, 640), elevation_degrees=50, zoom=1.3))[1]
+outside = viz.orbit_cameras(inside.means, viz.Orbit(frames=8, size=(420, 640), elevation_degrees=50, zoom=1.3), up=up)[
+    1
+]
 plotter = viz.make_plotter(*outside.size, off_screen=True)
 viz.add_cloud(plotter, inside, style="points", options=viz.CloudOptions(point_size=2.5, opacity=0.5))
 viz.add_cameras(plotter, cameras, size=0.45)
@@ -193,47 +197,48 @@ Image.fromarray(plotter.screenshot(return_img=True))
 # %% [markdown]
 # ## Selections
 #
-# `answers` gives the connected parts of a selection, each with its oriented box and the camera that sees it best.
+# `answers` gives the connected parts of a selection: how many Gaussians, where, how large, seen best from where. Scores
+# light up on the left, and on the right the parts stand in their oriented boxes. The rest keeps its brightness where there
+# are colours: so the selection is carried to the colour cloud first.
 
 # %%
-chairs = answers(semantic, found, cameras)
-for chair in chairs:
-    print(chair)
-boxes, called = [chair.box for chair in chairs], [f"{word} {n}" for n in range(1, len(chairs) + 1)]
-
-
-def draw_answers(plotter):
-    cloud = viz.add_cloud(plotter, color, color_by="view", style="gaussians")
-    viz.add_boxes(plotter, boxes)
-    viz.add_names(plotter, boxes, called)
-    return cloud
+parts = answers(semantic, found, cameras)
+for part in parts:
+    print(part)
+owner = torch.full((len(semantic),), -1)
+for number, part in enumerate(parts):
+    owner[part.indices] = number
+carried = transfer_labels(semantic, owner, color, 0.1).labels
+selections = {f"{word} {number + 1}": select_where(carried == number) for number in range(len(parts))}
 
 
 def draw_scores(plotter):
     cloud = viz.add_cloud(plotter, semantic, color_by=found.scores, style="gaussians", clim=(0, 1))
-    viz.add_scalar_bar(plotter, cloud, word)
+    viz.add_scalar_bar(plotter, cloud, f"relevancy of {word}")
 
 
-Image.fromarray(
-    viz.picture_grid([[shot(camera, draw_scores, 2), shot(camera, draw_answers, 2)]], ["scores", "answers"])
-)
+def draw_parts(plotter):
+    viz.add_selections(plotter, color, selections, style="gaussians")
+
+
+Image.fromarray(viz.picture_grid([[shot(camera, draw_scores, 2), shot(camera, draw_parts, 2)]], ["scores", "parts"]))
 
 # %% [markdown]
 # ## Matches
 #
-# Who gave a label to whom (Sec. 3.4), for the first chair: matched, ambiguous (sources in range disagree) and orphaned
-# destinations, each with a line to its source. Lines are as short as lambda, so the colour Gaussians are lifted by `shift`.
+# Who gave a label to whom (Sec. 3.4): matched, ambiguous (sources in range disagree, as at borders) and orphaned
+# destinations, and lines to the sources. Lines are as short as lambda, so the colour cloud is lifted off by `shift`.
 
 # %%
-box = replace(boxes[0], half=1.3 * boxes[0].half)
-near, patch = semantic.select(box.contains(semantic.means)), color.select(box.contains(color.means))
-carried = transfer_labels(near, near.labels, patch)
-around = viz.orbit_cameras(near.means, viz.Orbit(frames=8, size=(480, 640), elevation_degrees=15, zoom=0.6))[1]
+shift = 2 * float(scene.extent) * up
+around = viz.orbit_cameras(
+    torch.cat([semantic.means, semantic.means + shift]), viz.Orbit(frames=8, size=(480, 640)), up=up
+)[1]
 
 
 def draw_matches(plotter):
-    viz.add_cloud(plotter, near, style="points", options=viz.CloudOptions(point_size=3))
-    viz.add_matches(plotter, near, patch, carried, shift=(0, 0, 1.2), sample=150)
+    viz.add_cloud(plotter, semantic, style="points")
+    viz.add_matches(plotter, semantic, color, transfer, shift=tuple(shift.tolist()))
 
 
 Image.fromarray(shot(around, draw_matches))
@@ -310,12 +315,15 @@ Image.fromarray(view.screenshot())
 # %% [markdown]
 # ## Files to send around
 #
-# A turntable (GIF; MP4 with the extra `video`), drawn by kfgs's rasteriser without OpenGL.
+# A turntable (GIF; MP4 with the extra `video`), drawn by kfgs's rasteriser without OpenGL. Walls and ceiling would hide the
+# rest, and since the colour Gaussians know their classes now, they can be left out by name.
 
 # %%
 view.close()
-orbit = viz.Orbit(frames=24, size=(150, 200), elevation_degrees=40, zoom=1.5, cut=0.45)
-film = viz.save_turntable(out / "turntable.gif", inside, orbit=orbit, fps=8)
+shell = torch.tensor([-1, classes.index("wall"), classes.index("ceiling")])
+things = color.select(~torch.isin(color.labels, shell)).replace(labels=None)  # in its own colours
+orbit = viz.Orbit(frames=12, size=(120, 160), elevation_degrees=35, zoom=1.7)
+film = viz.save_turntable(out / "turntable.gif", things, orbit=orbit, up=up, fps=6)
 print(f"{film.stat().st_size / 1000:.0f} kB")
 display.Image(film)
 
