@@ -2,6 +2,7 @@
 
 from .camera import Camera, Distortion
 from .distortion import fold_radius
+from .kornia_camera import from_kornia, to_kornia
 from .projection import camera_to_pixel, project_points, projection_jacobian, unproject_depth, world_to_camera
 from .resample import resize_labels, resize_map
 from .similarity import Similarity, fit_similarity
@@ -14,10 +15,12 @@ __all__ = [
     "camera_to_pixel",
     "fit_similarity",
     "fold_radius",
+    "from_kornia",
     "project_points",
     "projection_jacobian",
     "resize_labels",
     "resize_map",
+    "to_kornia",
     "undistort",
     "undistort_labels",
     "unproject_depth",

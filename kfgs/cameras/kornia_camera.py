@@ -1,0 +1,118 @@
+"""Between kfgs's cameras, one view each, and kornia's `PinholeCamera`, a batch of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+
+import torch
+from kornia.geometry.camera import PinholeCamera
+
+from .._check import check_shapes
+from .camera import NEAR, Camera
+
+
+def to_kornia(cameras: Sequence[Camera], *, integer_centers: bool = False) -> PinholeCamera:
+    """Stack cameras into one kornia `PinholeCamera` of batch B = len(cameras).
+
+    **Convention**: both libraries map world to camera with x right, y down, z forward, and both project by K (R X + t):
+    pixels are counted as K counts them. As it stands, kfgs's K puts the centre of the first pixel at (0.5, 0.5), so
+    `project` gives the pixels of `project_points`, and `unproject` takes them. What in kornia enumerates pixels itself
+    (`create_meshgrid`, `DepthWarper`, `remap`) puts that centre at (0, 0): for those, `integer_centers=True` takes 0.5 off
+    cx and cy, and `project` then gives pixels smaller by 0.5. kornia's `scale` is right for the first form, not the second.
+
+    Args:
+        cameras: without distortion; on one device. Sizes may differ. A batch has one dtype: the widest of all matrices.
+        integer_centers: count pixel centres from 0, as kornia's grids do.
+
+    Returns:
+        `intrinsics` and `extrinsics` [B, 4, 4], `height` and `width` [B] int64. Names and `near` have no place there.
+
+    Raises:
+        ValueError: if there is no camera, one has distortion, or they are on several devices.
+
+    Note:
+        `project` knows no front and no border: a point behind a camera gets a plausible pixel (`project_points` masks it).
+
+    Example:
+        >>> camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48)
+        >>> to_kornia([camera]).project(torch.tensor([[[0.2, 0.1, 2.0]]]))
+        tensor([[[42., 29.]]])
+    """
+    if not len(cameras):
+        raise ValueError("cameras: expected at least one Camera, got none; select a view that the scene has")
+    for i, camera in enumerate(cameras):
+        if camera.distortion is not None:
+            raise ValueError(
+                f"cameras[{i}]: expected a pinhole camera, got {camera.distortion.model} distortion (camera "
+                f"{camera.name!r}), which PinholeCamera cannot hold; undistort it first (kfgs.cameras.undistort)"
+            )
+    matrices = [matrix for camera in cameras for matrix in (camera.K, camera.viewmat)]
+    devices = {str(matrix.device) for matrix in matrices}
+    if len(devices) > 1:
+        raise ValueError(
+            f"cameras: expected matrices on one device, got {', '.join(sorted(devices))}; move them with camera.to(device)"
+        )
+    dtype = reduce(torch.promote_types, (matrix.dtype for matrix in matrices))
+    K = [camera.intrinsics_at_integer_centers if integer_centers else camera.K for camera in cameras]
+    extrinsics = torch.stack([camera.viewmat.to(dtype) for camera in cameras])
+    intrinsics = torch.eye(4, dtype=dtype, device=extrinsics.device).repeat(len(cameras), 1, 1)
+    intrinsics[:, :3, :3] = torch.stack([matrix.to(dtype) for matrix in K])
+    sizes = torch.tensor([camera.size for camera in cameras], device=extrinsics.device)
+    return PinholeCamera(intrinsics, extrinsics, height=sizes[:, 0], width=sizes[:, 1])
+
+
+def from_kornia(
+    pinhole: PinholeCamera,
+    names: Sequence[str] = (),
+    *,
+    near: float = NEAR,
+    integer_centers: bool = False,
+) -> list[Camera]:
+    """The cameras of a kornia batch, one by one: the way back from `to_kornia`.
+
+    Args:
+        pinhole: B cameras; of `intrinsics` only the upper left 3 x 3 is read, as kornia does.
+        names: B names, or none.
+        near: of every camera, world units; kornia's cameras have none.
+        integer_centers: whether its K counts pixel centres from 0, as kornia's documentation says of its cameras;
+            0.5 is then added to cx and cy. A K from COLMAP counts from 0.5 also where kornia holds it.
+
+    Returns:
+        B cameras with matrices of their own, in the batch's dtype and on its device.
+
+    Raises:
+        TypeError: if `pinhole` is not kornia's.
+        ValueError: if it is not [B, 4, 4], names differ in number, or a camera is none of kfgs's (skew, a pose with scale,
+            a size that is not a whole number of pixels).
+
+    Example:
+        >>> camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48)
+        >>> [again] = from_kornia(to_kornia([camera]), ["a.png"])
+        >>> again.name, again.size, torch.equal(again.K, camera.K)
+        ('a.png', (48, 64), True)
+    """
+    if not isinstance(pinhole, PinholeCamera):
+        raise TypeError(
+            f"pinhole: expected a kornia.geometry.camera.PinholeCamera, got {type(pinhole).__name__}; "
+            "build one from its matrices, or a kfgs.Camera from viewmat and K"
+        )
+    check_shapes(
+        ("pinhole.intrinsics", pinhole.intrinsics, "B 4 4"), ("pinhole.extrinsics", pinhole.extrinsics, "B 4 4")
+    )
+    if names and len(names) != pinhole.batch_size:
+        raise ValueError(f"names: expected {pinhole.batch_size} (one per camera), got {len(names)}; give one for each")
+    viewmats, Ks = pinhole.extrinsics.clone(), pinhole.camera_matrix.clone()  # kornia's scale_ changes its own in place
+    if integer_centers:
+        Ks[:, :2, 2] += 0.5
+    return [
+        Camera(viewmat, K, width, height, name, near=near)
+        for viewmat, K, width, height, name in zip(
+            viewmats,
+            Ks,
+            pinhole.width.tolist(),
+            pinhole.height.tolist(),
+            names or [""] * pinhole.batch_size,
+            strict=True,
+        )
+    ]

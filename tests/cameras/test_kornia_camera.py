@@ -1,0 +1,163 @@
+"""The bridge to kornia's cameras against kfgs's own projection, loops, and what kornia does with a grid."""
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from kornia.geometry import create_meshgrid
+from kornia.geometry.camera import PinholeCamera
+from oracles_cameras import project_pinhole
+
+from kfgs.cameras import Camera, Distortion, from_kornia, project_points, to_kornia, unproject_depth
+
+K = torch.tensor([[70.0, 0.0, 50.0], [0.0, 66.0, 30.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def posed(quat_xyzw, translation, name, width=96, height=64, focal=1.0):
+    unit = np.array(quat_xyzw) / np.linalg.norm(quat_xyzw)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3] = torch.from_numpy(pycolmap.Rigid3d(pycolmap.Rotation3d(unit), np.array(translation)).matrix())
+    zoomed = K.clone()
+    zoomed[:2, :2] *= focal
+    return Camera(viewmat, zoomed, width, height, name, near=0.01)
+
+
+CAMERAS = [
+    posed([0.1, -0.2, 0.3, 0.9], [0.5, -1.0, 2.0], "a.png"),
+    posed([-0.3, 0.1, 0.2, 0.8], [-0.4, 0.3, 1.0], "b.png", width=80, focal=1.3),
+]
+
+
+def points_in_front(camera, count=40):
+    """World points whose depth in the camera lies in [1, 10]."""
+    rng = np.random.default_rng(0)
+    cam = np.stack([rng.uniform(-0.6, 0.6, count), rng.uniform(-0.4, 0.4, count), np.ones(count)], 1)
+    cam = torch.from_numpy(cam * rng.uniform(1, 10, (count, 1)))
+    return (cam - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
+
+
+def test_project_gives_the_pixels_of_kfgs_and_of_loops():
+    pinhole = to_kornia(CAMERAS)
+    points = torch.stack([points_in_front(camera) for camera in CAMERAS])
+    theirs = pinhole.project(points)
+    for camera, world, pixels in zip(CAMERAS, points, theirs, strict=True):
+        assert (pixels - project_points(camera, world)[0]).abs().max() <= 1e-9
+        loops, _ = project_pinhole(camera.K.numpy(), camera.viewmat.numpy(), world.numpy())
+        assert np.abs(pixels.numpy() - loops).max() <= 1e-9
+    assert (theirs[0] - project_points(CAMERAS[1], points[0])[0]).norm(dim=1).max() > 1  # the other camera's
+
+
+def test_unproject_takes_kfgs_pixels_back_to_the_points():
+    world = torch.stack([points_in_front(camera) for camera in CAMERAS])
+    pixels, depths, _ = (torch.stack(x) for x in zip(*map(project_points, CAMERAS, world), strict=True))
+    torch.testing.assert_close(to_kornia(CAMERAS).unproject(pixels, depths[..., None]), world, rtol=0, atol=1e-12)
+
+
+def test_kornias_own_grid_wants_integer_centers():
+    """A depth map lifted by kornia's pixel grid; without the option every point is half a pixel off."""
+    camera = CAMERAS[0]
+    depth = 2 + torch.rand(camera.size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    expected = unproject_depth(camera, depth)
+    grid = create_meshgrid(*camera.size, normalized_coordinates=False, dtype=torch.float64).reshape(1, -1, 2)
+    lifted = to_kornia([camera], integer_centers=True).unproject(grid, depth.reshape(1, -1, 1))
+    torch.testing.assert_close(lifted.reshape(expected.shape), expected, rtol=0, atol=1e-12)
+    wrong = to_kornia([camera]).unproject(grid, depth.reshape(1, -1, 1)).reshape(expected.shape)
+    off = (wrong - expected).norm(dim=-1) / depth
+    expected_off = float((0.5 / camera.K.diagonal()[:2]).norm())  # half a pixel in x and in y
+    torch.testing.assert_close(off, torch.full_like(off, expected_off), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("integer_centers", [False, True])
+def test_round_trip(integer_centers):
+    pinhole = to_kornia(CAMERAS, integer_centers=integer_centers)
+    names = [camera.name for camera in CAMERAS]
+    back = from_kornia(pinhole, names, near=0.01, integer_centers=integer_centers)
+    for camera, again in zip(CAMERAS, back, strict=True):
+        assert torch.equal(again.K, camera.K)  # 0.5 off and on again is exact here
+        assert torch.equal(again.viewmat, camera.viewmat)
+        assert (again.size, again.name, again.near) == (camera.size, camera.name, 0.01)
+        assert again.K.dtype == again.viewmat.dtype == torch.float64
+    shift = back[0].K - pinhole.camera_matrix[0]
+    assert shift.tolist() == [[0, 0, 0.5 * integer_centers], [0, 0, 0.5 * integer_centers], [0, 0, 0]]
+
+
+def test_the_batch_is_as_kornia_documents_it():
+    pinhole = to_kornia(CAMERAS)
+    assert pinhole.intrinsics.shape == pinhole.extrinsics.shape == (2, 4, 4)
+    assert pinhole.intrinsics[:, 3].tolist() == pinhole.intrinsics[:, :, 3].tolist() == [[0, 0, 0, 1]] * 2
+    assert (pinhole.height.tolist(), pinhole.width.tolist()) == ([64, 64], [96, 80])
+    assert pinhole.height.dtype == torch.int64
+
+
+def test_the_widest_dtype_is_kept():
+    camera = CAMERAS[0]
+    mixed = replace(camera, K=camera.K.float())
+    assert to_kornia([mixed]).intrinsics.dtype == torch.float64
+    assert to_kornia([mixed.to(torch.float32)]).extrinsics.dtype == torch.float32
+    assert torch.equal(to_kornia([mixed]).extrinsics[0], camera.viewmat)
+
+
+def test_gradients_reach_both_matrices():
+    """Poses can be optimised through kornia: d u / d cx = 1, d u / d t_x = fx / z."""
+    viewmat, matrix = CAMERAS[0].viewmat.clone().requires_grad_(), CAMERAS[0].K.clone().requires_grad_()
+    camera = replace(CAMERAS[0], viewmat=viewmat, K=matrix)
+    world = points_in_front(CAMERAS[0], count=1)
+    to_kornia([camera]).project(world[None])[..., 0].sum().backward()
+    assert float(matrix.grad[0, 2]) == pytest.approx(1, abs=1e-12)
+    depth = float(project_points(CAMERAS[0], world)[1])
+    assert float(viewmat.grad[0, 3]) == pytest.approx(float(K[0, 0]) / depth, abs=1e-9)
+
+
+def test_the_cameras_own_their_matrices():
+    pinhole = to_kornia(CAMERAS)
+    back = from_kornia(pinhole)
+    pinhole.scale_(2.0)
+    pinhole.tx = torch.zeros(2, dtype=torch.float64)
+    assert torch.equal(back[0].K, CAMERAS[0].K)
+    assert torch.equal(back[1].viewmat, CAMERAS[1].viewmat)
+    assert [camera.name for camera in back] == ["", ""]
+
+
+def test_kornias_scale_is_resized():
+    """fx and cx times 0.5 is right with centres on halves."""
+    [half] = from_kornia(to_kornia(CAMERAS[:1]).scale(torch.tensor([0.5], dtype=torch.float64)))
+    expected = CAMERAS[0].resized(32, 48)
+    assert torch.equal(half.K, expected.K)
+    assert half.size == (32, 48)
+
+
+def test_a_zero_padded_matrix_is_read_as_kornia_reads_it():
+    pinhole = to_kornia(CAMERAS[:1])
+    padded = PinholeCamera(
+        pinhole.intrinsics * torch.tensor([1, 1, 1, 0.0]), pinhole.extrinsics, pinhole.height, pinhole.width
+    )
+    assert torch.equal(from_kornia(padded)[0].K, CAMERAS[0].K)
+
+
+def test_distortion_is_refused():
+    bent = replace(CAMERAS[1], distortion=Distortion("kannala_brandt", (0.1, 0, 0, 0)))
+    with pytest.raises(
+        ValueError, match=r"cameras\[1\]: expected a pinhole camera, got kannala_brandt .*'b.png'.*undistort it first"
+    ):
+        to_kornia([CAMERAS[0], bent])
+
+
+def test_other_errors_say_what_to_do():
+    with pytest.raises(ValueError, match="cameras: expected at least one Camera, got none; select a view"):
+        to_kornia([])
+    elsewhere = replace(CAMERAS[1])
+    object.__setattr__(elsewhere, "K", K.to("meta"))  # a second device without a GPU
+    with pytest.raises(ValueError, match=r"cameras: expected matrices on one device, got cpu, meta; move them with"):
+        to_kornia([CAMERAS[0], elsewhere])
+    with pytest.raises(TypeError, match=r"pinhole: expected a kornia.*PinholeCamera, got Camera; build one"):
+        from_kornia(CAMERAS[0])
+    pinhole = to_kornia(CAMERAS)
+    with pytest.raises(ValueError, match=r"names: expected 2 \(one per camera\), got 1; give one for each"):
+        from_kornia(pinhole, ["a"])
+    stacked = PinholeCamera(pinhole.intrinsics[:, None], pinhole.extrinsics[:, None], pinhole.height, pinhole.width)
+    with pytest.raises(ValueError, match=r"pinhole.intrinsics: expected \[B, 4, 4\], got \(2, 1, 4, 4\)"):
+        from_kornia(stacked)
+    with pytest.raises(ValueError, match=r"whole number of pixels, got 28\.[78]"):
+        from_kornia(to_kornia(CAMERAS[:1]).scale(torch.tensor([0.3], dtype=torch.float64)))
