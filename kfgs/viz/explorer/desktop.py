@@ -143,16 +143,20 @@ class Desktop:
     # ---- verbs
 
     def call(self, verb: Callable[[], str | None]) -> None:
-        """Call a verb, and say what it did or what went wrong, which VTK's event loop would swallow."""
+        """Call a verb, and say what it did or what went wrong, which VTK's event loop would swallow.
+
+        There is one frame at the end: pyvista draws one for each actor that is added or removed.
+        """
+        plotter = self.explorer.plotter
         self.note = self.error = ""
-        self._calling = True
+        self._calling = plotter.suppress_rendering = True
         try:
             self.note = verb() or ""
         except Exception as error:  # the window stays, whatever it is
             self.error = error_line(error)
         finally:
-            self._calling = False
-        self.pane.refresh()
+            self._calling = plotter.suppress_rendering = False
+        self.pane.refresh(clouds=True)
 
     def ask(self, words: str | None) -> None:
         """Ask, which may take seconds for a phrase; None drops the question."""

@@ -67,11 +67,19 @@ class PanelPane:
         inside = not self._away and x >= self._left
         return inside, self.panel.find(x - self._left, y) if inside else None, x - self._left
 
-    def refresh(self) -> None:
-        """Draw the panel again and leave the clouds as they are: 20 ms instead of a frame of Gaussians."""
+    def refresh(self, clouds: bool = False) -> None:
+        """Draw the panel again, alone (20 ms instead of a frame of Gaussians) or with the clouds.
+
+        Before the first frame and after the last this does nothing.
+        """
         self._stale = True
         window = self.plotter.render_window
-        if window is None or self._removed or self._size is None:  # closed, or not yet open: the first frame draws it
+        if window is None or self._removed:
+            return
+        if clouds:
+            self.plotter.render()
+            return
+        if self._size is None:  # nothing is there yet that could stay
             return
         clouds = [renderer for renderer in self.plotter.renderers if renderer.GetDraw()]
         for renderer in clouds:
@@ -84,17 +92,13 @@ class PanelPane:
 
     @contextmanager
     def away(self) -> Iterator[None]:
-        """The subplots fill the window, as for a picture of them."""
-        self._move(away=True)
+        """The subplots fill the window, as for a picture of them; the next frame brings the panel back."""
+        self._away, self._size = True, None
+        self.plotter.render_window.Render()  # pyvista's pictures of a window are of its last frame
         try:
             yield
         finally:
-            self._move(away=False)
-
-    def _move(self, away: bool) -> None:
-        self._away, self._size = away, None
-        if self.plotter.render_window is not None:
-            self.plotter.render_window.Render()  # pyvista's pictures of a window are of its last frame
+            self._away, self._size = False, None
 
     def _before_frame(self, *_: Any) -> None:
         """Follow the window's size, and paint what has changed."""
