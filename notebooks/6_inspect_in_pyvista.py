@@ -191,7 +191,7 @@ Image.fromarray(plotter.screenshot(return_img=True))
 # They share no parameter, only space. Turning one turns the other (`plotter.show()`).
 
 # %%
-plotter = viz.linked_clouds(semantic, color, names=classes.names, camera=camera, height=420, off_screen=True)
+plotter = viz.linked_clouds(semantic, color, names=classes.names, camera=camera, height=360, off_screen=True)
 Image.fromarray(plotter.screenshot(return_img=True))
 
 # %% [markdown]
@@ -272,7 +272,7 @@ Image.fromarray(viz.picture_grid([[before, plotter.screenshot(return_img=True)]]
 # One call for all of it. `where="picture"` opens nothing; every control is a method, and the picture is the window.
 
 # %%
-options = viz.ExploreOptions(height=400, width=1080)
+options = viz.ExploreOptions(height=360, width=960)
 view = viz.explore(field, color, classes=classes, cameras=cameras, where="picture", options=options)
 view.look_from(camera)
 asked = view.ask("chair")
@@ -280,8 +280,9 @@ print("\n".join(view.lines()))
 Image.fromarray(view.screenshot())
 
 # %% [markdown]
-# *The question* was told from the other classes; gamma and lambda were chosen from the data and can be dragged. A higher
-# gamma keeps what is surest; a smaller lambda leaves colour Gaussians without a source.
+# The question was told from the other classes; gamma and lambda were chosen from the data, and can be dragged. A higher
+# gamma keeps what is surest. A smaller lambda leaves colour Gaussians without a source (grey once the question is dropped):
+# far too small here, to see what it does.
 
 # %%
 view.set_gamma(0.8)
@@ -294,7 +295,7 @@ Image.fromarray(view.screenshot())
 
 # %%
 view.ask(None)
-picked = view.pick(200, 300)
+picked = view.pick(180, 290)
 print("\n".join(picked.lines() if picked else ["background"]))
 Image.fromarray(view.screenshot())
 
@@ -320,9 +321,9 @@ Image.fromarray(view.screenshot())
 
 # %%
 view.close()
-shell = torch.tensor([-1, classes.index("wall"), classes.index("ceiling")])
+shell = torch.tensor([-1, *(classes.index(name) for name in ("wall", "ceiling", "door", "picture"))])
 things = color.select(~torch.isin(color.labels, shell)).replace(labels=None)  # in its own colours
-orbit = viz.Orbit(frames=12, size=(120, 160), elevation_degrees=35, zoom=1.7)
+orbit = viz.Orbit(frames=12, size=(135, 180), elevation_degrees=35, zoom=1.5)
 film = viz.save_turntable(out / "turntable.gif", things, orbit=orbit, up=up, fps=6)
 print(f"{film.stat().st_size / 1000:.0f} kB")
 display.Image(film)

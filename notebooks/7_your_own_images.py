@@ -260,7 +260,8 @@ with viz.explore(
     semantic, classes=classes, cameras=cameras, embed=lambda phrase: teacher.encode_text([phrase])[0], where="picture"
 ) as explorer:
     explorer.look_from(camera)
-    explorer.ask("mustard cushion")
+    explorer.ask("mustard cushion")  # no class
+    explorer.set_show("score")
     print("\n".join(explorer.lines()))
     picture = explorer.screenshot()
 Image.fromarray(picture)

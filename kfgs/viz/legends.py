@@ -112,7 +112,7 @@ def round_numbers(low: float, high: float) -> list[float]:
     from matplotlib.ticker import MaxNLocator
 
     slack = 1e-9 * (high - low)
-    ticks = MaxNLocator(nbins=5, min_n_ticks=3).tick_values(low, high)
+    ticks = MaxNLocator(nbins=5, steps=[1, 2, 2.5, 5, 10], min_n_ticks=3).tick_values(low, high)
     return [float(tick) + 0.0 for tick in ticks if low - slack <= tick <= high + slack]
 
 
