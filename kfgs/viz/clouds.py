@@ -46,8 +46,8 @@ class CloudOptions:
     sort: bool = True
     """Draw Gaussians back to front (exact). Without it their order is averaged: five times faster, less right."""
     moving: Moving = "auto"
-    """What stands for Gaussians while the mouse moves the camera: "points" (at most 50,000, evenly chosen), "gaussians",
-    or "auto": points where a frame of Gaussians takes longer than 0.1 s, as in software from some 20,000 on."""
+    """What stands for Gaussians while the mouse moves the camera: "points" (at most 50,000, evenly chosen; faint ones pale),
+    "gaussians", or "auto": points where a frame of Gaussians takes longer than 0.1 s, as in software from some 20,000 on."""
 
     def __post_init__(self) -> None:
         check_range("opacity", self.opacity, 0, 1, closed=(False, True))

@@ -12,6 +12,7 @@ from ..cameras.camera import NEAR
 from ..splat.engines import ALPHA_MAX, ALPHA_MIN
 from ..splat.project import FIELD_OF_VIEW_MARGIN
 from .meshes import draw_mesh
+from .stand_ins import FAINT
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -20,6 +21,8 @@ Array = np.ndarray[Any, Any]
 Moving = Literal["auto", "points", "gaussians"]
 LOW_PASS = 0.3  # pixels squared, added to each projected covariance as 3DGS does
 BOUND = 3.0  # standard deviations after which VTK stops drawing; 3.3, where ALPHA_MIN stops, agrees no better
+MOVING_FAINT = 10_000  # points beside them that let the others be seen
+FAINT_ALPHA = 0.12
 MOVING_POINTS = 50_000  # 0.14 s a frame of 1024 x 768 in software on two busy cores; 100,000 took 0.25 s
 STILL = 1.0  # frames per second: VTK asks for more while the mouse moves the camera, and for 0.0001 when it rests
 SLOW = 0.1  # seconds a frame from which "auto" moves points
@@ -67,8 +70,9 @@ def as_gaussians(
         plotter: where to draw.
         cloud: its arrays may be exchanged later; a frame only changes their order.
         sort: draw back to front.
-        moving: what to draw while the mouse moves the camera: "points" (at most 50,000, evenly chosen), "gaussians", or
-            "auto": points if a frame of Gaussians takes longer than 0.1 s.
+        moving: what to draw while the mouse moves the camera: "points" (at most 50,000, evenly chosen, and 10,000 pale ones
+            for the Gaussians of opacity at most 0.1), "gaussians", or "auto": points if a frame of Gaussians takes longer
+            than 0.1 s.
         near: depth up to which nothing is drawn, world units (`Camera.near`).
         colors_from: `rgb` in the order of `index`, given where the camera stands [3]; None: it does not change.
     """
@@ -115,7 +119,7 @@ class _Frame:
         self.forward: tuple[float, ...] | None = None
         self.center: tuple[float, ...] | None = None
         self.seconds, self.began = 0.0, 0.0
-        self.stand_in: Any = None  # an actor, while the camera moves
+        self.stand_ins: list[Any] = []  # actors, while the camera moves
 
     def start(self, *_: Any) -> None:
         """The renderer is about to draw."""
@@ -124,6 +128,8 @@ class _Frame:
             self._to_points()
             return
         self._to_gaussians()
+        if not self._drawn():
+            return
         width, height = self.renderer.GetSize()
         # VTK wants the covariance in normalised device coordinates, where the picture is 2 x 2
         self.actor.mapper.SetLowpassMatrix(LOW_PASS * (2 / width) ** 2, 0.0, LOW_PASS * (2 / height) ** 2)
@@ -136,11 +142,14 @@ class _Frame:
 
     def end(self, *_: Any) -> None:
         """The renderer has drawn."""
-        if self.stand_in is None:
+        if not self.stand_ins and self._drawn():
             self.seconds = perf_counter() - self.began
 
+    def _drawn(self) -> bool:
+        return bool(self.renderer.HasViewProp(self.actor) and (self.stand_ins or self.actor.GetVisibility()))
+
     def _moves(self) -> bool:
-        if not (self.renderer.HasViewProp(self.actor) and (self.stand_in is not None or self.actor.GetVisibility())):
+        if not self._drawn():
             return False
         asked = self.renderer.GetRenderWindow().GetDesiredUpdateRate() >= STILL
         return asked and (self.moving == "points" or (self.moving == "auto" and self.seconds > SLOW))
@@ -158,25 +167,33 @@ class _Frame:
         self.order = order
 
     def _to_points(self) -> None:
-        if self.stand_in is not None:
+        if self.stand_ins:
             return
-        import pyvista as pv
-
-        count = len(self.order)
-        some = np.linspace(0, count - 1, min(count, MOVING_POINTS)).round().astype(np.int64)
-        points = pv.PolyData(np.asarray(self.cloud.points)[some])
-        points["rgb"] = np.asarray(self.cloud.point_data["rgb"])[some]
-        mapper = pv.DataSetMapper(points)
-        mapper.set_scalars(points["rgb"], "rgb", rgb=True)
-        self.stand_in = pv.Actor(mapper=mapper)
-        self.stand_in.prop.style, self.stand_in.prop.point_size, self.stand_in.prop.lighting = "points", 3, False
-        self.stand_in.SetPickable(False)
-        self.renderer.AddActor(self.stand_in)
-        self.actor.SetVisibility(False)
+        opacity = np.asarray(self.cloud.point_data["opacity"])
+        clear, faint = opacity > FAINT["points"], (opacity <= FAINT["points"]) & (opacity >= ALPHA_MIN)
+        for kept, most, alpha in ((faint, MOVING_FAINT, FAINT_ALPHA), (clear, MOVING_POINTS, 1.0)):
+            rows = np.flatnonzero(kept)
+            if len(rows):
+                some = rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).round().astype(np.int64)]
+                self.stand_ins.append(_few_points(self.cloud, some, alpha))
+                self.renderer.AddActor(self.stand_ins[-1])
+        self.actor.SetVisibility(not self.stand_ins)
 
     def _to_gaussians(self) -> None:
-        if self.stand_in is None:
-            return
-        self.renderer.RemoveActor(self.stand_in)
-        self.stand_in = None
-        self.actor.SetVisibility(True)
+        for stand_in in self.stand_ins:
+            self.renderer.RemoveActor(stand_in)
+            self.actor.SetVisibility(True)
+        self.stand_ins.clear()
+
+
+def _few_points(cloud: pv.PolyData, rows: Array, alpha: float) -> pv.Actor:
+    import pyvista as pv
+
+    points = pv.PolyData(np.asarray(cloud.points)[rows])
+    points["rgb"] = np.asarray(cloud.point_data["rgb"])[rows]
+    mapper = pv.DataSetMapper(points)
+    mapper.set_scalars(points["rgb"], "rgb", rgb=True)
+    actor = pv.Actor(mapper=mapper)
+    actor.prop.style, actor.prop.point_size, actor.prop.lighting, actor.prop.opacity = "points", 3, False, alpha
+    actor.SetPickable(False)
+    return actor

@@ -82,14 +82,19 @@ def add_title(plotter: pv.Plotter, title: str) -> pv.CornerAnnotation:
     return plotter.add_text(title, position="upper_edge", font_size=10, color=letters(plotter))
 
 
-def look_over(plotter: pv.Plotter, gaussians: Gaussians) -> None:
+def look_over(plotter: pv.Plotter, gaussians: Gaussians, up: Sequence[float] = (0.0, 0.0, 1.0)) -> None:
     """An isometric view of all but the outermost hundredth, for all linked subplots."""
+    axis = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+    side = np.cross(axis, np.roll(axis, 1))
+    if np.linalg.norm(side) < 1e-6:  # along a diagonal
+        side = np.cross(axis, (1.0, 0.0, 0.0))
+    side /= np.linalg.norm(side)
     means = gaussians.means.detach().cpu().double().numpy()
     middle = np.median(means, axis=0)
     distance = np.linalg.norm(means - middle, axis=1)
     kept = means[distance <= np.percentile(distance, FAR)]
     bounds = np.stack([kept.min(axis=0), kept.max(axis=0)], axis=1).reshape(-1)
-    plotter.view_isometric()
+    plotter.view_vector(axis + side + np.cross(axis, side), viewup=axis)
     plotter.renderer.ResetCamera(*bounds)
     for renderer in plotter.renderers:
         renderer.camera_set = True

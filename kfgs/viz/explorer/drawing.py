@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from ...cameras.camera import NEAR
 from ...gaussians import Gaussians
 from ..clouds import CloudOptions, add_cloud, recolor_cloud
+from ..legends import add_legend, add_scalar_bar
 from ..linked import add_title
 from ..meshes import draw_mesh
 from ..stand_ins import FAINT
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 Array = np.ndarray[Any, Any]
 Drawn = Literal["gaussians", "points"]
 
-POINT_SIZE = 3.0  # pixels
+POINT_SIZES = ((30_000, 5.0), (150_000, 4.0))  # of so many points, in pixels; more have 3
 REST_POINTS = 30_000  # of what is not selected, evenly chosen: so many leave the selection visible behind them
 REST_ALPHA = 0.12  # of such a point
 
@@ -44,7 +45,7 @@ class Pane:
         self._means: Array = cloud.means.detach().cpu().numpy().astype(np.float32)
         self._gaussians: Any = None
         self._points: list[Any] | None = None  # what is clearly seen, and the rest
-        self._title: Any = None
+        self._said: Any = None
         self._notes: list[Any] = []
         self._mark = Mark(self.renderer)
 
@@ -72,19 +73,29 @@ class Pane:
             self._draw_gaussians(colors, strong, drawn, rest)
         else:
             self._draw_points(colors, drawn & ~strong)
-        if self._gaussians is not None:
-            self._gaussians.SetVisibility(style == "gaussians")
+        self._put(self._gaussians, style == "gaussians")
         for actor in self._points or ():
-            actor.SetVisibility(style == "points" and int(actor.mapper.dataset.field_data["shown"][0]) > 0)
+            self._put(actor, style == "points" and int(actor.mapper.dataset.field_data["shown"][0]) > 0)
 
-    def say(self, title: str, notes: Sequence[Callable[[pv.Plotter], Any]] = ()) -> None:
-        """Write a title; `notes` add a legend or a bar to the plotter's active subplot and return its actor."""
+    def say(
+        self,
+        title: str,
+        labels: Sequence[int] = (),
+        names: Sequence[str] = (),
+        clim: tuple[float, float] | None = None,
+    ) -> None:
+        """Write a title; list the labels, where there are any; draw a bar of scores, where there is a `clim`."""
+        said = title, tuple(labels), clim
+        if said == self._said:
+            return
         self.plotter.subplot(0, self.column)
-        for actor in [self._title, *self._notes]:
-            if actor is not None:
-                self.plotter.remove_actor(actor, render=False)
-        self._title = add_title(self.plotter, title)
-        self._notes = [add(self.plotter) for add in notes]
+        for actor in self._notes:
+            self.plotter.remove_actor(actor, render=False)
+        self._said, self._notes = said, [add_title(self.plotter, title)]
+        if len(labels):
+            self._notes.append(add_legend(self.plotter, np.array(labels), names))
+        if clim is not None:
+            self._notes.append(add_scalar_bar(self.plotter, clim))
 
     def mark(self, place: tuple[float, float, float] | None) -> None:
         """Draw a ring around a place in the world; None: no ring."""
@@ -96,6 +107,11 @@ class Pane:
         left, bottom = self.renderer.GetOrigin()
         x, y = x - left, y - (self.plotter.render_window.GetSize()[1] - bottom - height)
         return (x, y) if 0 <= x < width and 0 <= y < height else None
+
+    def _put(self, actor: Any, there: bool) -> None:
+        """In or out; a cloud's visibility is its own matter: points stand for it while the camera moves."""
+        if actor is not None and bool(self.renderer.HasViewProp(actor)) != there:
+            (self.renderer.AddActor if there else self.renderer.RemoveActor)(actor)
 
     def _draw_gaussians(self, colors: Array, strong: Array, drawn: Array, rest: float) -> None:
         if self._gaussians is None:
@@ -109,8 +125,9 @@ class Pane:
         others = others[np.linspace(0, len(others) - 1, min(len(others), REST_POINTS)).round().astype(np.int64)]
         parts = [self._part(rows, colors) for rows in (np.flatnonzero(self.visible), others)]
         if self._points is None:
+            size = next((pixels for most, pixels in POINT_SIZES if len(self.cloud) <= most), 3.0)
             self._points = [
-                draw_mesh(self.plotter, part, style="points", scalars="rgb", rgb=True, point_size=POINT_SIZE,
+                draw_mesh(self.plotter, part, style="points", scalars="rgb", rgb=True, point_size=size,
                           lighting=False, opacity=alpha, reset_camera=False)
                 for part, alpha in zip(parts, (1.0, REST_ALPHA), strict=True)
             ]  # fmt: skip

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
@@ -19,10 +19,10 @@ from ...cameras import Camera
 from ...cameras.camera import NEAR
 from ...labels import class_indices
 from ..headless import make_plotter
-from ..legends import add_legend, add_scalar_bar
 from ..linked import look_over
 from ..pictures import save_picture
 from ..through import camera_of, look_through
+from ..turntable import estimate_up
 from .drawing import Drawn, Pane
 from .exploration import Exploration, Show
 from .meaning import Asked
@@ -37,7 +37,9 @@ Style = Literal["auto", "gaussians", "points"]
 
 NAMES: dict[Side, str] = {"semantic": "semantic field", "color": "colour field"}
 WORDS: dict[Show, str] = {"labels": "classes", "rgb": "colours", "score": "scores", "latents": "latents"}
-SLOW = 2.0  # seconds a frame from which "auto" draws points
+SLOW = 1.0  # seconds a frame from which "auto" draws points: a slider that follows later feels broken
+SURE = 150_000  # Gaussians that "auto" draws without looking at the clock: half a second in software
+HIGHLIGHT = np.array((255, 120, 0))  # lies over a selection in its own colours, or a white sofa fades into the paper
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class ExploreOptions:
     width: int = 1200
     """Of the window with both panes, pixels; of one pane alone, half of it."""
     style: Style = "auto"
-    """`gaussians` (what kfgs's own rasteriser draws), `points`, or `auto`: points where a frame takes over 2 s."""
+    """`gaussians` (what kfgs's own rasteriser draws), `points`, or `auto`: points where a frame takes over 1 s."""
     rest: float = 0.04
     """Factor on the opacity of what is not selected, in [0, 1)."""
     background: str = "white"
@@ -74,7 +76,7 @@ class Explorer:
     Args:
         exploration: the state.
         options: size, style, where files are saved.
-        camera: to look through first; None: everything but floaters is seen.
+        camera: to look through first; None: the first of the state's, else everything but floaters is seen.
         off_screen: draw without a window; None: only where there is no display.
 
     Raises:
@@ -91,10 +93,10 @@ class Explorer:
         off_screen: bool | None = None,
     ) -> None:
         self.state, self.options = exploration, options
-        self._camera, self._closed = camera, False
+        self._camera = camera or next(iter(exploration.cameras), None)
+        self._near = NEAR if self._camera is None else self._camera.near
         self._listeners: list[Callable[[], None]] = []
-        views = exploration.cameras if camera is None else (camera,)
-        self._near = views[0].near if views else NEAR
+        self._closed, self._began, self._auto = False, (0.0, 0.0), options.style == "auto"
         count = len(exploration.sides)
         self.plotter: pv.Plotter = make_plotter(
             options.height, options.width * count // 2, shape=(1, count), off_screen=off_screen,
@@ -109,8 +111,9 @@ class Explorer:
             self.reset_view()
             self._style: Drawn = "points" if options.style == "points" else "gaussians"
             self._draw()
-            if options.style == "auto":
-                self._choose_style()
+            self.plotter.render_window.AddObserver("StartEvent", self._frame_begins)
+            self.plotter.render_window.AddObserver("EndEvent", self._frame_ends)
+            self._choose_style()
         except BaseException:
             self.close()
             raise
@@ -166,16 +169,16 @@ class Explorer:
         self._changed()
 
     def set_style(self, style: Style) -> None:
-        """Draw Gaussians or points; `auto`: points if a frame of Gaussians takes over 2 s.
+        """Draw Gaussians or points; `auto`: points if a frame of Gaussians takes over 1 s.
 
         Raises:
             ValueError: if it is unknown.
         """
         check_choice("style", style, get_args(Style))
-        self._style = "points" if style == "points" else "gaussians"
+        self._style, self._auto = "points" if style == "points" else "gaussians", style == "auto"
+        self._draw()
+        self._choose_style()
         self._changed()
-        if style == "auto":
-            self._choose_style()
 
     @property
     def style(self) -> Drawn:
@@ -222,11 +225,12 @@ class Explorer:
         self.plotter.subplot(0, 0)
         self.plotter.camera.SetUseExplicitAspectRatio(False)
         self.plotter.camera.SetWindowCenter(0, 0)
-        look_over(self.plotter, self.state.cloud("semantic"))
+        look_over(self.plotter, self.state.cloud("semantic"), self._up())
         self._moved()
 
     def screenshot(self, path: str | Path | None = None) -> Array:  # [H, W, 3] uint8
         """The picture of now; with a path also as a PNG file."""
+        self.plotter.render()  # pyvista's pictures are of the last frame
         picture: Array = np.array(self.plotter.screenshot(return_img=True))[..., :3]
         if path is not None:
             save_picture(path, picture)
@@ -274,7 +278,7 @@ class Explorer:
 
     def _changed(self) -> None:
         self._draw()
-        self.plotter.render()  # nothing before the plotter was shown
+        self._render()
         for callback in self._listeners:
             callback()
 
@@ -282,34 +286,58 @@ class Explorer:
         for pane in self.panes:
             pane.renderer.camera_set = True  # or the first render would move it to see everything
             pane.renderer.ResetCameraClippingRange()
-        self.plotter.render()
+        self._render()
+
+    def _render(self) -> None:
+        if not self.plotter.off_screen:  # there a frame is drawn when somebody wants to see one
+            self.plotter.render()  # nothing before the window is shown
 
     def _draw(self) -> None:
         """Bring what is drawn up to the state."""
         state, picked = self.state, self.state.picked
         for side, pane in zip(state.sides, self.panes, strict=True):
             selected = None if state.asked is None else state.selected(side)
-            pane.draw(self._style, state.colors(side), state.drawn(side), selected, self.options.rest)
+            colors = state.colors(side)
+            if selected is not None and state.show == "rgb":
+                colors = np.where(selected[:, None], (colors + HIGHLIGHT) // 2, colors).astype(np.uint8)
+            pane.draw(self._style, colors, state.drawn(side), selected, self.options.rest)
             pane.mark(None if picked is None else picked.position)
-            words = "" if state.asked is None else f" {state.asked.words!r}"
-            pane.say(f"{NAMES[side]}: {WORDS[state.show]}{words}", self._notes(pane))
+            words = "" if state.asked is None else f"{state.asked.words!r}, "
+            labels = self._present() if state.show == "labels" and pane is self.panes[0] else []
+            clim = state.clim if state.show == "score" and pane is self.panes[-1] else None
+            pane.say(f"{NAMES[side]}: {words}{WORDS[state.show]}", labels, state.meaning.names, clim)
 
-    def _notes(self, pane: Pane) -> list[Callable[[pv.Plotter], Any]]:
-        """The legend on the left, or the bar on the right."""
-        state = self.state
-        if state.show == "labels" and pane is self.panes[0]:
-            present = np.concatenate([np.unique(state.labels(side)[state.drawn(side)]) for side in state.sides])
-            return [partial(add_legend, labels=present, names=state.meaning.names)] if len(present) else []
-        if state.show == "score" and pane is self.panes[-1]:
-            return [partial(add_scalar_bar, cloud=state.clim)]
-        return []
+    def _present(self) -> list[int]:
+        """The labels that are drawn on either side, ascending."""
+        found = {int(label) for side in self.state.sides for label in np.unique(self.state.labels(side))}
+        return sorted(found - self.state.hidden)
+
+    def _up(self) -> list[float]:
+        """The world's up as the cameras hold it, else z."""
+        try:
+            return [float(x) for x in estimate_up(self.state.cameras)]
+        except ValueError:  # none, or not upright
+            return [0.0, 0.0, 1.0]
 
     def _choose_style(self) -> None:
-        began = perf_counter()
-        self.screenshot()
-        if perf_counter() - began > SLOW:
+        """Draw a frame to look at the clock, where "auto" is not sure; a window waits for its first frame."""
+        if self._auto and sum(len(pane.cloud) for pane in self.panes) > SURE and self.plotter.off_screen:
+            self.screenshot()
+
+    def _frame_begins(self, *_: Any) -> None:
+        self._began = perf_counter(), process_time()
+
+    def _frame_ends(self, *_: Any) -> None:
+        """The first frame of "auto" decides what the next ones draw."""
+        if not self._auto:
+            return
+        self._auto = False
+        self.plotter.render_window.WaitForCompletion()
+        wall, work = perf_counter() - self._began[0], process_time() - self._began[1]
+        # in software all cores draw; other programs on them do not count
+        if min(wall, work / (os.cpu_count() or 1)) > SLOW and sum(len(pane.cloud) for pane in self.panes) > SURE:
             self._style = "points"
-            self._changed()
+            self._draw()
 
     def _next(self, stem: str, suffix: str) -> Path:
         taken = {path.stem for path in self.options.out.glob(f"{stem}_*")}
