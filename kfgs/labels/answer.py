@@ -16,7 +16,7 @@ from ..splat import rasterize
 from ._rows import check_finite
 from .boxes import OrientedBox
 from .components import component_numbers
-from .selection import Selection
+from .selection import Selection, select_where
 
 LONGEST = 160  # pixels of the longer side of the views that are compared; on room_0 shares change by 0.3 % of the picture at most
 TOGETHER = 16  # answers drawn in one rendering, as channels
@@ -53,6 +53,25 @@ class Answer:
     def volume(self) -> float:
         """Of the oriented box, in cubed world units."""
         return self.box.volume
+
+    def selection(self, count: int) -> Selection:
+        """This answer as a selection of the cloud of `count` Gaussians that was selected in, for `add_selections` or `&`.
+
+        Scores are 1 inside and 0 outside, since a place decides what is part of an answer: which heap a Gaussian is
+        connected to, not how well it fits. The scores of the question come back through `selection & one.selection(count)`.
+
+        Raises:
+            ValueError: if an index does not fit into such a cloud.
+        """
+        check_whole("count", count, 1)
+        if int(self.indices[-1]) >= count:
+            raise ValueError(
+                f"count: expected more than {int(self.indices[-1])} (the answer's highest index), got {count}; pass len of "
+                "the cloud that was selected in, not of a part of it"
+            )
+        mask = torch.zeros(count, dtype=torch.bool, device=self.indices.device)
+        mask[self.indices] = True
+        return select_where(mask, self.how)
 
     def __repr__(self) -> str:
         place = ", ".join(f"{x:.3g}" for x in self.centroid.tolist())

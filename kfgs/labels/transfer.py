@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -33,11 +33,41 @@ class Transfer:
     sources: Tensor  # [N] int64, index of that source; -1 where there is none
     distance: float  # lambda, world units
     how: str  # where lambda comes from
-    labelled: int  # destinations with a label
-    orphaned: int  # destinations without: no labelled source in range
-    ambiguous: int  # labelled ones with another label among the sources looked at
     shares: Tensor  # [N] of the label in the weight of the sources looked at, in (0, 1]; 0 where there is none
+    disagree: Tensor  # [N] bool, labelled, but with another label among the sources looked at
     method: Method = "nearest"
+
+    @property
+    def labelled(self) -> int:
+        """Destinations with a label."""
+        return int((self.labels >= 0).sum())
+
+    @property
+    def orphaned(self) -> int:
+        """Destinations without: no labelled source in range."""
+        return len(self.labels) - self.labelled
+
+    @property
+    def ambiguous(self) -> int:
+        """Labelled destinations with another label among the sources looked at."""
+        return int(self.disagree.sum())
+
+    def select(self, which: Tensor) -> Transfer:  # which: [N] bool or [n] int64
+        """The transfer of the destinations under a mask or an index alone, to go with `Gaussians.select` of them.
+
+        Sources stay numbered as they were. Counts are those of the selected: over the parts of a partition they add up
+        to the counts of the whole.
+
+        Raises:
+            ValueError: if a mask is not of these destinations.
+        """
+        if which.dtype == torch.bool and which.shape != self.labels.shape:
+            raise ValueError(
+                f"which: expected a mask [N] with N = {len(self.labels)} (the destinations), got {tuple(which.shape)}; "
+                "select in the cloud that received the labels"
+            )
+        columns = ("labels", "distances", "sources", "shares", "disagree")
+        return replace(self, **{name: getattr(self, name)[which] for name in columns})
 
     def __repr__(self) -> str:
         return (
@@ -141,7 +171,7 @@ class _Found:
         self.sources = np.full(n, -1, dtype=np.int64)
         self.distances = np.full(n, np.inf)
         self.shares = np.zeros(n)
-        self.ambiguous = 0
+        self.disagree = np.zeros(n, dtype=np.bool_)
 
     def fill(self, rows: Array, sources: Sources, kept: Array, near: Near, verdict: Verdict) -> None:
         """Note a verdict on some rows; `kept` says which of the caller's sources each source is."""
@@ -150,21 +180,18 @@ class _Found:
         source, rows = near.source[some, column], rows[some]
         self.labels[rows], self.sources[rows] = sources.labels[source], kept[source]
         self.distances[rows], self.shares[rows] = near.distance[some, column], verdict.share[some]
-        self.ambiguous += int(verdict.ambiguous.sum())
+        self.disagree[rows] = verdict.ambiguous[some]
 
     def report(self, dst_means: Tensor, distance: float, how: str, method: Method) -> Transfer:
         device = dst_means.device
-        labelled = int((self.labels >= 0).sum())
         return Transfer(
             labels=torch.from_numpy(self.labels).to(device),
             distances=torch.from_numpy(self.distances).to(device, dst_means.dtype),
             sources=torch.from_numpy(self.sources).to(device),
             distance=distance,
             how=how,
-            labelled=labelled,
-            orphaned=len(self.labels) - labelled,
-            ambiguous=self.ambiguous,
             shares=torch.from_numpy(self.shares).to(device, dst_means.dtype),
+            disagree=torch.from_numpy(self.disagree).to(device),
             method=method,
         )
 

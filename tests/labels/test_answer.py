@@ -148,6 +148,34 @@ def test_large_pictures_are_compared_small():
     assert view_shares(gaussians, parts, [large]).equal(view_shares(gaussians, parts, [small]))
 
 
+def test_answers_are_selections_of_the_whole_cloud():
+    gaussians = scene()
+    asked = chosen(gaussians)
+    left, right = (one.selection(len(gaussians)) for one in answers(gaussians, asked, distance=0.3))
+    assert left.indices.tolist() == [0, 1, 2, 3, 4]
+    assert right.indices.tolist() == [5, 6, 7, 8]
+    assert left.scores.tolist() == [1.0] * 5 + [0.0] * 5
+    assert (left.threshold, left.how) == (None, "given; part 1 of 2")
+    assert not left & right
+    assert (left | right).mask.equal(asked.mask)
+    again = asked & left  # the question's own scores
+    assert again.mask.equal(left.mask)
+    assert again.scores[:5].equal(asked.scores[:5])
+    assert answer(gaussians, again).score == pytest.approx(float(asked.scores[:5].mean()))
+
+
+def test_an_answer_fits_no_smaller_cloud():
+    gaussians = scene()
+    one = answer(gaussians, chosen(gaussians, 5))
+    assert len(one.selection(5).mask) == 5
+    with pytest.raises(
+        ValueError, match=r"count: expected more than 4 \(the answer's highest index\), got 4; pass len of"
+    ):
+        one.selection(4)
+    with pytest.raises(ValueError, match="count: expected a whole number, got 5.0"):
+        one.selection(5.0)
+
+
 def test_json_round_trip():
     gaussians = scene()
     found = answer(gaussians, chosen(gaussians, 5), [camera(name="front")])

@@ -5,6 +5,7 @@ import pytest
 import torch
 from oracles_labels import transfer as oracle
 
+from kfgs.gaussians import Gaussians
 from kfgs.labels import transfer_labels
 
 
@@ -130,3 +131,42 @@ def test_dtypes_of_the_result():
 def test_wrong_input_is_named(src, labels, dst, distance, error, message):
     with pytest.raises(error, match=message):
         transfer_labels(src, labels, dst, distance)
+
+
+@pytest.mark.parametrize("method", ["nearest", "vote", "mahalanobis"])
+def test_parts_of_a_transfer_count_as_much_as_the_whole(method):
+    """Sources of two classes lie at one place too: then shares alone do not tell who is ambiguous."""
+    src = points(90, 8)
+    src[:10] = src[10:20]
+    labels = torch.randint(-1, 3, (90,), generator=torch.Generator().manual_seed(9))
+    shape = torch.tensor([[1.0, 0, 0, 0]]).expand(90, 4), torch.full((90, 3), 0.03), torch.full((90,), 0.5)
+    whole = transfer_labels(Gaussians(src, *shape), labels, points(300, 10), 0.2, method=method)
+    counts = [whole.labelled, whole.orphaned, whole.ambiguous]
+    assert min(counts) > 10
+    number = torch.arange(300) % 3
+    parts = [whole.select(number == i) for i in range(3)]
+    assert [sum(x) for x in zip(*[(p.labelled, p.orphaned, p.ambiguous) for p in parts], strict=True)] == counts
+    for name in ("labels", "distances", "sources", "shares", "disagree"):
+        assert torch.equal(getattr(parts[1], name), getattr(whole, name)[1::3])
+    assert (parts[0].distance, parts[0].how, parts[0].method) == (0.2, "given", method)
+    some = whole.select(torch.tensor([7, 3]))
+    assert some.labels.tolist() == [int(whole.labels[7]), int(whole.labels[3])]
+
+
+def test_a_destination_says_itself_whether_its_sources_disagree():
+    src = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [5.5, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    dst = torch.tensor([[0.1, 0.0, 0.0], [5.1, 0.0, 0.0], [9.1, 0.0, 0.0], [50.0, 0.0, 0.0]])
+    result = transfer_labels(src, torch.tensor([0, 1, 0, 1, 0]), dst, 1.0)
+    assert result.disagree.tolist() == [True, True, False, False]
+    assert result.shares.tolist() == [
+        1,
+        0.5,
+        1,
+        0,
+    ]  # of two at one place only the first speaks, but the other is counted
+
+
+def test_a_mask_of_other_destinations_is_named():
+    transfer = transfer_labels(points(5, 6), torch.arange(5), points(4, 7))
+    with pytest.raises(ValueError, match=r"which: expected a mask \[N\] with N = 4 .*got \(5,\); select in the cloud"):
+        transfer.select(torch.ones(5, dtype=torch.bool))
