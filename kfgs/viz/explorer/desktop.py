@@ -195,7 +195,7 @@ class Desktop:
 
     def _save_selection(self) -> str:
         paths = self.explorer.save_selection()
-        return f"saved {', '.join(path.name for path in paths)} in {paths[0].parent}"
+        return f"saved {len(paths)} files in {paths[0].parent}"
 
     def _slide(self, x: float, finally_: bool) -> None:
         """Move the dragged handle; the clouds follow at once where they are quick, and in the end."""

@@ -1,3 +1,8 @@
+import os
+import shutil
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -321,3 +326,66 @@ def test_a_window_needs_a_display(desktop, monkeypatch):
         RuntimeError, match=r"expected one that draws into a window, got one that draws off-screen; make"
     ):
         open_window(desktop.explorer)
+
+
+def test_one_cloud_alone_has_no_lambda(tmp_path):
+    semantic, _ = clouds()
+    options = ExploreOptions(height=HEIGHT, width=CLOUDS, style="points", out=tmp_path)
+    with Explorer(Exploration(SplatMeaning(splat_file(semantic))), options, off_screen=True) as explorer:
+        desktop = Desktop(explorer)
+        explorer.plotter.show(interactive=False, auto_close=False)
+        press(desktop, "slash", *"chair", "Return")
+        assert [one.value for one in desktop.pane.panel.spots if one.kind == "slider"] == ["gamma"]
+        assert shot(desktop).shape == (HEIGHT, CLOUDS // 2 + WIDTH, 3)
+
+
+WINDOW = """
+import os, sys
+import numpy as np
+sys.path.insert(0, os.path.join("tests", "viz", "explorer"))
+from test_desktop import Exploration, Explorer, ExploreOptions, SplatMeaning, clouds, open_window, splat_file
+
+semantic, color = clouds()
+explorer = Explorer(Exploration(SplatMeaning(splat_file(semantic)), color), ExploreOptions(height=420, width=600))
+interactor, seen = explorer.plotter.iren.interactor, []
+
+def work(*_):
+    if not seen:
+        seen.append(explorer.screenshot())
+        for key in ("slash", *"chair", "Return", "q"):
+            code = {"slash": "/", "Return": chr(13)}.get(key, key)
+            interactor.SetKeyEventInformation(0, 0, code, 0, key)
+            interactor.InvokeEvent("KeyPressEvent")
+            interactor.InvokeEvent("CharEvent")
+        seen.append(explorer.screenshot())
+
+interactor.AddObserver("TimerEvent", work)
+interactor.Initialize()
+interactor.CreateOneShotTimer(300)
+open_window(explorer)
+first, asked = seen
+assert explorer.state.asked.words == "chair"
+assert (first[:, :600] != asked[:, :600]).any() and (first[:, 600:] != asked[:, 600:]).any()
+explorer.ask("table")
+after = explorer.screenshot()
+assert after.shape == (420, 600, 3) and after.std() > 0
+explorer.close()
+print("closed")
+"""
+
+
+@pytest.mark.skipif(shutil.which("Xvfb") is None, reason="a real window needs Xvfb")
+def test_a_real_window_opens_answers_and_closes():
+    command = ["Xvfb", "-displayfd", "1", "-screen", "0", "1280x800x24"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as server:
+        try:
+            environment = {name: value for name, value in os.environ.items() if name not in headless.WITHOUT_DISPLAY}
+            paths = os.pathsep.join(["tests", *filter(None, [os.environ.get("PYTHONPATH")])])
+            done = subprocess.run(
+                [sys.executable, "-W", "error", "-c", WINDOW], capture_output=True, text=True, check=False, timeout=120,
+                env=environment | {"DISPLAY": f":{server.stdout.readline().strip()}", "PYTHONPATH": paths},
+                cwd=os.path.join(os.path.dirname(__file__), *[os.pardir] * 3),
+            )  # fmt: skip
+        finally:
+            server.terminate()
+    assert (done.returncode, done.stdout, done.stderr) == (0, "closed\n", "")
