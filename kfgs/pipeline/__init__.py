@@ -1,6 +1,7 @@
 """The paper's Figure 2 as a few named, resumable calls, and what a finished field is used for."""
 
 from .apply import (
+    feature_colors,
     label_cloud,
     label_field,
     query_field,
@@ -33,6 +34,7 @@ __all__ = [
     "Stage",
     "attach",
     "describe",
+    "feature_colors",
     "fit_color",
     "fit_scene",
     "label_cloud",

@@ -17,6 +17,7 @@ from .pictures import FeatureColors, legend_column, legend_strip, overlay_labels
 from .plots import plot_codebook_history, plot_confusion, plot_iou, plot_training
 from .quality import plot_quality_storage
 from .reports import CodebookRows, codebook_rows, plot_codebook_growth, plot_codebook_report
+from .score_plot import plot_scores
 from .shows import show_cloud
 from .through import look_through
 from .turntable import Orbit, estimate_up, orbit_cameras, save_turntable
@@ -63,6 +64,7 @@ __all__ = [
     "plot_distances",
     "plot_iou",
     "plot_quality_storage",
+    "plot_scores",
     "plot_training",
     "recolor_cloud",
     "save_animation",
