@@ -131,12 +131,17 @@ def add_selections(
 
     Raises:
         ValueError: if there is no selection, one is empty, or it is of another cloud.
+        TypeError: if one is no selection.
     """
     if not selections:
         raise ValueError("selections: expected at least one, got none; pass {name: selection}")
     labels = torch.full((len(gaussians),), -1, dtype=torch.int64)
     boxes = []
     for number, (name, selection) in enumerate(selections.items()):
+        if not isinstance(selection, Selection):
+            raise TypeError(
+                f"selections[{name!r}]: expected a Selection, got {type(selection).__name__}; select_where(mask) makes one"
+            )
         check_shapes(("gaussians.means", gaussians.means, "N 3"), (f"selections[{name!r}].mask", selection.mask, "N"))
         if not selection:
             raise ValueError(

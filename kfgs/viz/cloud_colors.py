@@ -38,8 +38,11 @@ def cloud_colors(
 
     Raises:
         ValueError: if what to colour by is missing, or of another size.
-        TypeError: if an array is neither of integers nor of floats.
+        TypeError: if an array is neither of integers nor of floats, or there are no Gaussians but what holds some.
     """
+    if not isinstance(gaussians, Gaussians):
+        hint = "its .gaussians" if hasattr(gaussians, "gaussians") else "Gaussians"
+        raise TypeError(f"gaussians: expected Gaussians, got {type(gaussians).__name__}; pass {hint}")
     if isinstance(color_by, str):
         check_choice("color_by", color_by, get_args(ColorBy))
         return _named(gaussians, color_by, feature_colors, clim)

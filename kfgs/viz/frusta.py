@@ -120,6 +120,9 @@ def evenly(count: int, most: int | None) -> Array:  # [min(count, most)] int64
 
 
 def _depth(cameras: Sequence[Camera], size: float | None) -> float:
+    if not isinstance(cameras, Sequence):
+        hint = "its .cameras" if hasattr(cameras, "cameras") else "a list"
+        raise TypeError(f"cameras: expected a list of cameras, got {type(cameras).__name__}; pass {hint}")
     if not cameras:
         raise ValueError("cameras: expected at least one camera, got none; load a scene with views")
     centers = np.stack([_numpy(camera.center) for camera in cameras]).astype(np.float64)

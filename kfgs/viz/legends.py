@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from .._check import check_range
 from .cloud_colors import COLORMAP
 from .pictures import LEGEND_INK, LEGEND_PAPER, check_names, legend_column
 from .pinned import MARGIN, pin_picture
@@ -34,9 +35,12 @@ def add_legend(
     subplot is too low for all classes, letters become smaller, down to 9 pixels, then there are several columns.
 
     Raises:
-        ValueError: if a label has no name.
+        ValueError: if there is no label, or one has no name.
+        TypeError: if `names` is no list of names.
     """
     present = np.unique(labels.cpu().numpy() if isinstance(labels, Tensor) else np.asarray(labels))
+    if present.size == 0:
+        raise ValueError("labels: expected at least one to list, got none; leave the legend out")
     check_names(present.tolist(), names)  # at once, and not in the midst of a frame
 
     def draw(height: int, width: int) -> Array:
@@ -59,14 +63,16 @@ def add_scalar_bar(plotter: pv.Plotter, cloud: pv.Actor | tuple[float, float], t
         title: over the bar; broken into lines where it is wider than a fifth of the subplot.
 
     Raises:
-        ValueError: if the cloud's colours stand for no numbers.
+        ValueError: if the cloud's colours stand for no numbers, or two numbers do not ascend.
     """
-    clim = cloud if isinstance(cloud, tuple) else cloud.mapper.dataset.field_data.get("clim")
+    clim = cloud if isinstance(cloud, tuple | list) else cloud.mapper.dataset.field_data.get("clim")
     if clim is None:
         raise ValueError(
             "cloud: expected one coloured by scores or opacity, got one without a scale; use add_legend for labels"
         )
     low, high = (float(end) for end in clim)
+    check_range("cloud (its darkest)", low, -np.inf, closed=(False, False))
+    check_range("cloud (its brightest)", high, low, closed=(False, False))
     return pin_picture(plotter, lambda height, width: bar_picture((low, high), title, height, width), "right")
 
 

@@ -214,7 +214,10 @@ def as_bytes(picture: Tensor | Array) -> Array:
 
 
 def check_names(labels: Sequence[int], names: Sequence[str]) -> None:
-    """Raise a ValueError if a label has no name."""
+    """Raise a ValueError if a label has no name, a TypeError if `names` is no list of names."""
+    if isinstance(names, str) or not isinstance(names, Sequence):
+        hint = "its .names" if hasattr(names, "names") else "a list"
+        raise TypeError(f"names: expected a list of class names, got {type(names).__name__}; pass {hint}")
     if labels and max(labels) >= len(names):
         raise ValueError(
             f"names: expected a name for every label up to {max(labels)}, got {len(names)} names; pass all class names"

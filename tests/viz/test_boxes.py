@@ -91,5 +91,9 @@ def test_what_cannot_be_boxed_is_named(plotter):
         add_selections(plotter, gaussians, {})
     with pytest.raises(ValueError, match="selections\\['chair'\\]: expected at least one selected Gaussian, got none"):
         add_selections(plotter, gaussians, {"chair": none})
+    with pytest.raises(
+        TypeError, match=r"selections\['chair'\]: expected a Selection, got Tensor; select_where\(mask\)"
+    ):
+        add_selections(plotter, gaussians, {"chair": none.mask})
     with pytest.raises(ValueError, match="mask: expected .* with N = 60"):
         add_selections(plotter, gaussians, {"chair": select_where(torch.ones(59, dtype=torch.bool), "all")})

@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -97,3 +99,11 @@ def test_wrong_pictures_are_named(plotter):
         add_camera_images(plotter, cameras, [quarters(0), np.zeros((4, 4))])
     with pytest.raises(ValueError, match="opacity: expected a number in"):
         add_camera_images(plotter, cameras, quarters, opacity=0)
+
+
+def test_what_holds_cameras_is_not_taken_for_a_list(plotter):
+    with pytest.raises(TypeError, match="cameras: expected a list of cameras, got Camera; pass a list"):
+        add_cameras(plotter, some_camera())
+    holder = SimpleNamespace(cameras=[some_camera()])
+    with pytest.raises(TypeError, match="cameras: expected a list of cameras, got SimpleNamespace; pass its .cameras"):
+        add_cameras(plotter, holder)

@@ -5,7 +5,10 @@ from cases_viz import some_gaussians, some_plotter
 from matplotlib import colormaps
 from oracles_palette import linear
 
+from kfgs.formats import SplatFile
+from kfgs.labels import LabelSet
 from kfgs.viz import add_cloud, add_legend, add_scalar_bar, legend_column, palette
+from kfgs.viz.cloud_colors import cloud_colors
 from kfgs.viz.legends import bar_picture, letter_size, round_numbers
 from kfgs.viz.pinned import pin_picture
 
@@ -39,6 +42,10 @@ def test_legend_is_drawn_as_it_is_in_the_lower_left_corner(plotter):
     assert not picture[: 120 - 10 - height].any()
     with pytest.raises(ValueError, match="names: expected a name for every label up to 5"):
         add_legend(plotter, np.array([5]), ["wall"])
+    with pytest.raises(ValueError, match="labels: expected at least one to list, got none"):
+        add_legend(plotter, np.zeros(0, dtype=int), ["wall"])
+    with pytest.raises(TypeError, match="names: expected a list of class names, got LabelSet; pass its .names"):
+        add_legend(plotter, labels, LabelSet(("wall", "floor"), torch.eye(2)))
 
 
 def test_legend_of_many_classes_fits_a_low_window(plotter):
@@ -103,6 +110,14 @@ def test_scalar_bar_stands_in_the_lower_right_corner_with_the_colours_of_its_sca
     np.testing.assert_array_equal(plotter.screenshot(return_img=True), picture)
     with pytest.raises(ValueError, match="cloud: expected one coloured by scores or opacity"):
         add_scalar_bar(plotter, add_cloud(plotter, some_gaussians()))
+    with pytest.raises(ValueError, match=r"cloud \(its brightest\): expected a number in \(1, inf\), got 0"):
+        add_scalar_bar(plotter, [1, 0])
+
+
+def test_what_holds_gaussians_is_not_taken_for_them(plotter):
+    splats = SplatFile(some_gaussians())
+    with pytest.raises(TypeError, match="gaussians: expected Gaussians, got SplatFile; pass its .gaussians"):
+        cloud_colors(splats, "label")
 
 
 def test_bar_grows_from_the_darkest_to_the_brightest_colour():
