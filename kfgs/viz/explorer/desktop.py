@@ -197,18 +197,18 @@ class Desktop:
         paths = self.explorer.save_selection()
         return f"saved {len(paths)} files in {paths[0].parent}"
 
-    def _slide(self, x: float, finally_: bool) -> None:
+    def _slide(self, x: float, last: bool) -> None:
         """Move the dragged handle; the clouds follow at once where they are quick, and in the end."""
         assert self._drag is not None
         slider, spot = self._drag
         left, _, right, _ = spot.box
         self._handle = value = slider.at((x - left) / (right - 1 - left))
         began = perf_counter()
-        if not (finally_ or self._took <= BUSY or began - self._applied > self._took):
+        if not (last or self._took <= BUSY or began - self._applied > self._took):
             self.pane.refresh()
             return
         verb = self.explorer.set_gamma if slider.name == "gamma" else self.explorer.set_distance
-        if finally_:
+        if last:
             self._drag = self._handle = None
         self.call(lambda: verb(value))
         self._applied = perf_counter()

@@ -78,17 +78,15 @@ class PanelPane:
             return
         if clouds:
             self.plotter.render()
-            return
-        if self._size is None:  # nothing is there yet that could stay
-            return
-        clouds = [renderer for renderer in self.plotter.renderers if renderer.GetDraw()]
-        for renderer in clouds:
-            renderer.DrawOff()
-        try:
-            window.Render()
-        finally:
-            for renderer in clouds:
-                renderer.DrawOn()
+        elif self._size is not None:  # a frame is there, of which most can stay
+            drawn = [renderer for renderer in self.plotter.renderers if renderer.GetDraw()]
+            for renderer in drawn:
+                renderer.DrawOff()
+            try:
+                window.Render()
+            finally:
+                for renderer in drawn:
+                    renderer.DrawOn()
 
     @contextmanager
     def away(self) -> Iterator[None]:
