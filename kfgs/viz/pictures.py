@@ -99,7 +99,8 @@ def _draw_legend(
     check_names(present, names)
     font = ImageFont.load_default(size=size)
     gap, line = size // 2, round(size * 1.6)
-    x, y, right, bottom, left, places = gap, gap, gap, gap, gap, []
+    x, y, right, bottom, left = gap, gap, gap, gap, gap
+    places: list[tuple[int, int, int, str]] = []
     for label in present:
         text = "none" if label < 0 else names[label]
         length = size + gap + round(font.getlength(text)) + 2 * gap
