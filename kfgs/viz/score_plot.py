@@ -17,7 +17,7 @@ from .plots import INK, _figure, _save
 
 Array = np.ndarray[Any, Any]
 BINS = 80
-STEEP = 10.0  # where the highest bin of the selected is so much lower than that of the rest, counts are drawn in logs
+STEEP = 5.0  # where the highest bin of the selected is so much lower than that of the rest, counts are drawn in logs
 CLASSES = 5  # of so many at most, those with the most selected, is a line drawn: more cannot be told apart
 WIDE = 88  # letters of a line over the picture
 
@@ -32,7 +32,7 @@ def plot_scores(
 
     Colours are those of `plot_distances`; bins meet at gamma. The title says how many are selected and how gamma came
     about. Counts are logarithmic where the selected would hardly be seen otherwise: where their highest bin is less than
-    a tenth as high as that of the rest.
+    a fifth as high as that of the rest.
 
     Args:
         selection: what a query returned; without a threshold nothing is marked.
@@ -87,17 +87,14 @@ def score_bins(scores: Array, threshold: float | None) -> Array:  # [N] -> [B + 
 def _by_class(scores: Array, mask: Array, labels: Array, edges: Array) -> list[tuple[str, Any, Array]]:
     """Name, colour and counts of the classes with the most selected, in class order."""
     palette(labels)  # whole numbers from -1, or it says so
-    selected = np.bincount(labels[mask & (labels >= 0)])
+    kinds, selected = np.unique(labels[mask], return_counts=True)
     most = np.sort(np.argsort(-selected, kind="stable")[:CLASSES])
-    return [
-        (
-            f"class {k}: {selected[k]:,} of {(labels == k).sum():,}",
-            tuple(PALETTE[k % len(PALETTE)] / 255),
-            np.histogram(scores[labels == k], edges)[0],
-        )
-        for k in most
-        if selected[k]
-    ]
+    found = []
+    for k, n in zip(kinds[most], selected[most], strict=True):
+        name = "no class" if k < 0 else f"class {k}"
+        count = np.histogram(scores[labels == k], edges)[0]
+        found.append((f"{name}: {n:,} of {(labels == k).sum():,}", tuple(palette(k) / 255), count))
+    return found
 
 
 def _title(selection: Selection) -> str:

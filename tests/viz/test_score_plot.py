@@ -86,7 +86,7 @@ def test_classes_of_the_selected_have_lines(tmp_path, figures):
     plot_scores(select_by_similarity(scores), tmp_path / "a.png", labels=labels)
     axes = figures[0].axes[0]
     entries = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert [entry for entry in entries if "class" in entry] == ["class 4: 97 of 197"]
+    assert [entry for entry in entries if "class" in entry] == ["no class: 3 of 3", "class 4: 97 of 197"]
     outline = axes.patches[-2]
     assert outline.get_data().values.sum() == 197
     np.testing.assert_allclose(outline.get_edgecolor()[:3], palette(np.array([4]))[0] / 255)
