@@ -110,8 +110,8 @@ class Listening:
 
     async def __aenter__(self) -> Listening:
         from trame.app import get_server
-        from trame_client import module
-        from trame_client.module import vue3
+        from trame_client import module  # type: ignore[import-untyped]
+        from trame_client.module import vue3  # type: ignore[import-untyped]
 
         self._server = server = get_server(self._name, client_type="vue3")
         self.page = ExplorerPage(self._explorer, server)

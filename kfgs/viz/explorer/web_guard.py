@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import hmac
 from collections.abc import Awaitable, Callable
+from ipaddress import ip_address
 from typing import Any
 from urllib.parse import urlsplit
 
-LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
 REFUSED = "This page opens with the whole link that kfgs gave.\n"
 
 
 def is_loopback(host: str) -> bool:
     """Whether a server that listens there is reached from this machine only."""
-    return host.strip("[]").lower() in LOOPBACK or host.startswith("127.")
+    try:
+        return ip_address(host.strip("[]")).is_loopback
+    except ValueError:  # a name
+        return host.lower() == "localhost"
 
 
 def make_guard(secret: str, host: str) -> Callable[[Any, Callable[[Any], Awaitable[Any]]], Awaitable[Any]]:

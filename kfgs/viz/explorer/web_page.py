@@ -74,7 +74,8 @@ class ExplorerPage:
         self._acting = False
         self._saved = self._error = self._pointed = ""
         self._fill()
-        self.pictures = Pictures(explorer.plotter)
+        self.pictures = Pictures(explorer.plotter, self._resized)
+        self._fitted: object = self.pictures.camera
         self.view = self._lay_out()
         server.add_protocol_to_configure(lambda protocol: protocol.registerLinkProtocol(make_delivery(self.pictures)))
         for name in ("ask", "set_number", "set_show", "set_style", "hide", "hide_all", "pick"):
@@ -94,12 +95,12 @@ class ExplorerPage:
             if self._waiting:
                 await self._tell_working(True)
             while self._waiting:
+                self._error = ""
                 self._do(self._waiting.pop(next(iter(self._waiting))))
             self._show()
             await self._tell_working(False)
 
     def _do(self, action: Callable[[], object]) -> None:
-        self._error = ""
         plotter = self.explorer.plotter
         # `_show` draws, once, unless a picture is needed before: to save it, or to see how long it takes
         self._acting, plotter.suppress_rendering = True, not isinstance(action, _Drawing)
@@ -145,8 +146,9 @@ class ExplorerPage:
 
     def _on_hide(self, label: object, hidden: object) -> None:
         def action() -> None:
-            others = self.explorer.state.hidden - {label}
-            self.explorer.set_hidden(sorted(others | {label} if hidden else others))  # type: ignore[type-var]
+            one = {_label(label)}
+            others = self.explorer.state.hidden - one
+            self.explorer.set_hidden(sorted(others | one if hidden else others))
 
         self._queue(f"hide {label!r}", action)
 
@@ -169,7 +171,23 @@ class ExplorerPage:
         self._queue("selection", lambda: self._say_saved(self.explorer.save_selection()))
 
     def _on_reset_view(self) -> None:
-        self._queue("view", self.explorer.reset_view)
+        self._queue("view", self._fit)
+
+    def _resized(self) -> None:
+        """The panes have another shape: whoever has not turned them sees all of the scene again."""
+        if self.pictures.camera == self._fitted and not self._acting:
+            self._do(self._fit)
+
+    def _fit(self) -> None:
+        """The first view, from further away where panes are narrow: VTK fits the height."""
+        self.explorer.reset_view()
+        renderers = self.explorer.plotter.renderers
+        width, height = renderers[0].GetSize()
+        if width < height:
+            renderers[0].GetActiveCamera().Dolly(width / height)
+            for renderer in renderers:
+                renderer.ResetCameraClippingRange()
+        self._fitted = self.pictures.camera
 
     def _on_gamma(self, gamma_at: object, **_: object) -> None:
         low, high = self.explorer.state.gamma_range
@@ -280,6 +298,13 @@ def _labels(values: list[int]) -> Any:
     import numpy as np
 
     return np.asarray(values, dtype=np.int64)
+
+
+def _label(value: object) -> int:
+    """A class from the browser."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError(f"label: expected a whole number, got {str(value)[:40]!r}; reload the page")
+    return value
 
 
 def _differs(at: object, here: float) -> bool:

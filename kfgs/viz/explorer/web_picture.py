@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -53,11 +54,20 @@ class Pictures:
 
     VTK's own web application draws twice for each picture: it encodes in another thread, sends the picture of before, and
     draws again to fetch the new one.
+
+    Args:
+        plotter: what is drawn.
+        resized: called when the browser has changed the window's size, before it is drawn.
     """
 
-    def __init__(self, plotter: pv.Plotter) -> None:
-        self.plotter, self.changes = plotter, 0
+    def __init__(self, plotter: pv.Plotter, resized: Callable[[], object]) -> None:
+        self.plotter, self.resized, self.changes = plotter, resized, 0
         self.frame: Frame | None = None
+
+    @property
+    def camera(self) -> Camera:
+        """From where the clouds are seen."""
+        return Camera.of(self.plotter.renderers[0])
 
     def now(self) -> Frame:
         """The picture of now; drawn if anything has changed since the last, or that one was made while moving."""
@@ -109,6 +119,7 @@ def make_delivery(pictures: Pictures) -> Any:
             width, height = options.get("size", window.GetSize())
             if min(width, height) > LEAST and [width, height] != list(window.GetSize()):
                 window.SetSize(width, height)
+                pictures.resized()
             frame = pictures.now()
             fresh = self.asked_for or frame.number != options.get("mtime")
             self.asked_for = False
