@@ -142,7 +142,8 @@ class _Frame:
 
     def end(self, *_: Any) -> None:
         """The renderer has drawn."""
-        if not self.stand_ins and self._drawn():
+        if self.moving == "auto" and not self.stand_ins and self._drawn():
+            self.renderer.GetRenderWindow().WaitForCompletion()  # what was drawn so far was only asked for
             self.seconds = perf_counter() - self.began
 
     def _drawn(self) -> bool:

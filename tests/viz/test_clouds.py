@@ -194,3 +194,22 @@ def test_scene_of_everything_is_not_blank(plotter):
     assert len(np.unique(background, axis=0)) == 1
     assert len(np.unique(picture, axis=0)) > 10
     assert (picture != background).any(axis=1).mean() > 0.05
+
+
+def test_opacities_are_exchanged_with_the_colours():
+    gaussians = some_gaussians()
+    with some_plotter() as plotter:
+        actor = add_cloud(plotter, gaussians, style="gaussians")
+        look_through(plotter, some_camera())
+        plotter.screenshot(return_img=True)  # drawn once, so back to front
+        colors = np.arange(180, dtype=np.uint8).reshape(60, 3)
+        opacities = np.linspace(0, 1, 60)
+        recolor_cloud(actor, colors, opacities)
+        cloud = data(actor)
+        assert not np.array_equal(cloud["index"], np.arange(60))
+        np.testing.assert_array_equal(cloud["rgb"], colors[cloud["index"]])
+        np.testing.assert_array_equal(cloud["opacity"], opacities.astype(np.float32)[cloud["index"]])
+        with pytest.raises(ValueError, match=r"opacities: expected numbers in \[0, 1\], got 0 to 2"):
+            recolor_cloud(actor, colors, 2 * opacities)
+        with pytest.raises(ValueError, match=r"opacities: expected \[N\] with N = 60"):
+            recolor_cloud(actor, colors, opacities[1:])

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from cases_viz import some_camera, some_gaussians
 
-from kfgs.viz import available, headless, legend_column, palette
-from kfgs.viz.linked import linked_clouds
+from kfgs.viz import available, headless, legend_column, make_plotter, palette
+from kfgs.viz.linked import linked_clouds, look_over
 
 
 @pytest.fixture(autouse=True)
@@ -62,3 +62,22 @@ def test_a_missing_label_closes_the_window_and_says_so():
         linked_clouds(gaussians.replace(labels=None), gaussians, off_screen=True)
     with pytest.raises(ValueError, match="height: expected a number in"):
         linked_clouds(gaussians, gaussians, height=0)
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.3, -0.9, 0.2), (1.0, 1.0, 1.0)])
+def test_the_overview_stands_upright(up):
+    gaussians = some_gaussians()
+    plotter = make_plotter(60, 80, off_screen=True)
+    try:
+        look_over(plotter, gaussians, up)
+        axis = np.array(up) / np.linalg.norm(up)
+        camera = plotter.camera
+        forward, view_up = np.array(camera.direction), np.array(camera.GetViewUp())
+        assert forward @ axis == pytest.approx(-1 / np.sqrt(3))  # looks down as an isometric view does
+        right = np.cross(forward, view_up)
+        assert right @ axis == pytest.approx(0, abs=1e-9)
+        assert view_up @ axis > 0
+        middle = np.median(gaussians.means.numpy(), axis=0)
+        assert (middle - camera.position) @ forward > 0
+    finally:
+        plotter.close()

@@ -9,7 +9,7 @@ from PIL import Image
 from kfgs.cameras import Distortion
 from kfgs.formats import SplatFile
 from kfgs.splat.rasterize import rasterize
-from kfgs.viz import available, headless, legend_column, palette
+from kfgs.viz import available, gaussian_actor, headless, legend_column, palette
 from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.explorer import ExploreOptions, Explorer
 from kfgs.viz.explorer.meaning import SplatMeaning
@@ -303,6 +303,27 @@ def test_in_a_notebook_it_is_a_picture(explorer):
 
     picture = np.asarray(Image.open(io.BytesIO(explorer._repr_png_())))
     np.testing.assert_array_equal(picture, explorer.screenshot())
+
+
+def test_while_the_view_turns_points_keep_the_selection_before_the_rest(explorer, monkeypatch):
+    monkeypatch.setattr(gaussian_actor, "SLOW", 0.0)
+    explorer.ask("chair")
+    still = explorer.screenshot()
+    window = explorer.plotter.render_window
+    window.SetDesiredUpdateRate(15.0)
+    explorer.screenshot()
+    for pane, side in zip(explorer.panes, explorer.state.sides, strict=True):
+        points = [actor for actor in pane.renderer.GetViewProps() if actor.IsA("vtkActor") and actor.GetVisibility()]
+        counts = {actor.prop.opacity: actor.mapper.dataset.n_points for actor in points}
+        opacities, selected = explorer.state.cloud(side).opacities.numpy(), explorer.state.selected(side)
+        faint = opacities * np.where(selected, 1, explorer.options.rest)
+        assert counts[1.0] == (faint > 0.1).sum()
+        assert counts[gaussian_actor.FAINT_ALPHA] == ((faint <= 0.1) & (faint >= 1 / 255)).sum()
+    explorer.set_style("points")  # in the midst of it
+    window.SetDesiredUpdateRate(0.0001)
+    explorer.screenshot()
+    explorer.set_style("gaussians")
+    np.testing.assert_array_equal(explorer.screenshot(), still)
 
 
 def test_auto_draws_points_where_a_frame_is_slow(monkeypatch):
