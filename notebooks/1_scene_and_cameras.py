@@ -5,10 +5,11 @@
 # in the room with their pictures, points projected into a picture and a picture seen again in space, which views are held
 # out for testing, and a lens removed.
 #
-# About 10 seconds on a CPU (20 more to make the toy room the first time). Needs nothing but `pip install "kfgs[notebook]"`.
+# About 10 seconds on two CPU cores (20 more to make the toy room the first time). Needs nothing but
+# `pip install "kfgs[notebook]"`.
 
 # %%
-# Your own data: a folder with images/ and a COLMAP model in sparse/0. (A transforms.json opens as well, but brings no points.)
+# Your own data: a folder with images/ and a COLMAP model in sparse/0, or a transforms.json (which often brings no points).
 import os
 from pathlib import Path
 
@@ -22,9 +23,12 @@ folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))  
 # ## What a scene holds
 #
 # Cameras, image files, points with their colours, and named splits. Pictures are read when asked for, one at a time, so
-# a scene of thousands costs nothing to open. Units are those of the file; the room's are metres.
+# a scene of thousands costs nothing to open. Units are those of the file; the room's are metres. Points are optional for
+# looking (training starts from them): where there are none, each camera's line of sight is drawn in their place.
 
 # %%
+import torch
+
 recorded = load_scene(folder)
 scene = recorded.undistorted()  # the last part shows what this does
 camera = scene.cameras[0]
@@ -33,7 +37,13 @@ print(
     f"view 0: {camera.name}, {camera.width} x {camera.height} pixels, fx {camera.K[0, 0]:.1f}, fy {camera.K[1, 1]:.1f}"
 )
 print(f"it stands at {[round(x, 2) for x in camera.center.tolist()]}; extent of the cameras {scene.extent:.2f}")
-print("notes:", *scene.notes or ["none"])
+print("notes:", *scene.notes or ["none"], sep="\n  ")
+
+points, colors, what = scene.points, scene.colors, f"{len(scene.points):,} sparse points"
+if not len(points):
+    ahead = scene.extent * torch.linspace(0.2, 2, 40)[:, None]
+    points = torch.cat([c.center + ahead * c.viewmat[2, :3] for c in scene.cameras]).float()
+    colors, what = torch.full_like(points, 0.5), "no sparse points: lines of sight"
 
 # %%
 from PIL import Image
@@ -41,7 +51,8 @@ from PIL import Image
 from kfgs.viz import picture_grid
 
 shown = scene.views("train")[:: max(1, len(scene.views("train")) // 8)][:8]
-Image.fromarray(picture_grid([[scene.image(i) for i in shown[:4]], [scene.image(i) for i in shown[4:]]]))
+rows = [[scene.image(i) for i in shown[first : first + 4]] for first in range(0, len(shown), 4)]
+Image.fromarray(picture_grid([row for row in rows if len(row) == len(rows[0])], width=min(camera.width, 256)))
 
 # %% [markdown]
 # ## Cameras in space
@@ -58,16 +69,15 @@ from kfgs.viz import Orbit, add_camera_images, add_cameras, estimate_up, look_th
 
 pv.set_jupyter_backend("static")  # "server" lets you turn the scene: pip install "pyvista[jupyter]"
 
-bounds = robust_bounds(scene.points)
-up = estimate_up(scene.cameras).to(scene.points)
-height = scene.points @ up
+bounds = robust_bounds(points)
+up = estimate_up(scene.cameras).to(points)
+height = points @ up
 inside = bounds.inside & (height < height[bounds.inside].quantile(0.8))
-orbit = orbit_cameras(scene.points[inside], Orbit(frames=8, size=(540, 720), elevation_degrees=40, zoom=1.12), up=up)
+orbit = orbit_cameras(points[inside], Orbit(frames=8, size=(540, 720), elevation_degrees=40, zoom=1.12), up=up)
 
 plotter = make_plotter(540, 720)
-plotter.add_points(
-    scene.points[inside].numpy(), scalars=scene.colors[inside].numpy(), rgb=True, point_size=3, lighting=False
-)
+plotter.add_points(points[inside].numpy(), scalars=colors[inside].numpy(), rgb=True, point_size=3, lighting=False)
+plotter.add_text(what, font_size=8, color="black")
 add_cameras(plotter, scene.cameras, size=0.3 * scene.extent, most=7)
 add_camera_images(plotter, scene.cameras, scene.image, size=0.3 * scene.extent, most=7)
 look_through(plotter, orbit[1])
@@ -77,22 +87,16 @@ plotter.show()
 # ## Points into a picture
 #
 # `project_points` takes world points to pixels (x, y) and says which of them the camera can see. The first pixel's centre
-# is (0.5, 0.5), as in COLMAP. kornia's `PinholeCamera` says the same: the largest difference is printed in pixels.
+# is (0.5, 0.5), as in COLMAP. `to_kornia` makes one kornia `PinholeCamera` of any number of cameras; it counts pixels as
+# K does and so says the same: the largest difference is printed. (kornia's own grids count pixel centres from 0: for
+# those, `to_kornia(cameras, integer_centers=True)`.)
 
 # %%
-import torch
-from kornia.geometry.camera import PinholeCamera
+from kfgs.cameras import project_points, to_kornia
 
-from kfgs.cameras import project_points
-
-pixels, depths, seen = project_points(camera, scene.points)
-
-K = torch.eye(4)
-K[:3, :3] = camera.K
-kornia_camera = PinholeCamera(
-    K[None], camera.viewmat[None].float(), torch.tensor([camera.height]), torch.tensor([camera.width])
-)
-theirs = kornia_camera.project(scene.points[seen])
+pixels, depths, seen = project_points(camera, points)
+kornia_camera = to_kornia([camera])
+theirs = kornia_camera.project(points[seen].to(kornia_camera.intrinsics)[None])[0]
 print(
     f"{int(seen.sum()):,} of {len(seen):,} points project into the picture; kornia's camera differs by at most "
     f"{float((theirs - pixels[seen]).abs().max()):.1e} pixels"
@@ -109,7 +113,7 @@ axes.imshow(scene.image(0).mean(-1), cmap="gray", vmin=-0.5, extent=(0, camera.w
 drawn = seen & bounds.inside
 dots = axes.scatter(*pixels[drawn].T, c=depths[drawn], s=2, cmap="plasma_r")
 figure.colorbar(dots, label="depth (world units)", shrink=0.8)
-axes.set(title=camera.name, xlim=(0, camera.width), ylim=(camera.height, 0))
+axes.set(title=f"{camera.name}, {what}", xlim=(0, camera.width), ylim=(camera.height, 0))
 plt.show()
 
 # %% [markdown]
@@ -117,12 +121,13 @@ plt.show()
 # poses, axes and principal point are read as they were meant. Points have no surface, so what is behind shines through.
 
 # %%
-plotter = make_plotter(camera.height, camera.width, off_screen=True)
-plotter.add_points(scene.points.numpy(), scalars=scene.colors.numpy(), rgb=True, point_size=4, lighting=False)
-look_through(plotter, camera)
+small = camera.resized(round(camera.height * min(1, 384 / camera.width)), min(camera.width, 384))
+plotter = make_plotter(small.height, small.width, off_screen=True)
+plotter.add_points(points.numpy(), scalars=colors.numpy(), rgb=True, point_size=4, lighting=False)
+look_through(plotter, small)
 through = plotter.screenshot(return_img=True)
 plotter.close()
-Image.fromarray(picture_grid([[scene.image(0), through]], ["photograph", "points through its camera"]))
+Image.fromarray(picture_grid([[scene.image(0), through]], ["photograph", what], width=small.width))
 
 # %% [markdown]
 # ## Which views are held out
@@ -135,8 +140,8 @@ from kfgs.scenes import make_split
 
 plotter = make_plotter(480, 720)
 plotter.add_points(
-    scene.points[inside].numpy(),
-    scalars=scene.colors[inside].numpy(),
+    points[inside].numpy(),
+    scalars=colors[inside].numpy(),
     rgb=True,
     point_size=2,
     opacity=0.4,
@@ -145,7 +150,7 @@ plotter.add_points(
 for split, color in {"train": "#0072b2", "test": "#d55e00"}.items():
     add_cameras(plotter, scene.select(split).cameras, size=0.15 * scene.extent, color=color, line_width=3)
 plotter.add_legend([["train", "#0072b2"], ["test", "#d55e00"]], face="rectangle", bcolor="white", size=(0.15, 0.12))
-above = orbit_cameras(scene.points[inside], Orbit(frames=1, size=(480, 720), elevation_degrees=75, zoom=1.3), up=up)
+above = orbit_cameras(points[inside], Orbit(frames=1, size=(480, 720), elevation_degrees=75, zoom=1.3), up=up)
 look_through(plotter, above[0])
 plotter.show()
 print({name: len(views) for name, views in make_split(len(scene), "holdout8").items()})
@@ -155,7 +160,7 @@ print({name: len(views) for name, views in make_split(len(scene), "holdout8").it
 #
 # Gaussians are drawn by a pinhole, so a lens has to go first: `scene.undistorted()` removes it from every picture on the
 # way in, and `scene.mask(i)` says which pixels were recorded. The room's pictures come from a pinhole; to have something
-# to remove, kornia gives view 0 a barrel lens, and `undistort` takes it away again.
+# to remove, kornia gives view 0 a barrel lens, and `undistort` takes it away again. Of a lens of yours, view 0 is shown.
 
 # %%
 from dataclasses import replace
@@ -175,10 +180,13 @@ if not recorded.distorted:
     bent = remap(photo.permute(2, 0, 1)[None], x, y, align_corners=True)[0].permute(1, 2, 0)
 
 straight, pinhole, known = undistort(bent, lens)
+columns = {"through the lens": bent, "undistorted": straight}
 print(lens.distortion)
-quality = psnr(straight[known][None], photo[known][None])
-print(f"undistorted: {quality:.1f} dB from the pinhole's picture; {known.float().mean():.0%} of the pixels recorded")
-Image.fromarray(picture_grid([[photo, bent, straight]], ["pinhole", "through the lens", "undistorted"]))
+print(f"undistorted: {known.float().mean():.0%} of the pixels recorded")
+if not recorded.distorted:
+    print(f"{psnr(straight[known][None], photo[known][None]):.1f} dB from the pinhole's picture")
+    columns = {"pinhole": photo, **columns}
+Image.fromarray(picture_grid([list(columns.values())], list(columns), width=small.width))
 
 # %% [markdown]
 # Next: [2_splat_a_feature_map](2_splat_a_feature_map.py) puts features on Gaussians and draws them.

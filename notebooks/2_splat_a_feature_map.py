@@ -5,7 +5,8 @@
 # 20,000 of them carry a teacher's 512 channels and are drawn from a view they have not seen. At the end: how much faster
 # the engines are than the plain equations, and that pyvista shows the same picture as the rasteriser.
 #
-# About 15 seconds on a CPU (20 more to make the toy room the first time). Needs `pip install "kfgs[notebook]"`.
+# About 15 seconds on two CPU cores (20 more to make the toy room the first time). Needs nothing but
+# `pip install "kfgs[notebook]"`.
 
 # %%
 # Your own data: a scene, and a folder with a feature map of each training view, as `kfgs features` writes it.
@@ -109,23 +110,16 @@ Image.fromarray(picture_grid([[*steps, opacity]], ["the nearest", "two", "three"
 # the whole scene, so that equal features have equal colours in every view. Edges are blurred, surfaces are noisy.
 
 # %%
-from kfgs import resize_map
 from kfgs.quant import sample_grid
 from kfgs.viz import FeatureColors
 
 colors = FeatureColors.fit(torch.cat([sample_grid(maps[i], samples=500) for i in range(len(maps))]))
-
-
-def to_picture(features, view):
-    return resize_map(torch.from_numpy(colors(features)) / 255, scene.cameras[view].size)
-
-
 print(
     f"{len(maps)} maps of {maps.shape}, {len(maps) * 2 * torch.tensor(maps.shape).prod() / 1e6:.0f} MB in half precision"
 )
 chosen = [0, len(train) // 3, 2 * len(train) // 3]
-rows = [[scene.image(train[i]) for i in chosen], [to_picture(maps[i], train[i]) for i in chosen]]
-Image.fromarray(picture_grid(rows))
+rows = [[scene.image(train[i]) for i in chosen], [colors(maps[i]) for i in chosen]]
+Image.fromarray(picture_grid(rows, width=min(scene.cameras[0].width, 320)))
 
 # %% [markdown]
 # ## Features on Gaussians
@@ -152,6 +146,7 @@ semantic = cloud.replace(features=sums / weights.clamp_min(1e-6)[:, None], sh=No
 print(semantic, f"{float((weights > 0).float().mean()):.0%} of them seen")
 
 # %%
+from kfgs import resize_map
 from kfgs.metrics import feature_cosine
 
 held = scene.cameras[train[0]]
@@ -160,11 +155,12 @@ cosine = feature_cosine(resize_map(rendering.map, (h, w)), maps[0])
 print(f"{tuple(rendering.map.shape)} rendered; cosine with the teacher on the view kept apart {float(cosine):.3f}")
 pictures = [
     scene.image(train[0]),
-    to_picture(maps[0], train[0]),
-    to_picture(rendering.map, train[0]),
+    colors(maps[0]),
+    colors(rendering.map),
     rendering.alpha[..., None].expand(-1, -1, 3),
 ]
-Image.fromarray(picture_grid([pictures], ["photograph", "the teacher", "rendered features", "opacity"]))
+titles = ["photograph", "the teacher", "rendered features", "opacity"]
+Image.fromarray(picture_grid([pictures], titles, width=min(held.width, 320)))
 
 # %% [markdown]
 # ## Engines

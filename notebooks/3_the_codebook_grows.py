@@ -6,7 +6,8 @@
 # a codeword from 512 channels to 9. You will see the growth (as in Figure 6), the codewords with their nearest words, the
 # index maps beside the teacher's, and what is left in bytes.
 #
-# About 25 seconds on a CPU (20 more to make the toy room the first time). Needs `pip install "kfgs[notebook]"`.
+# About 25 seconds on two CPU cores (20 more to make the toy room the first time). Needs nothing but
+# `pip install "kfgs[notebook]"`.
 
 # %%
 # Your own data: a scene, its feature maps as `kfgs features` writes them, and the teacher's words (`kfgs text`).
@@ -81,8 +82,7 @@ Shown(pictures / "codebook.png", width=900)
 import torch
 from PIL import Image
 
-from kfgs import quantize_maps, resize_map
-from kfgs.cameras import resize_labels
+from kfgs import quantize_maps
 from kfgs.labels import label_codewords
 from kfgs.viz import FeatureColors, palette, picture_grid
 
@@ -92,12 +92,10 @@ classes = label_codewords(codebook.codewords, words.embeddings).labels
 
 rows = []
 for i in (0, 2 * len(maps) // 3):
-    photo = scene.image(train[i])
-    teacher = resize_map(torch.from_numpy(colors(maps[i])) / 255, photo.shape[:2])
-    index = resize_labels(torch.from_numpy(index_maps[i]).long(), photo.shape[:2])  # K where the teacher says nothing
-    index = index.clamp_max(codebook.size - 1)
-    rows.append([photo, teacher, colors(codebook.codewords)[index], palette(classes)[index]])
-Image.fromarray(picture_grid(rows, ["photograph", "the teacher", "its codewords", "their classes"]))
+    index = torch.from_numpy(index_maps[i]).long().clamp_max(codebook.size - 1)  # K where the teacher says nothing
+    rows.append([scene.image(train[i]), colors(maps[i]), colors(codebook.codewords)[index], palette(classes)[index]])
+titles = ["photograph", "the teacher", "its codewords", "their classes"]
+Image.fromarray(picture_grid(rows, titles, width=min(scene.cameras[0].width, 320)))
 
 # %% [markdown]
 # How similar a pixel's feature is to its codeword, over the first maps: the codebook's error is the teacher's noise.
