@@ -80,7 +80,7 @@ def add_names(
     *,
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> Any:
-    """Write a name over each box, in front of everything.
+    """Write a name over each box, in front of everything, every one of them: names of boxes close by may overlap.
 
     Args:
         plotter: where to draw.
@@ -99,11 +99,13 @@ def add_names(
     height = (corners @ direction).max(axis=1) / (direction @ direction)
     centers = corners.mean(axis=1)
     tops = centers + np.outer(height - centers @ direction / (direction @ direction), direction)
-    return plotter.add_point_labels(
+    actor = plotter.add_point_labels(
         tops, list(names), shape="rounded_rect", shape_color=plotter.renderer.background_color, shape_opacity=0.6, margin=2,
         show_points=False, always_visible=True, font_size=LETTERS, text_color=letters(plotter), bold=True, pickable=False,
         reset_camera=False,
     )  # fmt: skip
+    actor.GetMapper().SetPlaceAllLabels(True)  # VTK would leave out those that overlap another
+    return actor
 
 
 def add_selections(

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 Row = Mapping[str, Any]
 Array = np.ndarray[Any, Any]
 STEPS = ("step", "iteration", "epoch")  # what may run along the bottom
+CLOCK = ("seconds",)  # a nearly straight line, which tells nothing about how training went
 COUNTS = {"size", "added", "pruned", "count", "gaussians"}  # recorded numbers that are whole, drawn from zero
 LINES = PALETTE[[4, 5, 2, 6, 1, 0]] / 255  # the darker ones of Okabe and Ito read well as lines
 INK = (0.08, 0.08, 0.08)
@@ -40,17 +41,19 @@ def plot_codebook_history(history: Sequence[Row], path: str | Path) -> None:
     _plot_rows(history, path, first="size", title="Codebook")
 
 
-def plot_training(history: Sequence[Row], path: str | Path) -> None:
+def plot_training(history: Sequence[Row], path: str | Path, *, leave_out: Sequence[str] = CLOCK) -> None:
     """Draw every number that a training recorded against its step: the loss first, one panel each.
 
     Args:
         history: rows with `step` (or `iteration`, or `epoch`) and numbers, for instance `FieldFit.history`.
         path: a .png file.
+        leave_out: numbers not to draw; () draws all.
 
     Raises:
         ValueError: if the history is empty or has no numbers.
     """
-    _plot_rows(history, path, first="loss", title="Training")
+    rows = [{key: value for key, value in row.items() if key not in leave_out} for row in history]
+    _plot_rows(rows, path, first="loss", title="Training")
 
 
 def plot_confusion(

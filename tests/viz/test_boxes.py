@@ -48,6 +48,22 @@ def test_names_stand_over_their_boxes(plotter):
     assert (picture > 200).all(axis=1).sum() > 20  # white letters on black
 
 
+def test_no_name_is_left_out_where_boxes_are_close():
+    def drawn(names):
+        with some_plotter() as plotter:
+            boxes = [OrientedBox.between([0.12 * i, 0, 0], [0.12 * i + 0.1, 0.1, 0.1 + 0.02 * i]) for i in range(3)]
+            add_boxes(plotter, boxes)
+            add_names(plotter, boxes, names)
+            plotter.view_xz()
+            plotter.camera.zoom(0.6)
+            return plotter.screenshot(return_img=True).astype(int)
+
+    everything = drawn(["chair 1", "chair 2", "chair 3"])
+    for i in range(3):
+        others = [" " if i == j else f"chair {j + 1}" for j in range(3)]
+        assert (np.abs(drawn(others) - everything).sum(axis=2) > 100).sum() > 20, f"chair {i + 1}"
+
+
 def test_selections_have_colours_and_boxes_of_their_own(plotter):
     gaussians = some_gaussians()
     low, high = select_where(gaussians.means[:, 0] < -0.5, "low"), select_where(gaussians.means[:, 0] > 0.5, "high")

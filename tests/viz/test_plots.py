@@ -42,6 +42,17 @@ def test_training_starts_with_the_loss_and_skips_gaps(tmp_path, figures):
     np.testing.assert_array_equal(panels[2].lines[0].get_xydata(), [(100, 20)])
 
 
+def test_the_clock_is_drawn_only_when_asked_for(tmp_path, figures):
+    rows = [{"step": i, "count": 5, "seconds": 0.1 * i, "loss": 0.5} for i in range(3)]
+    plot_training(rows, tmp_path / "a.png")
+    plot_training(rows, tmp_path / "a.png", leave_out=())
+    plot_training(rows, tmp_path / "a.png", leave_out=["count"])
+    titles = [[axes.get_title() for axes in figure.axes] for figure in figures]
+    assert titles == [["loss", "count"], ["loss", "count", "seconds"], ["loss", "seconds"]]
+    with pytest.raises(ValueError, match="history: expected rows with numbers to draw, got keys"):
+        plot_training(rows, tmp_path / "a.png", leave_out=["count", "seconds", "loss"])
+
+
 def test_confusion_is_in_per_cent_of_the_true_class(tmp_path, figures):
     matrix = torch.tensor([[3, 1, 0], [0, 0, 0], [2, 0, 2]])
     plot_confusion(matrix, ["wall", "unused?", "rug"], tmp_path / "confusion.png")
