@@ -89,6 +89,7 @@ class ExplorerPage:
     async def work(self) -> None:
         """Do what the browser asks for, until cancelled."""
         self._loop = asyncio.get_running_loop()
+        self._wake.set()  # a notebook's cells may have changed the explorer before
         while True:
             await self._wake.wait()
             self._wake.clear()
