@@ -18,8 +18,8 @@
 # selections, and at the end the explorer: type a word and watch it light up in the semantic cloud and, through lambda, in
 # the colour cloud.
 #
-# **Time**: about a minute and a half on two CPU cores the first time, half a minute when another notebook has made the
-# fields. **Needs**: nothing; without a display everything is drawn off-screen
+# **Time**: about a minute and a half on two CPU cores the first time, a quarter of a minute when another
+# notebook has made the fields. **Needs**: nothing; without a display everything is drawn off-screen
 # (Debian: `libegl1 libegl-mesa0 libgl1-mesa-dri`).
 
 # %%

@@ -21,7 +21,8 @@ def pin_picture(
 ) -> Any:
     """Put a picture into the lower left or the lower right corner of the active subplot.
 
-    It is drawn pixel by pixel, and drawn anew when the subplot's size changes.
+    It is drawn pixel by pixel, and drawn anew when the subplot's size changes. The next frame shows it: none is drawn here,
+    which may take long.
 
     Args:
         plotter: where to draw.
@@ -40,7 +41,7 @@ def pin_picture(
     actor.SetMapper(mapper)
     pinned = _Pinned(plotter.renderer, actor, draw, corner)
     pinned.draw(*_size_of(plotter))
-    plotter.add_actor(actor, reset_camera=False, pickable=False)
+    plotter.add_actor(actor, reset_camera=False, pickable=False, render=False)
     pinned.tag = plotter.renderer.AddObserver("StartEvent", pinned.before_frame)
     return actor
 

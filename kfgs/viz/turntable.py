@@ -158,6 +158,8 @@ def save_turntable(
 ) -> Path:
     """Write one round about a scene as a GIF or MP4 that can be played for ever.
 
+    A GIF takes about 60 kB a frame of 360x480 of textured colours, and 40 kB of labels: `orbit` bounds both.
+
     Args:
         path: a name that ends in .gif or .mp4.
         shows: Gaussians, or several things by title, side by side (`save_animation`). The cameras go round the first
