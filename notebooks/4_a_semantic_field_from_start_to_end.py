@@ -46,7 +46,7 @@ from kfgs import (
 )
 from kfgs.cameras import resize_labels
 from kfgs.labels import classify
-from kfgs.pipeline import load_history, score_teacher, true_labels
+from kfgs.pipeline import feature_colors, load_history, score_teacher, true_labels
 
 # %% [markdown]
 # ## What goes in
@@ -119,8 +119,7 @@ display.Image(filename=pictures / "codebook.png")
 # grows from the sparse points that it starts with: meaning is smooth where colour is not, so few of them do (Sec. 3.2).
 
 # %%
-history = [{key: row[key] for key in ("step", "loss", "count")} for row in load_history(stages["field"])]
-viz.plot_training(history, pictures / "field.png")
+viz.plot_training(load_history(stages["field"]), pictures / "field.png")
 display.Image(filename=pictures / "field.png")
 
 # %% [markdown]
@@ -133,7 +132,7 @@ display.Image(filename=pictures / "field.png")
 k = 2
 camera, image = scene.cameras[test[k]], scene.image(test[k])
 test_maps = FeatureFolder(features, [scene.stem(i) for i in test])
-latents = viz.FeatureColors.fit(field.features)(field.render(camera).map)
+latents = feature_colors(field)(field.render(camera).map)
 row = [image, latents, as_colors(field.feature_map(camera), camera.size), as_colors(test_maps[k], camera.size)]
 Image.fromarray(viz.picture_grid([row], ("photograph", "9 latents", "decoded to 512", "teacher's 512")))
 

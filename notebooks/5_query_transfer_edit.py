@@ -89,14 +89,9 @@ Image.fromarray(viz.picture_grid([row], list(found)))
 # needs no heaps.
 
 # %%
-import matplotlib.pyplot as plt
-
-figure, panels = plt.subplots(1, 2, figsize=(8, 2.4), layout="constrained")
-for axes, name in zip(panels, ("views", "views, other classes"), strict=True):
-    axes.hist(found[name].scores.numpy(), bins=80, log=True, color="#0072b2")
-    axes.axvline(found[name].threshold, color="black", label=f"gamma = {found[name].threshold:.3f}")
-    axes.set(title=name, xlabel="score", ylabel="Gaussians")
-    axes.legend(frameon=False, loc="upper center")
+for name in ("views", "views, other classes"):
+    viz.plot_scores(found[name], out / "scores.png")
+    display.display(display.Image(filename=out / "scores.png", width=560))
 
 # %% [markdown]
 # ## Things, not a heap of Gaussians
@@ -127,9 +122,7 @@ def furnished(gaussians):  # -> [N] bool
 
 
 inside = furnished(semantic)
-parts = {
-    f"{thing} {i}": select_where(torch.isin(inside.nonzero()[:, 0], one.indices)) for i, one in enumerate(things, 1)
-}
+parts = {f"{thing} {i}": select_where(one.selection(len(semantic)).mask[inside]) for i, one in enumerate(things, 1)}
 up = viz.estimate_up(scene.cameras)
 orbit = viz.Orbit(frames=1, size=(330, 440), elevation_degrees=50, start_degrees=120, zoom=1.8)
 outside = viz.orbit_cameras(semantic.means[inside], orbit, up=up)[0]
@@ -147,8 +140,7 @@ Image.fromarray(picture)
 row, titles = [], []
 for number, one in enumerate(things[:4]):
     view = cameras[one.best_view.index]
-    member = torch.zeros(len(semantic), 1)
-    member[one.indices] = 1
+    member = one.selection(len(semantic)).scores[:, None]  # 1 for its Gaussians, 0 for the others
     covered = kfgs.rasterize(semantic.replace(features=member), view).map[..., 0] > 0.5
     photograph = scene.image(scene.views("train")[one.best_view.index])
     row.append(viz.overlay_labels(photograph, torch.where(covered, number, -1)))
@@ -204,14 +196,15 @@ Image.fromarray(viz.picture_grid([row], titles))
 strict = kfgs.transfer_labels(semantic, labels, colors.gaussians, 0.3 * carried.distance)
 radius = float(things[0].box.half.norm())
 near = select_in_sphere(colors.gaussians.means, things[0].centroid, radius).mask
-part = replace(strict, **{name: getattr(strict, name)[near] for name in ("labels", "distances", "sources", "shares")})
 sources = semantic.select(select_in_sphere(semantic.means, things[0].centroid, radius).mask)
 shift = 2.2 * radius * up.to(semantic.means)
 whole = torch.cat([sources.means, colors.gaussians.means[near] + shift])
 side = viz.orbit_cameras(whole, replace(orbit, size=(480, 640), elevation_degrees=15, zoom=1.05), up=up)[0]
 plotter = viz.make_plotter(*side.size, off_screen=True)
 viz.add_cloud(plotter, sources, options=viz.CloudOptions(point_size=5))
-viz.add_matches(plotter, semantic, colors.gaussians.select(near), part, shift=tuple(shift.tolist()), sample=100)
+viz.add_matches(
+    plotter, semantic, colors.gaussians.select(near), strict.select(near), shift=tuple(shift.tolist()), sample=100
+)
 viz.look_through(plotter, side)
 picture = plotter.screenshot()
 plotter.close()
