@@ -43,7 +43,8 @@ points, colors, what = scene.points, scene.colors, f"{len(scene.points):,} spars
 if not len(points):
     ahead = scene.extent * torch.linspace(0.2, 2, 40)[:, None]
     points = torch.cat([c.center + ahead * c.viewmat[2, :3] for c in scene.cameras]).float()
-    colors, what = torch.full_like(points, 0.5), "no sparse points: lines of sight"
+    colors = torch.full_like(points, 128, dtype=torch.uint8)
+    what = "no sparse points: lines of sight"
 
 # %%
 from PIL import Image
@@ -73,7 +74,9 @@ bounds = robust_bounds(points)
 up = estimate_up(scene.cameras).to(points)
 height = points @ up
 inside = bounds.inside & (height < height[bounds.inside].quantile(0.8))
-orbit = orbit_cameras(points[inside], Orbit(frames=8, size=(540, 720), elevation_degrees=40, zoom=1.12), up=up)
+everything = torch.cat([points[inside], torch.stack([c.center for c in scene.cameras]).to(points)])
+corners = torch.stack([everything.amin(0), everything.amax(0)])
+orbit = orbit_cameras(corners, Orbit(frames=8, size=(540, 720), elevation_degrees=40, zoom=1.12), up=up)
 
 plotter = make_plotter(540, 720)
 plotter.add_points(points[inside].numpy(), scalars=colors[inside].numpy(), rgb=True, point_size=3, lighting=False)
@@ -150,7 +153,7 @@ plotter.add_points(
 for split, color in {"train": "#0072b2", "test": "#d55e00"}.items():
     add_cameras(plotter, scene.select(split).cameras, size=0.15 * scene.extent, color=color, line_width=3)
 plotter.add_legend([["train", "#0072b2"], ["test", "#d55e00"]], face="rectangle", bcolor="white", size=(0.15, 0.12))
-above = orbit_cameras(points[inside], Orbit(frames=1, size=(480, 720), elevation_degrees=75, zoom=1.3), up=up)
+above = orbit_cameras(corners, Orbit(frames=1, size=(480, 720), elevation_degrees=75, zoom=1.3), up=up)
 look_through(plotter, above[0])
 plotter.show()
 print({name: len(views) for name, views in make_split(len(scene), "holdout8").items()})
