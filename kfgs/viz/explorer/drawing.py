@@ -10,6 +10,7 @@ import numpy as np
 from ...cameras.camera import NEAR
 from ...gaussians import Gaussians
 from ..clouds import CloudOptions, add_cloud, recolor_cloud
+from ..gaussian_actor import MOVING_POINTS, STILL
 from ..legends import add_legend, add_scalar_bar
 from ..linked import add_title
 from ..meshes import draw_mesh
@@ -44,7 +45,7 @@ class Pane:
         self._opacities: Array = cloud.opacities.detach().cpu().numpy()
         self._means: Array = cloud.means.detach().cpu().numpy().astype(np.float32)
         self._gaussians: Any = None
-        self._points: list[Any] | None = None  # what is clearly seen, and the rest
+        self._points: list[Any] | None = None  # what is clearly seen, the rest, and few of the first
         self._said: Any = None
         self._notes: list[Any] = []
         self._mark = Mark(self.renderer)
@@ -121,19 +122,31 @@ class Pane:
         recolor_cloud(self._gaussians, colors, np.clip(self._opacities * factor, 0, 1))
 
     def _draw_points(self, colors: Array, faint: Array) -> None:
-        others = np.flatnonzero(faint & (self._opacities > FAINT["points"]))
-        others = others[np.linspace(0, len(others) - 1, min(len(others), REST_POINTS)).round().astype(np.int64)]
-        parts = [self._part(rows, colors) for rows in (np.flatnonzero(self.visible), others)]
-        if self._points is None:
-            size = next((pixels for most, pixels in POINT_SIZES if len(self.cloud) <= most), 3.0)
-            self._points = [
-                draw_mesh(self.plotter, part, style="points", scalars="rgb", rgb=True, point_size=size,
-                          lighting=False, opacity=alpha, reset_camera=False)
-                for part, alpha in zip(parts, (1.0, REST_ALPHA), strict=True)
-            ]  # fmt: skip
+        clear = np.flatnonzero(self.visible)
+        others = _evenly(np.flatnonzero(faint & (self._opacities > FAINT["points"])), REST_POINTS)
+        few = _evenly(clear, MOVING_POINTS) if len(clear) > MOVING_POINTS else clear[:0]
+        parts = [self._part(rows, colors) for rows in (clear, others, few)]
+        if self._points is not None:
+            for actor, part in zip(self._points, parts, strict=True):
+                actor.mapper.dataset.shallow_copy(part)
             return
-        for actor, part in zip(self._points, parts, strict=True):
-            actor.mapper.dataset.shallow_copy(part)
+        size = next((pixels for most, pixels in POINT_SIZES if len(self.cloud) <= most), 3.0)
+        self._points = [
+            draw_mesh(
+                self.plotter, part, style="points", scalars="rgb", rgb=True, point_size=size, lighting=False, opacity=alpha,
+                reset_camera=False,
+            )
+            for part, alpha in zip(parts, (1.0, REST_ALPHA, 1.0), strict=True)
+        ]  # fmt: skip
+        self.renderer.AddObserver("StartEvent", self._before_frame)
+
+    def _before_frame(self, *_: Any) -> None:
+        """While the camera moves, few points stand for many."""
+        assert self._points is not None
+        clear, _, few = self._points
+        moves = self.renderer.HasViewProp(few) and self.renderer.GetRenderWindow().GetDesiredUpdateRate() >= STILL
+        clear.SetVisibility(not moves)
+        few.SetVisibility(bool(moves))
 
     def _part(self, rows: Array, colors: Array) -> pv.PolyData:
         """Points for some Gaussians; `shown` in the field data says how many (pyvista draws no empty mesh)."""
@@ -145,3 +158,8 @@ class Pane:
         part.field_data["shown"] = np.array([len(rows)])
         part.set_active_scalars("rgb")
         return part
+
+
+def _evenly(rows: Array, most: int) -> Array:
+    """At most so many of some rows, evenly chosen."""
+    return rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).round().astype(np.int64)]

@@ -10,6 +10,7 @@ from kfgs.cameras import Distortion
 from kfgs.formats import SplatFile
 from kfgs.splat.rasterize import rasterize
 from kfgs.viz import available, gaussian_actor, headless, legend_column, palette
+from kfgs.viz.explorer import drawing
 from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.explorer import ExploreOptions, Explorer
 from kfgs.viz.explorer.meaning import SplatMeaning
@@ -132,7 +133,7 @@ def test_points_show_the_same_selection(explorer):
     explorer.set_hidden(["lamp"])
     explorer.ask("chair")
     for pane, side in zip(explorer.panes, explorer.state.sides, strict=True):
-        clear, rest = (actor.mapper.dataset for actor in pane._points)
+        clear, rest = (actor.mapper.dataset for actor in pane._points[:2])
         opaque = explorer.state.cloud(side).opacities.numpy() > 0.1
         selected, drawn = explorer.state.selected(side), explorer.state.drawn(side)
         np.testing.assert_array_equal(clear["index"], np.flatnonzero(selected & opaque))
@@ -146,6 +147,23 @@ def test_points_show_the_same_selection(explorer):
         assert not (pixels == palette(np.array(4))).all(axis=1).any()
     explorer.set_style("gaussians")
     assert agreement(explorer, "color", explorer.options.rest) > 45
+
+
+def test_few_points_stand_for_many_while_the_view_turns(explorer, monkeypatch):
+    monkeypatch.setattr(drawing, "MOVING_POINTS", 20)
+    explorer.set_style("points")
+    still = explorer.screenshot()
+    window = explorer.plotter.render_window
+    window.SetDesiredUpdateRate(15.0)
+    fast = explorer.screenshot()
+    drawn = [(half[TITLE:, LEGEND:] != 255).any(axis=2).sum() for half in panes(fast).values()]
+    assert all(0 < pixels < 20 * 36 for pixels in drawn)
+    assert (still[TITLE:, LEGEND:] != 255).any(axis=2).sum() > 2 * sum(drawn)
+    explorer.set_style("gaussians")
+    window.SetDesiredUpdateRate(0.0001)
+    assert agreement(explorer, "color") > 45
+    explorer.set_style("points")
+    np.testing.assert_array_equal(explorer.screenshot(), still)
 
 
 def test_points_of_nothing_are_none(explorer):
