@@ -39,7 +39,6 @@ from kfgs import (
     fit_scene,
     load_label_set,
     load_scene,
-    resize_map,
     score_scene,
     segment_scene,
     viz,
@@ -74,17 +73,17 @@ def teacher_labels(features, size):  # [h, w, D] -> [H, W]
     return resize_labels(classify(features.flatten(0, 1), classes.embeddings).labels.view(features.shape[:2]), size)
 
 
-def as_colors(features, size):  # [h, w, D] -> [H, W, 3] in [0, 1]
-    """A map of features in the scene's own colours, at a picture's size."""
-    return resize_map(torch.from_numpy(colors(unit(features, dim=-1))) / 255, size)
+def as_colors(features):  # [h, w, D] -> [h, w, 3] uint8
+    """A map of features in the scene's own colours."""
+    return colors(unit(features, dim=-1))
 
 
 rows = []
 for k in (0, 10):
     image, size = scene.image(train[k]), scene.cameras[train[k]].size
     said = viz.overlay_labels(image, teacher_labels(maps[k], size))
-    rows.append([image, as_colors(maps[k], size), said, viz.overlay_labels(image, truth[scene.stem(train[k])])])
-Image.fromarray(viz.picture_grid(rows, ("photograph", "teacher's features", "teacher's labels", "truth")))
+    rows.append([image, as_colors(maps[k]), said, viz.overlay_labels(image, truth[scene.stem(train[k])])])
+Image.fromarray(viz.picture_grid(rows, ("photograph", "teacher's features", "teacher's labels", "truth"), width=256))
 
 # %% [markdown]
 # ## Fitting: four stages, each found again
@@ -126,15 +125,16 @@ display.Image(filename=pictures / "field.png")
 # ## What is seen from a viewpoint nobody has stood at
 #
 # The field renders 9 channels (Eq. 3); the decoder Psi brings them back to the teacher's 512. The teacher's own map of this
-# view was never shown to the field: compare how calm the decoded one is.
+# view was never shown to the field. The decoded one has finer borders and none of the teacher's patches; its own faults are
+# stains on the walls.
 
 # %%
 k = 2
 camera, image = scene.cameras[test[k]], scene.image(test[k])
 test_maps = FeatureFolder(features, [scene.stem(i) for i in test])
 latents = feature_colors(field)(field.render(camera).map)
-row = [image, latents, as_colors(field.feature_map(camera), camera.size), as_colors(test_maps[k], camera.size)]
-Image.fromarray(viz.picture_grid([row], ("photograph", "9 latents", "decoded to 512", "teacher's 512")))
+row = [image, latents, as_colors(field.feature_map(camera)), as_colors(test_maps[k])]
+Image.fromarray(viz.picture_grid([row], ("photograph", "9 latents", "decoded to 512", "teacher's 512"), width=256))
 
 # %% [markdown]
 # Each pixel takes the class of its codeword (Sec. 3.4). All unseen views at once, then some of them beside the truth and

@@ -70,8 +70,9 @@ for name, selection in found.items():
 
 # %% [markdown]
 # The scores from a viewpoint of no picture, each on its own scale: bright is "chair". With other classes to be told from,
-# everything else goes dark; with views, so do the fringes along the borders. (`negatives="canonical"` tells from "object",
-# "things" and the like, where the table of words holds them.)
+# everything else goes dark. Faint seams stay along other things' borders, where latents blend; views make them only a little
+# fainter. What views change are single Gaussians, which a picture blends away: see the counts above. (`negatives="canonical"`
+# tells from "object", "things" and the like, where the table of words holds them.)
 
 # %%
 camera = scene.cameras[scene.views("test")[0]]
