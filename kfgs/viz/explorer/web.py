@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from ..._check import check_whole, error_line
+from ..headless import has_display
 from .web_guard import is_loopback, make_guard
 from .web_page import ExplorerPage
 
@@ -57,7 +58,7 @@ def serve(
         host: address to listen on. Any other than this machine's own lets everyone who reaches it and has the link look,
             and save pictures and selections here; nothing on the way is encrypted.
         port: of the page; 0: a free one.
-        open_browser: open the link in the default browser.
+        open_browser: open the link in the default browser, where there is a display.
         say: told the link, line by line; None: lines on standard error.
 
     Raises:
@@ -84,7 +85,7 @@ async def _serve(explorer: Explorer, host: str, port: int, open_browser: bool, s
                 f"selections into {explorer.options.out}; nothing on the way is encrypted"
             )
         say("Ctrl-C ends it; closing the tab does not")
-        if open_browser:
+        if open_browser and has_display():  # without one, Python would open a browser within the terminal
             webbrowser.open(listening.url)
         await listening.ended()
 
