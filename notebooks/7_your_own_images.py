@@ -221,14 +221,13 @@ for plant in plants:
 # %% [markdown]
 # ## Look
 #
-# The scores of all Gaussians and a box around each answer, from the camera that sees the largest of them best.
+# The scores of all Gaussians (yellow is 1) and a box around each answer, from the camera that sees the largest best.
 
 # %%
 best = plants[0].best_view.index if plants else 0
 camera, boxes = cameras[best], [plant.box for plant in plants]
 plotter = viz.make_plotter(2 * camera.height, 2 * camera.width, off_screen=True)
-cloud = viz.add_cloud(plotter, semantic.gaussians, color_by=found.scores, style="gaussians", clim=(0, 1))
-viz.add_scalar_bar(plotter, cloud, "relevancy")
+viz.add_cloud(plotter, semantic.gaussians, color_by=found.scores, style="gaussians", clim=(0, 1))
 if boxes:
     viz.add_boxes(plotter, boxes)
     viz.add_names(plotter, boxes, [f"plant {n}" for n in range(1, len(boxes) + 1)], up=tuple(up.tolist()))

@@ -27,6 +27,7 @@ MATCHED, AMBIGUOUS, ORPHANED = 0, 1, 2
 STATE_NAMES = ("matched", "ambiguous", "orphaned")
 STATE_COLORS = (1, 5, 7)  # in `PALETTE`: sky blue, which recedes, vermillion and deep blue; far apart for every eye
 BINS = 80
+CLOSEST = 100  # times smaller than the median: what is closer still makes no axis longer
 
 
 class Matches(NamedTuple):
@@ -156,8 +157,8 @@ def plot_distances(
 ) -> None:
     """Draw how far destinations are from their sources, with lambda marked, on a logarithmic axis.
 
-    To see what lies beyond lambda too, pass the distances of a transfer with a larger one. Distances of 0 are drawn in
-    the lowest bin.
+    To see what lies beyond lambda too, pass the distances of a transfer with a larger one. Distances of 0, and below a
+    hundredth of the median, are drawn in the lowest bin.
 
     Args:
         distances: `Transfer.distances`.
@@ -177,7 +178,8 @@ def plot_distances(
         )
     found = values[np.isfinite(values)].astype(np.float64)
     positive = found[found > 0]
-    low = min(float(np.percentile(positive, 0.5)) if positive.size else distance, distance / 10)
+    nearest = max(float(positive.min()), float(np.median(positive)) / CLOSEST) if positive.size else distance
+    low = min(nearest, distance / 10)
     high = max(float(found.max()) if found.size else distance, 2 * distance)
     edges = np.geomspace(low, high * (1 + 1e-9), BINS + 1)
     counts, _ = np.histogram(np.clip(found, low, high), edges)
