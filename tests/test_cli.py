@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from PIL import Image
 from small_room import make_room
 
 from kfgs.cli import main
@@ -179,3 +180,21 @@ def test_help_is_quick_to_ask_for_and_names_every_command():
     for command in ("demo", "sfm", "fit", "segment", "label", "info"):
         assert command in done.stdout
     assert done.stdout.strip().endswith("False")  # no heavy import for a help text
+
+
+def test_a_scene_without_points_is_told_before_features_are_asked_for(room, tmp_path, capsys):
+    (tmp_path / "images").mkdir()
+    frames = []
+    for number, picture in enumerate(sorted((room / "images").iterdir())[:2]):
+        shutil.copy(picture, tmp_path / "images")
+        pose = np.eye(4)
+        pose[0, 3] = number
+        frames.append({"file_path": f"images/{picture.name}", "transform_matrix": pose.tolist()})
+    lens = {"fl_x": 60.0, "fl_y": 60.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48}
+    with Image.open(picture) as opened:
+        lens |= {"w": opened.width, "h": opened.height}
+    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    assert main(["fit", str(tmp_path), "--out", str(tmp_path / "run")]) == 1
+    said = capsys.readouterr()
+    assert "note: no points: this transforms.json names no ply_file_path" in said.out
+    assert said.err.startswith("error: scene: expected sparse points to start from, got 0")

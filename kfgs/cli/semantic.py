@@ -112,6 +112,7 @@ def fit(
     """
     from .._files import bytes_in_words
     from ..pipeline import fit_scene, write_training_pictures
+    from ..pipeline.train import check_scene
     from ..scenes import load_scene
     from ..teachers import RecomputedMaps, discard_maps
 
@@ -122,6 +123,7 @@ def fit(
     loaded = as_taken.undistorted()
     for note in loaded.notes:
         say(f"note: {note}")
+    check_scene(loaded)  # before hours of features
     if teacher is not None:
         for name, given in (("features", features), ("level", level)):
             check_alone(name, given, "beside --teacher, whose maps are not stored")

@@ -73,7 +73,7 @@ def explain_missing(folder: Path, stems: Sequence[str], missing: Sequence[str]) 
             f"{text}; make them with `kfgs features ... --split all --out {folder}` (or the split of these views), or leave "
             "them out of `stems`"
         )
-    text += " (or .npy)"
+    text += f" (or {missing[0]}.npy)"
     others = [stem for stem in list_maps(folder, deep=True) if stem not in set(stems)]
     if len(missing) == len(stems) and others:
         return (
