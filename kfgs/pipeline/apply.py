@@ -41,7 +41,14 @@ def save_label_map(path: Path, labels: Tensor) -> None:  # [H, W] int64
 
 
 def feature_colors(field: SemanticField) -> FeatureColors:
-    """One projection of this field's features to RGB, the same for every view of it."""
+    """One projection of this field's features to RGB, the same for every view of it, for `SemanticField.render(...).map`.
+
+    Of d latents it is fitted to those of the codewords, and of features near codewords to the codewords: stray Gaussians
+    do not shape it. A field without codebook has its Gaussians' features alone.
+
+    Raises:
+        ValueError: if these are not finite, or there are none.
+    """
     assert field.gaussians.features is not None
     if field.codebook is None:
         return FeatureColors.fit(field.gaussians.features)
