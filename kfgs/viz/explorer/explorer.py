@@ -293,7 +293,15 @@ class Explorer:
             self.plotter.render()  # nothing before the window is shown
 
     def _draw(self) -> None:
-        """Bring what is drawn up to the state."""
+        """Bring what is drawn up to the state, without a frame: pyvista draws one for each thing that is added."""
+        before = self.plotter.suppress_rendering
+        self.plotter.suppress_rendering = True
+        try:
+            self._exchange()
+        finally:
+            self.plotter.suppress_rendering = before
+
+    def _exchange(self) -> None:
         state, picked = self.state, self.state.picked
         for side, pane in zip(state.sides, self.panes, strict=True):
             selected = None if state.asked is None else state.selected(side)

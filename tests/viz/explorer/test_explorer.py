@@ -344,6 +344,22 @@ def test_while_the_view_turns_points_keep_the_selection_before_the_rest(explorer
     np.testing.assert_array_equal(explorer.screenshot(), still)
 
 
+def test_a_verb_draws_no_frame_before_somebody_looks(explorer):
+    frames = []
+    window = explorer.plotter.render_window
+    explorer.screenshot()
+    tag = window.AddObserver("StartEvent", lambda *_: frames.append(1))
+    for style in ("points", "gaussians"):
+        explorer.set_style(style)
+        explorer.ask("chair")
+        explorer.set_show("score")
+        explorer.pick(180, 110)
+    assert not frames
+    explorer.screenshot()
+    window.RemoveObserver(tag)
+    assert len(frames) == 1
+
+
 def test_auto_draws_points_where_a_frame_is_slow(monkeypatch):
     from kfgs.viz.explorer import explorer as module
 
