@@ -72,3 +72,13 @@ def camera_of(plotter: pv.Plotter, subplot: tuple[int, int] = (0, 0), *, near: f
     x, y = view.GetWindowCenter()
     K = [[fx, 0.0, (1 - x) * width / 2], [0.0, fy, (1 + y) * height / 2], [0.0, 0.0, 1.0]]
     return Camera(torch.from_numpy(E), torch.tensor(K, dtype=torch.float64), width, height, near=near)
+
+
+def fitted(camera: Camera, height: int, width: int) -> Camera:
+    """A camera in whose picture lies all of another's, in the middle and undistorted."""
+    scale = min(height / camera.height, width / camera.width)
+    K = camera.K.detach().double().cpu().clone()
+    K[:2] *= scale
+    K[0, 2] += (width - scale * camera.width) / 2
+    K[1, 2] += (height - scale * camera.height) / 2
+    return Camera(camera.viewmat.detach().double().cpu(), K, width, height, camera.name, camera.distortion, camera.near)

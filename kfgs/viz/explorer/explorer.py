@@ -21,7 +21,7 @@ from ...labels import class_indices
 from ..headless import make_plotter
 from ..linked import look_over
 from ..pictures import save_picture
-from ..through import camera_of, look_through
+from ..through import camera_of, fitted, look_through
 from ..turntable import estimate_up
 from .drawing import Drawn, Pane
 from .exploration import Exploration, Show
@@ -212,7 +212,7 @@ class Explorer:
         """
         width, height = self.panes[0].renderer.GetSize()
         self.plotter.subplot(0, 0)
-        look_through(self.plotter, _fitted(camera, height, width))
+        look_through(self.plotter, fitted(camera, height, width))
         if np.isclose(float(camera.K[0, 0]), float(camera.K[1, 1]), rtol=1e-6):
             self.plotter.camera.SetUseExplicitAspectRatio(False)  # the window may be resized
         self._moved()
@@ -351,13 +351,3 @@ class Explorer:
         taken = {path.stem for path in self.options.out.glob(f"{stem}_*")}
         number = next(i for i in range(1, len(taken) + 2) if f"{stem}_{i:03d}" not in taken)
         return self.options.out / f"{stem}_{number:03d}{suffix}"
-
-
-def _fitted(camera: Camera, height: int, width: int) -> Camera:
-    """A camera in whose picture lies all of another's, in the middle and undistorted."""
-    scale = min(height / camera.height, width / camera.width)
-    K = camera.K.detach().double().cpu().clone()
-    K[:2] *= scale
-    K[0, 2] += (width - scale * camera.width) / 2
-    K[1, 2] += (height - scale * camera.height) / 2
-    return Camera(camera.viewmat.detach().double().cpu(), K, width, height, camera.name, camera.distortion, camera.near)
