@@ -11,6 +11,7 @@ from small_room import CONFIG, make_room
 
 import kfgs
 from kfgs import load_label_set, read_splats
+from kfgs.viz import available
 
 README = Path(kfgs.__file__).parents[1] / "README.md"
 
@@ -34,7 +35,7 @@ def desk(tmp_path_factory):
 
 def test_examples_run_one_after_the_other(examples, desk, monkeypatch):
     monkeypatch.chdir(desk)
-    _, fitting, editing = examples
+    _, fitting, editing, looking = examples
     assert fitting.count("FitConfig.cpu()") == 1
     known = {"SHORT": CONFIG, "other_points": read_splats("my.spz").gaussians.means}
     exec(fitting.replace("FitConfig.cpu()", "SHORT"), known)
@@ -46,6 +47,13 @@ def test_examples_run_one_after_the_other(examples, desk, monkeypatch):
     chairs = before.gaussians.labels == before.classes.index("chair")
     assert 0 < int(chairs.sum()) == len(before) - len(after)
     assert len(kfgs.EditList.load("edits.json")) == 1
+    if not available():
+        pytest.skip("nothing can be drawn here")
+    exec(looking, known)
+    with known["view"] as view:
+        assert view.state.distance == 0.05
+        assert view.state.selected("semantic").any()
+    assert Path("chair.png").stat().st_size > 10_000
 
 
 def test_the_example_of_a_teacher_runs_with_a_tiny_lseg(examples, tmp_path, monkeypatch):

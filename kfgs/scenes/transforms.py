@@ -303,7 +303,9 @@ def _points(reader: _Reader, top: dict[str, Any]) -> tuple[Tensor, Tensor, list[
     nothing = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)
     listed = top.get("ply_file_path")
     if listed is None:
-        return *nothing, ["no points: this transforms.json names no ply_file_path; a field needs some to start from (`kfgs sfm` finds them)"]
+        return *nothing, [
+            "no points: this transforms.json names no ply_file_path; a field needs some to start from (`kfgs sfm` finds them)"
+        ]
     file = reader.root / listed if isinstance(listed, str) and "\0" not in listed else None
     if file is None or not _normal(file).is_relative_to(_normal(reader.root)) or not _is_file(file):
         return *nothing, [f"no points: ply_file_path {listed!r:.200} is no file inside {reader.root}"]

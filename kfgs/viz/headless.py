@@ -8,7 +8,7 @@ import subprocess
 import sys
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from .._check import check_range
+from .._check import check_whole
 from ..splat.engines import available_engines
 
 if TYPE_CHECKING:
@@ -109,8 +109,8 @@ def make_plotter(
         RuntimeError: if nothing can be drawn here; the message names the packages to install.
         ValueError: if a size is not positive.
     """
-    check_range("height", height, 1)
-    check_range("width", width, 1)
+    check_whole("height", height, 1)
+    check_whole("width", width, 1)
     hidden = not has_display() if off_screen is None else off_screen
     prepare()
     require()

@@ -39,14 +39,9 @@ class Matches(NamedTuple):
 
 
 def match_states(transfer: Transfer) -> Array:  # [N] int64
-    """What became of each destination: 0 matched, 1 ambiguous (labelled, but its sources disagree), 2 orphaned (no label).
-
-    Sources disagree where the label's share among those looked at is below 1. With "vote" and "mahalanobis" a share may
-    round to 1 although a source of next to no weight has another label, which `transfer.ambiguous` counts.
-    """
+    """What became of each destination: 0 matched, 1 ambiguous (labelled, but its sources disagree), 2 orphaned (no label)."""
     labelled = _numpy(transfer.labels) >= 0
-    disagree = labelled & (_numpy(transfer.shares) < 1)
-    return np.where(labelled, np.where(disagree, AMBIGUOUS, MATCHED), ORPHANED)
+    return np.where(labelled, np.where(_numpy(transfer.disagree), AMBIGUOUS, MATCHED), ORPHANED)
 
 
 def add_matches(

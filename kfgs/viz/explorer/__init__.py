@@ -3,9 +3,10 @@
 from .desktop import open_window
 from .exploration import Exploration, Show
 from .explore import explore
-from .explorer import ExploreOptions, Explorer
+from .explorer import Explorer
 from .meaning import Asked, FieldMeaning, Meaning, SplatMeaning
 from .notebook import show_in_notebook
+from .options import ExploreOptions
 from .pick import Sight, gaussian_at, neighbours_of, views_seeing
 from .picked import Picked, Side
 from .web import serve

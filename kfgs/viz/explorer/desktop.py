@@ -89,6 +89,7 @@ class Desktop:
         # while a cloud turns, events reach the interactor's style alone
         explorer.plotter.iren.add_observer("LeftButtonReleaseEvent", self._on_cloud_release)
         explorer.listen(self._on_change)
+        explorer.set_legend(False)  # the panel lists the classes itself
 
     def leave(self) -> None:
         """Close the window and let the explorer draw off-screen, as large as before, without the panel."""
@@ -102,6 +103,7 @@ class Desktop:
         plotter.render_window.SetUseOffScreenBuffers(True)
         plotter.off_screen = True
         self.pane.remove()
+        self.explorer.set_legend(True)
 
     def view(self) -> PanelView:
         """What the panel has to say now."""

@@ -15,9 +15,10 @@ from ...labels import LabelSet
 from ..headless import has_display
 from .desktop import open_window
 from .exploration import Exploration
-from .explorer import ExploreOptions, Explorer
+from .explorer import Explorer
 from .meaning import FieldMeaning, Meaning, SplatMeaning
 from .notebook import in_notebook, show_in_notebook
+from .options import ExploreOptions
 from .web import require_web, serve
 
 if TYPE_CHECKING:
@@ -63,10 +64,6 @@ def explore(
         ValueError: if there is nothing to look at, or arguments contradict each other.
         ImportError: if `browser` or `notebook` is asked for and the extra `web` is missing.
         RuntimeError: if nothing can be drawn here, or a window is asked for and there is no display.
-
-    Example:
-        >>> view = explore(field, read_splats("color.ply"), classes=classes, cameras=views)  # doctest: +SKIP
-        >>> view.ask("chair").selection  # doctest: +SKIP
     """
     check_choice("where", where, get_args(Where))
     place = find_place() if where == "auto" else where
@@ -98,7 +95,9 @@ def meaning_of(
     if isinstance(source, SplatFile):
         for name, given in (("classes", classes), ("embed", embed)):
             if given is not None:
-                raise ValueError(f"{name}: expected none beside a splat, which has its own classes, got one; leave it out")
+                raise ValueError(
+                    f"{name}: expected none beside a splat, which has its own classes, got one; leave it out"
+                )
         return SplatMeaning(source)
     if classes is None:
         raise ValueError(

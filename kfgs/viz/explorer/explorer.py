@@ -5,16 +5,15 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter, process_time
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import torch
 from PIL import Image
 
-from ..._check import check_choice, check_range, check_whole
+from ..._check import check_choice
 from ...cameras import Camera
 from ...cameras.camera import NEAR
 from ...labels import class_indices
@@ -26,6 +25,7 @@ from ..turntable import estimate_up
 from .drawing import Drawn, Pane
 from .exploration import Exploration, Show
 from .meaning import Asked
+from .options import ExploreOptions, Style
 from .pick import gaussian_at
 from .picked import Picked, Side
 
@@ -33,38 +33,12 @@ if TYPE_CHECKING:
     import pyvista as pv
 
 Array = np.ndarray[Any, Any]
-Style = Literal["auto", "gaussians", "points"]
 
 NAMES: dict[Side, str] = {"semantic": "semantic field", "color": "colour field"}
 WORDS: dict[Show, str] = {"labels": "classes", "rgb": "colours", "score": "scores", "latents": "latents"}
 SLOW = 1.0  # seconds a frame from which "auto" draws points: a slider that follows later feels broken
 SURE = 150_000  # Gaussians that "auto" draws without looking at the clock: half a second in software
 HIGHLIGHT = np.array((255, 120, 0))  # lies over a selection in its own colours, or a white sofa fades into the paper
-
-
-@dataclass(frozen=True)
-class ExploreOptions:
-    """How the explorer draws, and where it saves."""
-
-    height: int = 600
-    """Of the window, pixels."""
-    width: int = 1200
-    """Of the window with both panes, pixels; of one pane alone, half of it."""
-    style: Style = "auto"
-    """`gaussians` (what kfgs's own rasteriser draws), `points`, or `auto`: points where a frame takes over 1 s."""
-    rest: float = 0.04
-    """Factor on the opacity of what is not selected, in [0, 1)."""
-    background: str = "white"
-    """A colour that pyvista knows."""
-    out: Path = Path("kfgs_view")
-    """A folder for pictures and selections."""
-
-    def __post_init__(self) -> None:
-        check_whole("height", self.height, 1)
-        check_whole("width", self.width, 2)
-        check_choice("style", self.style, get_args(Style))
-        check_range("rest", self.rest, 0, 1, closed=(True, False))
-        object.__setattr__(self, "out", Path(self.out))
 
 
 class Explorer:
@@ -87,7 +61,7 @@ class Explorer:
     def __init__(
         self,
         exploration: Exploration,
-        options: ExploreOptions = ExploreOptions(),
+        options: ExploreOptions = ExploreOptions(),  # noqa: B008  frozen
         *,
         camera: Camera | None = None,
         off_screen: bool | None = None,
@@ -96,7 +70,7 @@ class Explorer:
         self._camera = camera or next(iter(exploration.cameras), None)
         self._near = NEAR if self._camera is None else self._camera.near
         self._listeners: list[Callable[[], None]] = []
-        self._closed, self._began, self._auto = False, (0.0, 0.0), options.style == "auto"
+        self._closed, self._listed, self._began, self._auto = False, True, (0.0, 0.0), options.style == "auto"
         count = len(exploration.sides)
         self.plotter: pv.Plotter = make_plotter(
             options.height, options.width * count // 2, shape=(1, count), off_screen=off_screen,
@@ -221,17 +195,22 @@ class Explorer:
         """Look from where the first view was."""
         if self._camera is not None:
             self.look_from(self._camera)
-            return
-        self.plotter.subplot(0, 0)
-        self.plotter.camera.SetUseExplicitAspectRatio(False)
-        self.plotter.camera.SetWindowCenter(0, 0)
-        look_over(self.plotter, self.state.cloud("semantic"), self._up())
-        self._moved()
+        else:
+            self.plotter.subplot(0, 0)
+            self.plotter.camera.SetUseExplicitAspectRatio(False)
+            self.plotter.camera.SetWindowCenter(0, 0)
+            look_over(self.plotter, self.state.cloud("semantic"), self._up())
+            self._moved()
 
     def screenshot(self, path: str | Path | None = None) -> Array:  # [H, W, 3] uint8
         """The picture of now; with a path also as a PNG file."""
-        self.plotter.render()  # pyvista's pictures are of the last frame
-        picture: Array = np.array(self.plotter.screenshot(return_img=True))[..., :3]
+        listed = self._listed
+        self.set_legend(True)
+        try:
+            self.plotter.render()  # pyvista's pictures are of the last frame
+            picture: Array = np.array(self.plotter.screenshot(return_img=True))[..., :3]
+        finally:
+            self.set_legend(listed)
         if path is not None:
             save_picture(path, picture)
         return picture
@@ -254,6 +233,12 @@ class Explorer:
         """What there is to say, for a person: the question, gamma, lambda, counts, what is picked."""
         picked = self.state.picked
         return self.state.lines() + ([] if picked is None else picked.lines())
+
+    def set_legend(self, shown: bool) -> None:
+        """List the classes in the panes, or not: a window or page that lists them itself. Pictures always do."""
+        if shown != self._listed:
+            self._listed = shown
+            self._draw()
 
     def listen(self, callback: Callable[[], None]) -> None:
         """Have a function called after each change."""
@@ -278,19 +263,19 @@ class Explorer:
 
     def _changed(self) -> None:
         self._draw()
-        self._render()
-        for callback in self._listeners:
-            callback()
+        self._tell()
 
     def _moved(self) -> None:
         for pane in self.panes:
             pane.renderer.camera_set = True  # or the first render would move it to see everything
             pane.renderer.ResetCameraClippingRange()
-        self._render()
+        self._tell()
 
-    def _render(self) -> None:
+    def _tell(self) -> None:
         if not self.plotter.off_screen:  # there a frame is drawn when somebody wants to see one
             self.plotter.render()  # nothing before the window is shown
+        for callback in self._listeners:
+            callback()
 
     def _draw(self) -> None:
         """Bring what is drawn up to the state, without a frame: pyvista draws one for each thing that is added."""
@@ -311,7 +296,7 @@ class Explorer:
             pane.draw(self._style, colors, state.drawn(side), selected, self.options.rest)
             pane.mark(None if picked is None else picked.position)
             words = "" if state.asked is None else f"{state.asked.words!r}, "
-            labels = self._present() if state.show == "labels" and pane is self.panes[0] else []
+            labels = self._present() if self._listed and state.show == "labels" and pane is self.panes[0] else []
             clim = state.clim if state.show == "score" and pane is self.panes[-1] else None
             pane.say(f"{NAMES[side]}: {words}{WORDS[state.show]}", labels, state.meaning.names, clim)
 

@@ -45,9 +45,9 @@ def lines_of(state: Exploration) -> list[str]:
     for side in state.sides:
         total, chosen = len(state.cloud(side)), ""
         if state.asked is not None:
-            chosen = f"{int(state.selected(side).sum())} of "
-        lines.append(f"{side}: {chosen}{total} Gaussians")
+            chosen = f"{int(state.selected(side).sum()):,} of "
+        lines.append(f"{side}: {chosen}{total:,} Gaussians")
     if "color" in state.sides:
         orphaned = int((state.labels("color") < 0).sum())
-        lines.append(f"lambda {state.distance:.3g} ({state.distance_how}), {orphaned} out of reach")
+        lines.append(f"lambda {state.distance:.3g} ({state.distance_how}), {orphaned:,} out of reach")
     return lines

@@ -134,6 +134,7 @@ class Listening:
             raise _refused(self._host, self._port, task.exception())
         self._tasks = [task, asyncio.ensure_future(self.page.work())]
         self._quiet.enter_context(_closed_tabs())
+        self._explorer.set_legend(False)  # the page lists the classes itself
         return self
 
     @property
@@ -148,6 +149,7 @@ class Listening:
         await asyncio.wait(self._tasks[:1])  # a plain await would hand a cancellation on to wslink, which stumbles
 
     async def __aexit__(self, *_: object) -> None:
+        self._explorer.set_legend(True)
         serving, work = self._tasks
         work.cancel()
         await asyncio.wait([work])

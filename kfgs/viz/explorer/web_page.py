@@ -204,7 +204,7 @@ class ExplorerPage:
 
     def _fill(self) -> None:
         """What does not change, and first values of what does."""
-        from .explorer import Style
+        from .options import Style
 
         state = self.explorer.state
         self.server.state.update({

@@ -9,9 +9,9 @@ import torch
 from cases_explorer import NAMES, cloud, splat_file
 
 from kfgs.viz import available, headless
+from kfgs.viz.explorer import ExploreOptions, Explorer
 from kfgs.viz.explorer.desktop import Desktop, open_window
 from kfgs.viz.explorer.exploration import Exploration
-from kfgs.viz.explorer.explorer import ExploreOptions, Explorer
 from kfgs.viz.explorer.meaning import SplatMeaning
 from kfgs.viz.explorer.panel import WIDTH
 

@@ -10,9 +10,8 @@ from kfgs.cameras import Distortion
 from kfgs.formats import SplatFile
 from kfgs.splat.rasterize import rasterize
 from kfgs.viz import available, gaussian_actor, headless, legend_column, palette
-from kfgs.viz.explorer import drawing
+from kfgs.viz.explorer import ExploreOptions, Explorer, drawing
 from kfgs.viz.explorer.exploration import Exploration
-from kfgs.viz.explorer.explorer import ExploreOptions, Explorer
 from kfgs.viz.explorer.meaning import SplatMeaning
 from kfgs.viz.legends import bar_picture
 
