@@ -162,6 +162,8 @@ class Explorer:
     def pick(self, x: float, y: float) -> Picked | None:
         """Point at what is seen at a place of the window; None (and no mark) where that is the background.
 
+        What is clearly seen comes first; where nothing of it is, the faint rest answers.
+
         Args:
             x: pixels from the window's left edge.
             y: pixels from its top.
@@ -171,8 +173,11 @@ class Explorer:
             place = pane.within(x, y)
             if place is not None:
                 camera = camera_of(self.plotter, (0, pane.column), near=self._near)
-                index = gaussian_at(pane.cloud, camera, *place, torch.from_numpy(pane.visible))
-                picked = None if index is None else self.state.pick(side, index)
+                for mask in (pane.visible, self.state.drawn(side)):
+                    index = gaussian_at(pane.cloud, camera, *place, torch.from_numpy(mask))
+                    if index is not None:
+                        picked = self.state.pick(side, index)
+                        break
         if picked is None:
             self.state.drop_pick()
         self._changed()

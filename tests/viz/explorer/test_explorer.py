@@ -10,7 +10,7 @@ from kfgs.cameras import Distortion
 from kfgs.formats import SplatFile
 from kfgs.splat.rasterize import rasterize
 from kfgs.viz import available, gaussian_actor, headless, legend_column, palette
-from kfgs.viz.explorer import ExploreOptions, Explorer, drawing
+from kfgs.viz.explorer import ExploreOptions, Explorer, drawing, gaussian_at
 from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.meaning import SplatMeaning
 from kfgs.viz.legends import bar_picture
@@ -214,14 +214,22 @@ def test_a_click_picks_what_is_seen_there(explorer, side):
             assert (picked.side, picked.index) == (side, int(weights[row, column].argmax()))
 
 
-def test_faint_and_hidden_gaussians_are_not_picked(explorer):
+def test_what_is_clearly_seen_is_picked_first_and_hidden_gaussians_never(explorer):
     explorer.ask("chair")
-    labels = explorer.state.labels("semantic")
-    places = [(x, y) for x in range(80, 300, 55) for y in range(60, 200, 45)]
-    found = [explorer.pick(x, y) for x, y in places]
-    assert {labels[one.index] for one in found if one is not None} == {1}
-    explorer.set_hidden(["chair"])
-    assert [explorer.pick(x, y) for x, y in places] == [None] * len(places)
+    cloud, labels = explorer.state.cloud("semantic"), explorer.state.labels("semantic")
+    camera = some_camera().resized(240, 320).to(torch.float32)
+    chairs = torch.from_numpy(explorer.state.selected("semantic"))
+    faint = 0
+    for x, y in [(x, y) for x in range(80, 300, 55) for y in range(60, 200, 45)]:
+        clear, any_ = gaussian_at(cloud, camera, x, y, chairs), gaussian_at(cloud, camera, x, y)
+        picked = explorer.pick(x, y)
+        assert (None if picked is None else picked.index) == (any_ if clear is None else clear)
+        faint += clear is None and any_ is not None
+        explorer.set_hidden(["chair"])
+        picked = explorer.pick(x, y)
+        assert picked is None or labels[picked.index] != 1
+        explorer.set_hidden([])
+    assert faint > 0
 
 
 def test_what_is_picked_has_a_ring_in_both_panes(explorer):
