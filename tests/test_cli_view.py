@@ -144,3 +144,12 @@ def test_wrong_input_is_told(files, tmp_path, capsys, arguments, message):
     assert message in said
     assert said.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_interrupted_it_does_not_promise_to_go_on(files, monkeypatch, capsys):
+    def interrupt():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(headless, "probe", interrupt)
+    assert main(["view", str(files / "field"), "--where", "picture"]) == 130
+    assert capsys.readouterr().err == "interrupted\n"

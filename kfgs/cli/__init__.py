@@ -2,7 +2,7 @@
 select | edit | convert | view`.
 
 Every command names the files it wrote, shows progress on long work, and ends with 0 (done), 1 (bad input, with one
-message that says what to do), 2 (wrong usage), 130 (interrupted; the same command goes on where it stopped) or 141
+message that says what to do), 2 (wrong usage), 130 (interrupted; demo, features, fit and color go on where they stopped) or 141
 (nobody reads its lines any more).
 """
 
@@ -42,6 +42,7 @@ COMMANDS: dict[str, Any] = {
         view,
     )
 }
+RESUMED = {"demo", "features", "fit", "color"}  # commands that find what they did before
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -58,7 +59,9 @@ def main(arguments: list[str] | None = None) -> int:
                 args=arguments,
             )
     except KeyboardInterrupt:
-        print("interrupted; the same command goes on where it stopped", file=sys.stderr)  # noqa: T201
+        given = sys.argv[1:] if arguments is None else arguments
+        goes_on = "; the same command goes on where it stopped" if RESUMED.intersection(given[:1]) else ""
+        print(f"interrupted{goes_on}", file=sys.stderr)  # noqa: T201
         return 130
     except BrokenPipeError:  # whoever read our lines has gone, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter complains when it ends
