@@ -68,7 +68,7 @@ def test_a_question_lights_up_on_both_sides(room, files, tmp_path, capsys):
     said = drawn([files / "field", *words, "--ask", name, "--where", "picture", "--out", tmp_path / "out"], capsys)
     n, total = count(room, truth, name), len(truth)
     assert f"semantic: {n} of {total} Gaussians" in said.replace(",", "")
-    assert f"color: {n} of {total} Gaussians" in said.replace(",", "")  # every colour Gaussian lies on its source
+    assert f"colour: {n} of {total} Gaussians" in said.replace(",", "")  # every colour Gaussian lies on its source
     picture = np.asarray(Image.open(tmp_path / "out" / "view.png").convert("RGB")).astype(int)
     color = palette(truth.mode().values[None])[0].astype(int)
     near = np.abs(picture - color).max(axis=2) < 12

@@ -174,7 +174,7 @@ def _legend(labels: Tensor | Array | None, names: Sequence[str] | None) -> str:
     lines = []
     for label in present:
         red, green, blue = (int(v) for v in palette(np.array(label)))
-        name = html.escape("none" if label < 0 else names[label])
+        name = html.escape("no class" if label < 0 else names[label])
         lines.append(f'<div><span style="{SWATCH}({red},{green},{blue})"></span>{name}</div>')
     return "\n".join(lines)
 

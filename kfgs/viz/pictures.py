@@ -102,7 +102,7 @@ def _draw_legend(
     x, y, right, bottom, left = gap, gap, gap, gap, gap
     places: list[tuple[int, int, int, str]] = []
     for label in present:
-        text = "none" if label < 0 else names[label]
+        text = "no class" if label < 0 else names[label]
         length = size + gap + round(font.getlength(text)) + 2 * gap
         if places and width is None and height is not None and y + line + gap // 2 > height:
             left, y = right, gap

@@ -89,7 +89,7 @@ def plot_confusion(
     figure = _figure(side + 0.8, side)
     axes = figure.add_subplot()
     image = axes.imshow(share, cmap="cividis", vmin=0, vmax=100)  # cividis reads the same for colour-blind eyes
-    axes.set_xticks(range(share.shape[1]), [*labels, "none"][: share.shape[1]], rotation=90)
+    axes.set_xticks(range(share.shape[1]), [*labels, "no class"][: share.shape[1]], rotation=90)
     axes.set_yticks(range(len(kept)), labels)
     axes.set(xlabel="predicted class", ylabel="true class", title="Confusion (% of the true class)")
     for (i, j), value in np.ndenumerate(share):

@@ -226,4 +226,4 @@ def _words(words: Sequence[tuple[int, float]], names: Sequence[str]) -> str:
 
 
 def _name(label: int, names: Sequence[str]) -> str:
-    return "none" if label < 0 else names[label]
+    return "no class" if label < 0 else names[label]

@@ -118,7 +118,12 @@ def test_the_box_holds_legend_and_note_and_nothing_that_is_read_as_html():
     box = json.loads(text)
     assert 'id="kfgs"' in box
     assert "5 Gaussians &lt; 6" in box
-    for name, label, there in (("&lt;b&gt;sofa", 1, True), ("lamp", 3, True), ("none", -1, True), ("wall", 0, False)):
+    for name, label, there in (
+        ("&lt;b&gt;sofa", 1, True),
+        ("lamp", 3, True),
+        ("no class", -1, True),
+        ("wall", 0, False),
+    ):
         red, green, blue = palette(np.array(label))
         assert (f"rgb({red},{green},{blue})" in box) == there
         assert (f">{name}<" in box.replace("</span>", ">")) == there

@@ -76,7 +76,7 @@ def test_misses_are_a_last_column_and_count_in_their_row(tmp_path, figures):
     plot_confusion(matrix, ["wall", "rug", "lamp"], tmp_path / "a.png", misses=misses)
     axes = figures[0].axes[0]
     np.testing.assert_allclose(axes.images[0].get_array(), [[37.5, 12.5, 0, 50], [0, 0, 0, 0], [0, 0, 0, 100]])
-    assert [tick.get_text() for tick in axes.get_xticklabels()] == ["wall", "rug", "lamp", "none"]
+    assert [tick.get_text() for tick in axes.get_xticklabels()] == ["wall", "rug", "lamp", "no class"]
     plot_confusion(matrix, ["wall", "rug", "lamp"], tmp_path / "b.png", misses=torch.zeros(3))
     assert figures[1].axes[0].images[0].get_array().shape == (2, 2)
 

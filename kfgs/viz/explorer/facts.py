@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .picked import SPOKEN
+
 if TYPE_CHECKING:
     from .exploration import Exploration
 
@@ -46,7 +48,7 @@ def lines_of(state: Exploration) -> list[str]:
         total, chosen = len(state.cloud(side)), ""
         if state.asked is not None:
             chosen = f"{int(state.selected(side).sum()):,} of "
-        lines.append(f"{side}: {chosen}{total:,} Gaussians")
+        lines.append(f"{SPOKEN[side]}: {chosen}{total:,} Gaussians")
     if "color" in state.sides:
         orphaned = int((state.labels("color") < 0).sum())
         lines.append(f"lambda {state.distance:.3g} ({state.distance_how}), {orphaned:,} out of reach")

@@ -14,6 +14,7 @@ from .meaning import Asked, Meaning
 from .pick import Sight, neighbours_of, views_seeing
 
 Side = Literal["semantic", "color"]
+SPOKEN: dict[Side, str] = {"semantic": "semantic", "color": "colour"}
 SHOWN = 4  # views and neighbours named in a line
 NEIGHBOURS = 8
 MOST_VIEWS = 30  # asked who sees a Gaussian: 0.2 s among 600,000
@@ -40,7 +41,7 @@ class Picked:
         place = ", ".join(f"{x:.3f}" for x in self.position)
         score = "" if self.score is None else f", score {self.score:.3f}"
         lines = [
-            f"{self.side} Gaussian {self.index}: {self.name or 'no class'}{score}",
+            f"{SPOKEN[self.side]} Gaussian {self.index}: {self.name or 'no class'}{score}",
             f"at ({place}), opacity {self.opacity:.2f}",
         ]
         if self.source is not None:
@@ -48,7 +49,7 @@ class Picked:
             reach = "" if self.label >= 0 else ": out of reach"
             lines.append(f"{said} semantic Gaussian {self.source}, {self.distance:.3g} away{reach}")
         if self.neighbours:
-            near = [f"{name or 'none'} {distance:.2g}" for _, distance, name in self.neighbours[:SHOWN]]
+            near = [f"{name or 'no class'} {distance:.2g}" for _, distance, name in self.neighbours[:SHOWN]]
             lines.append(f"near it: {', '.join(near)}")
         if self.views:
             seen = [f"{sight.name or sight.index} ({sight.weight:.0%})" for sight in self.views[:SHOWN]]

@@ -211,7 +211,7 @@ def test_asking_moving_lambda_and_picking(server, browser, tmp_path):
     set_slider(page, "distance", at)
     state.set_distance(low * (high / low) ** at)
     wait_lines(page, state)
-    assert f"color: {expected} of 450 Gaussians" in said_lines(page)
+    assert f"colour: {expected} of 450 Gaussians" in said_lines(page)
     assert float(page.input_value("input[aria-label^='lambda, a number']")) == pytest.approx(state.distance, rel=1e-3)
     until(page, lambda: near(clouds(page)[:, half:], 1).sum() < 0.9 * near(asked[:, half:], 1).sum())
     moved = clouds(page)
@@ -234,7 +234,7 @@ def test_asking_moving_lambda_and_picking(server, browser, tmp_path):
 def check_picked(page, state, side):
     """What the page says of the picked Gaussian is what the state says; returns its class."""
     lines = page.locator(".picked p").all_inner_texts()
-    index = int(re.match(rf"{side} Gaussian (\d+): ", lines[0]).group(1))
+    index = int(re.match(rf"{dict(color='colour').get(side, side)} Gaussian (\d+): ", lines[0]).group(1))
     picked = state.pick(side, index)
     assert lines == picked.lines()
     return picked.label
@@ -276,9 +276,9 @@ def test_a_second_tab_shows_the_same_and_picks_with_other_pixels(server, browser
     assert tables.any()
     until(second, lambda: near(clouds(second), cases_page.TABLE).any())
     click(second, where["color"][tables].mean(0))
-    first.wait_for_selector(".picked >> text=color Gaussian")
+    first.wait_for_selector(".picked >> text=colour Gaussian")
     assert check_picked(first, state, "color") == cases_page.TABLE
-    second.wait_for_selector(".picked >> text=color Gaussian")
+    second.wait_for_selector(".picked >> text=colour Gaussian")
     assert check_picked(second, state, "color") == cases_page.TABLE
     click(second, (5, clouds(second).shape[0] - 5))
     first.wait_for_selector("text=Nothing is drawn there")

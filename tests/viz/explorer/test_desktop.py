@@ -166,7 +166,7 @@ def test_the_lambda_slider_is_logarithmic(desktop):
     assert (state.labels("color") < 0).any()
     after = shot(desktop)
     assert changed(before, after) == (True, True)
-    aside = np.s_[:, CLOUDS // 4 : CLOUDS // 2 - 2]  # of the semantic side, right of the legend, which gains "none"
+    aside = np.s_[:, CLOUDS // 4 : CLOUDS // 2 - 2]  # of the semantic side, right of the legend, which gains "no class"
     assert np.array_equal(before[aside], after[aside])
     drag(desktop, "lambda", [0.0, 0.5])
     assert state.distance == pytest.approx((low * high) ** 0.5, rel=0.05)  # within a pixel of 270

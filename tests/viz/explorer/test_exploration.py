@@ -280,10 +280,10 @@ def test_a_picked_gaussian_says_what_is_known_of_it():
     assert picked.neighbours[:2] == [(1, 1.5, None), (0, 2.25, "chair")]
     assert made.pick("color", 0).views[0].name == "view_0"
     lines = picked.lines()
-    assert lines[0] == "color Gaussian 2: table, score 0.600"
+    assert lines[0] == "colour Gaussian 2: table, score 0.600"
     assert lines[1] == "at (2.500, 0.000, 5.000), opacity 0.90"
     assert lines[2] == "label from semantic Gaussian 1, 0.5 away"
-    assert lines[3].startswith("near it: none 1.5, chair 2.2")
+    assert lines[3].startswith("near it: no class 1.5, chair 2.2")
 
 
 def test_of_many_views_some_are_asked_who_sees_it(monkeypatch):
@@ -300,7 +300,7 @@ def test_a_pick_follows_the_question_and_lambda():
     assert made.picked.score is None  # nothing is known of how far the table is a chair
     made.set_distance(0.1)
     assert (made.picked.label, made.picked.name, made.picked.source) == (-1, None, 1)
-    assert made.picked.lines()[0] == "color Gaussian 2: no class"
+    assert made.picked.lines()[0] == "colour Gaussian 2: no class"
     assert made.picked.lines()[2] == "nearest labelled semantic Gaussian 1, 0.5 away: out of reach"
     made.pick("semantic", 0)
     assert made.picked.source is None
@@ -347,7 +347,7 @@ def test_facts_are_json_and_lines_say_them():
     assert made.lines() == [
         "'chair': score > 0 (all of the class)",
         "semantic: 1 of 3 Gaussians",
-        "color: 1 of 5 Gaussians",
+        "colour: 1 of 5 Gaussians",
         "lambda 1 (given), 3 out of reach",
     ]
     made.ask(None)
