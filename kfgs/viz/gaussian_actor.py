@@ -11,6 +11,7 @@ import numpy as np
 from ..cameras.camera import NEAR
 from ..splat.engines import ALPHA_MAX, ALPHA_MIN
 from ..splat.project import FIELD_OF_VIEW_MARGIN
+from .frusta import evenly
 from .meshes import draw_mesh
 from .stand_ins import FAINT
 
@@ -175,7 +176,7 @@ class _Frame:
         for kept, most, alpha in ((faint, MOVING_FAINT, FAINT_ALPHA), (clear, MOVING_POINTS, 1.0)):
             rows = np.flatnonzero(kept)
             if len(rows):
-                some = rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).round().astype(np.int64)]
+                some = rows[evenly(len(rows), most)]
                 self.stand_ins.append(_few_points(self.cloud, some, alpha))
                 self.renderer.AddActor(self.stand_ins[-1])
         self.actor.SetVisibility(not self.stand_ins)

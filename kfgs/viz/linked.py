@@ -15,6 +15,7 @@ from .clouds import Style, add_cloud
 from .headless import make_plotter
 from .legends import add_legend, letters
 from .through import look_through
+from .turntable import estimate_up
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -99,3 +100,11 @@ def look_over(plotter: pv.Plotter, gaussians: Gaussians, up: Sequence[float] = (
     for renderer in plotter.renderers:
         renderer.camera_set = True
         renderer.ResetCameraClippingRange()
+
+
+def upwards(cameras: Sequence[Camera]) -> list[float]:
+    """The world's up as cameras hold it (`estimate_up`); z where there are none, or they are not upright."""
+    try:
+        return [float(x) for x in estimate_up(cameras)]
+    except ValueError:
+        return [0.0, 0.0, 1.0]

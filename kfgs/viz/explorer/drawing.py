@@ -6,16 +6,21 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+import torch
 
+from ...cameras import Camera
 from ...cameras.camera import NEAR
 from ...gaussians import Gaussians
+from ...splat import ALPHA_MIN
 from ..clouds import CloudOptions, add_cloud, recolor_cloud
+from ..frusta import evenly
 from ..gaussian_actor import MOVING_POINTS, STILL
 from ..legends import add_legend, add_scalar_bar
 from ..linked import add_title
 from ..meshes import draw_mesh
 from ..stand_ins import FAINT
 from .mark import Mark
+from .pick import gaussian_at
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -42,6 +47,7 @@ class Pane:
         self.plotter, self.column, self.cloud, self.near = plotter, column, cloud, near
         self.renderer: Any = plotter.renderers[column]
         self.visible = np.ones(len(cloud), dtype=bool)  # [N] drawn and not faint
+        self.faint = ~self.visible  # [N] drawn, and faint
         self._opacities: Array = cloud.opacities.detach().cpu().numpy()
         self._means: Array = cloud.means.detach().cpu().numpy().astype(np.float32)
         self._gaussians: Any = None
@@ -68,12 +74,16 @@ class Pane:
             rest: factor on the opacity of the others.
         """
         strong = drawn if selected is None else drawn & selected
-        self.visible = strong if style == "gaussians" else strong & (self._opacities > FAINT["points"])
+        others = drawn & ~strong & (self._opacities * rest >= ALPHA_MIN)  # fainter ones are no part of a picture
         self.plotter.subplot(0, self.column)
         if style == "gaussians":
+            self.visible, self.faint = strong, others
             self._draw_gaussians(colors, strong, drawn, rest)
         else:
-            self._draw_points(colors, drawn & ~strong)
+            opaque = self._opacities > FAINT["points"]
+            self.visible, self.faint = strong & opaque, np.zeros_like(others)
+            self.faint[_some(np.flatnonzero(others & opaque), REST_POINTS)] = True
+            self._draw_points(colors)
         self._put(self._gaussians, style == "gaussians")
         for actor in self._points or ():
             self._put(actor, style == "points" and int(actor.mapper.dataset.field_data["shown"][0]) > 0)
@@ -109,6 +119,14 @@ class Pane:
         x, y = x - left, y - (self.plotter.render_window.GetSize()[1] - bottom - height)
         return (x, y) if 0 <= x < width and 0 <= y < height else None
 
+    def gaussian_at(self, camera: Camera, x: float, y: float) -> int | None:
+        """The Gaussian that is seen at a place of this subplot: one that is clearly seen, else one of the faint rest."""
+        for mask in (self.visible, self.visible | self.faint):
+            index = gaussian_at(self.cloud, camera, x, y, torch.from_numpy(mask))
+            if index is not None:
+                return index
+        return None
+
     def _put(self, actor: Any, there: bool) -> None:
         """In or out; a cloud's visibility is its own matter: points stand for it while the camera moves."""
         if actor is not None and bool(self.renderer.HasViewProp(actor)) != there:
@@ -121,10 +139,9 @@ class Pane:
         factor = np.where(strong, 1.0, np.where(drawn, rest, 0.0))
         recolor_cloud(self._gaussians, colors, np.clip(self._opacities * factor, 0, 1))
 
-    def _draw_points(self, colors: Array, faint: Array) -> None:
-        clear = np.flatnonzero(self.visible)
-        others = _evenly(np.flatnonzero(faint & (self._opacities > FAINT["points"])), REST_POINTS)
-        few = _evenly(clear, MOVING_POINTS) if len(clear) > MOVING_POINTS else clear[:0]
+    def _draw_points(self, colors: Array) -> None:
+        clear, others = np.flatnonzero(self.visible), np.flatnonzero(self.faint)
+        few = _some(clear, MOVING_POINTS) if len(clear) > MOVING_POINTS else clear[:0]
         parts = [self._part(rows, colors) for rows in (clear, others, few)]
         if self._points is not None:
             for actor, part in zip(self._points, parts, strict=True):
@@ -160,6 +177,6 @@ class Pane:
         return part
 
 
-def _evenly(rows: Array, most: int) -> Array:
+def _some(rows: Array, most: int) -> Array:
     """At most so many of some rows, evenly chosen."""
-    return rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).round().astype(np.int64)]
+    return rows[evenly(len(rows), most)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -12,7 +13,7 @@ import torch
 from ..._check import check_choice, check_range, check_whole
 from ...cameras import Camera
 from ...gaussians import Gaussians
-from ...labels import Selection
+from ...labels import Selection, class_indices
 from ...labels.transfer_distance import positions
 from ..palette import palette
 from .carried import SPAN, Array, Carried
@@ -105,8 +106,13 @@ class Exploration:
         """Ask for a class or a phrase, with the gamma that the answer suggests; None or "" drops the question.
 
         Raises:
+            TypeError: if they are no text.
             ValueError: for words that cannot be answered; the question of before stays.
         """
+        if not isinstance(words, str | None):
+            raise TypeError(
+                f"words: expected text, got {words!r} ({type(words).__name__}); ask for one class or phrase"
+            )
         if words is None or not words.strip():
             self.asked, self.gamma, self.gamma_how = None, None, ""
             return None
@@ -118,10 +124,12 @@ class Exploration:
         """Select what scores above gamma.
 
         Raises:
+            TypeError: if it is no number.
             ValueError: if nothing is asked, or gamma is out of `gamma_range`.
         """
         if self.asked is None:
             raise ValueError(f"gamma: expected a question that it applies to, got none (gamma {gamma!r}); ask first")
+        _check_number("gamma", gamma)
         low, high = self.gamma_range
         slack = 1e-6 * max(high - low, abs(low), abs(high))  # a slider rounds to float32
         check_range("gamma", gamma, low - slack, high + slack)
@@ -131,8 +139,10 @@ class Exploration:
         """Let labels travel to what is strictly closer than this lambda, in world units.
 
         Raises:
+            TypeError: if it is no number.
             ValueError: if it is not positive.
         """
+        _check_number("distance", distance)
         check_range("distance", distance, 0, closed=(False, False))
         self.distance, self.distance_how = float(distance), "given"
 
@@ -150,16 +160,23 @@ class Exploration:
             )
         self.show = show
 
-    def set_hidden(self, labels: Iterable[int]) -> None:
-        """Draw no Gaussian of these labels; -1 hides those without a class.
+    def set_hidden(self, labels: Iterable[int | str]) -> None:
+        """Draw no Gaussian of these classes, by label or by name; -1 hides those without a class.
 
         Raises:
-            ValueError: if one is no label of this scene.
+            TypeError: if it is no list.
+            ValueError: if one is no label or name of this scene.
         """
-        wanted = list(labels)
-        for label in wanted:
-            check_whole("labels", label, -1, len(self.meaning.names) - 1)
-        self.hidden = frozenset(int(label) for label in wanted)
+        if isinstance(labels, str) or not isinstance(labels, Iterable):
+            raise TypeError(f"labels: expected a list of labels or names, got {labels!r}; pass [{labels!r}]")
+        wanted: list[int] = []
+        for label in labels:
+            if isinstance(label, str):
+                wanted += class_indices(label, self.meaning.names)
+            else:
+                check_whole("labels", label, -1, len(self.meaning.names) - 1)
+                wanted.append(int(label))
+        self.hidden = frozenset(wanted)
 
     def cloud(self, side: Side) -> Gaussians:
         """The Gaussians of a side.
@@ -187,6 +204,11 @@ class Exploration:
         """Which Gaussians of a side are of no hidden class."""
         labels = self.labels(side)
         return ~np.isin(labels, list(self.hidden)) if self.hidden else np.ones(len(labels), dtype=bool)
+
+    @property
+    def present(self) -> frozenset[int]:
+        """The labels that Gaussians of either side have now, -1 where one has none, hidden or not."""
+        return frozenset(int(label) for side in self.sides for label in np.unique(self.labels(side)))
 
     def scores(self, side: Side) -> Array:  # [N] float64
         """The score of the question, without one that of each label; NaN where nothing is known."""
@@ -268,6 +290,11 @@ class Exploration:
         """Carry values of the semantic Gaussians to the colour side; `nothing` where none is in reach."""
         assert self._carried is not None
         return np.where(self._carried.within(self.distance), values[self._carried.source], nothing)
+
+
+def _check_number(name: str, value: object) -> None:
+    if not isinstance(value, numbers.Real) or isinstance(value, bool):
+        raise TypeError(f"{name}: expected a number, got {value!r} ({type(value).__name__}); pass a float")
 
 
 def _numpy(values: Any) -> Array:

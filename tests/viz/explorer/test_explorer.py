@@ -368,7 +368,7 @@ def test_a_verb_draws_no_frame_before_somebody_looks(explorer):
 
 
 def test_auto_draws_points_where_a_frame_is_slow(monkeypatch):
-    from kfgs.viz.explorer import explorer as module
+    from kfgs.viz.explorer import first_frame as module
 
     monkeypatch.setattr(module, "SURE", 10)
     with an_explorer() as quick:
