@@ -6,12 +6,13 @@
 # lie and where its threshold gamma comes from, what is matched and what is orphaned for each lambda, the room before and
 # after from two viewpoints, and an edit undone.
 #
-# About a minute and a half on two CPU cores if no notebook was run before this one (room, semantic and colour field are
-# made), 20 seconds if `4_a_semantic_field_from_start_to_end` was. Needs nothing but `pip install "kfgs[notebook]"`.
+# About a minute and a half on two CPU cores if no notebook was run before this one, 35 seconds if
+# `4_a_semantic_field_from_start_to_end` was (the colour field is trained here), 15 afterwards. Needs the extra `notebook`,
+# no data.
 
 # %%
-# Your own data: a scene, a teacher's maps of its views, the classes with their text embeddings, a folder for the run; what
-# to look for; and a colour scene, if you have one of it (any splat file, in any frame).
+# Your own data: a scene, a teacher's maps of its views, the classes with their text embeddings, a folder for the run (and
+# a colour scene of it in any frame, if you have one); what to look for and to paint, two of the classes.
 import os
 from pathlib import Path
 
@@ -21,9 +22,11 @@ data = Path(os.environ.get("KFGS_NOTEBOOK_DATA", "data"))
 folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))  # yours: folder = Path("my/scene")
 features, names, text = folder / "features", folder / "classes.json", folder / "text.npy"
 run, out = data / "run", data / "edited"
-thing, painted, paint = "chair", "plant", "#c04040"
-shell = ("ceiling", "wall")  # what hides the rest from outside
 splat_file = None  # yours: Path("my.ply"); None: kfgs trains the colours
+thing, painted, paint = "chair", "plant", "#c04040"
+shell = ("ceiling", "wall")  # what hides the rest from outside, where there are such classes
+apart = 0.15  # scene units: parts that are nearer are one thing; None: the spacing of the Gaussians decides
+shown_view = 0  # of the test views
 
 # %%
 from dataclasses import replace
@@ -34,7 +37,7 @@ from PIL import Image
 
 import kfgs
 from kfgs import viz
-from kfgs.labels import Component, InBox, OfClass, select_in_sphere, select_where
+from kfgs.labels import Component, InBox, OfClass, select_in_sphere
 from kfgs.pipeline import query_field, views_of_change
 
 scene = kfgs.load_scene(folder).undistorted()
@@ -69,13 +72,15 @@ for name, selection in found.items():
     print(f"{name:<28} {len(selection):5d} Gaussians, gamma {selection.threshold:.3f}: {selection.how}")
 
 # %% [markdown]
-# The scores from a viewpoint of no picture, each on its own scale: bright is "chair". With other classes to be told from,
+# The scores from a view held out of training, each on its own scale: bright is the thing. With other classes to be told from,
 # everything else goes dark. Faint seams stay along other things' borders, where latents blend; views make them only a little
 # fainter. What views change are single Gaussians, which a picture blends away: see the counts above. (`negatives="canonical"`
 # tells from "object", "things" and the like, where the table of words holds them.)
 
 # %%
-camera = scene.cameras[scene.views("test")[0]]
+held_out = scene.views("test")[shown_view]
+camera = scene.cameras[held_out]
+width = min(camera.width, 256)  # of each picture in a row of them
 row = []
 for selection in found.values():
     plotter = viz.make_plotter(*camera.size, off_screen=True)
@@ -83,11 +88,11 @@ for selection in found.values():
     viz.look_through(plotter, camera)
     row.append(plotter.screenshot())
     plotter.close()
-Image.fromarray(viz.picture_grid([row], list(found)))
+Image.fromarray(viz.picture_grid([row], list(found), width=width))
 
 # %% [markdown]
-# Where gamma comes from: cosines fall into two heaps, and the threshold is put between them. With negatives it is 0.5 and
-# needs no heaps.
+# Where gamma comes from: the chairs' cosines lie in a heap of their own, and gamma is put into the gap below it. (The
+# few Gaussians at 0 are seen by no view.) With negatives it is 0.5 and needs no heaps.
 
 # %%
 for name in ("views", "views, other classes"):
@@ -99,12 +104,12 @@ for name in ("views", "views, other classes"):
 #
 # `answers` takes a selection apart: connected parts, each with its box, its size and the view that shows it best. How near is
 # connected follows from the spacing of the Gaussians; this room's five chairs stand so close that two of them are one part,
-# until we say 0.15 (metres here).
+# until the first cell says 0.15 (metres here).
 
 # %%
 selection = found["views, other classes"]
 print([one.count for one in kfgs.answers(field.gaussians, selection)], "Gaussians each, with the default distance")
-things = kfgs.answers(field.gaussians, selection, cameras, distance=0.15)
+things = kfgs.answers(field.gaussians, selection, cameras, distance=apart)
 for number, one in enumerate(things, start=1):
     print(f"{thing} {number}: {one!r}")
 
@@ -114,28 +119,23 @@ for number, one in enumerate(things, start=1):
 # %%
 labels = field.classify_by_views(classes.embeddings, cameras).labels
 semantic = field.gaussians.replace(labels=labels)
-outer = [classes.index(name) for name in shell if classes.knows(name)]
-
-
-def furnished(gaussians):  # -> [N] bool
-    """What stands in the room: labelled, and of no class of its shell."""
-    return (gaussians.labels >= 0) & ~torch.isin(gaussians.labels, torch.tensor(outer, dtype=torch.int64))
-
-
-inside = furnished(semantic)
-parts = {f"{thing} {i}": select_where(one.selection(len(semantic)).mask[inside]) for i, one in enumerate(things, 1)}
+hidden = torch.tensor([-1, *(classes.index(name) for name in shell if classes.knows(name))])
+inside = semantic.select(~torch.isin(labels, hidden))
 up = viz.estimate_up(scene.cameras)
-orbit = viz.Orbit(frames=1, size=(330, 440), elevation_degrees=50, start_degrees=120, zoom=1.8)
-outside = viz.orbit_cameras(semantic.means[inside], orbit, up=up)[0]
+orbit = viz.Orbit(frames=1, size=(450, 640), elevation_degrees=50, start_degrees=120, zoom=1.8)
+outside = viz.orbit_cameras(inside.means, orbit, up=up)[0]
+boxes = [one.box for one in things]
 plotter = viz.make_plotter(*outside.size, off_screen=True)
-viz.add_selections(plotter, semantic.select(inside), parts, style="gaussians", up=tuple(up.tolist()))
+viz.add_cloud(plotter, inside, color_by="label", style="gaussians")
+viz.add_boxes(plotter, boxes)
+viz.add_names(plotter, boxes, [f"{thing} {i}" for i in range(1, len(boxes) + 1)], up=tuple(up.tolist()))
 viz.look_through(plotter, outside)
 picture = plotter.screenshot()
 plotter.close()
 Image.fromarray(picture)
 
 # %% [markdown]
-# And in the training views that show them best: what is selected, drawn by the rasteriser over the photograph.
+# The first four in the training views that show them best: what is selected, drawn by the rasteriser over the photograph.
 
 # %%
 row, titles = [], []
@@ -146,7 +146,7 @@ for number, one in enumerate(things[:4]):
     photograph = scene.image(scene.views("train")[one.best_view.index])
     row.append(viz.overlay_labels(photograph, torch.where(covered, number, -1)))
     titles.append(f"{thing} {number + 1}, {one.best_view.share:.0%} of {one.best_view.camera}")
-Image.fromarray(viz.picture_grid([row], titles))
+Image.fromarray(viz.picture_grid([row], titles, width=width))
 
 # %% [markdown]
 # ## The colour scene
@@ -165,13 +165,14 @@ print(colors)
 print(f"PSNR on unseen views: {kfgs.score_views(colors.gaussians, scene).psnr.value:.1f} dB")
 draw = {"background": "black", "color_by": "rgb"}
 rendered = viz.show_cloud(colors.gaussians, **draw)(camera)
-Image.fromarray(viz.picture_grid([[scene.image(scene.views("test")[0]), rendered]], ("unseen view", "colour field")))
+Image.fromarray(viz.picture_grid([[scene.image(held_out), rendered]], ("unseen view", "colour field"), width=width))
 
 # %% [markdown]
 # ## Carried over by distance
 #
 # A colour Gaussian takes the label of the nearest labelled semantic Gaussian closer than lambda (Sec. 3.4). Without a lambda
-# of yours, the spacing of the two clouds decides. Small values leave orphans; large ones give floaters a class.
+# of yours, the spacing of the two clouds decides. Small values leave orphans; large ones give floaters a class. The histogram
+# is of a search to ten times lambda, to show the tail beyond it; a few Gaussians have no source even there.
 
 # %%
 carried = kfgs.transfer_labels(semantic, labels, colors.gaussians)
@@ -186,7 +187,7 @@ for scale in (0.1, 0.3, 1.0):
     some = kfgs.transfer_labels(semantic, labels, colors.gaussians, scale * carried.distance)
     row.append(viz.show_cloud(colors.gaussians.replace(labels=some.labels))(camera))
     titles.append(f"lambda {some.distance:.2g}: {some.orphaned:,} orphaned")
-Image.fromarray(viz.picture_grid([row], titles))
+Image.fromarray(viz.picture_grid([row], titles, width=width))
 
 # %% [markdown]
 # Around the first of the things, with a small lambda: destinations are matched, ambiguous (labelled, but their nearest sources
@@ -217,9 +218,9 @@ Image.fromarray(picture)
 
 # %%
 attached = {by: kfgs.attach(field, colors, classes, cameras=cameras, by=by) for by in ("distance", "views")}
-print(*attached["views"].words, sep="\n")
+print(*attached["views"].words[1:], sep="\n")  # the first says how the frames were found to agree
 row = [viz.show_cloud(one.splats.gaussians)(camera) for one in attached.values()]
-Image.fromarray(viz.picture_grid([row], ("by distance", "by views")))
+Image.fromarray(viz.picture_grid([row], ("by distance", "by views"), width=width))
 
 # %% [markdown]
 # ## Edits
@@ -234,24 +235,24 @@ print(f"{len(labelled)} Gaussians, {len(edited)} after {[edit.op for edit in edi
 unseen = [scene.cameras[i] for i in scene.views("test")]
 views = [unseen[i] for i in views_of_change(labelled.gaussians, edited.gaussians, unseen)]
 rows = [[viz.show_cloud(one.gaussians, **draw)(view) for one in (labelled, edited)] for view in views]
-Image.fromarray(viz.picture_grid(rows, ("before", f"no {thing}, {painted} in {paint}")))
+Image.fromarray(viz.picture_grid(rows, ("before", f"no {thing}, {painted} in {paint}"), width=width))
 
 # %% [markdown]
-# Floor and rug were hardly seen where the chairs stood, and kfgs does not invent them. Questions combine: a box tells one chair
-# from the others, and so does being the largest connected part. `undo` and `redo` give lists; the file holds them as text.
+# Floor and rug were hardly seen where the chairs stood, and kfgs does not invent them. Questions combine: a box tells one
+# chair from the others, and so does being the largest connected part. `undo` and `redo` give lists; the file holds them as text.
 
 # %%
 low, high = (corner.tolist() for corner in things[0].extent)
 one = kfgs.EditList().then(kfgs.Remove(OfClass(thing) & InBox(low, high)))
-largest = Component(OfClass(thing), distance=0.1)  # of those that are left: an edit sees what the one before it made
+largest = Component(OfClass(thing), distance=apart)  # of those that are left: an edit sees what the one before it made
 two = one.then(kfgs.Recolor(largest, "teal", allow_empty=True))
-print(*two, sep="\n")
+print([edit.op for edit in two])
 two.save(out / "two.edits.json")
 assert kfgs.EditList.load(out / "two.edits.json") == two
 assert two.undo().redo() == two
 lists = {"before": kfgs.EditList(), "one removed": one, "and one painted": two, "undone": two.undo()}
 row = [viz.show_cloud(some.apply(labelled).gaussians, **draw)(views[0]) for some in lists.values()]
-Image.fromarray(viz.picture_grid([row], list(lists)))
+Image.fromarray(viz.picture_grid([row], list(lists), width=width))
 
 # %% [markdown]
 # ## Out of kfgs
@@ -270,10 +271,4 @@ for ending in ("ply", "spz"):
     print(f"{ending}: {size:.2f} MiB, {same:.1%} of the labels as they were, the picture agrees to {-error:.0f} dB")
 
 # %% [markdown]
-# And a turntable of the edited room, without its shell:
-
-# %%
-shown = edited.gaussians.select(furnished(edited.gaussians))
-ring = viz.orbit_cameras(shown.means, replace(orbit, frames=12, size=(120, 160)), up=up)
-viz.save_animation(out / "edited.gif", viz.show_cloud(shown, color_by="rgb"), ring, fps=4)
-display.Image(filename=out / "edited.gif")
+# Next: [6_inspect_in_pyvista](6_inspect_in_pyvista.py) looks at all of this in space.
