@@ -1,7 +1,7 @@
 """The paper's Figure 2 as a few named, resumable calls, and what a finished field is used for."""
 
+from ..viz.field_colors import feature_colors
 from .apply import (
-    feature_colors,
     label_cloud,
     label_field,
     query_field,

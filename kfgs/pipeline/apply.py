@@ -27,7 +27,8 @@ from ..gaussians import Gaussians
 from ..labels import LabelSet, Score, Selection, Transfer, classify, select_by_label, teacher_mismatch, transfer_labels
 from ..labels.label_set import teacher_difference
 from ..scenes import Scene
-from ..viz import FeatureColors, overlay_labels, palette, save_picture
+from ..viz import overlay_labels, palette, save_picture
+from ..viz.field_colors import feature_colors
 
 Decode = Literal["exact", "latent"]
 Negatives = Literal["classes", "canonical", "none"]
@@ -38,24 +39,6 @@ def save_label_map(path: Path, labels: Tensor) -> None:  # [H, W] int64
     values = torch.where(labels < 0, VOID, labels).to(torch.uint8).cpu().numpy()
     with atomic_path(path) as temporary:
         Image.fromarray(values).save(temporary, format="PNG")
-
-
-def feature_colors(field: SemanticField) -> FeatureColors:
-    """One projection of this field's features to RGB, the same for every view of it, for `SemanticField.render(...).map`.
-
-    Of d latents it is fitted to those of the codewords, and of features near codewords to the codewords: stray Gaussians
-    do not shape it. A field without codebook has its Gaussians' features alone.
-
-    Raises:
-        ValueError: if these are not finite, or there are none.
-    """
-    assert field.gaussians.features is not None
-    if field.codebook is None:
-        return FeatureColors.fit(field.gaussians.features)
-    if field.autoencoder is None:
-        return FeatureColors.fit(field.codebook.codewords)
-    with torch.no_grad():
-        return FeatureColors.fit(field.autoencoder.encode(field.codebook.codewords))
 
 
 def segment_scene(

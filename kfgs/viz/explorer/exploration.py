@@ -74,7 +74,7 @@ class Exploration:
         self._clouds = clouds
         self._carried = None if color is None else Carried(meaning.gaussians, color)
         self._own_labels = _numpy(meaning.gaussians.labels).astype(np.int64)
-        self._colors = SideColors(clouds, self._carried)
+        self._colors = SideColors(clouds, self._carried, meaning.feature_colors)
         self.shows: tuple[Show, ...] = ("labels", *self._colors.shows, "score")
         self.show: Show = "labels"
         self.asked: Asked | None = None

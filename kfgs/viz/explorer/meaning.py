@@ -23,7 +23,9 @@ from ...labels import (
     select_by_similarity,
     teacher_mismatch,
 )
+from ..field_colors import feature_colors, learnt_colors
 from ..frusta import evenly
+from ..pictures import FeatureColors
 from .evidence import Evidence, OwnFeatures, SeenCodewords, SeenFeatures
 
 if TYPE_CHECKING:
@@ -64,6 +66,10 @@ class Meaning(Protocol):
         Raises:
             ValueError: for words that cannot be answered; near names are offered.
         """
+        ...
+
+    def feature_colors(self) -> FeatureColors:
+        """The scene's one projection of features to colours; asked for only where there are features."""
         ...
 
 
@@ -129,6 +135,10 @@ class FieldMeaning:
             target, negatives = self._class(words) if known else self._phrase(words)
             self._answers[words] = self._answer(words, target, negatives, known)
         return self._answers[words]
+
+    def feature_colors(self) -> FeatureColors:
+        """The field's own projection: latents have the colours that they have in its rendered views."""
+        return feature_colors(self._field)
 
     def _gather(self) -> Evidence:
         if not self._views:
@@ -214,13 +224,19 @@ class SplatMeaning:
             scores = torch.where(member, self.scores, 0)
             own = scores[member]
             low, high = (float(own.min()), float(own.max())) if len(own) else UNIT
-            if low > 0 and high <= 1:
+            if len(own) == 0 or (low > 0 and high <= 1):
                 low, high = UNIT
-            else:
-                low -= 0.01 * max(high - low, 1e-3)  # strictly below the least score
+            else:  # strictly below the least score, also once it is rounded to the scores' precision
+                below = float(torch.nextafter(own.min(), own.new_tensor(-torch.inf)))
+                low = min(low - 0.01 * max(high - low, 1e-3), below)
             found = Selection(member & (scores > low), scores, low, "all of the class")
             self._answers[words] = Asked(words, found, low, high, True, member)
         return self._answers[words]
+
+    def feature_colors(self) -> FeatureColors:
+        """A projection fitted to the features of all Gaussians that have any."""
+        assert self.gaussians.features is not None
+        return learnt_colors(self.gaussians.features)
 
 
 def _file_scores(gaussians: Gaussians, score: np.ndarray | None) -> Tensor:  # type: ignore[type-arg]  # [N]

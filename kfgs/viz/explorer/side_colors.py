@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Literal
 
 import numpy as np
@@ -20,10 +20,18 @@ GREY = np.array(UNLABELLED, dtype=np.uint8)
 
 
 class SideColors:
-    """Colours that are computed once, when first asked for."""
+    """Colours that are computed once, when first asked for.
 
-    def __init__(self, clouds: Mapping[Side, Gaussians], carried: Carried | None) -> None:
-        self._clouds, self._carried = clouds, carried
+    Args:
+        clouds: of each side.
+        carried: who gives each colour Gaussian its label.
+        projection: gives the scene's projection of latents to colours.
+    """
+
+    def __init__(
+        self, clouds: Mapping[Side, Gaussians], carried: Carried | None, projection: Callable[[], FeatureColors]
+    ) -> None:
+        self._clouds, self._carried, self._projection = clouds, carried, projection
         self._rgb: dict[Side, Array] = {}
         self._latents: Array | None = None
         shows: list[Literal["rgb", "latents"]] = []
@@ -46,15 +54,14 @@ class SideColors:
         return self._rgb[side]
 
     def latents(self, side: Side, distance: float) -> Array:  # [N, 3] uint8
-        """One projection of the latents for the scene; grey where one was never learnt, or none is in reach of lambda."""
+        """The scene's projection of the latents; grey where one was never learnt, or none is in reach of lambda."""
         features = self._clouds["semantic"].features
         assert features is not None
         if self._latents is None:
             learnt = features.any(dim=1)
             self._latents = np.broadcast_to(GREY, (len(features), 3)).copy()
             if bool(learnt.any()):
-                rows = features[learnt]
-                self._latents[learnt.cpu().numpy()] = FeatureColors.fit(rows)(rows)
+                self._latents[learnt.cpu().numpy()] = self._projection()(features[learnt])
         if side == "semantic" or self._carried is None:
             return self._latents
         return np.where(self._carried.within(distance)[:, None], self._latents[self._carried.source], GREY)

@@ -7,6 +7,7 @@ from cases_explorer import DIM, MODES, NAMES, cameras, classes, cloud, codebook,
 
 from kfgs.fields import SemanticField
 from kfgs.viz.explorer import evidence, meaning
+from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.meaning import FieldMeaning, SplatMeaning
 
 VIEWS = [(), tuple(cameras())]
@@ -196,3 +197,19 @@ def test_splats_without_labels_or_names():
 def test_classes_of_one_name_are_one():
     made = SplatMeaning(splat_file(cloud(LINE, LABELS)).replace(classes=("wall", "chair", "rug", "chair")))
     assert made.ask("chair").selection.indices.tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize("score", [0.0, 1.0, 100.0, 300.0, 65536.0, 1e30, -5e6])
+def test_all_of_a_class_answer_where_their_scores_are_equal(score):
+    """float32 has no number between 300 and 300 - 1e-5."""
+    made = SplatMeaning(splat_file(cloud(torch.rand(50, 3), [1] * 30 + [0] * 20), np.full(50, score, np.float32)))
+    asked = made.ask("chair")
+    assert asked.selection.mask.tolist() == [True] * 30 + [False] * 20
+    assert asked.low == asked.selection.threshold < asked.high
+    state = Exploration(made)
+    state.ask("chair")
+    state.set_show("score")
+    assert state.selected("semantic").sum() == 30
+    assert len(state.colors("semantic")) == 50
+    state.set_gamma(state.gamma_range[1])
+    assert not state.selected("semantic").any()
