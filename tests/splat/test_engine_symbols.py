@@ -1,6 +1,7 @@
 import os
 import sys
 from pathlib import Path
+from threading import Event, Thread
 
 import pytest
 
@@ -20,3 +21,42 @@ def test_engines_keep_to_their_own_symbols_only_beside_another_llvm(monkeypatch,
     with table._own_symbols():
         assert sys.getdlopenflags() == before | added
     assert sys.getdlopenflags() == before
+
+
+@pytest.mark.skipif(not DEEPBIND, reason="the flag is glibc's")
+def test_two_threads_that_load_at_once_leave_the_flags_as_they_were(monkeypatch):
+    """Without a lock the second saves the flags of the first, and puts them back for good."""
+    before, real = sys.getdlopenflags(), Path.read_text
+    maps = "7f00 /usr/lib/libLLVM-15.so.1"
+    monkeypatch.setattr(Path, "read_text", lambda path, **_: maps if str(path).startswith("/proc") else real(path))
+    first_in, first_may_leave, second_in = Event(), Event(), Event()
+
+    def first():
+        with table._own_symbols():
+            first_in.set()
+            first_may_leave.wait(10)
+
+    def second():
+        first_in.wait(10)
+        with table._own_symbols():
+            second_in.set()
+            done.wait(10)
+
+    done = Event()
+    threads = [Thread(target=work) for work in (first, second)]
+    try:
+        for thread in threads:
+            thread.start()
+        assert first_in.wait(10)
+        assert not second_in.wait(0.2)  # it waits for the first
+        first_may_leave.set()
+        threads[0].join(10)
+        assert second_in.wait(10)
+    finally:
+        first_may_leave.set()
+        done.set()
+        for thread in threads:
+            thread.join(10)
+        after = sys.getdlopenflags()
+        sys.setdlopenflags(before)  # or a failure here would reach the other tests
+    assert after == before

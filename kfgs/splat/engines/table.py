@@ -10,6 +10,7 @@ from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from threading import RLock
 from types import ModuleType
 from typing import NamedTuple
 
@@ -44,6 +45,9 @@ def available_engines(device: str | None = None) -> list[str]:
     return names if device is None else [name for name in names if _serves(name, device)]
 
 
+_FLAGS = RLock()  # who holds it may change the flags of dlopen; an engine may load another
+
+
 @cache
 def load(name: str) -> ModuleType:
     """The engine's module.
@@ -66,21 +70,25 @@ def load(name: str) -> ModuleType:
 def _own_symbols() -> Iterator[None]:
     """Import compiled modules so that they find their own functions before those of others with the same names.
 
-    triton and numba each bring an LLVM. Where a picture was drawn before (pyvista on Mesa's software driver) and pycolmap
-    is loaded, Mesa's LLVM is what the dynamic linker offers first, and Python ends with a segfault in it. Only then: with
-    this flag a module does not see an allocator that was loaded before all others (LD_PRELOAD), either.
+    triton brings an LLVM. Where a picture was drawn before (pyvista on Mesa's software driver) and pycolmap is loaded,
+    Mesa's LLVM is what the dynamic linker offers first, and Python ends with a segfault in it. Only then: with this flag a
+    module does not see an allocator that was loaded before all others (LD_PRELOAD), either. It changes nothing for numba,
+    whose LLVM is loaded by ctypes, past this flag, and keeps to itself.
+
+    The flag is the process's: one import at a time, and what other threads import meanwhile by themselves has it too.
     """
     flag = getattr(os, "RTLD_DEEPBIND", 0)  # glibc's
     maps = Path("/proc/self/maps")
     if not flag or not maps.is_file() or "libLLVM" not in maps.read_text(errors="replace"):
         yield
         return
-    flags = sys.getdlopenflags()
-    sys.setdlopenflags(flags | flag)
-    try:
-        yield
-    finally:
-        sys.setdlopenflags(flags)
+    with _FLAGS:
+        flags = sys.getdlopenflags()
+        sys.setdlopenflags(flags | flag)
+        try:
+            yield
+        finally:
+            sys.setdlopenflags(flags)
 
 
 def choose(engine: str, device: str, dtype: torch.dtype) -> str:
