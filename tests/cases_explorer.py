@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import numpy as np
 import torch
 
 from kfgs.cameras import Camera
@@ -11,10 +12,14 @@ from kfgs.gaussians import Gaussians
 from kfgs.labels import LabelSet
 from kfgs.quant.autoencoder import Autoencoder
 from kfgs.quant.codebook import Codebook
+from kfgs.splat import rgb_to_sh0
+from kfgs.viz.explorer.exploration import Exploration
+from kfgs.viz.explorer.meaning import SplatMeaning
 
 DIM, WORDS = 16, 12
 NAMES = ("wall", "chair", "table", "office chair")
 MODES = ("decouple", "adc", "adc+sc")
+LINE = [[float(i), 0, 5] for i in range(4)]
 
 
 @cache
@@ -102,3 +107,18 @@ def grid_clouds(seed=0, sources=150, targets=400):
 
 def splat_file(gaussians, score=None):
     return SplatFile(gaussians, {} if score is None else {"score": score}, NAMES)
+
+
+def grid(score=None, **options):
+    """An exploration of clouds whose distances tie."""
+    semantic, color = grid_clouds()
+    return Exploration(SplatMeaning(splat_file(semantic, score)), color, **options)
+
+
+def line(distance=1.0, **options):
+    """Three semantic Gaussians on a line, a chair, a table and one of no class; five colour Gaussians beside it."""
+    sh = rgb_to_sh0(torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [0, 0, 0]]))[:, None]
+    semantic = cloud([[0.0, 0, 5], [3, 0, 5], [6, 0, 5]], [1, 2, -1], features=torch.eye(3))
+    color = cloud([[0.25, 0, 5], [1, 0, 5], [2.5, 0, 5], [6, 0, 5], [60, 0, 5]], sh=sh)
+    made = SplatMeaning(splat_file(semantic, np.array([0.8, 0.6, 0.4], np.float32)))
+    return Exploration(made, color, distance=distance, **options)
