@@ -2,14 +2,14 @@
 # # 1. A scene and its cameras
 #
 # What goes in: photographs, the cameras that took them, and a sparse cloud of points. You will see the cameras standing
-# in the room with their pictures, points projected into a picture and a picture seen again in space, which views are held
-# out for testing, and a lens removed.
+# in the room with their pictures, points projected into a picture and a picture seen again in space, which views are
+# held out for testing, and a lens removed.
 #
-# About 10 seconds on two CPU cores (20 more to make the toy room the first time). Needs nothing but
-# `pip install "kfgs[notebook]"`.
+# About 10 seconds on two CPU cores (20 more to make the toy room the first time). Needs the extra
+# `notebook`, no data.
 
 # %%
-# Your own data: a folder with images/ and a COLMAP model in sparse/0, or a transforms.json (which often brings no points).
+# Your own data: a folder with images/ and a COLMAP model in sparse/0, or a transforms.json (which often has no points).
 import os
 from pathlib import Path
 
@@ -23,8 +23,8 @@ folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))  
 # ## What a scene holds
 #
 # Cameras, image files, points with their colours, and named splits. Pictures are read when asked for, one at a time, so
-# a scene of thousands costs nothing to open. Units are those of the file; the room's are metres. Points are optional for
-# looking (training starts from them): where there are none, each camera's line of sight is drawn in their place.
+# a scene of thousands costs nothing to open. Units are those of the file; the room's are metres. Points are optional
+# for looking (training starts from them): where there are none, each camera's line of sight is drawn in their place.
 
 # %%
 import torch
@@ -51,16 +51,17 @@ from PIL import Image
 
 from kfgs.viz import picture_grid
 
-shown = scene.views("train")[:: max(1, len(scene.views("train")) // 8)][:8]
+train = scene.views("train")
+shown = [train[i] for i in torch.linspace(0, len(train) - 1, min(8, len(train))).long().tolist()]
 rows = [[scene.image(i) for i in shown[first : first + 4]] for first in range(0, len(shown), 4)]
 Image.fromarray(picture_grid([row for row in rows if len(row) == len(rows[0])], width=min(camera.width, 256)))
 
 # %% [markdown]
 # ## Cameras in space
 #
-# Each camera is a pyramid with its true opening, its picture on the image plane, and a small roof on the picture's upper
-# edge. Structure from motion leaves points far outside of a scene; `robust_bounds` says where the bulk of the cloud is.
-# The lid of the room is taken off here, to look in.
+# Each camera is a pyramid with its true opening, its picture on the image plane, and a small roof on the picture's
+# upper edge; eight of them are drawn. Structure from motion leaves points far outside of a scene; `robust_bounds` says
+# where the bulk of the cloud is. The lid of the room is taken off here, to look in.
 
 # %%
 import pyvista as pv
@@ -76,23 +77,23 @@ height = points @ up
 inside = bounds.inside & (height < height[bounds.inside].quantile(0.8))
 everything = torch.cat([points[inside], torch.stack([c.center for c in scene.cameras]).to(points)])
 corners = torch.stack([everything.amin(0), everything.amax(0)])
-orbit = orbit_cameras(corners, Orbit(frames=8, size=(540, 720), elevation_degrees=40, zoom=1.12), up=up)
+orbit = orbit_cameras(corners, Orbit(frames=8, size=(540, 720), elevation_degrees=40, zoom=1.0), up=up)
 
 plotter = make_plotter(540, 720)
 plotter.add_points(points[inside].numpy(), scalars=colors[inside].numpy(), rgb=True, point_size=3, lighting=False)
-plotter.add_text(what, font_size=8, color="black")
-add_cameras(plotter, scene.cameras, size=0.3 * scene.extent, most=7)
-add_camera_images(plotter, scene.cameras, scene.image, size=0.3 * scene.extent, most=7)
+plotter.add_text(f"{int(inside.sum()):,} of {what}", font_size=8, color="black")
+add_cameras(plotter, scene.cameras, size=0.3 * scene.extent, most=8)
+add_camera_images(plotter, scene.cameras, scene.image, size=0.3 * scene.extent, most=8)
 look_through(plotter, orbit[1])
 plotter.show()
 
 # %% [markdown]
 # ## Points into a picture
 #
-# `project_points` takes world points to pixels (x, y) and says which of them the camera can see. The first pixel's centre
-# is (0.5, 0.5), as in COLMAP. `to_kornia` makes one kornia `PinholeCamera` of any number of cameras; it counts pixels as
-# K does and so says the same: the largest difference is printed. (kornia's own grids count pixel centres from 0: for
-# those, `to_kornia(cameras, integer_centers=True)`.)
+# `project_points` takes world points to pixels (x, y) and says which fall into the picture; what stands in front of
+# them is not asked. The first pixel's centre is (0.5, 0.5), as in COLMAP. `to_kornia` makes one kornia `PinholeCamera`
+# of any number of cameras; it counts pixels as K does and so says the same: the largest difference is printed.
+# (kornia's own grids count pixel centres from 0: for those, `to_kornia(cameras, integer_centers=True)`.)
 
 # %%
 from kfgs.cameras import project_points, to_kornia
@@ -135,8 +136,8 @@ Image.fromarray(picture_grid([[scene.image(0), through]], ["photograph", what], 
 # %% [markdown]
 # ## Which views are held out
 #
-# Training never sees the test views (orange). A `split.json` in the folder is used where there is one; any other rule is
-# one call, here every eighth view as in Mip-NeRF 360.
+# Training never sees the test views (orange). A `split.json` in the folder is used where there is one; any other rule
+# is one call, here every eighth view as in Mip-NeRF 360.
 
 # %%
 from kfgs.scenes import make_split
@@ -153,7 +154,7 @@ plotter.add_points(
 for split, color in {"train": "#0072b2", "test": "#d55e00"}.items():
     add_cameras(plotter, scene.select(split).cameras, size=0.15 * scene.extent, color=color, line_width=3)
 plotter.add_legend([["train", "#0072b2"], ["test", "#d55e00"]], face="rectangle", bcolor="white", size=(0.15, 0.12))
-above = orbit_cameras(corners, Orbit(frames=1, size=(480, 720), elevation_degrees=75, zoom=1.3), up=up)
+above = orbit_cameras(corners, Orbit(frames=1, size=(480, 720), elevation_degrees=75, zoom=1.1), up=up)
 look_through(plotter, above[0])
 plotter.show()
 print({name: len(views) for name, views in make_split(len(scene), "holdout8").items()})
@@ -161,9 +162,11 @@ print({name: len(views) for name, views in make_split(len(scene), "holdout8").it
 # %% [markdown]
 # ## A lens removed
 #
-# Gaussians are drawn by a pinhole, so a lens has to go first: `scene.undistorted()` removes it from every picture on the
-# way in, and `scene.mask(i)` says which pixels were recorded. The room's pictures come from a pinhole; to have something
-# to remove, kornia gives view 0 a barrel lens, and `undistort` takes it away again. Of a lens of yours, view 0 is shown.
+# Gaussians are drawn by a pinhole, so a lens has to go first: `scene.undistorted()` removes it from every picture on
+# the way in, and `scene.mask(i)` says which pixels were recorded. The room's pictures come from a pinhole; to have
+# something to remove, kornia gives view 0 a barrel lens, and `undistort` takes it away again (two interpolations cost
+# the decibels that are missing). The black rim is where kornia had no picture to bend. If your cameras have a lens, it
+# is that of view 0 that is removed.
 
 # %%
 from dataclasses import replace

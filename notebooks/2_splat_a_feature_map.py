@@ -1,12 +1,12 @@
 # %% [markdown]
 # # 2. Splat a feature map
 #
-# What splatting does, one step at a time: four Gaussians are projected, listed by tile, and composited front to back. Then
-# 20,000 of them carry a teacher's 512 channels and are drawn from a view they have not seen. At the end: how much faster
-# the engines are than the plain equations, and that pyvista shows the same picture as the rasteriser.
+# What splatting does, one step at a time: four Gaussians are projected, listed by tile, and composited front to back.
+# Then 20,000 of them carry a teacher's 512 channels and are drawn from a view they have not seen. At the end: how much
+# faster the engines are than the plain equations, and that pyvista shows the same picture as the rasteriser.
 #
-# About 15 seconds on two CPU cores (20 more to make the toy room the first time). Needs nothing but
-# `pip install "kfgs[notebook]"`.
+# About 10 seconds on two CPU cores (20 more to make the toy room the first time). Needs the extra
+# `notebook`, no data.
 
 # %%
 # Your own data: a scene, and a folder with a feature map of each training view, as `kfgs features` writes it.
@@ -55,9 +55,9 @@ plotter.show()
 # %% [markdown]
 # ## Project, then list by tile
 #
-# `project` gives each Gaussian's centre and shape on the image (EWA splatting); a Gaussian ends where its alpha falls to
-# 1/255, the outer line. `bin_tiles` lists for each square of 16 pixels which Gaussians touch it, front to back; the
-# numbers count them. Empty tiles cost nothing.
+# `project` gives each Gaussian's centre and shape on the image (EWA splatting); a Gaussian ends where its alpha falls
+# to 1/255, the outer line; the inner one is one standard deviation. `bin_tiles` lists for each square of 16 pixels
+# which Gaussians touch it, front to back; the numbers count them. Empty tiles cost nothing.
 
 # %%
 import matplotlib.pyplot as plt
@@ -106,8 +106,9 @@ Image.fromarray(picture_grid([[*steps, opacity]], ["the nearest", "two", "three"
 # %% [markdown]
 # ## A teacher's map
 #
-# A teacher gives each pixel a feature of many channels. `FeatureColors` shows them as colours: one linear projection for
-# the whole scene, so that equal features have equal colours in every view. Edges are blurred, surfaces are noisy.
+# A teacher gives each pixel a feature of many channels. `FeatureColors` shows them as colours: one linear projection
+# for the whole scene, so that equal features have equal colours in every view. Edges are blurred, surfaces are noisy,
+# and some patches are simply wrong (the picture on the wall).
 
 # %%
 from kfgs.quant import sample_grid
@@ -124,19 +125,22 @@ Image.fromarray(picture_grid(rows, width=min(scene.cameras[0].width, 320)))
 # %% [markdown]
 # ## Features on Gaussians
 #
-# Round Gaussians stand on the points of the cloud. Their features need no training to be looked at: each takes the mean of
-# the pixels that it shows in, weighted by how much it shows (`accumulate_pixels`). Training ([notebook 4](
-# 4_a_semantic_field_from_start_to_end.py)) also moves and reshapes them. The first training view is kept apart.
+# Round Gaussians stand on the points of the cloud. Their features need no training to be looked at: each takes the mean
+# of the pixels that it shows in, weighted by how much it shows (`accumulate_pixels`); hence blurred edges. Training also moves and
+# reshapes them ([notebook 4](4_a_semantic_field_from_start_to_end.py)). One training view is kept apart.
 
 # %%
 from kfgs import GaussianParams
 from kfgs.splat import accumulate_pixels
 
 h, w, D = maps.shape
+apart = len(maps) // 4
 cloud = GaussianParams.from_points(scene.points, colors=scene.colors, sh_degree=0, initial_opacity=0.8).activated()
 cloud = cloud.replace(scales=0.8 * cloud.scales)  # a little narrower: less blur, a few holes
 sums, weights = torch.zeros(len(cloud), D), torch.zeros(len(cloud))
-for i in range(1, len(maps)):
+for i in range(len(maps)):
+    if i == apart:
+        continue
     view = scene.cameras[train[i]].resized(h, w)
     seen = project(cloud, view)
     shown = accumulate_pixels(seen.means2d, seen.conics, seen.opacities, maps[i], bin_tiles(seen, w, h))
@@ -149,13 +153,13 @@ print(semantic, f"{float((weights > 0).float().mean()):.0%} of them seen")
 from kfgs import resize_map
 from kfgs.metrics import feature_cosine
 
-held = scene.cameras[train[0]]
+held = scene.cameras[train[apart]]
 rendering = rasterize(semantic, held)
-cosine = feature_cosine(resize_map(rendering.map, (h, w)), maps[0])
+cosine = feature_cosine(resize_map(rendering.map, (h, w)), maps[apart])
 print(f"{tuple(rendering.map.shape)} rendered; cosine with the teacher on the view kept apart {float(cosine):.3f}")
 pictures = [
-    scene.image(train[0]),
-    colors(maps[0]),
+    scene.image(train[apart]),
+    colors(maps[apart]),
     colors(rendering.map),
     rendering.alpha[..., None].expand(-1, -1, 3),
 ]
@@ -165,8 +169,9 @@ Image.fromarray(picture_grid([pictures], titles, width=min(held.width, 320)))
 # %% [markdown]
 # ## Engines
 #
-# The same equations are written once plainly in torch (`reference`) and once compiled. `engine="auto"` takes the fastest
-# for the tensors' device, Triton where there is a GPU. Times are of 9 channels, the paper's latents, as a ratio.
+# The same equations are written once plainly in torch (`reference`) and once compiled. `engine="auto"` takes the
+# fastest for the tensors' device, Triton where there is a GPU. Times are of 9 channels, the paper's latents, as a
+# ratio.
 
 # %%
 import time

@@ -268,8 +268,8 @@ class SemanticField:
         codewords = "no codebook" if self.codebook is None else f"{self.codebook.size} codewords"
         teacher = self.info.get("teacher")
         lines = [
-            f"semantic field ({row}): {len(self)} Gaussians, {self.channels} of {self.dim} channels, {codewords}",
-            f"  size as Table 1 counts it: {self.storage() / MIB:.2f} MB (MiB)",
+            f"semantic field ({row}): {len(self)} Gaussians, {self.channels} channels for {self.dim}, {codewords}",
+            f"  size as Table 1 counts it: {self.storage() / MIB:.2f} MiB",
             *([f"  teacher: {teacher.get('name')}"] if isinstance(teacher, dict) else []),
             *(f"  {name}: {value}" for name, value in self.info.items() if not isinstance(value, list | dict)),
         ]

@@ -26,6 +26,7 @@ LINES = 500  # more transfer lines than this hide what they show
 MATCHED, AMBIGUOUS, ORPHANED = 0, 1, 2
 STATE_NAMES = ("matched", "ambiguous", "orphaned")
 STATE_COLORS = (1, 5, 7)  # in `PALETTE`: sky blue, which recedes, vermillion and deep blue; far apart for every eye
+TAKEN, REST = tuple(PALETTE[4] / 255), (0.75, 0.75, 0.75)  # of bars: what is selected or in reach, and what is not
 BINS = 80
 CLOSEST = 100  # times smaller than the median: what is closer still makes no axis longer
 
@@ -182,8 +183,8 @@ def plot_distances(
     axes = figure.add_subplot()
     near = edges[:-1] < distance
     widths = np.diff(edges)
-    for part, color in ((near, PALETTE[STATE_COLORS[MATCHED]]), (~near, PALETTE[STATE_COLORS[ORPHANED]])):
-        axes.bar(edges[:-1][part], counts[part], widths[part], align="edge", color=tuple(color / 255))
+    for part, color, name in ((near, TAKEN, "within lambda"), (~near, REST, "beyond")):
+        axes.bar(edges[:-1][part], counts[part], widths[part], align="edge", color=color, label=name)
     axes.axvline(distance, color="black", linewidth=1.5, label=f"lambda = {distance:.4g}")
     axes.set(xscale="log", xlabel="distance to the source (world units)", ylabel="destinations")
     closer = 100 * float((values < distance).mean())

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from .._check import check_shapes
 from ..labels import Selection
-from .matches import MATCHED, ORPHANED, STATE_COLORS
-from .palette import PALETTE, palette
+from .matches import REST, TAKEN
+from .palette import palette
 from .plots import INK, _figure, _save
 
 Array = np.ndarray[Any, Any]
@@ -28,7 +28,7 @@ def plot_scores(
     *,
     labels: Tensor | None = None,  # [N] int64, -1 = none
 ) -> None:
-    """Draw how many Gaussians have which score, the selected ones in a colour of their own, and gamma.
+    """Draw how many Gaussians have which score, the selected ones in blue, the rest in grey, and gamma.
 
     Colours are those of `plot_distances`; bins meet at gamma. The title says how many are selected and how gamma came
     about. Counts are logarithmic where the selected would hardly be seen otherwise: where their highest bin is less than
@@ -52,8 +52,7 @@ def plot_scores(
     counts = [np.histogram(scores[part], edges)[0] for part in (~mask, mask)]
     figure = _figure(7.0, 4.0)
     axes = figure.add_subplot()
-    for count, name, state in zip(counts, ("not selected", "selected"), (ORPHANED, MATCHED), strict=True):
-        color = tuple(PALETTE[STATE_COLORS[state]] / 255)
+    for count, name, color in zip(counts, ("not selected", "selected"), (REST, TAKEN), strict=True):
         axes.bar(edges[:-1], count, np.diff(edges), align="edge", color=color, label=f"{name} {count.sum():,}")
     if labels is not None:
         for name, color, count in _by_class(scores, mask, _numpy(labels), edges):

@@ -185,8 +185,8 @@ def test_storage_as_table_1_counts_it():
 def test_summary_names_counts_and_size():
     text = field("adc+sc", n=10).summary()
     assert "decouple+ADC+SC" in text
-    assert "10 Gaussians, 4 of 16 channels, 4 codewords" in text
-    assert f"{field('adc+sc', n=10).storage() / MIB:.2f} MB" in text
+    assert "10 Gaussians, 4 channels for 16, 4 codewords" in text
+    assert f"{field('adc+sc', n=10).storage() / MIB:.2f} MiB" in text
     assert "seconds: 1.5" in text
     assert "teacher" not in text
 

@@ -107,15 +107,18 @@ def test_legend_counts_states_and_says_how_many_lines_are_drawn(monkeypatch, plo
 
 
 def test_histogram_counts_every_distance_and_marks_lambda(tmp_path, monkeypatch):
-    bars, lines = [], []
+    bars, lines, named = [], [], []
     real_bar, real_line = Axes.bar, Axes.axvline
     monkeypatch.setattr(
-        Axes, "bar", lambda self, x, h, *a, **k: (bars.append((x, h)), real_bar(self, x, h, *a, **k))[1]
+        Axes,
+        "bar",
+        lambda self, x, h, *a, **k: (bars.append((x, h)), named.append(k["label"]), real_bar(self, x, h, *a, **k))[2],
     )
     monkeypatch.setattr(Axes, "axvline", lambda self, x, **k: (lines.append(x), real_line(self, x, **k))[1])
     distances = torch.cat([torch.logspace(-3, 0, 300), torch.zeros(2), torch.full((5,), float("inf"))])
     plot_distances(distances, 0.1, tmp_path / "distances.png")
     assert lines == [0.1]
+    assert named == ["within lambda", "beyond"]
     (near_x, near), (far_x, far) = bars
     assert near.sum() + far.sum() == 302
     assert near_x.max() < 0.1 <= far_x.min()
@@ -123,7 +126,7 @@ def test_histogram_counts_every_distance_and_marks_lambda(tmp_path, monkeypatch)
     from PIL import Image
 
     picture = np.asarray(Image.open(tmp_path / "distances.png").convert("RGB")).reshape(-1, 3)
-    for color in palette(np.array([1, 7])):
+    for color in (palette(np.array(4)), [191, 191, 191]):
         assert (picture == color).all(axis=1).sum() > 500
 
 
