@@ -1,39 +1,31 @@
-# ---
-# jupyter:
-#   jupytext:
-#     text_representation:
-#       extension: .py
-#       format_name: percent
-#   kernelspec:
-#     display_name: Python 3
-#     language: python
-#     name: python3
-# ---
-
 # %% [markdown]
-# # 6 - Inspect in pyvista
+# # 6. Inspect in pyvista
 #
-# Everything that `kfgs.viz` draws, in pyvista's own grammar: `add_*(plotter, ...)` puts one actor into a plotter and returns
-# it, data travel as named arrays, and you call `.show()`. You will see both fields as true Gaussians, cameras, matches,
+# What `kfgs.viz` puts into a pyvista plotter, in pyvista's own grammar: `add_*(plotter, ...)` puts one actor into it and
+# returns it, data travel as named arrays, and you call `.show()`. You will see both fields as true Gaussians, cameras,
 # selections, and at the end the explorer: type a word and watch it light up in the semantic cloud and, through lambda, in
 # the colour cloud.
 #
-# **Time**: about a minute and a half on two CPU cores the first time, a quarter of a minute when another
-# notebook has made the fields. **Needs**: nothing; without a display everything is drawn off-screen
-# (Debian: `libegl1 libegl-mesa0 libgl1-mesa-dri`).
+# About a minute and a half on two CPU cores if no notebook was run before this one, 15 seconds if
+# `5_query_transfer_edit` was. Needs the extra `notebook`, no data and no display: without one everything is drawn
+# off-screen (Debian: `libegl1 libegl-mesa0 libgl1-mesa-dri`).
 
 # %%
-# Your own data: a scene, its teacher's maps, the classes with their text embeddings, and a run folder. Fields that are
-# there already are only read.
+# Your own data: a scene, its teacher's maps, the classes with their text embeddings, and a run folder (fields that are
+# there already are only read); what to ask for, a class to show alone, and what hides the rest from outside.
 import os
 from pathlib import Path
 
 from kfgs import ToyConfig, make_toy_room
 
 data = Path(os.environ.get("KFGS_NOTEBOOK_DATA", "data"))
-folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))  # or Path("my_scene")
+folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))  # yours: folder = Path("my/scene")
 features, names, text = folder / "features", folder / "classes.json", folder / "text.npy"
 run, out = data / "run", data / "pictures"
+word, alone = "chair", "table"
+shell = ("ceiling", "wall", "door", "picture")  # where there are such classes
+apart = 0.15  # scene units: parts that are nearer are one thing; None: the spacing of the Gaussians decides
+shown_view = 3  # of the test views
 
 # %%
 from dataclasses import replace
@@ -60,6 +52,7 @@ from kfgs import (
 )
 from kfgs.labels import select_where
 from kfgs.metrics import psnr
+from kfgs.pipeline import feature_colors
 
 # %% [markdown]
 # The same room and the same fields as in the notebooks before. The semantic Gaussians get their labels from the votes of
@@ -89,18 +82,14 @@ print(transfer)
 # anisotropic Gaussians, sorted and blended. `look_through` puts the view where one of the scene's cameras stood.
 
 # %%
-camera = scene.cameras[scene.views("test")[3]]
+camera = scene.cameras[scene.views("test")[shown_view]]
+width = min(camera.width, 256)  # of each picture in a row of them
 plotter = viz.make_plotter(480, 640, off_screen=True)
 actor = viz.add_cloud(plotter, semantic, color_by="label", style="gaussians")
 viz.add_legend(plotter, semantic.labels, classes.names)
 viz.look_through(plotter, camera)
+print(actor.mapper.dataset.array_names)  # what the actor carries, one row per Gaussian
 Image.fromarray(plotter.screenshot(return_img=True))  # with a display: plotter.show()
-
-# %% [markdown]
-# What the actor carries: one row per Gaussian, under names.
-
-# %%
-print(actor.mapper.dataset.array_names)
 
 # %% [markdown]
 # ## Points, Gaussians, ellipsoids
@@ -123,24 +112,22 @@ styles = ("points", "gaussians", "ellipsoids")
 pictures = [
     shot(camera, lambda plotter, style=style: viz.add_cloud(plotter, semantic, style=style)) for style in styles
 ]
-Image.fromarray(viz.picture_grid([pictures], styles))
+Image.fromarray(viz.picture_grid([pictures], styles, width=width))
 
 # %% [markdown]
 # ## What colours stand for
 #
 # Labels, colours, latents, scores, opacity. Latent colours are **one** projection per scene (`FeatureColors`), so that they
-# agree from view to view. A score bar is `add_scalar_bar`. Scores here are the relevancy of "chair", told from the other
+# agree from view to view. A score bar is `add_scalar_bar`. Scores here are the relevancy of the word, told from the other
 # classes.
 
 # %%
-word = "chair"
 others = classes.embeddings[[i for i, name in enumerate(classes.names) if name != word]]
 found = field.query(classes.embeddings[classes.index(word)], negatives=others, cameras=cameras)
-projection = viz.FeatureColors.fit(semantic.features)
 meanings = {
     "labels": (semantic, {"color_by": "label"}),
-    "latents": (semantic, {"color_by": "feature", "feature_colors": projection}),
-    "score of chair": (semantic, {"color_by": found.scores, "clim": (0, 1)}),
+    "latents": (semantic, {"color_by": "feature", "feature_colors": feature_colors(field)}),
+    f"score of {word}": (semantic, {"color_by": found.scores, "clim": (0, 1)}),
     "carried labels": (color, {"color_by": "label"}),
     "rgb": (color, {"color_by": "view"}),
     "opacity": (color, {"color_by": "opacity"}),
@@ -150,38 +137,42 @@ pictures = [
     for cloud, how in meanings.values()
 ]
 titles = list(meanings)
-rows = [viz.picture_grid([pictures[i : i + 3]], titles[i : i + 3]) for i in (0, 3)]
+rows = [viz.picture_grid([pictures[i : i + 3]], titles[i : i + 3], width=width) for i in (0, 3)]
 Image.fromarray(np.concatenate(rows))
 
 # %% [markdown]
 # ## Is it the right picture?
 #
 # The same Gaussians by kfgs's own rasteriser, the one that trains and scores. VTK's Gaussians are sorted, dilated, and cut
-# off by the rules of 3DGS, so the two agree to more than 40 dB: what you inspect is what was fitted.
+# off by the rules of 3DGS, so the two agree to about 40 dB (as in notebook 2, now with the trained colours): what you
+# inspect is what was fitted.
 
 # %%
 drawn = shot(camera, lambda plotter: viz.add_cloud(plotter, color, color_by="view", style="gaussians"))
 with torch.no_grad():
     ours = rasterize(color.replace(features=None), camera, background=torch.ones(3)).map.clamp(0, 1)
-apart = (torch.from_numpy(drawn / 255).float() - ours).abs()
+error = (torch.from_numpy(drawn / 255).float() - ours).abs()
+titles = ["pyvista", "kfgs.rasterize", "10 x difference"]
 print(f"{psnr(torch.from_numpy(drawn / 255).float(), ours):.1f} dB")
-Image.fromarray(viz.picture_grid([[drawn, ours, 10 * apart]], ["pyvista", "kfgs.rasterize", "10 x difference"]))
+Image.fromarray(viz.picture_grid([[drawn, ours, 10 * error]], titles, width=width))
 
 # %% [markdown]
 # ## Cameras and their pictures
 #
-# Pyramids with the true opening, each picture on its image plane, a roof on its upper edge.
+# Pyramids with the true opening, each picture on its image plane, a roof on its upper edge: twelve of them, evenly chosen.
 
 # %%
 up = viz.estimate_up(cameras).float()
-inside = semantic.select(semantic.labels != classes.index("ceiling"))
-outside = viz.orbit_cameras(inside.means, viz.Orbit(frames=8, size=(420, 640), elevation_degrees=50, zoom=1.3), up=up)[
-    1
-]
+hidden = torch.tensor([-1, *(classes.index(name) for name in shell if classes.knows(name))])
+inside = semantic.select(~torch.isin(semantic.labels, hidden))
+around = viz.Orbit(frames=8, size=(420, 640), elevation_degrees=40, zoom=1.3)
+outside = viz.orbit_cameras(inside.means, around, up=up)[1]
+photographs = [scene.image(i) for i in scene.views("train")]
+size = 0.2 * scene.extent
 plotter = viz.make_plotter(*outside.size, off_screen=True)
-viz.add_cloud(plotter, inside, style="points", options=viz.CloudOptions(point_size=2.5, opacity=0.5))
-viz.add_cameras(plotter, cameras, size=0.45)
-viz.add_camera_images(plotter, cameras, [scene.image(i) for i in scene.views("train")], size=0.45)
+viz.add_cloud(plotter, inside, style="gaussians")
+viz.add_cameras(plotter, cameras, size=size, most=12)
+viz.add_camera_images(plotter, cameras, photographs, size=size, most=12)
 viz.look_through(plotter, outside)
 Image.fromarray(plotter.screenshot(return_img=True))
 
@@ -199,16 +190,17 @@ Image.fromarray(plotter.screenshot(return_img=True))
 #
 # `answers` gives the connected parts of a selection: how many Gaussians, where, how large, seen best from where. Scores
 # light up on the left, and on the right the parts stand in their oriented boxes. The rest keeps its brightness where there
-# are colours: so the selection is carried to the colour cloud first.
+# are colours: so the selection is carried to the colour cloud first, to half of lambda, so that parts stay crisp.
+# (Matches and the histogram of their distances, `add_matches` and `plot_distances`, are in notebook 5.)
 
 # %%
-parts = answers(semantic, found, cameras)
+parts = answers(semantic, found, cameras, distance=apart)
 for part in parts:
     print(part)
 owner = torch.full((len(semantic),), -1)
 for number, part in enumerate(parts):
     owner[part.indices] = number
-carried = transfer_labels(semantic, owner, color, 0.1).labels
+carried = transfer_labels(semantic, owner, color, transfer.distance / 2).labels
 selections = {f"{word} {number + 1}": select_where(carried == number) for number in range(len(parts))}
 
 
@@ -221,35 +213,8 @@ def draw_parts(plotter):
     viz.add_selections(plotter, color, selections, style="gaussians")
 
 
-Image.fromarray(viz.picture_grid([[shot(camera, draw_scores, 2), shot(camera, draw_parts, 2)]], ["scores", "parts"]))
-
-# %% [markdown]
-# ## Matches
-#
-# Who gave a label to whom (Sec. 3.4): matched, ambiguous (sources in range disagree, as at borders) and orphaned
-# destinations, and lines to the sources. Lines are as short as lambda, so the colour cloud is lifted off by `shift`.
-
-# %%
-shift = 2 * float(scene.extent) * up
-around = viz.orbit_cameras(
-    torch.cat([semantic.means, semantic.means + shift]), viz.Orbit(frames=8, size=(480, 640)), up=up
-)[1]
-
-
-def draw_matches(plotter):
-    viz.add_cloud(plotter, semantic, style="points")
-    viz.add_matches(plotter, semantic, color, transfer, shift=tuple(shift.tolist()))
-
-
-Image.fromarray(shot(around, draw_matches))
-
-# %% [markdown]
-# How far the labels of the whole scene travelled, and where lambda cuts.
-
-# %%
-out.mkdir(parents=True, exist_ok=True)
-viz.plot_distances(transfer.distances, transfer.distance, out / "distances.png")
-display.Image(out / "distances.png")
+pictures = [shot(camera, draw_scores, 2), shot(camera, draw_parts, 2)]
+Image.fromarray(viz.picture_grid([pictures], ["scores", "parts"], width=2 * width))
 
 # %% [markdown]
 # ## Recolour without drawing anew
@@ -261,10 +226,11 @@ plotter = viz.make_plotter(*camera.size, off_screen=True)
 actor = viz.add_cloud(plotter, semantic, style="gaussians")
 viz.look_through(plotter, camera)
 before = plotter.screenshot(return_img=True)
-wanted = torch.where(semantic.labels == classes.index("table"), semantic.labels, -1)
+wanted = torch.where(semantic.labels == classes.index(alone), semantic.labels, -1)
 viz.recolor_cloud(actor, viz.palette(wanted))
 plotter.render()
-Image.fromarray(viz.picture_grid([[before, plotter.screenshot(return_img=True)]], ["all classes", "the table"]))
+after = plotter.screenshot(return_img=True)
+Image.fromarray(viz.picture_grid([[before, after]], ["all classes", alone], width=width))
 
 # %% [markdown]
 # ## The explorer, driven from cells
@@ -275,27 +241,28 @@ Image.fromarray(viz.picture_grid([[before, plotter.screenshot(return_img=True)]]
 options = viz.ExploreOptions(height=360, width=960)
 view = viz.explore(field, color, classes=classes, cameras=cameras, where="picture", options=options)
 view.look_from(camera)
-asked = view.ask("chair")
+view.ask(word)
 print("\n".join(view.lines()))
 Image.fromarray(view.screenshot())
 
 # %% [markdown]
 # The question was told from the other classes; gamma and lambda were chosen from the data, and can be dragged. A higher
 # gamma keeps what is surest. A smaller lambda leaves colour Gaussians without a source (grey once the question is dropped):
-# far too small here, to see what it does.
+# a sixth of it is far too small, to see what it does.
 
 # %%
 view.set_gamma(0.8)
-view.set_distance(0.05)
+view.set_distance(transfer.distance / 6)
 print("\n".join(view.lines()))
 Image.fromarray(view.screenshot())
 
 # %% [markdown]
-# Point at something (pixels, y from the top): its class, its neighbours, the views that see it.
+# Point at something (pixels, y from the top), here at the middle of the left half: its class, its neighbours, the views that
+# see it.
 
 # %%
 view.ask(None)
-picked = view.pick(180, 290)
+picked = view.pick(options.width / 4, options.height / 2)
 print("\n".join(picked.lines() if picked else ["background"]))
 Image.fromarray(view.screenshot())
 
@@ -305,9 +272,10 @@ Image.fromarray(view.screenshot())
 # The same explorer, with sliders, checkboxes and a line to type in:
 #
 # ```python
-# viz.explore(field, color, classes=classes, cameras=cameras)                      # here, in the notebook
-# viz.explore(field, color, classes=classes, cameras=cameras, where="browser")     # a page that only this machine opens
-# viz.explore(field, color, classes=classes, cameras=cameras, where="window")      # a desktop window
+# everything = {"classes": classes, "cameras": cameras}
+# viz.explore(field, color, **everything)                     # here, in the notebook
+# viz.explore(field, color, **everything, where="browser")    # a page that only this machine opens; interrupt the kernel to go on
+# viz.explore(field, color, **everything, where="window")     # a desktop window; the cell waits until it is closed
 # ```
 #
 # or, from a shell, `kfgs view data/run/field --color data/run/color.ply --scene data/room`. To ask for words that are no
@@ -316,15 +284,12 @@ Image.fromarray(view.screenshot())
 # %% [markdown]
 # ## Files to send around
 #
-# A turntable (GIF; MP4 with the extra `video`), drawn by kfgs's rasteriser without OpenGL. Walls and ceiling would hide the
-# rest, and since the colour Gaussians know their classes now, they can be left out by name.
+# A turntable (GIF; MP4 with the extra `video`), drawn by kfgs's rasteriser without OpenGL, of what stands in the room.
 
 # %%
 view.close()
-shell = torch.tensor([-1, *(classes.index(name) for name in ("wall", "ceiling", "door", "picture"))])
-things = color.select(~torch.isin(color.labels, shell)).replace(labels=None)  # in its own colours
-orbit = viz.Orbit(frames=12, size=(135, 180), elevation_degrees=35, zoom=1.5)
-film = viz.save_turntable(out / "turntable.gif", things, orbit=orbit, up=up, fps=6)
+orbit = viz.Orbit(frames=10, size=(165, 220), elevation_degrees=40, zoom=1.5)
+film = viz.save_turntable(out / "turntable.gif", inside, orbit=orbit, up=up, fps=5)
 print(f"{film.stat().st_size / 1000:.0f} kB")
 display.Image(film)
 
@@ -336,5 +301,9 @@ display.Image(film)
 plotter = viz.make_plotter(480, 640, off_screen=True)
 viz.add_cloud(plotter, inside, style="gaussians")
 viz.look_through(plotter, outside)
-page = viz.save_page(out / "room.html", plotter, labels=inside.labels, names=classes.names, title="the toy room")
+page = viz.save_page(out / "room.html", plotter, labels=inside.labels, names=classes.names, title=folder.name)
 print(f"{page.path.name}: {page.path.stat().st_size / 1e6:.1f} MB; {page.note}")
+display.FileLink(page.path)
+
+# %% [markdown]
+# Next: [7_your_own_images](7_your_own_images.py) starts from photographs, with a teacher of your own.
