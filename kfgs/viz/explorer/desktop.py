@@ -7,10 +7,9 @@ from collections.abc import Callable
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from ..._check import error_line
 from ..headless import has_display
+from .listed import listed
 from .pane import PanelPane
 from .panel import PanelView, Slider, Spot
 from .query_line import QueryLine
@@ -69,7 +68,7 @@ class Desktop:
         self._pressed: tuple[int, int] | None = None  # on a cloud
         self._applied = self._took = 0.0  # when the clouds followed a slider, and how long that took
         self._calling = False
-        self._labels = self._present()
+        self._classes = listed(explorer.state)
         self.pane = PanelPane(explorer.plotter, self.view)
         interactor = explorer.plotter.iren.interactor
         self._tags = {
@@ -116,7 +115,7 @@ class Desktop:
             sliders=self._sliders(),
             choices=(("show", state.shows, state.show), ("style", STYLES, self.explorer.style)),
             actions=ACTIONS,
-            classes=[(label, "no class" if label < 0 else state.meaning.names[label]) for label in self._labels],
+            classes=self._classes,
             hidden=state.hidden,
             scroll=self.scroll,
             lines=self.explorer.lines(),
@@ -134,13 +133,6 @@ class Desktop:
         if len(state.sides) > 1:
             sliders.append(Slider("lambda", distance, *state.distance_range, logarithmic=True))
         return sliders
-
-    def _present(self) -> list[int]:
-        """The labels in this scene, -1 last."""
-        found = {int(label) for label in np.unique(self.explorer.state.labels("semantic"))}
-        if len(self.explorer.state.sides) > 1:
-            found |= {-1}  # whether a colour Gaussian has none depends on lambda
-        return sorted(found - {-1}) + [-1] * (-1 in found)
 
     # ---- verbs
 
@@ -183,7 +175,7 @@ class Desktop:
         elif kind == "box":
             self.call(lambda: explorer.set_hidden(explorer.state.hidden ^ {value}))
         elif kind == "all":
-            self.call(lambda: explorer.set_hidden(() if value else self._labels))
+            self.call(lambda: explorer.set_hidden(() if value else [label for label, _ in self._classes]))
         elif value == "save picture":
             self.call(self._save_picture)
         elif value == "save selection":

@@ -17,7 +17,7 @@ from .desktop import open_window
 from .exploration import Exploration
 from .explorer import Explorer
 from .meaning import FieldMeaning, Meaning, SplatMeaning
-from .notebook import in_notebook, show_in_notebook
+from .notebook import close_earlier, in_notebook, show_in_notebook
 from .options import ExploreOptions
 from .web import require_web, serve
 
@@ -53,8 +53,10 @@ def explore(
         embed: the teacher's text encoder, word -> [D], to ask for more than the classes.
         distance: lambda, world units; None: from the clouds' spacing.
         where: `window` (blocks until it is closed), `browser` (a page that only this machine can open; blocks until
-            Ctrl-C), `notebook` (the page within the cell), `picture` (nothing opens; in a notebook the explorer shows as
-            a picture). `auto`: the notebook if there is one, else a window where there is a display, else a picture.
+            Ctrl-C), `notebook` (the page within the cell, or a picture and the line to install where the extra `web` is
+            missing; running the cell again closes the explorer that it made before), `picture` (nothing opens; in a
+            notebook the explorer shows as a picture). `auto`: the notebook if there is one, else a window where there is
+            a display, else a picture.
         options: size, style, where files are saved.
 
     Returns:
@@ -62,7 +64,7 @@ def explore(
 
     Raises:
         ValueError: if there is nothing to look at, or arguments contradict each other.
-        ImportError: if `browser` or `notebook` is asked for and the extra `web` is missing.
+        ImportError: if `browser` is asked for and the extra `web` is missing, or `notebook` and IPython is.
         RuntimeError: if nothing can be drawn here, or a window is asked for and there is no display.
     """
     check_choice("where", where, get_args(Where))
@@ -117,7 +119,7 @@ def check_place(place: Where) -> None:
     """Refuse a place that is not there, before anything is computed.
 
     Raises:
-        ImportError: if a page is asked for and the extra `web` is missing.
+        ImportError: if the browser's page is asked for and the extra `web` is missing.
         RuntimeError: if a window is asked for and there is no display.
     """
     if place == "browser":
@@ -136,4 +138,5 @@ def show(explorer: Explorer, place: Where) -> None:
     elif place == "browser":
         serve(explorer)
     elif place == "notebook":
+        close_earlier(explorer)
         show_in_notebook(explorer)

@@ -12,16 +12,17 @@ import secrets
 import socket
 import sys
 import weakref
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from PIL import Image
 
-from .web import Listening, require_web
+from .web import Listening, require_open, require_web
 
 if TYPE_CHECKING:
     from .explorer import Explorer
 
-LEAST = 560  # pixels of the page's height, for its controls
+LEAST = 640  # pixels of the page's height, for its controls
 QUALITY = 80  # of the JPEG that a saved notebook keeps: some 60 kB
 # The page is asked for again until the kernel, which may be busy, answers; a picture that only the page's server has is
 # what tells that it does. A kernel on another machine never answers, and the picture stays.
@@ -42,14 +43,22 @@ SCRIPT = """(() => {
   if (box) probe();
 })();"""
 
-_open: weakref.WeakKeyDictionary[Any, tuple[Listening, asyncio.Task[None]]] = weakref.WeakKeyDictionary()
+
+class Run(NamedTuple):
+    """One run of a notebook's cell."""
+
+    cell: str
+    number: int
+
+
+_open: dict[Explorer, tuple[Listening, asyncio.Task[None]]] = {}  # while the page is served
+_shown: weakref.WeakKeyDictionary[Explorer, Run] = weakref.WeakKeyDictionary()
+_made: weakref.WeakKeyDictionary[Explorer, Run] = weakref.WeakKeyDictionary()
 
 
 def in_notebook() -> bool:
     """Whether a Jupyter kernel runs this program."""
-    ipython = sys.modules.get("IPython")
-    shell = None if ipython is None else ipython.get_ipython()
-    return getattr(shell, "kernel", None) is not None
+    return getattr(_shell(), "kernel", None) is not None
 
 
 def show_in_notebook(explorer: Explorer) -> None:
@@ -57,25 +66,71 @@ def show_in_notebook(explorer: Explorer) -> None:
 
     The page is served by the kernel itself, to this machine only; it shows what cells do to the explorer, and cells see
     what was done in it. The saved notebook keeps the picture. Without the extra `web`, or without a kernel, there is the
-    picture alone, and a line that says how to get the controls.
+    picture alone, and a line that says how to get the controls. `explorer.close()` ends the page. An explorer that was
+    shown so is shown so again where a later cell displays it.
 
     Args:
         explorer: what to look at, with a plotter that is off the screen.
+
+    Raises:
+        RuntimeError: if the explorer is closed.
     """
-    reason = _reason()
+    require_open(explorer)
+    run, reason = _this_run(), _reason()
+    if run is not None:
+        _shown[explorer] = run
+        _shell().display_formatter.ipython_display_formatter.for_type(type(explorer), _display_again)
     picture = _picture(explorer)
     if reason is not None:
         _display(f"{picture}<p><small>{html.escape(reason)}</small></p>", reason)
         return
-    if explorer not in _open or _open[explorer][1].done():
+    if explorer not in _open:
         listening = Listening(explorer, "127.0.0.1", _free_port())
         task = asyncio.get_running_loop().create_task(_serve(listening))
-        task.add_done_callback(_tell)
         _open[explorer] = listening, task
+        task.add_done_callback(partial(_ended, explorer))
     url, height = _open[explorer][0].url, max(explorer.plotter.render_window.GetSize()[1], LEAST)
     name = f"kfgs-{secrets.token_hex(8)}"  # of the output: a cell may be run twice
     script = SCRIPT.replace("ID", json.dumps(name)).replace("URL_", json.dumps(url)).replace("HEIGHT", str(height))
     _display(f'<div id="{name}">{picture}</div><script>{script}</script>', f"the explorer is open at {url}")
+
+
+def close_earlier(explorer: Explorer) -> None:
+    """Close what this cell made when it ran before, now that it has made this explorer, or each run would leave one open.
+
+    A front end tells which cell runs; where none does, the same words are the same cell.
+    """
+    run = _this_run()
+    if run is None:
+        return
+    for other, its in list(_made.items()):
+        if its.cell == run.cell and its.number != run.number:
+            other.close()
+            del _made[other]
+    _made[explorer] = run
+
+
+def _display_again(explorer: Explorer) -> None:
+    """What a cell shows of its last value: nothing where the page is there, the page where it is not."""
+    run = _this_run()
+    if explorer.closed or explorer not in _shown or run is None:
+        raise NotImplementedError  # IPython goes on to the picture
+    if _shown[explorer] != run:
+        show_in_notebook(explorer)
+
+
+def _shell() -> Any:
+    ipython = sys.modules.get("IPython")
+    return None if ipython is None else ipython.get_ipython()
+
+
+def _this_run() -> Run | None:
+    """Which cell runs now; None without a kernel."""
+    if not in_notebook():
+        return None
+    shell = _shell()
+    told = shell.kernel.get_parent("shell").get("metadata", {}).get("cellId")
+    return Run(told or shell.history_manager.input_hist_raw[-1], shell.execution_count)
 
 
 def _reason() -> str | None:
@@ -98,7 +153,8 @@ async def _serve(listening: Listening) -> None:
         await listening.ended()
 
 
-def _tell(task: asyncio.Task[None]) -> None:
+def _ended(explorer: Explorer, task: asyncio.Task[None]) -> None:
+    _open.pop(explorer, None)
     if not task.cancelled() and task.exception() is not None:
         logging.getLogger(__name__).error("the explorer's page ended: %s", task.exception())
 

@@ -12,6 +12,7 @@ import socket
 import sys
 import webbrowser
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from ..._check import check_whole, error_line
@@ -50,13 +51,14 @@ def serve(
     """Show an explorer in the browser until Ctrl-C. Closing the tab ends nothing: its link opens the page again.
 
     The page listens on this machine only, and its link holds a secret: other pages in the same browser, other people who
-    reach the port, and other machines' names are refused. Several tabs show the same state. It saves into the explorer's
-    own folder (`ExploreOptions.out`) under names of its own.
+    reach the port, and other machines' names are refused. Several tabs show the same state, and the same picture in the
+    size of the tab that was resized last. It saves into the explorer's own folder (`ExploreOptions.out`) under names of
+    its own. `explorer.close()` ends the page.
 
     Args:
         explorer: what to look at, with a plotter that is off the screen.
-        host: address to listen on. Any other than this machine's own lets everyone who reaches it and has the link look,
-            and save pictures and selections here; nothing on the way is encrypted.
+        host: address to listen on. Any other than this machine's own lets everyone who reaches it and has the link look
+            and steer what all see, and save pictures and selections here; nothing on the way is encrypted.
         port: of the page; 0: a free one.
         open_browser: open the link in the default browser, where there is a display.
         say: told the link, line by line; None: lines on standard error.
@@ -64,7 +66,7 @@ def serve(
     Raises:
         ImportError: if the extra `web` is missing.
         ValueError: if the address is not one of this machine, or the port is taken.
-        RuntimeError: if an event loop runs already, as in a notebook.
+        RuntimeError: if an event loop runs already, as in a notebook, or the explorer is closed.
     """
     require_web()
     check_whole("port", port, 0, 65535)
@@ -76,13 +78,26 @@ def serve(
         asyncio.run(_serve(explorer, host, port, open_browser, say or _to_stderr))
 
 
+def require_open(explorer: Explorer) -> None:
+    """Refuse an explorer that has nothing to draw into.
+
+    Raises:
+        RuntimeError: if it is closed.
+    """
+    if explorer.closed:
+        raise RuntimeError(
+            "explorer: expected an open one to show, got one that is closed; make another with explore(...) or "
+            "Explorer(explorer.state)"
+        )
+
+
 async def _serve(explorer: Explorer, host: str, port: int, open_browser: bool, say: Callable[[str], object]) -> None:
     async with Listening(explorer, host, port) as listening:
         say(f"the explorer is open at {listening.url}")
         if not is_loopback(host):
             say(
-                f"note: it listens on {host}: everyone who reaches it and has the link can look, and save pictures and "
-                f"selections into {explorer.options.out}; nothing on the way is encrypted"
+                f"note: it listens on {host}: everyone who reaches it and has the link can look, steer, and save pictures "
+                f"and selections into {explorer.options.out}; nothing on the way is encrypted"
             )
         say("Ctrl-C ends it; closing the tab does not")
         if open_browser and has_display():  # without one, Python would open a browser within the terminal
@@ -99,15 +114,22 @@ class Listening:
         port: 0 for a free one.
 
     Raises:
-        ValueError: on entering, if the address is not one of this machine, or the port is taken.
+        ValueError: on entering, if the address is not one of this machine, or the port is taken; at once, if it is none.
+        RuntimeError: if the explorer is closed.
     """
 
     def __init__(self, explorer: Explorer, host: str, port: int) -> None:
+        require_open(explorer)
+        if not host.strip():  # aiohttp would listen to everyone
+            raise ValueError(
+                f"host: expected an address of this machine, got {host!r}; 127.0.0.1 is for this machine alone, 0.0.0.0 "
+                "for everyone"
+            )
         self.secret = secrets.token_urlsafe(24)
         self._explorer, self._host, self._port = explorer, host, port
         self._name = f"kfgs-{secrets.token_hex(8)}"
         self._tasks: list[asyncio.Task[Any]] = []
-        self._quiet = contextlib.ExitStack()
+        self._quiet, self._closed = contextlib.ExitStack(), asyncio.Event()
 
     async def __aenter__(self) -> Listening:
         from trame.app import get_server
@@ -135,6 +157,7 @@ class Listening:
         self._tasks = [task, asyncio.ensure_future(self.page.work())]
         self._quiet.enter_context(_closed_tabs())
         self._explorer.set_legend(False)  # the page lists the classes itself
+        self._explorer.on_close(partial(self._leave, asyncio.get_running_loop()))
         return self
 
     @property
@@ -145,8 +168,12 @@ class Listening:
         return f"http://{name}:{self._port or self._server.port}/{self.secret}/index.html"
 
     async def ended(self) -> None:
-        """Wait until the server stops."""
-        await asyncio.wait(self._tasks[:1])  # a plain await would hand a cancellation on to wslink, which stumbles
+        """Wait until the server stops, or the explorer is closed."""
+        closed = asyncio.ensure_future(self._closed.wait())
+        try:  # a plain await would hand a cancellation on to wslink, which stumbles
+            await asyncio.wait([self._tasks[0], closed], return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            closed.cancel()
 
     async def __aexit__(self, *_: object) -> None:
         self._explorer.set_legend(True)
@@ -159,8 +186,14 @@ class Listening:
         self._quiet.close()
         self._forget()
 
+    def _leave(self, loop: asyncio.AbstractEventLoop) -> None:
+        """The explorer was closed, perhaps by another thread, or long after the page."""
+        if not loop.is_closed():
+            loop.call_soon_threadsafe(self._closed.set)
+
     def _guard(self, wslink: Any, **_: Any) -> None:
         wslink.app.middlewares.append(make_guard(self.secret, self._host))
+        self._server.protocol.stopServer = lambda: None  # wslink lets any tab end the server
 
     def _forget(self) -> None:
         """Trame keeps every server for ever, by name."""

@@ -24,7 +24,8 @@ def make_guard(secret: str, host: str) -> Callable[[Any, Callable[[Any], Awaitab
 
     Refused with 403, before anything is read: a path without the secret; a request, such as a websocket of another page,
     whose Origin is not the page's own; and, while only this machine is listened to, another machine's name in Host (a
-    name that was made to point at 127.0.0.1). Answers forbid the browser to load anything from elsewhere.
+    name that was made to point at 127.0.0.1). Refused with 400: the websocket's address, opened as a page, which wslink
+    stumbles over. Answers, refusals too, forbid the browser to load anything from elsewhere.
 
     Args:
         secret: what only the link tells.
@@ -34,8 +35,7 @@ def make_guard(secret: str, host: str) -> Callable[[Any, Callable[[Any], Awaitab
 
     local = is_loopback(host)
 
-    @web.middleware
-    async def guard(request: Any, handler: Callable[[Any], Awaitable[Any]]) -> Any:
+    def check(request: Any) -> None:
         first = request.path.split("/")[1]
         if not hmac.compare_digest(first.encode(), secret.encode()):
             raise web.HTTPForbidden(text=REFUSED)
@@ -44,8 +44,17 @@ def make_guard(secret: str, host: str) -> Callable[[Any, Callable[[Any], Awaitab
         origin = request.headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc.lower() != request.host.lower():
             raise web.HTTPForbidden(text=REFUSED)
+        if request.path == f"/{secret}/ws" and not web.WebSocketResponse().can_prepare(request).ok:
+            raise web.HTTPBadRequest(text="This address is the page's own.\n")
+
+    @web.middleware
+    async def guard(request: Any, handler: Callable[[Any], Awaitable[Any]]) -> Any:
         try:
+            check(request)
             response = await handler(request)
+        except web.HTTPException as refusal:
+            refusal.headers.update(_headers(request.host))
+            raise
         except ConnectionError:  # the tab was closed in the midst of a picture
             return web.Response()
         if not response.prepared:  # a websocket is under way

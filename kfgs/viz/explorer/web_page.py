@@ -10,8 +10,12 @@ from math import isfinite, log
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
+import numpy as np
+
 from ..._check import error_line
 from ..palette import palette
+from .listed import listed
+from .web_mouse import make_mouse
 from .web_picture import Pictures, make_delivery
 
 if TYPE_CHECKING:
@@ -77,7 +81,7 @@ class ExplorerPage:
         self.pictures = Pictures(explorer.plotter, self._resized)
         self._fitted: object = self.pictures.camera
         self.view = self._lay_out()
-        server.add_protocol_to_configure(lambda protocol: protocol.registerLinkProtocol(make_delivery(self.pictures)))
+        server.add_protocol_to_configure(self._add_protocols)
         for name in ("ask", "set_number", "set_show", "set_style", "hide", "hide_all", "pick"):
             server.trigger(name)(getattr(self, f"_on_{name}"))
         for name in ("save_picture", "save_selection", "reset_view"):
@@ -86,17 +90,24 @@ class ExplorerPage:
         server.state.change("distance_at")(self._on_distance)
         explorer.listen(self._changed)
 
+    def _add_protocols(self, protocol: Any) -> None:
+        delivery = make_delivery(self.pictures)
+        protocol.registerLinkProtocol(delivery)
+        protocol.registerLinkProtocol(make_mouse(self.pictures, delivery))
+
     async def work(self) -> None:
-        """Do what the browser asks for, until cancelled."""
+        """Do what the browser asks for, until cancelled or the explorer is closed."""
         self._loop = asyncio.get_running_loop()
         self._wake.set()  # a notebook's cells may have changed the explorer before
         while True:
             await self._wake.wait()
             self._wake.clear()
+            if self.pictures.gone:
+                return
             if self._waiting:
                 await self._tell_working(True)
-            while self._waiting:
                 self._error = ""
+            while self._waiting:
                 self._do(self._waiting.pop(next(iter(self._waiting))))
             self._show()
             await self._tell_working(False)
@@ -133,7 +144,10 @@ class ExplorerPage:
     # What the browser sends. It may be anything: verbs check values, words are only words, and no path is among them.
 
     def _on_ask(self, words: object) -> None:
-        self._queue("ask", lambda: self.explorer.ask(str(words)[:LONGEST].strip() or None))
+        said = str(words)
+        if said not in self.explorer.state.meaning.names:  # a class may have a longer name
+            said = said[:LONGEST].strip()
+        self._queue("ask", lambda: self.explorer.ask(said or None))
 
     def _on_set_number(self, name: object, text: object) -> None:
         verb = {"gamma": self.explorer.set_gamma, "distance": self.explorer.set_distance}[str(name)]
@@ -154,7 +168,7 @@ class ExplorerPage:
         self._queue(f"hide {label!r}", action)
 
     def _on_hide_all(self, hidden: object) -> None:
-        labels = [item["label"] for item in self._classes()] if hidden else []
+        labels = [label for label, _ in listed(self.explorer.state)] if hidden else []
         self._queue("hide", lambda: self.explorer.set_hidden(labels))
 
     def _on_pick(self, across: object, down: object) -> None:
@@ -210,6 +224,7 @@ class ExplorerPage:
         self.server.state.update({
             "trame__title": "kfgs explorer",
             "query": "",
+            "names": list(dict.fromkeys(state.meaning.names)),
             "hint": state.meaning.names[0] if state.meaning.names else "",
             "has_color": "color" in state.sides,
             "shows": [{"value": value, "title": TITLES.get(value, value)} for value in state.shows],
@@ -244,20 +259,18 @@ class ExplorerPage:
 
     def _classes(self) -> list[dict[str, Any]]:
         state = self.explorer.state
-        counts = state.facts()["semantic"]
-        rows = [(label, name, count) for label, (name, count) in enumerate(counts["classes"])]
-        if counts["none"]:
-            rows.append((-1, "no class", counts["none"]))
-        colors = palette(_labels([label for label, _, _ in rows]))
+        rows, labels = listed(state), state.labels("semantic")
+        colors = palette(np.array([label for label, _ in rows], dtype=np.int64))
+        counts = [int((labels == label).sum()) for label, _ in rows]
         return [
             {
                 "label": label,
                 "name": name,
-                "count": f"{count:,}",
+                "count": f"{count:,}" if count else "",
                 "color": "#{:02x}{:02x}{:02x}".format(*color),
                 "shown": label not in state.hidden,
             }
-            for (label, name, count), color in zip(rows, colors.tolist(), strict=True)
+            for (label, name), count, color in zip(rows, counts, colors.tolist(), strict=True)
         ]
 
     def _show(self) -> None:
@@ -293,12 +306,6 @@ class ExplorerPage:
                     self.explorer.plotter.render_window, interactive_quality=80, interactive_ratio=1, still_quality=95
                 )
         return view
-
-
-def _labels(values: list[int]) -> Any:
-    import numpy as np
-
-    return np.asarray(values, dtype=np.int64)
 
 
 def _label(value: object) -> int:

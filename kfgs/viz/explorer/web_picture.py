@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 Array = np.ndarray[Any, Any]
 LEAST = 10  # pixels: a tab in the background has no size
+MOST = 8192  # pixels: what any browser's window has
 
 
 class Frame(NamedTuple):
@@ -63,6 +64,11 @@ class Pictures:
     def __init__(self, plotter: pv.Plotter, resized: Callable[[], object]) -> None:
         self.plotter, self.resized, self.changes = plotter, resized, 0
         self.frame: Frame | None = None
+
+    @property
+    def gone(self) -> bool:
+        """Whether the plotter was closed."""
+        return self.plotter.render_window is None
 
     @property
     def camera(self) -> Camera:
@@ -113,10 +119,14 @@ def make_delivery(pictures: Pictures) -> Any:
             self.asked_for = True
             return super().add_render_observer(view_id)
 
+        def push_render(self, *arguments: Any, **options: Any) -> None:
+            if not pictures.gone:
+                super().push_render(*arguments, **options)
+
         def still_render(self, options: dict[str, Any]) -> dict[str, Any]:
             began = perf_counter()
             window: Any = pictures.plotter.render_window
-            width, height = options.get("size", window.GetSize())
+            width, height = (min(int(length), MOST) for length in options.get("size", window.GetSize()))
             if min(width, height) > LEAST and [width, height] != list(window.GetSize()):
                 window.SetSize(width, height)
                 pictures.resized()

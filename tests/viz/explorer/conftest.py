@@ -1,10 +1,37 @@
-"""One Chromium for all tests of the explorer's page, and a server for each file of them."""
+"""What the tests of a file share: a window with an explorer; a Chromium and a server (while one is open, asyncio does not run)."""
 
 import cases_browser
 import pytest
+from cases_window import an_explorer
+
+from kfgs.viz import available, headless
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
+def driver():
+    """Where nothing can be drawn, such a test has nothing to say."""
+    if not available():
+        pytest.skip(headless.probe().reason)
+
+
+@pytest.fixture(scope="module")
+def shared_explorer(driver):
+    with an_explorer() as explorer:
+        yield explorer
+
+
+@pytest.fixture
+def explorer(shared_explorer):
+    """As if new, for tests that leave nothing behind."""
+    shared_explorer.ask(None)
+    shared_explorer.set_show("labels")
+    shared_explorer.set_hidden([])
+    shared_explorer.set_style("gaussians")
+    shared_explorer.state.drop_pick()
+    return shared_explorer
+
+
+@pytest.fixture(scope="module")
 def browser():
     with cases_browser.chromium() as opened:
         yield opened

@@ -1,178 +1,33 @@
 """A real browser opens the page, asks, moves lambda, picks: pixels and numbers change as they should."""
 
-import http.client
-import io
-import os
-import re
 import signal
-import subprocess
-import sys
-import threading
-from pathlib import Path
-from time import monotonic
-from types import SimpleNamespace
-from urllib.parse import urlsplit
 
 import cases_page
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from cases_browser import (
+    SECONDS,
+    changed,
+    check_hosts,
+    check_picked,
+    click,
+    clouds,
+    colored,
+    near,
+    needs_browser,
+    open_page,
+    places,
+    said_lines,
+    set_slider,
+    settled,
+    until,
+    wait_lines,
+)
 
 from kfgs.labels import transfer_labels
-from kfgs.viz import available, palette
-from kfgs.viz.through import camera_of
 
-CHROMIUM = next((path for path in ("/usr/bin/chromium", "/usr/bin/chromium-browser") if Path(path).exists()), None)
-SECONDS = 60  # of patience with a slow machine, for each thing that is waited for
-SIZE = {"width": 900, "height": 420}
-
-
-def has_playwright():
-    try:
-        import playwright.sync_api  # noqa: F401
-    except ImportError:
-        return False
-    return True
-
-
-pytestmark = [
-    pytest.mark.skipif(not has_playwright(), reason="needs playwright"),
-    pytest.mark.skipif(CHROMIUM is None, reason="needs chromium"),
-    pytest.mark.skipif(not available(), reason="needs a driver that draws"),
-]
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory):
-    """The page in a process of its own, as the command line serves it; ended with Ctrl-C, as a person does."""
-    out = tmp_path_factory.mktemp("page")
-    folders = [str(Path(cases_page.__file__).parent), str(Path(__file__).parents[3])]
-    process = subprocess.Popen(
-        [sys.executable, cases_page.__file__, str(out)],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(folders)},
-    )  # fmt: skip
-    said = []
-    reader = threading.Thread(target=lambda: said.extend(iter(process.stderr.readline, "")))
-    reader.start()
-    try:
-        end = monotonic() + SECONDS
-        while not any("http" in line for line in said):
-            assert process.poll() is None, f"the server ended: {''.join(said)}"
-            assert monotonic() < end, "no link was given"
-            reader.join(0.05)
-        url = re.search(r"http://\S+", "".join(said)).group()
-        yield SimpleNamespace(url=url, out=out, process=process, said=said)
-    finally:
-        if process.poll() is None:
-            process.send_signal(signal.SIGINT)
-            try:
-                process.wait(SECONDS)
-            except subprocess.TimeoutExpired:
-                process.kill()
-        process.stdout.close()
-        reader.join()
-        process.stderr.close()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield opened
-        opened.close()
-
-
-def open_page(browser, server, scale=1):
-    """A tab in which the clouds are shown, and the hosts that it has asked for anything."""
-    page = browser.new_context(viewport=SIZE, device_scale_factor=scale).new_page()
-    page.set_default_timeout(1000 * SECONDS)
-    page.hosts, page.errors = [], []
-    page.on("request", lambda request: page.hosts.append(urlsplit(request.url)))
-    page.on("websocket", lambda socket: page.hosts.append(urlsplit(socket.url)))
-    page.on("pageerror", lambda error: page.errors.append(str(error)))
-    page.goto(server.url)
-    page.wait_for_selector("#query")
-    until(page, lambda: colored(clouds(page)).sum() > 100)
-    return page
-
-
-def until(page, condition):
-    """Wait for something that the page shows."""
-    end = monotonic() + SECONDS
-    while not condition():
-        assert monotonic() < end, "it did not happen"
-        page.wait_for_timeout(100)
-
-
-def clouds(page):  # [H, W, 3] uint8
-    picture = Image.open(io.BytesIO(page.locator(".clouds").screenshot(scale="css")))
-    return np.asarray(picture.convert("RGB"))
-
-
-def settled(page):
-    """The picture once it has stopped changing: the first ones of a tab are coarse."""
-    pictures = [clouds(page)]
-
-    def rests():
-        page.wait_for_timeout(500)
-        pictures.append(clouds(page))
-        return np.array_equal(pictures[-1], pictures[-2])
-
-    until(page, rests)
-    return pictures[-1]
-
-
-def colored(picture):  # [H, W, 3] -> [H, W] bool
-    """Clearly coloured; the legend and the titles are left out."""
-    height, width = picture.shape[:2]
-    clear = picture.max(2).astype(int) - picture.min(2) > 110  # the rest is faint
-    clear[: height // 10] = False
-    clear[height // 2 :, : width // 5] = False
-    return clear
-
-
-def changed(picture, before):
-    """How many pixels look otherwise."""
-    return int((np.abs(picture.astype(int) - before).max(2) > 60).sum())
-
-
-def near(picture, label):  # [H, W, 3] -> [H, W] bool
-    """Of a class's colour."""
-    return (np.abs(picture.astype(int) - palette(np.array(label))).max(-1) < 40) & colored(picture)
-
-
-def places(tmp_path, shape):
-    """Where the Gaussians of both clouds lie in the page's picture, [N, 2] for each side; kfgs's camera tells."""
-    with cases_page.explorer(tmp_path) as opened:
-        opened.plotter.window_size = shape[1], shape[0]
-        opened.reset_view()
-        if shape[1] / 2 < shape[0]:  # narrow panes are seen from further away
-            opened.plotter.camera.Dolly(shape[1] / 2 / shape[0])
-        camera = camera_of(opened.plotter, (0, 0))
-        left = [renderer.GetOrigin()[0] for renderer in opened.plotter.renderers]
-        found = {}
-        for side, offset in zip(opened.state.sides, left, strict=True):
-            seen = opened.state.cloud(side).means.double() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-            xy = (seen @ camera.K.T)[:, :2] / seen[:, 2:]
-            found[side] = xy.numpy() + np.array([offset, 0])
-    return found
-
-
-def said_lines(page):
-    return page.locator(".numbers p").all_inner_texts()
-
-
-def wait_lines(page, state):
-    """Until the page says the numbers of a state."""
-    until(page, lambda: said_lines(page) == state.lines())
-
-
-def set_slider(page, name, at):
-    page.locator(f"#{name}").evaluate("(e, at) => { e.value = at; e.dispatchEvent(new Event('input')); }", at)
+pytestmark = needs_browser
 
 
 def test_asking_moving_lambda_and_picking(server, browser, tmp_path):
@@ -231,34 +86,6 @@ def test_asking_moving_lambda_and_picking(server, browser, tmp_path):
     page.context.close()
 
 
-def check_picked(page, state, side):
-    """What the page says of the picked Gaussian is what the state says; returns its class."""
-    lines = page.locator(".picked p").all_inner_texts()
-    index = int(re.match(rf"{dict(color='colour').get(side, side)} Gaussian (\d+): ", lines[0]).group(1))
-    picked = state.pick(side, index)
-    assert lines == picked.lines()
-    return picked.label
-
-
-def click(page, place, steps=0):
-    """A click at a place of the clouds; with steps, the mouse moves 30 pixels while the button is down."""
-    box = page.locator(".clouds").bounding_box()
-    x, y = box["x"] + place[0], box["y"] + place[1]
-    page.mouse.move(x, y)
-    page.mouse.down()
-    if steps:
-        page.mouse.move(x + 30, y + 10, steps=steps)
-    page.mouse.up()
-
-
-def check_hosts(page, server):
-    """Nothing was asked of anyone but the server, and nothing went wrong."""
-    assert page.errors == []
-    asked = {(host.scheme, host.netloc) for host in page.hosts if host.scheme not in ("blob", "data")}
-    netloc = urlsplit(server.url).netloc
-    assert asked == {("http", netloc), ("ws", netloc)}
-
-
 def test_a_second_tab_shows_the_same_and_picks_with_other_pixels(server, browser, tmp_path):
     state = cases_page.exploration()
     first, second = open_page(browser, server), open_page(browser, server, scale=2)
@@ -300,107 +127,6 @@ def test_a_drag_turns_both_clouds_and_picks_nothing(server, browser):
     until(page, lambda: changed(clouds(page), before) < 20)
     assert page.locator(".picked").inner_text() == picked
     page.context.close()
-
-
-def test_classes_are_words_hidden_by_their_box_and_asked_by_their_name(server, browser):
-    page = open_page(browser, server)
-    names = page.locator(".classes .name").all_inner_texts()
-    assert names == list(cases_page.NAMES)  # no name is taken for markup, or for a template
-    page.get_by_label("show table").uncheck()
-    until(page, lambda: not near(clouds(page), cases_page.TABLE).any())
-    page.get_by_label("show table").check()
-    until(page, lambda: near(clouds(page), cases_page.TABLE).any())
-    page.get_by_role("button", name=cases_page.NAMES[2]).click()
-    until(page, lambda: page.input_value("#query") == cases_page.NAMES[2])
-    page.get_by_role("button", name="clear the question").click()
-    until(page, lambda: page.input_value("#query") == "")
-    page.context.close()
-
-
-def test_what_cannot_be_answered_is_told_under_the_field(server, browser):
-    page = open_page(browser, server)
-    page.fill("#query", "chiar")
-    page.keyboard.press("Enter")
-    with pytest.raises(ValueError, match="chair") as told:
-        cases_page.exploration().ask("chiar")
-    until(page, lambda: page.inner_text("#error") == str(told.value))
-    page.fill("input[aria-label^='lambda, a number']", "-1")
-    page.keyboard.press("Enter")
-    until(page, lambda: "distance: expected a number in (0, inf)" in page.inner_text("#error"))
-    page.fill("#query", "chair")
-    page.keyboard.press("Enter")
-    until(page, lambda: not page.inner_text("#error"))
-    page.context.close()
-
-
-def test_saving_goes_into_the_folder_of_the_options(server, browser):
-    page = open_page(browser, server)
-    page.get_by_role("button", name="save picture").click()
-    page.wait_for_selector("text=picture_001.png")
-    picture = np.asarray(Image.open(server.out / "picture_001.png"))
-    shown = clouds(page)
-    assert picture.shape == shown.shape
-    assert np.abs(picture.astype(int) - shown).mean() < 3  # JPEG
-    page.fill("#query", "chair")
-    page.keyboard.press("Enter")
-    page.wait_for_selector("button[aria-label='save selection']:enabled")
-    page.get_by_role("button", name="save selection").click()
-    page.wait_for_selector("text=selection.json")
-    written = sorted(path.name for path in (server.out / "selection_001").iterdir())
-    assert {"selection.json", "selection_semantic.ply", "selection_color.ply"} <= set(written)
-    page.context.close()
-
-
-def test_panes_follow_the_window_and_a_reload_keeps_the_link(server, browser):
-    page = open_page(browser, server)
-    page.set_viewport_size({"width": 700, "height": 640})
-    until(page, lambda: clouds(page).shape[0] == 640 and colored(clouds(page)).sum() > 100)
-    middle = clouds(page)[320, :, :]
-    half = len(middle) // 2
-    assert (middle[half - 3 : half + 3].max(1) < 250).any()  # the border of the panes is in the middle
-    page.reload()
-    page.wait_for_selector("#query")
-    until(page, lambda: colored(clouds(page)).sum() > 100)
-    page.context.close()
-
-
-def ask_for(server, path, **headers):
-    """The status of one request; an upgrade where headers say so."""
-    connection = http.client.HTTPConnection(urlsplit(server.url).netloc, timeout=SECONDS)
-    try:
-        connection.request("GET", path, headers={name.replace("_", "-"): value for name, value in headers.items()})
-        answer = connection.getresponse()
-        return answer.status, dict(answer.getheaders())
-    finally:
-        connection.close()
-
-
-UPGRADE = {
-    "Connection": "Upgrade",
-    "Upgrade": "websocket",
-    "Sec_WebSocket_Version": "13",
-    "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
-}
-
-
-def test_only_the_page_itself_with_its_link_gets_through(server):
-    parts = urlsplit(server.url)
-    secret, own = parts.path.split("/")[1], f"http://{parts.netloc}"
-    assert len(secret) >= 32
-    assert parts.hostname == "127.0.0.1"
-    assert ask_for(server, f"/{secret}/ws", **UPGRADE, Origin=own)[0] == 101
-    assert ask_for(server, f"/{secret}/ws", **UPGRADE, Origin="http://evil.example")[0] == 403
-    assert ask_for(server, f"/{secret}/ws", **UPGRADE, Origin="http://127.0.0.1:1")[0] == 403
-    assert ask_for(server, f"/{secret}/ws", **UPGRADE, Origin="null")[0] == 403
-    assert ask_for(server, f"/{secret}/ws", **UPGRADE, Host="evil.example")[0] == 403
-    for path in ("/", "/index.html", "/ws", f"/{secret[:-1]}/ws", "/wslink-secret/ws", f"/{secret}x/index.html"):
-        assert ask_for(server, path, **UPGRADE, Origin=own)[0] == 403
-    assert ask_for(server, parts.path)[0] == 200
-    for path in ("/../../etc/passwd", "/kfgs_page/../__init__.py", "/kfgs_page/..%2f__init__.py"):
-        assert ask_for(server, f"/{secret}{path}")[0] == 404
-    policy = ask_for(server, parts.path)[1]["Content-Security-Policy"]
-    assert "default-src 'self'" in policy
-    assert f"connect-src 'self' ws://{parts.netloc}" in policy
 
 
 def test_ctrl_c_ends_the_server_without_a_word_more(server, browser):

@@ -116,7 +116,7 @@ def test_listening_to_others_is_told_and_trame_forgets_the_server(explorer, monk
     monkeypatch.setattr(web, "has_display", lambda: True)
     serve(explorer, host="0.0.0.0", say=said.append)
     assert said[0] == f"the explorer is open at {opened[0]}"
-    assert "everyone who reaches it and has the link can look, and save" in said[1]
+    assert "everyone who reaches it and has the link can look, steer, and save" in said[1]
     assert str(explorer.options.out) in said[1]
     assert (set(AVAILABLE_SERVERS), set(HELPERS_PER_SERVER)) == before
 
