@@ -250,7 +250,7 @@ print([edit.op for edit in two])
 two.save(out / "two.edits.json")
 assert kfgs.EditList.load(out / "two.edits.json") == two
 assert two.undo().redo() == two
-lists = {"before": kfgs.EditList(), "one removed": one, "and one painted": two, "undone": two.undo()}
+lists = {"before": kfgs.EditList(), "one removed": one, "and one painted": two, "that undone": two.undo()}
 row = [viz.show_cloud(some.apply(labelled).gaussians, **draw)(views[0]) for some in lists.values()]
 Image.fromarray(viz.picture_grid([row], list(lists), width=width))
 
