@@ -18,6 +18,37 @@ view = cases_page.explorer("out")
 show_in_notebook(view)
 show_in_notebook(view)
 """
+MAKE = """
+import cases_page
+from kfgs.gaussians import Gaussians
+from kfgs.viz import explore
+from kfgs.viz.explorer import ExploreOptions
+from kfgs.formats import SplatFile
+state = cases_page.exploration()
+file = SplatFile(state.cloud("semantic"), classes=cases_page.NAMES)
+options = ExploreOptions(style="points")
+"""
+EXPLORE = "explore(file, options=options)"
+AGAIN = "view = _; view"
+COUNT = """
+import asyncio, gc, weakref, aiohttp
+from kfgs.viz.explorer import notebook
+while len(notebook._open) > 1 or not notebook._open[view][0].page._loop:
+    await asyncio.sleep(0.02)
+import pyvista
+print(len(notebook._open), len(notebook._made), len(pyvista.plotting.plotter._ALL_PLOTTERS))
+"""
+CLOSE = """
+url, port = notebook._open[view][0].url, notebook._open[view][0]._port
+view.close()
+while notebook._open:
+    await asyncio.sleep(0.02)
+try:
+    await asyncio.open_connection("127.0.0.1", port)
+except ConnectionRefusedError:
+    print("nobody listens")
+"""
+CLOSED = "view"
 LOOK = """
 import asyncio, aiohttp
 from kfgs.viz.explorer import notebook
@@ -45,19 +76,28 @@ print("both ways")
 """
 
 
-@pytest.mark.skipif(bool(MISSING), reason=f"needs {', '.join(MISSING)}")
-@pytest.mark.skipif(not available(), reason="needs a driver that draws")
-def test_a_cell_shows_the_page_and_keeps_a_picture(tmp_path, monkeypatch):
+pytestmark = [
+    pytest.mark.skipif(bool(MISSING), reason=f"needs {', '.join(MISSING)}"),
+    pytest.mark.skipif(not available(), reason="needs a driver that draws"),
+]
+
+
+def run(folder, monkeypatch, *cells):
+    """What cells put out, and the notebook as it would be saved."""
     import nbclient
     import nbformat
 
     folders = [str(Path(cases_page.__file__).parent), str(Path(__file__).parents[3])]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(folders))
-    book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source) for source in (SHOW, LOOK, CHANGE)])
+    book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source) for source in cells])
     nbclient.NotebookClient(
-        book, timeout=120, kernel_name="python3", resources={"metadata": {"path": tmp_path}}
+        book, timeout=120, kernel_name="python3", resources={"metadata": {"path": folder}}
     ).execute()
-    shown, looked, changed = (cell.outputs for cell in book.cells)
+    return [cell.outputs for cell in book.cells], nbformat.writes(book)
+
+
+def test_a_cell_shows_the_page_and_keeps_a_picture(tmp_path, monkeypatch):
+    (shown, looked, changed), saved = run(tmp_path, monkeypatch, SHOW, LOOK, CHANGE)
     assert [output.output_type for output in shown] == ["display_data"] * 2
     for output in shown:
         assert "data:image/jpeg;base64," in output.data["text/html"]
@@ -66,4 +106,17 @@ def test_a_cell_shows_the_page_and_keeps_a_picture(tmp_path, monkeypatch):
     assert len(urls) == 1  # shown twice, served once
     assert [output.text for output in looked] == ["200 image/png 403 1\n"]  # and nothing on standard error
     assert [output.text for output in changed] == ["both ways\n"]
-    assert len(nbformat.writes(book)) < 150_000
+    assert len(saved) < 150_000
+
+
+def test_explore_as_the_last_line_shows_once_and_run_again_leaves_one_open(tmp_path, monkeypatch):
+    cells = (MAKE, EXPLORE, EXPLORE, EXPLORE, AGAIN, COUNT, CLOSE, CLOSED)
+    (_, *shown, again, counted, closed, after), _ = run(tmp_path, monkeypatch, *cells)
+    for outputs in shown:  # the page, and no second picture below it
+        assert [output.output_type for output in outputs] == ["display_data"]
+        assert "<script>" in outputs[0].data["text/html"]
+    assert len({outputs[0].data["text/plain"] for outputs in shown}) == 3
+    assert [output.data["text/plain"] for output in again] == [shown[-1][0].data["text/plain"]]  # the page once more
+    assert [output.text for output in counted] == ["1 1 1\n"]
+    assert [output.text for output in closed] == ["nobody listens\n"]
+    assert [set(output.data) for output in after] == [{"text/plain"}]
