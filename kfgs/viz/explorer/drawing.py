@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import torch
 
+from ..._check import check_range
 from ...cameras import Camera
 from ...cameras.camera import NEAR
 from ...gaussians import Gaussians
@@ -19,6 +20,7 @@ from ..legends import add_legend, add_scalar_bar
 from ..linked import add_title
 from ..meshes import draw_mesh
 from ..stand_ins import FAINT
+from .exploration import check_number
 from .mark import Mark
 from .pick import gaussian_at
 
@@ -113,7 +115,15 @@ class Pane:
         self._mark.move(place)
 
     def within(self, x: float, y: float) -> tuple[float, float] | None:
-        """A place of the window (y from its top) in this subplot's pixels; None: it is in another."""
+        """A place of the window (y from its top) in this subplot's pixels; None: it is in another.
+
+        Raises:
+            TypeError: if x or y is no number.
+            ValueError: if one is not finite.
+        """
+        for name, value in (("x", x), ("y", y)):
+            check_number(name, value)
+            check_range(name, value, float("-inf"), closed=(False, False))
         width, height = self.renderer.GetSize()
         left, bottom = self.renderer.GetOrigin()
         x, y = x - left, y - (self.plotter.render_window.GetSize()[1] - bottom - height)

@@ -129,7 +129,7 @@ class Exploration:
         """
         if self.asked is None:
             raise ValueError(f"gamma: expected a question that it applies to, got none (gamma {gamma!r}); ask first")
-        _check_number("gamma", gamma)
+        check_number("gamma", gamma)
         low, high = self.gamma_range
         slack = 1e-6 * max(high - low, abs(low), abs(high))  # a slider rounds to float32
         check_range("gamma", gamma, low - slack, high + slack)
@@ -142,7 +142,7 @@ class Exploration:
             TypeError: if it is no number.
             ValueError: if it is not positive.
         """
-        _check_number("distance", distance)
+        check_number("distance", distance)
         check_range("distance", distance, 0, closed=(False, False))
         self.distance, self.distance_how = float(distance), "given"
 
@@ -292,7 +292,8 @@ class Exploration:
         return np.where(self._carried.within(self.distance), values[self._carried.source], nothing)
 
 
-def _check_number(name: str, value: object) -> None:
+def check_number(name: str, value: object) -> None:
+    """Raise a TypeError unless it is a number; a bool is none."""
     if not isinstance(value, numbers.Real) or isinstance(value, bool):
         raise TypeError(f"{name}: expected a number, got {value!r} ({type(value).__name__}); pass a float")
 

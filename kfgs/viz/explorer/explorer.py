@@ -41,8 +41,8 @@ class Explorer:
     """Both clouds side by side, and verbs that change what is asked, shown and picked.
 
     Each verb changes `state`, draws, and then calls the listeners. Nothing opens by itself: `plotter` draws with and
-    without a display. Verbs of several threads wait for each other; the thread that made the explorer should draw. Every verb
-    of a closed explorer raises a RuntimeError.
+    without a display. Verbs of several threads wait for each other, but OpenGL is of one thread: once a picture was drawn,
+    call them from the thread that drew it. Every verb of a closed explorer raises a RuntimeError.
 
     Args:
         exploration: the state.

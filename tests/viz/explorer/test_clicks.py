@@ -1,10 +1,15 @@
 import numpy as np
 import pytest
 import torch
-from cases_viz import some_camera
+from cases_viz import some_camera, some_gaussians
+from cases_window import LEGEND, NAMES, TITLE, an_explorer, panes
 
+from kfgs.formats import SplatFile
 from kfgs.splat.rasterize import rasterize
-from kfgs.viz.explorer import gaussian_at
+from kfgs.viz import palette
+from kfgs.viz.explorer import drawing, gaussian_at
+from kfgs.viz.explorer.exploration import Exploration
+from kfgs.viz.explorer.meaning import SplatMeaning
 
 pytestmark = pytest.mark.usefixtures("driver")
 
@@ -58,3 +63,62 @@ def test_what_is_picked_has_a_ring_in_both_panes(explorer):
     explorer.pick(320 * 2 - 1, 239)  # the background drops it
     assert explorer.state.picked is None
     np.testing.assert_array_equal(explorer.screenshot(), before)
+
+
+def places(width=320, height=240):
+    return [(x + 0.5, y + 0.5) for x in range(60, width - 20, 20) for y in range(40, height - 20, 20)]
+
+
+def picked_at(explorer):
+    return {place: None if found is None else found.index for place in places() for found in [explorer.pick(*place)]}
+
+
+def test_points_that_are_not_drawn_are_not_picked():
+    """Style "points" leaves Gaussians of opacity 0.1 and less out, asked for or not."""
+    semantic = some_gaussians().replace(sh=None)
+    semantic.opacities[::2] = 0.09
+    with an_explorer(Exploration(SplatMeaning(SplatFile(semantic, {}, NAMES)))) as explorer:
+        assert any(index is not None and index % 2 == 0 for index in picked_at(explorer).values())
+        explorer.set_style("points")
+        for words in (None, "chair"):
+            explorer.ask(words)
+            drawn = np.concatenate([actor.mapper.dataset["index"] for actor in explorer.panes[0]._points[:2]])
+            found = {index for index in picked_at(explorer).values() if index is not None}
+            assert found <= set(drawn.tolist())
+            assert found
+
+
+def test_of_the_rest_only_those_that_are_drawn_as_points_are_picked(explorer, monkeypatch):
+    monkeypatch.setattr(drawing, "REST_POINTS", 5)
+    explorer.set_style("points")
+    explorer.ask("chair")
+    pane, selected = explorer.panes[0], explorer.state.selected("semantic")
+    few = set(np.asarray(pane._points[1].mapper.dataset["index"]).tolist())
+    assert len(few) == 5
+    found = {index for index in picked_at(explorer).values() if index is not None and not selected[index]}
+    assert found
+    assert found <= few
+
+
+@pytest.mark.parametrize("style", ["gaussians", "points"])
+def test_a_rest_that_is_not_drawn_is_not_picked(style):
+    with an_explorer(rest=0.0, style=style) as explorer:
+        everything = picked_at(explorer)
+        explorer.ask("chair")
+        selected = explorer.state.selected("semantic")
+        found = picked_at(explorer)
+        assert all(index is None or selected[index] for index in found.values())
+        assert any(index is None and everything[place] is not None for place, index in found.items())
+        half = panes(explorer.screenshot())["semantic"]
+        assert not (half == palette(np.array(2))).all(axis=2)[TITLE:, LEGEND:].any()
+
+
+@pytest.mark.parametrize("place", [("a", 1), (1, None), (True, 1)])
+def test_a_place_is_two_numbers(explorer, place):
+    with pytest.raises(TypeError, match=r"[xy]: expected a number, got .*; pass a float"):
+        explorer.pick(*place)
+
+
+def test_a_place_is_finite(explorer):
+    with pytest.raises(ValueError, match=r"x: expected a number in \(-inf, inf\), got nan"):
+        explorer.pick(float("nan"), 1)

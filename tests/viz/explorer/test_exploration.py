@@ -196,3 +196,37 @@ def test_facts_are_json_and_lines_say_them():
     ]
     made.ask(None)
     assert made.lines()[0] == "semantic: 3 Gaussians"
+
+
+@pytest.mark.parametrize("value", ["0,05", None, [], True], ids=str)
+def test_what_is_no_number_is_refused(value):
+    made = line()
+    made.ask("chair")
+    for name, verb in (("gamma", made.set_gamma), ("distance", made.set_distance)):
+        with pytest.raises(
+            TypeError, match=rf"{name}: expected a number, got .* \({type(value).__name__}\); pass a float"
+        ):
+            verb(value)
+    made.set_gamma(np.float32(0.5))
+    assert made.gamma == 0.5
+
+
+@pytest.mark.parametrize("words", [5, b"chair", ["chair"]], ids=str)
+def test_what_is_no_text_is_refused(words):
+    made = line()
+    with pytest.raises(TypeError, match=r"words: expected text, got .* \((int|bytes|list)\); ask for one"):
+        made.ask(words)
+    assert made.asked is None
+
+
+def test_hidden_classes_are_a_list_of_labels_or_names():
+    made = line()
+    made.set_hidden(["table", -1])
+    assert made.hidden == {2, -1}
+    for labels in ("chair", 2):
+        with pytest.raises(TypeError, match=rf"labels: expected a list of labels or names, got {labels!r}; pass \["):
+            made.set_hidden(labels)
+    with pytest.raises(ValueError, match="did you mean 'chair'"):
+        made.set_hidden(["chiar"])
+    assert made.hidden == {2, -1}
+    assert made.present == {1, 2, -1}

@@ -1,3 +1,6 @@
+from pathlib import Path
+from threading import Event, Thread
+
 import numpy as np
 import pytest
 import torch
@@ -147,3 +150,125 @@ def test_unknown_styles_and_classes_are_refused(explorer):
     with pytest.raises(ValueError, match="chair"):
         explorer.set_hidden(["chiar"])
     assert explorer.state.hidden == frozenset()
+
+
+def test_a_closed_explorer_refuses_all_verbs_alike(tmp_path):
+    explorer = an_explorer(out=tmp_path / "view")
+    explorer.ask("chair")
+    explorer.close()
+    assert explorer.closed
+    before = explorer.state.facts()
+    verbs = {
+        "ask": ["sofa"],
+        "set_gamma": [0.9],
+        "set_distance": [0.1],
+        "set_show": ["score"],
+        "set_hidden": [["wall"]],
+        "set_style": ["points"],
+        "pick": [180, 110],
+        "look_from": [some_camera()],
+        "reset_view": [],
+        "screenshot": [],
+        "save_picture": [],
+        "save_selection": [],
+    }
+    for name, arguments in verbs.items():
+        message = rf"explorer: expected an open one for {name}, got one that is closed; make another with explore\("
+        with pytest.raises(RuntimeError, match=message):
+            getattr(explorer, name)(*arguments)
+    assert explorer.state.facts() == before
+    assert not (tmp_path / "view").exists()
+    explorer.set_legend(False)  # what a page does when it ends
+    assert explorer.lines()[0].startswith("'chair': score >")
+
+
+def test_a_notebook_shows_a_line_where_the_explorer_is_closed():
+    with an_explorer() as explorer:
+        assert repr(explorer).startswith("<Explorer: semantic: ")
+        assert explorer._repr_png_().startswith(b"\x89PNG")
+    assert explorer._repr_png_() is None
+    assert repr(explorer).startswith("<Explorer, closed: semantic: ")
+
+
+def test_a_window_that_the_desktop_destroyed_counts_as_closed():
+    with an_explorer() as explorer:
+        explorer.plotter.close()
+        assert explorer.closed
+        with pytest.raises(RuntimeError, match="expected an open one for ask"):
+            explorer.ask("chair")
+
+
+def test_who_waits_for_the_end_is_told_once():
+    told = []
+    explorer = an_explorer()
+    explorer.on_close(lambda: told.append(explorer.closed))
+    assert not told
+    explorer.close()
+    explorer.close()
+    assert told == [True]
+    explorer.on_close(lambda: told.append("late"))
+    assert told == [True, "late"]
+
+
+def test_verbs_of_two_threads_leave_a_window_that_draws(monkeypatch):
+    """Without a lock the second finds drawing suppressed by the first, and leaves it so."""
+    inside, both, exchange = Event(), Event(), Explorer._exchange
+
+    def slowly(self):
+        if not inside.is_set():
+            inside.set()
+            both.wait(0.3)  # for the second to begin, if it does not wait
+        elif one.is_alive():
+            both.set()
+            one.join(20)  # and end after the first
+        exchange(self)
+
+    with an_explorer() as explorer:  # of which no frame was drawn yet
+        monkeypatch.setattr(Explorer, "_exchange", slowly)
+        one = Thread(target=explorer.ask, args=["chair"])
+        two = Thread(target=explorer.ask, args=["sofa"])
+        one.start()
+        assert inside.wait(10)
+        two.start()
+        for thread in (one, two):
+            thread.join(20)
+        assert not explorer.plotter.suppress_rendering
+        assert explorer.state.asked.words == "sofa"
+        assert agreement(explorer, "color", explorer.options.rest) > 45
+
+
+def test_two_explorers_that_save_into_one_folder_lose_nothing(tmp_path, monkeypatch):
+    """As two programs would: the second looks for a number before the first has written."""
+    with an_explorer(out=tmp_path) as one, an_explorer(out=tmp_path) as two:
+        for explorer in (one, two):
+            explorer.ask("chair")
+        draw, paths = Explorer.screenshot, []
+
+        def late(self, path=None):
+            if self is one and not paths:
+                paths.append(two.save_picture())
+            return draw(self, path)
+
+        monkeypatch.setattr(Explorer, "screenshot", late)
+        paths.append(one.save_picture())
+        assert {path.name for path in paths} == {"picture_001.png", "picture_002.png"}
+        assert all(np.asarray(Image.open(path)).shape == (240, 640, 3) for path in paths)
+        monkeypatch.setattr(Path, "glob", lambda *_: iter(()))  # as both saw it: nothing there
+        assert one.save_selection()[0].parent.name == "selection_001"
+        assert two.save_selection()[0].parent.name == "selection_002"
+
+
+def test_what_cannot_be_saved_leaves_nothing(tmp_path, monkeypatch):
+    with an_explorer(out=tmp_path / "a" / "view") as explorer:
+        with pytest.raises(ValueError, match="selection: expected at least one Gaussian"):
+            explorer.save_selection()
+        assert not (tmp_path / "a" / "view").exists()
+        explorer.save_picture()
+
+        def fail(self, path=None):
+            raise OSError("disk full")
+
+        monkeypatch.setattr(Explorer, "screenshot", fail)
+        with pytest.raises(OSError, match="disk full"):
+            explorer.save_picture()
+        assert [path.name for path in (tmp_path / "a" / "view").iterdir()] == ["picture_001.png"]
