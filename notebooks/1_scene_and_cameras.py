@@ -136,8 +136,8 @@ Image.fromarray(picture_grid([[scene.image(0), through]], ["photograph", what], 
 # %% [markdown]
 # ## Which views are held out
 #
-# Training never sees the test views (orange). A `split.json` in the folder is used where there is one; any other rule
-# is one call, here every eighth view as in Mip-NeRF 360.
+# Training never sees the test views (orange); at most 30 of each are drawn. A `split.json` in the folder is used where
+# there is one; any other rule is one call, here every eighth view as in Mip-NeRF 360.
 
 # %%
 from kfgs.scenes import make_split
@@ -152,7 +152,7 @@ plotter.add_points(
     lighting=False,
 )
 for split, color in {"train": "#0072b2", "test": "#d55e00"}.items():
-    add_cameras(plotter, scene.select(split).cameras, size=0.15 * scene.extent, color=color, line_width=3)
+    add_cameras(plotter, scene.select(split).cameras, size=0.15 * scene.extent, color=color, line_width=3, most=30)
 plotter.add_legend([["train", "#0072b2"], ["test", "#d55e00"]], face="rectangle", bcolor="white", size=(0.15, 0.12))
 above = orbit_cameras(corners, Orbit(frames=1, size=(480, 720), elevation_degrees=75, zoom=1.1), up=up)
 look_through(plotter, above[0])

@@ -142,8 +142,8 @@ Image.fromarray(viz.picture_grid([row], ("photograph", "9 latents", "decoded to 
 
 # %% [markdown]
 # Each pixel takes the class of its codeword (Sec. 3.4), found here among the latents: faster than decoding every pixel,
-# as the paper does (`decode="exact"`; mIoU 0.895 here instead of 0.910). All unseen views at once, then some of them
-# beside the truth and beside the teacher, who saw the picture itself:
+# as the paper does (`decode="exact"`; mIoU 0.895 in the toy room instead of 0.910). All unseen views at once, then some
+# of them beside the truth and beside the teacher, who saw the picture itself:
 
 # %%
 found = segment_scene(field, scene, classes, run / "segmentation")

@@ -54,7 +54,7 @@ def test_the_first_cell_says_what_how_long_and_what_it_needs(source):
     assert re.fullmatch(rf"# {source.name.split('_')[0]}\. [A-Z][^\n]+", title)
     last = " ".join(last.split())
     assert re.match(r"About (a|half a|\d+) (minute|seconds?)\b.*\bCPU\b", last)
-    assert "Needs the extra `notebook`, no data" in last
+    assert "Needs the extra `notebook`, no " in last
 
 
 def test_each_but_the_last_ends_with_the_next(source):
