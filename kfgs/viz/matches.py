@@ -151,7 +151,7 @@ def plot_distances(
     distance: float,
     path: str | Path,
 ) -> None:
-    """Draw how far destinations are from their sources, with lambda marked, on a logarithmic axis.
+    """Draw how far destinations are from their sources, with lambda marked, on a logarithmic axis; bins meet at lambda.
 
     To see what lies beyond lambda too, pass the distances of a transfer with a larger one. Distances of 0, and below a
     hundredth of the median, are drawn in the lowest bin.
@@ -177,8 +177,10 @@ def plot_distances(
     nearest = max(float(positive.min()), float(np.median(positive)) / CLOSEST) if positive.size else distance
     low = min(nearest, distance / 10)
     high = max(float(found.max()) if found.size else distance, 2 * distance)
-    edges = np.geomspace(low, high * (1 + 1e-9), BINS + 1)
-    counts, _ = np.histogram(np.clip(found, low, high), edges)
+    step = np.log(high / low) / BINS
+    first, last = np.floor(np.log(low / distance) / step), np.ceil(np.log(high / distance) / step)
+    edges = distance * np.exp(step * np.arange(first, last + 1))  # one of them is lambda exactly
+    counts, _ = np.histogram(np.clip(found, edges[0], edges[-1]), edges)
     figure = _figure(7.0, 4.0)
     axes = figure.add_subplot()
     near = edges[:-1] < distance
