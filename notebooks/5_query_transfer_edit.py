@@ -24,7 +24,7 @@ features, names, text = folder / "features", folder / "classes.json", folder / "
 run, out = data / "run", data / "edited"
 splat_file = None  # yours: Path("my.ply"); None: kfgs trains the colours
 thing, painted, paint = "chair", "plant", "#c04040"
-shell = ("ceiling", "wall")  # what hides the rest from outside, where there are such classes
+shell = ("ceiling", "wall", "window blind")  # what hides the rest from outside, where there are such classes
 apart = 0.15  # scene units: parts that are nearer are one thing; None: the spacing of the Gaussians decides
 shown_view = 0  # of the test views
 

@@ -23,7 +23,7 @@ folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))  
 features, names, text = folder / "features", folder / "classes.json", folder / "text.npy"
 run, out = data / "run", data / "pictures"
 word, alone = "chair", "table"
-shell = ("ceiling", "wall", "door", "picture")  # where there are such classes
+shell = ("ceiling", "wall", "window blind", "door", "picture")  # where there are such classes
 apart = 0.15  # scene units: parts that are nearer are one thing; None: the spacing of the Gaussians decides
 shown_view = 3  # of the test views
 
@@ -83,7 +83,7 @@ print(transfer)
 
 # %%
 camera = scene.cameras[scene.views("test")[shown_view]]
-width = min(camera.width, 256)  # of each picture in a row of them
+camera = camera.resized(round(256 * camera.height / camera.width), 256)  # small pictures
 plotter = viz.make_plotter(480, 640, off_screen=True)
 actor = viz.add_cloud(plotter, semantic, color_by="label", style="gaussians")
 viz.add_legend(plotter, semantic.labels, classes.names)
@@ -112,7 +112,7 @@ styles = ("points", "gaussians", "ellipsoids")
 pictures = [
     shot(camera, lambda plotter, style=style: viz.add_cloud(plotter, semantic, style=style)) for style in styles
 ]
-Image.fromarray(viz.picture_grid([pictures], styles, width=width))
+Image.fromarray(viz.picture_grid([pictures], styles))
 
 # %% [markdown]
 # ## What colours stand for
@@ -137,7 +137,7 @@ pictures = [
     for cloud, how in meanings.values()
 ]
 titles = list(meanings)
-rows = [viz.picture_grid([pictures[i : i + 3]], titles[i : i + 3], width=width) for i in (0, 3)]
+rows = [viz.picture_grid([pictures[i : i + 3]], titles[i : i + 3]) for i in (0, 3)]
 Image.fromarray(np.concatenate(rows))
 
 # %% [markdown]
@@ -154,7 +154,7 @@ with torch.no_grad():
 error = (torch.from_numpy(drawn / 255).float() - ours).abs()
 titles = ["pyvista", "kfgs.rasterize", "10 x difference"]
 print(f"{psnr(torch.from_numpy(drawn / 255).float(), ours):.1f} dB")
-Image.fromarray(viz.picture_grid([[drawn, ours, 10 * error]], titles, width=width))
+Image.fromarray(viz.picture_grid([[drawn, ours, 10 * error]], titles))
 
 # %% [markdown]
 # ## Cameras and their pictures
@@ -214,7 +214,7 @@ def draw_parts(plotter):
 
 
 pictures = [shot(camera, draw_scores, 2), shot(camera, draw_parts, 2)]
-Image.fromarray(viz.picture_grid([pictures], ["scores", "parts"], width=2 * width))
+Image.fromarray(viz.picture_grid([pictures], ["scores", "parts"]))
 
 # %% [markdown]
 # ## Recolour without drawing anew
@@ -230,7 +230,7 @@ wanted = torch.where(semantic.labels == classes.index(alone), semantic.labels, -
 viz.recolor_cloud(actor, viz.palette(wanted))
 plotter.render()
 after = plotter.screenshot(return_img=True)
-Image.fromarray(viz.picture_grid([[before, after]], ["all classes", alone], width=width))
+Image.fromarray(viz.picture_grid([[before, after]], ["all classes", alone]))
 
 # %% [markdown]
 # ## The explorer, driven from cells
