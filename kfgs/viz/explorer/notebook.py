@@ -129,7 +129,8 @@ def _this_run() -> Run | None:
     if not in_notebook():
         return None
     shell = _shell()
-    told = shell.kernel.get_parent("shell").get("metadata", {}).get("cellId")
+    get_parent = getattr(shell.kernel, "get_parent", None)  # ipykernel's
+    told = None if get_parent is None else get_parent("shell").get("metadata", {}).get("cellId")
     return Run(told or shell.history_manager.input_hist_raw[-1], shell.execution_count)
 
 

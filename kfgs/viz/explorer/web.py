@@ -185,6 +185,12 @@ class Listening:
             await serving
         self._quiet.close()
         self._forget()
+        del (
+            self._explorer,
+            self.page.explorer,
+            self.page.pictures,
+            self.page.view,
+        )  # trame keeps widgets, and they the page
 
     def _leave(self, loop: asyncio.AbstractEventLoop) -> None:
         """The explorer was closed, perhaps by another thread, or long after the page."""
@@ -196,10 +202,13 @@ class Listening:
         self._server.protocol.stopServer = lambda: None  # wslink lets any tab end the server
 
     def _forget(self) -> None:
-        """Trame keeps every server for ever, by name."""
+        """Trame keeps every server for ever, by name, and the last one."""
         from trame.app.core import AVAILABLE_SERVERS
+        from trame_server.protocol import CoreServer  # type: ignore[import-untyped]
         from trame_vtk.modules.vtk import HELPERS_PER_SERVER
 
+        if CoreServer.server is self._server:
+            CoreServer.server = None
         AVAILABLE_SERVERS.pop(self._name, None)
         HELPERS_PER_SERVER.pop(self._name, None)
 

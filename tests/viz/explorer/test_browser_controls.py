@@ -116,6 +116,14 @@ def test_only_the_page_itself_with_its_link_gets_through(server):
     assert ask_for(server, parts.path)[0] == 200
     for path in ("/../../etc/passwd", "/kfgs_page/../__init__.py", "/kfgs_page/..%2f__init__.py"):
         assert ask_for(server, f"/{secret}{path}")[0] == 404
+    for path, status in (
+        ("/", 403),
+        (f"/{secret}/nothing", 404),
+        (f"/{secret}/ws", 400),
+    ):  # refusals do not tell the link
+        answered, headers = ask_for(server, path)
+        assert (answered, headers["Referrer-Policy"]) == (status, "no-referrer")
+        assert "default-src 'self'" in headers["Content-Security-Policy"]
     policy = ask_for(server, parts.path)[1]["Content-Security-Policy"]
     assert "default-src 'self'" in policy
     assert f"connect-src 'self' ws://{parts.netloc}" in policy

@@ -3,6 +3,7 @@ import importlib.util
 import logging
 import socket
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import cases_page
 import pytest
@@ -199,9 +200,8 @@ def test_outside_a_notebook_there_is_a_picture_and_a_reason(explorer, monkeypatc
 def test_in_a_notebook_without_the_extra_the_install_line_is_told(explorer, monkeypatch):
     shown = []
     monkeypatch.setattr(notebook, "_display", lambda page, words: shown.append((page, words)))
-    monkeypatch.setitem(
-        notebook.sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: SimpleNamespace(kernel=object()))
-    )
+    shell = MagicMock(kernel=object(), execution_count=1)
+    monkeypatch.setitem(notebook.sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     notebook.show_in_notebook(explorer)
     assert 'pip install "kfgs[web]"' in shown[0][1]

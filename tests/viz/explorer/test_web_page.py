@@ -1,8 +1,10 @@
 """What tabs may send to the page, and what becomes of it when a tab or the explorer is closed."""
 
 import asyncio
+import gc
 import importlib.util
 import logging
+import weakref
 
 import cases_page
 import pytest
@@ -109,6 +111,23 @@ def test_closing_the_explorer_ends_its_page_without_a_word(explorer, caplog, cap
     assert explorer.state.asked is None
     assert [record for record in caplog.records if record.levelno > logging.INFO] == []
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_closed_explorer_is_freed_with_its_page(tmp_path):
+    def serve_and_close():
+        opened = cases_page.explorer(tmp_path)
+
+        async def close(listening):
+            opened.ask("chair")
+            opened.close()
+            await listening.ended()
+
+        within(opened, close)
+        return weakref.ref(opened)
+
+    freed = serve_and_close()
+    gc.collect()
+    assert freed() is None
 
 
 def test_a_closed_explorer_is_not_shown(explorer):
