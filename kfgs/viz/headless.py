@@ -42,10 +42,11 @@ def prepare() -> None:
 
     Sets `VTK_DEFAULT_OPENGL_WINDOW=vtkEGLRenderWindow` and `PYVISTA_OFF_SCREEN=true` in this process on Linux, and only
     where neither DISPLAY nor WAYLAND_DISPLAY is set; values that are already there are left alone. Where a display has
-    come since (a virtual one, started by the program), the choice is taken back. Without it, VTK tries X first and
-    complains on stderr.
+    come since (a virtual one, started by the program), the choice is taken back, from pyvista too if it was imported
+    meanwhile. Without it, VTK tries X first and complains on stderr.
 
-    Importing `kfgs.viz` does this, for plotters that `make_plotter` does not make.
+    Importing `kfgs.viz` does this, for plotters that `make_plotter` does not make, and `make_plotter` does it again. A
+    program that starts a display later and makes windows of its own calls `kfgs.viz.headless.prepare()` then.
     """
     if not sys.platform.startswith("linux"):
         return
@@ -54,6 +55,8 @@ def prepare() -> None:
             os.environ[name] = WITHOUT_DISPLAY[name]
             _ours.add(name)
         return
+    if "PYVISTA_OFF_SCREEN" in _ours and "pyvista" in sys.modules:
+        sys.modules["pyvista"].OFF_SCREEN = False  # read from the variable when it was imported
     while _ours:
         os.environ.pop(_ours.pop(), None)
 

@@ -1,6 +1,7 @@
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -48,6 +49,20 @@ def test_the_choice_is_taken_back_when_a_display_comes(bare):
     bare.setenv("DISPLAY", ":99")
     headless.prepare()
     assert not headless.WITHOUT_DISPLAY.keys() & os.environ.keys()
+
+
+def test_pyvista_opens_windows_again_when_a_display_comes(bare):
+    headless.prepare()
+    pyvista = SimpleNamespace(OFF_SCREEN=True)  # as imported now
+    bare.setitem(sys.modules, "pyvista", pyvista)
+    headless.prepare()
+    assert pyvista.OFF_SCREEN
+    bare.setenv("DISPLAY", ":99")
+    headless.prepare()
+    assert not pyvista.OFF_SCREEN
+    pyvista.OFF_SCREEN = True  # by the user
+    headless.prepare()
+    assert pyvista.OFF_SCREEN
 
 
 def test_other_systems_are_left_alone(bare):

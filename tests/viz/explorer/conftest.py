@@ -1,6 +1,7 @@
-"""What the tests of a file share: a window with an explorer; a Chromium and a server (while one is open, asyncio does not run)."""
+"""What tests of a file share: a window; a Chromium and a server (while one is open, asyncio does not run)."""
 
 import cases_browser
+import cases_desktop
 import pytest
 from cases_window import an_explorer
 
@@ -41,3 +42,9 @@ def browser():
 def server(tmp_path_factory):
     with cases_browser.served(tmp_path_factory.mktemp("page")) as started:
         yield started
+
+
+@pytest.fixture
+def desktop(tmp_path):
+    with cases_desktop.opened(tmp_path) as window:
+        yield window
