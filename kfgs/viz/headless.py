@@ -55,8 +55,9 @@ def prepare() -> None:
             os.environ[name] = WITHOUT_DISPLAY[name]
             _ours.add(name)
         return
-    if "PYVISTA_OFF_SCREEN" in _ours and "pyvista" in sys.modules:
-        sys.modules["pyvista"].OFF_SCREEN = False  # read from the variable when it was imported
+    pyvista: Any = sys.modules.get("pyvista")
+    if pyvista is not None and "PYVISTA_OFF_SCREEN" in _ours:
+        pyvista.OFF_SCREEN = False  # read from the variable when it was imported
     while _ours:
         os.environ.pop(_ours.pop(), None)
 
