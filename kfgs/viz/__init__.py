@@ -4,6 +4,7 @@ from .animation import save_animation, save_frames
 from .boxes import add_boxes, add_names, add_selections
 from .clouds import CloudOptions, add_cloud, recolor_cloud
 from .explorer import ExploreOptions, Explorer, explore
+from .field_colors import feature_colors
 from .flythrough import flythrough_cameras, save_flythrough
 from .frusta import add_camera_images, add_cameras
 from .headless import available, make_plotter
@@ -46,6 +47,7 @@ __all__ = [
     "codebook_rows",
     "estimate_up",
     "explore",
+    "feature_colors",
     "flythrough_cameras",
     "legend_column",
     "legend_strip",
