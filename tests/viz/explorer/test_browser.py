@@ -129,23 +129,6 @@ def test_a_drag_turns_both_clouds_and_picks_nothing(server, browser):
     page.context.close()
 
 
-def test_a_tab_closed_in_a_drag_leaves_the_clouds_at_rest(server, browser):
-    first, second = open_page(browser, server), open_page(browser, server)
-    for name in ("clear the question", "Reset view"):
-        first.get_by_role("button", name=name).click(force=True)
-    box, before = second.locator(".clouds").bounding_box(), settled(first)
-    second.mouse.move(box["x"] + 150, box["y"] + 150)
-    second.mouse.down()
-    second.mouse.move(box["x"] + 190, box["y"] + 160, steps=4)
-    until(first, lambda: changed(clouds(first), before) > 100)
-    second.context.close()
-    turned = settled(first)
-    first.mouse.move(box["x"] + 60, box["y"] + 60)
-    first.mouse.move(box["x"] + 160, box["y"] + 90, steps=4)
-    assert changed(settled(first), turned) == 0
-    first.context.close()
-
-
 def test_ctrl_c_ends_the_server_without_a_word_more(server, browser):
     page = open_page(browser, server)
     server.process.send_signal(signal.SIGINT)
