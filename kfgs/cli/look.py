@@ -99,17 +99,20 @@ def view(
             explorer.ask(ask)
         for line in explorer.lines():
             say(line)
-        if place == "picture":
-            explorer.screenshot(out / "view.png")
-            wrote([out / "view.png"])
-        elif place == "window":
-            from ..viz.explorer import open_window
+        _open(explorer, place, host, port)
 
-            open_window(explorer)
-        else:
-            from ..viz.explorer import serve
 
-            serve(explorer, host=host, port=port)
+def _open(explorer: Any, place: Where, host: str, port: int) -> None:
+    """Show an explorer where it is wanted, until the user has seen enough; or write its picture."""
+    from ..viz.explorer import open_window, serve
+
+    if place == "picture":
+        explorer.screenshot(explorer.options.out / "view.png")
+        wrote([explorer.options.out / "view.png"])
+    elif place == "window":
+        open_window(explorer)
+    else:
+        serve(explorer, host=host, port=port, say=say)
 
 
 def _meaning(
