@@ -31,6 +31,7 @@ def demo(out: Path = Path("kfgs_demo"), seed: int = 0, steps: int | None = None)
 
     config = fit_config("cpu", "adc+sc", seed, steps, None, "train")
     wrote(run_demo.run(out, config, room=ToyConfig(seed=seed), report=say, progress=True))
+    say(f"next: kfgs view {out / 'run' / 'field'} --scene {out / 'scene'} --color {out / 'color.ply'}")
 
 
 def sfm(
