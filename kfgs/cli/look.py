@@ -91,7 +91,7 @@ def view(
     cloud = None if color is None else open_splats("color", color).gaussians
     state = Exploration(meaning, cloud, cameras=cameras, distance=distance)
     _note(state)
-    height, width = (820, 1280) if place == "window" else (600, 1200)  # beside the clouds a window has a panel
+    height, width = (680, 980) if place == "window" else (600, 1200)  # beside the clouds a window has a panel
     options = ExploreOptions(height=height, width=width, style=style, out=out)
     with Explorer(state, options, off_screen=place != "window") as explorer:
         explorer.set_show(show)

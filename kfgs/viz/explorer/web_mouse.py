@@ -23,11 +23,13 @@ def make_mouse(pictures: Pictures, delivery: Any) -> Any:
     class Mouse(vtkWebMouseHandler):  # type: ignore[misc]
         @register("viewport.mouse.interaction")
         def mouse_interaction(self, event: Any) -> Any:
-            return None if pictures.gone else super().mouse_interaction(event)
+            with pictures.lock:
+                return None if pictures.gone else super().mouse_interaction(event)
 
         @register("viewport.mouse.zoom.wheel")
         def update_zoomFromWheel(self, event: Any) -> Any:  # noqa: N802  wslink calls it so
-            return None if pictures.gone else super().update_zoomFromWheel(event)
+            with pictures.lock:
+                return None if pictures.gone else super().update_zoomFromWheel(event)
 
         def onClose(self, client_id: str) -> None:  # noqa: N802  wslink calls it so
             """Let go of the buttons that a closed tab cannot; another tab that drags presses again as it moves."""

@@ -78,7 +78,7 @@ class ExplorerPage:
         self._acting = False
         self._saved = self._error = self._pointed = ""
         self._fill()
-        self.pictures = Pictures(explorer.plotter, self._resized)
+        self.pictures = Pictures(explorer.plotter, self._resized, explorer.lock)
         self._fitted: object = self.pictures.camera
         self.view = self._lay_out()
         server.add_protocol_to_configure(self._add_protocols)
@@ -113,6 +113,10 @@ class ExplorerPage:
             await self._tell_working(False)
 
     def _do(self, action: Callable[[], object]) -> None:
+        with self.explorer.lock:
+            self._do_alone(action)
+
+    def _do_alone(self, action: Callable[[], object]) -> None:
         plotter = self.explorer.plotter
         # `_show` draws, once, unless a picture is needed before: to save it, or to see how long it takes
         self._acting, plotter.suppress_rendering = True, not isinstance(action, _Drawing)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -59,10 +60,11 @@ class Pictures:
     Args:
         plotter: what is drawn.
         resized: called when the browser has changed the window's size, before it is drawn.
+        lock: held while something is drawn, as verbs of other threads hold it while they change what is drawn.
     """
 
-    def __init__(self, plotter: pv.Plotter, resized: Callable[[], object]) -> None:
-        self.plotter, self.resized, self.changes = plotter, resized, 0
+    def __init__(self, plotter: pv.Plotter, resized: Callable[[], object], lock: AbstractContextManager[Any]) -> None:
+        self.plotter, self.resized, self.lock, self.changes = plotter, resized, lock, 0
         self.frame: Frame | None = None
 
     @property
@@ -126,11 +128,12 @@ def make_delivery(pictures: Pictures) -> Any:
         def still_render(self, options: dict[str, Any]) -> dict[str, Any]:
             began = perf_counter()
             window: Any = pictures.plotter.render_window
-            width, height = (min(int(length), MOST) for length in options.get("size", window.GetSize()))
-            if min(width, height) > LEAST and [width, height] != list(window.GetSize()):
-                window.SetSize(width, height)
-                pictures.resized()
-            frame = pictures.now()
+            with pictures.lock:
+                width, height = (min(int(length), MOST) for length in options.get("size", window.GetSize()))
+                if min(width, height) > LEAST and [width, height] != list(window.GetSize()):
+                    window.SetSize(width, height)
+                    pictures.resized()
+                frame = pictures.now()
             fresh = self.asked_for or frame.number != options.get("mtime")
             self.asked_for = False
             data = _jpeg(frame.picture, options.get("quality", 100)) if fresh else None
