@@ -253,7 +253,7 @@ class Explorer:
             self._draw()
 
     def listen(self, callback: Callable[[], None]) -> None:
-        """Have a function called after each change."""
+        """Have a function called after each change. It may call verbs, but not wait for those of another thread."""
         self._listeners.append(callback)
 
     @property

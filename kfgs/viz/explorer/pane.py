@@ -46,7 +46,8 @@ class PanelPane:
         self._renderer.InteractiveOff()
         width, height = plotter.window_size
         window.AddRenderer(self._renderer)
-        plotter.window_size = [width + WIDTH, height]
+        most = plotter.render_window.GetScreenSize()  # a window that is larger hides the panel
+        plotter.window_size = [min(width + WIDTH, most[0] or width + WIDTH), min(height, most[1] or height)]
         self._observer = window.AddObserver("StartEvent", self._before_frame)
 
     def remove(self) -> None:

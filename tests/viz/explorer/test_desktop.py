@@ -127,6 +127,18 @@ def test_one_cloud_alone_has_no_lambda(tmp_path):
         assert shot(desktop).shape == (HEIGHT, CLOUDS // 2 + WIDTH, 3)
 
 
+def test_with_its_panel_a_window_is_no_larger_than_the_screen(tmp_path):
+    semantic, _ = clouds()
+    state = Exploration(SplatMeaning(splat_file(semantic)))
+    with Explorer(
+        state, ExploreOptions(height=90, width=200, style="points", out=tmp_path), off_screen=True
+    ) as explorer:
+        wide, high = explorer.plotter.render_window.GetScreenSize()
+        explorer.plotter.window_size = [wide - 50, high + 80]
+        Desktop(explorer)
+        assert explorer.plotter.window_size == [wide, high]
+
+
 WINDOW = """
 import os, sys
 import numpy as np
