@@ -13,7 +13,7 @@ import tyro
 from .._check import check_range, check_whole
 from .checks import check_alone, check_folder, open_field, open_splats
 from .say import load_classes, say, training_cameras, wrote
-from .words import note_other_teacher
+from .words import note_other_teacher, text_encoder
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
@@ -152,21 +152,16 @@ def _words_of(label_set: Any, teacher: str | None, weights: str | None) -> tuple
         check_alone("weights", weights, "without --teacher, whose weights they are")
         return label_set, None
     from ..labels import CANONICAL
-    from ..teachers.load import load_teacher
-    from ..teachers.prompts import make_label_set
 
-    loaded, templates = load_teacher(teacher, weights), label_set.info.get("templates")
-    try:
-        probe = make_label_set(loaded, ["thing"], templates=templates, negatives=CANONICAL)
-    except NotImplementedError as error:
-        raise ValueError(str(error)) from error
+    encode, templates = text_encoder(teacher, weights), label_set.info.get("templates")
+    probe = encode(["thing"], templates=templates, negatives=CANONICAL)
     note_other_teacher(probe, label_set)
     if label_set.negatives is None and probe.dim == label_set.dim:
         label_set = dataclasses.replace(label_set, negatives=probe.negatives, negative_names=probe.negative_names)
 
     @functools.cache
     def embed(phrase: str) -> Any:
-        return make_label_set(loaded, [phrase], templates=templates).embeddings[0]
+        return encode([phrase], templates=templates).embeddings[0]
 
     return label_set, embed
 

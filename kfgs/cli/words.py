@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -102,18 +102,27 @@ def _words_of_file(name: str, kind: str) -> Any:
 
 
 def embed(teacher: str, weights: str | None, names: Sequence[str], **options: Any) -> Any:
-    """The label set that a teacher makes of words (`teachers.prompts.make_label_set`).
+    """The label set that a teacher makes of words, once; `text_encoder` for more than once."""
+    return text_encoder(teacher, weights)(names, **options)
 
-    Raises:
-        ValueError: if the teacher has no text encoder, beside what loading it can raise.
+
+def text_encoder(teacher: str, weights: str | None) -> Callable[..., Any]:
+    """A function that makes label sets of words (`teachers.prompts.make_label_set`) with a teacher that is loaded now.
+
+    The function raises a ValueError if the teacher has no text encoder.
     """
     from ..teachers.load import load_teacher
     from ..teachers.prompts import make_label_set
 
-    try:
-        return make_label_set(load_teacher(teacher, weights), names, **options)
-    except NotImplementedError as error:
-        raise ValueError(str(error)) from error
+    loaded = load_teacher(teacher, weights)
+
+    def encode(names: Sequence[str], **options: Any) -> Any:
+        try:
+            return make_label_set(loaded, names, **options)
+        except NotImplementedError as error:
+            raise ValueError(str(error)) from error
+
+    return encode
 
 
 def ask(
