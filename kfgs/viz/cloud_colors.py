@@ -11,6 +11,7 @@ from torch import Tensor
 from .._check import check_choice, check_range, check_shapes
 from ..gaussians import Gaussians
 from ..splat.sh import evaluate_sh, sh0_to_rgb
+from .arrays import as_array
 from .palette import UNLABELLED, palette
 from .pictures import FeatureColors, as_bytes
 
@@ -46,7 +47,7 @@ def cloud_colors(
     if isinstance(color_by, str):
         check_choice("color_by", color_by, get_args(ColorBy))
         return _named(gaussians, color_by, feature_colors, clim)
-    values = _numpy(color_by) if isinstance(color_by, Tensor) else np.asarray(color_by)
+    values = as_array(color_by) if isinstance(color_by, Tensor) else np.asarray(color_by)
     if values.ndim == 2:
         check_shapes(("gaussians", gaussians.opacities, "N"), ("color_by", values, "N 3"))
         return CloudColors(as_bytes(values), "rgb", None, None)
@@ -76,7 +77,7 @@ def _named(
             raise ValueError(
                 "gaussians.labels: expected labels to colour by, got None; label them or choose another color_by"
             )
-        return CloudColors(palette(gaussians.labels), "label", _numpy(gaussians.labels).astype(np.int64), None)
+        return CloudColors(palette(gaussians.labels), "label", as_array(gaussians.labels).astype(np.int64), None)
     if color_by in ("rgb", "view"):
         if gaussians.sh is None:
             raise ValueError("gaussians.sh: expected harmonics to colour by, got None; a semantic field has no colour")
@@ -88,7 +89,7 @@ def _named(
                 f"{missing}: expected it to colour by features, got None; fit FeatureColors once per scene"
             )
         return CloudColors(feature_colors(gaussians.features), "feature", None, None)
-    return _scale("opacity", _numpy(gaussians.opacities), clim or (0.0, 1.0))
+    return _scale("opacity", as_array(gaussians.opacities), clim or (0.0, 1.0))
 
 
 def _scale(name: str, values: Array, clim: tuple[float, float] | None) -> CloudColors:
@@ -114,8 +115,3 @@ def _middle_range(values: Array) -> tuple[float, float]:
         if high > low:
             return low, high
     return low - 0.5, high + 0.5
-
-
-def _numpy(values: Tensor) -> Array:
-    array: Array = values.detach().cpu().numpy()
-    return array

@@ -16,6 +16,7 @@ from torch import Tensor
 from .._check import check_choice, check_range, check_shapes
 from ..cameras.camera import NEAR
 from ..gaussians import Gaussians
+from .arrays import as_array
 from .cloud_colors import CloudColors, ColorBy, cloud_colors, seen_from
 from .ellipsoids import ellipsoids
 from .gaussian_actor import Moving, as_gaussians
@@ -108,7 +109,7 @@ def add_cloud(
     if style == "ellipsoids":
         cloud = _surfaces(gaussians, options)
     else:
-        cloud = pv.PolyData(_numpy(gaussians.means).astype(np.float32))
+        cloud = pv.PolyData(as_array(gaussians.means).astype(np.float32))
         cloud["index"] = np.arange(len(gaussians))
     _fill(cloud, gaussians, colors)
     if style == "points":
@@ -121,9 +122,9 @@ def add_cloud(
         actor = draw_mesh(plotter, cloud, scalars="rgb", rgb=True, ambient=0.45, diffuse=0.6, opacity=options.opacity)
         actor.prop.interpolation = "Phong"
         return actor
-    quats = _numpy(gaussians.quats).astype(np.float64)
+    quats = as_array(gaussians.quats).astype(np.float64)
     cloud["opacity"] *= np.float32(options.opacity)
-    cloud["scale"] = _numpy(gaussians.scales).astype(np.float32)
+    cloud["scale"] = as_array(gaussians.scales).astype(np.float32)
     cloud["quat"] = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
     follow = partial(seen_from, gaussians) if by_view else None
     return as_gaussians(plotter, cloud, sort=options.sort, moving=options.moving, near=options.near, colors_from=follow)
@@ -171,24 +172,19 @@ def _surfaces(gaussians: Gaussians, options: CloudOptions) -> pv.PolyData:
             f"gaussians: expected at least one of opacity above {options.faint:g}, got none; lower options.faint"
         )
     mesh = ellipsoids(gaussians.select(opaque), options.deviations)
-    mesh["index"] = _numpy(opaque)[np.asarray(mesh["index"])]
+    mesh["index"] = as_array(opaque)[np.asarray(mesh["index"])]
     return mesh
 
 
 def _fill(cloud: pv.PolyData, gaussians: Gaussians, colors: CloudColors) -> None:
     """Give each point the values of its Gaussian."""
     index = np.asarray(cloud["index"])
-    cloud["opacity"] = _numpy(gaussians.opacities).astype(np.float32)[index]
+    cloud["opacity"] = as_array(gaussians.opacities).astype(np.float32)[index]
     if gaussians.labels is not None:
-        cloud["label"] = _numpy(gaussians.labels).astype(np.int64)[index]
+        cloud["label"] = as_array(gaussians.labels).astype(np.int64)[index]
     if colors.values is not None and colors.name != "opacity":
         cloud[colors.name] = colors.values[index]
     cloud["rgb"] = colors.rgb[index]
     cloud.field_data["count"] = np.array([len(gaussians)])
     if colors.clim is not None:
         cloud.field_data["clim"] = np.asarray(colors.clim, dtype=np.float64)
-
-
-def _numpy(values: Tensor) -> Array:
-    array: Array = values.detach().cpu().numpy()
-    return array

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from .._check import check_range, check_shapes, check_whole
 from ..cameras import Camera, resize_map
+from .arrays import as_array
 from .meshes import draw_mesh
 from .pictures import as_bytes
 
@@ -125,7 +126,7 @@ def _depth(cameras: Sequence[Camera], size: float | None) -> float:
         raise TypeError(f"cameras: expected a list of cameras, got {type(cameras).__name__}; pass {hint}")
     if not cameras:
         raise ValueError("cameras: expected at least one camera, got none; load a scene with views")
-    centers = np.stack([_numpy(camera.center) for camera in cameras]).astype(np.float64)
+    centers = np.stack([as_array(camera.center) for camera in cameras]).astype(np.float64)
     extent = float(np.ptp(centers, axis=0).max())
     depth = size if size is not None else (0.05 * extent if extent > 0 else 0.2)
     check_range("size", depth, 0, closed=(False, False))
@@ -149,15 +150,10 @@ def _reduced(picture: Tensor | Array, longest: int) -> Array:  # [h, w, 3] uint8
 
 def _frustum(camera: Camera, depth: float) -> Array:  # [10, 2, 3]
     """Four edges from the centre, four around the picture, two for the roof."""
-    K, E = _numpy(camera.K).astype(np.float64), _numpy(camera.viewmat).astype(np.float64)
+    K, E = as_array(camera.K).astype(np.float64), as_array(camera.viewmat).astype(np.float64)
     w, h = camera.width, camera.height
     pixels = np.array([[0, 0], [w, 0], [w, h], [0, h], [w / 2, -h / 5]])  # the corners, then the ridge of the roof
     rays = np.column_stack([(pixels - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(len(pixels))]) * depth
     a, b, c, d, ridge = (rays - E[:3, 3]) @ E[:3, :3]  # R^T (x - t)
     o = -E[:3, 3] @ E[:3, :3]
     return np.array([(o, a), (o, b), (o, c), (o, d), (a, b), (b, c), (c, d), (d, a), (a, ridge), (ridge, b)])
-
-
-def _numpy(values: Tensor) -> Array:
-    array: Array = values.detach().cpu().numpy()
-    return array

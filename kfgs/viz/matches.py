@@ -12,6 +12,7 @@ from torch import Tensor
 from .._check import check_choice, check_range, check_shapes, check_whole
 from ..gaussians import Gaussians
 from ..labels import Transfer
+from .arrays import as_array
 from .frusta import evenly
 from .legends import add_legend
 from .meshes import draw_mesh
@@ -41,8 +42,8 @@ class Matches(NamedTuple):
 
 def match_states(transfer: Transfer) -> Array:  # [N] int64
     """What became of each destination: 0 matched, 1 ambiguous (labelled, but its sources disagree), 2 orphaned (no label)."""
-    labelled = _numpy(transfer.labels) >= 0
-    return np.where(labelled, np.where(_numpy(transfer.disagree), AMBIGUOUS, MATCHED), ORPHANED)
+    labelled = as_array(transfer.labels) >= 0
+    return np.where(labelled, np.where(as_array(transfer.disagree), AMBIGUOUS, MATCHED), ORPHANED)
 
 
 def add_matches(
@@ -82,9 +83,9 @@ def add_matches(
     states = match_states(transfer)
     import pyvista as pv
 
-    points = pv.PolyData(_numpy(moved.means).astype(np.float32))
-    points["state"], points["label"] = states, _numpy(transfer.labels)
-    points["distance"] = _numpy(transfer.distances)
+    points = pv.PolyData(as_array(moved.means).astype(np.float32))
+    points["state"], points["label"] = states, as_array(transfer.labels)
+    points["distance"] = as_array(transfer.distances)
     points["rgb"] = _state_colors(states)
     dots = draw_mesh(plotter, points, style="points", scalars="rgb", rgb=True, point_size=point_size, lighting=False)
     lines = None
@@ -123,25 +124,25 @@ def add_transfer(
     check_choice("color_by", color_by, ("label", "state"))
     check_shapes(("dst.means", dst.means, "N 3"), ("transfer.labels", transfer.labels, "N"))
     check_whole("sample", sample, 1)
-    labelled = np.flatnonzero(_numpy(transfer.labels) >= 0)
+    labelled = np.flatnonzero(as_array(transfer.labels) >= 0)
     if labelled.size == 0:
         raise ValueError(
             f"transfer: expected labelled Gaussians to draw, got none within {transfer.distance:g}; raise the distance"
         )
     chosen = labelled[evenly(labelled.size, sample)]
-    sources = _numpy(transfer.sources)[chosen]
+    sources = as_array(transfer.sources)[chosen]
     if sources.max() >= len(src):
         raise ValueError(
             f"transfer: expected sources below {len(src)} (from src), got {sources.max()}; pass its own clouds"
         )
     import pyvista as pv
 
-    ends = np.stack([_numpy(dst.means)[chosen], _numpy(src.means)[sources]], axis=1).reshape(-1, 3)
-    labels, states = _numpy(transfer.labels)[chosen], match_states(transfer)[chosen]
+    ends = np.stack([as_array(dst.means)[chosen], as_array(src.means)[sources]], axis=1).reshape(-1, 3)
+    labels, states = as_array(transfer.labels)[chosen], match_states(transfer)[chosen]
     lines = pv.line_segments_from_points(ends.astype(np.float32))
     lines.cell_data["label"], lines.cell_data["state"] = labels, states
     lines.cell_data["source"], lines.cell_data["destination"] = sources, chosen
-    lines.cell_data["distance"] = _numpy(transfer.distances)[chosen]
+    lines.cell_data["distance"] = as_array(transfer.distances)[chosen]
     lines.cell_data["rgb"] = palette(labels) if color_by == "label" else _state_colors(states)
     return draw_mesh(plotter, lines, scalars="rgb", rgb=True, line_width=line_width, lighting=False)
 
@@ -164,7 +165,7 @@ def plot_distances(
     Raises:
         ValueError: if there are no distances, one is negative or not a number, or lambda is not positive.
     """
-    values = _numpy(distances) if isinstance(distances, Tensor) else np.asarray(distances)
+    values = as_array(distances) if isinstance(distances, Tensor) else np.asarray(distances)
     check_shapes(("distances", values, "N"))
     check_range("distance", distance, 0, closed=(False, False))
     if values.size == 0 or not (values >= 0).all():
@@ -213,8 +214,3 @@ def _state_legend(states: Array, sample: int) -> tuple[Array, list[str]]:
         for state in (MATCHED, AMBIGUOUS):
             names[STATE_COLORS[state]] += f" (1 line in {labelled / sample:.3g})"
     return np.array(STATE_COLORS)[counts > 0], names
-
-
-def _numpy(values: Tensor) -> Array:
-    array: Array = values.detach().cpu().numpy()
-    return array

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from .._check import check_shapes
 from ..labels import Selection
+from .arrays import as_array
 from .matches import REST, TAKEN
 from .palette import palette
 from .plots import INK, _figure, _save
@@ -45,7 +46,7 @@ def plot_scores(
         TypeError: if the labels are not integers.
     """
     check_shapes(("selection.scores", selection.scores, "N"), ("labels", labels, "N"))
-    scores, mask = _numpy(selection.scores.double()), _numpy(selection.mask)
+    scores, mask = as_array(selection.scores.double()), as_array(selection.mask)
     if scores.size == 0:
         raise ValueError("selection: expected the scores of at least one Gaussian, got none; ask a cloud that has some")
     edges = score_bins(scores, selection.threshold)
@@ -55,7 +56,7 @@ def plot_scores(
     for count, name, color in zip(counts, ("not selected", "selected"), (REST, TAKEN), strict=True):
         axes.bar(edges[:-1], count, np.diff(edges), align="edge", color=color, label=f"{name} {count.sum():,}")
     if labels is not None:
-        for name, color, count in _by_class(scores, mask, _numpy(labels), edges):
+        for name, color, count in _by_class(scores, mask, as_array(labels), edges):
             axes.stairs(count, edges, color=color, linewidth=3.0, zorder=3)  # told from bars of any colour by its core
             axes.stairs(count, edges, color=INK, linewidth=1.0, zorder=3)
             axes.plot([], [], color=color, linewidth=3.0, label=name)
@@ -99,8 +100,3 @@ def _by_class(scores: Array, mask: Array, labels: Array, edges: Array) -> list[t
 def _title(selection: Selection) -> str:
     share = f"{len(selection):,} of {len(selection.mask):,} selected ({len(selection) / len(selection.mask):.1%})"
     return "\n".join([share, *textwrap.wrap(selection.how, WIDE)[:3]])
-
-
-def _numpy(values: Tensor) -> Array:
-    array: Array = values.detach().cpu().numpy()
-    return array

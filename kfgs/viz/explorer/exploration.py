@@ -15,6 +15,7 @@ from ...cameras import Camera
 from ...gaussians import Gaussians
 from ...labels import Selection, class_indices
 from ...labels.transfer_distance import positions
+from ..arrays import as_array
 from ..palette import palette
 from .carried import SPAN, Array, Carried
 from .facts import facts_of, lines_of
@@ -73,7 +74,7 @@ class Exploration:
         self.sides: tuple[Side, ...] = tuple(clouds)
         self._clouds = clouds
         self._carried = None if color is None else Carried(meaning.gaussians, color)
-        self._own_labels = _numpy(meaning.gaussians.labels).astype(np.int64)
+        self._own_labels = as_array(meaning.gaussians.labels).astype(np.int64)
         self._colors = SideColors(clouds, self._carried, meaning.feature_colors)
         self.shows: tuple[Show, ...] = ("labels", *self._colors.shows, "score")
         self.show: Show = "labels"
@@ -197,7 +198,7 @@ class Exploration:
         cloud = self.cloud(side)
         if self.asked is None or self.gamma is None:
             return np.zeros(len(cloud), dtype=bool)
-        own = _numpy((self.asked.selection.scores > self.gamma) & self.asked.valid)
+        own = as_array((self.asked.selection.scores > self.gamma) & self.asked.valid)
         return own if side == "semantic" else self._take(own, False)
 
     def drawn(self, side: Side) -> Array:  # [N] bool
@@ -216,8 +217,8 @@ class Exploration:
         if self.asked is None:
             values, known = self.meaning.scores, self._own_labels >= 0
         else:
-            values, known = self.asked.selection.scores, _numpy(self.asked.valid)
-        own = np.where(known, _numpy(values).astype(np.float64), np.nan)
+            values, known = self.asked.selection.scores, as_array(self.asked.valid)
+        own = np.where(known, as_array(values).astype(np.float64), np.nan)
         return own if side == "semantic" else self._take(own, np.nan)
 
     @property
@@ -296,8 +297,3 @@ def check_number(name: str, value: object) -> None:
     """Raise a TypeError unless it is a number; a bool is none."""
     if not isinstance(value, numbers.Real) or isinstance(value, bool):
         raise TypeError(f"{name}: expected a number, got {value!r} ({type(value).__name__}); pass a float")
-
-
-def _numpy(values: Any) -> Array:
-    array: Array = values.detach().cpu().numpy()
-    return array

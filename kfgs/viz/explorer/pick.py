@@ -16,8 +16,8 @@ from ...cameras import Camera
 from ...gaussians import Gaussians
 from ...splat import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, project
 from ...splat.project import FIELD_OF_VIEW_MARGIN
+from ..gaussian_actor import LOW_PASS
 
-LOW_PASS = 0.3  # pixels^2, as `project` has it
 BACKGROUND = 0.05  # a pixel that less than this is drawn over shows the background
 LEAST_WEIGHT = 0.01  # of a view that sees a Gaussian
 
