@@ -48,8 +48,8 @@ def compare_rules(
     """Print how well each rule of `transfer_labels` carries the semantic Gaussians' classes."""
     print(f"{'semantic Gaussians by':24s} {'rule':12s}  mIoU  weighted  without label")
     sources = {
-        "votes of views": field.classify_by_views(classes.embeddings, cameras)[0],
-        "own latents (Sec. 3.4)": field.classify(classes.embeddings)[0],
+        "what the views show": field.classify(classes).labels,
+        "own latents (Sec. 3.4)": field.classify(classes, rule="paper").labels,
     }
     for who, labels in sources.items():
         for method in ("nearest", "vote", "mahalanobis"):

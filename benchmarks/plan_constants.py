@@ -89,7 +89,9 @@ def codebook() -> None:
         """Work per number of four passes: what five more epochs and one take, less what one epoch takes."""
         both = []
         for epochs in (1, 5):
-            config = CodebookConfig(initial=K, maximum=K, expand_below=-1, prune_above=1, epochs=epochs, step_every=2)
+            config = CodebookConfig.paper(
+                initial=K, maximum=K, expand_below=-1, prune_above=1, epochs=epochs, step_every=2
+            )
             both.append(work_of(lambda config=config: fit_codebook(values, config), 2))
         return (both[1] - both[0]) / (4 * 4 * rows.numel())
 
@@ -97,12 +99,23 @@ def codebook() -> None:
     report("LOOK_CODEWORD_WORK", (many - few) / 90, "per number and codeword")
     report("LOOK_WORK", few - (many - few) / 9, "per number")
 
+    generator = torch.Generator().manual_seed(0)  # few directions, as splits pay in them until the book is full
+    pool = torch.randn(128, 256, 8, generator=generator) @ torch.randn(8, CHANNELS, generator=generator)
+
+    def growth(K: int) -> float:
+        """Work per number of growing to K codewords."""
+        return work_of(lambda: fit_codebook([pool], CodebookConfig(maximum=K, samples=pool.numel())), 2) / pool.numel()
+
+    few, many = growth(55), growth(255)
+    report("GROW_CODEWORD_WORK", (many - few) / 200, "per number and codeword")
+    report("GROW_WORK", few - (many - few) * 55 / 200, "per number")
+
 
 def autoencoder() -> None:
     """Steps on 20 and on 100 codewords."""
     found = []
     for K in (20, 100):
-        config, book = AutoencoderConfig(steps=100), Codebook(torch.randn(K, CHANNELS))
+        config, book = AutoencoderConfig(steps=100, blends=0), Codebook(torch.randn(K, CHANNELS))
         work = work_of(lambda book=book, config=config: fit_autoencoder(book, config))
         found.append(work / 100 / autoencoder_weights(config, CHANNELS))
     report("AUTOENCODER_ROW_WORK", (found[1] - found[0]) / 80, "per weight, step and codeword")

@@ -2,6 +2,8 @@
 
     python benchmarks/streaming.py SCENE [--images 90] [--size 360 480] [--channels 512] [--epochs 28] [--folder DIR]
 
+With --epochs, the codebook is fitted as in the paper, in so many epochs.
+
 Each stage runs in a process of its own, whose highest resident memory is what Linux says (VmHWM): writing the maps with
 `extract_features`, fitting the codebook, making the index maps. The teacher is a seeded random matrix on smoothed
 pictures, which takes next to nothing, so what is measured is all that surrounds a teacher. The maps (15.9 GB as they
@@ -60,7 +62,7 @@ def main() -> None:
     )
     parser.add_argument("--size", type=int, nargs=2, default=(360, 480), metavar=("H", "W"))
     parser.add_argument("--channels", type=int, default=512)
-    parser.add_argument("--epochs", type=int, default=28)
+    parser.add_argument("--epochs", type=int, help="fit the codebook as in the paper, in so many epochs")
     parser.add_argument("--folder", type=Path, help="where the maps go, and stay; a temporary folder if not given")
     parser.add_argument("--json", type=Path, help="also write the numbers here")
     parser.add_argument("--stage", choices=STAGES, help=argparse.SUPPRESS)
@@ -86,7 +88,8 @@ def run_apart(args: argparse.Namespace, stage: str) -> dict[str, Any]:
     """One stage in a fresh process."""
     size, options = map(str, args.size), ("images", "channels", "epochs", "folder")
     command = [sys.executable, __file__, str(args.scene), "--stage", stage, "--size", *size]
-    command += [text for name in options for text in (f"--{name}", str(getattr(args, name)))]
+    given = [name for name in options if getattr(args, name) is not None]
+    command += [text for name in given for text in (f"--{name}", str(getattr(args, name)))]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)  # the bars go to the terminal
     found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found
@@ -111,10 +114,10 @@ def extract(args: argparse.Namespace) -> str:
 
 def codebook(args: argparse.Namespace) -> str:
     """Maps to a codebook."""
-    config = CodebookConfig(epochs=args.epochs, learning_rate=8e-4)
+    config = CodebookConfig() if args.epochs is None else CodebookConfig.paper(epochs=args.epochs)
     fit = fit_codebook(FeatureFolder(args.folder / "maps"), config, progress=True)
     fit.codebook.save(args.folder / "codebook.safetensors")
-    return f"K = {fit.codebook.size}, coverage {fit.coverage:.3f}, {args.epochs} epochs"
+    return f"K = {fit.codebook.size}, coverage {fit.coverage:.3f}, maps looked at: {config.passes} x"
 
 
 def index_maps(args: argparse.Namespace) -> str:

@@ -37,9 +37,9 @@ def frames_per_second(work, cameras) -> float:
     return 1 / sorted(times)[len(times) // 2]
 
 
-def segment(field, embeddings, decode, camera) -> None:
+def segment(field, embeddings, rule, camera) -> None:
     """One frame of labels."""
-    field.segment(camera, embeddings, decode=decode)
+    field.segment(camera, embeddings, rule=rule)
 
 
 def main() -> None:
@@ -71,7 +71,7 @@ def main() -> None:
 
     for mode in args.modes:
         config = FitConfig.cpu() if args.preset == "cpu" else FitConfig.paper()
-        config = dataclasses.replace(config, mode=mode, seed=args.seed)
+        config = dataclasses.replace(config, method="paper", mode=mode, seed=args.seed)
         if args.steps:
             config = dataclasses.replace(config, field=config.field.with_steps(args.steps))
         result = fit_scene(scene, maps, args.out / mode, config, report=print, progress=True)
@@ -81,10 +81,10 @@ def main() -> None:
         cameras = [scene.cameras[i] for i in test[:12]]
         with torch.no_grad():
             fps = frames_per_second(field.render, cameras)
-            decodes = ("exact", "latent") if field.autoencoder is not None else ("exact",)
+            rules = ("paper", "fused")
             label_fps = {
-                decode: frames_per_second(partial(segment, field, classes.embeddings, decode), cameras[:5])
-                for decode in decodes
+                rule: frames_per_second(partial(segment, field, classes.embeddings, rule), cameras[:5])
+                for rule in rules
             }
         storage = field.storage() / 2**20
         print(f"{mode}: {scores}")

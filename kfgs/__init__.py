@@ -52,6 +52,8 @@ _WHERE = {
     "Teacher": ".teachers",
     "RecomputedMaps": ".teachers",
     "plan_scene": ".pipeline",
+    "uplift": ".pipeline",
+    "UpliftConfig": ".fields",
     "check_feature_folder": ".teachers",
     "FieldConfig": ".fields",
     "GaussianParams": ".fields",
@@ -62,6 +64,7 @@ _WHERE = {
     "segment_scene": ".pipeline",
     "score_scene": ".pipeline",
     "LabelSet": ".labels",
+    "label_set_from_examples": ".fields",
     "evaluate_segmentation": ".evaluation",
     "load_label_set": ".labels",
     "explore": ".viz",
@@ -79,7 +82,9 @@ if TYPE_CHECKING:
     from .fields import FieldConfig as FieldConfig
     from .fields import GaussianParams as GaussianParams
     from .fields import SemanticField as SemanticField
+    from .fields import UpliftConfig as UpliftConfig
     from .fields import fit_field as fit_field
+    from .fields import label_set_from_examples as label_set_from_examples
     from .formats import SplatFile as SplatFile
     from .formats import read_splats as read_splats
     from .formats import write_splats as write_splats
@@ -100,6 +105,7 @@ if TYPE_CHECKING:
     from .pipeline import plan_scene as plan_scene
     from .pipeline import score_scene as score_scene
     from .pipeline import segment_scene as segment_scene
+    from .pipeline import uplift as uplift
     from .quant import Autoencoder as Autoencoder
     from .quant import AutoencoderConfig as AutoencoderConfig
     from .quant import Codebook as Codebook

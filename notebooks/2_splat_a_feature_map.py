@@ -126,8 +126,9 @@ Image.fromarray(picture_grid(rows, width=min(scene.cameras[0].width, 320)))
 # ## Features on Gaussians
 #
 # Round Gaussians stand on the points of the cloud. Their features need no training to be looked at: each takes the mean
-# of the pixels that it shows in, weighted by how much it shows (`accumulate_pixels`); hence blurred edges. Training also
-# moves and reshapes them ([notebook 4](4_a_semantic_field_from_start_to_end.py)). One training view is kept apart.
+# of the pixels that it shows in, weighted by how much it shows (`accumulate_pixels`); hence blurred edges.
+# [Notebook 4](4_a_semantic_field_from_start_to_end.py) does so with sharp Gaussians and corrects for blending. One training
+# view is kept apart.
 
 # %%
 from kfgs import GaussianParams

@@ -1,14 +1,13 @@
 # %% [markdown]
 # # 5. Ask, carry over, edit
 #
-# The semantic field of a scene is asked for the chair; what it knows crosses to an ordinary colour scene by distance alone
-# (Sec. 3.4 of the paper); and there the chairs are taken away and the plants painted. You will see where a question's scores
-# lie and where its threshold gamma comes from, what is matched and what is orphaned for each lambda, the room before and
+# The semantic field of a scene is asked for the chair. Its classes are carried over to an ordinary colour scene, by distance
+# (Sec. 3.4 of the paper) or by views. There the chairs are removed and the plants painted. You will see where the scores of a
+# question lie and where its threshold gamma comes from, which Gaussians find no label for each lambda, the room before and
 # after from two viewpoints, and an edit undone.
 #
-# About a minute and a half on two CPU cores if no notebook was run before this one, 35 seconds if
-# `4_a_semantic_field_from_start_to_end` was (the colour field is trained here), 15 afterwards. Needs the extra `notebook`,
-# no data.
+# About a minute on two CPU cores if no notebook was run before this one, 20 seconds if
+# `4_a_semantic_field_from_start_to_end` was, and as long afterwards. Needs the extra `notebook`, no data.
 
 # %%
 # Your own data: a scene, a teacher's maps of its views, the classes with their text embeddings, a folder for the run (and
@@ -22,7 +21,7 @@ data = Path(os.environ.get("KFGS_NOTEBOOK_DATA", "data"))
 folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))  # yours: folder = Path("my/scene")
 features, names, text = folder / "features", folder / "classes.json", folder / "text.npy"
 run, out = data / "run", data / "edited"
-splat_file = None  # yours: Path("my.ply"); None: kfgs trains the colours
+splat_file = None  # yours: Path("my.ply"); None: the colour field of notebook 4
 thing, painted, paint = "chair", "plant", "#c04040"
 shell = ("ceiling", "wall", "window blind")  # what hides the rest from outside, where there are such classes
 apart = 0.15  # scene units: parts that are nearer are one thing; None: the spacing of the Gaussians decides
@@ -38,44 +37,35 @@ from PIL import Image
 import kfgs
 from kfgs import viz
 from kfgs.labels import Component, InBox, OfClass, select_in_sphere
-from kfgs.pipeline import query_field, views_of_change
+from kfgs.pipeline import views_of_change
 
 scene = kfgs.load_scene(folder).undistorted()
 classes = kfgs.load_label_set(names, text)
 cameras = [scene.cameras[i] for i in scene.views("train")]
 maps = kfgs.FeatureFolder(features, [scene.stem(i) for i in scene.views("train")])
-config = replace(
-    kfgs.FitConfig.cpu(),
-    autoencoder=kfgs.AutoencoderConfig(steps=1_000),
-    field=kfgs.FieldConfig.cpu().with_steps(800),
-)
-field = kfgs.fit_scene(scene, maps, run, config).field  # notebook 4 looks at this step
+quick = kfgs.ColorConfig.quick()
+quick = replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000))
+own = kfgs.fit_color(scene, run, quick).gaussians  # notebook 4 looks at this step and the next
+field = kfgs.fit_scene(scene, maps, run, kfgs.FitConfig.cpu(), splat=own).field
 print(field.summary())
 
 # %% [markdown]
 # ## "Where is the chair?"
 #
-# A Gaussian fits a word as well as its cosine with the word's text embedding, and is selected above a threshold gamma. The
-# paper publishes no gamma; kfgs reads one off the scores and says how. Two things help: telling the word from the scene's
-# other classes (then the score is a relevancy, and 0.5 means "as much like another word"), and letting the pixels of the
-# training views speak for a Gaussian instead of its own latent, which training constrains only in blends.
+# A Gaussian fits a word as well as its feature's cosine with the word's text embedding, and it is selected above a threshold
+# gamma. The paper publishes no gamma. With the cosine alone, kfgs reads one off the scores and says how. By default it tells
+# the word from the other classes of the scene: the score is then a relevancy, and gamma is 0.5, "as much like another word".
 
 # %%
-questions = {
-    "own latents": {},
-    "own latents, other classes": {"negatives": "classes"},
-    "views": {"cameras": cameras},
-    "views, other classes": {"cameras": cameras, "negatives": "classes"},
-}
-found = {name: query_field(field, classes, thing, **options) for name, options in questions.items()}
+questions = {"cosine": {"score": "cosine"}, "relevancy": {}}
+found = {name: field.query(thing, classes, **options) for name, options in questions.items()}
 for name, selection in found.items():
-    print(f"{name:<28} {len(selection):5d} Gaussians, gamma {selection.threshold:.3f}: {selection.how}")
+    print(f"{name:<10} {len(selection):5d} Gaussians, gamma {selection.threshold:.3f}: {selection.how}")
 
 # %% [markdown]
-# The scores from a view held out of training, each on its own scale: bright is the thing. With other classes to be told from,
-# everything else goes dark. Faint seams stay along other things' borders, where latents blend; views make them only a little
-# fainter. What views change are single Gaussians, which a picture blends away: see the counts above. (`negatives="canonical"`
-# tells from "object", "things" and the like, where the table of words holds them.)
+# The scores from a view held out of training, each on its own scale: bright is the thing. Told from the other classes,
+# everything else goes dark. (`negatives="canonical"` tells it from "object", "things" and the like, if the label set holds
+# them; a phrase that is no class is compared with those by default.)
 
 # %%
 held_out = scene.views("test")[shown_view]
@@ -91,12 +81,12 @@ for selection in found.values():
 Image.fromarray(viz.picture_grid([row], list(found), width=width))
 
 # %% [markdown]
-# Where gamma comes from: the chairs' cosines lie in a heap of their own, and gamma is put into the gap below it. (The
-# few Gaussians at 0 are seen by no view.) With negatives it is 0.5 and needs no heaps.
+# Where gamma comes from: the chairs' cosines form a heap of their own, and gamma lies in the gap below it. A relevancy needs
+# no heaps: its gamma is 0.5.
 
 # %%
-for name in ("views", "views, other classes"):
-    viz.plot_scores(found[name], out / "scores.png")
+for selection in found.values():
+    viz.plot_scores(selection, out / "scores.png")
     display.display(display.Image(filename=out / "scores.png", width=560))
 
 # %% [markdown]
@@ -107,7 +97,7 @@ for name in ("views", "views, other classes"):
 # until the first cell says 0.15 (metres here).
 
 # %%
-selection = found["views, other classes"]
+selection = found["relevancy"]
 print([one.count for one in kfgs.answers(field.gaussians, selection)], "Gaussians each, with the default distance")
 things = kfgs.answers(field.gaussians, selection, cameras, distance=apart)
 for number, one in enumerate(things, start=1):
@@ -117,8 +107,8 @@ for number, one in enumerate(things, start=1):
 # In their boxes, from outside; what hides the room is left out of the picture.
 
 # %%
-labels = field.classify_by_views(classes.embeddings, cameras).labels
-semantic = field.gaussians.replace(labels=labels)
+semantic = field.label(classes)
+labels = semantic.labels
 hidden = torch.tensor([-1, *(classes.index(name) for name in shell if classes.knows(name))])
 inside = semantic.select(~torch.isin(labels, hidden))
 up = viz.estimate_up(scene.cameras)
@@ -151,16 +141,11 @@ Image.fromarray(viz.picture_grid([row], titles, width=width))
 # %% [markdown]
 # ## The colour scene
 #
-# An ordinary 3DGS field: spherical harmonics, L1 + D-SSIM. It shares no parameter with the semantic field, and was trained
-# without a thought of classes; any splat file of the scene will do.
+# An ordinary 3DGS field: spherical harmonics, L1 + D-SSIM, trained without any class. Here it is the one that the features
+# were fused onto, before merging; any splat file of the scene will do.
 
 # %%
-if splat_file is None:
-    quick = kfgs.ColorConfig.quick()
-    quick = replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000))
-    colors = kfgs.SplatFile(kfgs.fit_color(scene, run, quick).gaussians)
-else:
-    colors = kfgs.read_splats(splat_file)
+colors = kfgs.SplatFile(own) if splat_file is None else kfgs.read_splats(splat_file)
 print(colors)
 print(f"PSNR on unseen views: {kfgs.score_views(colors.gaussians, scene).psnr.value:.1f} dB")
 draw = {"background": "black", "color_by": "rgb"}
@@ -172,7 +157,8 @@ Image.fromarray(viz.picture_grid([[scene.image(held_out), rendered]], ("unseen v
 #
 # A colour Gaussian takes the label of the nearest labelled semantic Gaussian closer than lambda (Sec. 3.4). Without a lambda
 # of yours, the spacing of the two clouds decides. Small values leave orphans; large ones give floaters a class. The histogram
-# is of a search to ten times lambda, to show the tail beyond it; a few Gaussians have no source even there.
+# is of a search to ten times lambda, to show the tail beyond it; a few Gaussians have no source even there. The bar at the
+# left: Gaussians that are in both clouds, because the field kept them.
 
 # %%
 carried = kfgs.transfer_labels(semantic, labels, colors.gaussians)
@@ -213,11 +199,13 @@ plotter.close()
 Image.fromarray(picture)
 
 # %% [markdown]
-# Distance follows a border only as well as the sparser cloud does. `attach` does the same in one call, finds the common frame
-# if there is another, and can let the colour Gaussians themselves be voted on by the segmented views, which is sharper.
+# Distance follows a border only as well as the sparser cloud does. `attach` does all of it in one call and finds the common
+# frame if the splat has another one. By default the field segments its training views, and each colour Gaussian takes the class
+# of most of the pixels that it fills there, which is sharper. (For a splat in the field's own frame, `kfgs.uplift` gives each
+# Gaussian a feature of its own, to be asked like the field.)
 
 # %%
-attached = {by: kfgs.attach(field, colors, classes, cameras=cameras, by=by) for by in ("distance", "views")}
+attached = {by: kfgs.attach(field, colors, classes, by=by) for by in ("distance", "views")}
 print(*attached["views"].words[1:], sep="\n")  # the first says how the frames were found to agree
 row = [viz.show_cloud(one.splats.gaussians)(camera) for one in attached.values()]
 Image.fromarray(viz.picture_grid([row], ("by distance", "by views"), width=width))

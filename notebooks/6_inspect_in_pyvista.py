@@ -6,7 +6,7 @@
 # selections, and at the end the explorer: type a word and watch it light up in the semantic cloud and, through lambda, in
 # the colour cloud.
 #
-# About a minute and a half on two CPU cores if no notebook was run before this one, 15 seconds if
+# About a minute on two CPU cores if no notebook was run before this one, 15 seconds if
 # `5_query_transfer_edit` was. Needs the extra `notebook`, no data and no display: without one everything is drawn
 # off-screen (Debian: `libegl1 libegl-mesa0 libgl1-mesa-dri`).
 
@@ -36,10 +36,8 @@ from IPython import display
 from PIL import Image
 
 from kfgs import (
-    AutoencoderConfig,
     ColorConfig,
     FeatureFolder,
-    FieldConfig,
     FitConfig,
     answers,
     fit_color,
@@ -55,21 +53,20 @@ from kfgs.metrics import psnr
 from kfgs.pipeline import feature_colors
 
 # %% [markdown]
-# The same room and the same fields as in the notebooks before. The semantic Gaussians get their labels from the votes of
-# the training views; the colour Gaussians get theirs by distance alone (Sec. 3.4).
+# The same room and the same fields as in the notebooks before. The semantic Gaussians take the class of their own fused
+# feature; the colour Gaussians get theirs by distance alone (Sec. 3.4).
 
 # %%
 scene = load_scene(folder).undistorted()
 classes = load_label_set(names, text)
 cameras = [scene.cameras[i] for i in scene.views("train")]
 maps = FeatureFolder(features, [scene.stem(i) for i in scene.views("train")])
-config = replace(FitConfig.cpu(), autoencoder=AutoencoderConfig(steps=1_000), field=FieldConfig.cpu().with_steps(800))
-field = fit_scene(scene, maps, run, config).field
 quick = ColorConfig.quick()
 color_config = replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000))
 color = fit_color(scene, run, color_config).gaussians
+field = fit_scene(scene, maps, run, FitConfig.cpu(), splat=color).field
 
-semantic = field.gaussians.replace(labels=field.classify_by_views(classes.embeddings, cameras).labels)
+semantic = field.label(classes)
 transfer = transfer_labels(semantic, semantic.labels, color)
 color = color.replace(labels=transfer.labels)
 print(f"{len(semantic):,} semantic Gaussians, {len(color):,} of colour")
@@ -122,8 +119,7 @@ Image.fromarray(viz.picture_grid([pictures], styles))
 # classes.
 
 # %%
-others = classes.embeddings[[i for i, name in enumerate(classes.names) if name != word]]
-found = field.query(classes.embeddings[classes.index(word)], negatives=others, cameras=cameras)
+found = field.query(word, classes)
 meanings = {
     "labels": (semantic, {"color_by": "label"}),
     "latents": (semantic, {"color_by": "feature", "feature_colors": feature_colors(field)}),
@@ -179,7 +175,7 @@ Image.fromarray(plotter.screenshot(return_img=True))
 # %% [markdown]
 # ## Both fields, linked
 #
-# They share no parameter, only space. Turning one turns the other (`plotter.show()`).
+# They share only space. Turning one turns the other (`plotter.show()`).
 
 # %%
 plotter = viz.linked_clouds(semantic, color, names=classes.names, camera=camera, height=360, off_screen=True)
@@ -288,7 +284,7 @@ Image.fromarray(view.screenshot())
 
 # %%
 view.close()
-orbit = viz.Orbit(frames=10, size=(165, 220), elevation_degrees=40, zoom=1.5)
+orbit = viz.Orbit(frames=8, size=(165, 220), elevation_degrees=40, zoom=1.5)
 film = viz.save_turntable(out / "turntable.gif", inside, orbit=orbit, up=up, fps=5)
 print(f"{film.stat().st_size / 1000:.0f} kB")
 display.Image(film)

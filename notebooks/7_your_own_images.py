@@ -10,12 +10,13 @@
 
 # %%
 # Your own data: a folder of photos that overlap (JPEG, PNG, ...), and a folder for what is made of them; a phrase for each
-# class of things there, the one to look for, and one that is no class. 30 to 150 photos of one camera at one zoom are
-# enough for a room; walk around, do not just turn on the spot.
+# class of things there, the one to look for, and one that is no class; places where things are seen. 30 to 150 photos of
+# one camera at one zoom are enough for a room; walk around, do not just turn on the spot.
 import os
 from pathlib import Path
 
 from kfgs import ToyConfig, make_toy_room
+from kfgs.fields import Clicks
 
 data = Path(os.environ.get("KFGS_NOTEBOOK_DATA", "data"))
 photos = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6)) / "images"
@@ -25,6 +26,16 @@ phrases = [
     "pinkish grey wall", "cloudy blue wall", "greenish grey wall", "medium grey ceiling", "dusty red rug", "cocoa floor",
 ]  # fmt: skip
 question, no_class = "dark forest green plant", "mustard cushion"
+clicks = {  # things that you point at: (x, y) pixels of pictures
+    "red things": Clicks("view_020.png", [(54, 93), (74, 91), (244, 138), (144, 98)]),  # chair and rug
+    "floor": Clicks("view_020.png", [(14, 148)]),
+    "table": Clicks("view_020.png", [(164, 48)]),
+    "plant": Clicks("view_020.png", [(151, 23)]),
+    "blue wall": Clicks("view_020.png", [(44, 23)]),
+    "wall": Clicks("view_010.png", [(128, 80)]),
+    "sofa": Clicks("view_010.png", [(178, 178)]),
+    "ceiling": Clicks("view_010.png", [(128, 25)]),
+}
 
 # %%
 from dataclasses import replace
@@ -38,13 +49,13 @@ from PIL import Image
 from torch.nn.functional import avg_pool2d, normalize
 
 from kfgs import (
-    AutoencoderConfig,
+    ColorConfig,
     FeatureFolder,
-    FieldConfig,
     FitConfig,
     answers,
     extract_features,
     fit_scene,
+    label_set_from_examples,
     load_scene,
     make_label_set,
     pictures_of,
@@ -156,21 +167,21 @@ Image.fromarray(viz.picture_grid([pictures], ["photo", "features", question], wi
 # ## What it will cost
 #
 # Before anything long starts: minutes, memory and disk of each stage, on this machine at this moment. Ask with
-# `teacher="lseg"` to see what the paper's would take. `FitConfig.paper()` is the paper's schedule (30,000 steps); this is
-# the one for a CPU, shorter still. Structure from motion gives few points, so the field may grow at a lower gradient; the
-# guess of how many Gaussians it will have may then be half of them.
+# `teacher="lseg"` to see what the paper's would take. The field is fused onto Gaussians that are trained on the photographs
+# first (`color`, a short schedule here); if you have a splat in this frame, `fit_scene` takes it instead (`splat=`).
 
 # %%
-field = replace(FieldConfig.cpu().with_steps(1_000), densify_gradient=1e-4, max_gaussians=30_000)
-config = replace(FitConfig.cpu(), autoencoder=AutoencoderConfig(steps=1_000), field=field)
+quick = ColorConfig.quick()
+config = FitConfig.cpu(color=replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000)))
 map_size = tuple(teacher.encode_image(photo.movedim(-1, 0)).movedim(0, -1).shape)
 print(plan_scene(scene, teacher=TeacherCost.of_maps("colour words", map_size), config=config, folder=out))
 
 # %% [markdown]
 # ## Features, then the field
 #
-# Maps are written one picture at a time, and a killed run goes on where it stopped; so does the fit. Each stage is found
-# again when nothing it depends on has changed: run this notebook twice, and the second time takes seconds.
+# Maps are written one picture at a time, and a killed run goes on where it stopped; so does the fit: Gaussians from the
+# photographs, then the maps averaged onto them, merged and compressed (notebook 4). Each stage is found again when nothing
+# it depends on has changed: run this notebook twice, and the second time takes seconds.
 
 # %%
 manifest = extract_features(teacher, pictures_of(scene, train), out / "features")
@@ -190,7 +201,7 @@ print(semantic.summary())
 classes = make_label_set(teacher, phrases, negatives=None)
 rows = []
 for i in test[:2]:
-    photo, labels = scene.image(i), semantic.segment(scene.cameras[i], classes.embeddings)
+    photo, labels = scene.image(i), semantic.segment(scene.cameras[i], classes)
     rows.append([photo, viz.overlay_labels(photo, labels, alpha=0.8)])
 sheet = viz.picture_grid(rows, ["unseen picture", "segmented"], width=320)
 legend = viz.legend_strip(torch.arange(len(phrases)), phrases, sheet.shape[1])
@@ -199,14 +210,12 @@ Image.fromarray(np.concatenate([sheet, legend]))
 # %% [markdown]
 # ## Ask
 #
-# A query is told from the other classes (its relevancy), scored by the views, and cut at a gamma that is chosen from the
-# scores and said. `answers` counts the connected parts: how many, where, how large, seen best from where. Sizes are in
-# the units of the reconstruction.
+# A query is told from the other classes (the score is its relevancy) and cut at a gamma, which the result states. `answers`
+# counts the connected parts: how many, where, how large, seen best from where. Sizes are in the units of the
+# reconstruction.
 
 # %%
-others = [row for row, phrase in enumerate(phrases) if phrase != question]
-embedding = teacher.encode_text([question])[0]
-found = semantic.query(embedding, negatives=classes.embeddings[others], cameras=cameras)
+found = semantic.query(question, classes)
 things = answers(semantic.gaussians, found, cameras)
 print(found)
 for thing in things:
@@ -231,15 +240,23 @@ view = plotter.screenshot(return_img=True)
 Image.fromarray(viz.picture_grid([[scene.image(train[best]), view]], ["picture", question], width=480))
 
 # %% [markdown]
-# And all classes at once, by the votes of the views.
+# ## Without words
+#
+# Some teachers have no text (DINOv2, SAM), and some things have no name. Then show what you mean: a few clicks in
+# pictures make classes for `segment`, `classify` and `query` alike. Several clicks for one class are averaged: here a chair
+# and squares of the rug, which a teacher of colours hardly tells apart.
 
 # %%
-votes = semantic.classify_by_views(classes.embeddings, cameras)
-labelled = semantic.gaussians.replace(labels=votes.labels)
-plotter = viz.make_plotter(round(legend.shape[1] * camera.height / camera.width), legend.shape[1], off_screen=True)
-viz.add_cloud(plotter, labelled, style="gaussians")
-viz.look_through(plotter, camera)
-Image.fromarray(np.concatenate([plotter.screenshot(return_img=True), legend]))
+pointed = label_set_from_examples(semantic, clicks)
+labels, photo = semantic.segment(scene.cameras[test[-1]], pointed), scene.image(test[-1])
+marked = {scene.cameras[i].name: scene.image(i).clone() for i in train}
+for shown in clicks.values():
+    for x, y in shown.points:
+        marked[shown.view][max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3] = torch.tensor([1.0, 1.0, 0.0])
+row = [*(marked[view] for view in sorted({shown.view for shown in clicks.values()})), photo]
+row.append(viz.overlay_labels(photo, labels, alpha=0.8))
+sheet = viz.picture_grid([row], [*["clicks"] * (len(row) - 2), "unseen picture", "segmented"], width=240)
+Image.fromarray(np.concatenate([sheet, viz.legend_strip(torch.arange(len(pointed)), pointed.names, sheet.shape[1])]))
 
 # %% [markdown]
 # ## Explore
@@ -263,5 +280,5 @@ Image.fromarray(picture)
 #
 # - `semantic` is saved in `data/own/run/field`; `SemanticField.load` brings it back, `kfgs query` and `kfgs view` ask it
 #   from a shell.
-# - `fit_color(scene, out / "run", ColorConfig.quick())` adds colours to edit: notebook 5.
+# - `data/own/run/color.ply` holds the colour Gaussians that the features were fused onto: notebook 5 edits them.
 # - `kfgs sfm`, `kfgs plan`, `kfgs features`, `kfgs fit` are these cells as commands.

@@ -1,5 +1,6 @@
 """A small field, classes and views to ask, and clouds whose positions tie, for the tests of the explorer."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -7,18 +8,21 @@ import torch
 
 from kfgs.cameras import Camera
 from kfgs.fields import SemanticField
+from kfgs.fields.remembered import remember
 from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
 from kfgs.labels import LabelSet
 from kfgs.quant.autoencoder import Autoencoder
-from kfgs.quant.codebook import Codebook
+from kfgs.quant.codebook import Codebook, unit_rows
+from kfgs.quant.linear import fit_linear_latents
 from kfgs.splat import rgb_to_sh0
 from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.meaning import SplatMeaning
 
 DIM, WORDS = 16, 12
 NAMES = ("wall", "chair", "table", "office chair")
-MODES = ("decouple", "adc", "adc+sc")
+MODES = ("decouple", "adc", "adc+sc", "fused")
+TRAINED = MODES[:3]
 LINE = [[float(i), 0, 5] for i in range(4)]
 
 
@@ -42,14 +46,27 @@ def autoencoder():
     )
 
 
+@cache
+def linear():
+    """Twelve latents that hold every codeword."""
+    made = fit_linear_latents(codebook().unit, keep=1.0)
+    assert made.latent == WORDS
+    return made
+
+
 def field(mode="adc+sc", n=80, seed=0):
-    """Gaussians that overlap, near codewords; two that were never learnt, one that no view shows."""
+    """Gaussians that overlap, near codewords; two that were never learnt, one that no view shows.
+
+    As trained by one of the paper's rows, or "fused": with linear latents, of different lengths.
+    """
     generator = torch.Generator().manual_seed(seed)
     rand = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
     features = codebook().codewords[torch.arange(n) % WORDS] + 0.05 * rand(n, DIM)
     if mode == "adc+sc":
         with torch.no_grad():
             features = autoencoder().encode(features)
+    if mode == "fused":
+        features = linear().encode(unit_rows(features) * torch.linspace(0.5, 1, n)[:, None])
     features[:2] = 0
     means = torch.stack([rand(n) * 4 - 2, rand(n) * 2 - 1, rand(n) * 2 + 4], dim=1)
     means[2] = torch.tensor([0.0, 50.0, 5.0])
@@ -60,8 +77,20 @@ def field(mode="adc+sc", n=80, seed=0):
         opacities=rand(n) * 0.5 + 0.45,
         features=features,
     )
+    if mode == "fused":
+        return SemanticField(gaussians, linear=linear())
     book = None if mode == "decouple" else codebook()
     return SemanticField(gaussians, book, autoencoder() if mode == "adc+sc" else None)
+
+
+def stored(folder, mode="fused", **changes):
+    """A field on disk that remembers its classes."""
+    scene = folder / "scene"
+    scene.mkdir()
+    classes().save(scene / "text.safetensors")
+    made = replace(field(mode), info=remember(scene, folder / "field"), **changes)
+    made.save(folder / "field")
+    return SemanticField.load(folder / "field")
 
 
 def classes(count=4, negatives=True):

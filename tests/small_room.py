@@ -26,9 +26,9 @@ FIELD = FieldConfig.cpu(
     reset_every=0,
     checkpoint_every=7,
 )
-CONFIG = FitConfig(
-    codebook=CodebookConfig(initial=4, maximum=24, epochs=4, step_every=1, learning_rate=0.02),
-    autoencoder=AutoencoderConfig(latent=4, encoder=(24, 16), decoder=(16, 24), steps=400, learning_rate=3e-3),
+CONFIG = FitConfig.paper(
+    codebook=CodebookConfig.paper(initial=4, maximum=24, epochs=4, step_every=1, learning_rate=0.02),
+    autoencoder=AutoencoderConfig.paper(latent=4, encoder=(24, 16), decoder=(16, 24), steps=400, learning_rate=3e-3),
     field=FIELD,
 )
 

@@ -22,7 +22,7 @@ def run(room, tmp_path_factory):
     """A fitted run, made through the command line, without an autoencoder for speed."""
     out = tmp_path_factory.mktemp("run")
     arguments = ["fit", str(room), "--features", str(room / "features"), "--out", str(out)]
-    assert main([*arguments, "--mode", "adc", "--steps", "60", "--max-gaussians", "2000"]) == 0
+    assert main([*arguments, "--method", "paper", "--mode", "adc", "--steps", "60", "--max-gaussians", "2000"]) == 0
     return out
 
 
@@ -100,7 +100,7 @@ def test_nothing_of_the_users_is_overwritten(run, room, tmp_path, capsys):
 def test_a_clouds_own_colours_are_kept(run, room, tmp_path):
     red = np.full(4, 200, np.uint8)
     write_ply(tmp_path / "c.ply", {n: np.zeros(4, np.float32) for n in "xyz"} | {"red": red, "green": red, "blue": red})
-    arguments = ["label", str(run / "field"), "--scene", str(room), "--out", str(tmp_path / "o"), "--by", "latents"]
+    arguments = ["label", str(run / "field"), "--scene", str(room), "--out", str(tmp_path / "o"), "--rule", "paper"]
     assert main([*arguments, "--cloud", str(tmp_path / "c.ply")]) == 0
     assert read_ply(tmp_path / "o" / "cloud.ply")["red"].tolist() == [200] * 4
 
@@ -142,7 +142,12 @@ def test_a_single_query_reports_its_threshold(run, room, tmp_path, capsys):
             ["fit", "{room}", "--features", "{room}/features", "--out", "{tmp}/o", "--split", "val"],
             "expected one of train, test",
         ),
-        (["label", "{run}/field", "--out", "{tmp}/o"], "pass --classes and --text"),
+        (["label", "{run}/field", "--out", "{tmp}/o", "--classes", "{room}/classes.json"], "pass --classes and --text"),
+        (
+            ["fit", "{room}", "--features", "{room}/features", "--out", "{tmp}/o", "--mode", "adc"],
+            "mode: expected none",
+        ),
+        (["fit", "{room}", "--out", "{tmp}/o", "--method", "paper", "--splat", "a.ply"], "splat: expected none beside"),
         (["label", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--query", "dragon"], "got 'dragon'"),
         (
             ["label", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--distance", "1"],

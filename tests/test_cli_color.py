@@ -123,11 +123,11 @@ def test_color_of_a_scene_without_held_out_views_says_that_there_is_no_score(roo
 
 def test_attach_by_distance_gives_each_gaussian_the_class_at_its_place(labelled, field, splat, truth, room):
     found, before = read_splats(labelled), read_splats(splat)
-    # The field's Gaussians lie at the same places; a vote of few, small views leaves some with another class.
+    # The field's Gaussians lie at the same places; few, small views show some as their neighbours.
     assert (found.gaussians.labels == truth).float().mean() > 0.9
     scene = load_scene(room).select("train")
-    embeddings = load_label_set(room / "classes.json", room / "text.npy").embeddings
-    semantic, _, _ = SemanticField.load(field).classify_by_views(embeddings, scene.cameras)
+    classes = load_label_set(room / "classes.json", room / "text.npy")
+    semantic = SemanticField.load(field).with_answers(scene.cameras).classify(classes).labels
     assert torch.equal(torch.from_numpy(found.extra["score"] == 1), semantic >= 0)  # the same place: no distance
     assert torch.equal(found.gaussians.labels[semantic >= 0], semantic[semantic >= 0])
     assert found.classes == tuple(json.loads((room / "classes.json").read_text()))
@@ -193,7 +193,7 @@ def test_select_asks_a_field_by_text(field, truth, room, capsys):
     # Each Gaussian carries its class's own embedding.
     assert f"lamp: {int((truth == names.index('lamp')).sum())} of 4000 Gaussians" in said
     assert "12 negatives" in said
-    assert "note: each Gaussian's own latent decides, which is noisy; with --scene the field's views do" in said
+    assert "note: this field was made before fields kept what the views show of each Gaussian" in said
     assert main(["select", "lamp", str(field), "--scene", str(room)]) == 0
     said = capsys.readouterr().out
     assert "own latent" not in said

@@ -26,7 +26,7 @@ from kfgs.teachers.lseg.layout import layout
 
 HERE = Path(__file__).parent
 TEACHER = ["--teacher", "cases_teach:TinyLSeg", "--weights"]
-QUICK = ["--steps", "3", "--mode", "adc"]
+QUICK = ["--steps", "3", "--method", "paper", "--mode", "adc"]
 
 
 @pytest.fixture(scope="module")
@@ -270,7 +270,7 @@ def test_discarded_maps_serve_other_fields_and_are_missed_by_another_codebook(
 ):
     folder, out = tmp_path / "maps", tmp_path / "run"
     shutil.copytree(maps, folder)
-    arguments = ["fit", str(scene), "--features", str(folder), "--out", str(out), "--mode", "adc"]
+    arguments = ["fit", str(scene), "--features", str(folder), "--out", str(out), "--method", "paper", "--mode", "adc"]
     assert main([*arguments, "--steps", "3", "--discard-features"]) == 0
     assert f"of {len(pictures)} dense maps deleted" in capsys.readouterr().out
     assert not list(folder.glob("*.npy"))
@@ -432,10 +432,10 @@ def test_maps_that_nothing_would_stand_for_are_not_deleted(scene, maps, tmp_path
     folder = tmp_path / "maps"
     shutil.copytree(maps, folder)
     arguments = ["fit", str(scene), "--features", str(folder), "--out", str(tmp_path / "run"), "--discard-features"]
-    error = fails([*arguments, "--mode", "decouple"], capsys)
+    error = fails([*arguments, "--method", "paper", "--mode", "decouple"], capsys)
     assert "expected a mode that makes index maps (adc or adc+sc), got decouple" in error
     (folder / "features.json").unlink()
-    error = fails([*arguments, "--mode", "adc"], capsys)
+    error = fails([*arguments, "--method", "paper", "--mode", "adc"], capsys)
     assert "expected maps that kfgs made (with features.json)" in error
     assert len(list(folder.glob("*.npy"))) == len(list(maps.glob("*.npy")))
     assert not (tmp_path / "run").exists()  # found out before any work

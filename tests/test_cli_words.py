@@ -186,9 +186,11 @@ def test_a_phrase_joins_the_classes_of_a_table(field, room, truth, names, tmp_pa
     assert f"palm: {lamps} of 4000 Gaussians, score > 0.999" in capsys.readouterr().out
     assert main(["select", "palm", *arguments, "--negatives", "classes"]) == 0
     said = capsys.readouterr().out
-    assert "palm: 0 of 4000 Gaussians" in said  # nothing is more like it than like a lamp
-    assert f"{len(names)} negatives" in said
+    assert f"palm: {lamps} of 4000 Gaussians" in said  # the same letters as a lamp: not told from itself
+    assert f"{len(names) - 1} negatives" in said
     assert main(["select", "palm", *arguments]) == 0
+    assert f"{len(names) - 1} negatives" in capsys.readouterr().out
+    assert main(["select", "spoon", *arguments]) == 0  # like no class of the table
     assert "4 negatives" in capsys.readouterr().out
     assert main(["select", "Lamp", *arguments]) == 0  # a class of the table
     said = capsys.readouterr().out
@@ -256,7 +258,7 @@ def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
         (["lamp", "--text", "{table}", "--score", "cosine", "--negatives", "classes"], "none beside --score cosine"),
         (["lamp", "--text", "{table}", "--score", "softmax", "--negatives", "none"], "expected classes or canonical"),
         (["lamp", "--teacher", "cases_words:MUTE"], "teacher 'mute': expected one with a text encoder"),
-        (["palm", "--text", "{other}", *LETTERS], "got (16,); text of another teacher?"),
+        (["palm", "--text", "{other}", *LETTERS], "text of another teacher?"),
         (
             ["lamp", "--text", "{other}"],
             "classes: expected embeddings [C, 16] (from the field), got ({count}, 5): text of another teacher?",

@@ -1,4 +1,4 @@
-"""The command line: `kfgs demo | sfm | plan | features | text | fit | segment | label | info | color | attach |
+"""The command line: `kfgs demo | sfm | plan | features | text | fit | uplift | segment | label | info | color | attach |
 select | edit | convert | view`.
 
 Every command names the files it wrote, shows progress on long work, and ends with 0 (done), 1 (bad input, with one
@@ -18,7 +18,7 @@ from .color import attach, color, convert, edit
 from .look import view
 from .query import select
 from .say import warnings_as_notes
-from .semantic import demo, fit, info, label, segment, sfm
+from .semantic import demo, fit, info, label, segment, sfm, uplift
 from .teach import features, plan
 from .words import text
 
@@ -31,6 +31,7 @@ COMMANDS: dict[str, Any] = {
         features,
         text,
         fit,
+        uplift,
         segment,
         label,
         info,

@@ -17,11 +17,10 @@ from .checks import (
     check_target,
     choose_views,
     edits_beside,
-    open_field,
     open_splats,
 )
 from .edit_words import edits_from_words, inserted_files
-from .say import load_classes, say, say_lost, size_of, training_cameras, wrote
+from .say import field_classes, open_answering, say, say_lost, size_of, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
@@ -109,12 +108,12 @@ def attach(
         field: the folder that `kfgs fit` wrote (`RUN/field`).
         splats: a splat of the same scene in any format, by any program.
         out: the labelled splat to write; its ending chooses the format.
-        scene: the field's scene folder: classes.json, text.npy, and the cameras that vote.
+        scene: a scene folder with classes.json and text.npy; those that the field remembers when not given.
         classes: JSON list of class names; SCENE/classes.json when not given.
         text: .npy of one embedding per class; SCENE/text.npy when not given.
         by: `views`: the field segments its training views and each Gaussian takes the class of the pixels that it fills;
-            `distance`: the labelled Gaussians of the field within lambda decide, as in the paper; those are labelled by
-            their own latents, as in the paper, or with --scene by the votes of its views. `views` when a scene is given.
+            `distance`: the labelled Gaussians of the field within lambda (the distance within which a label is carried over)
+            decide, as in the paper. `views` when not given.
         method: where distance decides: the `nearest` labelled Gaussian (as in the paper), a `vote` of those around, or their
             overlap (`mahalanobis`), which is the best of the three where the field's labels are noisy.
         distance: the paper's lambda in the splat's world units; from the clouds' spacing when not given.
@@ -131,14 +130,15 @@ def attach(
     check_target("out", out, splats)
     if scene is None:
         check_alone("images", images, "without --scene, whose pictures they are")
-        for name, asked in (("by", by == "views"), ("splat_scene", splat_scene is not None)):
-            if asked:
-                raise ValueError(f"{name}: expected --scene beside it, whose cameras it needs, got none; pass --scene")
     if same_frame and splat_scene is not None:
         raise ValueError("same_frame: expected it alone, got --splat-scene too, whose cameras find the frame; drop one")
-    by = by or ("distance" if scene is None else "views")
-    loaded, cloud, label_set = open_field(field), open_splats("splats", splats), load_classes(scene, classes, text)
-    cameras = None if scene is None else training_cameras(loaded, scene, images)
+    loaded, cloud = open_answering(field, scene, images), open_splats("splats", splats)
+    for name, asked in (("by", by == "views"), ("splat_scene", splat_scene is not None)):
+        if asked and not loaded.cameras:
+            raise ValueError(
+                f"{name}: expected --scene beside it for a field that remembers no cameras, got none; pass --scene"
+            )
+    label_set = field_classes(loaded, scene, classes, text)
     same = Similarity.identity() if same_frame else None
     frame = same if splat_scene is None else load_scene(splat_scene).undistorted().cameras
     try:
@@ -146,7 +146,6 @@ def attach(
             loaded,
             cloud,
             label_set,
-            cameras=cameras,
             frame=frame,
             distance=distance,
             by=by,

@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from .._check import check_range, check_whole
-from .checks import check_alone, check_folder, open_field, open_splats
-from .say import load_classes, say, training_cameras, wrote
+from .checks import check_alone, check_folder, open_splats
+from .say import field_classes, open_answering, say, wrote
 from .words import note_other_teacher, text_encoder
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -49,8 +49,8 @@ def view(
     Args:
         source: a field folder (`RUN/field`), asked by text; or a splat with classes (`kfgs attach`), asked by class.
         color: the colour scene in the same frame, any splat file; without it the source is shown alone.
-        scene: scene folder: classes.json and text.npy, or text.safetensors; its cameras score each Gaussian and tell who
-            sees it.
+        scene: scene folder: classes.json and text.npy, or text.safetensors; a field remembers its own. For a splat, the cameras
+            that tell who sees a Gaussian.
         classes: JSON list of class names; SCENE/classes.json when not given.
         text: .npy of one embedding per class, or a table that `kfgs text` made (.safetensors); SCENE/text.npy or
             SCENE/text.safetensors when not given.
@@ -123,19 +123,14 @@ def _meaning(
     images: Path | None,
 ) -> tuple[Any, list[Any]]:
     """What can be asked, and the cameras of the scene (those that a field was trained on)."""
-    from ..pipeline.apply import check_words
     from ..scenes import load_scene
     from ..viz.explorer import FieldMeaning, SplatMeaning
 
     scene, classes, text = words
     if (source / "field.json").is_file() or not source.is_file():
-        field, label_set = open_field(source), load_classes(scene, classes, text)
-        cameras = [] if scene is None else training_cameras(field, scene, images)
-        if scene is None:
-            say("note: each Gaussian's own latent decides, which is noisy; with --scene the field's views do")
-        label_set, embed = _words_of(label_set, teacher, weights)
-        check_words(field, label_set)
-        return FieldMeaning(field, label_set, cameras=cameras, embed=embed), cameras
+        field = open_answering(source, scene, images)
+        label_set, embed = _words_of(field_classes(field, scene, classes, text), teacher, weights)
+        return FieldMeaning(field, label_set, embed=embed), list(field.cameras)
     for name, value in {"classes": classes, "text": text, "teacher": teacher, "weights": weights}.items():
         check_alone(name, value, "beside a splat, which has its own classes")
     cameras = [] if scene is None else load_scene(scene, images=images).undistorted().cameras

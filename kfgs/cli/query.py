@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from .._check import check_range
-from .checks import check_alone, check_folder, open_field, open_splats
-from .say import say, training_cameras, wrote
+from .checks import check_alone, check_folder, open_splats
+from .say import open_answering, say, wrote
 from .words import ask
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -41,7 +41,8 @@ def select(
         query: a class name, "chair"; of a field with --teacher any phrase, "the red chair by the window".
         source: a field folder (`RUN/field`), asked by text; or a splat with classes, asked by label.
         out: folder for selection.json (with the indices) and selection.ply (the Gaussians), if wanted.
-        scene: scene folder: classes.json and text.npy, or text.safetensors; and the cameras that score and show.
+        scene: scene folder: classes.json and text.npy, or text.safetensors. A field remembers its own; for a splat, the
+            cameras that tell which view shows a part best.
         classes: JSON list of class names; SCENE/classes.json when not given.
         text: .npy of one embedding per class, or a table that `kfgs text` made (.safetensors), which needs no classes;
             SCENE/text.npy or SCENE/text.safetensors when not given.
@@ -57,7 +58,6 @@ def select(
     """
     from ..formats import SplatFile
     from ..labels import answers
-    from ..pipeline import query_field
     from ..pipeline.apply import select_labelled
     from ..scenes import load_scene
 
@@ -72,14 +72,12 @@ def select(
     is_field = (source / "field.json").is_file()
     counted = not is_field and threshold is None  # parts are numbered as `kfgs edit` does
     if is_field:
-        field, (label_set, query, known) = open_field(source), ask(query, (scene, classes, text), teacher, weights)
-        cameras = None if scene is None else training_cameras(field, scene, images)
+        field = open_answering(source, scene, images)
+        label_set, target = ask(query, (scene, classes, text), teacher, weights, field)
+        query = target if isinstance(target, str) else query
         how = None if score == "auto" else score
-        against = _negatives(negatives, score, known and len(label_set) > 1)
-        found = query_field(field, label_set, query, threshold, cameras=cameras, negatives=against, score=how)
-        cloud = SplatFile(field.gaussians, {"score": found.scores.numpy()})
-        if cameras is None:
-            say("note: each Gaussian's own latent decides, which is noisy; with --scene the field's views do")
+        found = field.query(target, label_set, threshold, negatives=_negatives(negatives, score), score=how)
+        cloud, cameras = SplatFile(field.gaussians, {"score": found.scores.numpy()}), field.cameras or None
     else:
         given = {"classes": classes, "text": text, "negatives": negatives, "score": score, "teacher": teacher}
         for name, value in (given | {"weights": weights}).items():
@@ -110,11 +108,13 @@ def _save(out: Path, query: str, cloud: Any, found: Any, things: list[Any]) -> l
     return [out / "selection.json", *write_splats(out / "selection.ply", cloud.select(found.mask)).paths]
 
 
-def _negatives(negatives: Negatives, score: Score, others: bool) -> Any:
-    """The kind of negatives: as asked, if the score can use it; else the classes for a class, canonical for a phrase."""
-    if negatives == "auto":
-        return "none" if score == "cosine" else "classes" if others else "canonical"
-    if score == "cosine" and negatives != "none":
+def _negatives(negatives: Negatives, score: Score) -> Any:
+    """As asked, if the score can use it.
+
+    Raises:
+        ValueError: if it cannot.
+    """
+    if score == "cosine" and negatives not in ("auto", "none"):
         raise ValueError(f"negatives: expected none beside --score cosine, got {negatives}; leave one of both out")
     if score in ("softmax", "relevancy") and negatives == "none":
         raise ValueError(f"negatives: expected classes or canonical for --score {score}, got none; leave it out")

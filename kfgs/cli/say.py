@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 Preset = Literal["cpu", "paper"]
+Method = Literal["fuse", "paper"]
 Mode = Literal["decouple", "adc", "adc+sc"]
 
 
@@ -33,15 +34,53 @@ def say_lost(written: Any) -> None:
         say("note: neighbours now lie side by side (Morton order), so indices into the old file do not fit the new one")
 
 
-def fit_config(preset: Preset, mode: Mode, seed: int, steps: int | None, max_gaussians: int | None, split: str) -> Any:
+def fit_config(
+    preset: Preset,
+    method: Method,
+    mode: Mode | None,
+    seed: int,
+    steps: int | None,
+    max_gaussians: int | None,
+    split: str,
+) -> Any:
     """The options of a fit, from a preset and what was given beside it."""
     from ..pipeline import FitConfig
+    from ..pipeline.color import ColorConfig
 
-    config = FitConfig.cpu() if preset == "cpu" else FitConfig.paper()
-    fields = config.field if steps is None else config.field.with_steps(steps)
+    if mode is not None and method != "paper":
+        raise ValueError(f"mode: expected none for method {method!r}, got {mode!r}; pass --method paper as well")
+    config = FitConfig.cpu() if preset == "cpu" else FitConfig.paper(method=method, color=ColorConfig.paper())
+    config = dataclasses.replace(config, method=method, mode=mode or config.mode, seed=seed, split=split)
+    if steps is not None:
+        color = dataclasses.replace(config.color, field=config.color.field.with_steps(steps))
+        config = dataclasses.replace(config, color=color, field=config.field.with_steps(steps))
     if max_gaussians is not None:
-        fields = dataclasses.replace(fields, max_gaussians=max_gaussians)
-    return dataclasses.replace(config, mode=mode, seed=seed, split=split, field=fields)
+        fields = dataclasses.replace(config.field, max_gaussians=max_gaussians)
+        uplift = dataclasses.replace(config.uplift, max_gaussians=max_gaussians)
+        config = dataclasses.replace(config, field=fields, uplift=uplift)
+    return config
+
+
+def field_classes(field: Any, scene: Path | None, classes: Path | None, text: Path | None) -> Any:
+    """The label set that options name, or else the one that a field remembers."""
+    given = any(path is not None for path in (scene, classes, text))
+    return load_classes(scene, classes, text) if given or "classes" not in field.info else field.label_set()
+
+
+def open_answering(path: Path, scene: Path | None, images: Path | None) -> Any:
+    """A field whose Gaussians can answer by themselves: an older one asks the views of its scene, if that is given."""
+    from .checks import open_field
+
+    field = open_field(path)
+    if field.linear is not None and (field.cameras or scene is None):
+        return field
+    if scene is None:
+        say(
+            "note: this field was made before fields kept what the views show of each Gaussian; each one's own latent answers, "
+            "which is noisy. Pass --scene, or fit it again"
+        )
+        return field
+    return field.with_answers(training_cameras(field, scene, images))
 
 
 def load_classes(scene: Path | None, classes: Path | None, text: Path | None) -> Any:
@@ -107,9 +146,10 @@ def training_cameras(field: Any, scene: Path | None, images: Path | None) -> lis
     from ..scenes import load_scene
 
     if scene is None:
-        raise ValueError("by: expected 'latents' without a scene, got 'views'; pass --scene, whose cameras vote")
-    cameras = load_scene(scene, images=images).undistorted().cameras
-    trained = set(field.info.get("views", ()))
+        raise ValueError("scene: expected the field's own scene, got none; pass --scene, whose cameras it needs")
+    loaded = load_scene(scene, images=images).undistorted()
+    cameras = loaded.cameras
+    trained = set(field.info.get("views", ())) or {cameras[i].name for i in loaded.splits.get("train", ())}
     voting = [camera for camera in cameras if camera.name in trained]
     if not voting:
         raise ValueError(

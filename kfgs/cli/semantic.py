@@ -1,4 +1,4 @@
-"""Commands of the semantic field: demo, sfm, fit, segment, label, info."""
+"""Commands of the semantic field: demo, sfm, fit, uplift, segment, label, info."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from .checks import check_alone, check_folder
-from .say import Mode, Preset, fit_config, load_classes, say, training_cameras, wrote
+from .checks import check_alone, check_folder, open_field, open_splats
+from .say import Method, Mode, Preset, field_classes, fit_config, load_classes, open_answering, say, wrote
 from .teach import Level, check_discard, choose_teacher, scene_folder, stored_maps
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
+Rule = Literal["fused", "paper"]
 SceneFolder = Annotated[Path, tyro.conf.Positional]
 
 
-def demo(out: Path = Path("kfgs_demo"), seed: int = 0, steps: int | None = None) -> None:
+def demo(out: Path = Path("kfgs_demo"), seed: int = 0) -> None:
     """Make a furnished toy room, fit a semantic field to it, segment unseen views, label points: the whole main job.
 
     Args:
         out: folder for the scene, the run and its results; running again goes on where it stopped.
         seed: of the room and of the fit.
-        steps: training steps of the field; the CPU preset's when not given.
     """
     from ..pipeline import demo as run_demo
     from ..scenes.toy import ToyConfig
 
-    config = fit_config("cpu", "adc+sc", seed, steps, None, "train")
+    config = fit_config("cpu", "fuse", None, seed, None, None, "train")
     wrote(run_demo.run(out, config, room=ToyConfig(seed=seed), report=say, progress=True))
     say(f"next: kfgs view {out / 'run' / 'field'} --scene {out / 'scene'} --color {out / 'color.ply'}")
 
@@ -70,6 +70,7 @@ def fit(
     scene: SceneFolder,
     out: Path,
     features: Path | None = None,
+    splat: Path | None = None,
     teacher: str | None = None,
     weights: str | None = None,
     fast: bool = False,
@@ -77,7 +78,8 @@ def fit(
     discard_features: bool = False,
     level: Level | None = None,
     preset: Preset = "cpu",
-    mode: Mode = "adc+sc",
+    method: Method = "fuse",
+    mode: Mode | None = None,
     split: str = "train",
     seed: int = 0,
     steps: int | None = None,
@@ -86,27 +88,33 @@ def fit(
     undistorted_features: bool = False,
     device: str = "auto",
 ) -> None:
-    """Fit a semantic field to a posed scene and its teacher features.
+    """Make a semantic field of a posed scene and its teacher features.
+
+    The features are averaged onto Gaussians in 3-D, and compressed after: those of --splat, or, without one, Gaussians that are
+    trained on the pictures first (`kfgs color` in the same folder OUT makes better ones, which are then taken).
 
     Args:
         scene: folder with images and a COLMAP model or transforms.json.
         out: run folder; running again goes on where it stopped. `out/field` receives the field.
         features: folder of teacher maps as `kfgs features`, Feature 3DGS or LangSplat write them; SCENE/features when not
             given.
-        teacher: run this teacher instead of reading maps (see `kfgs features`), and store none of them: it runs twice, once
-            for the codebook's samples and once for the index maps.
+        splat: any splat file of the scene, in its frame: the Gaussians to fuse onto.
+        teacher: run this teacher instead of reading maps (see `kfgs features`), and store none of them: it looks at most
+            pictures once more, for samples.
         weights: of the teacher.
         fast: of the teacher, see `kfgs features`.
         size: of the teacher's maps, see `kfgs features`.
-        discard_features: delete the dense maps when the index maps are made of them; later runs with the same codebook
-            options do not need them.
+        discard_features: delete the dense maps when the stages made of them are done; later runs with the same options do not
+            need them, but others (another --splat, say) do.
         level: which masks of LangSplat's maps are read: `default`, or those of subparts (s), parts (m) or wholes (l).
-        preset: `cpu` (minutes on two cores) or `paper` (30,000 steps).
-        mode: `adc+sc` (codebook and autoencoder, 9 channels), `adc` (codebook), `decouple` (raw features).
+        preset: `cpu` (minutes on two cores) or `paper` (30,000 steps of training).
+        method: `fuse` as above; `paper` compresses maps per pixel and trains Gaussians on them (DF-3DGS).
+        mode: of the paper's method: `adc+sc` (codebook and autoencoder, 9 channels), `adc` (codebook), `decouple` (raw
+            features). `adc+sc` when not given.
         split: views to learn from.
         seed: every random choice follows from it.
-        steps: training steps of the field, instead of the preset's.
-        max_gaussians: stop densifying at this many Gaussians.
+        steps: training steps, instead of the preset's.
+        max_gaussians: most Gaussians of the field.
         images: folder of the pictures, if it is not SCENE/images.
         undistorted_features: the teacher saw undistorted pictures already, so its maps need no lens removed.
         device: where the field is trained: `auto` (a GPU if there is one), `cpu` or `cuda`.
@@ -117,9 +125,13 @@ def fit(
     from ..scenes import load_scene
     from ..teachers import RecomputedMaps, discard_maps
 
-    config = fit_config(preset, mode, seed, steps, max_gaussians, split)
+    config = fit_config(preset, method, mode, seed, steps, max_gaussians, split)
     config = dataclasses.replace(config, undistorted_features=undistorted_features)
     check_folder("out", out)
+    if method == "paper":
+        check_alone("splat", splat, "beside --method paper, which trains its own Gaussians")
+    elif splat is not None:
+        check_alone("steps", steps, "beside --splat, which needs no training")
     as_taken = load_scene(scene, images=images)
     loaded = as_taken.undistorted()
     for note in loaded.notes:
@@ -138,27 +150,29 @@ def fit(
         check_alone("fast", fast, "without --teacher, whose option it is")
         maps = stored_maps(as_taken, loaded.views(split), features or scene_folder(scene) / "features", level)
         if discard_features:
-            check_discard(maps, mode)
-    result = fit_scene(loaded, maps, out, config, report=say, progress=True, device=device)
+            check_discard(maps, config)
+    result = fit_scene(loaded, maps, out, config, splat=splat, report=say, progress=True, device=device)
     if teacher is not None:
         maps.clear()  # the samples; the stages made of them are found without
     say(result.field.summary())
     written = [result.field_path, *write_training_pictures(result)]
     if discard_features:
         freed = discard_maps(maps.path, maps.stems)
-        say(f"{maps.path}: {bytes_in_words(freed)} of {len(maps)} dense maps deleted; their index maps are in {out}")
+        say(
+            f"{maps.path}: {bytes_in_words(freed)} of {len(maps)} dense maps deleted; what was made of them is in {out}"
+        )
     wrote(written)
 
 
 def segment(
     field: Annotated[Path, tyro.conf.Positional],
-    scene: Path,
     out: Path,
+    scene: Path | None = None,
     split: str = "test",
     classes: Path | None = None,
     text: Path | None = None,
     labels: Path | None = None,
-    decode: Literal["exact", "latent"] = "latent",
+    rule: Rule = "fused",
     pictures: int = 4,
     images: Path | None = None,
 ) -> None:
@@ -166,23 +180,25 @@ def segment(
 
     Args:
         field: the folder that `kfgs fit` wrote (`RUN/field`).
-        scene: scene folder in the field's frame.
         out: receives label maps, pictures and scores.json.
+        scene: scene folder in the field's frame; the one that the field remembers when not given.
         split: views to segment.
         classes: JSON list of class names; SCENE/classes.json when not given.
         text: .npy of one embedding per class in the teacher's space, or a table of `kfgs text`; SCENE/text.npy or
             SCENE/text.safetensors when not given.
         labels: folder of true label pictures; SCENE/labels_scored or SCENE/labels when not given.
-        decode: `exact` decodes every pixel as the paper does, `latent` compares latents: the same question, much faster.
+        rule: `fused`, what the field's Gaussians answer; `paper` decodes every pixel (Sec. 3.4), seconds a view.
         pictures: how many views get pictures.
         images: folder of the pictures, if it is not SCENE/images.
     """
     from .._files import read_json
-    from ..fields import SemanticField
+    from ..fields import recall_scene
     from ..pipeline import score_scene, segment_scene, true_labels, write_report
     from ..scenes import load_scene
     from ..viz import plot_confusion, plot_iou
 
+    field_ = open_field(field)
+    scene = recall_scene(field_.info, field_.folder) if scene is None else scene
     loaded, label_set = load_scene(scene, images=images).undistorted(), load_classes(scene, classes, text)
     folder = labels or next((scene / name for name in ("labels_scored", "labels") if (scene / name).is_dir()), None)
     listed = scene / "classes.json"
@@ -194,22 +210,64 @@ def segment(
         raise ValueError(
             f"labels: expected pictures <stem>.png of the views of split {split!r} in {labels}, found none"
         )
-    field_ = SemanticField.load(field)
     seen = set(field_.info.get("views", ())) & {loaded.cameras[i].name for i in loaded.views(split)}
     if seen:
         say(f"note: the field was trained on {len(seen)} of these views")
-    found = segment_scene(field_, loaded, label_set, out, split=split, decode=decode, pictures=pictures, progress=True)
+    found = segment_scene(field_, loaded, label_set, out, split=split, rule=rule, pictures=pictures, progress=True)
     written = [out / name for name in ("predicted", "overlay", "features") if (out / name).is_dir()]
     if truth:
         scores = score_scene(found, truth, label_set)
         say(str(scores))
-        write_report(out / "scores.json", segmentation=scores, truth=str(folder), field=str(field), decode=decode)
+        write_report(out / "scores.json", segmentation=scores, truth=str(folder), field=str(field), rule=rule)
         plot_confusion(scores.confusion, list(label_set.names), out / "confusion.png", misses=scores.misses)
         plot_iou(scores.iou, list(label_set.names), out / "iou.png")
         written += [out / name for name in ("scores.json", "confusion.png", "iou.png")]
     else:
         say(f"note: no label pictures of split {split!r} to score against")
     wrote(written)
+
+
+def uplift(
+    scene: SceneFolder,
+    splat: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    features: Path | None = None,
+    max_gaussians: int | None = None,
+    split: str = "train",
+    level: Level | None = None,
+    images: Path | None = None,
+    undistorted_features: bool = False,
+) -> None:
+    """Give every Gaussian of a splat the teacher's features, without training: `kfgs fit` without merging.
+
+    Args:
+        scene: folder with images and a COLMAP model or transforms.json.
+        splat: any splat file of the scene, or a field folder, in the scene's frame.
+        out: the field folder to write.
+        features: folder of teacher maps; SCENE/features when not given.
+        max_gaussians: prune and merge to at most this many; every Gaussian is kept when not given.
+        split: views to learn from.
+        level: which masks of LangSplat's maps are read: `default`, `s`, `m` or `l`.
+        images: folder of the pictures, if it is not SCENE/images.
+        undistorted_features: the teacher saw undistorted pictures already, so its maps need no lens removed.
+    """
+    from ..fields import UpliftConfig
+    from ..pipeline.fuse import uplift as uplift_scene
+    from ..scenes import load_scene
+
+    check_folder("out", out)
+    as_taken = load_scene(scene, images=images)
+    loaded = as_taken.undistorted()
+    for note in loaded.notes:
+        say(f"note: {note}")
+    maps = stored_maps(as_taken, loaded.views(split), features or scene_folder(scene) / "features", level)
+    cloud = open_field(splat).gaussians if (splat / "field.json").is_file() else open_splats("splat", splat).gaussians
+    config = UpliftConfig(max_gaussians=max_gaussians)
+    options: dict[str, Any] = {"split": split, "undistorted_features": undistorted_features, "folder": out}
+    found = uplift_scene(loaded, maps, cloud, config, progress=True, report=say, **options)
+    found.save(out)
+    say(found.summary())
+    wrote([out])
 
 
 def label(
@@ -222,29 +280,28 @@ def label(
     threshold: float | None = None,
     cloud: Path | None = None,
     distance: float | None = None,
-    by: Literal["views", "latents"] | None = None,
+    rule: Rule = "fused",
     images: Path | None = None,
 ) -> None:
-    """Label the Gaussians of a field, and carry the labels to a colour cloud by distance.
+    """Label the Gaussians of a field, and carry the labels to a cloud by distance.
 
     Args:
         field: the folder that `kfgs fit` wrote (`RUN/field`).
         out: receives gaussians.ply (and cloud.ply).
-        classes: JSON list of class names; SCENE/classes.json when not given.
+        classes: JSON list of class names; those that the field remembers when neither these nor --scene are given.
         text: .npy of one embedding per class; SCENE/text.npy when not given.
-        scene: a scene folder that holds classes.json and text.npy, and the cameras that vote.
-        query: label only the Gaussians of this class (single target with threshold).
-        threshold: the paper's gamma, a cosine; from the scores' distribution when not given.
-        cloud: PLY of points or of a colour splat in the field's frame to carry the labels to.
-        distance: the paper's lambda in world units; from the clouds' spacing when not given.
-        by: `views`: the training views of SCENE vote on each Gaussian; `latents`: each Gaussian's own latent decides, as
-            in the paper. `views` when a scene is given.
+        scene: a scene folder that holds classes.json and text.npy.
+        query: label only the Gaussians of this class, as `kfgs select` finds them.
+        threshold: the paper's gamma; see `kfgs select`.
+        cloud: PLY of points in the field's frame to carry the labels to. For a splat `kfgs attach` does better.
+        distance: the paper's lambda: the distance within which a label is carried over, in world units; from the clouds'
+            spacing when not given.
+        rule: `fused`: what the training views show of a Gaussian decides; `paper`: its own latent (Sec. 3.4).
         images: folder of the scene's pictures, if it is not SCENE/images.
     """
     import torch
 
-    from ..fields import SemanticField
-    from ..pipeline import label_cloud, label_field, query_field, read_cloud, save_labelled
+    from ..pipeline import label_cloud, read_cloud, save_labelled
 
     for name, value, other, needed in (
         ("threshold", threshold, "query", query),
@@ -252,31 +309,25 @@ def label(
     ):
         if value is not None and needed is None:
             raise ValueError(f"{name}: expected --{other} beside it, got none; it would have no effect")
-    if query is not None and by is not None:
-        raise ValueError("by: expected none beside --query, which compares each Gaussian's own latent; leave one out")
-    label_set = load_classes(scene, classes, text)
-    loaded = SemanticField.load(field)
+    loaded = open_answering(field, scene, images)
+    label_set = field_classes(loaded, scene, classes, text)
     carried = None if cloud is None else read_cloud(cloud)
     targets = [out / "gaussians.ply"] + ([] if cloud is None else [out / "cloud.ply"])
     if cloud is not None and cloud.resolve() in {target.resolve() for target in targets}:
         raise ValueError(f"out: expected another folder than that of --cloud, got {out}; {cloud} would be overwritten")
     if query is None:
-        by = by or ("latents" if scene is None else "views")
-        cameras = training_cameras(loaded, scene, images) if by == "views" else None
-        gaussians, scores = label_field(loaded, label_set, cameras)
-        rule = "votes of the training views; score = winner's share" if cameras else "own latents; score = cosine"
+        labels, scores = loaded.classify(label_set, rule=rule)
+        who = "what the views show of each Gaussian" if rule == "fused" else "each Gaussian's own latent (Sec. 3.4)"
+        how = f"{who}; score = cosine"
     else:
-        found = query_field(loaded, label_set, query, threshold)
-        gaussians = loaded.gaussians.replace(labels=torch.where(found.mask, label_set.index(query), -1))
-        scores, rule = (
-            found.scores,
-            f"{query}: {len(found)} Gaussians above gamma = {found.threshold:.4f} ({found.how})",
-        )
-    say(f"labelled by {rule}")
-    assert gaussians.labels is not None
-    written = save_labelled(targets[0], gaussians, scores, label_set, rule=rule)
+        found = loaded.query(query, label_set, threshold, rule=rule)
+        labels, scores = torch.where(found.mask, label_set.index(query), -1), found.scores
+        how = f"{query}: {len(found)} Gaussians above gamma = {found.threshold:.4f} ({found.how})"
+    gaussians = loaded.gaussians.replace(labels=labels)
+    say(f"labelled by {how}")
+    written = save_labelled(targets[0], gaussians, scores, label_set, rule=how)
     for i, name in enumerate(label_set.names):
-        say(f"  {name:<16s} {int((gaussians.labels == i).sum()):8d} Gaussians")
+        say(f"  {name:<16s} {int((labels == i).sum()):8d} Gaussians")
     if carried is not None:
         moved, paths = label_cloud(gaussians, carried, targets[1], label_set, distance=distance)
         say(str(moved))

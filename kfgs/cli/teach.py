@@ -10,7 +10,7 @@ import tyro
 
 from .._check import one_line
 from .checks import check_alone, check_file, check_folder
-from .say import Mode, Preset, fit_config, say, wrote
+from .say import Method, Mode, Preset, fit_config, say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
@@ -83,7 +83,8 @@ def plan(
     fast: bool = False,
     size: tuple[int, ...] = (),
     preset: Preset = "cpu",
-    mode: Mode = "adc+sc",
+    method: Method = "fuse",
+    mode: Mode | None = None,
     steps: int | None = None,
     split: str = "train",
     store: Literal["keep", "discard", "recompute"] = "keep",
@@ -103,6 +104,7 @@ def plan(
         fast: as for `kfgs features`.
         size: as for `kfgs features`.
         preset: as for `kfgs fit`.
+        method: as for `kfgs fit`.
         mode: as for `kfgs fit`.
         steps: as for `kfgs fit`.
         split: views to encode and to learn from.
@@ -118,7 +120,7 @@ def plan(
 
     if out is not None:
         check_file("out", out)
-    config = fit_config(preset, mode, 0, steps, None, split)
+    config = fit_config(preset, method, mode, 0, steps, None, split)
     loaded = load_scene(scene, images=images)
     found = plan_scene(
         loaded,
@@ -208,7 +210,7 @@ def stored_maps(scene: Any, views: list[int], folder: Path, level: Level | None)
     return maps
 
 
-def check_discard(maps: Any, mode: Mode) -> None:
+def check_discard(maps: Any, config: Any) -> None:
     """Refuse to delete dense maps that nothing would stand for: before the work, not after it.
 
     Raises:
@@ -216,7 +218,7 @@ def check_discard(maps: Any, mode: Mode) -> None:
     """
     from ..teachers import check_discardable
 
-    if mode == "decouple":
+    if config.needs_maps:
         raise ValueError(
             "discard-features: expected a mode that makes index maps (adc or adc+sc), got decouple, which learns from the "
             "dense maps themselves; leave it out"

@@ -10,26 +10,31 @@ from typing import Annotated, Any
 
 import tyro
 
-from .checks import check_alone
-from .say import find_classes, load_classes, say, wrote
+from .checks import check_alone, open_field
+from .say import field_classes, find_classes, load_classes, say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
 
 def text(
-    names: Annotated[str, tyro.conf.Positional],
-    teacher: str,
-    out: Path,
+    names: Annotated[str | None, tyro.conf.Positional] = None,
+    teacher: str | None = None,
+    out: Path = Path("text.safetensors"),
     weights: str | None = None,
     templates: str | None = None,
     negatives: bool = True,
+    examples: Path | None = None,
+    field: Path | None = None,
 ) -> None:
-    """Embed words with a teacher's text encoder, once, into a table that all other commands take as --text.
+    """Make classes for all other commands (--text): embed words with a teacher's text encoder, or show examples.
 
     Args:
         names: classes.json (a list), a .txt file (a class a line), or words between commas. A class may have synonyms:
             "chair;armchair;seat" is called chair.
         teacher: lseg, clip, siglip, ... (a wrong name lists them), or package.module:name of your own.
+        examples: a .json file in place of words, for a teacher without text: {"chair": [{"view": "a.png", "points": [[x, y]]},
+            {"view": "b.png", "box": [x0, y0, x1, y1]}, {"gaussians": [3, 14]}], ...}; beside --field.
+        field: the field folder that the examples are shown in.
         out: the table to write, .safetensors; as SCENE/text.safetensors it is found by itself.
         weights: checkpoint file (lseg), or folder or hub id (the others).
         templates: bare (as LSeg and the paper), clip7, tcl9, siglip, or one of your own with {} for the word; what suits
@@ -43,6 +48,25 @@ def text(
 
     if out.suffix != SUFFIX or out.is_dir():
         raise ValueError(f"out: expected a file whose name ends in {SUFFIX}, got {out}; give another name")
+    if examples is not None:
+        for name, given in (("names", names), ("teacher", teacher), ("weights", weights), ("templates", templates)):
+            check_alone(name, given, "beside --examples, which take the place of words")
+        if field is None:
+            raise ValueError(
+                "field: expected --field beside --examples, got none; pass the field that they are shown in"
+            )
+        from ..fields import label_set_from_examples, read_examples
+
+        shown = label_set_from_examples(open_field(field), read_examples(examples))
+        shown.save(out)
+        say(f"{len(shown)} classes, {shown.dim} channels each, by examples: {', '.join(shown.names)}")
+        wrote([out])
+        return
+    check_alone("field", field, "without --examples, which are shown in it")
+    if names is None or teacher is None:
+        raise ValueError(
+            "names, teacher: expected words and --teacher, or --examples and --field, got neither whole pair"
+        )
     words, patterns = read_words(names), None if templates is None else template_set(templates)
     made = embed(teacher, weights, words, templates=patterns, negatives=CANONICAL if negatives else None)
     made.save(out)
@@ -126,49 +150,53 @@ def text_encoder(teacher: str, weights: str | None) -> Callable[..., Any]:
 
 
 def ask(
-    query: str, sources: tuple[Path | None, Path | None, Path | None], teacher: str | None, weights: str | None
-) -> tuple[Any, str, bool]:
-    """The label set to look a query up in, its name in there, and whether it is one of the table's own classes.
+    query: str,
+    sources: tuple[Path | None, Path | None, Path | None],
+    teacher: str | None,
+    weights: str | None,
+    field: Any,
+) -> tuple[Any, Any]:
+    """The label set to look a query up in, and what to ask for: a class's name, or a phrase's embedding.
 
-    Without a teacher the query is a class of the table. With one it may be any phrase: where there is a table too, it
-    joins that table's classes, in the same templates; canonical negatives come from the teacher.
+    Without a teacher the query is a class of the table. With one it may be any phrase, embedded in the table's templates;
+    canonical negatives come from the teacher.
 
     Args:
         query: class name or phrase.
-        sources: scene, classes and text, as `load_classes` takes them.
+        sources: scene, classes and text, as `load_classes` takes them; without any the field's own.
         teacher: name of a teacher with text.
         weights: its weights.
+        field: whose own label set counts where no source is given.
     """
     if teacher is None:
         check_alone("weights", weights, "without --teacher, whose weights they are")
-        label_set = load_classes(*sources)
+        label_set = field_classes(field, *sources)
         try:
-            return label_set, label_set.names[label_set.index(query)], True
+            return label_set, label_set.names[label_set.index(query)]
         except ValueError as error:
             raise ValueError(
                 f"{error}; for any other phrase pass --teacher and --weights, or add it to the table with `kfgs text`"
             ) from error
     found = find_classes(*sources)
     there = found is not None and (any(sources[1:]) or all(path.is_file() for path in found))
-    label_set = load_classes(*sources) if there else None
+    label_set = load_classes(*sources) if there else field.label_set() if "classes" in field.info else None
     asked = embed(teacher, weights, [query], templates=None if label_set is None else label_set.info.get("templates"))
     if label_set is None:
-        return asked, asked.names[0], False
+        return asked, asked.names[0]
     note_other_teacher(asked, label_set)
     name = asked.names[0]
     known = label_set.knows(name)
-    if not known:
-        label_set = label_set.with_class(name, asked.embeddings[0])  # refuses other channels
-    label_set = dataclasses.replace(
-        label_set, negatives=asked.negatives, negative_names=asked.negative_names, info=asked.info
-    )
-    return label_set, label_set.names[label_set.index(name)], known
+    if asked.dim == label_set.dim:  # else the query says what does not fit
+        label_set = dataclasses.replace(
+            label_set, negatives=asked.negatives, negative_names=asked.negative_names, info=asked.info
+        )
+    return label_set, label_set.names[label_set.index(name)] if known else asked.embeddings[0]
 
 
 def note_other_teacher(asked: Any, table: Any) -> None:
     """Say where a query and the table whose classes it joins were embedded by different teachers.
 
-    Whether the query fits the field is told apart from this, by `pipeline.query_field`.
+    Whether the query fits the field is told apart from this, by `SemanticField.query`.
     """
     from ..labels.label_set import teacher_difference
 

@@ -1,50 +1,54 @@
-"""The finished semantic field: Gaussians with latents, and what turns latents into features and classes."""
+"""The finished semantic field: Gaussians with latents, what turns latents into features, and the one rule of what is what."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from dataclasses import field as default
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from .._check import check_shapes
+from .._check import check_choice, check_shapes
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels import (
+    LOGIT_SCALES,
+    Classification,
     CodewordLabels,
+    LabelSet,
     Score,
     Selection,
-    Votes,
-    average_views,
-    classify,
     label_codewords,
     label_pixels,
-    nearest_codeword,
-    select_by_query,
     select_by_similarity,
-    vote_labels,
 )
 from ..labels._rows import unit_embeddings
-from ..labels.segment import Decode
+from ..labels.questions import Classes, Negatives, check_rows, class_rows, make_question
 from ..metrics import MIB, semantic_storage_bytes
-from ..quant.autoencoder import Autoencoder
-from ..quant.codebook import Codebook, unit_rows
+from ..quant import Autoencoder, Codebook, LinearLatents, unit_rows
 from ..splat import Rendering, rasterize
+from .answers import Answers, Seen, fused_answers
 from .store import load_field, save_field
 
 CHUNK = 8192  # latents decoded at once: the decoder's widest layer then holds 32 MB
+Rule = Literal["fused", "paper"]
+RULES: tuple[Rule, ...] = ("fused", "paper")
 
 
 @dataclass(frozen=True, eq=False)
 class SemanticField:
-    """A scene's semantics in 3-D (Sec. 3.2-3.4), in any of the three rows of Table 1.
+    """A scene's semantics in 3-D, and everything that is needed to ask it.
 
-    With codebook and autoencoder the Gaussians carry d latents ("decouple+ADC+SC"); with the codebook alone they carry
-    features near codewords ("decouple+ADC"); with neither, the teacher's features as they are ("just decouple").
+    Latents are linear in the teacher's features (`linear`, what `uplift` makes), or one of the three rows of Table 1: with
+    codebook and autoencoder d latents ("decouple+ADC+SC"), with the codebook alone features near codewords
+    ("decouple+ADC"), with neither the teacher's features as they are ("just decouple").
+
+    **The rule.** Each Gaussian has a class, or a score, of its own: that of its *fused* feature, the mean of what the
+    training views show where it is seen. Selections, labels of other clouds, and the views of a fused field follow from it.
+    `rule="paper"` is Sec. 3.4 as printed: a Gaussian's own latent, or a pixel's rendered one, is decoded and quantised.
     """
 
     gaussians: Gaussians
@@ -52,12 +56,33 @@ class SemanticField:
     autoencoder: Autoencoder | None = None
     info: dict[str, Any] = default(default_factory=dict)
     """Where it comes from; anything that JSON can hold."""
+    linear: LinearLatents | None = None
+    """What linear latents stand for: `answers` where there are some, else the Gaussians' features."""
+    answers: Tensor | None = None  # [N, e]
+    """Each Gaussian's fused feature, as linear latents; None where the Gaussians' features are just that."""
+    seen: Seen | None = None
+    """How well the training views show each Gaussian."""
+    cameras: tuple[Camera, ...] = ()
+    """The training views, undistorted."""
+    folder: Path | None = None
+    """Where it was loaded from."""
 
     def __post_init__(self) -> None:
         if self.gaussians.features is None:
             raise ValueError("gaussians: expected features [N, d], got None; fit them with fit_field")
         if self.autoencoder is not None and self.codebook is None:
             raise ValueError("codebook: expected the one that the autoencoder was fitted to, got None; pass it as well")
+        if self.linear is None and self.answers is not None:
+            raise ValueError("linear: expected what the answers stand for, got None; pass it as well")
+        if self.linear is not None:
+            check_shapes(
+                ("gaussians.means", self.gaussians.means, "N 3"),
+                ("gaussians.features" if self.answers is None else "answers", self._own, ("N", self.linear.latent)),
+            )
+            if self.answers is None and self.codebook is not None:
+                raise ValueError(
+                    "codebook: expected none for linear latents, got one; pass answers, or leave linear out"
+                )
         if self.codebook is None:
             return
         expected = self.codebook.dim if self.autoencoder is None else self.autoencoder.latent
@@ -74,7 +99,7 @@ class SemanticField:
 
     @property
     def features(self) -> Tensor:  # [N, d]
-        """The Gaussians' latents (or features, without an autoencoder)."""
+        """The Gaussians' latents (or features, of a field without compression)."""
         assert self.gaussians.features is not None
         return self.gaussians.features
 
@@ -86,10 +111,31 @@ class SemanticField:
     @property
     def dim(self) -> int:
         """D, the channels of the teacher's features."""
+        if self._is_linear:
+            assert self.linear is not None
+            return self.linear.dim
         return self.channels if self.codebook is None else self.codebook.dim
+
+    @property
+    def method(self) -> str:
+        """Either "fused", or the row of Table 1."""
+        if self._is_linear:
+            return "fused"
+        row = "just decouple" if self.codebook is None else "decouple+ADC"
+        return row + ("+SC" if self.autoencoder is not None else "")
+
+    @property
+    def known(self) -> Tensor:  # [N] bool
+        """Which Gaussians a training view has shown: the others have learnt nothing, and belong to no class."""
+        return self._own.any(dim=1)
 
     def __len__(self) -> int:
         return len(self.gaussians)
+
+    def __repr__(self) -> str:
+        return f"SemanticField({self.method}: {len(self)} Gaussians, {self.channels} channels for {self.dim})"
+
+    # Maps
 
     def render(self, camera: Camera, *, engine: str = "auto") -> Rendering:
         """The latent map F_r (Eq. 3) from a viewpoint, with its alpha. No gradient."""
@@ -100,20 +146,170 @@ class SemanticField:
         self,
         latents: Tensor,  # [..., d]
     ) -> Tensor:  # [..., D]
-        """Bring latents back to the teacher's space (Psi of Sec. 3.3.2); features are returned as they are."""
+        """Bring latents back to the teacher's space (Psi of Sec. 3.3.2, or B z); features are returned as they are."""
         if latents.shape[-1] != self.channels:
             raise ValueError(
                 f"latents: expected [..., d] with d = {self.channels} (from gaussians), got {tuple(latents.shape)}; "
                 "pass maps or features of this field"
             )
-        if self.autoencoder is None:
-            return latents
         with torch.no_grad():
-            return self.autoencoder.decode(latents, chunk=CHUNK)
+            if self._is_linear:
+                assert self.linear is not None
+                return self.linear.decode(latents)
+            return latents if self.autoencoder is None else self.autoencoder.decode(latents, chunk=CHUNK)
 
     def feature_map(self, camera: Camera) -> Tensor:  # [H, W, D]
         """The teacher's features as seen from a viewpoint. 512 channels at 640x480 take 630 MB."""
         return self.decode(self.render(camera).map)
+
+    # The rule
+
+    def cosines(
+        self,
+        rows: Tensor,  # [M, D]
+        *,
+        rule: Rule = "fused",
+    ) -> Tensor:  # [N, M]
+        """The cosine of each Gaussian's feature with some rows; 0 where nothing is known of the Gaussian.
+
+        Args:
+            rows: embeddings in the teacher's space, of any length.
+            rule: `fused`: its fused feature. `paper`: the codeword nearest to its own decoded latent (Sec. 3.4). A field
+                that was made without its training views has no fused features, and follows the paper either way.
+
+        Raises:
+            ValueError: if there is no row, shapes disagree, or a row is all-zero.
+        """
+        check_choice("rule", rule, RULES)
+        check_rows("rows", rows, ("M",), self.dim)
+        unit = unit_embeddings(rows, "rows").to(self.features)
+        with torch.no_grad():
+            if self.linear is not None and (rule == "fused" or self._is_linear):
+                return self.linear.cosines(self._own, unit)
+            if self.codebook is None:
+                return torch.cat([unit_rows(part) @ unit.T for part in self.features.split(CHUNK)])
+            per_codeword = self.codebook.unit.to(unit) @ unit.T  # [K, M]
+            index = [self.codebook.quantize(self.decode(part)) for part in self.features.split(CHUNK)]
+            return per_codeword[torch.cat(index)] * self.features.any(dim=1)[:, None]
+
+    def own_features(
+        self,
+        rows: Tensor,  # [n] int64
+    ) -> Tensor:  # [n, D]
+        """The features that some Gaussians answer with, in the teacher's space; all-zero where nothing is known."""
+        if self.linear is not None:
+            return self.linear.decode(self._own[rows])
+        return self.decode(self.features[rows]) * self.known[rows, None]
+
+    def classify(self, classes: Classes | None = None, *, rule: Rule = "fused") -> Classification:
+        """The class of each Gaussian by max-similarity (Sec. 3.4), and its cosine with that class.
+
+        Args:
+            classes: a label set, or embeddings [C, D]; None: the field's own (`label_set`).
+            rule: see `cosines`.
+
+        Returns:
+            Labels [N], -1 where nothing is known of the Gaussian, and scores [N]. A tie goes to the lowest class.
+        """
+        cosines = self.cosines(self._rows(classes), rule=rule)
+        scores, labels = cosines.max(dim=1)
+        nothing = ~(self.known if rule == "fused" else self.features.any(dim=1))
+        return Classification(labels.masked_fill(nothing, -1), scores.masked_fill(nothing, 0))
+
+    def label(self, classes: Classes | None = None, *, rule: Rule = "fused") -> Gaussians:
+        """The Gaussians with the labels of `classify`."""
+        return self.gaussians.replace(labels=self.classify(classes, rule=rule).labels)
+
+    def query(
+        self,
+        target: str | Tensor,
+        classes: Classes | None = None,
+        threshold: float | None = None,
+        *,
+        negatives: Negatives | Tensor = "auto",
+        score: Score | None = None,
+        logit_scale: float | str = "clip",
+        rule: Rule = "fused",
+    ) -> Selection:
+        """The Gaussians of one thing: those that are more like it than a threshold (gamma of Sec. 3.4).
+
+        By default they are those that are more like the target than like anything that it is compared with: the other classes
+        for a class, the canonical words for anything else. The score is then a relevancy (`labels.relevancy`), gamma 0.5.
+
+        Args:
+            target: the name of a class, or an embedding [D].
+            classes: where the name is looked up, and what it is compared with; None: the field's own (`label_set`).
+            threshold: gamma. None: 0.5 for a relevancy, else read off the scores; the result says how.
+            negatives: what the target is compared with: "classes", "canonical" (words of the classes' table), "none", rows
+                [M, D], or "auto" as above.
+            score: "relevancy", "softmax" over target and negatives, or "cosine"; None: relevancy with negatives, else
+                cosine.
+            logit_scale: of the softmax: "raw", "lseg", "clip", or a number that multiplies the cosines.
+            rule: see `cosines`.
+
+        Raises:
+            ValueError: if there is no such class, shapes disagree, a row is all-zero, or an option is unknown.
+        """
+        if score == "cosine" and isinstance(negatives, str) and negatives == "auto":
+            negatives = "none"
+        compared = isinstance(negatives, str) and negatives != "none"  # from something that the classes' files hold
+        if classes is None and (isinstance(target, str) or (compared and "classes" in self.info)):
+            try:
+                classes = self.label_set()
+            except (FileNotFoundError, ValueError):
+                if isinstance(target, str) or negatives != "auto":  # an embedding needs no classes
+                    raise
+        asked = make_question(target, classes, negatives, self.dim, self.info)
+        rows = (
+            asked.row[None] if asked.negatives is None else torch.cat([asked.row[None], asked.negatives.to(asked.row)])
+        )
+        cosines = self.cosines(rows, rule=rule)
+        known = self.known if rule == "fused" else self.features.any(dim=1)
+        against = None if asked.negatives is None else cosines[:, 1:]
+        return select_by_similarity(cosines[:, 0], against, threshold, known, score=score, logit_scale=logit_scale)
+
+    def segment(
+        self, camera: Camera, classes: Classes | None = None, *, rule: Rule = "fused"
+    ) -> Tensor:  # [H, W] int64
+        """The class of each pixel from a viewpoint; -1 where nothing was drawn.
+
+        Args:
+            camera: any viewpoint.
+            classes: a label set, or embeddings [C, D]; None: the field's own (`label_set`).
+            rule: `fused`: each Gaussian of a fused field shares one vote among the classes (the softmax of 100 cosines,
+                CLIP's scale), and a pixel takes the class with most votes, as blended; a trained field, which learnt
+                blends of latents, takes the codeword whose latent is nearest to the rendered one. `paper`: render the
+                latent map, decode every pixel, quantise, look up (Sec. 3.4). Features without an autoencoder need no codeword:
+                the class most similar to the rendered feature wins, quantised first only by the paper's rule.
+
+        Raises:
+            ValueError: if shapes disagree or `rule` is unknown.
+        """
+        check_choice("rule", rule, RULES)
+        rows = self._rows(classes)
+        if rule == "fused" and self._is_linear:
+            return self._blend_votes(camera, rows)
+        rendering = self.render(camera)
+        if self.codebook is None or (rule == "fused" and self.autoencoder is None):
+            pixels = [self.decode(part) for part in rendering.map.flatten(0, 1).split(CHUNK)]
+            unit = unit_embeddings(rows).to(self.features)
+            found = torch.cat([(part @ unit.T).max(dim=1).indices.masked_fill(~part.any(dim=1), -1) for part in pixels])
+            return found.view(camera.size).masked_fill(rendering.alpha <= 0, -1)
+        labels = self.codeword_labels(rows)
+        decode: Literal["exact", "latent"] = "exact" if rule == "paper" else "latent"
+        covered = rendering.alpha > 0
+        return label_pixels(rendering.map, self.codebook, labels, self.autoencoder, decode=decode, covered=covered)
+
+    def _blend_votes(self, camera: Camera, rows: Tensor) -> Tensor:  # [C, D] -> [H, W] int64
+        with torch.no_grad():
+            cosines = self.cosines(rows)
+            winners = cosines.argmax(dim=1)[self.known].unique()  # a class that no Gaussian prefers wins no pixel
+            if len(winners) == 0:
+                return torch.full(camera.size, -1, dtype=torch.int64, device=self.features.device)
+            votes = torch.softmax(LOGIT_SCALES["clip"] * cosines[:, winners], dim=1) * self.known[:, None]
+            blended = rasterize(self.gaussians.replace(features=votes.contiguous(), sh=None), camera).map
+            most, index = blended.max(dim=-1)
+            return winners[index].masked_fill(most <= 0, -1)
 
     def codeword_labels(
         self,
@@ -124,151 +320,58 @@ class SemanticField:
         Raises:
             ValueError: if the field has no codebook, or shapes disagree.
         """
-        self._check_embeddings(embeddings)
+        check_rows("embeddings", embeddings, ("C",), self.dim)
         if self.codebook is None:
             raise ValueError("codebook: expected one, got None in this field; use classify or segment, which need none")
         return label_codewords(self.codebook.codewords, embeddings)
 
-    def segment(
-        self,
-        camera: Camera,
-        embeddings: Tensor,  # [C, D]
-        *,
-        decode: Decode = "exact",
-    ) -> Tensor:  # [H, W] int64
-        """The class of each pixel from a viewpoint (Sec. 3.4): render, decode, quantise, look up.
+    def with_answers(self, cameras: Sequence[Camera], found: Answers | None = None) -> SemanticField:
+        """This field with fused features found from some views, which it remembers. A fused field has its own.
 
         Args:
-            camera: any viewpoint.
-            embeddings: one row per class.
-            decode: "exact" as in the paper, or "latent", which compares latents and skips the decoder.
-
-        Returns:
-            Class indices; -1 where no Gaussian was drawn.
+            cameras: those that the field was trained with.
+            found: what `fused_answers` gave; None asks it.
 
         Raises:
-            ValueError: if shapes disagree or `decode` is unknown.
+            ValueError: if there is no camera.
         """
-        self._check_embeddings(embeddings)
-        rendering = self.render(camera)
-        labels = None if self.codebook is None else self.codeword_labels(embeddings)
-        return label_pixels(
-            rendering.map,
-            self.codebook,
-            labels,
-            self.autoencoder,
-            decode=decode,
-            embeddings=embeddings,
-            covered=rendering.alpha > 0,
-        )
+        if not cameras:
+            raise ValueError("cameras: expected at least one, got none; pass those that the field was trained with")
+        if not self._is_linear:
+            found = found or fused_answers(self.gaussians, self.codebook, self.autoencoder, cameras)
+            self = replace(self, answers=found.latents, linear=found.linear, seen=found.seen)
+        return replace(self, cameras=tuple(cameras))
 
-    def quantized(self) -> Tensor:  # [N, D]
-        """The codeword nearest to each Gaussian's decoded feature; without a codebook the features themselves.
-
-        All-zero where the Gaussian was never learnt.
-        """
-        if self.codebook is None:
-            return self.features
-        return self.codebook.codewords[self._codeword_index()] * self._learnt()[:, None]
-
-    def classify(
-        self,
-        embeddings: Tensor,  # [C, D]
-    ) -> tuple[Tensor, Tensor]:  # labels [N] int64, scores [N]
-        """The class of each Gaussian by max-similarity (Sec. 3.4), and its cosine with that class.
-
-        This decodes each Gaussian's own latent, as the paper does. Training constrains only blends of latents, so
-        `classify_by_views` is more accurate where cameras are at hand. A Gaussian that no training view ever showed
-        still has its all-zero start: label -1, score 0.
-        """
-        self._check_embeddings(embeddings)
-        if self.codebook is None:
-            found = classify(self.features, embeddings)
-            return found.labels, found.scores
-        per_codeword = classify(self.codebook.codewords, embeddings)
-        index, learnt = self._codeword_index(), self._learnt()
-        return per_codeword.labels[index].masked_fill(~learnt, -1), per_codeword.scores[index].masked_fill(~learnt, 0)
-
-    def classify_by_views(
-        self,
-        embeddings: Tensor,  # [C, D]
-        cameras: Iterable[Camera],
-        *,
-        decode: Decode = "latent",
-    ) -> Votes:
-        """The class of each Gaussian by a vote of segmented views, weighted by how much each view shows it.
-
-        Args:
-            embeddings: one row per class.
-            cameras: which views vote; those that the field was trained on are the natural choice.
-            decode: as in `segment`.
-
-        Returns:
-            Labels (-1 = no view shows the Gaussian, or fewer than seven votes in ten agree), the winner's share of the
-            votes, and the votes cast.
-        """
-        self._check_embeddings(embeddings)
-        views = ((camera, self.segment(camera, embeddings, decode=decode)) for camera in cameras)
-        return vote_labels(self.gaussians, views, len(embeddings))
-
-    def query(
-        self,
-        embedding: Tensor,  # [D]
-        threshold: float | None = None,
-        *,
-        negatives: Tensor | None = None,  # [M, D]
-        cameras: Iterable[Camera] | None = None,
-        score: Score | None = None,
-        logit_scale: float | str = "clip",
-    ) -> Selection:
-        """The Gaussians that are more similar to one target than a threshold (gamma of Sec. 3.4).
-
-        The paper publishes no gamma: without one it is chosen from the scores, and the result says how. Both options
-        make it better: on room_0 the selected Gaussians agree with the data set's labels (IoU, mean of 18 classes) at
-        0.36 with neither, 0.37 with the other classes as negatives, 0.88 with cameras and 0.90 with both.
-
-        Args:
-            embedding: the target, in the teacher's space.
-            threshold: gamma; a cosine, or with negatives a relevancy in [0, 1].
-            negatives: what the target is to be told from, such as the scene's other classes (`labels.relevancy`).
-            cameras: score each Gaussian by the mean of its pixels in these views, instead of by its own latent, which
-                training constrains only in blends; those that the field was trained on are the natural choice.
-            score: "cosine", "softmax" over the target and the negatives, or "relevancy" (`labels.text_scores`); when not
-                given the relevancy with negatives, the cosine without.
-            logit_scale: of the softmax: "raw", "lseg", "clip", or a number that multiplies the cosines.
+    def label_set(self) -> LabelSet:
+        """The classes that the field remembers from its scene.
 
         Raises:
-            ValueError: if shapes disagree, a row is all-zero, `cameras` is empty, or an option is unknown.
+            ValueError: if it remembers none, or they have changed.
+            FileNotFoundError: if they are no longer where they were.
         """
-        self._check_text("embedding", embedding, ())
-        self._check_text("negatives", negatives, ("M",))
-        if cameras is None:
-            features = self.quantized()
-            return select_by_query(features, embedding, threshold, negatives, score=score, logit_scale=logit_scale)
-        targets = embedding[None] if negatives is None else torch.cat([embedding[None], negatives])
-        rows = unit_embeddings(targets, "embedding, negatives").to(self.features)
-        views = ((camera, self._similarity_map(camera, rows)) for camera in cameras)
-        values, weights = average_views(self.gaussians, views)
-        against = None if negatives is None else values[:, 1:]
-        return select_by_similarity(values[:, 0], against, threshold, weights > 0, score=score, logit_scale=logit_scale)
+        from .remembered import recall_classes
+
+        return recall_classes(self.info, self.folder)
+
+    # Size and files
 
     def storage(self) -> int:
-        """Bytes as Table 1 counts them: every attribute of the Gaussians, the decoder and the codebook, in float32.
+        """Bytes as Table 1 counts them: every attribute of the Gaussians, and what decodes them, in float32.
 
         With no autoencoder the table's sizes hold no codebook or decoder; ours counts the codebook, which labelling needs.
+        Fused answers of a trained field are not counted.
         """
         decoder = 0 if self.autoencoder is None else self.autoencoder.decoder_parameters
         codebook = 0 if self.codebook is None else self.codebook.codewords.numel()
-        return semantic_storage_bytes(len(self), self.channels, decoder, codebook)
+        basis = self.linear.basis.numel() if self._is_linear and self.linear is not None else 0
+        return semantic_storage_bytes(len(self), self.channels, decoder, codebook + basis)
 
     def summary(self) -> str:
         """A few lines for a person: counts, channels, codewords, size."""
-        row = "just decouple" if self.codebook is None else "decouple+ADC"
-        row += "+SC" if self.autoencoder is not None else ""
         codewords = "no codebook" if self.codebook is None else f"{self.codebook.size} codewords"
         teacher = self.info.get("teacher")
         lines = [
-            f"semantic field ({row}): {len(self)} Gaussians, {self.channels} channels for {self.dim}, {codewords}",
+            f"semantic field ({self.method}): {len(self)} Gaussians, {self.channels} channels for {self.dim}, {codewords}",
             f"  size as Table 1 counts it: {self.storage() / MIB:.2f} MiB",
             *([f"  teacher: {teacher.get('name')}"] if isinstance(teacher, dict) else []),
             *(f"  {name}: {value}" for name, value in self.info.items() if not isinstance(value, list | dict)),
@@ -282,7 +385,7 @@ class SemanticField:
             FileExistsError: if something else than a field lies at `path`.
             ValueError: if `info` is not JSON.
         """
-        save_field(path, self.gaussians, self.codebook, self.autoencoder, self.info)
+        save_field(path, self)
 
     @classmethod
     def load(cls, path: str | Path) -> SemanticField:
@@ -292,43 +395,15 @@ class SemanticField:
             FileNotFoundError: if there is no field at `path`.
             ValueError: if it is damaged, from another version, or something else.
         """
-        return cls(*load_field(path))
+        return cls(**load_field(path), folder=Path(path))
 
-    def _codeword_index(self) -> Tensor:  # [N] int64
-        """Each Gaussian's codeword; decoded in chunks, so [N, D] is never held."""
-        assert self.codebook is not None
-        return torch.cat([self.codebook.quantize(self.decode(part)) for part in self.features.split(CHUNK)])
+    @property
+    def _is_linear(self) -> bool:
+        return self.linear is not None and self.answers is None
 
-    def _similarity_map(self, camera: Camera, rows: Tensor) -> Tensor:  # rows [M, D] unit -> [H, W, M]
-        """The cosine of each pixel's codeword (or feature) with some rows; 0 where nothing was drawn."""
-        rendering = self.render(camera)
-        pixels = rendering.map.flatten(0, 1)
-        with torch.no_grad():
-            if self.codebook is None:
-                similarity = torch.cat([unit_rows(part) @ rows.T for part in pixels.split(CHUNK)])
-            else:
-                if self.autoencoder is None:
-                    index = torch.cat([self.codebook.quantize(part) for part in pixels.split(CHUNK)])
-                else:
-                    centres = self.autoencoder.encode(self.codebook.codewords)
-                    index = nearest_codeword(pixels, centres.to(pixels))
-                similarity = (unit_rows(self.codebook.codewords) @ rows.T)[index]
-            return similarity.view(*camera.size, len(rows)) * (rendering.alpha > 0)[..., None]
+    @property
+    def _own(self) -> Tensor:  # [N, e]
+        return self.features if self.answers is None else self.answers
 
-    def _learnt(self) -> Tensor:  # [N] bool
-        """Whether a Gaussian's features left their start at 0, which those that no view shows never do."""
-        return self.features.any(dim=1)
-
-    def _check_embeddings(self, embeddings: Tensor) -> None:
-        self._check_text("embeddings", embeddings, ("C",))
-
-    def _check_text(self, name: str, rows: Tensor | None, axes: tuple[str, ...]) -> None:
-        """Refuse rows of another shape; where only D differs, they are mostly text of another teacher."""
-        shape = tuple(getattr(rows, "shape", ()))
-        if len(shape) == len(axes) + 1 and shape[-1] != self.dim:
-            expected = ", ".join((*axes, str(self.dim)))
-            raise ValueError(
-                f"{name}: expected [{expected}], got {shape}: text of another teacher? Embed the words with the one whose "
-                "features this field was fitted to"
-            )
-        check_shapes((name, rows, (*axes, self.dim)))
+    def _rows(self, classes: Classes | None) -> Tensor:  # [C, D]
+        return class_rows(self.label_set() if classes is None else classes, self.dim, self.info)

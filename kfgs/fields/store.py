@@ -4,59 +4,70 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from .._files import atomic_folder, digest_file, read_json, write_json
+from ..cameras import Camera
 from ..gaussians import Gaussians
-from ..quant.autoencoder import Autoencoder
-from ..quant.codebook import Codebook
+from ..quant import Autoencoder, Codebook, LinearLatents
+from .answers import Seen
+from .remembered import rebased
 
-FORMAT, VERSION = "kfgs.semantic_field", 1
+if TYPE_CHECKING:
+    from .semantic_field import SemanticField
+
+FORMAT, VERSIONS = "kfgs.semantic_field", (1, 2)
+"""Version 2 may hold linear latents, fused answers and cameras."""
 TENSORS, DESCRIPTION = "field.safetensors", "field.json"
-Parts = tuple[Gaussians, Codebook | None, Autoencoder | None, dict[str, Any]]
 
 
-def save_field(
-    path: str | Path,
-    gaussians: Gaussians,
-    codebook: Codebook | None,
-    autoencoder: Autoencoder | None,
-    info: dict[str, Any],
-) -> None:
+def save_field(path: str | Path, field: SemanticField) -> None:
     """Write the folder, replacing a field that lies there and nothing else; see `SemanticField.save`."""
     path = Path(path)
     if path.exists() and not (path / DESCRIPTION).is_file() and not (path.is_dir() and not any(path.iterdir())):
         raise FileExistsError(
             f"path: expected a new folder or an older field at {path}, got something else; give another"
         )
+    info = rebased(field.info, field.folder, path)
     try:
         json.dumps(info, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ValueError(f"info: expected what JSON can hold, got {error}; use strings and finite numbers") from error
-    tensors = {f"gaussians.{name}": value for name, value in vars(gaussians).items() if value is not None}
-    if codebook is not None:
-        tensors["codebook.codewords"] = codebook.codewords
-    if autoencoder is not None:
-        tensors |= {f"autoencoder.{name}": value for name, value in autoencoder.to_tensors().items()}
+    tensors = {f"gaussians.{name}": value for name, value in vars(field.gaussians).items() if value is not None}
+    if field.codebook is not None:
+        tensors["codebook.codewords"] = field.codebook.codewords
+    if field.autoencoder is not None:
+        tensors |= {f"autoencoder.{name}": value for name, value in field.autoencoder.to_tensors().items()}
+    if field.linear is not None:
+        tensors |= {f"linear.{name}": value for name, value in field.linear.to_tensors().items()}
+    if field.answers is not None:
+        tensors["answers.latents"] = field.answers
+    if field.seen is not None:
+        tensors |= {f"seen.{name}": value for name, value in field.seen._asdict().items()}
+    if field.cameras:
+        tensors["cameras.viewmats"] = torch.stack([camera.viewmat for camera in field.cameras])
+        tensors["cameras.Ks"] = torch.stack([camera.K for camera in field.cameras])
     with atomic_folder(path) as folder:
         whole = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
         save_file(whole, folder / TENSORS)
         description = {
             "format": FORMAT,
-            "version": VERSION,
+            "version": VERSIONS[-1],
             "sha256": digest_file(folder / TENSORS),
-            "gaussians": len(gaussians),
+            "gaussians": len(field),
+            "cameras": [[camera.name, camera.width, camera.height, camera.near] for camera in field.cameras],
             "info": info,
         }
         write_json(folder / DESCRIPTION, description)
 
 
-def load_field(path: str | Path) -> Parts:
-    """Read the folder; see `SemanticField.load`."""
+def load_field(path: str | Path) -> dict[str, Any]:
+    """The parts of a field, by name; see `SemanticField.load`."""
     path = Path(path)
     if not (path / DESCRIPTION).is_file():
         raise FileNotFoundError(
@@ -66,9 +77,10 @@ def load_field(path: str | Path) -> Parts:
     found = description.get("format") if isinstance(description, dict) else None
     if found != FORMAT:
         raise ValueError(f"{path}: expected a field ({FORMAT}), got {found!r}; pass what SemanticField.save wrote")
-    if description.get("version") != VERSION:
+    if description.get("version") not in VERSIONS:
+        known = " or ".join(map(str, VERSIONS))
         raise ValueError(
-            f"{path}: expected format version {VERSION}, got {description.get('version')!r}; use the kfgs that wrote it"
+            f"{path}: expected format version {known}, got {description.get('version')!r}; use the kfgs that wrote it"
         )
     if not (path / TENSORS).is_file() or digest_file(path / TENSORS) != description.get("sha256"):
         raise ValueError(
@@ -77,18 +89,29 @@ def load_field(path: str | Path) -> Parts:
         )
     try:
         tensors = load_file(path / TENSORS)
-        gaussians = Gaussians(**_part(tensors, "gaussians"))
+        linear, seen, answers = (_part(tensors, name) for name in ("linear", "seen", "answers"))
         codebook, autoencoder = _part(tensors, "codebook"), _part(tensors, "autoencoder")
-        return (
-            gaussians,
-            Codebook.from_tensors(codebook) if codebook else None,
-            Autoencoder.from_tensors(autoencoder) if autoencoder else None,
-            description["info"],
-        )
+        return {
+            "gaussians": Gaussians(**_part(tensors, "gaussians")),
+            "codebook": Codebook.from_tensors(codebook) if codebook else None,
+            "autoencoder": Autoencoder.from_tensors(autoencoder) if autoencoder else None,
+            "info": description["info"],
+            "linear": LinearLatents.from_tensors(linear) if linear else None,
+            "answers": answers.get("latents"),
+            "seen": Seen(**seen) if seen else None,
+            "cameras": _cameras(description.get("cameras", []), _part(tensors, "cameras")),
+        }
     except (SafetensorError, TypeError, KeyError) as error:
         raise ValueError(
             f"{path}: expected a field, but its parts do not fit together ({error}); fit it again"
         ) from error
+
+
+def _cameras(rows: list[Any], tensors: dict[str, Tensor]) -> tuple[Camera, ...]:
+    if not rows:
+        return ()
+    both = zip(rows, tensors["viewmats"], tensors["Ks"], strict=True)
+    return tuple(Camera(E, K, width, height, name, near=near) for (name, width, height, near), E, K in both)
 
 
 def _part(tensors: dict[str, Tensor], kind: str) -> dict[str, Tensor]:

@@ -123,7 +123,7 @@ def transfer_labels(
     Note:
         Measured on the colour Gaussians of the toy room (true classes of its surface) and of Replica's room_0 (classes of
         the labelled pixels that they fill), mIoU in per cent over nearest / vote / mahalanobis of Gaussians: 88.6 / 89.6 /
-        90.9 and 74.7 / 75.4 / 78.7 from `SemanticField.classify_by_views`; 50.1 / 70.1 / 74.4 and 30.7 / 51.1 / 48.9 from
+        90.9 and 74.7 / 75.4 / 78.7 from votes of segmented views; 50.1 / 70.1 / 74.4 and 30.7 / 51.1 / 48.9 from
         `SemanticField.classify`, whose labels are noisy. Times: benchmarks/transfer.py.
     """
     check_choice("method", method, get_args(Method))

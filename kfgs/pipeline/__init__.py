@@ -3,8 +3,6 @@
 from ..viz.field_colors import feature_colors
 from .apply import (
     label_cloud,
-    label_field,
-    query_field,
     read_cloud,
     save_labelled,
     score_scene,
@@ -19,6 +17,7 @@ from .color import ColorConfig, ColorResult, fit_color
 from .compare import render_color, views_of_change, write_comparison
 from .describe import describe
 from .fit import FitConfig, FitResult, fit_scene, load_history
+from .fuse import uplift
 from .pictures import write_training_pictures
 from .plan import Plan, plan_scene
 from .stages import Run, Stage
@@ -38,10 +37,8 @@ __all__ = [
     "fit_color",
     "fit_scene",
     "label_cloud",
-    "label_field",
     "load_history",
     "plan_scene",
-    "query_field",
     "read_cloud",
     "render_color",
     "save_labelled",
@@ -50,6 +47,7 @@ __all__ = [
     "segment_scene",
     "select_labelled",
     "true_labels",
+    "uplift",
     "views_of_change",
     "write_comparison",
     "write_report",

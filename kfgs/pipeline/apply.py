@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,25 +12,22 @@ from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
 
-from .._check import check_choice, check_range
+from .._check import check_range
 from .._files import atomic_path, write_json
-from ..cameras import Camera, resize_labels, undistort_labels
+from ..cameras import resize_labels, undistort_labels
 from ..evaluation import SegmentationReport, evaluate_segmentation, load_label_map
 from ..evaluation.segmentation import VOID
-from ..fields import SemanticField
+from ..fields import Rule, SemanticField
 from ..formats.ply import Columns, other_elements, points_from_columns, read_ply, write_ply
 from ..formats.ply_3dgs import columns_from_gaussians
 from ..formats.sidecar import write_names
 from ..formats.splat_file import SCORE, SplatFile
 from ..gaussians import Gaussians
-from ..labels import LabelSet, Score, Selection, Transfer, classify, select_by_label, teacher_mismatch, transfer_labels
-from ..labels.label_set import teacher_difference
+from ..labels import LabelSet, Selection, Transfer, classify, select_by_label, transfer_labels
+from ..labels.questions import class_rows
 from ..scenes import Scene
 from ..viz import overlay_labels, palette, save_picture
 from ..viz.field_colors import feature_colors
-
-Decode = Literal["exact", "latent"]
-Negatives = Literal["classes", "canonical", "none"]
 
 
 def save_label_map(path: Path, labels: Tensor) -> None:  # [H, W] int64
@@ -48,7 +44,7 @@ def segment_scene(
     out: str | Path,
     *,
     split: str = "test",
-    decode: Decode = "latent",
+    rule: Rule = "fused",
     pictures: int = 4,
     progress: bool = False,
 ) -> dict[str, Tensor]:
@@ -60,8 +56,7 @@ def segment_scene(
         classes: names and embeddings in the teacher's space.
         out: receives `predicted/<stem>.png` and, for `pictures` evenly spread views, `overlay/` and `features/`.
         split: which views.
-        decode: `exact` decodes every pixel as the paper does; `latent` asks the same of the latents: much faster, and
-            no worse (`docs/results.md`).
+        rule: as in `SemanticField.segment`; `paper` decodes every pixel, which takes seconds a view.
         pictures: how many views get an overlay and a feature picture.
         progress: show a progress bar.
 
@@ -75,14 +70,14 @@ def segment_scene(
             f"classes: expected at most {VOID} (label pictures hold a byte per pixel, {VOID} = none), got {len(classes)}; "
             "segment with fewer classes, or call SemanticField.segment, which has no such limit"
         )
-    check_words(field, classes)
+    class_rows(classes, field.dim, field.info)  # refuses words of another teacher before any file is written
     views = scene.views(split)
     shown = {views[i] for i in np.linspace(0, len(views) - 1, min(pictures, len(views))).round().astype(int)}
     colors = feature_colors(field)
     results: dict[str, Tensor] = {}
     for i in tqdm(views, desc="segment", unit="view", disable=not progress):
         camera, stem = scene.cameras[i], scene.stem(i)
-        labels = field.segment(camera, classes.embeddings, decode=decode)
+        labels = field.segment(camera, classes, rule=rule)
         save_label_map(out / "predicted" / f"{stem}.png", labels)
         if i in shown:
             picture = overlay_labels(scene.image(i), labels, list(classes.names))
@@ -134,106 +129,6 @@ def score_teacher(
         return resize_labels(labels.view(features.shape[:2]), size)
 
     return evaluate_segmentation(predict, truth, classes.names)
-
-
-def label_field(
-    field: SemanticField, classes: LabelSet, cameras: Sequence[Camera] | None = None
-) -> tuple[Gaussians, Tensor]:
-    """The field's Gaussians with their classes, and a score [N] in [0, 1] or a cosine for each.
-
-    Args:
-        field: a finished field.
-        classes: names and embeddings.
-        cameras: views that vote on each Gaussian (`classify_by_views`; the score is the winner's share). Without them
-            each Gaussian's own latent decides, as in Sec. 3.4 (the score is its cosine with the class).
-    """
-    check_words(field, classes)
-    if cameras is None:
-        labels, scores = field.classify(classes.embeddings)
-    else:
-        labels, scores, _ = field.classify_by_views(classes.embeddings, cameras)
-    return field.gaussians.replace(labels=labels), scores
-
-
-def query_field(
-    field: SemanticField,
-    classes: LabelSet,
-    name: str,
-    threshold: float | None = None,
-    *,
-    cameras: Sequence[Camera] | None = None,
-    negatives: Negatives = "none",
-    score: Score | None = None,
-    logit_scale: float | str = "clip",
-) -> Selection:
-    """The field's Gaussians of one class: those more similar to it than gamma (Sec. 3.4).
-
-    Warns where the words were embedded by another teacher than the field's, as far as both are known.
-
-    Args:
-        field: a finished field.
-        classes: names and embeddings.
-        name: the class asked for.
-        threshold: gamma, which scores must exceed. When not given, 0.5 for a relevancy, else from the scores' distribution.
-        cameras: views whose pixels score each Gaussian; without them its own latent does, as in the paper.
-        negatives: what to tell the class from: all others of `classes`, its `negatives` (LERF's canonical words, less the
-            class's own name), or nothing.
-        score: "cosine", "softmax" or "relevancy" (`labels.text_scores`); when not given the relevancy with negatives, the
-            cosine without.
-        logit_scale: of the softmax, as in `labels.text_scores`.
-
-    Raises:
-        ValueError: if there is no such class, no negatives of that kind, or shapes disagree.
-    """
-    check_choice("negatives", negatives, ("classes", "canonical", "none"))
-    check_words(field, classes)
-    target = classes.index(name)
-    against = None if negatives == "none" else _negatives(classes, target, negatives)
-    return field.query(
-        classes.embeddings[target],
-        threshold,
-        negatives=against,
-        cameras=cameras,
-        score=score,
-        logit_scale=logit_scale,
-    )
-
-
-def _negatives(classes: LabelSet, target: int, kind: Negatives) -> Tensor:  # [M, D]
-    """The rows that a class is told from."""
-    if kind == "classes":
-        rows = classes.embeddings[torch.arange(len(classes)) != target]
-        if len(rows) == 0:
-            raise ValueError(
-                f"negatives: expected other classes than {classes.names[target]!r}, got none; use 'canonical' or 'none'"
-            )
-        return rows
-    own = classes.names[target].casefold()
-    others = [i for i, word in enumerate(classes.negative_names) if word.casefold() != own]
-    if classes.negatives is None or not others:
-        raise ValueError(
-            "negatives: expected canonical words in the classes' table, got none; make the table with `kfgs text`, or use "
-            "'classes' or 'none'"
-        )
-    return classes.negatives[others]
-
-
-def check_words(field: SemanticField, classes: LabelSet) -> None:
-    """Refuse words that cannot be compared with a field's features, and warn where another teacher embedded them.
-
-    Raises:
-        ValueError: if they have another number of channels: the words are another teacher's.
-    """
-    if classes.dim != field.dim:
-        words = teacher_difference(field.info, classes.info)
-        told = "" if words is None else f" ({words[0]} {words[2]!r:.40} in place of {words[1]!r:.40})"
-        raise ValueError(
-            f"classes: expected embeddings [C, {field.dim}] (from the field), got {tuple(classes.embeddings.shape)}: text of "
-            f"another teacher?{told} Embed the words with the one whose features this field was fitted to"
-        )
-    mismatch = teacher_mismatch(field.info, classes.info)
-    if mismatch is not None:
-        warnings.warn(mismatch, stacklevel=3)
 
 
 def select_labelled(splats: SplatFile, name: str, threshold: float | None = None) -> Selection:

@@ -24,7 +24,6 @@ from ..scenes.align import Alignment, align_by_cameras
 from ..scenes.frames import frames_agree
 from ..scenes.register import align_clouds
 from ..splat.transform import transform_gaussians
-from .apply import check_words, label_field
 
 By = Literal["distance", "views"]
 WAYS: tuple[By, ...] = ("distance", "views")
@@ -57,12 +56,12 @@ class Attached:
 def attach(
     field: SemanticField,
     splats: SplatFile,
-    classes: LabelSet,
+    classes: LabelSet | None = None,
     *,
     cameras: Sequence[Camera] | None = None,
     frame: Similarity | Sequence[Camera] | None = None,
     distance: float | None = None,
-    by: By = "distance",
+    by: By | None = None,
     method: Method = "nearest",
 ) -> Attached:
     """Give every Gaussian of a splat the class that the semantic field has at its place.
@@ -70,12 +69,11 @@ def attach(
     Frames: a similarity is taken as it is given; to cameras of the splat's own, one is fitted by their names; without
     either, both share one frame where `frames_agree` says so, and else the clouds themselves are aligned.
 
-    Classes, `by="distance"` (Sec. 3.4): the semantic Gaussians are classified, by votes of `cameras` or else by their
-    own latents, and those within lambda decide on each Gaussian of the splat. `by="views"`: the semantic field segments
-    `cameras`, and each Gaussian of the splat takes the class of most of the pixels that it fills in them (the score is
-    the winner's share of its votes); on one that no view shows, those of the splat that have a class decide, within
-    lambda. How distance decides is `method`'s: "nearest" gives a score of 1 - d / lambda, "vote" and "mahalanobis" the
-    winner's share of the weights.
+    Classes, `by="views"`: the field segments its training views, and each Gaussian of the splat takes the class of most of
+    the pixels that it fills in them (the score is the winner's share of its votes); on one that no view shows, those of the
+    splat that have a class decide, within lambda (the distance within which a label is carried over). `by="distance"`, the
+    paper's Sec. 3.4: the field's own Gaussians are classified, and those within lambda decide. How distance decides is
+    `method`'s: "nearest" gives a score of 1 - d / lambda, "vote" and "mahalanobis" the winner's share of the weights.
 
     Args:
         field: a finished field.
@@ -85,7 +83,7 @@ def attach(
         frame: what tells the splat's frame: the similarity from the field's to it (`Similarity.identity()` says that they
             are one), or views in it, some of which share their names with `cameras`. None compares the clouds.
         distance: lambda in the splat's world units; None takes `default_distance`.
-        by: "distance" needs no cameras; "views" follows the borders of objects much better.
+        by: None: "views", which follows the borders of objects much better, or "distance" for a field without cameras.
         method: which label wins where distance decides, see `transfer_labels`; "nearest" is the paper's.
 
     Raises:
@@ -100,6 +98,11 @@ def attach(
         0.969 are gone and 0.976 untouched. A vote of neighbours for such Gaussians, or the class of the nearest
         rendered surface, made it worse.
     """
+    classes = field.label_set() if classes is None else classes
+    cameras = cameras or field.cameras or None
+    if field.linear is None and cameras:
+        field = field.with_answers(cameras)
+    by = by or ("distance" if cameras is None else "views")
     check_choice("by", by, WAYS)
     _check_frame(frame)
     check_choice("method", method, get_args(Method))
@@ -110,11 +113,11 @@ def attach(
     for name, needed in (('by="views"', by == "views"), ("frame", not isinstance(frame, Similarity | None))):
         if needed and not cameras:
             raise ValueError(f"cameras: expected views in the field's frame (for {name}), got none; pass them as well")
-    check_words(field, classes)
+    semantic = field.label(classes)  # refuses words of another teacher before the frames are compared
     similarity, alignment, said = _common_frame(field, splats, cameras, frame)
     carry = partial(transfer_labels, distance=distance, method=method)
     if by == "distance":
-        labels, scores, transfer, found = _by_distance(field, splats, classes, cameras, similarity, carry)
+        labels, scores, transfer, found = _by_distance(semantic, splats, similarity, carry)
     else:
         assert cameras is not None
         labels, scores, transfer, found = _by_views(field, splats, classes, cameras, similarity, carry)
@@ -191,20 +194,16 @@ def _solid(means: Tensor, opacities: Tensor) -> Tensor:  # [N, 3], [N] -> [n, 3]
 
 
 def _by_distance(
-    field: SemanticField,
+    semantic: Gaussians,
     splats: SplatFile,
-    classes: LabelSet,
-    cameras: Sequence[Camera] | None,
     similarity: Similarity,
     carry: Callable[[Gaussians, Tensor, Gaussians], Transfer],
 ) -> tuple[Tensor, Tensor, Transfer, dict[str, Any]]:
     """Labels [N], scores [N], the transfer and facts: the rule of Sec. 3.4."""
-    semantic, _ = label_field(field, classes, cameras)
     assert semantic.labels is not None
     transfer = carry(transform_gaussians(semantic, similarity), semantic.labels, splats.gaussians)
-    who = "own latents" if cameras is None else f"votes of {len(cameras)} views"
     facts = {
-        "labelled by": f"distance to semantic Gaussians classified by {who}",
+        "labelled by": "distance to the field's Gaussians",
         "method": transfer.method,
         "score": _meaning(transfer),
         "ambiguous": transfer.ambiguous,
@@ -224,7 +223,7 @@ def _by_views(
 
     def segmented() -> Iterator[tuple[Camera, Tensor]]:
         for camera in cameras:
-            yield similarity.apply_to_camera(camera), field.segment(camera, classes.embeddings, decode="latent")
+            yield similarity.apply_to_camera(camera), field.segment(camera, classes.embeddings)
 
     colour = splats.gaussians
     votes = vote_labels(colour, segmented(), len(classes), min_share=0.0)

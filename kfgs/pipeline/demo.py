@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from ..scenes.toy import ToyConfig, make_toy_room
 from ..teachers import FeatureFolder
 from .apply import (
     label_columns,
-    label_field,
     save_labelled,
     score_scene,
     score_teacher,
@@ -66,7 +66,11 @@ def run(
     classes = load_label_set(folder / "classes.json", folder / "text.npy")
 
     maps = FeatureFolder(folder / "features", [scene.stem(i) for i in scene.views("train")])
-    fitted = fit_scene(scene, maps, out / "run", config, report=say, progress=progress)
+    colors = replace(ColorConfig.quick(), seed=config.seed)
+    colored = fit_color(scene, out / "run", colors, report=say, progress=progress)
+    quality = score_views(colored.gaussians, scene)
+    say(f"colours of unseen views: {quality}")
+    fitted = fit_scene(scene, maps, out / "run", config, splat=colored.gaussians, report=say, progress=progress)
     say(fitted.field.summary())
 
     found = segment_scene(fitted.field, scene, classes, out / "segmentation", progress=progress)
@@ -78,20 +82,20 @@ def run(
     say(f"unseen views: {scores}")
     say(f"the teacher on the same views: {teacher.miou}")
 
-    gaussians, shares = label_field(fitted.field, classes, [scene.cameras[i] for i in scene.views("train")])
-    written = save_labelled(out / "gaussians.ply", gaussians, shares, classes, rule="votes of the training views")
-    surface = {"votes of the training views": _label_surface(gaussians, folder, out / "surface.ply")}
-    surface["own latents (Sec. 3.4)"] = _label_surface(label_field(fitted.field, classes)[0], folder, None)
-    for rule, facts in surface.items():
-        say(f"surface points, Gaussians labelled by {rule}: {facts['agreement']:.4f} agree ({SURFACE_PROTOCOL})")
-    edited, edit_scores = _edit_colors(out, scene, folder, fitted, classes, say, progress)
+    labels, cosines = fitted.field.classify(classes)
+    gaussians = fitted.field.gaussians.replace(labels=labels)
+    written = save_labelled(out / "gaussians.ply", gaussians, cosines, classes, rule="fused features; score = cosine")
+    surface = _label_surface(gaussians, folder, out / "surface.ply")
+    say(f"surface points: {surface['agreement']:.4f} agree ({SURFACE_PROTOCOL})")
+    edited, edit_scores = _edit_colors(out, scene, folder, fitted, colored.gaussians, classes, say)
     write_report(
         out / "scores.json",
         unseen_views=scores,
         teacher=teacher,
         surface=surface,
+        color=quality,
         **edit_scores,
-        seconds=fitted.seconds,
+        seconds=colored.seconds + fitted.seconds,
     )
     segmentation = out / "segmentation"
     return [
@@ -112,18 +116,16 @@ def _edit_colors(
     scene: Scene,
     folder: Path,
     fitted: FitResult,
+    colors: Gaussians,
     classes: LabelSet,
     say: Callable[[str], None],
-    progress: bool,
 ) -> tuple[list[Path], dict[str, Any]]:
-    """Fit the colours, attach the classes, remove the chairs and recolour the plants; the files and the scores."""
-    colored = fit_color(scene, out / "run", ColorConfig.quick(), report=say, progress=progress)
-    quality = score_views(colored.gaussians, scene)
-    say(f"colours of unseen views: {quality}")
-    cameras = [scene.cameras[i] for i in scene.views("train")]
-    splats = attach(fitted.field, SplatFile(colored.gaussians), classes, cameras=cameras, by="views").splats
+    """Attach the classes to the colours, remove the chairs and recolour the plants; the files and the scores."""
+    splats = attach(fitted.field, SplatFile(colors), classes).splats
     written = write_splats(out / "color.ply", splats).paths
-    for thing in answers(splats.gaussians, select_by_label(splats.gaussians, REMOVED, classes.names), cameras):
+    for thing in answers(
+        splats.gaussians, select_by_label(splats.gaussians, REMOVED, classes.names), fitted.field.cameras
+    ):
         say(f"  {REMOVED}: {thing!r}")
     rgb = parse_color(PAINT)
     edits = {"removed": EditList((Remove(OfClass(REMOVED)),)), "recolored": EditList((Recolor(OfClass(PAINTED), rgb),))}
@@ -139,7 +141,7 @@ def _edit_colors(
     recolored = score_recolor(before, after["recolored"].gaussians, folder, PAINTED, rgb)
     say(str(removal))
     say(str(recolored))
-    return written, {"color": quality, "removal": removal, "recolor": recolored}
+    return written, {"removal": removal, "recolor": recolored}
 
 
 def _label_surface(gaussians: Gaussians, folder: Path, out: Path | None) -> dict[str, Any]:

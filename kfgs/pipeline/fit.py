@@ -1,4 +1,4 @@
-"""Figure 2 of the paper as named calls: teacher maps and posed images in, a saved semantic field out.
+"""Teacher maps and posed images in, a saved semantic field out: fused in 3-D and then compressed, or as the paper's Figure 2.
 
 Each call is a stage of a run folder: finished stages are found again by the hash of their inputs, and the long one
 (the field) also resumes from its last checkpoint.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from dataclasses import field as default
 from importlib.metadata import version
 from pathlib import Path
@@ -20,7 +20,17 @@ from torch import Tensor
 
 from .._check import check_choice
 from .._files import digest_value, read_json, write_json
-from ..fields import FieldConfig, FieldFit, GaussianParams, SemanticField, fit_field
+from ..fields import (
+    FieldConfig,
+    FieldFit,
+    GaussianParams,
+    SemanticField,
+    UpliftConfig,
+    fit_field,
+    remember,
+)
+from ..formats import SplatFile
+from ..gaussians import Gaussians
 from ..quant import (
     Autoencoder,
     AutoencoderConfig,
@@ -33,44 +43,63 @@ from ..quant import (
     quantize_maps,
 )
 from ..scenes import Scene
+from .color import ColorConfig
 from .device import training_device
 from .digests import describe_lens, digest_scene, stage_generator
+from .fuse import answers_stage, find_geometry, uplift_stage
 from .maps import KnownFeatures, Maps, UndistortedMaps, check_readable, map_digests, map_shape
 from .stages import Run, Stage
 from .train import check_scene, field_stage
 
+Method = Literal["fuse", "paper"]
+METHODS: tuple[Method, ...] = ("fuse", "paper")
 Mode = Literal["decouple", "adc", "adc+sc"]
 MODES: tuple[Mode, ...] = ("decouple", "adc", "adc+sc")
 
 
 @dataclass(frozen=True)
 class FitConfig:
-    """What a run does; the defaults are the paper's."""
+    """What a run does."""
 
+    method: Method = "fuse"
+    """`fuse`: features are averaged onto sharp Gaussians in 3-D, merged and compressed after (`fields.uplift_maps`).
+    `paper`: maps are compressed per pixel, and Gaussians are trained on them (Sec. 3)."""
     mode: Mode = "adc+sc"
-    """Rows of Table 1: `decouple` (raw features), `adc` (+ codebook), `adc+sc` (+ codebook + autoencoder)."""
+    """Of method `paper`, rows of Table 1: `decouple` (raw features), `adc` (+ codebook), `adc+sc` (+ codebook + autoencoder)."""
     seed: int = 0
     """Every random choice of the run follows from it."""
     split: str = "train"
     """Which views of the scene are learnt from."""
     undistorted_features: bool = False
     """Whether the teacher saw undistorted pictures; otherwise the lens is removed from its maps as from the pictures."""
+    uplift: UpliftConfig = default(default_factory=UpliftConfig.field)
+    """Of method `fuse`."""
+    color: ColorConfig = default(default_factory=ColorConfig.geometry)
+    """Of method `fuse`: how Gaussians are trained to fuse onto, where there is no splat."""
     codebook: CodebookConfig = default(default_factory=CodebookConfig)
+    """This and the rest: of method `paper`."""
     autoencoder: AutoencoderConfig = default(default_factory=AutoencoderConfig)
     field: FieldConfig = default(default_factory=FieldConfig)
 
     def __post_init__(self) -> None:
+        check_choice("method", self.method, METHODS)
         check_choice("mode", self.mode, MODES)
 
-    @staticmethod
-    def paper() -> FitConfig:
-        """The paper's schedule: 28 epochs, 5,000 autoencoder steps, 30,000 field steps. For a workstation."""
-        return FitConfig()
+    @property
+    def needs_maps(self) -> bool:
+        """Whether the field learns from the dense maps themselves, so that they must be stored and stay."""
+        return self.method == "paper" and self.mode == "decouple"
 
     @staticmethod
-    def cpu() -> FitConfig:
-        """A schedule for two CPU cores: the same method, fewer steps. Minutes instead of hours."""
-        return FitConfig(codebook=CodebookConfig.cpu(), field=FieldConfig.cpu())
+    def paper(**changes: Any) -> FitConfig:
+        """The paper's method and schedule: 28 epochs, 5,000 autoencoder steps, 30,000 field steps. For a workstation."""
+        options: dict[str, Any] = {"codebook": CodebookConfig.paper(), "autoencoder": AutoencoderConfig.paper()}
+        return FitConfig(**{"method": "paper", **options, **changes})
+
+    @staticmethod
+    def cpu(**changes: Any) -> FitConfig:
+        """For two CPU cores: the same as `FitConfig()`, and 2,000 field steps where the method is the paper's."""
+        return FitConfig(**{"field": FieldConfig.cpu(), **changes})
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +136,8 @@ def _codebook_stage(
         check_readable(maps, "the codebook")
         fit = fit_codebook(maps, config.codebook, generator=stage_generator(config.seed, "codebook"), **options)
         fit.codebook.save(folder / "codebook.safetensors")
+        if fit.note is not None and run.report is not None:
+            run.report(f"note: {fit.note}")
         write_json(folder / "history.json", fit.history)
 
     inputs = {"features": features, "config": asdict(config.codebook), "seed": config.seed}
@@ -182,9 +213,10 @@ def _field_stage(
     return field_stage(run, "field", inputs, train)
 
 
-def _check_inputs(scene: Scene, views: Sequence[int], maps: Maps, split: str, mode: Mode) -> None:
+def _check_inputs(scene: Scene, views: Sequence[int], maps: Maps, config: FitConfig) -> None:
     """Refuse what would fail only after the first stages are done."""
-    if mode == "decouple":
+    split = config.split
+    if config.needs_maps:
         if getattr(maps, "recomputed", False):
             raise ValueError(
                 "maps: expected stored maps for mode 'decouple', which looks at one in every step, got maps that run the "
@@ -211,47 +243,91 @@ def fit_scene(
     folder: str | Path,
     config: FitConfig | None = None,
     *,
+    splat: Gaussians | SplatFile | str | Path | None = None,
     report: Callable[[str], None] | None = None,
     progress: bool = False,
     callback: Callable[[dict[str, Any]], None] | None = None,
     device: str | torch.device = "auto",
 ) -> FitResult:
-    """Fit a decoupled semantic field to a scene (Figure 2), resuming whatever a run folder already holds.
+    """Make a semantic field of a scene, resuming whatever a run folder already holds.
 
     Args:
         scene: posed, undistorted views with their sparse points.
-        maps: one teacher map [h, w, D] per training view; read one at a time, for the codebook and for the index maps.
-            Once both are in the run folder the maps may be gone (`discard_maps`), except for mode `decouple`.
+        maps: one teacher map [h, w, D] per training view; read one at a time. Once the stages made of them are in the run
+            folder the maps may be gone (`discard_maps`), except for the paper's mode `decouple`.
         folder: the run folder; `folder/field` receives the finished field.
-        config: the method's options; the paper's when not given.
+        config: the method and its options.
+        splat: of method `fuse`, the Gaussians to fuse onto, in the scene's frame: a splat file or its content. None trains them
+            on the pictures with `config.color` (`folder/color.ply`), or takes those of a longer `fit_color` in the same folder.
         report: receives one line per stage.
         progress: show progress bars.
-        callback: receives the history rows of every stage as they appear.
-        device: where to train the field, see `training_device`; the other stages and the result stay on the CPU.
+        callback: receives the history rows of every trained stage as they appear.
+        device: where a field is trained, see `training_device`; the other stages and the result stay on the CPU.
 
     Raises:
-        ValueError: if the counts of views and maps differ, a camera has distortion, there is no such device, or mode
-            `decouple` is asked of maps that are made anew at each look (`RecomputedMaps`).
-        FileNotFoundError: if a stage is to be made of maps that were discarded.
+        ValueError: if the counts of views and maps differ, a camera has distortion, there is no such device, a splat is given
+            to the paper's method, or its mode `decouple` gets maps that run the teacher at each look (`RecomputedMaps`).
+        FileNotFoundError: if a stage is to be made of maps that were discarded, or a picture is missing.
     """
-    config = config or FitConfig.paper()
+    config = config or FitConfig()
     target_device = training_device(device)
     views = scene.views(config.split)
-    _check_inputs(scene, views, maps, config.split, config.mode)
+    _check_inputs(scene, views, maps, config)
+    if splat is not None and config.method == "paper":
+        raise ValueError("splat: expected none for method 'paper', which trains its own Gaussians; leave it out")
     run = Run(Path(folder), report)
     options: dict[str, Any] = {"progress": progress, "callback": callback}
-    codebook, autoencoder = None, None
     teacher = getattr(maps, "identity", None)
     lenses = [] if scene.lenses is None else [scene.lenses[i] for i in views]
     if lenses and not config.undistorted_features:
         maps = UndistortedMaps(maps, lenses)
-    targets: Sequence[Tensor] = KnownFeatures(maps)
     features = {"files": map_digests(run, maps), "lenses": _lens_digest(maps)}
+    cameras = [scene.cameras[i] for i in views]
+    if config.method == "fuse":
+        color = replace(config.color, seed=config.seed, split=config.split)
+        geometry, where = find_geometry(run, scene, splat, color, target_device, options)
+        found = uplift_stage(run, geometry, cameras, maps, features, config.uplift, config.seed, progress)
+        about: dict[str, Any] = {"geometry": where}
+    else:
+        found = _paper_stages(run, scene, views, maps, features, config, target_device, options)
+        found = answers_stage(run, found, cameras)
+        about = {"mode": config.mode}
+    done = FitResult(found, Path(folder), run.stages)
+    info = {
+        "method": config.method,
+        **about,
+        "seed": config.seed,
+        "views": [camera.name for camera in cameras],
+        "teacher_map": list(map_shape(maps)),
+        **({"teacher": teacher} if teacher else {}),
+        **({} if scene.folder is None else remember(scene.folder, done.field_path)),
+        "seconds": {stage.name: round(stage.seconds, 3) for stage in run.stages},
+        "kfgs": version("kfgs"),
+    }
+    done = replace(done, field=replace(found, info=info, folder=done.field_path))
+    if not _is_saved(done.field, done.field_path):
+        done.field.save(done.field_path)
+    return done
+
+
+def _paper_stages(
+    run: Run,
+    scene: Scene,
+    views: Sequence[int],
+    maps: Maps,
+    features: dict[str, Any],
+    config: FitConfig,
+    device: torch.device,
+    options: dict[str, Any],
+) -> SemanticField:
+    """Figure 2: codebook, index maps, autoencoder, and Gaussians trained on what they make of the maps."""
+    codebook, autoencoder = None, None
+    targets: Sequence[Tensor] = KnownFeatures(maps)
     if config.mode == "decouple":
         inputs: dict[str, Any] = {"mode": config.mode, "features": features}
     else:
         codebook, made = _codebook_stage(run, maps, features, config, options)
-        index_maps, indexed = _index_stage(run, maps, features, codebook, made, progress)
+        index_maps, indexed = _index_stage(run, maps, features, codebook, made, bool(options["progress"]))
         inputs = {"mode": config.mode, "index_maps": indexed.key}
         targets = LatentMaps(index_maps, codebook.codewords)
         if config.mode == "adc+sc":
@@ -259,21 +335,8 @@ def fit_scene(
             inputs["autoencoder"] = compressed.key
             with torch.no_grad():
                 targets = LatentMaps(index_maps, autoencoder.encode(codebook.codewords))
-    params, _ = _field_stage(run, scene, views, targets, inputs, config, target_device, options)
-    info = {
-        "mode": config.mode,
-        "seed": config.seed,
-        "views": [scene.cameras[i].name for i in views],
-        "teacher_map": list(map_shape(maps)),
-        **({"teacher": teacher} if teacher else {}),
-        "seconds": {stage.name: round(stage.seconds, 3) for stage in run.stages},
-        "kfgs": version("kfgs"),
-    }
-    result = SemanticField(params.activated().detach(), codebook, autoencoder, info)
-    done = FitResult(result, Path(folder), run.stages)
-    if not _is_saved(result, done.field_path):
-        result.save(done.field_path)
-    return done
+    params, _ = _field_stage(run, scene, views, targets, inputs, config, device, options)
+    return SemanticField(params.activated().detach(), codebook, autoencoder)
 
 
 def _is_saved(field: SemanticField, path: Path) -> bool:
@@ -283,7 +346,8 @@ def _is_saved(field: SemanticField, path: Path) -> bool:
     except (OSError, ValueError):
         return False
     names = ("means", "quats", "scales", "opacities", "features")
-    same = all(torch.equal(getattr(saved.gaussians, name), getattr(field.gaussians, name)) for name in names)
+    same = len(saved) == len(field) and saved.features.shape == field.features.shape and saved.method == field.method
+    same = same and all(torch.equal(getattr(saved.gaussians, name), getattr(field.gaussians, name)) for name in names)
     return same and saved.info == json.loads(json.dumps(field.info))
 
 

@@ -141,7 +141,7 @@ def plan_scene(
         weights: tells the teacher's size, see `teacher_cost`; not loaded, but refused where `load_teacher` would at first
             sight (`check_weights`).
         options: the teacher's.
-        config: the method's options; the paper's when not given.
+        config: the method and its options; those of `fit_scene` when not given.
         dense: what becomes of the dense maps: `keep`, `discard` once index maps are made of them, or `recompute` them
             instead of storing any.
         device: where teacher and field run, see `training_device`.
@@ -154,8 +154,8 @@ def plan_scene(
         FileNotFoundError: if the weights are not there.
     """
     check_choice("dense", dense, DENSE)
-    config = config or FitConfig.paper()
-    if config.mode == "decouple" and dense != "keep":
+    config = config or FitConfig()
+    if config.needs_maps and dense != "keep":
         raise ValueError(
             f"dense: expected 'keep' with mode 'decouple', whose field learns from the dense maps, got {dense!r}; keep them"
         )
@@ -171,7 +171,7 @@ def plan_scene(
         memory_free=memory_free(),
         forwards=sizes.cost.forwards,
     )
-    if config.mode == "decouple" or dense == "recompute" or sizes.existing:
+    if config.needs_maps or dense == "recompute" or sizes.existing:
         return plan
     anew = replace(sizes, dense="recompute", made=(0,) * len(sizes.made))
     return replace(plan, disk_recomputed=add([one.disk_bytes for one in anew.stages(target)]))

@@ -10,6 +10,8 @@ from typing import Any, Literal
 import torch
 
 from .._files import bytes_in_words
+from ..fields.answers import MOST, PIXELS
+from ..fields.uplift import WORKING
 from ..quant.sampling import choose_grid_step
 from ..scenes import Scene
 from ..teachers.costs import TeacherCost, check_weights, teacher_cost
@@ -21,6 +23,9 @@ from .machine import Speed, measure_speed
 Dense = Literal["keep", "discard", "recompute"]
 DENSE: tuple[Dense, ...] = ("keep", "discard", "recompute")
 _HALF, _FLOAT = 2, 4  # bytes
+COLOR_CHANNELS = (
+    12  # a step of colours with harmonics of degree 1 and SSIM costs about as much as one of so many features
+)
 
 
 @dataclass(frozen=True)
@@ -141,27 +146,33 @@ class Sizes:
     def _grid(self, cost: TeacherCost) -> int:
         h, w = cost.map_size or (0, 0)
         options = self.config.codebook
-        rows, columns = options.grid_step or choose_grid_step(h, w, options.samples)
-        return max(1, -(-(h - rows // 2) // rows)) * max(1, -(-(w - columns // 2) // columns))
+        most = options.samples_of(self.count)
+        rows, columns = options.grid_step or choose_grid_step(h, w, most)
+        found = max(1, -(-(h - rows // 2) // rows)) * max(1, -(-(w - columns // 2) // columns))
+        return min(found, most) if options.adaptive else found
 
     def title(self, device: torch.device) -> str:
         """What is planned, in a line."""
-        (height, width), steps = self.views[0][1], self.config.field.steps
+        (height, width), fuse = self.views[0][1], self.config.method == "fuse"
+        steps, method = (self.config.color.field.steps, "fuse") if fuse else (self.config.field.steps, self.config.mode)
         maps = f"{self.channels} channels at {say_size(self.cost.map_size)}" if self.known else "maps of unknown size"
         stored = {"keep": "kept", "discard": "discarded", "recompute": "made anew instead of stored"}[self.dense]
         return (
-            f"{self.count} views of {width}x{height}, {self.cost.name} ({maps}, {stored}), {self.config.mode}, "
+            f"{self.count} views of {width}x{height}, {self.cost.name} ({maps}, {stored}), {method}, "
             f"{steps} steps, on {device} ({self.speed.threads} threads, {self.speed.flops / 1e9:.0f} GFLOP/s)"
         )
 
     def stages(self, device: torch.device) -> list[StagePlan]:
         """All stages in their order."""
         found = [] if self.existing or sum(self.made) == self.count else [self.features(device)]
+        if self.config.method == "fuse":
+            return [*found, self.geometry(device), self.uplift()]
         if self.config.mode != "decouple":
             found += [self.codebook(), self.index_maps(device)]
         if self.config.mode == "adc+sc":
             found.append(self.autoencoder())
-        return [*found, self.field(device)]
+        found.append(self.field(device))
+        return [*found, self.answers()]
 
     def _teacher_seconds(self, device: torch.device) -> float | None:
         """One run over the pictures that lack a map, what is written not counted."""
@@ -196,15 +207,15 @@ class Sizes:
     def codebook(self) -> StagePlan:
         """Adaptive Data Compression, Sec. 3.3.1."""
         options, first = self.config.codebook, self._grid(self.cost)
+        passes = f"{options.passes} pass{'es' if options.passes > 1 else ''}"
         if not self.known:
-            return StagePlan("codebook", f"{options.epochs + 1} passes over unknown maps", None, None, None, None)
+            return StagePlan("codebook", f"{passes} over unknown maps", None, None, None, None)
         size = _FLOAT * options.maximum * self.channels
-        amount = work.codebook_work(
-            self.samples, self.channels, options.maximum, options.epochs, first, raw=self.samples * self.channels
-        )
-        peak = work.BASE_BYTES + work.codebook_peak(first, self.channels, options.maximum)
-        what = f"{options.epochs + 1} passes over {first:,} features a map"
-        return StagePlan("codebook", what, amount / self.speed.flops, peak, size, size)
+        amount = work.codebook_work(options, self.samples, first, self.channels)
+        together = self.samples if options.adaptive else first
+        peak = work.codebook_peak(together, self.channels, options.maximum, adaptive=options.adaptive)
+        what = f"{passes} over {first:,} features a map"
+        return StagePlan("codebook", what, amount / self.speed.flops, work.BASE_BYTES + peak, size, size)
 
     def index_maps(self, device: torch.device) -> StagePlan:
         """Quantisation of every pixel, Eq. 5."""
@@ -254,6 +265,60 @@ class Sizes:
         peak = work.BASE_BYTES + work.field_peak(pixels, last, channels, targets)
         return StagePlan("field", guessed, options.steps * step, peak, kept + 3 * size, kept)
 
+    def geometry(self, device: torch.device) -> StagePlan:
+        """Gaussians trained on the pictures, to fuse onto; a splat of the user's takes their place."""
+        options, (height, width) = self.config.color.field, self.views[0][1]
+        last = options.max_gaussians or work.gaussian_counts(options, self.points)[1]
+        mean = (self.points + last) / 2
+        pixels = [height * width // options.divisor(step) ** 2 for step in range(1, options.steps + 1)]
+        step = work.step_work(sum(pixels) / len(pixels), mean, COLOR_CHANNELS, 0) / self.speed.flops
+        if device.type == "cuda":
+            step = max(work.GPU_STEP_SECONDS, step * self.speed.flops / measure_speed(device).flops)
+        size = work.field_bytes(last, COLOR_CHANNELS)
+        peak = work.BASE_BYTES + work.field_peak(
+            height * width, last, COLOR_CHANNELS, (3 * height * width * self.count,)
+        )
+        what = f"{options.steps:,} steps on the pictures, perhaps {last / 1e3:.1f}k Gaussians; none with --splat"
+        return StagePlan("color", what, options.steps * step, peak, 2 * size + 3 * size, 2 * size)
+
+    def uplift(self) -> StagePlan:
+        """Maps averaged onto the Gaussians and corrected: the views once in the working directions, and twice in few."""
+        options, (height, width) = self.config.uplift, self.views[0][1]
+        what = f"{self.count} maps onto the Gaussians, at most {options.max_gaussians or 'all'} left"
+        if not self.known:
+            return StagePlan("uplift", what, None, None, None, None)
+        fields = self.config.color.field
+        last = fields.max_gaussians or work.gaussian_counts(fields, self.points)[1]
+        pixels, channels = min(options.pixels, height * width), min(WORKING, self.channels)
+        passes = [channels] + [options.max_latents] * 2 * options.corrections
+        amount: float = self.count * sum(work.step_work(pixels, last, one, 0) for one in passes) / 2  # no backward pass
+        amount += self.pixels * self.channels * (work.READ_WORK + 2 * channels)
+        seconds: float | None = amount / self.speed.flops
+        peak = work.BASE_BYTES + 2 * self.largest + 2 * 2 * _FLOAT * last * (channels + 1)
+        if self.dense == "recompute" and not self.existing:
+            seconds = add([seconds, self._teacher_seconds(torch.device("cpu"))])
+            peak += max(cost.peak_bytes or 0 for _, _, cost in self.views)
+        size = 2 * _FLOAT * (min(last, options.max_gaussians or last) * (13 + options.max_latents))
+        working = (
+            _HALF * self.count * channels * min(options.pixels, self.pixels // max(1, self.count))
+        )  # a temporary file
+        return StagePlan("uplift", what, seconds, peak, size + working, size)
+
+    def answers(self) -> StagePlan:
+        """What each Gaussian of the trained field answers with: every view rendered once and averaged onto the Gaussians."""
+        what = f"{self.count} views averaged onto the Gaussians"
+        if not self.known:
+            return StagePlan("answers", what, None, None, None, None)
+        _, last = work.gaussian_counts(self.config.field, self.points)
+        rank = self.channels if self.config.mode == "decouple" else min(self.channels, self.config.codebook.maximum)
+        latents, (height, width) = min(MOST, rank), self.views[0][1]
+        rendered = self.config.autoencoder.latent if self.config.mode == "adc+sc" else self.channels
+        pixels = min(PIXELS, height * width)
+        amount = self.count * sum(work.step_work(pixels, last, channels, 0) for channels in (rendered, latents))
+        peak = work.BASE_BYTES + work.field_peak(pixels, last, max(rendered, latents), ())
+        size = 2 * _FLOAT * (last * (latents + 2) + latents * self.channels)  # in the stage and in the finished field
+        return StagePlan("answers", what, amount / self.speed.flops, peak, size, size)
+
     def notes(self, device: torch.device) -> list[str]:
         """What a reader should know besides the numbers."""
         found = ["times are rough, within a factor of two or so, at the speed that this machine has at the moment"]
@@ -274,12 +339,12 @@ class Sizes:
             found.append(f"the scene has {self.points} points; training needs some: estimate them with `kfgs sfm`")
         if self.existing or not self.known:
             return found
-        if self.dense == "recompute" and self.samples == self.pixels:
+        if self.dense == "recompute" and self.samples == self.pixels and self.config.method == "paper":
             found.append(
                 "the codebook looks at every feature of these maps: keeping them takes no more disk, and half the time"
             )
-        if self.dense == "keep" and self.config.mode != "decouple":
-            left = f"the {bytes_in_words(self.dense_bytes)} of maps can be deleted once there are index maps"
+        if self.dense == "keep" and not self.config.needs_maps:
+            left = f"the {bytes_in_words(self.dense_bytes)} of maps can be deleted once the field is made"
             found.append(f"{left} (kfgs fit --discard-features)")
         return found
 

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 from ..fields import FieldConfig
-from ..quant import AutoencoderConfig
+from ..quant import AutoencoderConfig, CodebookConfig
 
 FEATURES_EFFICIENCY = 0.5
 """Share of the matrix product's speed that a vision transformer reaches (its convolutions, norms and softmax included)."""
@@ -25,11 +25,16 @@ WRITE_WORK = 800.0
 READ_WORK = 900.0
 """Per number of a map that is read in half precision and made a float32 one."""
 LOOK_WORK = 150.0
-"""Codebook, per number of a sample: norms, balance of classes, gradient (Eq. 6-9)."""
+"""The paper's codebook, per number of a sample: norms, balance of classes, gradient (Eq. 6-9)."""
 LOOK_CODEWORD_WORK = 5.5
 """The same, per number and codeword: similarities (Eq. 5)."""
 FARTHEST_EFFICIENCY = 0.45
 """Share of the product's speed in the all-pairs similarities of farthest-point sampling."""
+GROW_WORK = 3.5e4
+"""Adaptive codebook, per number of the pool: k-means, widest directions and trial splits of all rounds (measured
+on 2 shared cores of an EPYC, which were busy: 49,000, and 108 per codeword)."""
+GROW_CODEWORD_WORK = 100.0
+"""The same, per number and codeword."""
 QUANTIZE_WORK = 250.0
 """Index maps, per number of a map: norms and checks."""
 QUANTIZE_CODEWORD_WORK = 2.5
@@ -65,19 +70,21 @@ def features_work(flops: float, pictures: int, written: float) -> float:
     return flops / FEATURES_EFFICIENCY + pictures * PICTURE_WORK + written * WRITE_WORK
 
 
-def codebook_work(samples: float, channels: int, codewords: int, epochs: int, first: int, *, raw: float) -> float:
+def codebook_work(config: CodebookConfig, samples: float, first: int, channels: int) -> float:
     """Fitting the codebook.
 
     Args:
+        config: its size, and whether it is fitted as in the paper.
         samples: features that are looked at in one pass, all maps together.
+        first: samples of the first map, from which the paper's first codewords are chosen.
         channels: D.
-        codewords: K_max.
-        epochs: passes, without the last one that counts.
-        first: samples of the first map, from which the first codewords are chosen.
-        raw: numbers that are read from files in one pass.
     """
-    looks = samples * channels * (epochs + 1) * (LOOK_WORK + LOOK_CODEWORD_WORK * codewords)
-    return looks + (epochs + 1) * raw * READ_WORK + float(first) ** 2 * channels / FARTHEST_EFFICIENCY
+    numbers, K = samples * channels, config.maximum
+    read = config.passes * numbers * READ_WORK
+    if config.adaptive:
+        return read + numbers * (GROW_WORK + GROW_CODEWORD_WORK * K)
+    looks = numbers * config.passes * (LOOK_WORK + LOOK_CODEWORD_WORK * K)
+    return read + looks + float(first) ** 2 * channels / FARTHEST_EFFICIENCY
 
 
 def quantize_work(pixels: float, channels: int, codewords: int) -> float:
@@ -92,8 +99,8 @@ def autoencoder_weights(config: AutoencoderConfig, channels: int) -> int:
 
 
 def autoencoder_work(config: AutoencoderConfig, channels: int, codewords: int) -> float:
-    """All steps; each takes all codewords."""
-    per_weight = AUTOENCODER_WEIGHT_WORK + AUTOENCODER_ROW_WORK * codewords
+    """All steps; each takes all codewords and some blends of them."""
+    per_weight = AUTOENCODER_WEIGHT_WORK + AUTOENCODER_ROW_WORK * (codewords + config.blends)
     return config.steps * autoencoder_weights(config, channels) * per_weight
 
 
@@ -134,12 +141,14 @@ def field_bytes(gaussians: int, channels: int) -> int:
     return 4 * gaussians * (11 + channels)
 
 
-def codebook_peak(samples: int, channels: int, codewords: int) -> int:
-    """Samples of one map (four arrays of them), similarities, and the first map's pairs by blocks of 2048 rows.
+def codebook_peak(samples: int, channels: int, codewords: int, *, adaptive: bool) -> int:
+    """Samples of one map (four arrays of them), similarities, and the first map's pairs by blocks of 2048 rows; adaptive:
+    the samples of all maps, and no pairs.
 
-    Measured beyond the base: 600 MB for 28,800 samples of 512 channels, where this gives 742.
+    Measured beyond the base: 600 MB for the paper's 28,800 samples of 512 channels, where this gives 742.
     """
-    return 4 * (4 * samples * channels + 3 * samples * codewords + 2 * min(2048, samples) * samples)
+    pairs = 0 if adaptive else 2 * min(2048, samples) * samples
+    return 4 * (4 * samples * channels + 3 * samples * codewords + pairs)
 
 
 def field_peak(pixels: float, gaussians: int, channels: int, targets: Sequence[int]) -> int:

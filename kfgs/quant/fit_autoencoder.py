@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -16,12 +17,18 @@ from .._check import check_range, check_whole
 from .autoencoder import Autoencoder, Layer, mlp, unit_latents
 from .codebook import Codebook, row_norms, unit_rows
 
+BLENDED = 4  # codewords per blend: pixels at borders and noisy Gaussians mix a few
+LAST_RATE = 0.02  # of the learning rate, at the last step
 NORM_EPS = 1e-5  # added to the variance in batch normalisation, torch's default
 
 
 @dataclass(frozen=True)
 class AutoencoderConfig:
-    """How the autoencoder is built and trained; defaults are the paper's, or its script's where the paper is silent."""
+    """How the autoencoder is built and trained.
+
+    The networks are the paper's, or its script's where the paper is silent. The paper trains them on the codewords alone
+    (`AutoencoderConfig.paper()`); by default blends of codewords are learnt as well, because a field renders blends.
+    """
 
     latent: int = 9
     """Channels of a latent (d)."""
@@ -29,10 +36,14 @@ class AutoencoderConfig:
     """Hidden widths of E, with batch normalisation and ReLU after each (script)."""
     decoder: tuple[int, ...] = (32, 64, 128, 256, 1024)
     """Hidden widths of Psi, with ReLU after each (script)."""
-    steps: int = 5000
-    """Adam steps, each on all codewords."""
-    learning_rate: float = 1e-4
-    """Adam's learning rate."""
+    steps: int = 1500
+    """Adam steps, each on all codewords (paper: 5,000)."""
+    learning_rate: float = 1e-3
+    """Adam's learning rate at the first step (paper: 1e-4, at every step)."""
+    decay: bool = True
+    """Lower the learning rate to a fiftieth along a cosine."""
+    blends: int = 256
+    """Blends of codewords per step, whose blended latents are to decode to the blended features; 0 as in the paper."""
     weight_decay: float = 5e-6
     """L2 penalty in Adam's gradient (script)."""
     record_every: int = 100
@@ -41,11 +52,17 @@ class AutoencoderConfig:
     def __post_init__(self) -> None:
         for name in ("latent", "steps", "record_every"):
             check_whole(name, getattr(self, name), 1)
+        check_whole("blends", self.blends, 0)
         for name in ("encoder", "decoder"):
             for i, width in enumerate(getattr(self, name)):
                 check_whole(f"{name}[{i}]", width, 1)
         check_range("learning_rate", self.learning_rate, 0, closed=(False, True))
         check_range("weight_decay", self.weight_decay, 0)
+
+    @staticmethod
+    def paper(**changes: Any) -> AutoencoderConfig:
+        """The paper's training: 5,000 steps of 1e-4 on the codewords alone."""
+        return AutoencoderConfig(**({"steps": 5000, "learning_rate": 1e-4, "decay": False, "blends": 0} | changes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +71,7 @@ class AutoencoderFit:
 
     autoencoder: Autoencoder
     history: list[dict[str, Any]] = field(repr=False)
-    """Every `record_every` steps: step (from 1), loss (Eq. 10, mean over codewords)."""
+    """Every `record_every` steps: step (from 1), loss (Eq. 10, mean over codewords and blends)."""
     latents: Tensor  # [K, d]
     """S' of Sec. 3.3.2: the codewords' latents in [0, 1]."""
     recovered: float
@@ -76,13 +93,16 @@ def fit_autoencoder(
 ) -> AutoencoderFit:
     """Fit the scene's autoencoder to its codewords (Eq. 10): the mean over codewords of |Psi(E(f)) - f|_2.
 
+    With blends, the mean also goes over rows |Psi(sum_j w_j E(f_j)) - f|_2, f the direction of sum_j w_j f_j: `BLENDED`
+    codewords drawn at random with weights from the flat Dirichlet distribution, other ones in every step.
+
     All codewords are one batch, so batch normalisation and the range of the latents are functions of the weights alone.
     When training ends, both are frozen exactly as the decoder saw them last.
 
     Args:
         codebook: its K codewords, K >= 1; targets are their unit directions.
         config: see `AutoencoderConfig`.
-        generator: draws the initial weights; None stands for a fresh one with seed 0.
+        generator: draws the initial weights and the blends; None stands for a fresh one with seed 0.
         progress: show a progress bar.
         callback: called with each record as it is written to the history.
 
@@ -105,8 +125,13 @@ def fit_autoencoder(
         for step in tqdm(range(1, config.steps + 1), desc="autoencoder", disable=not progress):
             latents = unit_latents(_normalised_mlp(encoder, norms, target))
             low, high = latents.detach().amin(), latents.detach().amax()
-            decoded = unit_rows(mlp(decoder, (latents - low) / (high - low).clamp_min(_SMALLEST)))
-            loss = row_norms(decoded - target).mean()
+            rows, wanted = (latents - low) / (high - low).clamp_min(_SMALLEST), target
+            if config.blends:
+                weights_of = _blends(config.blends, codebook.size, generator, target)
+                rows, wanted = torch.cat([rows, weights_of @ rows]), torch.cat([target, unit_rows(weights_of @ target)])
+            loss = row_norms(unit_rows(mlp(decoder, rows)) - wanted).mean()
+            if config.decay:
+                optimizer.param_groups[0]["lr"] = config.learning_rate * _cosine((step - 1) / config.steps)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             optimizer.step()
@@ -123,7 +148,7 @@ def fit_autoencoder(
 def _quick_on_a_cpu() -> Iterator[None]:
     """One torch thread, and denormal numbers taken as zero, for a while.
 
-    The weights of dead units shrink to denormal numbers, which a CPU multiplies some ten times slower. And at most 100
+    The weights of dead units shrink to denormal numbers, which a CPU multiplies some ten times slower. And at most some hundred
     rows leave a second thread little to do, while beside other busy programs its waiting slows every step (measured).
     """
     threads = torch.get_num_threads()
@@ -134,6 +159,20 @@ def _quick_on_a_cpu() -> Iterator[None]:
     finally:
         torch.set_flush_denormal(False)
         torch.set_num_threads(threads)
+
+
+def _blends(count: int, K: int, generator: torch.Generator, like: Tensor) -> Tensor:  # [count, K], rows sum to 1
+    """Weights of `BLENDED` codewords each, uniform on the simplex (normalised exponentials)."""
+    which = torch.randint(0, K, (count, BLENDED), generator=generator, device=generator.device).to(like.device)
+    drawn = torch.rand(count, BLENDED, generator=generator, device=generator.device, dtype=torch.float64)
+    share = -torch.log1p(-drawn).clamp_max(-1e-12)
+    share = (share / share.sum(dim=1, keepdim=True)).to(like)
+    return like.new_zeros(count, K).scatter_add_(1, which, share)
+
+
+def _cosine(done: float) -> float:
+    """From 1 to `LAST_RATE` as `done` goes from 0 to 1."""
+    return LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * done))
 
 
 _SMALLEST = 1e-6  # range of the latents of one codeword with one channel

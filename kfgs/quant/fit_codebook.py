@@ -11,72 +11,95 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._check import check_range, check_shapes, check_whole
-from .codebook import EPS, Codebook, row_norms
+from .codebook import EPS, Codebook, row_norms, unit_rows
 from .evolve import admit, prune
+from .grow import ROUNDS, grow, kmeans
 from .loss import class_balanced_loss
 from .maps import FeatureMaps
 from .row_adam import RowAdam
 from .sampling import SAMPLES, farthest_points, sample_grid
 
+POOL = 32_768  # features that codewords grow on: 67 MB of 512 channels in float32, 365 of each of 90 maps
+CODEWORD_RMS = 0.5  # of a codeword's channels: in mode adc the field learns them at absolute rates made for [0, 1]
+
 
 @dataclass(frozen=True)
 class CodebookConfig:
-    """How a codebook is fitted; the defaults are the paper's, or its released script's where the paper is silent.
+    """How a codebook is fitted: from the data alone by default, or as the paper does (`CodebookConfig.paper()`)."""
 
-    The learning rate moves every channel of a codeword by up to 8e-4 a step, whatever the features' length, so it fits
-    features of a length of order 10, as LSeg's summed scales have; scale it with the teacher's typical feature length.
-    """
-
-    initial: int = 8
-    """Codewords from farthest-point sampling on the first image (the paper's rho)."""
-    maximum: int = 100
-    """Most codewords (K_max)."""
-    expand_below: float = 0.9
-    """A feature joins the codebook when its similarity to its codeword is below this (alpha, Eq. 8)."""
-    joins_per_image: int | None = None
-    """Most features of one image that join in one visit, the least similar first. None shares the free slots among the
-    images, so that the first ones seen do not fill the codebook; the paper leaves the size of its batches open."""
+    adaptive: bool = True
+    """Grow by splitting cells and let the data decide (`grow`); False follows Eq. 6-9 to the letter."""
+    maximum: int = 255
+    """Most codewords (K_max). 255 and holes still fit one byte per pixel; 1,024 won 1.7 points in mode adc on room_0."""
+    expand_below: float | None = None
+    """The similarity that features should reach (alpha, Eq. 8). None grows as long as a split pays and reports the
+    similarity that a share `coverage` of the features has reached."""
+    coverage: float = 0.9
+    """Share of the features of a cell that must reach alpha; a cell below that is split."""
     prune_above: float = 0.99
     """The later of two codewords is dropped when their similarity is above this (beta, Eq. 9)."""
-    epochs: int = 28
-    """Passes over all maps, in random order."""
-    learning_rate: float = 8e-4
-    """Adam's learning rate, in units of the features."""
-    eps: float = 1e-9
-    """Adam's epsilon (script)."""
-    eager_epochs: int = 2
-    """Epochs at the start with a step after every image (script)."""
-    step_every: int = 8
-    """Images per step afterwards, their gradients averaged; an epoch's last step takes what is left (script: 8)."""
     grid_step: tuple[int, int] | None = None
-    """Every how many rows and columns of a map are looked at; None: the finest grid within `samples`."""
+    """Every how many rows and columns of a map are looked at; None: the finest grid within `samples_of`."""
     samples: int = SAMPLES
-    """Most features of a map that are looked at when `grid_step` is None: (2, 3) on 360 x 480, all of 90 x 120."""
+    """Most features of a map that are looked at when `grid_step` is None: (2, 3) on 360 x 480, all of 90 x 120. Unless
+    as in the paper, at most `POOL` of all maps together, whatever the grid."""
+    initial: int = 8
+    """Paper only: codewords from farthest-point sampling on the first image (rho)."""
+    joins_per_image: int | None = None
+    """Paper only: most features of one image that join in one visit, the least similar first. None shares the free slots
+    among the images, so that the first ones seen do not fill the codebook; the paper leaves its batches open."""
+    epochs: int = 28
+    """Paper only: passes over all maps, in random order."""
+    learning_rate: float = 8e-4
+    """Paper only: Adam's learning rate, in units of the features. It fits features of a length of order 10, as LSeg's
+    summed scales have."""
+    eps: float = 1e-9
+    """Paper only: Adam's epsilon (script)."""
+    eager_epochs: int = 2
+    """Paper only: epochs at the start with a step after every image (script)."""
+    step_every: int = 8
+    """Paper only: images per step afterwards, their gradients averaged; an epoch's last step takes what is left."""
 
     def __post_init__(self) -> None:
-        for name in ("initial", "epochs", "step_every", "samples"):
+        for name in ("initial", "epochs", "step_every", "samples", "maximum"):
             check_whole(name, getattr(self, name), 1)
         if self.joins_per_image is not None:
             check_whole("joins_per_image", self.joins_per_image, 1)
-        check_whole("maximum", self.maximum, self.initial)
         check_whole("eager_epochs", self.eager_epochs, 0)
         for i, step in enumerate(self.grid_step or ()):
             check_whole(f"grid_step[{i}]", step, 1)
-        check_range("expand_below", self.expand_below, -1, 1)
+        if self.expand_below is not None:
+            check_range("expand_below", self.expand_below, -1, 1)
+        if not self.adaptive:
+            check_whole("maximum", self.maximum, self.initial)
+            if self.expand_below is None:
+                raise ValueError(
+                    "expand_below: expected a similarity with adaptive = False, got None; the paper has 0.9"
+                )
         # Otherwise what joins is pruned at once, and joins again.
-        check_range("prune_above", self.prune_above, self.expand_below, 1)
+        check_range("prune_above", self.prune_above, -1 if self.expand_below is None else self.expand_below, 1)
+        check_range("coverage", self.coverage, 0, 1, closed=(False, True))
         check_range("learning_rate", self.learning_rate, 0, closed=(False, True))
         check_range("eps", self.eps, 0, closed=(False, True))
 
+    @property
+    def passes(self) -> int:
+        """How often each map is looked at."""
+        return 1 if self.adaptive else self.epochs + 1
+
+    def samples_of(self, maps: int) -> int:
+        """Most features that are looked at in each of so many maps when `grid_step` is None."""
+        return min(self.samples, -(-POOL // maps)) if self.adaptive else self.samples
+
     @staticmethod
-    def paper() -> CodebookConfig:
-        """The paper's values, which are also the defaults."""
-        return CodebookConfig()
+    def paper(**changes: Any) -> CodebookConfig:
+        """The paper's method and values, or its released script's where the paper is silent."""
+        return CodebookConfig(**({"adaptive": False, "maximum": 100, "expand_below": 0.9} | changes))
 
     @staticmethod
     def cpu() -> CodebookConfig:
-        """A third of the passes with as many Adam steps per map (540 instead of 492 on 90 maps): for a slow machine."""
-        return CodebookConfig(epochs=10, step_every=2)
+        """The defaults, which take seconds on two cores."""
+        return CodebookConfig()
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,15 +108,18 @@ class CodebookFit:
 
     codebook: Codebook
     history: list[dict[str, Any]] = field(repr=False)
-    """Per epoch: epoch (from 0), size, added, pruned, loss (Eq. 6, mean over images), coverage and mean_similarity; the
-    last two as each image found the codebook, before it grew for that image."""
+    """Per round of growth (paper: per epoch): epoch (from 0), size, added, pruned, coverage and mean_similarity, the last
+    two as each round found the codebook, before it grew; with the paper's method also loss (Eq. 6, mean over images)."""
     usage: Tensor  # [K] int64
     """Sampled features of each codeword of the final codebook; unused codewords are kept, as in the paper."""
     coverage: float
-    """Share of the sampled features whose similarity to their final codeword is at least alpha. Low with a codebook of
-    K_max codewords: the teacher's features scatter by more than alpha allows, so lower `expand_below` (or raise K_max)."""
+    """Share of the sampled features whose similarity to their codeword is at least `alpha`."""
     mean_similarity: float
-    """Mean similarity of the sampled features to their final codeword."""
+    """Mean similarity of the sampled features to their codeword."""
+    alpha: float
+    """The similarity that `coverage` counts: `expand_below`, or what the data reached."""
+    note: str | None
+    """One line that says what to do when the book is full or covers too little; None if all is well."""
 
 
 def fit_codebook(
@@ -104,12 +130,16 @@ def fit_codebook(
     progress: bool = False,
     callback: Callable[[dict[str, Any]], None] | None = None,
 ) -> CodebookFit:
-    """Fit a codebook to the feature maps of a scene (Sec. 3.3.1, Eq. 5-9).
+    """Fit a codebook to the feature maps of a scene (Sec. 3.3.1).
 
-    Farthest-point sampling on the first image gives the first codewords. Then, image by image: quantise (Eq. 5), let
-    badly represented features join (Eq. 8), gather the gradient of the class-balanced loss (Eq. 6-7), take an Adam step
-    when one is due, and drop codewords that became too similar (Eq. 9). Codewords that survive keep Adam's moments and
-    the gradients gathered so far.
+    By default: take a pool of features evenly from the maps, grow codewords on it by splitting cells (`grow`), and drop
+    those that are too similar (Eq. 9). A codeword is the mean direction of its cell, scaled to channels of root mean
+    square `CODEWORD_RMS`. Only directions count: scaling any feature by a positive factor changes nothing but rounding.
+
+    With `CodebookConfig.paper()` (Eq. 5-9): farthest-point sampling on the first image gives the first codewords. Then,
+    image by image: quantise (Eq. 5), let badly represented features join (Eq. 8), gather the gradient of the
+    class-balanced loss (Eq. 6-7), take an Adam step when one is due, and drop codewords that became too similar (Eq. 9).
+    Codewords that survive keep Adam's moments and the gradients gathered so far.
 
     Args:
         maps: one map per image; only `len(maps)` and `maps[i]` are used, and one map is in memory at a time. Sizes may
@@ -117,10 +147,10 @@ def fit_codebook(
             that offer `grid(i, step, samples)`, equal to `sample_grid(maps[i], step, samples=samples)`, are asked for
             that instead: maps on disk then read only what is looked at.
         config: see `CodebookConfig`.
-        generator: draws the order of the images; None stands for a fresh one with seed 0. On a CPU the same generator
-            state gives the same bits.
+        generator: draws the first directions of splits (paper: the order of the images); None stands for a fresh one
+            with seed 0. On a CPU the same generator state gives the same bits.
         progress: show a progress bar.
-        callback: called with each epoch's record as it is written to the history.
+        callback: called with each record as it is written to the history.
 
     Returns:
         The codebook, the history, and how well the final codebook represents the sampled features.
@@ -131,12 +161,88 @@ def fit_codebook(
     if len(maps) == 0:
         raise ValueError("maps: expected at least one feature map, got none; encode the training images first")
     generator = torch.Generator().manual_seed(0) if generator is None else generator
+    fit = _fit_adaptive if config.adaptive else _fit_paper
+    return fit(maps, config, generator, progress, callback or (lambda record: None))
+
+
+def _fit_adaptive(
+    maps: FeatureMaps,
+    config: CodebookConfig,
+    generator: torch.Generator,
+    progress: bool,
+    callback: Callable[[dict[str, Any]], None],
+) -> CodebookFit:
+    """One pass over the maps that gathers the pool; everything else is done on the pool."""
+    pool = _pool(maps, config, progress)
+    grown = grow(pool, config.maximum, alpha=config.expand_below, coverage=config.coverage, generator=generator)
+    cells = grown.cells
+    stays = prune(cells.centres, threshold=config.prune_above)
+    pruned = len(cells.centres) - len(stays)
+    if pruned:
+        cells = kmeans(pool, cells.centres[stays], ROUNDS)
+    alpha = config.expand_below
+    if alpha is None:
+        alpha = float(cells.similarity.sort().values[int((1 - config.coverage) * (len(pool) - 1))])
+    history = [
+        {"epoch": i, **record, "pruned": 0, "coverage": _share(similarity, alpha)}
+        for i, (record, similarity) in enumerate(zip(grown.history, grown.similarity, strict=True))
+    ]
+    history[-1] |= {"size": len(cells.centres), "pruned": pruned}
+    for record in history:
+        callback(dict(record))
+    codebook = Codebook(cells.centres * (CODEWORD_RMS * cells.centres.shape[1] ** 0.5))
+    usage = torch.bincount(cells.index, minlength=codebook.size).cpu()
+    coverage, mean = _share(cells.similarity, alpha), float(cells.similarity.mean(dtype=torch.float64))
+    note = _note(config, codebook.size, grown.full, coverage, alpha)
+    return CodebookFit(codebook, history, usage, coverage, mean, alpha, note)
+
+
+def _share(similarity: Tensor, alpha: float) -> float:
+    """The share of features that are at least so similar."""
+    return float((similarity >= alpha).double().mean())
+
+
+def _pool(maps: FeatureMaps, config: CodebookConfig, progress: bool) -> Tensor:  # [n, D] unit
+    """Unit features from the grid of every map, in order."""
+    parts, most = list[Tensor](), config.samples_of(len(maps))
+    for i in tqdm(range(len(maps)), desc="codebook", disable=not progress):
+        features = _samples(maps, i, config, dim=parts[0].shape[1] if parts else None)
+        if len(features) > most:  # on a grid that the caller chose
+            features = features[torch.arange(most, device=features.device) * len(features) // most]
+        parts.append(unit_rows(features))
+    pool = torch.cat(parts)
+    if len(pool) == 0:
+        raise ValueError(f"maps: expected nonzero features, got {len(maps)} all-zero maps; check the teacher")
+    return pool
+
+
+def _note(config: CodebookConfig, size: int, full: bool, coverage: float, alpha: float) -> str | None:
+    """What a user should know and do, in one line."""
+    reached = f"{100 * coverage:.0f} % of the features are {alpha:.2f} similar to their codeword"
+    if full:
+        otherwise = "" if config.expand_below is None else ", or lower expand_below"
+        return f"the codebook is full ({size} codewords): {reached}; raise maximum for finer codewords{otherwise}"
+    if config.expand_below is not None and coverage < config.coverage:
+        return f"{size} codewords, low coverage: {reached}; lower expand_below, or leave it out to follow the data"
+    return None
+
+
+def _fit_paper(
+    maps: FeatureMaps,
+    config: CodebookConfig,
+    generator: torch.Generator,
+    progress: bool,
+    callback: Callable[[dict[str, Any]], None],
+) -> CodebookFit:
+    """Eq. 5-9 as the paper has them, pass after pass."""
+    alpha = config.expand_below
+    assert alpha is not None  # checked by the config
     book = _EvolvingCodebook(_first_codewords(maps, config), config, images=len(maps))
     history: list[dict[str, Any]] = []
     with tqdm(total=(config.epochs + 1) * len(maps), desc="codebook", disable=not progress) as bar:
         for epoch in range(config.epochs):
             order = torch.randperm(len(maps), generator=generator, device=generator.device).tolist()
-            tally = _Tally(config.expand_below)
+            tally = _Tally(alpha)
             period = 1 if epoch < config.eager_epochs else config.step_every
             for seen, i in enumerate(order, start=1):
                 book.look_at(_samples(maps, i, config, dim=book.dim), tally)
@@ -145,16 +251,17 @@ def fit_codebook(
                 bar.update()
             history.append({"epoch": epoch, "size": book.size, **tally.record()})
             bar.set_postfix(K=book.size, coverage=f"{tally.coverage:.3f}")
-            if callback is not None:
-                callback(dict(history[-1]))
+            callback(dict(history[-1]))
         codebook = Codebook(book.adam.rows)
-        usage, tally = torch.zeros(codebook.size, dtype=torch.int64), _Tally(config.expand_below)
+        usage, tally = torch.zeros(codebook.size, dtype=torch.int64), _Tally(alpha)
         for i in range(len(maps)):
             index, similarity = codebook.nearest(_samples(maps, i, config, dim=book.dim))
             usage += torch.bincount(index, minlength=codebook.size).cpu()
             tally.see(similarity)
             bar.update()
-    return CodebookFit(codebook, history, usage, tally.coverage, tally.mean_similarity)
+    full = codebook.size >= config.maximum and tally.coverage < config.coverage
+    note = _note(config, codebook.size, full, tally.coverage, alpha)
+    return CodebookFit(codebook, history, usage, tally.coverage, tally.mean_similarity, alpha, note)
 
 
 class _EvolvingCodebook:
@@ -162,6 +269,8 @@ class _EvolvingCodebook:
 
     def __init__(self, codewords: Tensor, config: CodebookConfig, *, images: int) -> None:
         self.config = config
+        assert config.expand_below is not None  # checked by the config
+        self.alpha = config.expand_below
         self.joins = config.joins_per_image or -(-(config.maximum - config.initial) // images) or 1
         self.adam = RowAdam(codewords, learning_rate=config.learning_rate, eps=config.eps)
         self.gradient, self.gathered = torch.zeros_like(codewords), 0
@@ -181,7 +290,7 @@ class _EvolvingCodebook:
         index, similarity = Codebook(self.adam.rows).nearest(features)
         tally.see(similarity)
         room = min(self.joins, self.config.maximum - self.size)
-        joining = features[admit(features, similarity, threshold=self.config.expand_below, room=room)]
+        joining = features[admit(features, similarity, threshold=self.alpha, room=room)]
         if joining.shape[0] > 0:
             newest = Codebook(joining).nearest(features)
             index = torch.where(newest.similarity > similarity, newest.codeword + self.size, index)
@@ -250,12 +359,12 @@ def _samples(maps: FeatureMaps, i: int, config: CodebookConfig, dim: int | None 
     """The nonzero features of map i that lie on the grid, in at least single precision."""
     grid: Callable[..., Tensor] | None = getattr(maps, "grid", None)
     if grid is not None:
-        features = grid(i, config.grid_step, config.samples)
+        features = grid(i, config.grid_step, config.samples_of(len(maps)))
         check_shapes((f"maps.grid({i})", features, f"n {dim or 'D'}"))
     else:
         feature_map = maps[i]  # once: this may read a file
         check_shapes((f"maps[{i}]", feature_map, f"h w {dim or 'D'}"))
-        features = sample_grid(feature_map, config.grid_step, samples=config.samples)
+        features = sample_grid(feature_map, config.grid_step, samples=config.samples_of(len(maps)))
     # row by row, whatever memory they come in: sums over another layout differ in their last bits
     features = features.to(torch.promote_types(features.dtype, torch.float32)).contiguous()
     norms = row_norms(features)

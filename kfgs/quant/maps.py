@@ -15,7 +15,7 @@ from tqdm import tqdm
 from .._check import check_shapes
 from .._files import atomic_path
 from ._store import read_tensors, write_tensors
-from .codebook import EPS, Codebook, row_norms
+from .codebook import EPS, Codebook, compare
 
 
 class FeatureMaps(Protocol):
@@ -172,8 +172,7 @@ def quantize_maps(
 def _quantize_map(maps: FeatureMaps, i: int, codebook: Codebook) -> NDArray[np.uint16]:  # [h, w]
     feature_map = maps[i]  # once: this may read a file
     check_shapes((f"maps[{i}]", feature_map, f"h w {codebook.dim}"))
-    norms = row_norms(feature_map.to(torch.promote_types(feature_map.dtype, torch.float32)))
-    if not bool(torch.isfinite(norms).all()):
+    index, _, length = compare(feature_map, codebook.unit)
+    if not bool(torch.isfinite(length).all()):
         raise ValueError(f"maps[{i}]: expected finite features, got NaN or infinity; encode that image again")
-    index = codebook.quantize(feature_map).masked_fill(norms <= EPS, codebook.size)
-    return index.cpu().numpy().astype(np.uint16)
+    return index.masked_fill(length <= EPS, codebook.size).cpu().numpy().astype(np.uint16)

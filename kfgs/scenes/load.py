@@ -48,7 +48,7 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such folder; expected a scene there")
     root = path if path.is_dir() else path.parent
-    scene = _load_views(path, root, images)
+    scene = replace(_load_views(path, root, images), folder=root)
     return _with_split(scene, root, split)
 
 

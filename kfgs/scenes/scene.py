@@ -62,6 +62,8 @@ class Scene:
     """What a user should know about how the scene was read: what is missing, what was assumed."""
     lenses: list[Camera] | None = None
     """Of an undistorted scene: the cameras with the distortion that the files on disk still have."""
+    folder: Path | None = None
+    """Where it was loaded from."""
 
     def __post_init__(self) -> None:
         check_shapes(("points", self.points, "P 3"), ("colors", self.colors, "P 3"))

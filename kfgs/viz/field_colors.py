@@ -16,9 +16,15 @@ if TYPE_CHECKING:
 def feature_colors(field: SemanticField) -> FeatureColors:
     """One projection of this field's features to RGB, the same for every view of it, for `SemanticField.render(...).map`.
 
-    Of d latents it is fitted to those of the codewords, and of features near codewords to the codewords: stray Gaussians
-    do not shape it. A field without codebook has its Gaussians' features alone, of which those that left their start at 0
-    count.
+    Of a trained field with codebook it is fitted to the codewords' latents (mode adc: to the codewords), so that stray
+    Gaussians do not shape it. A fused field, and one without codebook, has no codewords: it is fitted to the Gaussians'
+    latents, without those that are all-zero.
+
+    Note:
+        Linear latents share a main direction. The colours come from what varies about their mean, so nothing is normalised:
+        on room_0 (17 latents, lengths 0.43 to 0.96) no colour channel correlates with the length by more than 0.11, and
+        normalised latents separate the classes no better (91, 79 and 80 % of a channel's variance lies between classes,
+        with both). Unnormalised, the colour of a rendered blend is the blend of the colours.
 
     Raises:
         ValueError: if these are not finite, or there are none.

@@ -29,10 +29,10 @@ DPI = 110
 
 
 def plot_codebook_history(history: Sequence[Row], path: str | Path) -> None:
-    """Draw how the codebook grew (Sec. 3.3.1): its size, its loss (Eq. 6) and what else each epoch recorded.
+    """Draw how the codebook grew (Sec. 3.3.1): its size, and what else each round of growth or epoch recorded.
 
     Args:
-        history: `CodebookFit.history`: one row per epoch.
+        history: `CodebookFit.history`: one row per round of growth, or per epoch of the paper's method (with a loss).
         path: a .png file.
 
     Raises:

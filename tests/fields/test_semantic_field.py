@@ -1,20 +1,26 @@
+import hashlib
 import json
 import math
 import pickle
 from dataclasses import replace
 from functools import cache
 
+import numpy as np
+import oracles_uplift
 import pytest
 import torch
+from cases_splat import a_camera, gaussians_before
+from safetensors.torch import save_file
 
 from kfgs import Camera, Gaussians
-from kfgs.fields import SemanticField
+from kfgs.fields import Seen, SemanticField
 from kfgs.metrics import MIB
-from kfgs.quant.autoencoder import Autoencoder
-from kfgs.quant.codebook import Codebook
+from kfgs.quant import Autoencoder, Codebook, LinearLatents
 
 DIM, CLASSES = 16, 3
-MODES = ["decouple", "adc", "adc+sc"]
+TRAINED = ["decouple", "adc", "adc+sc"]
+MODES = [*TRAINED, "fused"]
+RULES = ["fused", "paper"]
 
 
 @cache
@@ -45,12 +51,21 @@ def autoencoder() -> Autoencoder:
     )
 
 
+@cache
+def linear():
+    """The four directions of the codewords, mixed: no latent is one of them."""
+    mixed = torch.linalg.qr(torch.randn(4, 4, generator=torch.Generator().manual_seed(0))).Q
+    return LinearLatents(torch.eye(DIM, 4) @ mixed)
+
+
 def field(mode="adc+sc", n=4):
     """Opaque balls side by side, the i-th at codeword i (mod 4) exactly."""
     features = codebook().codewords[torch.arange(n) % 4]
     if mode == "adc+sc":
         with torch.no_grad():
             features = autoencoder().encode(features)
+    if mode == "fused":
+        features = linear().encode(features)
     gaussians = Gaussians(
         means=torch.tensor([[i - (n - 1) / 2, 0.0, 5.0] for i in range(n)]),
         quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
@@ -58,8 +73,12 @@ def field(mode="adc+sc", n=4):
         opacities=torch.full((n,), 0.95),
         features=features,
     )
-    book = None if mode == "decouple" else codebook()
-    return SemanticField(gaussians, book, autoencoder() if mode == "adc+sc" else None, {"mode": mode, "seconds": 1.5})
+    parts = {
+        "codebook": codebook() if "adc" in mode else None,
+        "autoencoder": autoencoder() if mode == "adc+sc" else None,
+        "linear": linear() if mode == "fused" else None,
+    }
+    return SemanticField(gaussians, info={"mode": mode, "seconds": 1.5}, **parts)
 
 
 def camera():
@@ -70,51 +89,146 @@ def camera():
 CENTRES = [8, 16, 24, 32]
 
 
+@pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("mode", MODES)
-def test_segment_sees_each_ball_in_its_class(mode):
-    labels = field(mode).segment(camera(), embeddings())
+def test_segment_sees_each_ball_in_its_class(mode, rule):
+    labels = field(mode).segment(camera(), embeddings(), rule=rule)
     assert labels.shape == (16, 40)
     assert labels[8, CENTRES].tolist() == [0, 1, 2, 2]
     assert labels[0].tolist() == [-1] * 40  # nothing was drawn there
-    if mode == "adc+sc":
-        latent = field(mode).segment(camera(), embeddings(), decode="latent")
-        assert latent[8, CENTRES].tolist() == [0, 1, 2, 2]
 
 
+def test_views_of_a_fused_field_blend_votes():
+    """Pixel by pixel: sum over Gaussians of w = T alpha times the softmax of 100 cosines, over the classes that some Gaussian
+    prefers. The last class is nobody's favourite, and the last Gaussian knows nothing."""
+    view = a_camera(16, 12, focal=(15.0, 13.0), principal=(7.3, 6.1))
+    cloud = gaussians_before(view, 12, seed=3, channels=4, sigma=(0.05, 0.2))
+    cloud = cloud.replace(features=torch.cat([cloud.features[:-1], torch.zeros(1, 4).double()]))
+    made = SemanticField(cloud, linear=linear().to(torch.float64))
+    g = torch.Generator().manual_seed(1)
+    classes = torch.cat([torch.randn(5, DIM, generator=g), -made.decode(cloud.features[:-1]).sum(0)[None].float()])
+    parts = [x.numpy() for x in (cloud.means, cloud.quats, cloud.scales, cloud.opacities)]
+    weights = oracles_uplift.blend_weights(*parts, view.viewmat.numpy(), view.K.numpy(), view.width, view.height)
+    features, rows = cloud.features.numpy() @ linear().basis.T.double().numpy(), classes.double().numpy()
+    cosines = np.array([[oracles_uplift.cosine(f, row) for row in rows] for f in features])
+    preferred = sorted({int(cosines[i].argmax()) for i in range(11)})
+    assert len(preferred) >= 3
+    votes = np.zeros((12, len(rows)))
+    for i in range(11):
+        shares = np.exp(100 * cosines[i, preferred])
+        votes[i, preferred] = shares / shares.sum()
+    blended = weights @ votes
+    expected = np.where(blended.max(axis=2) > 0, blended.argmax(axis=2), -1)
+    margin = np.sort(blended, axis=2)
+    clear = (margin[..., -1] - margin[..., -2] > 1e-4) | (margin[..., -1] == 0)
+    assert clear.mean() > 0.95
+    assert len(set(expected[clear].ravel().tolist())) >= 3
+    found = made.segment(view, classes.double()).numpy()
+    assert (found == expected)[clear].all()
+
+
+def test_pixels_of_what_knows_nothing_have_no_class():
+    made = field("fused")
+    features = made.features.clone()
+    features[1] = 0
+    labels = replace(made, gaussians=made.gaussians.replace(features=features)).segment(camera(), embeddings())
+    assert labels[8, CENTRES].tolist() == [0, -1, 2, 2]
+
+
+def test_a_class_that_is_second_everywhere_wins_no_pixel():
+    """The front ball votes 0.52 for class 0 and 0.48 for class 2, the one behind it the same for classes 1 and 2. Class 2 has
+    the most votes in the sum."""
+    one = Gaussians(
+        means=torch.tensor([[0.0, 0, 4], [0, 0, 5]]),
+        quats=torch.tensor([[1.0, 0, 0, 0]] * 2),
+        scales=torch.full((2, 3), 0.3),
+        opacities=torch.tensor([0.5, 0.9]),
+        features=torch.tensor([[1.0, 0, 0.999], [0, 1, 0.999]]),
+    )
+    labels = SemanticField(one, linear=LinearLatents(torch.eye(3))).segment(camera(), torch.eye(3))
+    assert labels[8, 20] == 0
+    assert not (labels == 2).any()
+
+
+def test_a_fused_field_that_knows_nothing_labels_no_pixel():
+    made = field("fused")
+    blank = replace(made, gaussians=made.gaussians.replace(features=torch.zeros(4, 4)))
+    assert (blank.segment(camera(), embeddings()) == -1).all()
+    assert blank.classify(embeddings()).labels.tolist() == [-1] * 4
+
+
+@pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("mode", MODES)
-def test_classify_and_its_scores(mode):
-    labels, scores = field(mode, n=6).classify(embeddings())
+def test_classify_and_its_scores(mode, rule):
+    made = field(mode, n=6)
+    labels, scores = made.classify(embeddings(), rule=rule)
     assert labels.tolist() == [0, 1, 2, 2, 0, 1]
     torch.testing.assert_close(scores, torch.tensor([1.0, 1.0, 0.5**0.5, 0.5**0.5, 1.0, 1.0]))
+    assert made.label(embeddings(), rule=rule).labels.tolist() == [0, 1, 2, 2, 0, 1]
+    root = 0.5**0.5
+    expected = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, root], [0, 0, root], [1, 0, 0], [0, 1, 0]])
+    torch.testing.assert_close(made.cosines(7 * embeddings(), rule=rule), expected)  # rows of any length
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("mode", MODES)
+def test_gaussians_without_features_belong_to_no_class(mode, rule):
+    made = field(mode)
+    features = made.features.clone()
+    features[1] = 0
+    made = replace(made, gaussians=made.gaussians.replace(features=features))
+    labels, scores = made.classify(embeddings(), rule=rule)
+    assert (labels.tolist(), scores[1]) == ([0, -1, 2, 2], 0)
+    assert made.known.tolist() == [True, False, True, True]
+    assert made.cosines(embeddings(), rule=rule)[1].tolist() == [0, 0, 0]
+    assert made.query(embeddings()[1], threshold=-1.0, rule=rule).mask.tolist() == [True, False, True, True]
 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_query_with_and_without_threshold(mode):
-    found = field(mode, n=8).query(embeddings()[2], 0.5)
+    found = field(mode, n=8).query(embeddings()[2], threshold=0.5)
     assert found.mask.tolist() == [False, False, True, True] * 2
     assert found.threshold == 0.5
     assert field(mode, n=8).query(embeddings()[2]).mask.tolist() == [False, False, True, True] * 2
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_query_by_views_and_with_negatives(mode):
+@pytest.mark.parametrize("mode", TRAINED)
+def test_a_query_of_fused_answers(mode):
     made = field(mode)
-    by_views = made.query(embeddings()[0], 0.5, cameras=[camera()])
+    fused = made.with_answers([camera()])
+    by_views = fused.query(embeddings()[0], threshold=0.5)
     assert by_views.mask.tolist() == [True, False, False, False]
     assert by_views.scores[0] > 0.99  # its own pixels all point at codeword 0; only those of its neighbour do not
     assert by_views.scores[2:].abs().max() < 0.01
-    for cameras in (None, [camera()]):
-        against = made.query(embeddings()[2], negatives=embeddings()[:2], cameras=cameras)
-        assert against.mask.tolist() == [False, False, True, True]
-        assert against.threshold == 0.5
-    hidden = field(mode).gaussians
+    hidden = made.gaussians
     hidden = hidden.replace(
         means=torch.cat([-hidden.means[:1], hidden.means[1:]])
     )  # the first stands behind the camera
-    unseen = SemanticField(hidden, made.codebook, made.autoencoder).query(embeddings()[0], -1.0, cameras=[camera()])
-    assert unseen.mask.tolist() == [False, True, True, True]
-    with pytest.raises(ValueError, match="views: expected at least one camera, got none"):
-        made.query(embeddings()[0], cameras=[])
+    unseen = SemanticField(hidden, made.codebook, made.autoencoder).with_answers([camera()])
+    assert unseen.query(embeddings()[0], threshold=-1.0).mask.tolist() == [False, True, True, True]
+    assert unseen.known.tolist() == [False, True, True, True]
+    assert unseen.classify(embeddings()).labels.tolist() == [-1, 1, 2, 2]
+    assert unseen.classify(embeddings(), rule="paper").labels.tolist() == [0, 1, 2, 2]  # its own latent says so
+    with pytest.raises(ValueError, match="cameras: expected at least one, got none"):
+        made.with_answers([])
+
+
+def test_a_fused_field_has_its_answers_and_remembers_the_views():
+    made = field("fused")
+    fused = made.with_answers([camera()])
+    assert fused.answers is None
+    assert len(fused.cameras) == 1
+    assert torch.equal(fused.cosines(embeddings()), made.cosines(embeddings()))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_query_with_negatives(mode):
+    made = field(mode)
+    for asked in (made, made.with_answers([camera()])):
+        against = asked.query(embeddings()[2], negatives=embeddings()[:2])
+        assert against.mask.tolist() == [False, False, True, True]
+        assert against.threshold == 0.5
+        assert torch.equal(asked.query(embeddings()[2], embeddings()).scores, against.scores)  # the other classes
     with pytest.raises(ValueError, match=r"negatives: expected \[M, 16\], got \(2, 5\)"):
         made.query(embeddings()[0], negatives=torch.ones(2, 5))
 
@@ -123,19 +237,30 @@ def test_query_by_views_and_with_negatives(mode):
 def test_query_by_any_score(mode):
     """Each ball lies at a codeword, so its cosines with the three classes are 1, 0 or sqrt(1/2), and scores follow."""
     made, root = field(mode), 0.5**0.5
-    against = {"negatives": embeddings()[:2], "cameras": None}
-    cosine = made.query(embeddings()[2], 0.5, score="cosine", **against)
+    against = {"negatives": embeddings()[:2]}
+    cosine = made.query(embeddings()[2], threshold=0.5, score="cosine", **against)
     torch.testing.assert_close(cosine.scores, torch.tensor([0, 0, root, root]))
-    raw = made.query(embeddings()[2], 0.3, score="softmax", logit_scale="raw", **against)
+    raw = made.query(embeddings()[2], threshold=0.3, score="softmax", logit_scale="raw", **against)
     low, high = 1 / (2 + math.e), math.exp(root) / (math.exp(root) + 2)
     torch.testing.assert_close(raw.scores, torch.tensor([low, low, high, high]))
     assert raw.mask.tolist() == [False, False, True, True]
     relevant = made.query(embeddings()[2], score="relevancy", **against)
     torch.testing.assert_close(relevant.scores[2:], torch.sigmoid(torch.tensor([10 * root] * 2)))
-    by_views = made.query(embeddings()[2], 0.3, score="softmax", negatives=embeddings()[:2], cameras=[camera()])
+    by_views = made.with_answers([camera()]).query(embeddings()[2], threshold=0.3, score="softmax", **against)
     assert by_views.mask.tolist() == [False, False, True, True]
     with pytest.raises(ValueError, match="negatives: expected some for score 'relevancy', got none"):
         made.query(embeddings()[2], score="relevancy")
+
+
+def test_an_unknown_rule_is_named():
+    for ask in (
+        lambda: field().classify(embeddings(), rule="views"),
+        lambda: field().query(embeddings()[0], rule="views"),
+        lambda: field().segment(camera(), embeddings(), rule="views"),
+        lambda: field().cosines(embeddings(), rule="views"),
+    ):
+        with pytest.raises(ValueError, match="rule: expected one of 'fused', 'paper', got 'views'"):
+            ask()
 
 
 def test_text_of_another_size_is_guessed_to_be_another_teachers():
@@ -162,10 +287,18 @@ def test_feature_map_points_at_the_codewords(mode):
     assert field(mode).decode(torch.zeros(2, 3, field(mode).channels)).shape == (2, 3, DIM)
 
 
-def test_decoding_in_chunks_changes_nothing(monkeypatch):
-    whole = field(n=9).quantized()
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("mode", MODES)
+def test_decoding_in_chunks_changes_nothing(monkeypatch, mode, rule):
+    made = field(mode, n=9)
+
+    def ask():
+        return made.cosines(embeddings(), rule=rule), made.segment(camera(), embeddings(), rule=rule)
+
+    whole = ask()
     monkeypatch.setattr("kfgs.fields.semantic_field.CHUNK", 2)
-    assert torch.equal(field(n=9).quantized(), whole)
+    for one, other in zip(ask(), whole, strict=True):
+        torch.testing.assert_close(one, other)
 
 
 def test_codeword_labels():
@@ -180,6 +313,8 @@ def test_storage_as_table_1_counts_it():
     assert field("adc", n=10).storage() == 4 * (10 * (14 + DIM) + 4 * DIM)
     decoder = (4 * 16 + 16) + (16 * 16 + 16)
     assert field("adc+sc", n=10).storage() == 4 * (10 * (14 + 4) + 4 * DIM + decoder)
+    assert field("fused", n=10).storage() == 4 * (10 * (14 + 4) + DIM * 4)  # the basis
+    assert field("adc+sc", n=10).with_answers([camera()]).storage() == field("adc+sc", n=10).storage()
 
 
 def test_summary_names_counts_and_size():
@@ -189,6 +324,20 @@ def test_summary_names_counts_and_size():
     assert f"{field('adc+sc', n=10).storage() / MIB:.2f} MiB" in text
     assert "seconds: 1.5" in text
     assert "teacher" not in text
+
+
+def test_a_fused_field_says_so():
+    assert "semantic field (fused): 10 Gaussians, 4 channels for 16, no codebook" in field("fused", n=10).summary()
+
+
+@pytest.mark.parametrize(
+    ("mode", "method"),
+    [("decouple", "just decouple"), ("adc", "decouple+ADC"), ("adc+sc", "decouple+ADC+SC"), ("fused", "fused")],
+)
+def test_repr_is_one_short_line(mode, method):
+    made = field(mode)
+    assert repr(made) == f"SemanticField({method}: 4 Gaussians, {made.channels} channels for 16)"
+    assert (repr(made.with_answers([camera()])), made.method) == (repr(made), method)
 
 
 def test_summary_names_the_teacher():
@@ -209,9 +358,55 @@ def test_save_then_load_is_the_same(tmp_path, mode):
         other = getattr(loaded.gaussians, name)
         assert (value is None and other is None) or torch.equal(value, other), name
     assert loaded.info == saved.info
+    assert loaded.folder == tmp_path / "field"
     assert torch.equal(loaded.segment(camera(), embeddings()), saved.segment(camera(), embeddings()))
     assert torch.equal(loaded.feature_map(camera()), saved.feature_map(camera()))
     assert sorted(file.name for file in (tmp_path / "field").iterdir()) == ["field.json", "field.safetensors"]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_answers_and_views_are_saved_as_well(tmp_path, mode):
+    moved = torch.eye(4)
+    moved[0, 3] = 0.25
+    second = replace(camera(), name="second", near=0.01, width=39, viewmat=moved)
+    saved = field(mode).with_answers([replace(camera(), name="first"), second])
+    if mode == "fused":
+        saved = replace(saved, seen=Seen(torch.tensor([1.0, 2, 3, 4]), torch.tensor([1.0, 0.5, 0.25, 0])))
+    saved.save(tmp_path / "field")
+    loaded = SemanticField.load(tmp_path / "field")
+    assert torch.equal(loaded.linear.basis, saved.linear.basis)
+    assert (loaded.answers is None) == (mode == "fused")
+    if mode != "fused":
+        assert torch.equal(loaded.answers, saved.answers)
+    for one, other in zip(loaded.seen, saved.seen, strict=True):
+        assert torch.equal(one, other)
+    assert len(loaded.cameras) == 2
+    for one, other in zip(loaded.cameras, saved.cameras, strict=True):
+        assert (one.name, one.size, one.near) == (other.name, other.size, other.near)
+        assert torch.equal(one.K, other.K)
+        assert torch.equal(one.viewmat, other.viewmat)
+    assert torch.equal(loaded.cosines(embeddings()), saved.cosines(embeddings()))
+    assert (loaded.method, loaded.storage()) == (saved.method, saved.storage())
+
+
+def test_a_folder_of_version_1_still_loads(tmp_path):
+    """Written by hand, as kfgs wrote it before there were linear latents, answers and cameras."""
+    old, path = field("adc+sc"), tmp_path / "old"
+    path.mkdir()
+    tensors = {f"gaussians.{name}": value for name, value in vars(old.gaussians).items() if value is not None}
+    tensors["codebook.codewords"] = codebook().codewords
+    tensors |= {f"autoencoder.{name}": value for name, value in autoencoder().to_tensors().items()}
+    save_file({name: value.contiguous().clone() for name, value in tensors.items()}, path / "field.safetensors")
+    digest = hashlib.sha256((path / "field.safetensors").read_bytes()).hexdigest()
+    description = {"format": "kfgs.semantic_field", "version": 1, "sha256": digest, "gaussians": 4, "info": {"a": 1}}
+    (path / "field.json").write_text(json.dumps(description))
+    loaded = SemanticField.load(path)
+    assert (loaded.linear, loaded.answers, loaded.seen, loaded.cameras) == (None, None, None, ())
+    assert loaded.info == {"a": 1}
+    assert loaded.classify(embeddings()).labels.tolist() == [0, 1, 2, 2]
+    assert torch.equal(loaded.segment(camera(), embeddings()), old.segment(camera(), embeddings()))
+    loaded.save(tmp_path / "new")
+    assert SemanticField.load(tmp_path / "new").method == "decouple+ADC+SC"
 
 
 def test_saving_replaces_an_older_field_and_nothing_else(tmp_path):
@@ -249,7 +444,7 @@ def test_missing_foreign_and_damaged_folders(tmp_path):
     with pytest.raises(ValueError, match=r"expected a field \(kfgs\.semantic_field\), got 'other'"):
         SemanticField.load(path)
     rewrite(version=99)
-    with pytest.raises(ValueError, match="expected format version 1, got 99"):
+    with pytest.raises(ValueError, match="expected format version 1 or 2, got 99"):
         SemanticField.load(path)
     (path / "field.json").write_text("{")
     with pytest.raises(ValueError, match="expected a JSON file"):
@@ -265,8 +460,6 @@ def test_missing_foreign_and_damaged_folders(tmp_path):
 
 
 def test_a_pickle_under_the_right_name_is_not_opened(tmp_path):
-    import hashlib
-
     class Trap:
         def __reduce__(self):
             return (exec, ("raise SystemExit('unpickled')",))
@@ -292,6 +485,14 @@ def test_parts_must_belong_together():
         SemanticField(field().gaussians, Codebook(torch.eye(5)), autoencoder())
     with pytest.raises(ValueError, match=r"gaussians: expected 4 features each .* got 16"):
         SemanticField(field("adc").gaussians, codebook(), autoencoder())
+    with pytest.raises(ValueError, match=r"gaussians\.features: expected \[N, 4\] with N = 4 .*, got \(4, 16\)"):
+        SemanticField(field("decouple").gaussians, linear=linear())
+    with pytest.raises(ValueError, match=r"answers: expected \[N, 4\] with N = 4 .*, got \(3, 4\)"):
+        SemanticField(field("adc").gaussians, codebook(), linear=linear(), answers=torch.ones(3, 4))
+    with pytest.raises(ValueError, match="codebook: expected none for linear latents, got one; pass answers, or leave"):
+        SemanticField(field("fused").gaussians, codebook(), linear=linear())
+    with pytest.raises(ValueError, match="linear: expected what the answers stand for, got None"):
+        SemanticField(field("adc").gaussians, codebook(), answers=torch.ones(4, 4))
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -87,7 +87,7 @@ def test_once_index_maps_are_made_discarded_maps_serve_every_later_field(scene, 
     assert again.field.info["teacher_map"] == [15, 20, 16]
     smaller = dataclasses.replace(QUICK, autoencoder=dataclasses.replace(QUICK.autoencoder, latent=3))
     other = fit_scene(scene, maps, tmp_path / "run", smaller)
-    assert [stage.reused for stage in other.stages] == [True, True, False, False]
+    assert [stage.reused for stage in other.stages] == [True, True, False, False, False]
     with pytest.raises(FileNotFoundError, match=r"mode 'decouple' looks at, got 6 of 6 that are gone .*kfgs features"):
         fit_scene(scene, maps, tmp_path / "run", dataclasses.replace(QUICK, mode="decouple"))
     before = sorted((tmp_path / "run" / "stages").iterdir())

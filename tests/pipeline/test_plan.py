@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,14 +13,22 @@ from kfgs.cameras import Camera
 from kfgs.fields import FieldConfig
 from kfgs.pipeline import FitConfig, fit_scene, plan_stages
 from kfgs.pipeline.machine import Speed, disk_free, measure_speed, memory_free
-from kfgs.pipeline.plan import Plan, plan_scene
+from kfgs.pipeline.plan import Plan
+from kfgs.pipeline.plan import plan_scene as plan_any
 from kfgs.pipeline.work import gaussian_counts, render_pixels
+from kfgs.quant import CodebookConfig
 from kfgs.scenes import Scene, load_scene
 from kfgs.teachers import FeatureFolder
 from kfgs.teachers.costs import TeacherCost
 from kfgs.teachers.manifest import Manifest, MapRecord
 
 GB = 1e9
+
+
+def plan_scene(*args, config=None, **options):
+    """Plans of the paper's method, with its schedule unless another is given."""
+    config = FitConfig.paper() if config is None else replace(config, method="paper")
+    return plan_any(*args, config=config, **options)
 
 
 @pytest.fixture(autouse=True)
@@ -61,7 +70,14 @@ def stages(plan):
 
 def test_the_papers_90_views_take_15_9_gigabytes(big):
     plan = plan_scene(scene(), config=FitConfig.cpu())
-    assert [stage.name for stage in plan.stages] == ["features", "codebook", "index maps", "autoencoder", "field"]
+    assert [stage.name for stage in plan.stages] == [
+        "features",
+        "codebook",
+        "index maps",
+        "autoencoder",
+        "field",
+        "answers",
+    ]
     maps = 90 * 360 * 480 * 512 * 2
     assert stages(plan)["features"].disk_bytes == stages(plan)["features"].kept_bytes == maps
     assert stages(plan)["index maps"].disk_bytes == 90 * 360 * 480
@@ -73,12 +89,33 @@ def test_the_papers_90_views_take_15_9_gigabytes(big):
 
 
 def test_recomputing_takes_the_samples_disk_and_twice_the_teacher(big):
-    keep, anew = (stages(plan_scene(scene(), config=FitConfig.cpu(), dense=dense)) for dense in ("keep", "recompute"))
+    paper = replace(FitConfig.cpu(), codebook=CodebookConfig.paper())
+    keep, anew = (stages(plan_scene(scene(), config=paper, dense=dense)) for dense in ("keep", "recompute"))
     assert anew["features"].disk_bytes == 90 * 180 * 160 * 512 * 2  # 2.65 GB
     assert anew["features"].kept_bytes == 0
     extra = anew["index maps"].seconds - keep["index maps"].seconds
     assert extra == pytest.approx(keep["features"].seconds, rel=0.1)
     assert anew["index maps"].peak_bytes > keep["index maps"].peak_bytes
+
+
+def test_the_adaptive_codebook_looks_at_fewer_features_once(big):
+    config, paper = FitConfig.cpu(), replace(FitConfig.cpu(), codebook=CodebookConfig.paper())
+    few, many = (stages(plan_scene(scene(), config=each, dense="recompute")) for each in (config, paper))
+    assert few["features"].disk_bytes == 90 * 16 * 22 * 512 * 2  # rows 11::22, columns 11::22 of 360 x 480
+    assert few["codebook"].what == "1 pass over 352 features a map"
+    assert many["codebook"].what == "29 passes over 28,800 features a map"
+    assert few["codebook"].seconds < many["codebook"].seconds / 20
+    dense = replace(config, codebook=CodebookConfig(grid_step=(1, 1)))
+    assert stages(plan_scene(scene(), config=dense))["codebook"].what == "1 pass over 365 features a map"
+    unknown = plan_scene(scene(), teacher="mine:encode", config=config)
+    assert stages(unknown)["codebook"].what == "1 pass over unknown maps"
+
+
+def test_blends_make_the_autoencoder_longer(big):
+    config = FitConfig.cpu()
+    plain = replace(config, autoencoder=replace(config.autoencoder, blends=0))
+    with_blends, without = (stages(plan_scene(scene(), config=each))["autoencoder"] for each in (config, plain))
+    assert with_blends.seconds > 1.2 * without.seconds
 
 
 def test_maps_so_small_that_recomputing_saves_nothing_are_named(big):
@@ -102,8 +139,8 @@ def test_fast_is_26_times_faster_and_takes_the_same_disk(big):
 @pytest.mark.parametrize(
     ("mode", "names"),
     [
-        ("decouple", ["features", "field"]),
-        ("adc", ["features", "codebook", "index maps", "field"]),
+        ("decouple", ["features", "field", "answers"]),
+        ("adc", ["features", "codebook", "index maps", "field", "answers"]),
     ],
 )
 def test_modes_have_their_own_stages(big, mode, names):
@@ -221,8 +258,8 @@ def test_too_little_disk_is_said_with_what_helps(monkeypatch):
     plan = plan_scene(scene())
     assert plan.fits is False
     assert re.search(
-        r"does not fit: needs 16\.0 GB on disk, 12\.3 GB free; --fast does not change that; recompute instead of storing: "
-        r"2\.7 GB on disk.*kfgs fit SCENE --teacher",
+        r"does not fit: needs 16\.1 GB on disk, 12\.3 GB free; --fast does not change that; recompute instead of storing: "
+        r"2\.8 GB on disk.*kfgs fit SCENE --teacher",
         plan.verdict,
     )
     machine(monkeypatch, disk=10**8, memory=10**11)
@@ -309,7 +346,33 @@ def test_a_real_run_writes_what_was_planned(tmp_path, real_speed):
     plan = plan_scene(room, teacher=TeacherCost.of_maps("folder", maps.shape), config=CONFIG, folder=tmp_path)
     assert isinstance(plan, Plan)
     result = fit_scene(room, maps, tmp_path / "run", CONFIG)
+    assert [stage.name.replace(" ", "_") for stage in plan.stages] == [stage.name for stage in result.stages]
     written = sum(path.stat().st_size for path in (tmp_path / "run").rglob("*.safetensors"))
     assert plan.kept_bytes == pytest.approx(written, rel=0.25)
     assert plan.seconds / 20 < result.seconds < plan.seconds * 20
     assert ROOM.feature_dim == maps.shape[2]
+
+
+def test_the_default_method_trains_colours_and_uplifts_once(big):
+    found = plan_any(scene(), teacher="clip")
+    assert [stage.name for stage in found.stages] == ["features", "color", "uplift"]
+    assert "at most 30000 left" in found.stages[-1].what
+    assert found.disk_bytes > found.kept_bytes  # the working maps are a temporary file
+    more = plan_any(scene(views=180), teacher="clip").stages
+    assert more[2].seconds == pytest.approx(2 * found.stages[2].seconds, rel=0.01)
+    assert more[1].seconds == found.stages[1].seconds  # steps, not views
+    again = plan_any(scene(), teacher="clip", dense="recompute")
+    assert again.stages[-1].seconds > found.stages[-1].seconds
+
+
+def test_a_real_default_run_stays_within_its_plan(tmp_path, real_speed):
+    loaded = load_scene(make_room(tmp_path / "scene"))
+    maps = FeatureFolder(tmp_path / "scene" / "features", [loaded.stem(i) for i in loaded.views("train")])
+    few = FitConfig()
+    few = replace(few, color=replace(few.color, field=replace(few.color.field.with_steps(60), max_gaussians=3_000)))
+    cost = TeacherCost.of_maps("letters", maps.shape)
+    planned = {stage.name: stage for stage in plan_any(loaded, teacher=cost, config=few, folder=tmp_path).stages}
+    made = fit_scene(loaded, maps, tmp_path / "run", few)
+    assert [stage.name for stage in made.stages] == list(planned)
+    written = sum(file.stat().st_size for file in made.stages[-1].folder.iterdir())
+    assert written <= planned["uplift"].kept_bytes

@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from kfgs.quant import EPS, Codebook, IndexMaps, unit_rows
+from kfgs.quant.codebook import compare
 
 
 def random_rows(n, dim, seed=0, dtype=torch.float64):
@@ -133,3 +134,21 @@ def test_all_zero_features_of_half_precision_have_similarity_zero(dtype):
     found = Codebook(torch.eye(2, dtype=dtype)).nearest(torch.tensor([[0.0, 0.0], [0.0, 2.0]], dtype=dtype))
     assert found.similarity.tolist() == [0, 1]
     assert found.codeword.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("size", [1, 15, 16, 17, 255])
+def test_every_feature_gets_the_first_largest_product_whatever_the_size(size):
+    """One product of all at once is the oracle; whole numbers have no rounding, so near ties and ties are exact."""
+    generator = torch.Generator().manual_seed(size)
+    codewords = torch.randint(-3, 4, (size, 8), generator=generator).double()
+    codewords[:, 0] = 9  # not all-zero; all products of the first feature are negative
+    features = torch.randint(-3, 4, (3_000, 8), generator=generator).half()  # many chunks
+    features[0] = torch.tensor([-5.0, 0, 0, 0, 0, 0, 0, 0])
+    unit = torch.cat([codewords, codewords])  # each codeword twice
+    found = compare(features, unit)
+    products = (features.double()[:, None] * unit).sum(dim=2)
+    assert torch.equal(found.product, products.amax(dim=1))
+    assert torch.equal(found.codeword, (products == found.product[:, None]).int().argmax(dim=1))
+    assert found.codeword.max() < size
+    torch.testing.assert_close(found.length, features.double().square().sum(dim=1).sqrt())
+    assert found.product[0] < 0

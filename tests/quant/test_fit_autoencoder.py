@@ -3,9 +3,9 @@ import pytest
 import torch
 
 from kfgs.quant import AutoencoderConfig, Codebook, fit_autoencoder
-from kfgs.quant.fit_autoencoder import _linears, _normalised_mlp
+from kfgs.quant.fit_autoencoder import BLENDED, _blends, _cosine, _linears, _normalised_mlp
 
-SHORT = AutoencoderConfig(encoder=(64, 32), decoder=(32, 128), steps=800, learning_rate=2e-3)
+SHORT = AutoencoderConfig.paper(encoder=(64, 32), decoder=(32, 128), steps=800, learning_rate=2e-3)
 
 
 def realistic_codebook(groups=12, each=4, dim=96, seed=0):
@@ -41,7 +41,9 @@ def test_frozen_network_is_what_training_saw_last(fitted):
 def test_folding_normalisation_is_exact():
     """Full-batch normalisation and the folded encoder agree; with running statistics they would not."""
     book = Codebook(realistic_codebook(4, 3, 20).codewords.double())
-    config = AutoencoderConfig(latent=3, encoder=(16, 8), decoder=(8,), steps=1, learning_rate=1e-30, weight_decay=0)
+    config = AutoencoderConfig.paper(
+        latent=3, encoder=(16, 8), decoder=(8,), steps=1, learning_rate=1e-30, weight_decay=0
+    )
     fit = fit_autoencoder(book, config, generator=torch.Generator().manual_seed(4))
     encoder = _linears((20, 16, 8, 3), torch.Generator().manual_seed(4), book.codewords)
     rows = book.unit
@@ -82,11 +84,12 @@ def test_loss_is_eq_10_with_unit_targets(fitted):
 
 def test_the_paper_s_network_has_831744_decoder_weights():
     book = Codebook(torch.randn(5, 512, generator=torch.Generator().manual_seed(0)))
-    fit = fit_autoencoder(book, AutoencoderConfig(steps=1))
+    fit = fit_autoencoder(book, AutoencoderConfig.paper(steps=1))
     assert fit.autoencoder.decoder_parameters == 831_744
     assert [weight.shape[0] for weight, _ in fit.autoencoder.encoder] == [256, 128, 64, 32, 9]
     assert [weight.shape[0] for weight, _ in fit.autoencoder.decoder] == [32, 64, 128, 256, 1024, 512]
-    config = AutoencoderConfig()
+    config = AutoencoderConfig.paper()
+    assert (config.decay, config.blends) == (False, 0)
     assert (config.latent, config.steps, config.learning_rate, config.weight_decay) == (9, 5000, 1e-4, 5e-6)
 
 
@@ -95,7 +98,7 @@ def test_small_codebooks(K, dim, latent):
     angles = torch.arange(K) * 2.0
     rows = torch.zeros(K, dim)
     rows[:, 0], rows[:, 1] = angles.cos(), angles.sin()
-    config = AutoencoderConfig(latent=latent, encoder=(8,), decoder=(16,), steps=200, learning_rate=5e-3)
+    config = AutoencoderConfig.paper(latent=latent, encoder=(8,), decoder=(16,), steps=200, learning_rate=5e-3)
     fit = fit_autoencoder(Codebook(rows), config)
     assert fit.recovered == 1.0
     assert fit.latents.shape == (K, latent)
@@ -106,7 +109,9 @@ def test_small_codebooks(K, dim, latent):
 def test_recovered_is_honest():
     """Cut short, the autoencoder confuses some codewords, and says so."""
     book = realistic_codebook(12, 2)
-    fit = fit_autoencoder(book, AutoencoderConfig(latent=2, encoder=(16,), decoder=(16,), steps=60, learning_rate=1e-2))
+    fit = fit_autoencoder(
+        book, AutoencoderConfig.paper(latent=2, encoder=(16,), decoder=(16,), steps=60, learning_rate=1e-2)
+    )
     found = oracle.quantize(fit.autoencoder.decode(fit.latents).numpy(), book.codewords.numpy())
     right = sum(int(found[i]) == i for i in range(24))
     assert fit.recovered == right / 24
@@ -114,7 +119,10 @@ def test_recovered_is_honest():
 
 
 def test_same_generator_state_same_bits_and_the_global_one_is_left_alone():
-    book, config = realistic_codebook(3, 2, 16), AutoencoderConfig(encoder=(8,), decoder=(8,), steps=10, record_every=4)
+    book, config = (
+        realistic_codebook(3, 2, 16),
+        AutoencoderConfig.paper(encoder=(8,), decoder=(8,), steps=10, record_every=4),
+    )
     torch.manual_seed(0)
     expected = torch.rand(1)
     torch.manual_seed(0)
@@ -145,15 +153,55 @@ def test_results_carry_no_graph_and_the_codebook_is_unchanged(fitted):
         ({"encoder": (8, 0)}, r"encoder\[1\]: expected a number in \[1, inf\), got 0"),
         ({"decoder": (-1,)}, r"decoder\[0\]: expected a number in \[1, inf\), got -1"),
         ({"learning_rate": float("nan")}, r"learning_rate: expected a number in \(0, inf\), got nan"),
+        ({"blends": -1}, r"blends: expected a number in \[0, inf\), got -1"),
         ({"weight_decay": -1.0}, r"weight_decay: expected a number in \[0, inf\), got -1.0"),
     ],
 )
 def test_bad_config(values, message):
     with pytest.raises(ValueError, match=message):
-        AutoencoderConfig(**values)
+        AutoencoderConfig.paper(**values)
 
 
-@pytest.mark.parametrize("name", ["latent", "steps", "record_every"])
+@pytest.mark.parametrize("name", ["latent", "steps", "record_every", "blends"])
 def test_counts_are_integers(name):
     with pytest.raises(ValueError, match=rf"{name}: expected a whole number, got 9.5; pass an int"):
-        AutoencoderConfig(**{name: 9.5})
+        AutoencoderConfig.paper(**{name: 9.5})
+
+
+def test_paper_gives_the_autoencoder_it_always_gave():
+    """Numbers of the training before blends were added (commit bfd4440; equal in every bit there)."""
+    fit = fit_autoencoder(realistic_codebook(4, 3, 20), AutoencoderConfig.paper(steps=60))
+    assert float(fit.latents.double().sum()) == pytest.approx(51.6016, abs=1e-3)
+    assert fit.loss == pytest.approx(0.643469, abs=1e-5)
+
+
+def test_blends_are_the_weights_of_a_few_codewords():
+    weights = _blends(4000, 7, torch.Generator().manual_seed(0), torch.zeros(1, dtype=torch.float64))
+    assert weights.shape == (4000, 7)
+    assert (weights >= 0).all()
+    torch.testing.assert_close(weights.sum(dim=1), torch.ones(4000, dtype=torch.float64))
+    assert int((weights > 0).sum(dim=1).max()) == BLENDED
+    # every codeword is as likely: 1/7 each, within 4 standard errors of a Dirichlet(1, 1, 1, 1) weight
+    torch.testing.assert_close(weights.mean(dim=0), torch.full((7,), 1 / 7, dtype=torch.float64), atol=0.015, rtol=0)
+
+
+def test_blended_latents_decode_to_blended_features():
+    """The default learns what the field renders; the paper's training leaves it to chance."""
+    book = realistic_codebook(8, 2)
+    options = dict(encoder=(64, 32), decoder=(32, 128), steps=600, learning_rate=2e-3)
+    plain, blended = (
+        fit_autoencoder(book, AutoencoderConfig.paper(**options)),
+        fit_autoencoder(book, AutoencoderConfig(**options)),
+    )
+    weights = _blends(500, book.size, torch.Generator().manual_seed(9), book.unit)  # others than in training
+    wanted = weights @ book.unit
+
+    def error(fit):
+        return (1 - torch.cosine_similarity(fit.autoencoder.decode(weights @ fit.latents), wanted)).mean()
+
+    assert error(blended) < 0.5 * error(plain)
+    assert blended.recovered >= 0.9
+
+
+def test_the_learning_rate_falls_along_a_cosine():
+    assert [_cosine(done) for done in (0, 0.5, 1)] == pytest.approx([1, 0.51, 0.02])

@@ -135,3 +135,8 @@ def test_quantising_goes_on_with_the_map_it_was_at(tmp_path):
     assert maps.read == [0, 1, 2, 2, 3]
     whole = quantize_maps(list(maps), book)
     assert all(np.array_equal(a, b) and a.dtype == b.dtype for a, b in zip(found, whole, strict=True))
+
+
+def test_a_short_feature_is_no_hole_because_half_precision_codewords_cannot_hold_it():
+    features = torch.tensor([[[0.0, 2e-8], [1e-9, 0.0]]])  # the first would be zero in half precision
+    assert (quantize_maps([features], Codebook(torch.eye(2).half()))[0] == 2).tolist() == [[False, True]]

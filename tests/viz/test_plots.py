@@ -5,6 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
+from kfgs.quant import fit_codebook
 from kfgs.viz import palette, plot_codebook_history, plot_confusion, plot_training, plots
 from kfgs.viz.plots import plot_iou
 
@@ -32,6 +33,18 @@ def test_codebook_panels_hold_the_history(tmp_path, figures):
     assert panels[0].get_ylim()[0] == 0
     assert panels[0].get_xlabel() == "epoch"
     assert len(np.unique(picture(tmp_path / "codebook.png").reshape(-1, 3), axis=0)) > 20
+
+
+def test_codebook_panels_of_an_adaptive_fit_have_no_loss(tmp_path, figures):
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(5, 16, generator=generator), dim=1)
+    history = fit_codebook([directions[torch.randint(0, 5, (20, 30), generator=generator)]]).history
+    plot_codebook_history(history, tmp_path / "codebook.png")
+    panels = figures[0].axes
+    assert [axes.get_title() for axes in panels] == ["size", "added", "mean_similarity", "pruned", "coverage"]
+    np.testing.assert_array_equal(panels[0].lines[0].get_xydata(), [(row["epoch"], row["size"]) for row in history])
+    assert len(history) > 2
+    assert history[-1]["size"] == 5
 
 
 def test_training_starts_with_the_loss_and_skips_gaps(tmp_path, figures):

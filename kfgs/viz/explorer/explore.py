@@ -47,9 +47,10 @@ def explore(
     Args:
         source: a semantic field, asked by text; or a labelled splat, asked by class.
         color: the colour scene, in the same frame; None shows the source alone.
-        classes: names and embeddings in the teacher's space; required for a field, none for a splat, which has its own.
-        cameras: views that score each Gaussian and tell who sees it, best those that the field was trained on; without
-            them each Gaussian's own latent decides, which is noisy.
+        classes: names and embeddings in the teacher's space; None: those that the field remembers. None for a splat, which
+            has its own.
+        cameras: views among which those that see a picked Gaussian are named; None given: the field's own. A field without
+            fused features finds them from these views; without any each Gaussian's own latent decides, which is noisy.
         embed: the teacher's text encoder, word -> [D], to ask for more than the classes.
         distance: lambda, world units; None: from the clouds' spacing.
         where: `window` (blocks until it is closed), `browser` (a page that only this machine can open; blocks until
@@ -70,6 +71,8 @@ def explore(
     check_choice("where", where, get_args(Where))
     place = find_place() if where == "auto" else where
     check_place(place)
+    if not cameras and not isinstance(source, SplatFile):
+        cameras = source.cameras
     meaning = meaning_of(source, classes, cameras=cameras, embed=embed)
     cloud = color.gaussians if isinstance(color, SplatFile) else color
     state = Exploration(meaning, cloud, cameras=cameras, distance=distance)
@@ -84,7 +87,7 @@ def explore(
 
 def meaning_of(
     source: SemanticField | SplatFile,
-    classes: LabelSet | None,
+    classes: LabelSet | None = None,
     *,
     cameras: Sequence[Camera] = (),
     embed: Callable[[str], Tensor] | None = None,
@@ -92,7 +95,7 @@ def meaning_of(
     """What can be asked of a field (by text) or a labelled splat (by class).
 
     Raises:
-        ValueError: if classes are missing for a field, or given beside a splat.
+        ValueError: if classes are neither given for a field nor remembered by it, or are given beside a splat.
     """
     if isinstance(source, SplatFile):
         for name, given in (("classes", classes), ("embed", embed)):
@@ -101,10 +104,6 @@ def meaning_of(
                     f"{name}: expected none beside a splat, which has its own classes, got one; leave it out"
                 )
         return SplatMeaning(source)
-    if classes is None:
-        raise ValueError(
-            "classes: expected a LabelSet to ask the field by, got None; load_label_set reads one, make_label_set makes one"
-        )
     return FieldMeaning(source, classes, cameras=cameras, embed=embed)
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
@@ -20,18 +20,14 @@ from ...labels import (
     class_index,
     class_indices,
     select_by_label,
-    select_by_similarity,
-    teacher_mismatch,
 )
+from ...labels.questions import class_rows, make_question
 from ..field_colors import feature_colors, learnt_colors
-from ..frusta import evenly
 from ..pictures import FeatureColors
-from .evidence import Evidence, OwnFeatures, SeenCodewords, SeenFeatures
 
 if TYPE_CHECKING:
     from ...fields import SemanticField
 
-MOST_VIEWS = 30  # room_0 is labelled alike by 30 views and by all: more views cost time alone
 UNIT = (0.0, 1.0)
 
 
@@ -74,21 +70,22 @@ class Meaning(Protocol):
 
 
 class FieldMeaning:
-    """A semantic field asked by text, as `SemanticField.query` answers it.
+    """A semantic field asked by text: labels are those of `SemanticField.classify`, answers those of `SemanticField.query`.
 
-    A class is told from the other classes, anything else from the canonical negatives (`classes.negatives`): the score is
-    a relevancy, gamma 0.5. Where there are none it is the cosine, and gamma is read off the scores. With cameras, one pass
-    over at most 30 of them, evenly chosen, answers all later questions at once (of a field without codebook: all classes).
+    A class is compared with the other classes, anything else with the canonical words (`classes.negatives`): the score is a
+    relevancy, gamma 0.5. Where there are none it is the cosine, and gamma is read off the scores.
 
     Args:
         field: a finished field.
-        classes: names and embeddings in the teacher's space.
-        cameras: views that label and score each Gaussian, in the field's frame, without distortion; those that the field
-            was trained on are the natural choice. Without any each Gaussian's own latent decides, as in the paper.
+        classes: names and embeddings in the teacher's space; None: those that the field remembers.
+        cameras: used only if the field has no fused features yet: views to find them from (`SemanticField.with_answers`),
+            those that it was trained with. None given: the field's own. Without any each Gaussian's own latent decides, as
+            in the paper.
         embed: the teacher's text encoder, words -> [D]; without it only classes can be asked.
 
     Raises:
-        ValueError: if the embeddings have another number of channels than the field's features.
+        ValueError: if the embeddings have another number of channels than the field's features, or classes are neither
+            given nor remembered.
 
     Note:
         Warns where the classes were embedded by another teacher than the field's, as far as both are known.
@@ -97,28 +94,21 @@ class FieldMeaning:
     def __init__(
         self,
         field: SemanticField,
-        classes: LabelSet,
+        classes: LabelSet | None = None,
         *,
         cameras: Sequence[Camera] = (),
         embed: Callable[[str], Tensor] | None = None,
     ) -> None:
-        if classes.dim != field.dim:
-            raise ValueError(
-                f"classes: expected embeddings [C, {field.dim}] (from the field), got {tuple(classes.embeddings.shape)}: "
-                "text of another teacher? Embed the words with the one whose features this field was fitted to"
-            )
-        mismatch = teacher_mismatch(field.info, classes.info)
-        if mismatch is not None:
-            warnings.warn(mismatch, stacklevel=2)
+        classes = field.label_set() if classes is None else classes
+        class_rows(classes, field.dim, field.info)  # refuses them before views are rendered
+        self._classes = replace(classes, info={})  # the teacher has been compared: one warning, not one per question
+        self._field, self.by = _with_answers(field, cameras or field.cameras)
+        labels, self.scores = self._field.classify(self._classes)
+        self._embed = embed
+        self._answers: dict[str, Asked] = {}
         self.names = classes.names
         self.phrases = embed is not None
-        self._field, self._classes, self._embed = field, classes, embed
-        self._views = [cameras[i] for i in evenly(len(cameras), MOST_VIEWS)] if cameras else []
-        self._evidence = self._gather()
-        self._answers: dict[str, Asked] = {}
-        labels, self.scores = self._evidence.labels(classes.embeddings)
         self.gaussians = field.gaussians.replace(labels=labels)
-        self.by = f"votes of {len(self._views)} views" if self._views else "each Gaussian's own latent (Sec. 3.4)"
 
     def ask(self, words: str) -> Asked:
         """The answer to a class's name or, with an encoder, to any words; the second time it is at hand.
@@ -132,30 +122,14 @@ class FieldMeaning:
         if known:
             words = self.names[class_index(words, self.names)]
         if words not in self._answers:
-            target, negatives = self._class(words) if known else self._phrase(words)
-            self._answers[words] = self._answer(words, target, negatives, known)
+            self._answers[words] = self._answer(words, words if known else self._phrase(words))
         return self._answers[words]
 
     def feature_colors(self) -> FeatureColors:
         """The field's own projection: latents have the colours that they have in its rendered views."""
         return feature_colors(self._field)
 
-    def _gather(self) -> Evidence:
-        if not self._views:
-            return OwnFeatures.of(self._field)
-        if self._field.codebook is not None:
-            return SeenCodewords.of(self._field, self._views)
-        classes = self._classes
-        others = classes.embeddings[:0] if classes.negatives is None else classes.negatives.to(classes.embeddings)
-        return SeenFeatures(self._field, self._views, classes.embeddings, others)
-
-    def _class(self, name: str) -> tuple[Tensor, Tensor | None]:  # [D], [M, D]
-        """A class's embedding and the other classes', or the canonical words' where it is the only class."""
-        index = class_index(name, self.names)
-        others = self._classes.embeddings[torch.arange(len(self.names)) != index]
-        return self._classes.embeddings[index], others if len(others) else self._canonical(name)
-
-    def _phrase(self, words: str) -> tuple[Tensor, Tensor | None]:  # [D], [M, D]
+    def _phrase(self, words: str) -> Tensor:  # [D]
         if self._embed is None or not words:
             try:
                 class_indices(words, self.names)
@@ -169,18 +143,12 @@ class FieldMeaning:
                 f"embed: expected [{self._field.dim}] (from the field) for {words!r}, got {tuple(target.shape)}; "
                 "pass the text encoder of the teacher whose features this field was fitted to"
             )
-        return target.to(self._classes.embeddings), self._canonical(words)
+        return target
 
-    def _canonical(self, words: str) -> Tensor | None:  # [M, D]
-        """The canonical negatives, less the words themselves."""
-        kept = [i for i, word in enumerate(self._classes.negative_names) if word.casefold() != words.casefold()]
-        return None if self._classes.negatives is None or not kept else self._classes.negatives[kept]
-
-    def _answer(self, words: str, target: Tensor, negatives: Tensor | None, known: bool) -> Asked:
-        rows = target[None] if negatives is None else torch.cat([target[None], negatives.to(target)])
-        cosines, valid = self._evidence.cosines(rows)
-        found = select_by_similarity(cosines[:, 0], None if negatives is None else cosines[:, 1:], None, valid)
-        return _asked(words, found, valid, negatives is not None, known)
+    def _answer(self, words: str, target: str | Tensor) -> Asked:
+        found = self._field.query(target, self._classes)
+        question = make_question(target, self._classes, "auto", self._field.dim, {})
+        return _asked(words, found, self._field.known, question.negatives is not None, isinstance(target, str))
 
 
 class SplatMeaning:
@@ -237,6 +205,16 @@ class SplatMeaning:
         """A projection fitted to the features of all Gaussians that have any."""
         assert self.gaussians.features is not None
         return learnt_colors(self.gaussians.features)
+
+
+def _with_answers(field: SemanticField, cameras: Sequence[Camera]) -> tuple[SemanticField, str]:
+    """A field with fused features if it has them or there are views to find them from, and where its answers come from."""
+    if field.linear is not None:
+        return field, "what the training views show of each Gaussian"
+    if not cameras:
+        return field, "each Gaussian's own latent (Sec. 3.4)"
+    views = list(cameras)
+    return field.with_answers(views), f"what {len(views)} views show of each Gaussian"
 
 
 def _file_scores(gaussians: Gaussians, score: np.ndarray | None) -> Tensor:  # type: ignore[type-arg]  # [N]

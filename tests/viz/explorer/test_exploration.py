@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from cases_explorer import LINE, cameras, cloud, field, grid, grid_clouds, line, splat_file
+from cases_explorer import LINE, MODES, cameras, cloud, field, grid, grid_clouds, line, splat_file
 from cases_explorer import classes as some_classes
 
 from kfgs.cameras import Distortion
@@ -78,17 +78,17 @@ def test_gamma_selects_on_both_sides():
     assert made.gamma == 1.0
 
 
+@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("views", [(), tuple(cameras())], ids=["own", "views"])
-def test_any_gamma_of_a_field_is_that_of_query(views):
-    made, given = FieldMeaning(field(), some_classes(1, negatives=False), cameras=views), some_classes()
-    state = Exploration(made)
+def test_any_gamma_of_a_field_is_that_of_query(mode, views):
+    given = some_classes(1, negatives=False)
+    answering = field(mode).with_answers(views) if views else field(mode)
+    state = Exploration(FieldMeaning(field(mode), given, cameras=views))
     state.ask("wall")
     low, high = state.gamma_range
-    for gamma in (low, low + 0.3 * (high - low), low + 0.9 * (high - low)):
-        state.set_gamma(gamma)
-        found = field().query(given.embeddings[0], gamma + 1e-5, cameras=views or None)
-        state.gamma += 1e-5  # away from the least score itself, which rounding may put on either side
-        assert state.selected("semantic").tolist() == found.mask.tolist()
+    for share in (0, 0.3, 0.9, 1):
+        state.set_gamma(low + share * (high - low))
+        assert state.selected("semantic").tolist() == answering.query("wall", given, state.gamma).mask.tolist()
 
 
 def test_a_question_comes_and_goes():

@@ -3,14 +3,46 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from cases_explorer import DIM, MODES, NAMES, cameras, classes, cloud, codebook, field, splat_file
+from cases_explorer import (
+    DIM,
+    MODES,
+    NAMES,
+    TRAINED,
+    cameras,
+    classes,
+    cloud,
+    codebook,
+    field,
+    linear,
+    splat_file,
+    stored,
+)
 
-from kfgs.fields import SemanticField
-from kfgs.viz.explorer import evidence, meaning
+from kfgs.fields import SemanticField, answers, semantic_field
 from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.meaning import FieldMeaning, SplatMeaning
 
-VIEWS = [(), tuple(cameras())]
+HOWS = [*((mode, how) for mode in TRAINED for how in ("own", "views", "answered")), ("fused", "fused")]
+KINDS = pytest.mark.parametrize(("mode", "how"), HOWS, ids=[f"{mode}-{how}" for mode, how in HOWS])
+BY = {
+    "own": "each Gaussian's own latent (Sec. 3.4)",
+    "views": "what 3 views show of each Gaussian",
+    "answered": "what the training views show of each Gaussian",
+    "fused": "what the training views show of each Gaussian",
+}
+
+
+def asked_and_answering(mode, how):
+    """What the explorer is given, and the field whose `query` it must agree with.
+
+    `own`: a trained field and no views. `views`: a trained field, and views to find its answers from. `answered`: a trained
+    field that has its answers; other views must not change them. `fused`: a field that needs none.
+    """
+    made = field(mode)
+    if how in ("own", "fused"):
+        return (made, ()), made
+    answered = made.with_answers(cameras())
+    return ((made, cameras()), answered) if how == "views" else ((answered, cameras(1)), answered)
 
 
 def embed(words):
@@ -19,100 +51,179 @@ def embed(words):
 
 
 def same_answer(asked, found):
+    """The very same Gaussians, scores, gamma and reason."""
     assert torch.equal(asked.selection.mask, found.mask)
-    torch.testing.assert_close(asked.selection.scores, found.scores, rtol=0, atol=2e-6)
-    assert asked.selection.threshold == pytest.approx(found.threshold, abs=1e-4)
-    assert asked.selection.how == found.how
+    assert torch.equal(asked.selection.scores, found.scores)
+    assert (asked.selection.threshold, asked.selection.how) == (found.threshold, found.how)
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("views", VIEWS, ids=["own", "views"])
-def test_labels_are_those_of_the_field(mode, views):
-    made = FieldMeaning(field(mode), classes(), cameras=views)
-    if views:
-        labels, scores, _ = field(mode).classify_by_views(classes().embeddings, views, decode="latent")
-    else:
-        labels, scores = field(mode).classify(classes().embeddings)
-    assert torch.equal(made.gaussians.labels, labels)
-    torch.testing.assert_close(made.scores, scores, rtol=0, atol=2e-6)
-    assert len(set(labels.tolist())) == 5  # all four classes, and none
-    assert made.names == NAMES
-    assert made.by == ("votes of 3 views" if views else "each Gaussian's own latent (Sec. 3.4)")
+@KINDS
+def test_labels_are_those_of_the_field(mode, how):
+    (source, views), answering = asked_and_answering(mode, how)
+    made = FieldMeaning(source, classes(), cameras=views)
+    found = answering.classify(classes())
+    assert torch.equal(made.gaussians.labels, found.labels)
+    assert torch.equal(made.scores, found.scores)
+    assert len(set(found.labels.tolist())) == 5  # all four classes, and none
+    assert (made.names, made.by) == (NAMES, BY[how])
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("views", VIEWS, ids=["own", "views"])
-def test_a_class_is_told_from_the_others_as_query_does(mode, views):
-    made, given = FieldMeaning(field(mode), classes(), cameras=views), classes()
+@KINDS
+def test_a_class_is_answered_as_query_answers_its_name(mode, how):
+    (source, views), answering = asked_and_answering(mode, how)
+    made, given = FieldMeaning(source, classes(), cameras=views), classes()
     for index, name in enumerate(NAMES):
-        others = given.embeddings[[i for i in range(4) if i != index]]
-        found = field(mode).query(given.embeddings[index], negatives=others, cameras=views or None)
-        asked = made.ask(name)
+        asked, found = made.ask(name), answering.query(name, given)
         same_answer(asked, found)
+        others = given.embeddings[[i for i in range(4) if i != index]]
+        same_answer(asked, answering.query(given.embeddings[index], given, negatives=others))
+        same_answer(asked, answering.query(given.embeddings[index], given))  # a class's own embedding is that class
         assert len(found) > 0
         assert (asked.words, asked.low, asked.high, asked.known) == (name, 0.0, 1.0, True)
+        assert torch.equal(asked.valid, answering.known)
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("views", VIEWS, ids=["own", "views"])
-def test_a_phrase_is_told_from_the_canonical_words(mode, views):
+@KINDS
+def test_a_class_selects_what_it_is_the_label_of(mode, how):
+    """With the other classes as negatives and gamma 0.5 both say: more like it than like any other."""
+    (source, views), _ = asked_and_answering(mode, how)
+    made = FieldMeaning(source, classes(), cameras=views)
+    for index, name in enumerate(NAMES):
+        assert torch.equal(made.ask(name).selection.mask, made.gaussians.labels == index)
+
+
+def test_the_answers_of_a_fused_field_by_hand():
+    made, given = FieldMeaning(field("fused"), classes()), classes()
+    features = (field("fused").features @ linear().basis.T).double().numpy()
+    words = given.embeddings.double().numpy()
+    for index, name in enumerate(NAMES):
+        chosen = []
+        for i, feature in enumerate(features):
+            length = np.linalg.norm(feature)
+            cosines = [feature @ word / max(length, 1e-30) / np.linalg.norm(word) for word in words]
+            if length > 0 and cosines[index] > max(cosines[:index] + cosines[index + 1 :]):
+                chosen.append(i)
+        assert made.ask(name).selection.indices.tolist() == chosen
+        assert len(chosen) > 0
+
+
+@KINDS
+def test_a_phrase_is_told_from_the_canonical_words(mode, how):
+    (source, views), answering = asked_and_answering(mode, how)
     given = classes()
-    made = FieldMeaning(field(mode), given, cameras=views, embed=embed)
+    made = FieldMeaning(source, given, cameras=views, embed=embed)
     asked = made.ask("a red thing")
-    same_answer(asked, field(mode).query(embed("a red thing"), negatives=given.negatives, cameras=views or None))
-    assert (asked.known, made.phrases) == (False, True)
-    # a canonical word is not told from itself
-    own = field(mode).query(embed("Stuff"), negatives=given.negatives[:1], cameras=views or None)
-    same_answer(made.ask("Stuff"), own)
+    same_answer(asked, answering.query(embed("a red thing"), given))
+    same_answer(asked, answering.query(embed("a red thing"), given, negatives=given.negatives))
+    assert (asked.low, asked.high, asked.known, made.phrases) == (0.0, 1.0, False, True)
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("views", VIEWS, ids=["own", "views"])
-def test_without_negatives_the_cosine_counts_and_gamma_comes_from_the_scores(mode, views):
-    made = FieldMeaning(field(mode), classes(1, negatives=False), cameras=views)
-    found = field(mode).query(classes().embeddings[0], cameras=views or None)
-    asked = made.ask("wall")
-    same_answer(asked, found)
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float64])
+def test_an_encoder_of_another_precision_changes_nothing_between_the_two(dtype):
+    row = embed("a red thing").to(dtype)
+    asked = FieldMeaning(field("fused"), classes(), embed=lambda words: row).ask("a red thing")
+    same_answer(asked, field("fused").query(row, classes()))
+    close = field("fused").query(row.float(), classes())
+    torch.testing.assert_close(asked.selection.scores, close.scores, rtol=0, atol=1e-6)
+
+
+@KINDS
+def test_a_canonical_word_is_not_told_from_itself(mode, how):
+    (source, views), answering = asked_and_answering(mode, how)
+    given = classes()
+    stuff = 2 * given.negatives[1] * (1 + 1e-6 * torch.arange(DIM))  # the same words, another length, rounded
+    asked = FieldMeaning(source, given, cameras=views, embed=lambda words: stuff).ask("stuff")
+    same_answer(asked, answering.query(stuff, given))
+    same_answer(asked, answering.query(stuff, given, negatives=given.negatives[:1]))
+    assert len(asked.selection) > 0
+
+
+@KINDS
+def test_without_canonical_words_the_cosine_of_a_phrase_counts(mode, how):
+    (source, views), answering = asked_and_answering(mode, how)
+    given = classes(negatives=False)
+    asked = FieldMeaning(source, given, cameras=views, embed=embed).ask("a red thing")
+    same_answer(asked, answering.query(embed("a red thing"), given))
+    same_answer(asked, answering.query(embed("a red thing"), given, negatives="none"))
+
+
+@KINDS
+def test_without_negatives_the_cosine_counts_and_gamma_comes_from_the_scores(mode, how):
+    (source, views), answering = asked_and_answering(mode, how)
+    given = classes(1, negatives=False)
+    asked = FieldMeaning(source, given, cameras=views).ask("wall")
+    same_answer(asked, answering.query("wall", given))
     own = asked.selection.scores[asked.valid]
-    assert asked.low == pytest.approx(float(own.min()))
-    assert asked.high == pytest.approx(float(own.max()))
+    assert (asked.low, asked.high) == (float(own.min()), float(own.max()))
     assert asked.low < asked.selection.threshold < asked.high
     # what nothing is known of is never selected, however low gamma is
-    lowest = field(mode).query(classes().embeddings[0], -1.0, cameras=views or None)
+    lowest = answering.query("wall", given, -1.0)
     assert torch.equal((asked.selection.scores > -1.0) & asked.valid, lowest.mask)
-    assert not bool(asked.valid[2 if views else 0])
+    assert not bool(asked.valid[2 if how in ("views", "answered") else 0])
+
+
+def test_a_single_class_is_told_from_the_canonical_words():
+    asked = FieldMeaning(field(), classes(1)).ask("wall")
+    same_answer(asked, field().query("wall", classes(1), negatives="canonical"))
+    assert (asked.low, asked.high) == (0.0, 1.0)
+
+
+def drawn(monkeypatch):
+    """Counts the views that are rendered from now on."""
+    count, rasterize = [], answers.rasterize
+    for module in (answers, semantic_field):
+        monkeypatch.setattr(module, "rasterize", lambda *args, **kw: count.append(1) or rasterize(*args, **kw))
+    return count
+
+
+@pytest.mark.parametrize("mode", TRAINED)
+def test_one_pass_over_the_views_answers_every_question(mode, monkeypatch):
+    count = drawn(monkeypatch)
+    made = FieldMeaning(field(mode), classes(), cameras=cameras(), embed=embed)
+    assert len(count) == 3
+    for words in (*NAMES, "a red thing"):
+        made.ask(words)
+    assert len(count) == 3
+    assert made.ask(" a red thing") is made.ask("a red thing")
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_one_pass_over_the_views_answers_every_class(mode, monkeypatch):
-    count, render = [], SemanticField.render
-    monkeypatch.setattr(SemanticField, "render", lambda *args, **kw: count.append(1) or render(*args, **kw))
-    made = FieldMeaning(field(mode), classes(), cameras=cameras(), embed=embed)
-    for name in NAMES:
-        made.ask(name)
-    assert len(count) == 3
-    first = made.ask("a red thing")
-    assert len(count) == (6 if mode == "decouple" else 3)  # without codebook a phrase takes a pass of its own
-    assert made.ask(" a red thing") is first
-    assert len(count) == (6 if mode == "decouple" else 3)
+def test_a_field_that_has_its_answers_renders_nothing(mode, monkeypatch):
+    made = field(mode).with_answers(cameras())
+    count = drawn(monkeypatch)
+    opened = FieldMeaning(made, classes(), cameras=cameras(), embed=embed)
+    for words in (*NAMES, "a red thing"):
+        opened.ask(words)
+    assert len(count) == 0
+    assert opened.by == BY["answered"]
 
 
-def test_many_views_are_thinned_evenly(monkeypatch):
-    monkeypatch.setattr(meaning, "MOST_VIEWS", 3)
-    views = cameras(9)
-    some = FieldMeaning(field(), classes(), cameras=[views[0], views[4], views[8]])
+def test_a_field_without_answers_finds_them_from_its_own_cameras():
+    made = replace(field(), cameras=tuple(cameras()))
+    opened = FieldMeaning(made, classes())
+    assert opened.by == BY["views"]
+    same_answer(opened.ask("chair"), field().with_answers(cameras()).query("chair", classes()))
+
+
+def test_all_views_that_are_given_are_asked():
+    views = cameras(35)
     made = FieldMeaning(field(), classes(), cameras=views)
-    assert made.by == "votes of 3 views"
-    assert torch.equal(made.scores, some.scores)
+    assert torch.equal(made.scores, field().with_answers(views).classify(classes()).scores)
 
 
-def test_codewords_a_few_at_a_time_change_nothing(monkeypatch):
-    whole = evidence.SeenCodewords.of(field(), cameras())
-    monkeypatch.setattr(evidence, "SIGNAL", 1)  # eight at a time
-    parts = evidence.SeenCodewords.of(field(), cameras())
-    assert int((whole.sums.sum(dim=0) > 0).sum()) > 8
-    assert torch.equal(whole.sums, parts.sums)
-    assert torch.equal(whole.weights, parts.weights)
+@pytest.mark.parametrize("mode", ["adc+sc", "fused"])
+def test_a_field_is_asked_by_the_classes_that_it_remembers(mode, tmp_path):
+    made = stored(tmp_path, mode)
+    opened = FieldMeaning(made, embed=embed)
+    assert opened.names == NAMES
+    for name in NAMES:
+        same_answer(opened.ask(name), made.query(name))
+    same_answer(opened.ask("a red thing"), made.query(embed("a red thing")))
+
+
+def test_a_field_that_remembers_no_classes_needs_some():
+    with pytest.raises(ValueError, match="classes: expected a label set, or a field that remembers the classes"):
+        FieldMeaning(field())
 
 
 def test_words_are_found_whatever_their_case_and_kept():
@@ -132,16 +243,19 @@ def test_words_that_cannot_be_answered():
         short.ask("sofa")
 
 
-def test_classes_of_another_teacher():
+def test_classes_of_another_teacher(monkeypatch):
+    count = drawn(monkeypatch)
     wide = replace(classes(negatives=False), embeddings=torch.ones(4, DIM + 1))
     with pytest.raises(
         ValueError, match=r"classes: expected embeddings \[C, 16\] \(from the field\), got \(4, 17\): text"
     ):
-        FieldMeaning(field(), wide)
+        FieldMeaning(field(), wide, cameras=cameras())
+    assert not count  # refused before the views are rendered
     ours = SemanticField(*[getattr(field("decouple"), part) for part in ("gaussians", "codebook", "autoencoder")])
     ours.info["teacher"] = {"name": "lseg"}
-    with pytest.warns(UserWarning, match="field's teacher"):
-        FieldMeaning(ours, replace(classes(), info={"teacher": {"name": "clip"}}))
+    with pytest.warns(UserWarning, match="field's teacher") as warned:
+        FieldMeaning(ours, replace(classes(), info={"teacher": {"name": "clip"}})).ask("chair")
+    assert len(warned) == 1  # not again at every question
 
 
 def test_scores_that_are_all_the_same_still_have_a_range():

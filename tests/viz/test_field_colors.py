@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from cases_explorer import classes, field
+from cases_explorer import MODES, cameras, classes, field
 
 from kfgs.fields import SemanticField
 from kfgs.gaussians import Gaussians
-from kfgs.pipeline import feature_colors
-from kfgs.quant import Autoencoder, Codebook
-from kfgs.viz import FeatureColors
+from kfgs.quant import Autoencoder, Codebook, fit_linear_latents, unit_rows
+from kfgs.viz import FeatureColors, feature_colors
 from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.meaning import FieldMeaning
 
@@ -54,7 +53,48 @@ def test_gaussians_that_were_never_learnt_shape_no_colours():
     assert len(np.unique(nothing(torch.zeros(3, 6)))) == 1
 
 
-@pytest.mark.parametrize("mode", ["decouple", "adc", "adc+sc"])
+def fused(n=600, spread=0.5):
+    """Unit features of four things, with one direction common to all; blends of pixels made them shorter."""
+    generator = torch.Generator().manual_seed(3)
+    things = unit_rows(torch.eye(4, 24) + 2 * torch.eye(24)[20])  # cosines of 0.8 with each other
+    labels = torch.arange(n) % 4
+    features = unit_rows(things[labels] + 0.02 * torch.randn(n, 24, generator=generator))
+    linear = fit_linear_latents(features, keep=0.9)
+    lengths = 1 - spread * torch.rand(n, generator=generator)
+    latents = linear.encode(features) * lengths[:, None]
+    return SemanticField(gaussians(torch.cat([latents, torch.zeros(50, linear.latent)])), linear=linear), labels
+
+
+def test_colours_of_linear_latents_come_from_what_varies_and_not_from_their_length():
+    made, labels = fused()
+    known = made.features[: len(labels)]
+    colors = feature_colors(made)
+    fitted = FeatureColors.fit(known)  # the 50 unknown ones count for nothing
+    np.testing.assert_array_equal(colors(known), fitted(known))
+    seen = colors(known).astype(float)
+    centres = np.stack([seen[labels.numpy() == thing].mean(axis=0) for thing in range(4)])
+    within = np.stack([seen[labels.numpy() == thing].std(axis=0).max() for thing in range(4)])
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=-1) + 1e9 * np.eye(4)
+    print(apart.min(), within)
+    assert apart.min() > 3 * within.max()
+
+
+def test_a_blend_of_latents_has_the_blend_of_their_colours():
+    made, _ = fused(spread=0.0)
+    colors, (one, other) = feature_colors(made), made.features[:2]
+    inner = made.features[:600].mean(dim=0)  # no channel of its blends is clipped
+    one, other = inner + 0.3 * (one - inner), inner + 0.3 * (other - inner)
+    blend = colors(0.25 * one + 0.75 * other).astype(float)
+    np.testing.assert_allclose(blend, 0.25 * colors(one) + 0.75 * colors(other), atol=1.01)  # three roundings to bytes
+
+
+def test_the_colours_of_a_trained_field_with_answers_are_those_of_its_latents():
+    made = field("adc+sc")
+    answered = made.with_answers(cameras())
+    np.testing.assert_array_equal(feature_colors(answered)(made.features), feature_colors(made)(made.features))
+
+
+@pytest.mark.parametrize("mode", MODES)
 def test_the_explorer_has_the_colours_of_rendered_views(mode):
     made = field(mode)
     state = Exploration(FieldMeaning(made, classes()))

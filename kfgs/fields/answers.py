@@ -1,0 +1,84 @@
+"""What each Gaussian answers when it is asked alone: the mean of what the training views show where it is seen.
+
+Training constrains only blends of Gaussians, so a trained Gaussian's own latent may say something that no view shows. The mean
+over its pixels, weighted by w = T alpha, does not. It is found once, when a field is finished, and needs no camera afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..cameras import Camera
+from ..gaussians import Gaussians
+from ..labels import average_views, nearest_codeword
+from ..quant import EPS, Autoencoder, Codebook, LinearLatents, fit_linear_latents, row_norms, unit_rows
+from ..splat import rasterize
+
+KEEP, MOST = 0.999, 64  # of the variation between codewords, and at most so many latents for it
+CHUNK = 8192  # pixels quantised at once
+PIXELS = 80_000  # most of a view that is rendered for it
+
+
+class Seen(NamedTuple):
+    """How well the training views show each Gaussian."""
+
+    pixels: Tensor  # [N] how many pixels it fills, in all training views together
+    agreement: Tensor  # [N] in [0, 1]: length of the mean of the unit features that it was shown with
+
+
+class Answers(NamedTuple):
+    """Each Gaussian's fused feature."""
+
+    latents: Tensor  # [N, e], all-zero where no view shows the Gaussian
+    linear: LinearLatents
+    seen: Seen
+
+
+def fused_answers(
+    gaussians: Gaussians, codebook: Codebook | None, autoencoder: Autoencoder | None, cameras: Sequence[Camera]
+) -> Answers:
+    """Render a trained field from each camera, quantise, and average onto the Gaussians what their pixels show.
+
+    Args:
+        gaussians: with the field's latents.
+        codebook: S; None: the rendered features themselves are averaged.
+        autoencoder: E and Psi, or None.
+        cameras: at least one; those that the field was trained with.
+    """
+    assert gaussians.features is not None
+    with torch.no_grad():
+        if codebook is None:
+            linear = fit_linear_latents(unit_rows(gaussians.features), gaussians.opacities, keep=KEEP, maximum=MOST)
+            table, centres = None, None
+        else:
+            linear = fit_linear_latents(codebook.unit, keep=KEEP, maximum=MOST)
+            table = linear.encode(codebook.unit).to(gaussians.means)
+            centres = None if autoencoder is None else autoencoder.encode(codebook.codewords).to(gaussians.means)
+
+        def shown(camera: Camera) -> Tensor:  # [H, W, e]
+            rendering = rasterize(gaussians, camera)
+            pixels = rendering.map.flatten(0, 1)
+            parts = pixels.split(CHUNK)
+            if codebook is None or table is None:
+                rows = torch.cat([linear.encode(unit_rows(part)) for part in parts])
+            elif centres is None:
+                rows = table[torch.cat([codebook.quantize(part) for part in parts])]
+            else:
+                rows = table[torch.cat([nearest_codeword(part, centres) for part in parts])]
+            something = rendering.alpha > 0 if centres is not None else row_norms(pixels).view(camera.size) > EPS
+            return rows.view(*camera.size, -1) * something[..., None]
+
+        small = [_shrunk(camera) for camera in cameras]
+        mean = average_views(gaussians, ((camera, shown(camera)) for camera in small))
+        length = torch.linalg.vector_norm(mean.values, dim=1)
+        scale = sum(a.width * a.height for a in cameras) / max(1, sum(b.width * b.height for b in small))
+    return Answers(mean.values, linear, Seen(mean.weights * scale, length.clamp_max(1)))
+
+
+def _shrunk(camera: Camera) -> Camera:
+    factor = min(1.0, (PIXELS / (camera.width * camera.height)) ** 0.5)
+    return camera.resized(max(1, round(camera.height * factor)), max(1, round(camera.width * factor)))

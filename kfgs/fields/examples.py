@@ -1,0 +1,170 @@
+"""Classes without text: what a class looks like is shown by examples in views, or by Gaussians of the field."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .._check import check_shapes
+from .._files import read_json
+from ..cameras import Camera
+from ..labels import LabelSet
+from ..quant import EPS, row_norms, unit_rows
+from .semantic_field import SemanticField
+
+
+@dataclass(frozen=True, eq=False)
+class Clicks:
+    """Pixels of a view that show a class."""
+
+    view: str | Camera
+    """A training view of the field by its name, with or without ending, or any camera."""
+    points: Sequence[Sequence[float]]
+    """(x, y) in pixels of that view; the first pixel's centre is (0.5, 0.5)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """A rectangle of a view that a class fills."""
+
+    view: str | Camera
+    corners: Sequence[float]
+    """(x0, y0, x1, y1) in pixels, x0 < x1 and y0 < y1."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mask:
+    """The pixels of a view that are true in a mask."""
+
+    view: str | Camera
+    mask: Tensor  # [H, W] bool, of the view's size
+
+
+@dataclass(frozen=True, eq=False)
+class Picked:
+    """Gaussians of the field that belong to a class."""
+
+    indices: Sequence[int] | Tensor
+    """Which, or a mask [N]."""
+
+
+Example = Clicks | Box | Mask | Picked
+
+
+def label_set_from_examples(field: SemanticField, examples: Mapping[str, Example | Sequence[Example]]) -> LabelSet:
+    """Make classes out of examples, for a teacher that has no text (DINOv2, SAM) or words that it does not know.
+
+    A class's row is the mean direction of the features that its examples show: of the field rendered at the pixels, or of the
+    Gaussians themselves. Every example counts alike, however many pixels it has.
+
+    Args:
+        field: a finished field.
+        examples: one or more examples of each class, by its name.
+
+    Raises:
+        ValueError: if there is no class or no example of one, a view is unknown, a place lies outside its view, or the field
+            shows nothing there.
+    """
+    if not examples:
+        raise ValueError("examples: expected at least one class, got none; name one and show it")
+    rows, counts = [], {}
+    for name, given in examples.items():
+        shown = [given] if isinstance(given, Example) else list(given)
+        if not shown:
+            raise ValueError(f"examples[{name!r}]: expected at least one example, got none; show one")
+        features = torch.stack([_feature(field, one, f"examples[{name!r}][{i}]") for i, one in enumerate(shown)])
+        rows.append(unit_rows(features.mean(dim=0)))
+        counts[name] = len(shown)
+    teacher = field.info.get("teacher")
+    info: dict[str, Any] = {"examples": counts, **({"teacher": teacher} if teacher else {})}
+    return LabelSet(tuple(examples), torch.stack(rows), info=info)
+
+
+def read_examples(path: str | Path) -> dict[str, list[Example]]:
+    """Read examples from JSON: {"chair": [{"view": "a.png", "points": [[x, y], ...]}, {"view": "b.png", "box": [x0, y0, x1, y1]},
+    {"gaussians": [3, 14]}], ...}.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is something else.
+    """
+    content = read_json(path)
+    if not isinstance(content, dict) or not all(isinstance(shown, list) for shown in content.values()):
+        raise ValueError(f"{path}: expected an object of lists of examples by class name, got {type(content).__name__}")
+    return {
+        name: [_read(f"{path}: {name!r}[{i}]", one) for i, one in enumerate(shown)] for name, shown in content.items()
+    }
+
+
+def _read(where: str, one: Any) -> Example:
+    keys = set(one) if isinstance(one, dict) else set()
+    try:
+        if keys == {"gaussians"}:
+            return Picked([int(i) for i in one["gaussians"]])
+        if keys == {"view", "points"}:
+            return Clicks(str(one["view"]), [(float(x), float(y)) for x, y in one["points"]])
+        if keys == {"view", "box"}:
+            x0, y0, x1, y1 = map(float, one["box"])
+            return Box(str(one["view"]), (x0, y0, x1, y1))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where}: expected numbers ({error}); see kfgs text --help") from error
+    raise ValueError(
+        f"{where}: expected 'view' with 'points' or 'box', or 'gaussians', got {sorted(keys) or type(one).__name__}; correct it"
+    )
+
+
+def _feature(field: SemanticField, example: Example, name: str) -> Tensor:  # [D] unit
+    """The mean direction of what one example shows."""
+    where = _of_gaussians if isinstance(example, Picked) else _of_pixels
+    features = where(field, example, name)
+    known = features[row_norms(features) > EPS]
+    if len(known) == 0:
+        raise ValueError(f"{name}: expected a place where the field shows something, got none; choose another")
+    return unit_rows(unit_rows(known).mean(dim=0))
+
+
+def _of_gaussians(field: SemanticField, example: Any, name: str) -> Tensor:  # [n, D]
+    which = torch.as_tensor(example.indices)
+    rows = which.nonzero()[:, 0] if which.dtype == torch.bool else which.long()
+    wrong = which.is_floating_point() or (which.dtype == torch.bool and len(which) != len(field))
+    if wrong or which.ndim != 1 or len(rows) == 0 or int(rows.min()) < 0 or int(rows.max()) >= len(field):
+        raise ValueError(f"{name}: expected indices of the field's {len(field)} Gaussians, got {example.indices!r:.80}")
+    return field.own_features(rows)
+
+
+def _of_pixels(field: SemanticField, example: Any, name: str) -> Tensor:  # [n, D]
+    camera = _camera(field, example.view, name)
+    mask = torch.zeros(camera.size, dtype=torch.bool)
+    if isinstance(example, Mask):
+        check_shapes((f"{name}.mask", example.mask, camera.size))
+        mask = example.mask.bool()
+    elif isinstance(example, Clicks):
+        for x, y in example.points:
+            if not (0 <= x < camera.width and 0 <= y < camera.height):
+                raise ValueError(f"{name}: expected points within {camera.width} x {camera.height}, got ({x:g}, {y:g})")
+            mask[int(y), int(x)] = True
+    else:
+        x0, y0, x1, y1 = example.corners
+        if not (0 <= x0 < x1 <= camera.width and 0 <= y0 < y1 <= camera.height):
+            raise ValueError(
+                f"{name}: expected x0 < x1 and y0 < y1 within {camera.width} x {camera.height}, got {tuple(example.corners)}"
+            )
+        mask[int(y0) : max(int(y1), int(y0) + 1), int(x0) : max(int(x1), int(x0) + 1)] = True
+    rendering = field.render(camera)
+    rows = mask.to(rendering.alpha.device) & (rendering.alpha > 0)
+    return field.decode(rendering.map[rows])
+
+
+def _camera(field: SemanticField, view: str | Camera, name: str) -> Camera:
+    if isinstance(view, Camera):
+        return view
+    found = [camera for camera in field.cameras if view in (camera.name, Path(camera.name).stem)]
+    if len(found) != 1:
+        some = ", ".join(camera.name for camera in field.cameras[:3]) or "none"
+        raise ValueError(f"{name}: expected the name of a training view ({some}, ...), got {view!r}; correct it")
+    return found[0]

@@ -1,0 +1,85 @@
+"""What a field remembers of its scene: where classes and text table lay, relative to the field, and their digests."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from .._files import digest_file
+from ..labels import LabelSet, load_label_set
+
+CLASSES = ("classes.json", "text.npy"), ("classes.json", "text.safetensors"), ("text.safetensors",)
+"""Files of a scene folder that make a label set, the first pair that is there."""
+
+
+def remember(scene: Path, field: Path) -> dict[str, Any]:
+    """What a field at `field` notes of the scene folder `scene`: paths relative to the field, and digests; JSON."""
+    found: dict[str, Any] = {"scene": _relative(scene, field)}
+    for names in CLASSES:
+        files = [scene / name for name in names]
+        if all(file.is_file() for file in files):
+            found["classes"] = [{"path": _relative(file, field), "sha256": digest_file(file)} for file in files]
+            break
+    return found
+
+
+def rebased(info: dict[str, Any], old: Path | None, new: Path) -> dict[str, Any]:
+    """The same notes for a field that moves from one folder to another."""
+    if old is None or old.resolve() == new.resolve():
+        return info
+    moved = dict(info)
+    if isinstance(info.get("scene"), str):
+        moved["scene"] = _relative(old.resolve() / info["scene"], new)
+    if info.get("classes"):
+        moved["classes"] = [one | {"path": _relative(old.resolve() / one["path"], new)} for one in info["classes"]]
+    return moved
+
+
+def recall_scene(info: dict[str, Any], folder: Path | None) -> Path:
+    """The scene folder that a field remembers.
+
+    Raises:
+        ValueError: if it remembers none.
+        FileNotFoundError: if there is none any more.
+    """
+    noted = info.get("scene")
+    if not isinstance(noted, str) or folder is None:
+        raise ValueError("scene: expected a field that remembers its scene, got one that does not; pass the scene")
+    path = _absolute(folder, noted)
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}: no such folder, where this field's scene was; pass the scene")
+    return path
+
+
+def recall_classes(info: dict[str, Any], folder: Path | None) -> LabelSet:
+    """The label set that a field remembers.
+
+    Raises:
+        ValueError: if it remembers none, or a file has changed.
+        FileNotFoundError: if a file is gone.
+    """
+    noted = info.get("classes")
+    if not noted or folder is None:
+        raise ValueError(
+            "classes: expected a label set, or a field that remembers the classes of its scene, got neither; pass "
+            "load_label_set(names, embeddings)"
+        )
+    files = [_absolute(folder, str(one["path"])) for one in noted]
+    for file, one in zip(files, noted, strict=True):
+        if not file.is_file():
+            raise FileNotFoundError(f"{file}: no such file, where this field's classes were; pass the classes")
+        if digest_file(file) != one["sha256"]:
+            raise ValueError(
+                f"classes: expected {file} as it was when the field was fitted, got another; pass the classes that you mean"
+            )
+    return load_label_set(*files)
+
+
+def _relative(path: Path, field: Path) -> str:
+    return Path(os.path.relpath(path.resolve(), field.resolve())).as_posix()
+
+
+def _absolute(field: Path, noted: str) -> Path:
+    """Where a noted path leads. The field's folder may be a link, and paths were noted from where it really lies."""
+    return Path(os.path.normpath(field.resolve() / noted))

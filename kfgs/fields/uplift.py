@@ -1,0 +1,358 @@
+"""Features of 2-D maps carried to Gaussians without training: averaged in 3-D first, corrected, compressed after.
+
+Each Gaussian takes the mean of the pixels that show it, weighted by its rendering weight w = T alpha. Every rendered pixel
+is a blend of Gaussians, so the mean of a Gaussian near a border holds some of its neighbours. A few passes of the simultaneous
+iterative reconstruction technique (SIRT, Gilbert 1972) take that out: render, compare with the maps, carry the difference back.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+from tqdm import tqdm
+
+from .._check import check_range, check_shapes, check_whole
+from .._files import atomic_path
+from ..cameras import Camera, resize_map
+from ..gaussians import Gaussians
+from ..labels.average import sum_pixels
+from ..quant import EPS, FeatureMaps, row_norms, unit_rows
+from ..quant.linear import LinearLatents, fit_linear_latents, principal_directions
+from ..quant.sampling import sample_grid
+from ..splat import rasterize
+from .coarse import shrink_map
+from .merge import FAINT, Merged, merge_gaussians
+
+WORKING = 64
+"""Directions in which maps are averaged at first. Those of room_0's maps hold 98.8 % of their energy, and what they leave out is
+noise of single pixels: the latents found among them keep a cosine above 0.99 with the average of all 512 channels."""
+NEIGHBOURS = 17  # a Gaussian and 16 around it, whose corrections are judged together
+SPARSE = 0.3  # of the views: a splat of the scene fills nearly all of them
+LOOKED_AT = 32, 2_000  # views, and features of each, that the working directions are found in
+
+
+@dataclass(frozen=True)
+class UpliftConfig:
+    """How maps become features of Gaussians. The defaults change no Gaussian; `UpliftConfig.field()` makes a small field."""
+
+    max_gaussians: int | None = None
+    """Prune and merge down to at most this many (`merge_gaussians`). None keeps every Gaussian as it is."""
+    keep: float = 0.995
+    """Share of the fused features' variation beside their main direction that the latents must hold: decides their number."""
+    max_latents: int = 32
+    """Most latents of a Gaussian."""
+    corrections: int = 1
+    """Passes of SIRT over all views, and one more after merging if there is any. A second one wins a little where maps are
+    blurred, and costs as much where they are sharp and noisy."""
+    pixels: int = 80_000
+    """Most pixels of a working view. Maps are rendered at the largest whole multiple of their size within it, and larger maps are
+    shrunk to a whole fraction of theirs."""
+    faint: float = FAINT
+    """Before merging, the faintest Gaussians are dropped that together fill this share of all pixels (`merge_gaussians`)."""
+
+    def __post_init__(self) -> None:
+        if self.max_gaussians is not None:
+            check_whole("max_gaussians", self.max_gaussians, 1)
+        check_range("keep", self.keep, 0, 1, closed=(False, True))
+        check_range("faint", self.faint, 0, 1, closed=(True, False))
+        check_whole("max_latents", self.max_latents, 1)
+        check_whole("corrections", self.corrections, 0)
+        check_whole("pixels", self.pixels, 64)
+
+    @staticmethod
+    def field(**changes: Any) -> UpliftConfig:
+        """At most 30,000 Gaussians, as the paper's semantic fields have; other values as given."""
+        return UpliftConfig(**({"max_gaussians": 30_000} | changes))
+
+
+@dataclass(frozen=True, eq=False)
+class Uplifted:
+    """Gaussians with fused features, and how sure these are."""
+
+    gaussians: Gaussians
+    """With latents as features; all-zero where no view shows the Gaussian."""
+    latents: LinearLatents
+    """What the latents stand for."""
+    pixels: Tensor  # [N]
+    """How many pixels the Gaussian fills, in all views together."""
+    agreement: Tensor  # [N] in [0, 1]
+    """Length of the mean of the unit features that it was shown with: 1 where all pixels said the same, 0 = never shown. Of
+    merged Gaussians the mean of their members'."""
+
+
+def uplift_maps(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    maps: FeatureMaps,  # C maps [h, w, D]
+    config: UpliftConfig | None = None,
+    *,
+    generator: torch.Generator | None = None,
+    scratch: Path | None = None,
+    progress: bool = False,
+    report: Callable[[str], None] | None = None,
+) -> Uplifted:
+    """Average feature maps onto Gaussians by rendering weight, correct for blending, and keep few linear latents.
+
+    Features count by direction. No class is used anywhere, so the result answers any words. Each map is read once for the
+    average and, for at most 32 views, once before to find the working directions. In memory are 2 x [N, 65] numbers; the maps in
+    the working directions, at most 10 MB each, lie in files.
+
+    Args:
+        gaussians: any cloud in the cameras' frame; colours and features that it has are not used.
+        cameras: C posed cameras without distortion.
+        maps: one per camera, covering its picture at any size; all-zero features say nothing about their pixel.
+        config: see `UpliftConfig`.
+        generator: draws the first centres of merging; None stands for seed 0.
+        scratch: a folder of these maps alone for these files: those that a killed process left there are not made again. The
+            caller deletes it. None: a temporary folder.
+        progress: show a bar.
+        report: receives a line per step.
+
+    Raises:
+        ValueError: if counts or shapes disagree, a map is not finite, or no view shows any Gaussian.
+
+    Note:
+        To train on from here, start `fit_field` with `GaussianParams.from_gaussians(found.gaussians)` and give it the maps
+        `found.latents.encode(unit features)`.
+    """
+    config, say = config or UpliftConfig(), report or (lambda text: None)
+    if len(gaussians) == 0:
+        raise ValueError("gaussians: expected at least one, got none; there is nothing to carry features to")
+    if len(cameras) == 0 or len(cameras) != len(maps):
+        raise ValueError(
+            f"maps: expected one per camera ({len(cameras)}, at least one), got {len(maps)}; pass the views that have maps"
+        )
+    cloud = gaussians.replace(sh=None, features=None, labels=None).detach()
+    cloud = cloud.to(torch.promote_types(cloud.means.dtype, torch.float32))
+    steps = len(cameras) * (1 + config.corrections + (config.max_gaussians is not None and config.corrections > 0))
+    with torch.no_grad(), tqdm(total=steps, desc="uplift", unit="view", disable=not progress) as bar:
+        directions = _working_directions(maps).to(cloud.means)
+        with _Views(cameras, maps, directions, config.pixels, scratch) as views:
+            sums, shown = _average(cloud, views, bar)
+            if not bool((shown > 0).any()):
+                raise ValueError(
+                    "cameras: expected views that show the Gaussians, got none that does; do both share one frame?"
+                )
+            filled = float(shown.sum()) / sum(camera.width * camera.height for camera in cameras)
+            if filled < SPARSE:
+                say(f"note: the Gaussians fill {filled:.0%} of the views; are they in the cameras' frame?")
+            average = _mean(sums)
+            agreement = row_norms(average).clamp_max(1)
+            chosen = fit_linear_latents(
+                unit_rows(average), _capped(shown), keep=config.keep, maximum=config.max_latents
+            )
+            views.project(chosen.basis)
+            sums = torch.cat([sums[..., :-1] @ chosen.basis, sums[..., -1:]], dim=-1)
+            latents = LinearLatents((directions.double() @ chosen.basis.double()).to(directions))
+            say(f"fused {len(cameras)} maps of {latents.dim} channels as {latents.latent} latents")
+            for _ in range(config.corrections):
+                sums = _correct(cloud, sums, views, bar)
+            if config.max_gaussians is not None:
+                merged = merge_gaussians(
+                    cloud.replace(features=_mean(sums)),
+                    shown,
+                    config.max_gaussians,
+                    faint=config.faint,
+                    generator=generator,
+                )
+                say(f"{len(merged.gaussians)} of {len(cloud)} Gaussians left")
+                cloud, agreement = merged.gaussians, _pooled(agreement * shown, merged) / _some(merged.weights)
+                sums, shown = torch.stack([_pooled(half, merged) for half in sums]), merged.weights
+                if config.corrections:
+                    sums = _correct(cloud, sums, views, bar)
+    return Uplifted(cloud.replace(features=_mean(sums)), latents, shown, agreement)
+
+
+class _Views:
+    """The maps at their working size, in few directions, each kept in a file."""
+
+    def __init__(
+        self, cameras: Sequence[Camera], maps: FeatureMaps, directions: Tensor, pixels: int, scratch: Path | None
+    ) -> None:
+        self._cameras, self._maps, self._directions, self._pixels = cameras, maps, directions, pixels
+        self._temporary = tempfile.TemporaryDirectory(prefix="kfgs_") if scratch is None else None
+        self._folder = Path(self._temporary.name) if self._temporary is not None else Path(scratch or "")
+        self._basis: Tensor | None = None
+
+    def __enter__(self) -> _Views:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._temporary is not None:
+            self._temporary.cleanup()
+
+    def __len__(self) -> int:
+        return len(self._cameras)
+
+    @property
+    def channels(self) -> int:
+        """Of the maps as they are given now."""
+        return int((self._directions if self._basis is None else self._basis).shape[1])
+
+    def project(self, basis: Tensor) -> None:  # [d', d]
+        """From now on give maps in these directions of the working ones."""
+        self._basis = basis
+
+    def __getitem__(self, i: int) -> tuple[Camera, Tensor, int, float]:
+        """The working camera, the map [h, w, d] (NaN where nothing is known), by what to shrink, and pixels per pixel."""
+        kept, shape = self._keep(i)
+        h, w, _ = kept.shape
+        camera = self._cameras[i]
+        largest = min(camera.height // h, camera.width // w)
+        factor = max(1, min(largest, int((self._pixels / (h * w)) ** 0.5)))
+        features = kept if self._basis is None else kept @ self._basis
+        # (width, height) of the whole picture in working pixels: not whole if some at the right or bottom were left over
+        span = shape.flip(0) / (int(shape[0]) // h) * factor / torch.tensor([camera.width, camera.height])
+        K = camera.K.to(features) * torch.cat([span, torch.ones(1)]).to(features)[:, None]
+        working = replace(camera.to(features), K=K, width=w * factor, height=h * factor)
+        return working, features, factor, 1 / float(span.prod())
+
+    def _keep(self, i: int) -> tuple[Tensor, Tensor]:  # [h, w, d'], [2]
+        """The map in the working directions, and the (height, width) that it had; made once, then read."""
+        file = self._folder / f"{i}.npz"
+        if not file.is_file():
+            rows, shape = self._make(i)
+            with atomic_path(file) as path, path.open("wb") as opened:
+                np.savez(opened, rows=rows.to(torch.float16).cpu().numpy(), shape=np.asarray(shape))
+            return rows, torch.tensor(shape, dtype=torch.float64)
+        with np.load(file, allow_pickle=False) as found:
+            rows = torch.from_numpy(found["rows"].astype(np.float32)).to(self._directions)
+            return rows, torch.from_numpy(found["shape"]).double()
+
+    def _make(self, i: int) -> tuple[Tensor, tuple[int, int]]:  # [h, w, d']
+        """Read a map, take unit features in the working directions, and shrink it to its working size."""
+        features = self._maps[i]
+        check_shapes((f"maps[{i}]", features, ("h", "w", len(self._directions))))
+        features = features.to(self._directions)
+        lengths = row_norms(features)
+        if not bool(torch.isfinite(lengths).all()):
+            raise ValueError(f"maps[{i}]: expected finite features, got NaN or infinity; encode that image again")
+        known = (lengths > EPS)[..., None]
+        rows = (features @ self._directions) / lengths.clamp_min(EPS)[..., None] * known
+        height, width = rows.shape[:2]
+        shrink = 1
+        while (height // shrink) * (width // shrink) > self._pixels and shrink < min(height, width):
+            shrink += 1
+        if shrink > 1:
+            rows, share = shrink_map(rows, shrink), shrink_map(known.to(rows), shrink)
+            rows, known = rows / share.clamp_min(EPS), share > 0.5
+        return torch.where(known, rows, torch.nan).contiguous(), (height, width)
+
+
+def _working_directions(maps: FeatureMaps) -> Tensor:  # [D, d']
+    """The main directions of unit features, found in samples of some evenly spread maps."""
+    most, samples = LOOKED_AT
+    views = sorted({round(i) for i in np.linspace(0, len(maps) - 1, min(most, len(maps)))})
+    moment: Tensor | float = 0.0
+    for i in views:
+        grid: Callable[..., Tensor] | None = getattr(maps, "grid", None)
+        channels = "D" if isinstance(moment, float) else len(moment)
+        if grid is None:
+            whole = maps[i]
+            check_shapes((f"maps[{i}]", whole, ("h", "w", channels)))
+            rows = sample_grid(whole, samples=samples)
+        else:
+            rows = grid(i, None, samples)
+            check_shapes((f"maps[{i}]", rows, ("n", channels)))
+        rows = unit_rows(rows.float())
+        if not bool(torch.isfinite(rows).all()):
+            raise ValueError(f"maps[{i}]: expected finite features, got NaN or infinity; encode that image again")
+        moment = moment + rows.T @ rows
+    assert isinstance(moment, Tensor)
+    values, directions = principal_directions(moment)
+    if not float(values[0]) > 0:
+        raise ValueError(f"maps: expected nonzero features, got {len(maps)} all-zero maps; check the teacher")
+    return directions[:, :WORKING].float()
+
+
+def _add(cloud: Gaussians, camera: Camera, signal: Tensor, sums: Tensor) -> None:  # [h, w, c], [N, c + 1]
+    """Add the signal of one view to the sums by rendering weight, and in the last column the weight of its known pixels."""
+    known = ~signal[..., :1].isnan()
+    both = torch.cat([torch.where(known, signal, 0), known.to(signal)], dim=-1)
+    both = resize_map(both, camera.size).contiguous()
+    index, total, _ = sum_pixels(cloud, camera, both)
+    sums.index_add_(0, index, total)
+
+
+def _average(cloud: Gaussians, views: _Views, bar: Any) -> tuple[Tensor, Tensor]:  # [2, N, d' + 1], [N]
+    """Sums of features and of weights over the even and over the odd views, and the pixels that each Gaussian fills."""
+    sums, shown = cloud.means.new_zeros(2, len(cloud), views.channels + 1), torch.zeros_like(cloud.opacities)
+    for i in range(len(views)):
+        camera, features, _, scale = views[i]
+        before = sums[i % 2, :, -1].clone()
+        _add(cloud, camera, features, sums[i % 2])
+        shown += scale * (sums[i % 2, :, -1] - before)
+        bar.update()
+    return sums, shown
+
+
+def _correct(cloud: Gaussians, sums: Tensor, views: _Views, bar: Any) -> Tensor:  # [2, N, d + 1]
+    """One pass of SIRT: add to each Gaussian's feature the mean, by weight, of what its pixels lack, without the noise.
+
+    The even and the odd views make a reconstruction each, from their own maps alone. How well the two corrections agree
+    among neighbours tells signal from noise (`_reliability`), and both take the reliable share.
+    """
+    weights = sums[..., -1:]
+    halves = sums[..., :-1] / _some(weights)
+    lacking = torch.zeros_like(sums)
+    for i in range(len(views)):
+        camera, features, factor, _ = views[i]
+        rendered, alpha, _ = rasterize(cloud.replace(features=halves[i % 2]), camera)
+        covered = shrink_map(alpha[..., None], factor)  # the rest of the pixel is empty: no Gaussian can explain it
+        _add(cloud, camera, covered * features - shrink_map(rendered, factor), lacking[i % 2])
+        bar.update()
+    corrections = lacking[..., :-1] / _some(lacking[..., -1:])
+    share = _reliability(corrections[0], corrections[1], _neighbours(cloud.means))
+    return torch.cat([(halves + share[:, None] * corrections) * weights, weights], dim=-1)
+
+
+def _reliability(one: Tensor, other: Tensor, near: Tensor) -> Tensor:  # [N, d] x 2, [N, k] -> [N] in [0, 1]
+    """The share of signal in the mean of two independent estimates: 2 r / (1 + r), the Spearman-Brown formula.
+
+    r is the common part of the estimates, sum of products over mean sum of squares, among a Gaussian and its neighbours. Below 0
+    it counts as 0, and so does that of Gaussians that one half of the views does not show.
+    """
+    products = (one * other).sum(1)[near].sum(1)
+    squares = (one.square().sum(1) + other.square().sum(1))[near].sum(1) / 2
+    r = (products / _some(squares)).clamp(0, 1)
+    return 2 * r / (1 + r)
+
+
+def _neighbours(means: Tensor) -> Tensor:  # [N, 3] -> [N, k] int64
+    """Each Gaussian and those nearest to it."""
+    places = means.detach().cpu().double().numpy()
+    count = min(NEIGHBOURS, len(places))
+    found = cKDTree(places).query(places, k=[*range(1, count + 1)], workers=-1)[1]
+    return torch.from_numpy(np.asarray(found)).to(means.device)
+
+
+def _mean(sums: Tensor) -> Tensor:  # [2, N, d + 1] -> [N, d]
+    """The mean feature over both halves of the views; 0 where none shows the Gaussian."""
+    whole = sums.sum(0)
+    return whole[:, :-1] / _some(whole[:, -1:])
+
+
+def _pooled(values: Tensor, merged: Merged) -> Tensor:  # [N, ...] -> [M, ...]
+    """Sums over the members of each merged Gaussian."""
+    rows = merged.source >= 0
+    sums = values.new_zeros(len(merged.gaussians), *values.shape[1:])
+    return sums.index_add_(0, merged.source[rows], values[rows])
+
+
+def _capped(weights: Tensor) -> Tensor:
+    """Weights held to their 0.99 quantile: a few wall-sized Gaussians must not choose all latents."""
+    sample = weights[weights > 0]
+    sample = sample[:: max(1, len(sample) // 100_000)]
+    return weights.clamp_max(torch.quantile(sample, 0.99))
+
+
+def _some(weights: Tensor) -> Tensor:
+    return weights.clamp_min(torch.finfo(weights.dtype).tiny)

@@ -1,0 +1,174 @@
+"""The stages of the default method: Gaussians that are sharp, features fused onto them, and answers of trained fields."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file, save_file
+
+from .._files import write_json
+from ..cameras import Camera
+from ..fields import Answers, Seen, SemanticField, UpliftConfig, fused_answers, remember, uplift_maps
+from ..formats import SplatFile, read_splats
+from ..gaussians import Gaussians
+from ..quant import LinearLatents
+from ..scenes import Scene
+from .color import ColorConfig, find_color, fit_color
+from .digests import digest_tensors, stage_generator
+from .maps import Maps, UndistortedMaps, check_readable
+from .stages import Run
+
+SHAPE = ("means", "quats", "scales", "opacities")
+
+
+def find_geometry(
+    run: Run,
+    scene: Scene,
+    splat: Gaussians | SplatFile | str | Path | None,
+    config: ColorConfig,
+    device: torch.device,
+    options: dict[str, Any],
+) -> tuple[Gaussians, str]:
+    """The Gaussians to fuse onto, and where they come from.
+
+    Without a splat they are the colour field of the run, whose stage is found again; one that was trained by `fit_color` with
+    other options of the same scene, as `kfgs color` does, is taken as it is.
+    """
+    if isinstance(splat, Gaussians):
+        return splat, "given"
+    if isinstance(splat, SplatFile):
+        return splat.gaussians, "given"
+    if splat is not None:
+        return read_splats(splat).gaussians, str(splat)
+    found = find_color(run, scene, config)
+    if found is None:
+        made = fit_color(scene, run.folder, config, report=run.report, device=device, **options)
+        run.stages.extend(made.stages)
+        found = made.gaussians
+    return found, "trained on the pictures"
+
+
+def uplift_stage(
+    run: Run,
+    geometry: Gaussians,
+    cameras: Sequence[Camera],
+    maps: Maps,
+    features: dict[str, Any],
+    config: UpliftConfig,
+    seed: int,
+    progress: bool,
+) -> SemanticField:
+    """Fuse the maps onto the Gaussians, merge and compress, as a stage of a run."""
+    inputs = {
+        "geometry": digest_tensors(*(getattr(geometry, name) for name in SHAPE)),
+        "cameras": _digest_cameras(cameras),
+        "features": features,
+        "config": asdict(config),
+        "seed": seed,
+    }
+
+    scratch = run.scratch("uplift", {"features": features, "cameras": inputs["cameras"], "pixels": config.pixels})
+
+    def make(folder: Path) -> None:
+        check_readable(maps, "the uplift")
+        options: dict[str, Any] = {"scratch": scratch, "progress": progress, "report": run.report}
+        generator = stage_generator(seed, "uplift")
+        found = uplift_maps(geometry.to("cpu"), cameras, maps, config, generator=generator, **options)
+        cloud = found.gaussians
+        tensors = {name: getattr(cloud, name) for name in (*SHAPE, "features")}
+        tensors |= {"basis": found.latents.basis, "pixels": found.pixels, "agreement": found.agreement}
+        save_file({name: value.cpu().contiguous() for name, value in tensors.items()}, folder / "uplift.safetensors")
+        write_json(folder / "facts.json", {"gaussians": len(cloud), "latents": found.latents.latent})
+
+    stage = run.stage("uplift", inputs, make)
+    shutil.rmtree(scratch, ignore_errors=True)
+    tensors = load_file(stage.folder / "uplift.safetensors")
+    return SemanticField(
+        Gaussians(**{name: tensors[name] for name in (*SHAPE, "features")}),
+        linear=LinearLatents(tensors["basis"]),
+        seen=Seen(tensors["pixels"], tensors["agreement"]),
+        cameras=tuple(cameras),
+    )
+
+
+def uplift(
+    scene: Scene,
+    maps: Maps,  # teacher maps of the views of `split`, in their order
+    splat: Gaussians | SplatFile | SemanticField | str | Path,
+    config: UpliftConfig | None = None,
+    *,
+    split: str = "train",
+    undistorted_features: bool = False,
+    seed: int = 0,
+    folder: str | Path | None = None,
+    progress: bool = False,
+    report: Callable[[str], None] | None = None,
+) -> SemanticField:
+    """Give the Gaussians of any splat or field the features of a teacher, without training (`fields.uplift_maps`).
+
+    Args:
+        scene: posed, undistorted views in the splat's frame.
+        maps: one teacher map per view of `split`, of the pictures as they were taken; read one at a time.
+        splat: the Gaussians, a splat file or its content, or a field.
+        config: see `UpliftConfig`; by default every Gaussian is kept as it is.
+        split: which views.
+        undistorted_features: whether the teacher saw undistorted pictures; otherwise the lens is removed from its maps.
+        seed: of merging, if Gaussians are merged.
+        folder: where the field will be saved: what it remembers of the scene is relative to it.
+        progress: show a bar.
+        report: receives a line per step.
+
+    Raises:
+        ValueError: if counts disagree, a camera has distortion, or no view shows any Gaussian.
+    """
+    views = scene.views(split)
+    if scene.distorted:
+        raise ValueError("scene: expected cameras without distortion, got a lens; pass scene.undistorted()")
+    if isinstance(splat, str | Path):
+        splat = read_splats(splat)
+    cloud = splat if isinstance(splat, Gaussians) else splat.gaussians
+    lenses = [] if scene.lenses is None else [scene.lenses[i] for i in views]
+    straight = UndistortedMaps(maps, lenses) if lenses and not undistorted_features else maps
+    cameras = tuple(scene.cameras[i] for i in views)
+    generator = stage_generator(seed, "uplift")
+    found = uplift_maps(
+        cloud.to("cpu"), cameras, straight, config, generator=generator, progress=progress, report=report
+    )
+    teacher = getattr(maps, "identity", None)
+    info = {
+        "method": "uplift",
+        "views": [camera.name for camera in cameras],
+        **({"teacher": teacher} if teacher else {}),
+        **({} if folder is None or scene.folder is None else remember(scene.folder, Path(folder))),
+        "kfgs": version("kfgs"),
+    }
+    seen = Seen(found.pixels, found.agreement)
+    place = None if folder is None else Path(folder)
+    return SemanticField(found.gaussians, info=info, linear=found.latents, seen=seen, cameras=cameras, folder=place)
+
+
+def answers_stage(run: Run, field: SemanticField, cameras: Sequence[Camera]) -> SemanticField:
+    """Find what each Gaussian of a trained field answers with, as a stage of a run."""
+    field_stage = next(stage for stage in reversed(run.stages) if stage.name == "field")
+    inputs = {"field": field_stage.key}
+
+    def make(folder: Path) -> None:
+        found = fused_answers(field.gaussians, field.codebook, field.autoencoder, cameras)
+        tensors = {"latents": found.latents, "basis": found.linear.basis, **found.seen._asdict()}
+        save_file({name: value.cpu().contiguous() for name, value in tensors.items()}, folder / "answers.safetensors")
+
+    tensors = load_file(run.stage("answers", inputs, make).folder / "answers.safetensors")
+    seen = Seen(tensors["pixels"], tensors["agreement"])
+    return field.with_answers(cameras, Answers(tensors["latents"], LinearLatents(tensors["basis"]), seen))
+
+
+def _digest_cameras(cameras: Sequence[Camera]) -> str:
+    rows = [tensor for camera in cameras for tensor in (camera.viewmat, camera.K)]
+    facts = torch.tensor([[camera.width, camera.height, camera.near] for camera in cameras], dtype=torch.float64)
+    return digest_tensors(*rows, facts)

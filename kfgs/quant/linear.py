@@ -1,0 +1,146 @@
+"""Latents that are linear in the feature: blends stay right, and a class is scored without a decoder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .._check import check_range, check_shapes, check_whole
+from .codebook import unit_rows
+
+NOISE = 1e-10  # of the first eigenvalue: what float32 rounding puts into a direction that the data do not have
+
+
+@dataclass(frozen=True, eq=False)
+class LinearLatents:
+    """Features f of D channels as d numbers z, with f = B z and orthonormal columns of B.
+
+    Rendering blends latents, and B of a blend is the blend of the features. A cosine needs no feature either:
+    f·t / |f| = z·(Bᵀ t) / |z|, d products whatever D is. There is no mean to add: B's first column is close to it.
+    """
+
+    basis: Tensor  # B [D, d]
+
+    def __post_init__(self) -> None:
+        sizes = check_shapes(("basis", self.basis, "D d"))
+        if not 1 <= sizes["d"] <= sizes["D"]:
+            raise ValueError(
+                f"basis: expected [D, d] with 1 <= d <= D, got {tuple(self.basis.shape)}; one column per latent"
+            )
+        gram = self.basis.detach().T @ self.basis.detach()
+        if not bool((gram - torch.eye(sizes["d"]).to(gram)).abs().max() < 1e-3):
+            raise ValueError("basis: expected orthonormal columns, got others; make one with fit_linear_latents")
+
+    @property
+    def dim(self) -> int:
+        """Channels of a feature, D."""
+        return int(self.basis.shape[0])
+
+    @property
+    def latent(self) -> int:
+        """Channels of a latent, d."""
+        return int(self.basis.shape[1])
+
+    def encode(
+        self,
+        features: Tensor,  # [..., D]
+    ) -> Tensor:  # [..., d]
+        """The latents of features: Bᵀ f, the least-squares ones."""
+        _check_last("features", features, self.dim)
+        return features @ self.basis.to(features)
+
+    def decode(
+        self,
+        latents: Tensor,  # [..., d]
+    ) -> Tensor:  # [..., D]
+        """The features of latents, B z, as long as the latents are."""
+        _check_last("latents", latents, self.latent)
+        return latents @ self.basis.T.to(latents)
+
+    def cosines(
+        self,
+        latents: Tensor,  # [..., d]
+        rows: Tensor,  # [C, D] unit rows
+    ) -> Tensor:  # [..., C]
+        """The cosine of each decoded feature with some unit rows; 0 for an all-zero latent. No feature is made."""
+        _check_last("latents", latents, self.latent)
+        return unit_rows(latents) @ (rows.to(latents) @ self.basis.to(latents)).T
+
+    def to(self, *args: Any, **kwargs: Any) -> LinearLatents:
+        """Move or convert the basis as `Tensor.to` does."""
+        return LinearLatents(self.basis.to(*args, **kwargs))
+
+    def to_tensors(self) -> dict[str, Tensor]:
+        """What `from_tensors` needs."""
+        return {"basis": self.basis}
+
+    @staticmethod
+    def from_tensors(tensors: Mapping[str, Tensor]) -> LinearLatents:
+        """The latents that `to_tensors` took apart; other names are ignored."""
+        return LinearLatents(tensors["basis"])
+
+
+def principal_directions(
+    moment: Tensor,  # [D, D] sum of w f fᵀ
+) -> tuple[Tensor, Tensor]:  # [D], [D, D]
+    """Eigenvalues of a second moment, the largest first, and their directions as columns.
+
+    The sign of a column makes its entry of largest magnitude positive, so that the same data give the same latents.
+    """
+    values, vectors = torch.linalg.eigh(moment.double())
+    values, vectors = values.flip(0).clamp_min(0), vectors.flip(1)
+    largest = vectors.abs().argmax(dim=0)
+    signs = torch.sign(vectors[largest, torch.arange(len(largest), device=largest.device)])
+    return values, vectors * signs
+
+
+def fit_linear_latents(
+    features: Tensor,  # [n, D]
+    weights: Tensor | None = None,  # [n]
+    *,
+    keep: float = 0.99,
+    minimum: int = 1,
+    maximum: int | None = None,
+) -> LinearLatents:
+    """The fewest latents that keep a stated share of the features' variation about their mean direction.
+
+    Args:
+        features: their length counts as a weight; normalise rows that should count alike.
+        weights: of the rows; 1 if None.
+        keep: share in (0, 1] of the energy beyond the first direction that the other latents must hold.
+        minimum: fewest latents.
+        maximum: most latents, whatever `minimum` says; D if None.
+
+    Raises:
+        ValueError: if shapes disagree, an option is out of range, a number is not finite, or there is nothing but zeros.
+    """
+    sizes = check_shapes(("features", features, "n D"), ("weights", weights, "n"))
+    check_range("keep", keep, 0, 1, closed=(False, True))
+    check_whole("minimum", minimum, 1)
+    if maximum is not None:
+        check_whole("maximum", maximum, 1)
+    maximum = sizes["D"] if maximum is None else min(sizes["D"], maximum)
+    rows = features.double()
+    moment = rows.T @ (rows if weights is None else rows * weights.double()[:, None])
+    if not bool(torch.isfinite(moment).all()):
+        raise ValueError("features, weights: expected finite numbers, got NaN or infinity; encode those images again")
+    values, vectors = principal_directions(moment)
+    values = values * (values > NOISE * values[0])
+    if not float(values[0]) > 0:
+        raise ValueError(f"features: expected a nonzero row, got {sizes['n']} all-zero rows; check the teacher")
+    beyond = values[1:].cumsum(0)
+    enough = 1 + int((beyond < keep * beyond[-1]).sum()) + 1 if len(beyond) and float(beyond[-1]) > 0 else 1
+    count = max(1, min(maximum, max(minimum, enough)))
+    return LinearLatents(vectors[:, :count].to(features))
+
+
+def _check_last(name: str, values: Tensor, channels: int) -> None:
+    if values.ndim < 1 or values.shape[-1] != channels:
+        raise ValueError(
+            f"{name}: expected [..., {channels}] (from the basis), got {tuple(values.shape)}; pass what belongs to the same "
+            "field"
+        )

@@ -1,0 +1,294 @@
+import math
+
+import numpy as np
+import oracles_merge
+import pytest
+import torch
+
+from kfgs.fields import merge_gaussians as merge_any
+from kfgs.gaussians import Gaussians
+from kfgs.splat import covariance_3d
+
+
+def merge_gaussians(*args, **options):
+    """Without dropping the faintest, so that each Gaussian can be followed."""
+    return merge_any(*args, faint=0.0, **options)
+
+
+def random_cloud(n=300, channels=5, kinds=4, seed=0):
+    """Gaussians in a box, with features around a few directions."""
+    g = torch.Generator().manual_seed(seed)
+    features = torch.eye(kinds, channels)[torch.randint(kinds, (n,), generator=g)]
+    cloud = Gaussians(
+        means=torch.rand(n, 3, generator=g) * torch.tensor([4.0, 2.0, 3.0]) - 1,
+        quats=torch.randn(n, 4, generator=g),
+        scales=0.01 + 0.2 * torch.rand(n, 3, generator=g),
+        opacities=0.1 + 0.8 * torch.rand(n, generator=g),
+        features=features + 0.05 * torch.randn(n, channels, generator=g),
+    )
+    return cloud, 0.6 + 5 * torch.rand(n, generator=g)
+
+
+def balls(means, features, scale=0.1, opacity=0.3):
+    n = len(means)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1)
+    return Gaussians(
+        torch.as_tensor(means, dtype=torch.float32),
+        quats,
+        torch.full((n, 3), scale),
+        torch.full((n,), opacity),
+        torch.as_tensor(features, dtype=torch.float32),
+    )
+
+
+def covariances(cloud):
+    return covariance_3d(cloud.quats, cloud.scales)
+
+
+def test_two_equal_balls_become_their_mixture():
+    """Two balls of deviation s at -a and +a along x: variances s^2 + a^2, s^2, s^2. The opacity keeps 2 o s^2 = o' s A."""
+    a, s, o = 0.05, 0.1, 0.3
+    cloud = balls([[1 - a, 2, 3], [1 + a, 2, 3]], [[1, 0], [0.8, 0.6]], s, o)
+    merged = merge_gaussians(cloud, torch.tensor([2.0, 2.0]), 1, clusters=1)
+    assert merged.source.tolist() == [0, 0]
+    assert merged.weights.tolist() == [4.0]
+    found = merged.gaussians
+    torch.testing.assert_close(found.means, torch.tensor([[1.0, 2.0, 3.0]]))
+    torch.testing.assert_close(covariances(found)[0], torch.diag(torch.tensor([s * s + a * a, s * s, s * s])))
+    torch.testing.assert_close(found.scales[0].sort().values, torch.tensor([s, s, math.hypot(s, a)]))
+    assert found.opacities.item() == pytest.approx(2 * o * s * s / (s * math.hypot(s, a)), rel=1e-5)
+    torch.testing.assert_close(found.features, torch.tensor([[0.9, 0.3]]))
+    assert torch.linalg.vector_norm(found.quats).item() == pytest.approx(1, abs=1e-5)
+
+
+def test_weights_move_the_mixture():
+    cloud = balls([[0, 0, 0], [0.4, 0, 0]], [[1, 0], [0, 1]])
+    merged = merge_gaussians(cloud, torch.tensor([3.0, 1.0]), 1, clusters=1)
+    torch.testing.assert_close(merged.gaussians.means, torch.tensor([[0.1, 0, 0]]))
+    torch.testing.assert_close(merged.gaussians.features, torch.tensor([[0.75, 0.25]]))
+
+
+@pytest.mark.parametrize(("opacity", "expected"), [(0.9, 0.99), (0.001, 0.05)])
+def test_opacity_stays_between_its_bounds(opacity, expected):
+    cloud = balls([[0, 0, 0]] * 2, [[1, 0]] * 2, opacity=opacity)
+    assert merge_gaussians(cloud, torch.ones(2), 1).gaussians.opacities.tolist() == pytest.approx([expected])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_every_group_is_the_mixture_of_its_members(seed):
+    cloud, weights = random_cloud(seed=seed)
+    merged = merge_gaussians(cloud, weights, 60)
+    assert 30 < len(merged.gaussians) <= 60
+    parts = [
+        x.double().numpy() for x in (cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.features, weights)
+    ]
+    spreads = covariances(merged.gaussians).double().numpy()
+    for k in range(len(merged.gaussians)):
+        members = [i for i, group in enumerate(merged.source.tolist()) if group == k]
+        mean, spread, opacity, feature = oracles_merge.merged(*parts, members)
+        np.testing.assert_allclose(merged.gaussians.means[k].numpy(), mean, atol=2e-6)
+        np.testing.assert_allclose(spreads[k], spread, atol=2e-6)
+        np.testing.assert_allclose(merged.gaussians.features[k].numpy(), feature, atol=2e-6)
+        assert merged.gaussians.opacities[k].item() == pytest.approx(opacity, rel=2e-5)
+        assert merged.weights[k].item() == pytest.approx(sum(parts[5][i] for i in members), rel=1e-5)
+
+
+def test_what_is_few_enough_stays_as_it_is():
+    cloud, weights = random_cloud(20)
+    cloud = cloud.replace(sh=torch.zeros(20, 1, 3), labels=torch.zeros(20, dtype=torch.int64))
+    merged = merge_gaussians(cloud, weights, 20)
+    assert merged.source.tolist() == list(range(20))
+    assert torch.equal(merged.weights, weights)
+    for name in ("means", "quats", "scales", "opacities", "features"):
+        assert torch.equal(getattr(merged.gaussians, name), getattr(cloud, name))
+    assert merged.gaussians.sh is None  # its colours and labels were of another cloud
+    assert merged.gaussians.labels is None
+
+
+def test_the_faintest_are_dropped_as_far_as_their_share_goes():
+    """Weights 1 to 10 add up to 55: a tenth of it holds 1 and 2, but not 3 as well."""
+    cloud, _ = random_cloud(10)
+    weights = torch.tensor([4.0, 2, 10, 6, 1, 8, 3, 9, 7, 5])
+    assert (merge_any(cloud, weights, 9, faint=0.1).source < 0).nonzero()[:, 0].tolist() == [1, 4]
+    assert (merge_any(cloud, weights, 9, faint=0.0).source >= 0).all()
+    assert (merge_any(cloud, weights, 10, faint=0.9).source >= 0).all()  # none is too many
+    assert len(merge_any(cloud, torch.ones(10), 9, faint=0.99).gaussians) >= 1
+
+
+def test_splitting_every_gaussian_drops_no_more_of_what_is_shown():
+    """Ten copies of each with a tenth of its weight: what is kept shows the same."""
+    cloud, weights = random_cloud(200)
+    ten = Gaussians(
+        **{name: value.repeat(10, *[1] * (value.ndim - 1)) for name, value in vars(cloud).items() if value is not None}
+    )
+    whole = merge_any(cloud, weights, 150)
+    split = merge_any(ten, weights.repeat(10) / 10, 150)
+    for merged in (whole, split):
+        assert 0.93 * float(weights.sum()) < float(merged.weights.sum()) < float(weights.sum())
+    assert float(split.weights.sum()) == pytest.approx(float(whole.weights.sum()), rel=0.01)
+
+
+def test_gaussians_without_weight_are_dropped_even_when_all_weights_are_allowed():
+    cloud, weights = random_cloud(30)
+    weights[10:] = 0
+    merged = merge_gaussians(cloud, weights, 5)
+    assert (merged.source[10:] == -1).all()
+    assert (merged.source[:10] >= 0).all()
+    for name in ("means", "quats", "scales", "opacities", "features"):
+        assert torch.isfinite(getattr(merged.gaussians, name)).all(), name
+
+
+@pytest.mark.parametrize("maximum", [1, 2, 7, 50, 150, 299])
+def test_at_most_maximum_are_left_and_no_weight_is_lost(maximum):
+    cloud, weights = random_cloud(kinds=5)
+    weights[::10] = 0.1
+    merged = merge_gaussians(cloud, weights, maximum)
+    assert 1 <= len(merged.gaussians) <= maximum
+    kept = weights > 0
+    assert torch.equal(merged.source >= 0, kept)
+    torch.testing.assert_close(merged.weights.sum(), weights[kept].sum())
+    sums = torch.zeros(len(merged.gaussians)).index_add_(0, merged.source[kept], weights[kept])
+    torch.testing.assert_close(merged.weights, sums)  # `source` is a map onto 0 ... M - 1
+    assert (sums > 0).all()
+
+
+def all_in_one_place(n, g):
+    return torch.full((n, 3), 7.0)
+
+
+def in_five_places(n, g):
+    return torch.randn(5, 3, generator=g)[torch.arange(n) % 5]
+
+
+def on_a_line(n, g):
+    return torch.linspace(0, 1, n)[:, None] * torch.tensor([1.0, 0, 0])
+
+
+def with_far_outliers(n, g):
+    means = torch.rand(n, 3, generator=g)
+    means[0], means[1] = 1e6, -1e6
+    return means
+
+
+def far_from_the_origin(n, g):
+    return 1e4 + torch.rand(n, 3, generator=g)
+
+
+@pytest.mark.parametrize(
+    "places", [all_in_one_place, in_five_places, on_a_line, with_far_outliers, far_from_the_origin]
+)
+@pytest.mark.parametrize("maximum", [1, 3, 40])
+def test_difficult_clouds_stay_below_the_maximum_as_well(places, maximum):
+    """Each Gaussian has a feature of its own, so that there are 64 kinds in one place."""
+    n, g = 200, torch.Generator().manual_seed(0)
+    cloud, _ = random_cloud(n)
+    cloud = cloud.replace(means=places(n, g), features=torch.randn(n, 30, generator=g))
+    merged = merge_gaussians(cloud, torch.ones(n), maximum)
+    assert 1 <= len(merged.gaussians) <= maximum
+    for name in ("means", "quats", "scales", "opacities", "features"):
+        assert torch.isfinite(getattr(merged.gaussians, name)).all(), name
+    assert (merged.gaussians.scales > 0).all()
+
+
+def test_what_lies_apart_stays_apart_in_a_grid_of_more_cubes_than_numbers():
+    """40 would be allowed, so the search ends at its finest edge, with 2^23 cubes along y and z. The number of a cube in a
+    single int64, (x * 2^23 + y) * 2^23 + z, would be the same for x = 0 and x = 2^18."""
+    edge = 1.001 / 2**24
+    far = (2**23 - 0.5) * edge
+    near = (2**18 + 0.5) * edge
+    places = torch.tensor([[0, 0, 0], [near, 0, 0], [1, 0, 0], [0, far, 0], [0, 0, far]], dtype=torch.float64)
+    cloud = balls(torch.zeros(200, 3), torch.ones(200, 2)).to(torch.float64)
+    cloud = cloud.replace(means=places[torch.arange(200) % 5])
+    merged = merge_gaussians(cloud, torch.ones(200).double(), 40)
+    assert len(merged.gaussians) == 5
+    torch.testing.assert_close(merged.gaussians.means[merged.source], cloud.means)
+
+
+def test_kinds_that_are_not_small_are_never_merged():
+    """Two kinds of equal weight in each of four places."""
+    places = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    cloud = balls(places.repeat(6, 1), torch.eye(2)[torch.arange(24) // 4 % 2])
+    merged = merge_gaussians(cloud, torch.ones(24), 8)
+    assert len(merged.gaussians) == 8
+    torch.testing.assert_close(merged.gaussians.features[merged.source], cloud.features)
+    torch.testing.assert_close(merged.gaussians.means[merged.source], cloud.means)
+
+
+@pytest.mark.parametrize(("light", "groups"), [(0.9, 1), (1.1, 2)])
+def test_a_fragment_joins_the_heaviest_kind_of_its_cube(light, groups):
+    """A kind with less than a quarter of the cube's weight is a fragment: 0.9 of 3.9, but not 1.1 of 4.1."""
+    cloud = balls([[0, 0, 0]] * 4, [[1, 0], [1, 0], [1, 0], [0, 1]])
+    weights = torch.tensor([1.0, 1.0, 1.0, light])
+    merged = merge_gaussians(cloud, weights, 3)
+    assert len(merged.gaussians) == groups
+    expected = (3 * torch.tensor([1.0, 0]) + light * torch.tensor([0.0, 1])) / (3 + light)
+    if groups == 1:
+        torch.testing.assert_close(merged.gaussians.features[0], expected)
+
+
+def test_a_fragment_alone_in_its_cube_stays():
+    """Its weight is little, but its cube holds nothing else."""
+    cloud = balls([[0, 0, 0]] * 3 + [[5, 0, 0]], [[1, 0], [1, 0], [1, 0], [0, 1]])
+    merged = merge_gaussians(cloud, torch.tensor([9.0, 9.0, 9.0, 0.6]), 3)
+    assert merged.gaussians.means.tolist() == [[0, 0, 0], [5, 0, 0]]
+    assert merged.gaussians.features.tolist() == [[1, 0], [0, 1]]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_order_of_gaussians_does_not_matter(seed):
+    """With one kind of feature; the first centres of k-means are drawn by position."""
+    cloud, weights = random_cloud(seed=seed)
+    order = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(seed))
+    one = merge_gaussians(cloud, weights, 60, clusters=1)
+    other = merge_gaussians(cloud.select(order), weights[order], 60, clusters=1)
+    assert torch.equal(other.source, one.source[order])
+    torch.testing.assert_close(other.weights, one.weights)
+    for name in ("means", "opacities", "features"):
+        torch.testing.assert_close(getattr(other.gaussians, name), getattr(one.gaussians, name))
+    torch.testing.assert_close(covariances(other.gaussians), covariances(one.gaussians), atol=1e-6, rtol=1e-4)
+
+
+def test_moving_the_cloud_moves_the_result():
+    cloud, weights = random_cloud()
+    shift = torch.tensor([8.0, -4.0, 16.0])  # whole powers of two: nothing is rounded away
+    cloud = cloud.replace(means=(cloud.means * 1024).round() / 1024)
+    one = merge_gaussians(cloud, weights, 60)
+    other = merge_gaussians(cloud.replace(means=cloud.means + shift), weights, 60)
+    assert torch.equal(one.source, other.source)
+    torch.testing.assert_close(other.gaussians.means, one.gaussians.means + shift)
+
+
+def test_the_same_input_gives_the_same_result_and_is_not_changed():
+    cloud, weights = random_cloud()
+    before = [value.clone() for value in (cloud.means, cloud.features, weights)]
+    one, other = (merge_gaussians(cloud, weights, 60) for _ in range(2))
+    assert torch.equal(one.source, other.source)
+    assert torch.equal(one.gaussians.means, other.gaussians.means)
+    seeded = merge_gaussians(cloud, weights, 60, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(seeded.source, one.source)  # None stands for seed 0
+    for old, new in zip(before, (cloud.means, cloud.features, weights), strict=True):
+        assert torch.equal(old, new)
+
+
+def test_merged_gaussians_keep_dtype():
+    cloud, weights = random_cloud(50)
+    found = merge_gaussians(cloud.to(torch.float64), weights.double(), 10).gaussians
+    for name in ("means", "quats", "scales", "opacities", "features"):
+        assert getattr(found, name).dtype == torch.float64, name
+
+
+def test_wrong_input_is_named():
+    cloud, weights = random_cloud(10)
+    with pytest.raises(ValueError, match=r"gaussians: expected features \[N, d\], got None; uplift some first"):
+        merge_gaussians(cloud.replace(features=None), weights, 5)
+    with pytest.raises(ValueError, match="weights: expected Gaussians that some view shows, got none; do"):
+        merge_gaussians(cloud, torch.zeros(10), 5)
+    with pytest.raises(ValueError, match=r"weights: expected \[N\] with N = 10 .*, got \(3,\)"):
+        merge_gaussians(cloud, torch.ones(3), 5)
+    for maximum in (0, 2.0):
+        with pytest.raises(ValueError, match="maximum: expected"):
+            merge_gaussians(cloud, weights, maximum)
+    with pytest.raises(ValueError, match="clusters: expected"):
+        merge_gaussians(cloud, weights, 5, clusters=0)
+    with pytest.raises(ValueError, match="faint: expected"):
+        merge_any(cloud, weights, 5, faint=1.0)

@@ -1,0 +1,529 @@
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import oracles_uplift
+import pytest
+import torch
+from cases_splat import a_camera, gaussians_before
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from kfgs import Camera, Gaussians
+from kfgs.cameras import resize_map
+from kfgs.fields import FieldConfig, GaussianParams, UpliftConfig, fit_field, uplift, uplift_maps
+from kfgs.fields.coarse import shrink_map
+from kfgs.labels import average_views
+from kfgs.quant import unit_rows
+from kfgs.splat import rasterize
+
+PLAIN = UpliftConfig(corrections=0, keep=1.0)  # the average alone, and as many latents as channels
+
+
+def cameras(n=4, width=13, height=10):
+    """Views from beside each other."""
+    base = a_camera(width, height, focal=(14.0, 12.0), principal=(5.3, 5.6))
+    moved = []
+    for i in range(n):
+        viewmat = base.viewmat.clone()
+        viewmat[:2, 3] += torch.tensor([0.3 * i, -0.2 * i])
+        moved.append(replace(base, viewmat=viewmat, name=f"view {i}"))
+    return moved
+
+
+def cloud(n=12, seed=0):
+    return gaussians_before(cameras()[0], n, seed=seed, depth=(2.0, 6.0), spread=0.9).replace(features=None)
+
+
+def random_maps(views, channels=5, size=None, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    return [torch.randn(*(size or view.size), channels, generator=g) for view in views]
+
+
+def ahead(n=1, size=8):
+    """A camera at the origin that looks along z, seen n times."""
+    K = torch.tensor([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]])
+    return [Camera(torch.eye(4), K, size, size, f"view {i}") for i in range(n)]
+
+
+def balls(means, scale=0.15, opacity=0.9):
+    n = len(means)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1)
+    return Gaussians(torch.tensor(means), quats, torch.full((n, 3), scale), torch.full((n,), opacity))
+
+
+def decoded(uplifted):
+    return uplifted.latents.decode(uplifted.gaussians.features)
+
+
+# Against the equations
+
+
+@pytest.mark.parametrize("corrections", [0, 1, 2])
+def test_features_are_those_of_the_slow_oracle(monkeypatch, corrections):
+    monkeypatch.setattr(uplift, "NEIGHBOURS", 4)
+    views, gaussians = cameras(), cloud()
+    maps = random_maps(views)
+    smooth = torch.randn(5, generator=torch.Generator().manual_seed(1))
+    maps = [0.5 * features + smooth for features in maps]
+    maps[1][3:5, 2:9] = 0  # nothing is known there
+    parts = [x.numpy() for x in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)]
+    weights = [
+        oracles_uplift.blend_weights(*parts, view.viewmat.numpy(), view.K.numpy(), view.width, view.height)
+        for view in views
+    ]
+    expected, pixels = oracles_uplift.uplift(weights, [m.double().numpy() for m in maps], parts[0], corrections, 4)
+    found = uplift_maps(gaussians, views, maps, UpliftConfig(corrections=corrections, keep=1.0))
+    assert (pixels > 1).sum() >= 8
+    # Corrections read maps in half precision: 5e-4 of a unit feature, and they are at most 1 per pass.
+    np.testing.assert_allclose(decoded(found).numpy(), expected, atol=1e-5 if corrections == 0 else 1e-3 * corrections)
+    np.testing.assert_allclose(found.pixels.numpy(), pixels, atol=1e-5)
+
+
+def test_without_corrections_it_is_the_average_of_unit_features():
+    views, gaussians = cameras(), cloud()
+    maps = random_maps(views, size=(5, 6))  # smaller than the pictures: rendered at once the size
+    small = [view.resized(10, 12) for view in views]
+    resized = ((view, resize_map(unit_rows(m), view.size).double()) for view, m in zip(small, maps, strict=True))
+    average = average_views(gaussians, resized)
+    found = uplift_maps(gaussians, views, maps, PLAIN)
+    torch.testing.assert_close(decoded(found), average.values, atol=1e-5, rtol=0)
+    torch.testing.assert_close(found.pixels, average.weights * 13 * 10 / (12 * 10), atol=1e-5, rtol=1e-5)
+    length = torch.linalg.vector_norm(average.values, dim=1)
+    torch.testing.assert_close(found.agreement, length, atol=1e-5, rtol=0)
+
+
+def test_latents_are_a_projection_of_the_same_average():
+    views, gaussians, maps = cameras(), cloud(), random_maps(cameras(), channels=9)
+    whole = decoded(uplift_maps(gaussians, views, maps, PLAIN))
+    few = uplift_maps(gaussians, views, maps, replace(PLAIN, max_latents=3))
+    assert few.latents.latent == 3
+    torch.testing.assert_close(few.gaussians.features, few.latents.encode(whole), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("shares", [([1.0], [1.0], 1.0), ([1.0], [-1.0], 0.0), ([1.0], [0.0], 0.0)])
+def test_reliability_of_one_number(shares):
+    one, other, expected = shares
+    found = uplift._reliability(torch.tensor([one]), torch.tensor([other]), torch.tensor([[0]]))
+    assert found.tolist() == [expected]
+
+
+def test_reliability_is_the_spearman_brown_share_among_neighbours():
+    one, other = torch.tensor([[1.0, 0.0], [2.0, 0.0], [0.0, 0.0]]), torch.tensor([[0.6, 0.8], [2.0, 0.0], [0.0, 0.0]])
+    alone = uplift._reliability(one, other, torch.tensor([[0], [1], [2]]))
+    torch.testing.assert_close(alone, torch.tensor([2 * 0.6 / 1.6, 1.0, 0.0]))
+    r = (0.6 + 4) / (1 + 4)
+    together = uplift._reliability(one, other, torch.tensor([[0, 1], [1, 0], [2, 0]]))
+    torch.testing.assert_close(together, torch.tensor([2 * r / (1 + r), 2 * r / (1 + r), 2 * 0.6 / 1.6]))
+
+
+def test_latents_are_chosen_by_directions_and_pixels():
+    """Three balls, each before a feature of its own. The second one's views agree only on 0.6 of e1, but it has more pixels
+    than the third, so that e0 and e1 are the two latents to keep."""
+    gaussians = balls([[-0.7, 0.0, 2.0], [0.0, 0.0, 2.0], [0.7, 0.0, 2.0]])
+    gaussians = gaussians.replace(scales=torch.tensor([[0.1], [0.08], [0.05]]).expand(3, 3))
+    maps = [torch.zeros(24, 24, 4) for _ in range(2)]
+    for features, sign in zip(maps, (1, -1), strict=True):
+        features[:, :8, 0] = 1
+        features[:, 8:16] = torch.tensor([0.0, 0.6, 0.8 * sign, 0.0])
+        features[:, 16:, 3] = 1
+    found = uplift_maps(gaussians, ahead(2, size=24), maps, replace(PLAIN, max_latents=2))
+    expected = torch.tensor([[1.0, 0, 0, 0], [0, 0.6, 0, 0], [0, 0, 0, 0]])
+    torch.testing.assert_close(decoded(found), expected, atol=1e-5, rtol=0)
+
+
+def test_one_huge_weight_is_held_among_those_that_count():
+    weights = torch.cat([torch.zeros(900), torch.ones(199), torch.tensor([1e6])])
+    assert torch.equal(uplift._capped(weights), weights.clamp_max(1))
+
+
+# Laws
+
+
+@pytest.mark.parametrize("corrections", [0, 1, 3])
+def test_uniform_maps_give_their_feature_to_every_gaussian_that_is_shown(corrections):
+    views, gaussians = cameras(), cloud()
+    feature = torch.tensor([2.0, 0, -1, 2, 0])
+    found = uplift_maps(
+        gaussians, views, [feature.expand(*v.size, 5) for v in views], UpliftConfig(corrections=corrections)
+    )
+    shown = found.pixels > 0
+    assert shown.sum() >= 8
+    assert found.latents.latent == 1
+    expected = (feature / 3).double() * shown[:, None]
+    # Corrections read maps in half precision: 5e-4 of a unit feature.
+    torch.testing.assert_close(decoded(found), expected, atol=1e-5 if corrections == 0 else 1e-3, rtol=0)
+    torch.testing.assert_close(found.agreement, shown.double(), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("config", [PLAIN, UpliftConfig(max_gaussians=5)])
+def test_only_the_directions_of_features_count(config):
+    views, gaussians = cameras(), cloud()
+    maps = random_maps(views)
+    factors = [4 * torch.rand(*view.size, 1, generator=torch.Generator().manual_seed(7)) + 0.01 for view in views]
+    one = uplift_maps(gaussians, views, maps, config)
+    other = uplift_maps(gaussians, views, [m * f for m, f in zip(maps, factors, strict=True)], config)
+    torch.testing.assert_close(decoded(other), decoded(one), atol=2e-3, rtol=0)  # rounded to half precision elsewhere
+    torch.testing.assert_close(other.pixels, one.pixels)
+    torch.testing.assert_close(other.agreement, one.agreement, atol=1e-5, rtol=0)
+
+
+def test_all_zero_pixels_are_holes():
+    """The left ball stands before unknown pixels alone, the right one before both; they change nothing of it."""
+    gaussians = balls([[-0.7, 0.0, 2.0], [0.1, 0.0, 2.0]])
+    holes = torch.zeros(8, 8, 2)
+    holes[:, 4:] = torch.tensor([0.0, 3.0])
+    found = uplift_maps(gaussians, ahead(), [holes], PLAIN)
+    torch.testing.assert_close(decoded(found), torch.tensor([[0.0, 0], [0, 1]]))
+    assert found.agreement.tolist() == pytest.approx([0, 1])
+    assert found.pixels[0] == 0
+    whole = uplift_maps(gaussians, ahead(), [torch.ones(8, 8, 2)], PLAIN)
+    assert 0 < found.pixels[1] < whole.pixels[1]
+
+
+@pytest.mark.parametrize("corrections", [0, 1])
+def test_what_no_view_shows_knows_nothing(corrections):
+    gaussians = balls([[0.0, 0.0, 2.0], [0.0, 0.0, -2.0], [50.0, 0.0, 2.0], [0.2, 0.0, 2.5]])
+    found = uplift_maps(gaussians, ahead(3), random_maps(ahead(3)), UpliftConfig(corrections=corrections))
+    assert (found.gaussians.features != 0).any(dim=1).tolist() == [True, False, False, True]
+    assert (found.pixels > 0).tolist() == [True, False, False, True]
+    assert (found.agreement > 0).tolist() == [True, False, False, True]
+
+
+def test_disagreement_of_views_is_seen():
+    """Half of the pixels say x and half say y: the mean (1/2, 1/2) has length sqrt(1/2)."""
+    x, y = torch.tensor([1.0, 0.0]).expand(8, 8, 2), torch.tensor([0.0, 1.0]).expand(8, 8, 2)
+    found = uplift_maps(balls([[0.0, 0.0, 2.0]]), ahead(2), [x, y], PLAIN)
+    torch.testing.assert_close(found.agreement, torch.tensor([0.5**0.5]))
+    torch.testing.assert_close(decoded(found), torch.tensor([[0.5, 0.5]]))
+
+
+def test_the_cloud_keeps_its_shape_and_loses_colours():
+    gaussians = cloud()
+    carried = gaussians.replace(sh=torch.zeros(12, 1, 3).double(), features=torch.ones(12, 2).double())
+    found = uplift_maps(carried, cameras(), random_maps(cameras())).gaussians
+    for name in ("means", "quats", "scales", "opacities"):
+        assert torch.equal(getattr(found, name), getattr(gaussians, name))
+    assert found.sh is None
+    assert found.features.shape[0] == 12
+
+
+# Corrections
+
+
+def row_of_balls(n=24):
+    """Two rows of small balls close together: every pixel blends some. Their features change from ball to ball."""
+    g = torch.Generator().manual_seed(0)
+    means = torch.stack([torch.linspace(-1.5, 1.5, n), torch.arange(n) % 2 * 0.2 - 0.1, torch.full((n,), 3.0)], dim=1)
+    truth = torch.nn.functional.normalize(torch.randn(4, 6, generator=g)[torch.arange(n) // 6], dim=1)
+    return balls(means.tolist(), scale=0.12, opacity=0.8), truth
+
+
+def side_views(n=8, size=32):
+    views = []
+    for i in range(n):
+        viewmat = torch.eye(4)
+        viewmat[:2, 3] = torch.tensor([0.05 * (i - n / 2), 0.03 * (i % 3)])
+        K = torch.tensor([[28.0, 0, size / 2], [0, 28.0, size / 2], [0, 0, 1]])
+        views.append(Camera(viewmat, K, size, size))
+    return views
+
+
+def wrongness(uplifted, truth):
+    """1 - cosine with the true features, on average over the Gaussians."""
+    return float((1 - torch.nn.functional.cosine_similarity(decoded(uplifted), truth, dim=1)).mean())
+
+
+def test_a_correction_takes_out_what_blurred_maps_mixed_in():
+    gaussians, truth = row_of_balls()
+    views = side_views()
+    maps = [shrink_map(rasterize(gaussians.replace(features=truth), view).map, 2) for view in views]
+    errors = [
+        wrongness(uplift_maps(gaussians, views, maps, UpliftConfig(corrections=k, keep=1.0)), truth) for k in (0, 1, 2)
+    ]
+    assert errors[0] > 0.02  # or there is nothing to correct
+    assert errors[1] < 0.8 * errors[0]
+    assert errors[2] < errors[1]
+
+
+def test_a_correction_does_not_follow_noise(monkeypatch):
+    """Every pixel of every view is wrong in a way of its own. A correction that is believed follows it."""
+    gaussians, views = row_of_balls()[0], side_views()
+    truth = torch.eye(6)[:1].expand(24, 6)
+    g = torch.Generator().manual_seed(0)
+    maps = [truth[0] + 1.5 * torch.randn(32, 32, 6, generator=g) for _ in views]
+    errors = [
+        wrongness(uplift_maps(gaussians, views, maps, UpliftConfig(corrections=k, keep=1.0)), truth) for k in (0, 1)
+    ]
+    monkeypatch.setattr(uplift, "_reliability", lambda one, other, near: torch.ones(len(one)))
+    believed = wrongness(uplift_maps(gaussians, views, maps, UpliftConfig(corrections=1, keep=1.0)), truth)
+    assert errors[1] < 1.1 * errors[0]
+    assert believed > 1.5 * errors[0]
+
+
+# Sizes
+
+
+def test_large_maps_are_shrunk_to_the_working_size():
+    """Maps of equal 2 x 2 blocks shrink to maps of a pixel each, without loss."""
+    views, gaussians = cameras(width=24, height=20), cloud()
+    small = [unit_rows(m) for m in random_maps(views, size=(10, 12))]
+    large = [m.repeat_interleave(2, dim=0).repeat_interleave(2, dim=1) for m in small]
+    config = UpliftConfig(corrections=1, keep=1.0, pixels=130)
+    one, other = (uplift_maps(gaussians, views, maps, config) for maps in (small, large))
+    torch.testing.assert_close(decoded(one), decoded(other), atol=2e-3, rtol=0)  # half precision
+    torch.testing.assert_close(one.pixels, other.pixels)
+
+
+def test_a_shrunk_pixel_is_the_mean_of_the_known_ones_if_these_are_most():
+    views, gaussians = cameras(width=24, height=20), cloud()
+    small = [unit_rows(m) for m in random_maps(views, size=(10, 12))]
+    large = [m.repeat_interleave(2, dim=0).repeat_interleave(2, dim=1) for m in small]
+    for one, whole in zip(small, large, strict=True):
+        whole[0::4, 0::4] = 0  # one of four is unknown: the others stand for it
+        whole[2::4, 2::4], whole[3::4, 3::4] = 0, 0  # two of four: a hole
+        one[1::2, 1::2] = 0
+    config = replace(PLAIN, pixels=130)
+    one, other = (uplift_maps(gaussians, views, maps, config) for maps in (small, large))
+    torch.testing.assert_close(decoded(one), decoded(other), atol=1e-5, rtol=0)
+    torch.testing.assert_close(one.pixels, other.pixels)
+
+
+def test_pixels_left_over_by_shrinking_move_nothing():
+    """A map of 21 x 25 pixels leaves a row and a column over. What remains is the view of a smaller picture."""
+    views, gaussians = cameras(width=25, height=21), cloud()
+    small = [unit_rows(m) for m in random_maps(views, size=(10, 12))]
+    large = [torch.ones(21, 25, 5) for _ in views]
+    for whole, m in zip(large, small, strict=True):
+        whole[:20, :24] = m.repeat_interleave(2, dim=0).repeat_interleave(2, dim=1)
+    config = replace(PLAIN, pixels=130)
+    cut = [replace(view, width=24, height=20) for view in views]
+    one, other = uplift_maps(gaussians, cut, small, config), uplift_maps(gaussians, views, large, config)
+    torch.testing.assert_close(decoded(one), decoded(other), atol=1e-5, rtol=0)
+    torch.testing.assert_close(one.pixels, other.pixels)
+
+
+def test_pixels_are_those_of_the_pictures_at_any_working_size():
+    views, gaussians = ahead(1, size=64), balls([[0.0, 0.0, 2.0]], scale=0.5)
+    small, large = (
+        uplift_maps(gaussians, views, [torch.ones(8, 8, 2)], replace(PLAIN, pixels=n)).pixels.item() for n in (64, 4096)
+    )
+    # A deviation of 2 working pixels, whose variance of 4 the low-pass filter widens by 0.3; in the picture it is 16^2 + 0.3.
+    assert 1 < small / large < 1.075
+
+
+def test_maps_are_read_twice_and_sampled_by_their_own_grid_where_they_have_one():
+    class Maps:
+        def __init__(self, maps):
+            self.maps, self.reads, self.samples = maps, [], []
+
+        def __len__(self):
+            return len(self.maps)
+
+        def __getitem__(self, i):
+            self.reads.append(i)
+            return self.maps[i]
+
+    class Grid(Maps):
+        def grid(self, i, step, samples):
+            self.samples.append(i)
+            return self.maps[i].reshape(-1, 5)[:samples]
+
+    config = UpliftConfig(corrections=2, max_gaussians=5)
+    plain, grid = Maps(random_maps(cameras())), Grid(random_maps(cameras()))
+    one, other = (uplift_maps(cloud(), cameras(), maps, config) for maps in (plain, grid))
+    assert plain.reads == [0, 1, 2, 3, 0, 1, 2, 3]
+    assert (grid.samples, grid.reads) == ([0, 1, 2, 3], [0, 1, 2, 3])
+    torch.testing.assert_close(decoded(one), decoded(other), atol=2e-3, rtol=0)
+
+
+def test_no_table_of_gaussians_by_channels_is_made():
+    """Counted over every tensor that torch makes: none has 301 Gaussians (or more) and 211 channels."""
+
+    class Shapes(TorchDispatchMode):
+        def __init__(self):
+            super().__init__()
+            self.seen = set()
+
+        def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+            result = function(*args, **(kwargs or {}))
+            for value in result if isinstance(result, tuple | list) else (result,):
+                if isinstance(value, torch.Tensor):
+                    self.seen.add(tuple(value.shape))
+            return result
+
+    gaussians = cloud(301)
+    with Shapes() as shapes:
+        uplift_maps(gaussians, cameras(), random_maps(cameras(), channels=211), UpliftConfig(max_gaussians=100))
+    assert (2, 301, 65) in shapes.seen  # or nothing was recorded
+    assert not [shape for shape in shapes.seen if 211 in shape and any(size >= 301 for size in shape)]
+
+
+# Merging
+
+
+def test_merging_leaves_at_most_what_was_asked_for():
+    views, gaussians = cameras(), cloud(200)
+    maps = random_maps(views, channels=8)
+    kept = uplift_maps(gaussians, views, maps, UpliftConfig(corrections=0))
+    lines = []
+    found = uplift_maps(gaussians, views, maps, UpliftConfig(max_gaussians=40, faint=0.0), report=lines.append)
+    assert 20 < len(found.gaussians) <= 40
+    assert found.pixels.shape == found.agreement.shape == (len(found.gaussians),)
+    fill = kept.pixels > 0
+    torch.testing.assert_close(found.pixels.sum(), kept.pixels[fill].sum())
+    mean = (kept.agreement * kept.pixels)[fill].sum() / kept.pixels[fill].sum()
+    torch.testing.assert_close((found.agreement * found.pixels).sum() / found.pixels.sum(), mean)
+    assert lines == [
+        f"fused 4 maps of 8 channels as {found.latents.latent} latents",
+        f"{len(found.gaussians)} of 200 Gaussians left",
+    ]
+
+
+def test_merged_features_are_means_by_pixels():
+    """Two balls in one place become one: half of the pixels say x, half say y."""
+    gaussians = balls([[-0.5, 0.0, 2.0], [0.5, 0.0, 2.0]])
+    signal = torch.zeros(8, 8, 2)
+    signal[:, :4, 0], signal[:, 4:, 1] = 1, 1
+    found = uplift_maps(gaussians, ahead(), [signal], replace(PLAIN, max_gaussians=1))
+    assert len(found.gaussians) == 1
+    torch.testing.assert_close(decoded(found), torch.tensor([[0.5, 0.5]]), atol=1e-4, rtol=0)
+
+
+def test_the_same_input_gives_the_same_result():
+    views, gaussians, maps = cameras(), cloud(60), random_maps(cameras())
+    config = UpliftConfig(max_gaussians=20)
+    one, other = (uplift_maps(gaussians, views, maps, config) for _ in range(2))
+    assert torch.equal(one.gaussians.features, other.gaussians.features)
+    assert torch.equal(one.gaussians.means, other.gaussians.means)
+
+
+def test_no_gradient_is_kept():
+    gaussians = cloud()
+    gaussians = gaussians.replace(means=gaussians.means.clone().requires_grad_())
+    found = uplift_maps(gaussians, cameras(), random_maps(cameras()))
+    assert not found.gaussians.features.requires_grad
+    assert not found.gaussians.means.requires_grad
+
+
+# The files of the maps
+
+
+@pytest.fixture
+def folders(monkeypatch):
+    """The temporary folders that were made."""
+    made, make = [], tempfile.TemporaryDirectory
+
+    def record(*args, **kwargs):
+        made.append(make(*args, **kwargs))
+        return made[-1]
+
+    monkeypatch.setattr(tempfile, "TemporaryDirectory", record)
+    return made
+
+
+def test_the_temporary_folder_is_gone_afterwards(folders):
+    uplift_maps(cloud(), cameras(), random_maps(cameras()))
+    assert [Path(folder.name).exists() for folder in folders] == [False]
+
+
+def test_the_temporary_folder_is_gone_after_an_error(folders, monkeypatch):
+    monkeypatch.setattr(uplift, "LOOKED_AT", (1, 2_000))  # so that the bad map is met in the second reading
+    maps = random_maps(cameras())
+    maps[2][4, 5, 1] = torch.nan
+    with pytest.raises(
+        ValueError, match=r"maps\[2\]: expected finite features, got NaN or infinity; encode that image"
+    ):
+        uplift_maps(cloud(), cameras(), maps)
+    assert [Path(folder.name).exists() for folder in folders] == [False]
+
+
+def test_a_killed_uplift_reads_no_map_twice(tmp_path, monkeypatch):
+    monkeypatch.setattr(uplift, "LOOKED_AT", (1, 2_000))
+    maps, reads, dies = random_maps(cameras()), [], [True]
+
+    class Maps:
+        def __len__(self):
+            return len(maps)
+
+        def grid(self, i, step, samples):
+            return maps[i].reshape(-1, maps[i].shape[-1])
+
+        def __getitem__(self, i):
+            if i == 2 and dies:
+                raise KeyboardInterrupt
+            reads.append(i)
+            return maps[i]
+
+    with pytest.raises(KeyboardInterrupt):
+        uplift_maps(cloud(), cameras(), Maps(), scratch=tmp_path)
+    assert reads == [0, 1]
+    dies.clear()
+    resumed = uplift_maps(cloud(), cameras(), Maps(), scratch=tmp_path)
+    assert reads == [0, 1, *range(2, len(maps))]
+    whole = uplift_maps(cloud(), cameras(), Maps()).gaussians.features
+    torch.testing.assert_close(resumed.gaussians.features, whole, atol=2e-3, rtol=0)  # files hold half precision
+
+
+def test_an_uplifted_cloud_is_a_start_for_training():
+    views = cameras()
+    maps = [torch.nn.functional.normalize(one, dim=-1) for one in random_maps(views)]
+    found = uplift_maps(cloud(), views, maps)
+    targets = [found.latents.encode(one) for one in maps]
+    config = FieldConfig(steps=30, densify_until=0, reset_every=0, features_lr=0.02, report_every=10)
+    trained = fit_field(GaussianParams.from_gaussians(found.gaussians), views, targets, config, extent=1.0)
+    assert trained.history[-1]["loss"] < trained.history[0]["loss"]
+    assert trained.params.channels == found.latents.latent
+
+
+def test_gaussians_that_fill_little_of_the_views_are_pointed_out():
+    small, lines = cloud(), []
+    uplift_maps(small, cameras(), random_maps(cameras()), report=lines.append)
+    assert not any("frame" in line for line in lines)
+    one = small.select(torch.arange(1)).replace(scales=torch.full((1, 3), 0.01))
+    uplift_maps(one, cameras(), random_maps(cameras()), report=lines.append)
+    assert any("of the views; are they in the cameras' frame?" in line for line in lines)
+
+
+# Wrong input
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_a_map_that_is_not_finite_is_named(value):
+    maps = random_maps(cameras())
+    maps[3][0, 0, 0] = value
+    with pytest.raises(ValueError, match=r"maps\[3\]: expected finite features, got NaN or infinity"):
+        uplift_maps(cloud(), cameras(), maps)
+
+
+def test_wrong_counts_and_shapes_are_named():
+    maps = random_maps(cameras())
+    with pytest.raises(ValueError, match=r"maps: expected one per camera \(4, at least one\), got 3; pass the views"):
+        uplift_maps(cloud(), cameras(), maps[:3])
+    with pytest.raises(ValueError, match=r"maps: expected one per camera \(0, at least one\), got 0"):
+        uplift_maps(cloud(), [], [])
+    with pytest.raises(ValueError, match="gaussians: expected at least one, got none; there is nothing to carry"):
+        uplift_maps(cloud().select(torch.zeros(12, dtype=torch.bool)), cameras(), maps)
+    with pytest.raises(ValueError, match=r"maps\[1\]: expected \[h, w, 5\], got \(10, 13, 7\)"):
+        uplift_maps(cloud(), cameras(), [maps[0], torch.ones(10, 13, 7), *maps[2:]])
+    with pytest.raises(ValueError, match=r"maps\[0\]: expected \[h, w, D\], got \(4, 5\)"):
+        uplift_maps(cloud(), cameras(), [torch.ones(4, 5)] * 4)
+
+
+def test_maps_that_say_nothing_and_views_that_show_nothing_are_named():
+    with pytest.raises(ValueError, match="maps: expected nonzero features, got 4 all-zero maps; check the teacher"):
+        uplift_maps(cloud(), cameras(), [torch.zeros(5, 6, 3)] * 4)
+    with pytest.raises(
+        ValueError, match="cameras: expected views that show the Gaussians, got none that does; do both"
+    ):
+        uplift_maps(balls([[0.0, 0.0, -2.0]]), ahead(), [torch.ones(8, 8, 2)])
+
+
+def test_options_are_checked():
+    bad = {"max_gaussians": 0, "keep": 0.0, "max_latents": 0, "corrections": -1, "pixels": 10, "faint": 1.0}
+    for name, value in bad.items():
+        with pytest.raises(ValueError, match=f"{name}: expected a number in"):
+            UpliftConfig(**{name: value})
+    assert UpliftConfig().max_gaussians is None
+    assert UpliftConfig.field() == UpliftConfig(max_gaussians=30_000)
+    assert UpliftConfig.field(max_gaussians=7, keep=0.9) == UpliftConfig(max_gaussians=7, keep=0.9)

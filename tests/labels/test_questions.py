@@ -1,0 +1,170 @@
+import dataclasses
+
+import pytest
+import torch
+
+from kfgs import Camera, Gaussians
+from kfgs.fields import SemanticField
+from kfgs.labels import LabelSet
+from kfgs.labels.questions import class_rows, make_question
+
+NAMES = ("chair", "table", "lamp")
+ROWS = torch.eye(3, 6)
+CANONICAL = torch.eye(6)[3:5]
+FULL = LabelSet(NAMES, ROWS, CANONICAL, ("object", "stuff"))
+BARE = LabelSet(NAMES, ROWS)
+PHRASE = torch.tensor([1.0, 0, 0, 0, 0, 1])
+
+
+def told_from(target, classes, negatives="auto"):
+    found = make_question(target, classes, negatives, 6, {}).negatives
+    return None if found is None else found.tolist()
+
+
+@pytest.mark.parametrize("classes", [FULL, BARE], ids=["canonical", "bare"])
+@pytest.mark.parametrize("target", ["Table", ROWS[1], 3 * ROWS[1] + 1e-6], ids=["name", "row", "rounded"])
+def test_a_class_is_told_from_the_other_classes(target, classes):
+    assert told_from(target, classes) == ROWS[[0, 2]].tolist()
+
+
+def test_classes_without_names_are_told_from_each_other():
+    assert told_from(ROWS[1], ROWS) == ROWS[[0, 2]].tolist()
+
+
+def test_the_only_class_is_told_from_the_canonical_words():
+    one = LabelSet(("Stuff",), ROWS[:1], CANONICAL, ("object", "stuff"))
+    assert told_from(ROWS[0], one) == CANONICAL.tolist()
+    assert told_from("stuff", one) == CANONICAL[:1].tolist()  # but not from itself
+    assert told_from("chair", LabelSet(("chair",), ROWS[:1])) is None
+
+
+def test_anything_else_is_told_from_the_canonical_words_or_from_nothing():
+    assert told_from(PHRASE, FULL) == CANONICAL.tolist()
+    assert told_from(CANONICAL[1], FULL) == CANONICAL[:1].tolist()
+    assert told_from(PHRASE, BARE) is None
+    assert told_from(PHRASE, None) is None
+    assert told_from(PHRASE, BARE, "classes") == ROWS.tolist()
+
+
+def test_a_row_is_brought_to_the_precision_of_the_classes():
+    assert make_question(PHRASE.half(), FULL, "auto", 6, {}).row.dtype == torch.float32
+    assert told_from(CANONICAL[1].half(), FULL) == CANONICAL[:1].tolist()
+
+
+# Asked of a field
+
+FIVE = torch.eye(5)
+CLASSES = LabelSet(("wall", "chair", "stuff"), FIVE[:3], FIVE[3:], ("Stuff", "object"), {"teacher": {"name": "lseg"}})
+CAMERA = Camera(torch.eye(4), torch.tensor([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), 8, 8)
+
+
+def field(teacher="lseg"):
+    """Six Gaussians: one like each row, and one that was never learnt."""
+    features = torch.cat([FIVE, torch.zeros(1, 5)])
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(6, 1)
+    gaussians = Gaussians(torch.rand(6, 3), quats, torch.full((6, 3), 0.1), torch.full((6,), 0.9), features)
+    return SemanticField(gaussians, info={"teacher": {"name": teacher}})
+
+
+def test_negatives_are_the_classes_the_canonical_words_or_none():
+    chair = field().query("chair", CLASSES, negatives="classes")
+    assert chair.indices.tolist() == [1]
+    assert "any of 2 negatives" in chair.how
+    assert chair.scores[3] == 0.5  # like neither: the canonical rows play no part
+    canonical = field().query("chair", CLASSES, negatives="canonical")
+    assert "any of 2 negatives" in canonical.how
+    assert canonical.scores[3] < 0.01
+    assert canonical.scores[0] == 0.5
+    alone = field().query("chair", CLASSES, 0.9, negatives="none")
+    assert alone.scores.tolist() == [0, 1, 0, 0, 0, 0]
+    share = field().query("chair", CLASSES, 0.5, negatives="classes", score="softmax", logit_scale="clip")
+    assert share.indices.tolist() == [1]
+    rows = field().query("chair", CLASSES, negatives=FIVE[4:])
+    assert "any of 1 negatives" in rows.how
+    assert rows.scores[4] < 0.01
+    for found in (chair, canonical, alone, share, rows):
+        assert found.scores[5] == 0  # never learnt
+
+
+def test_by_default_a_class_is_told_from_the_others_and_a_phrase_from_the_canonical_words():
+    asked, told = field(), field().query("chair", CLASSES, negatives="classes")
+    for target in ("Chair", FIVE[1]):
+        assert torch.equal(asked.query(target, CLASSES).scores, told.scores)
+    phrase = torch.tensor([0.0, 1, 0, 0.5, 0])
+    canonical = asked.query(phrase, CLASSES, negatives="canonical")
+    assert torch.equal(asked.query(phrase, CLASSES).scores, canonical.scores)
+    cosine = asked.query("chair", CLASSES, 0.9, score="cosine")  # to which negatives are nothing
+    assert cosine.scores.tolist() == [0, 1, 0, 0, 0, 0]
+
+
+def test_a_class_is_not_told_from_its_own_name():
+    stuff = field().query("stuff", CLASSES, negatives="canonical")
+    assert "any of 1 negatives" in stuff.how
+    assert stuff.scores[3] == 0.5  # the row of "Stuff" among the canonical words was left out
+
+
+def test_names_and_embeddings_of_classes_give_the_same_labels():
+    by_name, by_row = field().classify(CLASSES), field().classify(FIVE[:3])
+    assert by_name.labels.tolist() == by_row.labels.tolist() == [0, 1, 2, 0, 0, -1]  # rows 3 and 4 are like no class
+    assert by_name.scores.tolist() == by_row.scores.tolist() == [1, 1, 1, 0, 0, 0]
+    assert field().label(CLASSES).labels.tolist() == [0, 1, 2, 0, 0, -1]
+
+
+def test_missing_negatives_are_named():
+    bare = LabelSet(("wall",), FIVE[:1])
+    with pytest.raises(ValueError, match="negatives: expected other classes than 'wall', got none; use 'canonical'"):
+        field().query("wall", bare, negatives="classes")
+    with pytest.raises(ValueError, match="negatives: expected canonical words in the classes' table, got none; make"):
+        field().query("wall", bare, negatives="canonical")
+    with pytest.raises(
+        ValueError, match="negatives: expected one of 'auto', 'classes', 'canonical', 'none', got 'all'"
+    ):
+        field().query("wall", bare, negatives="all")
+
+
+def test_a_name_needs_classes_and_classes_are_a_label_set_or_rows():
+    with pytest.raises(
+        ValueError, match="classes: expected a LabelSet to look 'wall' up in, got Tensor; pass one, or an"
+    ):
+        field().query("wall", FIVE)
+    with pytest.raises(ValueError, match="classes: expected a label set, or a field that remembers the classes"):
+        field().query("wall")
+    with pytest.raises(
+        TypeError, match=r"classes: expected a LabelSet or embeddings \[C, 5\], got list; load_label_set"
+    ):
+        class_rows(["wall"], 5, {})
+    with pytest.raises(ValueError, match="sofa"):
+        field().query("sofa", CLASSES)
+
+
+def test_words_of_another_teacher_are_warned_of():
+    clip = field("clip")
+    for ask in (
+        lambda: clip.query("wall", CLASSES, 0.5),
+        lambda: clip.query(FIVE[0], CLASSES, 0.5),
+        lambda: clip.classify(CLASSES),
+        lambda: clip.label(CLASSES),
+        lambda: clip.segment(CAMERA, CLASSES),
+    ):
+        with pytest.warns(UserWarning, match="expected text of the field's teacher .name 'clip'.*another .'lseg'"):
+            ask()
+    unknown = dataclasses.replace(CLASSES, info={})
+    assert len(clip.query("wall", unknown, 0.5)) == 1  # no warning, which would be an error here
+
+
+def test_words_of_other_channels_are_refused_before_any_view_is_drawn(monkeypatch):
+    monkeypatch.setattr(SemanticField, "render", lambda *_: pytest.fail("a view was drawn"))
+    monkeypatch.setattr("kfgs.fields.semantic_field.rasterize", lambda *_, **__: pytest.fail("a view was drawn"))
+    other = LabelSet(("wall", "chair"), torch.eye(2, 7), info={"teacher": {"name": "clip"}})
+    for ask in (
+        lambda: field().segment(CAMERA, other),
+        lambda: field().label(other),
+        lambda: field().classify(other),
+        lambda: field().query("wall", other),
+    ):
+        with pytest.raises(
+            ValueError,
+            match=r"classes: expected embeddings \[C, 5\] \(from the field\), got \(2, 7\): text of another teacher\? "
+            r"\(name 'clip' in place of 'lseg'\) Embed the words",
+        ):
+            ask()

