@@ -18,17 +18,17 @@ import numpy as np
 import torch
 from scipy.optimize import nnls
 
+from kfgs.features import FeatureFolder
+from kfgs.features.layouts import write_npy_map
 from kfgs.fields import FieldConfig, GaussianParams, fit_field
 from kfgs.pipeline.machine import measure_speed
 from kfgs.pipeline.work import autoencoder_weights
 from kfgs.quant import AutoencoderConfig, Codebook, CodebookConfig, fit_autoencoder, fit_codebook, quantize_maps
 from kfgs.quant.sampling import farthest_points
 from kfgs.scenes import load_scene
-from kfgs.scenes.toy import ToyConfig, make_toy_room
-from kfgs.teachers import FeatureFolder
 from kfgs.teachers.costs import lseg_flops
-from kfgs.teachers.layouts import write_npy_map
 from kfgs.teachers.lseg.network import LSegConfig, LSegNetwork
+from kfgs.toy.room_folder import ToyConfig, make_toy_room
 
 CHANNELS = 512
 

@@ -5,13 +5,16 @@ nothing. `python benchmarks/random_lseg.py OUT` takes ten seconds.
 """
 
 import argparse
+import sys
 from pathlib import Path
 
 import torch
 
 from kfgs._files import atomic_path
 from kfgs.teachers.lseg import LSegConfig
-from kfgs.teachers.lseg.layout import random_state
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+from lseg_layout import random_state
 
 
 def save_random_checkpoint(out: Path, config: LSegConfig, *, seed: int = 0, half_text: bool = False) -> int:

@@ -19,9 +19,9 @@ import torch
 
 from kfgs._files import write_json
 from kfgs.evaluation import load_label_set
+from kfgs.features import FeatureFolder
 from kfgs.pipeline import FitConfig, fit_scene, score_scene, score_teacher, segment_scene, true_labels
 from kfgs.scenes import load_scene
-from kfgs.teachers import FeatureFolder
 
 NAMES = {"decouple": "just decouple", "adc": "decouple + ADC", "adc+sc": "decouple + ADC + SC"}
 

@@ -27,8 +27,8 @@ _WHERE = {
     "SceneError": ".scenes",
     "load_scene": ".scenes",
     "run_sfm": ".scenes",
-    "ToyConfig": ".scenes",
-    "make_toy_room": ".scenes",
+    "ToyConfig": ".toy",
+    "make_toy_room": ".toy",
     "Similarity": ".cameras",
     "SplatFile": ".formats",
     "read_splats": ".formats",
@@ -44,17 +44,17 @@ _WHERE = {
     "fit_color": ".pipeline",
     "score_views": ".evaluation",
     "transfer_labels": ".labels",
-    "FeatureFolder": ".teachers",
+    "FeatureFolder": ".features",
     "load_teacher": ".teachers",
-    "extract_features": ".teachers",
-    "pictures_of": ".teachers",
+    "extract_features": ".features",
+    "pictures_of": ".features",
     "make_label_set": ".teachers",
     "Teacher": ".teachers",
-    "RecomputedMaps": ".teachers",
+    "RecomputedMaps": ".features",
     "plan_scene": ".pipeline",
     "uplift": ".pipeline",
     "UpliftConfig": ".fields",
-    "check_feature_folder": ".teachers",
+    "check_feature_folder": ".features",
     "FieldConfig": ".fields",
     "GaussianParams": ".fields",
     "SemanticField": ".fields",
@@ -79,6 +79,11 @@ if TYPE_CHECKING:
     from .cameras import resize_map as resize_map
     from .evaluation import evaluate_segmentation as evaluate_segmentation
     from .evaluation import score_views as score_views
+    from .features import FeatureFolder as FeatureFolder
+    from .features import RecomputedMaps as RecomputedMaps
+    from .features import check_feature_folder as check_feature_folder
+    from .features import extract_features as extract_features
+    from .features import pictures_of as pictures_of
     from .fields import FieldConfig as FieldConfig
     from .fields import GaussianParams as GaussianParams
     from .fields import SemanticField as SemanticField
@@ -115,22 +120,17 @@ if TYPE_CHECKING:
     from .quant import quantize_maps as quantize_maps
     from .scenes import Scene as Scene
     from .scenes import SceneError as SceneError
-    from .scenes import ToyConfig as ToyConfig
     from .scenes import load_scene as load_scene
-    from .scenes import make_toy_room as make_toy_room
     from .scenes import run_sfm as run_sfm
     from .splat import Rendering as Rendering
     from .splat import available_engines as available_engines
     from .splat import rasterize as rasterize
     from .splat import transform_gaussians as transform_gaussians
-    from .teachers import FeatureFolder as FeatureFolder
-    from .teachers import RecomputedMaps as RecomputedMaps
     from .teachers import Teacher as Teacher
-    from .teachers import check_feature_folder as check_feature_folder
-    from .teachers import extract_features as extract_features
     from .teachers import load_teacher as load_teacher
     from .teachers import make_label_set as make_label_set
-    from .teachers import pictures_of as pictures_of
+    from .toy import ToyConfig as ToyConfig
+    from .toy import make_toy_room as make_toy_room
     from .viz import explore as explore
 
 

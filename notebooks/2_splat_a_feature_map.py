@@ -14,7 +14,7 @@ import os
 from pathlib import Path
 
 from kfgs import FeatureFolder, load_scene
-from kfgs.scenes import ToyConfig, make_toy_room
+from kfgs.toy import ToyConfig, make_toy_room
 
 data = Path(os.environ.get("KFGS_NOTEBOOK_DATA", "data"))
 folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))

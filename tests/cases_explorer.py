@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import torch
 
+from kfgs._rows import unit_rows
 from kfgs.cameras import Camera
 from kfgs.fields import SemanticField
 from kfgs.fields.remembered import remember
@@ -13,7 +14,7 @@ from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
 from kfgs.labels import LabelSet
 from kfgs.quant.autoencoder import Autoencoder
-from kfgs.quant.codebook import Codebook, unit_rows
+from kfgs.quant.codebook import Codebook
 from kfgs.quant.linear import fit_linear_latents
 from kfgs.splat import rgb_to_sh0
 from kfgs.viz.explorer.exploration import Exploration

@@ -5,10 +5,10 @@ import time
 from pathlib import Path
 
 import torch
+from lseg_layout import random_state
 from PIL import Image
 
 from kfgs.teachers.lseg import LSegConfig, load_lseg
-from kfgs.teachers.lseg.layout import random_state
 
 TINY = LSegConfig(
     width=32, depth=4, heads=4, window=64, position_grid=3, hooks=(0, 1, 2, 3), neck=(8, 12, 16, 20), fusion=12, dim=16,

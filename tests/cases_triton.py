@@ -142,7 +142,7 @@ def check_manners(
     inputs: list[Tensor], index: Tensor | None, tiles: Tiles, cotangents: list[Tensor], grads: tuple[Tensor, ...]
 ) -> dict[str, float | bool]:
     """Whether the same comes out again, and whether what is asked for alone is what comes with the others."""
-    from kfgs.splat.engines import triton_gpu
+    from kfgs.splat.engines.triton import engine as triton_gpu
 
     facts: dict[str, float | bool] = {}
     view = (index, *tiles)
@@ -245,7 +245,9 @@ def compile_ahead(build: Build) -> dict[str, Any]:
     from triton.backends.compiler import GPUTarget
     from triton.compiler import ASTSource
 
-    from kfgs.splat.engines import triton_gpu, triton_kernels, triton_kernels_backward
+    from kfgs.splat.engines.triton import engine as triton_gpu
+    from kfgs.splat.engines.triton import kernels as triton_kernels
+    from kfgs.splat.engines.triton import kernels_backward as triton_kernels_backward
 
     kernel = {
         "composite": triton_kernels.composite_kernel,

@@ -6,7 +6,7 @@ from pathlib import Path
 from kfgs.fields import FieldConfig
 from kfgs.pipeline import FitConfig
 from kfgs.quant import AutoencoderConfig, CodebookConfig
-from kfgs.scenes.toy import ToyConfig, make_toy_room
+from kfgs.toy.room_folder import ToyConfig, make_toy_room
 
 ROOM = ToyConfig(
     train_views=6,

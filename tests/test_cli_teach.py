@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from cases_teach import TinyLSeg, save_checkpoint, shrink_door
+from lseg_layout import layout
 from PIL import Image
 from safetensors.torch import load_file
 from small_room import make_room
@@ -22,7 +23,6 @@ from kfgs.cli import main
 from kfgs.fields import SemanticField
 from kfgs.scenes import load_scene
 from kfgs.teachers.lseg import LSegConfig
-from kfgs.teachers.lseg.layout import layout
 
 HERE = Path(__file__).parent
 TEACHER = ["--teacher", "cases_teach:TinyLSeg", "--weights"]

@@ -5,6 +5,7 @@ import skimage.metrics
 import torch
 from oracles_metrics import mean_ssim, segmentation_scores
 
+from kfgs._rows import unit_rows
 from kfgs.metrics import (
     COSINE_EPSILON,
     MIB,
@@ -17,7 +18,6 @@ from kfgs.metrics import (
     semantic_storage_bytes,
     ssim,
 )
-from kfgs.quant.codebook import unit_rows
 
 
 def labels(low, high, shape, seed):

@@ -27,7 +27,7 @@ def demo(out: Path = Path("kfgs_demo"), seed: int = 0) -> None:
         seed: of the room and of the fit.
     """
     from ..pipeline import demo as run_demo
-    from ..scenes.toy import ToyConfig
+    from ..toy.room_folder import ToyConfig
 
     config = fit_config("cpu", "fuse", None, seed, None, None, "train")
     wrote(run_demo.run(out, config, room=ToyConfig(seed=seed), report=say, progress=True))
@@ -120,10 +120,10 @@ def fit(
         device: where the field is trained: `auto` (a GPU if there is one), `cpu` or `cuda`.
     """
     from .._files import bytes_in_words
+    from ..features import RecomputedMaps, discard_maps
     from ..pipeline import fit_scene, write_training_pictures
     from ..pipeline.train import check_scene
     from ..scenes import load_scene
-    from ..teachers import RecomputedMaps, discard_maps
 
     config = fit_config(preset, method, mode, seed, steps, max_gaussians, split)
     config = dataclasses.replace(config, undistorted_features=undistorted_features)

@@ -52,8 +52,8 @@ def features(
             that does not fit.
         level: which masks of LangSplat's maps are looked at: `default`, `s`, `m` or `l`; beside --check.
     """
+    from ..features import extract_features, pictures_of
     from ..scenes import load_scene
-    from ..teachers import extract_features, pictures_of
 
     if check is not None:
         for name, given in (("teacher", teacher), ("weights", weights), ("out", out)):
@@ -181,7 +181,7 @@ def teacher_options(name: str, fast: bool, size: tuple[int, ...]) -> dict[str, A
 
 def look_over(scene: Any, views: list[int], folder: Path, level: Level | None) -> None:
     """Report every map of a folder that does not fit the scene's views; a ValueError counts them."""
-    from ..teachers import check_feature_folder
+    from ..features import check_feature_folder
 
     pictures = [(scene.stem(i), scene.cameras[i].size) for i in views]
     report = check_feature_folder(folder, pictures, level=level or "default")
@@ -191,8 +191,8 @@ def look_over(scene: Any, views: list[int], folder: Path, level: Level | None) -
 
 def stored_maps(scene: Any, views: list[int], folder: Path, level: Level | None) -> Any:
     """The maps of some views of a scene as taken; those whose headers do not look like their pictures' are named."""
-    from ..teachers import FeatureFolder, check_feature_folder
-    from ..teachers.langsplat import INDEX
+    from ..features import FeatureFolder, check_feature_folder
+    from ..features.langsplat import INDEX
 
     stems, sizes = [scene.stem(i) for i in views], [scene.cameras[i].size for i in views]
     maps = FeatureFolder(folder, stems, sizes=sizes, level=level or "default")
@@ -216,7 +216,7 @@ def check_discard(maps: Any, config: Any) -> None:
     Raises:
         ValueError: if the mode makes no index maps, or kfgs did not make the maps as they are and could not make them again.
     """
-    from ..teachers import check_discardable
+    from ..features import check_discardable
 
     if config.needs_maps:
         raise ValueError(

@@ -12,10 +12,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .._rows import EPS, row_norms, unit_rows
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels import average_views, nearest_codeword
-from ..quant import EPS, Autoencoder, Codebook, LinearLatents, fit_linear_latents, row_norms, unit_rows
+from ..quant import Autoencoder, Codebook, LinearLatents, fit_linear_latents
 from ..splat import rasterize
 
 KEEP, MOST = 0.999, 64  # of the variation between codewords, and at most so many latents for it

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from .._check import check_shapes
 from .._files import read_json
+from .._rows import EPS, row_norms, unit_rows
 from ..cameras import Camera
 from ..labels import LabelSet
-from ..quant import EPS, row_norms, unit_rows
 from .semantic_field import SemanticField
 
 

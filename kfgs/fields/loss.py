@@ -107,7 +107,7 @@ class _CompiledSimilarity(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, picture: Tensor, target: Tensor, counted: Tensor | None) -> Tensor:
-        from ..splat.engines.numba_ssim import similarity  # compiles, so only when it is needed
+        from ..splat.engines.cpu.ssim import similarity  # compiles, so only when it is needed
 
         window = get_gaussian_kernel1d(SSIM_WINDOW, SSIM_SIGMA, dtype=torch.float64)[0].to(picture.dtype)
         value, slope = similarity(picture.contiguous(), target.contiguous(), counted, window, SSIM_CONSTANTS)

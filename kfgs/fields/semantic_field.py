@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_choice, check_shapes
+from .._rows import unit_embeddings, unit_rows
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels import (
@@ -25,10 +26,9 @@ from ..labels import (
     label_pixels,
     select_by_similarity,
 )
-from ..labels._rows import unit_embeddings
 from ..labels.questions import Classes, Negatives, check_rows, class_rows, make_question
 from ..metrics import MIB, semantic_storage_bytes
-from ..quant import Autoencoder, Codebook, LinearLatents, unit_rows
+from ..quant import Autoencoder, Codebook, LinearLatents
 from ..splat import Rendering, rasterize
 from .answers import Answers, Seen, fused_answers
 from .store import load_field, save_field

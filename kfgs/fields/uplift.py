@@ -21,10 +21,11 @@ from tqdm import tqdm
 
 from .._check import check_range, check_shapes, check_whole
 from .._files import atomic_path
+from .._rows import EPS, row_norms, unit_rows
 from ..cameras import Camera, resize_map
 from ..gaussians import Gaussians
 from ..labels.average import sum_pixels
-from ..quant import EPS, FeatureMaps, row_norms, unit_rows
+from ..quant import FeatureMaps
 from ..quant.linear import LinearLatents, fit_linear_latents, principal_directions
 from ..quant.sampling import sample_grid
 from ..splat import rasterize

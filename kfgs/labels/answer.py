@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes, check_whole
+from .._rows import check_finite
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..splat import rasterize
-from ._rows import check_finite
 from .boxes import OrientedBox
 from .components import component_numbers
 from .selection import Selection, select_where

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from .._check import check_shapes
-from ._rows import check_finite
+from .._rows import check_finite
 
 ROUNDS = 3  # over the three faces; room_0's objects no longer change after two
 

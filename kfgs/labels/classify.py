@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes, check_whole
-from ..quant.codebook import EPS, row_norms, unit_rows
-from ._rows import check_finite, unit_embeddings
+from .._rows import EPS, check_finite, row_norms, unit_embeddings, unit_rows
 from .selection import Selection
 from .text_scores import Score, select_by_similarity
 

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from .._check import check_range, check_shapes, check_whole
-from ._rows import check_finite
+from .._rows import check_finite
 from .classify import select_like
 from .radius_graph import radius_components
 from .selection import Selection, select_where

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_choice, check_shapes
-from ..quant import unit_rows
+from .._rows import unit_rows
 from .label_set import LabelSet, teacher_difference, teacher_mismatch
 
 SAME = 1 - 1e-4  # cosine of one text embedded twice: half precision stays well above, other words below

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes
-from ._rows import check_finite
+from .._rows import check_finite
 
 TEMPERATURE = 10.0  # of the softmax, as LERF (Kerr 2023) uses it
 CANONICAL = ("object", "things", "stuff", "texture")  # LERF's negatives where nothing is known of a scene

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from .._check import check_choice, check_range, check_shapes
-from ..quant.codebook import EPS, Codebook, row_norms
+from .._rows import EPS, row_norms
+from ..quant.codebook import Codebook
 from .classify import CodewordLabels, classify
 
 if TYPE_CHECKING:  # only a name here: anything with its encode and decode will do

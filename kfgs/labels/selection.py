@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from .._check import check_range, check_shapes
+from .._rows import check_finite
 from ..gaussians import Gaussians
-from ._rows import check_finite
 from .boxes import OrientedBox
 from .names import class_of, labelled
 

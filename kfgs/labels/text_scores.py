@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_choice, check_range, check_shapes
-from ._rows import check_finite
+from .._rows import check_finite
 from .relevancy import relevancy
 from .selection import Selection
 from .threshold import similarity_threshold

@@ -11,6 +11,9 @@ import torch
 from torch import Tensor
 
 from .._check import check_choice, check_range
+from ..align.by_cameras import Alignment, align_by_cameras
+from ..align.by_shape import align_clouds
+from ..align.frames import frames_agree
 from ..cameras import Camera
 from ..cameras.similarity import Similarity
 from ..evaluation import LabelSet
@@ -20,9 +23,6 @@ from ..gaussians import Gaussians
 from ..labels import Transfer, transfer_labels, vote_labels
 from ..labels.transfer import Method
 from ..scenes import SceneError
-from ..scenes.align import Alignment, align_by_cameras
-from ..scenes.frames import frames_agree
-from ..scenes.register import align_clouds
 from ..splat.transform import transform_gaussians
 
 By = Literal["distance", "views"]

@@ -11,13 +11,13 @@ import numpy as np
 import torch
 
 from ..evaluation import LabelSet, load_label_set, score_recolor, score_removal, score_views
+from ..features import FeatureFolder
 from ..formats import SplatFile, write_splats
 from ..formats.ply import write_ply
 from ..gaussians import Gaussians
 from ..labels import EditList, OfClass, Recolor, Remove, answers, parse_color, select_by_label, transfer_labels
 from ..scenes import Scene, load_scene
-from ..scenes.toy import ToyConfig, make_toy_room
-from ..teachers import FeatureFolder
+from ..toy.room_folder import ToyConfig, make_toy_room
 from .apply import (
     label_columns,
     save_labelled,

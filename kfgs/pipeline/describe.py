@@ -6,11 +6,11 @@ from pathlib import Path
 
 from .._check import one_line
 from .._files import bytes_in_words, read_json
+from ..features.manifest import MANIFEST, read_manifest
 from ..fields import SemanticField
 from ..formats import SplatFile, find_format, read_splats
 from ..formats.ply import read_ply
 from ..scenes import load_scene
-from ..teachers.manifest import MANIFEST, read_manifest
 
 
 def describe(path: str | Path) -> str:

@@ -9,8 +9,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from .._rows import EPS, row_norms
 from ..cameras import Camera, undistort
-from ..quant import EPS, row_norms
 from ..quant.sampling import SAMPLES, sample_grid
 from .digests import describe_lens
 from .stages import Run

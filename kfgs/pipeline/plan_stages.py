@@ -10,12 +10,12 @@ from typing import Any, Literal
 import torch
 
 from .._files import bytes_in_words
+from ..features.manifest import read_manifest
 from ..fields.answers import MOST, PIXELS
 from ..fields.uplift import WORKING
 from ..quant.sampling import choose_grid_step
 from ..scenes import Scene
 from ..teachers.costs import TeacherCost, check_weights, teacher_cost
-from ..teachers.manifest import read_manifest
 from . import work
 from .fit import FitConfig
 from .machine import Speed, measure_speed

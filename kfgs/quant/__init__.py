@@ -2,7 +2,7 @@
 
 from .autoencoder import Autoencoder
 from .clusters import Clusters, spherical_kmeans
-from .codebook import EPS, Codebook, Nearest, row_norms, unit_rows
+from .codebook import Codebook, Nearest
 from .evolve import expand, prune
 from .fit_autoencoder import AutoencoderConfig, AutoencoderFit, fit_autoencoder
 from .fit_codebook import CodebookConfig, CodebookFit, fit_codebook
@@ -12,7 +12,6 @@ from .maps import FeatureMaps, IndexMaps, LatentMaps, quantize_maps
 from .sampling import choose_grid_step, farthest_points, grid_slices, sample_grid
 
 __all__ = [
-    "EPS",
     "Autoencoder",
     "AutoencoderConfig",
     "AutoencoderFit",
@@ -36,8 +35,6 @@ __all__ = [
     "grid_slices",
     "prune",
     "quantize_maps",
-    "row_norms",
     "sample_grid",
     "spherical_kmeans",
-    "unit_rows",
 ]

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from .._check import check_range, check_shapes
+from .._rows import unit_rows
 from ._store import read_tensors, write_tensors
-from .codebook import unit_rows
 
 Layer = tuple[Tensor, Tensor]  # weight [out, in], bias [out]
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes, check_whole
-from .codebook import EPS, row_norms, unit_rows
+from .._rows import EPS, row_norms, unit_rows
 
 ROUNDS = 10  # of assignment and averaging: later ones move few features
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_range, check_shapes
-from .codebook import EPS, row_norms, unit_rows
+from .._rows import EPS, row_norms, unit_rows
 
 
 def expand(

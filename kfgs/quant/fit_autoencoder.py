@@ -14,8 +14,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._check import check_range, check_whole
+from .._rows import row_norms, unit_rows
 from .autoencoder import Autoencoder, Layer, mlp, unit_latents
-from .codebook import Codebook, row_norms, unit_rows
+from .codebook import Codebook
 
 BLENDED = 4  # codewords per blend: pixels at borders and noisy Gaussians mix a few
 LAST_RATE = 0.02  # of the learning rate, at the last step

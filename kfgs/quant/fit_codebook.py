@@ -11,7 +11,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._check import check_range, check_shapes, check_whole
-from .codebook import EPS, Codebook, row_norms, unit_rows
+from .._rows import EPS, row_norms, unit_rows
+from .codebook import Codebook
 from .evolve import admit, prune
 from .grow import ROUNDS, grow, kmeans
 from .loss import class_balanced_loss

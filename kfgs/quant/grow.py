@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .codebook import unit_rows
+from .._rows import unit_rows
 
 LEAST_GAIN = 0.05  # of a cell's cosine distance; isotropic noise in n dimensions gains about 2 / (pi n) from a split
 LEAST_SHARE = 1 / 16  # of the mean cell's features, at maximum size: fewer are outliers, not content

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_range, check_shapes, check_whole
-from .codebook import unit_rows
+from .._rows import unit_rows
 
 NOISE = 1e-10  # of the first eigenvalue: what float32 rounding puts into a direction that the data do not have
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes
-from .codebook import EPS, row_norms
+from .._rows import EPS, row_norms
 
 
 class BalancedLoss(NamedTuple):

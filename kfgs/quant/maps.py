@@ -14,8 +14,9 @@ from tqdm import tqdm
 
 from .._check import check_shapes
 from .._files import atomic_path
+from .._rows import EPS
 from ._store import read_tensors, write_tensors
-from .codebook import EPS, Codebook, compare
+from .codebook import Codebook, compare
 
 
 class FeatureMaps(Protocol):

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_range, check_shapes
-from .codebook import EPS, row_norms, unit_rows
+from .._rows import EPS, row_norms, unit_rows
 
 SAMPLES = 28_800  # what rows 1::2 and columns 1::3 leave of a 360 x 480 map, as the paper's experiments used
 

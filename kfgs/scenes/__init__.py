@@ -1,43 +1,32 @@
 """Scenes: posed images and points, read from what COLMAP, nerfstudio, instant-ngp and Blender write, or estimated."""
 
-from .align import Alignment, align_by_cameras
 from .colmap import load_colmap
 from .colmap_check import ModelSummary, check_model
 from .errors import SceneError
 from .files import list_images
-from .frames import FrameCheck, frames_agree
 from .load import load_scene
 from .names import file_stem, natural_key
 from .points import Bounds, robust_bounds
-from .register import align_clouds
 from .scene import Scene, read_image
 from .sfm import SfmConfig, SfmReport, run_sfm
 from .splits import make_split, read_split, split_every
-from .toy import ToyConfig, make_toy_room
 from .transforms import load_transforms
 from .undistort import undistort_scene
 
 __all__ = [
-    "Alignment",
     "Bounds",
-    "FrameCheck",
     "ModelSummary",
     "Scene",
     "SceneError",
     "SfmConfig",
     "SfmReport",
-    "ToyConfig",
-    "align_by_cameras",
-    "align_clouds",
     "check_model",
     "file_stem",
-    "frames_agree",
     "list_images",
     "load_colmap",
     "load_scene",
     "load_transforms",
     "make_split",
-    "make_toy_room",
     "natural_key",
     "read_image",
     "read_split",

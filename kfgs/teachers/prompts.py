@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes
+from .._rows import EPS, row_norms, unit_rows
 from ..labels.label_set import LabelSet
 from ..labels.relevancy import CANONICAL
-from ..quant.codebook import EPS, row_norms, unit_rows
 from .protocol import PROMPTS_AT_ONCE, Teacher, as_teacher, identify
 
 _CLIP7 = (

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes, check_whole
+from .._rows import unit_rows
 from ..labels import label_codewords
-from ..quant.codebook import unit_rows
 from .palette import palette
 from .plots import INK, LINES, Row, _check_names, _curve, _figure, _from_zero, _is_number, _save
 

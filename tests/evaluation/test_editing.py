@@ -16,8 +16,8 @@ from kfgs.evaluation.scene_truth import SceneTruth
 from kfgs.labels.edit import recolor, remove
 from kfgs.metrics import psnr
 from kfgs.scenes import load_scene
-from kfgs.scenes.toy import ToyConfig, make_toy_room
 from kfgs.splat import rasterize
+from kfgs.toy.room_folder import ToyConfig, make_toy_room
 
 ROOM = ToyConfig(
     train_views=8, test_views=2, size=(120, 160), feature_size=(8, 8), feature_dim=16, surface_points=20_000, sparse_points=100

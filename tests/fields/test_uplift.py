@@ -10,11 +10,11 @@ from cases_splat import a_camera, gaussians_before
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from kfgs import Camera, Gaussians
+from kfgs._rows import unit_rows
 from kfgs.cameras import resize_map
 from kfgs.fields import FieldConfig, GaussianParams, UpliftConfig, fit_field, uplift, uplift_maps
 from kfgs.fields.coarse import shrink_map
 from kfgs.labels import average_views
-from kfgs.quant import unit_rows
 from kfgs.splat import rasterize
 
 PLAIN = UpliftConfig(corrections=0, keep=1.0)  # the average alone, and as many latents as channels

@@ -10,6 +10,7 @@ import torch
 from cases_clouds import room
 from scipy.spatial.transform import Rotation
 
+from kfgs.align import by_shape as register
 from kfgs.cameras import Camera
 from kfgs.cameras.similarity import Similarity
 from kfgs.evaluation import LabelSet
@@ -20,7 +21,7 @@ from kfgs.formats.table import read_splats, write_splats
 from kfgs.gaussians import Gaussians
 from kfgs.labels import transfer_labels
 from kfgs.pipeline.attach import attach
-from kfgs.scenes import SceneError, register
+from kfgs.scenes import SceneError
 from kfgs.splat.transform import transform_gaussians
 
 CLASSES = LabelSet(("wall", "box", "table"), torch.eye(4)[:3])

@@ -7,13 +7,13 @@ import torch
 from small_room import CONFIG, config, make_room
 
 from kfgs.cameras import Distortion
+from kfgs.features import FeatureFolder
+from kfgs.features.extract import discard_maps, extract_features, pictures_of
+from kfgs.features.recompute import RecomputedMaps
 from kfgs.pipeline import Run, fit_scene
 from kfgs.pipeline.maps import UndistortedMaps, map_digests, map_shape
 from kfgs.quant import sample_grid
 from kfgs.scenes import load_scene
-from kfgs.teachers import FeatureFolder
-from kfgs.teachers.cache import discard_maps, extract_features, pictures_of
-from kfgs.teachers.recompute import RecomputedMaps
 
 QUICK = config(field=dataclasses.replace(CONFIG.field, steps=3))
 LENS = Distortion("brown_conrady", (0.3, 0.05, 0.001, -0.002))

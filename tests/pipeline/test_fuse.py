@@ -11,6 +11,7 @@ from small_room import make_room
 
 import kfgs
 from kfgs.cli import main
+from kfgs.features import FeatureFolder
 from kfgs.fields import Clicks, SemanticField, UpliftConfig
 from kfgs.formats import SplatFile, read_splats, write_splats
 from kfgs.gaussians import Gaussians
@@ -18,7 +19,6 @@ from kfgs.labels import load_label_set
 from kfgs.pipeline import FitConfig, fit_color, fit_scene, score_scene, segment_scene, true_labels, uplift
 from kfgs.pipeline.color import ColorConfig
 from kfgs.scenes import load_scene
-from kfgs.teachers import FeatureFolder
 from kfgs.viz import explore
 
 CONFIG = FitConfig(uplift=UpliftConfig.field(max_gaussians=1_500))

@@ -6,10 +6,10 @@ import torch
 from small_room import CONFIG, make_room
 
 from kfgs.cameras import Camera, Distortion, undistort
+from kfgs.features import FeatureFolder
 from kfgs.pipeline import fit_scene
 from kfgs.pipeline.maps import KnownFeatures, UndistortedMaps
 from kfgs.scenes import load_scene
-from kfgs.teachers import FeatureFolder
 
 LENS = Distortion("brown_conrady", (0.3, 0.05, 0.001, -0.002))
 

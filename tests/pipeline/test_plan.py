@@ -10,6 +10,8 @@ import torch
 from small_room import CONFIG, ROOM, make_room
 
 from kfgs.cameras import Camera
+from kfgs.features import FeatureFolder
+from kfgs.features.manifest import Manifest, MapRecord
 from kfgs.fields import FieldConfig
 from kfgs.pipeline import FitConfig, fit_scene, plan_stages
 from kfgs.pipeline.machine import Speed, disk_free, measure_speed, memory_free
@@ -18,9 +20,7 @@ from kfgs.pipeline.plan import plan_scene as plan_any
 from kfgs.pipeline.work import gaussian_counts, render_pixels
 from kfgs.quant import CodebookConfig
 from kfgs.scenes import Scene, load_scene
-from kfgs.teachers import FeatureFolder
 from kfgs.teachers.costs import TeacherCost
-from kfgs.teachers.manifest import Manifest, MapRecord
 
 GB = 1e9
 

@@ -2,7 +2,8 @@ import oracles_quant as oracle
 import pytest
 import torch
 
-from kfgs.quant import EPS, Codebook, IndexMaps, unit_rows
+from kfgs._rows import EPS, unit_rows
+from kfgs.quant import Codebook, IndexMaps
 from kfgs.quant.codebook import compare
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from kfgs.quant import unit_rows
+from kfgs._rows import unit_rows
 from kfgs.quant.grow import grow, kmeans, nearest_cells
 
 

@@ -5,9 +5,10 @@ import pytest
 import torch
 from cases_explorer import MODES, cameras, classes, field
 
+from kfgs._rows import unit_rows
 from kfgs.fields import SemanticField
 from kfgs.gaussians import Gaussians
-from kfgs.quant import Autoencoder, Codebook, fit_linear_latents, unit_rows
+from kfgs.quant import Autoencoder, Codebook, fit_linear_latents
 from kfgs.viz import FeatureColors, feature_colors
 from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.meaning import FieldMeaning

@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..._check import check_range
+from ..._rows import check_finite
 from ...formats.splat_file import SplatFile
 from .._plain import number_of
-from .._rows import check_finite
 from ..where import Where
 from .base import Edit, as_where, selected
 

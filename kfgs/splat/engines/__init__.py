@@ -10,7 +10,7 @@ from torch import Tensor
 from ..._check import check_shapes
 from . import ops
 from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from .numba_memory import free_memory
+from .cpu.memory import free_memory
 from .ops import check_values
 from .table import available_engines, choose, load, offers
 

@@ -27,8 +27,8 @@ class _Entry(NamedTuple):
 
 
 _ENGINES = {
-    "triton": _Entry("kfgs.splat.engines.triton_gpu", "triton", "pip install triton"),
-    "numba": _Entry("kfgs.splat.engines.numba_cpu", "numba", "pip install numba"),
+    "triton": _Entry("kfgs.splat.engines.triton.engine", "triton", "pip install triton"),
+    "numba": _Entry("kfgs.splat.engines.cpu.engine", "numba", "pip install numba"),
     "reference": _Entry("kfgs.splat.engines.reference", "torch", "pip install torch"),
 }
 """In order of preference: `engine="auto"` takes the first that knows the device and can be imported."""

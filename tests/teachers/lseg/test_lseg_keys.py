@@ -1,10 +1,10 @@
 import pytest
 import torch
 from cases_lseg import TINY
+from lseg_layout import random_state
 from torch.nn import functional
 
 from kfgs.teachers.lseg.keys import network_from_state, text_from_state
-from kfgs.teachers.lseg.layout import random_state
 from kfgs.teachers.lseg.network import LSegConfig
 
 HEAD = "net.scratch.head1.weight"

@@ -4,8 +4,8 @@ import math
 from collections import Counter
 
 import torch
+from lseg_layout import layout, random_state
 
-from kfgs.teachers.lseg.layout import layout, random_state
 from kfgs.teachers.lseg.network import LSegConfig
 
 TINY = LSegConfig(

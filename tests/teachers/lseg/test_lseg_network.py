@@ -3,11 +3,11 @@ import dataclasses
 import oracles_lseg
 import pytest
 import torch
+from lseg_layout import random_state
 from torch import nn
 from torch.nn import functional
 
 from kfgs.teachers.lseg.keys import network_from_state, text_from_state
-from kfgs.teachers.lseg.layout import random_state
 from kfgs.teachers.lseg.network import LSegConfig
 
 SIZES = {

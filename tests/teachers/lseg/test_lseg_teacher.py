@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from lseg_layout import random_state
 from torch import Tensor
 from torch.nn import functional
 
 from kfgs.teachers.lseg import LSeg, LSegConfig, LSegOptions, load_lseg
 from kfgs.teachers.lseg.keys import network_from_state, text_from_state
-from kfgs.teachers.lseg.layout import random_state
 from kfgs.teachers.lseg.text import ClipText
 from kfgs.teachers.lseg.windows import multi_scale_features
 from kfgs.teachers.protocol import Teacher, check_features, identify

@@ -4,10 +4,10 @@ import cases_lseg
 import oracles_lseg
 import pytest
 import torch
+from lseg_layout import random_state
 from torch.nn import functional
 
 from kfgs.teachers.lseg.keys import text_from_state
-from kfgs.teachers.lseg.layout import random_state
 
 TINY = replace(cases_lseg.TINY, text_layers=3)
 IDS = torch.tensor(

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from lseg_layout import random_state
 from oracles_bpe import hugging_face, read_merges
 from oracles_lseg import network, prompt_embeddings
 from oracles_windows import evaluate, resize
 
 import kfgs
 from kfgs.teachers.lseg import LSeg, LSegConfig, load_lseg
-from kfgs.teachers.lseg.layout import random_state
 
 TINY = LSegConfig(
     width=32, depth=5, heads=4, window=64, position_grid=3, hooks=(0, 1, 3, 4), neck=(8, 12, 16, 20), fusion=12, dim=10,

@@ -1,0 +1,41 @@
+"""Clouds of points as frames are compared by: the bulk of a cloud, its spacing, nearest points."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from ..scenes.points import robust_bounds
+
+Array = np.ndarray[Any, Any]
+
+SAMPLE = 20_000  # points of each cloud that are measured
+
+
+def bulk(name: str, points: Tensor, sample: int = SAMPLE) -> Array:
+    """The points within robust bounds, float64, evenly thinned, each place once; refuses NaN and fewer than two."""
+    values = points.detach().double().cpu()
+    finite = values.isfinite().all(1)
+    if not bool(finite.all()):
+        raise ValueError(
+            f"{name}: expected finite positions, got NaN or infinity in row {int((~finite).nonzero()[0])}; remove such "
+            "points first"
+        )
+    if len(values) < 2:
+        raise ValueError(f"{name}: expected at least two points, got {len(values)}; there is nothing to compare")
+    kept: Array = values[robust_bounds(values, margin=0.0).inside].numpy() if len(values) > 100 else values.numpy()
+    return np.unique(kept[:: max(1, len(kept) // sample)], axis=0)  # no two at one place: the spacing is not 0
+
+
+def median_spacing(tree: cKDTree) -> float:
+    """Median distance from a point to the next at another place."""
+    return float(np.median(nearest(tree, np.asarray(tree.data)[:: max(1, tree.n // 5_000)], k=2)[0][:, 1]))
+
+
+def nearest(tree: cKDTree, places: Array, k: int = 1) -> tuple[Array, Array]:
+    """Distances and indices of the k nearest points, [N] each, or [N, k] for more than one."""
+    distances, indices = tree.query(places, k=k, workers=1)
+    return np.asarray(distances), np.asarray(indices)

@@ -1,0 +1,1 @@
+"""The CPU engine: projection, binning and compositing compiled by numba. README.md beside this file explains it."""

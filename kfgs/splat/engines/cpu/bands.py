@@ -1,0 +1,228 @@
+"""The compiled kernels over a band of tiles, forward: compositing and accumulation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from . import narrow as narrow
+from . import wide as wide
+from .cache import compiled
+from .simd import (
+    LANES,
+    add_scaled,
+    lanes_below,
+    load,
+    load_many,
+    put,
+    spread_many,
+    store,
+    store_many,
+    store_part,
+    transpose,
+)
+from .square import (
+    BLOCK,
+    BLOCKS,
+    CHUNK,
+    INLINE,
+    LEFT,
+    OPTIONS,
+    PIXELS,
+    STATE,
+    Picture,
+    View,
+    aligned,
+    read_block,
+    square_box,
+    start_square,
+    write_block,
+)
+
+SIXTEEN = (0,) * LANES
+"""A block's pixels, or as many channels."""
+
+
+@njit(**INLINE)
+def whole_planes(passes: Any, channels: int) -> int:
+    """Planes that hold the channels of all passes, and of whole vectors of channels."""
+    return max(passes[2], wide.padded(channels))
+
+
+@njit(**INLINE)
+def _write_alphas(state: Any, box: tuple[int, int, int, int], alphas: Any, lefts: Any, width: int) -> None:
+    """Transmittance of a square's pixels, and 1 - transmittance."""
+    left, top, right, bottom = box
+    for y in range(bottom - top):
+        for x in range(right - left):
+            p = (y // BLOCK * BLOCK + x // BLOCK) * LANES + y % BLOCK * BLOCK + x % BLOCK
+            put(lefts, (top + y) * width + left + x, state[LEFT + p])
+            put(alphas, (top + y) * width + left + x, 1 - state[LEFT + p])
+
+
+@compiled(**OPTIONS)
+def composite_narrow(
+    band: int, view: View, rows: Any, length: int, passes: Any, background: Any, images: Any, trace: Any
+) -> None:
+    """Composite the tiles of one band, with few channels.
+
+    Args:
+        band: which.
+        view: the tiles.
+        rows: packed Gaussians with their features.
+        length: of a packed row.
+        passes: from `plan_passes`.
+        background: as many numbers as the passes have channels.
+        images: maps [H * W * D], alphas [H * W] and transmittances [H * W], written.
+        trace: written: per tile and square how many Gaussians were looked at, then the blocks that each was drawn in.
+    """
+    maps, alphas, lefts = images
+    channels = len(maps) // len(alphas)
+    picture, planes = Picture(maps, view.width, channels), whole_planes(passes, channels)
+    state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
+    sums, weights = aligned(planes * PIXELS, rows), aligned(CHUNK * LANES, rows)
+    sums[:] = 0
+    hits, counts = np.empty(BLOCKS * CHUNK, np.int32), np.empty(BLOCKS, np.int32)
+    block_sums = aligned(LANES * LANES, rows)
+    squares = view.across**2
+    drawn = trace[squares * (len(view.offsets) - 1) :]
+    for tile in range(view.bounds[band], view.bounds[band + 1]):
+        start, end = view.offsets[tile], view.offsets[tile + 1]
+        for square in range(squares):
+            box = square_box(view, tile, square)
+            if box[0] >= box[2] or box[1] >= box[3]:
+                continue
+            dark = start_square(state, corners, box)
+            sums[: passes[2] * PIXELS] = 0
+            span = start, end, start * squares + square * (end - start)
+            scratch = corners, sums, weights, hits, counts
+            done = narrow.composite_square((rows, length, view.order), span, state, dark, passes, scratch, drawn)
+            trace[tile * squares + square] = done - start
+            _write_alphas(state, box, alphas, lefts, view.width)
+            for block in range(BLOCKS):
+                p = block * LANES
+                left = load(state, LEFT + p)
+                for channel in range(0, channels, LANES):
+                    total = load_many(SIXTEEN, sums, channel * PIXELS + p, PIXELS)
+                    total = add_scaled(total, left, spread_many(SIXTEEN, background, channel, 1))
+                    store_many(block_sums, 0, LANES, transpose(total))
+                    write_block(picture, box, block, channel, block_sums, 0, LANES)
+
+
+@compiled(**OPTIONS)
+def composite_wide(
+    band: int, view: View, rows: Any, length: int, features: Any, begins: Any, background: Any, images: Any, trace: Any
+) -> None:
+    """Composite the tiles of one band, with many channels.
+
+    Args:
+        band: which.
+        view: the tiles.
+        rows: packed Gaussians without features.
+        length: of a packed row.
+        features: flat.
+        begins: [M], where each Gaussian's row of features begins.
+        background: D numbers and zeros up to a whole vector.
+        images: maps [H * W * D], alphas [H * W] and transmittances [H * W], written.
+        trace: see `composite_narrow`.
+    """
+    maps, alphas, lefts = images
+    channels = len(maps) // len(alphas)
+    stride = wide.padded(channels)
+    state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
+    sums = aligned(PIXELS * stride, rows)
+    kept = wide.make_kept(rows)
+    hits, counts = np.empty(BLOCKS * CHUNK, np.int32), np.empty(BLOCKS, np.int32)
+    squares = view.across**2
+    drawn = trace[squares * (len(view.offsets) - 1) :]
+    for tile in range(view.bounds[band], view.bounds[band + 1]):
+        start, end = view.offsets[tile], view.offsets[tile + 1]
+        for square in range(squares):
+            box = square_box(view, tile, square)
+            if box[0] >= box[2] or box[1] >= box[3]:
+                continue
+            dark = start_square(state, corners, box)
+            span = start, end, start * squares + square * (end - start)
+            scratch = corners, sums, kept, hits, counts
+            packed, source = (rows, length, view.order), (features, begins, channels)
+            done, filled = wide.composite_square(packed, span, state, dark, source, scratch, drawn)
+            trace[tile * squares + square] = done - start
+            _write_alphas(state, box, alphas, lefts, view.width)
+            for y in range(box[3] - box[1]):
+                for x in range(box[2] - box[0]):
+                    block = y // BLOCK * BLOCK + x // BLOCK
+                    p = block * LANES + y % BLOCK * BLOCK + x % BLOCK
+                    at = ((box[1] + y) * view.width + box[0] + x) * channels
+                    _write_pixel(
+                        maps,
+                        at,
+                        channels,
+                        sums,
+                        p * stride,
+                        (filled >> np.uint32(block)) & 1,
+                        background,
+                        state[LEFT + p],
+                    )
+
+
+@njit(**INLINE)
+def _write_pixel(
+    maps: Any, at: int, channels: int, sums: Any, place: int, filled: int, background: Any, left: Any
+) -> None:
+    """A pixel's sums, if it has any, and what shows through."""
+    whole = channels // LANES * LANES
+    lanes = lanes_below(maps, channels - whole)
+    for channel in range(0, whole, LANES):
+        value = load(background, channel) * left
+        if filled:
+            value = value + load(sums, place + channel)
+        store(maps, at + channel, value)
+    if whole < channels:
+        value = load(background, whole) * left
+        if filled:
+            value = value + load(sums, place + whole)
+        store_part(maps, at + whole, lanes, value)
+
+
+@compiled(**OPTIONS)
+def accumulate_band(
+    band: int, view: View, rows: Any, length: int, pixels: Any, channels: int, slots: Any, firsts: Any, out: Any
+) -> None:
+    """Sum one band's pixels into its own rows of `out`, weighted: the weights' sum follows the channels.
+
+    Args:
+        band: which.
+        view: the tiles.
+        rows: packed Gaussians without features.
+        length: of a packed row.
+        pixels: [H * W * D].
+        channels: D.
+        slots: [P] from `number_slots`.
+        firsts: [B + 1], where the bands' rows begin.
+        out: [R * padded(D + 1)], written.
+    """
+    width = wide.padded(channels + 1)
+    picture = Picture(pixels, view.width, channels)
+    state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
+    planes, weights = aligned(width * PIXELS, rows), aligned(PIXELS, rows)
+    planes[:] = 0
+    scratch = aligned(LANES * LANES, rows)
+    own = out[firsts[band] * width : firsts[band + 1] * width]
+    own[:] = 0
+    for tile in range(view.bounds[band], view.bounds[band + 1]):
+        start, end = view.offsets[tile], view.offsets[tile + 1]
+        for square in range(view.across**2):
+            box = square_box(view, tile, square)
+            if start == end or box[0] >= box[2] or box[1] >= box[3]:
+                continue
+            dark = start_square(state, corners, box)
+            for block in range(BLOCKS):
+                for channel in range(0, channels, LANES):
+                    read_block(picture, box, block, channel, scratch, 0, LANES)
+                    values = transpose(load_many(SIXTEEN, scratch, 0, LANES))
+                    store_many(planes, channel * PIXELS + block * LANES, PIXELS, values)
+            planes[channels * PIXELS : (channels + 1) * PIXELS] = 1
+            packed = rows, length, view.order
+            narrow.accumulate_square(packed, (start, end), state, dark, corners, planes, weights, slots, width, own)

@@ -1,0 +1,235 @@
+"""The CPU engine: compositing compiled by numba, with its own backward pass.
+
+Work is cut into bands of tiles by the data alone; each band writes its own pixels and its own gradient rows, and the
+rows are summed in the order of the bands. Reruns are therefore equal to the bit, whatever the number of threads.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .bands import accumulate_band, composite_narrow, composite_wide
+from .bands_backward import differentiate_narrow, differentiate_wide
+from .memory import take
+from .narrow import FIRST, MOMENTS, plan_passes
+from .project import project, project_backward
+from .simd import LANES
+from .slots import chain_slots, gather_gradients, gather_sums, number_slots
+from .square import SIDE, View, pack_rows
+from .square import row_length as _row_length
+from .threads import run_bands
+from .tiles import bin
+from .wide import padded as _whole
+
+row_length, padded = _row_length.py_func, _whole.py_func  # as Python: one call is not worth a compilation
+
+__all__ = ["accumulate", "backward", "bin", "devices", "forward", "project", "project_backward"]
+
+BANDS, BAND = 32, 2048
+"""Shares of the work, and the fewest pairs that make one: more shares keep more threads busy, and let more gradient rows
+meet at their borders. How many there are depends on the data alone."""
+
+NARROW = len(FIRST) + LANES
+"""Up to so many channels stay in registers, a vector each; more are multiplied in blocks."""
+
+
+DTYPES = torch.float32, torch.float64
+
+
+def devices() -> tuple[str, ...]:
+    """Where the engine runs."""
+    return ("cpu",)
+
+
+def forward(
+    means2d: Tensor,  # [M, 2]
+    conics: Tensor,  # [M, 3]
+    opacities: Tensor,  # [M]
+    features: Tensor,  # [N, D]
+    background: Tensor,  # [D]
+    index: Tensor | None,  # [M] int64
+    rows: Tensor,  # [P]
+    offsets: Tensor,  # [T + 1]
+    width: int,
+    height: int,
+    tile_size: int,
+) -> tuple[Tensor, Tensor, Tensor]:  # maps [H, W, D], alphas [H, W], trace int32
+    """Composite as `contract` promises; a Gaussian whose conic is not positive definite is not drawn."""
+    channels = features.shape[1]
+    view = _view(rows, offsets, width, height, tile_size)
+    bands = len(view.bounds) - 1
+    maps, alphas = take(features, height, width, channels), features.new_empty(height, width)
+    trace, packed, lefts, ends = _make_trace(view, means2d, channels)
+    ends[: view.across**2 * (len(view.offsets) - 1)] = 0
+    splats = _flat(means2d), _flat(conics), _flat(opacities)
+    run_bands(pack_rows, bands, bands, splats, _flat(features), _packed(channels), _index(index), packed)
+    images, length = (_flat(maps), _flat(alphas), lefts), row_length(_packed(channels))
+    behind = _padded(background, padded(channels))
+    if channels <= NARROW:
+        passes = plan_passes(channels)
+        run_bands(composite_narrow, bands, view, packed, length, passes, behind, images, ends)
+    else:
+        shared = (view, packed, length, _flat(features), _begins(index, len(means2d), channels), behind, images, ends)
+        run_bands(composite_wide, bands, *shared)
+    return maps, alphas, trace
+
+
+def backward(
+    grad_maps: Tensor,  # [H, W, D]
+    grad_alphas: Tensor,  # [H, W]
+    wanted: list[bool],
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    background: Tensor,
+    index: Tensor | None,
+    rows: Tensor,
+    offsets: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+    maps: Tensor,
+    alphas: Tensor,
+    trace: Tensor,
+) -> list[Tensor]:
+    """Gradients of means2d, conics, opacities, features and background; empty where not wanted."""
+    channels = features.shape[1]
+    view = _view(rows, offsets, width, height, tile_size)
+    bands = len(view.bounds) - 1
+    slots, firsts, total, chains = _number(view, len(means2d))
+    packed, lefts, ends = _read_trace(trace, view, means2d, channels)
+    images = _flat(maps), _flat(grad_maps), lefts, _flat(grad_alphas)
+    length, behind = row_length(_packed(channels)), _padded(background, padded(channels))
+    row, column = (length, MOMENTS) if channels <= NARROW else (LANES + padded(channels), LANES)
+    out = take(means2d, total * row).numpy()
+    if channels <= NARROW:
+        passes = plan_passes(channels)
+        run_bands(differentiate_narrow, bands, view, packed, length, passes, behind, images, ends, slots, firsts, out)
+    else:
+        source = _flat(features), _begins(index, len(means2d), channels), channels
+        shared = (view, packed, length, source, behind, images, ends, slots, firsts, out, any(wanted[:3]))
+        run_bands(differentiate_wide, bands, *shared)
+    grads = [
+        torch.empty_like(means2d),
+        torch.empty_like(conics),
+        torch.empty_like(opacities),
+        torch.zeros_like(features),
+    ]
+    which, layout = _index(index), (row, column, channels)
+    shares = bands if _increasing(which) else 1  # two Gaussians that show the same row must not meet
+    splats, targets = (_flat(conics), _flat(opacities)), tuple(_flat(value) for value in grads)
+    run_bands(gather_gradients, shares, shares, splats, chains, out, layout, which, targets)
+    grads.append(
+        (grad_maps * torch.from_numpy(lefts).view_as(alphas)[..., None]).sum((0, 1)) if wanted[4] else background
+    )
+    return [value if want else value.new_empty(0) for value, want in zip(grads, wanted, strict=True)]
+
+
+def accumulate(
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    pixels: Tensor,  # [H, W, D]
+    rows: Tensor,
+    offsets: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+) -> tuple[Tensor, Tensor]:  # sums [M, D], weights [M]
+    """Sum pixels into the Gaussians by compositing weight, in one walk."""
+    channels = pixels.shape[2]
+    view = _view(rows, offsets, width, height, tile_size)
+    bands = len(view.bounds) - 1
+    slots, firsts, total, chains = _number(view, len(means2d))
+    packed = torch.empty(len(means2d) * row_length(0), dtype=pixels.dtype).numpy()
+    splats = _flat(means2d), _flat(conics), _flat(opacities)
+    run_bands(pack_rows, bands, bands, splats, packed[:0], 0, _index(None), packed)
+    length = padded(channels + 1)
+    out = take(pixels, total * length).numpy()
+    shared = (view, packed, row_length(0), _flat(pixels), channels, slots, firsts, out)
+    run_bands(accumulate_band, bands, *shared)
+    sums, weights = pixels.new_empty(len(means2d), channels), pixels.new_empty(len(means2d))
+    run_bands(gather_sums, bands, bands, chains, out, length, sums.numpy(), weights.numpy())
+    return sums, weights
+
+
+def _flat(tensor: Tensor) -> np.ndarray:
+    """The tensor's memory as numpy sees it, in one dimension."""
+    return tensor.detach().contiguous().view(-1).numpy()
+
+
+def _packed(channels: int) -> int:
+    """How many channels are packed with their Gaussian."""
+    return channels if channels <= NARROW else 0
+
+
+def _make_trace(view: View, like: Tensor, channels: int) -> tuple[Tensor, np.ndarray, np.ndarray, np.ndarray]:
+    """What backward wants to know of forward, in one int32 tensor, and its parts.
+
+    The packed Gaussians come first, on whole cache lines; then each pixel's transmittance, of which 1 - alpha keeps few
+    digits; then, per tile and square, how many Gaussians were looked at, and the blocks that each was drawn in.
+    """
+    squares = view.across**2
+    numbers = sum(_floats(view, like, channels)) * like.element_size() // 4
+    length = numbers + squares * (len(view.offsets) - 1 + len(view.order))
+    trace = take(torch.empty(0, dtype=torch.int32), length)
+    return trace, *_read_trace(trace, view, like, channels)
+
+
+def _read_trace(trace: Tensor, view: View, like: Tensor, channels: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The packed Gaussians, the transmittances and the rest of a trace."""
+    packed, pixels = _floats(view, like, channels)
+    numbers = (packed + pixels) * like.element_size() // 4
+    floats = trace.numpy()[:numbers].view(like.detach().numpy().dtype)
+    return floats[:packed], floats[packed:], trace.numpy()[numbers:]
+
+
+def _floats(view: View, like: Tensor, channels: int) -> tuple[int, int]:
+    """How many numbers of the data's type are in a trace: packed Gaussians, and pixels."""
+    return len(like) * row_length(_packed(channels)), view.width * view.height
+
+
+def _index(index: Tensor | None) -> np.ndarray:
+    return np.empty(0, np.int64) if index is None else index.numpy()
+
+
+def _increasing(index: np.ndarray) -> bool:
+    return bool((index[1:] > index[:-1]).all())
+
+
+def _begins(index: Tensor | None, count: int, channels: int) -> np.ndarray:
+    """Where each Gaussian's row of features begins, [M] int64."""
+    return channels * (np.arange(count) if index is None else index.numpy())
+
+
+def _padded(background: Tensor, channels: int) -> np.ndarray:
+    behind = np.zeros(channels, background.detach().numpy().dtype)
+    behind[: len(background)] = background.detach().numpy()
+    return behind
+
+
+def _view(rows: Tensor, offsets: Tensor, width: int, height: int, tile_size: int) -> View:
+    """The tiles, and bands of consecutive tiles with about as many pairs each (an empty tile costs something, too)."""
+    ends = offsets.numpy().astype(np.int64, copy=False)
+    cost = ends + 4 * np.arange(len(ends))
+    bands = min(BANDS, 1 + int(cost[-1]) // BAND)
+    bounds = np.searchsorted(cost, np.linspace(0, cost[-1], bands + 1)).astype(np.int64)
+    bounds[0], bounds[-1] = 0, len(ends) - 1
+    across = -(-min(tile_size, max(width, height)) // SIDE)
+    return View(rows.numpy().astype(np.int32, copy=False), ends, bounds, width, height, tile_size, across)
+
+
+def _number(view: View, count: int) -> tuple[np.ndarray, np.ndarray, int, Any]:
+    """Gradient rows: of each pair within its band, where each band's begin, how many, and which belong together."""
+    slots, owners = np.empty(len(view.order), np.int32), np.empty(len(view.order), np.int32)
+    counts = np.empty(len(view.bounds) - 1, np.int64)
+    run_bands(number_slots, len(counts), view, slots, owners, counts, count)
+    total = int(counts.sum())
+    chains = np.empty(count, np.int32), np.empty(total, np.int32)
+    chain_slots(view, owners, counts, *chains)
+    return slots, np.concatenate([[0], np.cumsum(counts)]), total, chains

@@ -1,0 +1,75 @@
+"""Which Gaussians touch which tile, compiled by numba: one sort of the Gaussians by depth, none of the pairs.
+
+Gaussians are taken front to back in bands. A band lists the (tile, Gaussian) pairs that touch, and counts them by tile;
+then every band knows where its part of each tile's list begins, and copies its pairs there. The work is proportional to
+the pairs found. The lists are those of the torch code in `kfgs.splat.tiles`, to the bit: the tests are the same
+arithmetic in the same order, without fused multiply-adds.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .radix import sort_rows
+from .reach import find_reach
+from .threads import run_bands
+from .tiles_kernels import find_pairs, list_rows
+
+__all__ = ["bin", "depth_order"]
+
+_SHARE = 8192
+"""Gaussians of a band: few enough that threads end together, and many against the counters of every tile."""
+
+
+@torch.no_grad()
+def bin(
+    means2d: Tensor,  # [M, 2]
+    conics: Tensor,  # [M, 3]
+    depths: Tensor,  # [M]
+    opacities: Tensor,  # [M]
+    extents: Tensor,  # [M, 2]
+    width: int,
+    height: int,
+    tile_size: int,
+) -> tuple[Tensor, Tensor]:  # rows [P] int32, offsets [T + 1] int64
+    """List the Gaussians of every tile, as `kfgs.splat.bin_tiles` says.
+
+    Args:
+        means2d: contiguous, like all that follow, float32 or float64, on the CPU.
+        conics: as `project` returns them.
+        depths: as `project` returns them.
+        opacities: as `project` returns them.
+        extents: as `project` returns them.
+        width: of the picture, pixels.
+        height: of the picture, pixels.
+        tile_size: side of a tile, pixels.
+
+    Returns:
+        Tile t owns rows[offsets[t]:offsets[t + 1]], by depth, then by row.
+    """
+    M, tiles = len(depths), -(-width // tile_size) * -(-height // tile_size)
+    bands = max(1, -(-M // _SHARE))
+    values = (value.detach().view(-1).numpy() for value in (means2d, conics, extents))
+    splats = *values, find_reach(opacities)
+    picture, eps = (width, height, tile_size), float(torch.finfo(means2d.dtype).eps)
+    order, counts = depth_order(depths), np.zeros((bands, tiles), np.int32)
+    pairs: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+    def find(band: int) -> None:
+        pairs[band] = find_pairs(band, bands, order, splats, eps, picture, counts[band])
+
+    run_bands(find, bands)
+    offsets = np.zeros(tiles + 1, np.int64)
+    np.cumsum(counts.sum(axis=0, dtype=np.int64), out=offsets[1:])
+    starts = np.cumsum(counts, axis=0, dtype=np.int64) - counts + offsets[:-1]
+    rows = np.empty(int(offsets[-1]), np.int32)
+    run_bands(lambda band: list_rows(*pairs[band], starts[band], rows), bands)
+    return torch.from_numpy(rows), torch.from_numpy(offsets)
+
+
+def depth_order(depths: Tensor) -> np.ndarray:  # [M] -> [M] int32
+    """The rows by depth; equal depths by row. NaN comes last, as torch sorts."""
+    values = depths.detach().numpy()
+    return sort_rows(values.view(np.uint32 if values.itemsize == 4 else np.uint64))

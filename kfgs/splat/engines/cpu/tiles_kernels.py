@@ -1,0 +1,314 @@
+"""The compiled tests of Gaussians against tiles.
+
+Most Gaussians lie in boxes of at most 2 x 2 tiles. These are tested together: blocks of BLOCK Gaussians are gathered into
+planes (entry i of plane p is `state[p + i]`), and one loop without branches tests four tiles for 8 or 16 Gaussians at a
+time. In a larger box each row of tiles is first cut to where the ellipse is, so that a long needle costs no more than the
+tiles it crosses.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from .cache import compiled
+
+BLOCK = 64
+_X, _Y, _A, _B, _C, _EXTENT_X, _EXTENT_Y, _REACH = (k * BLOCK for k in range(8))
+_LEFT, _RIGHT, _TOP, _BOTTOM, _HIT = (k * BLOCK for k in range(8, 13))  # the box, in tiles, and four answers
+_TILE_X, _TILE_Y, _TOUCHED = (k * BLOCK for k in range(16, 19))  # tiles of one Gaussian
+_STATE = 19 * BLOCK
+
+_WIDE = 8
+"""A row of more tiles than this is cut to where the ellipse is; testing a shorter one costs less."""
+
+_ROUNDING = 1e-6
+"""Relative, of the float64 arithmetic that cuts a row of tiles."""
+_FLAT, _HUGE = 1e-9, 1e30
+"""No row is cut where the determinant has lost its digits, a c - b^2 <= 1e-9 a c, or for a level beyond 1e30."""
+
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}  # no fused multiply-add: torch rounds each product
+
+
+@compiled(**_OPTIONS)
+def find_pairs(
+    band: int,
+    bands: int,
+    order: Any,
+    splats: tuple[Any, Any, Any, Any],
+    eps: float,
+    picture: tuple[int, int, int],
+    counts: Any,
+) -> tuple[Any, Any]:
+    """Find the tiles of one share of the Gaussians.
+
+    Args:
+        band: which.
+        bands: into how many equal shares the M Gaussians are cut.
+        order: [M] int32, rows by depth.
+        splats: means2d [2 M], conics [3 M], extents [2 M] and reach [M], 2 ln(opacity / ALPHA_MIN).
+        eps: of the dtype.
+        picture: width, height and tile size, pixels.
+        counts: [T] int32 of zeros, written: how many Gaussians of this share touch each tile.
+
+    Returns:
+        Tiles and rows, int32, of the pairs, front to back.
+    """
+    width, height, side = picture
+    columns = (width + side - 1) // side
+    tiles = columns * ((height + side - 1) // side)
+    state, end = np.zeros(_STATE, splats[0].dtype), 0
+    first, last = len(order) * band // bands, len(order) * (band + 1) // bands
+    pairs = np.empty((2, 4 * (last - first) + 4 * BLOCK), np.int32)
+    for begin in range(first, last, BLOCK):
+        count = min(BLOCK, last - begin)
+        _gather(state, order, begin, count, splats)
+        _test_block(state, width, height, side, eps)
+        if end + _count_boxes(state, count) > pairs.shape[1]:
+            pairs = _grow(pairs, end, BLOCK * tiles)
+        end = _append_block(state, order, begin, count, side, columns, eps, pairs[0], pairs[1], end)
+    _count_tiles(pairs[0], end, counts)
+    return pairs[0, :end], pairs[1, :end]
+
+
+@compiled(**_OPTIONS)
+def list_rows(tiles: Any, which: Any, starts: Any, rows: Any) -> None:
+    """Write the rows of one share's pairs into the tiles' lists.
+
+    Args:
+        tiles: of the pairs, from `find_pairs`.
+        which: the pairs' rows.
+        starts: [T] int64, where the share's part of each tile's list begins; changed.
+        rows: [P] int32, written.
+    """
+    for p in range(len(tiles)):
+        tile = max(tiles[p], 0)
+        at = max(starts[tile], 0)
+        rows[at] = which[p]
+        starts[tile] = at + 1
+
+
+@njit(**_OPTIONS)
+def _count_tiles(tiles: Any, end: int, counts: Any) -> None:
+    """Count the pairs of each tile. A function of its own: numba counts references to arrays that a loop exchanges."""
+    for p in range(end):
+        counts[max(tiles[p], 0)] += 1
+
+
+@njit(**_OPTIONS)
+def _count_boxes(state: Any, count: int) -> int:
+    """How many pairs `_append_block` may look at."""
+    total = 0
+    for k in range(count):
+        total += max(4, int((state[_RIGHT + k] - state[_LEFT + k]) * (state[_BOTTOM + k] - state[_TOP + k])))
+    return total
+
+
+@njit(**_OPTIONS)
+def _grow(pairs: Any, count: int, room: int) -> Any:
+    """A longer copy."""
+    longer = np.empty((2, 2 * pairs.shape[1] + room), pairs.dtype)
+    longer[:, :count] = pairs[:, :count]
+    return longer
+
+
+@njit(**_OPTIONS)
+def _gather(state: Any, order: Any, begin: int, count: int, splats: tuple[Any, Any, Any, Any]) -> None:
+    """Copy some Gaussians, front to back, into the planes."""
+    means2d, conics, extents, reaches = splats
+    for k in range(count):
+        row = max(order[begin + k], 0)
+        state[_X + k], state[_Y + k] = means2d[2 * row], means2d[2 * row + 1]
+        state[_A + k], state[_B + k], state[_C + k] = conics[3 * row], conics[3 * row + 1], conics[3 * row + 2]
+        state[_EXTENT_X + k], state[_EXTENT_Y + k] = extents[2 * row], extents[2 * row + 1]
+        state[_REACH + k] = reaches[row]
+
+
+@njit(**_OPTIONS)
+def _test_block(state: Any, width: int, height: int, side: int, eps: float) -> None:
+    """Find each Gaussian's box of tiles, and test the first 2 x 2 of them."""
+    kind = state.dtype.type
+    one, size, length = kind(1), kind(side), kind(side - 1)
+    across, down = kind(width), kind(height)
+    half, per_side, rounding, slack = kind(0.5), kind(1 / side), kind(4 * eps), kind(8 * eps)
+    for i in range(BLOCK):
+        x, y, reach = state[_X + i], state[_Y + i], state[_REACH + i]
+        a, b, c = state[_A + i], state[_B + i], state[_C + i]
+        form = a, b + b, c, -b / a, -b / c, reach, slack, one
+        left, right = _span(x, state[_EXTENT_X + i], across, half, one, per_side, rounding)
+        top, bottom = _span(y, state[_EXTENT_Y + i], down, half, one, per_side, rounding)
+        right, bottom = (right if bottom > top else left), (bottom if right > left else top)  # both or none are empty
+        state[_LEFT + i], state[_RIGHT + i], state[_TOP + i], state[_BOTTOM + i] = left, right, top, bottom
+        x_0, x_1 = left * size + half - x, (left + one) * size + half - x
+        y_0, y_1 = top * size + half - y, (top + one) * size + half - y
+        filled, wide, high = right > left, left + one < right, top + one < bottom
+        state[_HIT + i] = one if filled & _touches(form, x_0, y_0, length) else one - one
+        state[_HIT + BLOCK + i] = one if wide & _touches(form, x_1, y_0, length) else one - one
+        state[_HIT + 2 * BLOCK + i] = one if high & _touches(form, x_0, y_1, length) else one - one
+        state[_HIT + 3 * BLOCK + i] = one if wide & high & _touches(form, x_1, y_1, length) else one - one
+
+
+@njit(inline="always", **_OPTIONS)
+def _span(mean: Any, extent: Any, pixels: Any, half: Any, one: Any, per_side: Any, rounding: Any) -> tuple[Any, Any]:
+    """First and one past the last tile, along one axis, with a pixel centre within `extent` of the mean (`pixel_box`)."""
+    slack = rounding * (abs(mean) + extent)
+    first, last = np.ceil(mean - extent - half - slack), np.floor(mean + extent - half + slack) + one
+    known = (first == first) & (last == last)
+    first, last = max(first, one - one), min(last, pixels)
+    # A pixel's number and a half lies off the tiles' borders: no rounding matters.
+    begin, end = np.floor((first + half) * per_side), np.floor((last - half) * per_side) + one
+    filled = known & (last > first)
+    return begin if filled else one - one, end if filled else one - one
+
+
+@njit(inline="always", **_OPTIONS)
+def _touches(form: tuple[Any, Any, Any, Any, Any, Any, Any, Any], left: Any, top: Any, length: Any) -> bool:
+    """Whether the form's least value over a square of pixel centres is within its limit; NaN is not.
+
+    See `_touches_tile` of `kfgs.splat.tiles`, whose arithmetic this is.
+
+    Args:
+        form: a, 2 b, c, -b / a, -b / c, reach, the limit's relative slack, and 1.
+        left: of the square, relative to the mean.
+        top: likewise.
+        length: of the square's sides.
+    """
+    a, b2, c, along_x, along_y, reach, slack, one = form
+    none = one - one
+    right, bottom = left + length, top + length
+    near_x, near_y = max(left, none) + min(right, none), max(top, none) + min(bottom, none)
+    lean_y, lean_x = along_y * near_x, along_x * near_y
+    at_y, at_x = min(max(lean_y, top), bottom), min(max(lean_x, left), right)
+    on_x = a * near_x * near_x + b2 * near_x * at_y + c * at_y * at_y
+    on_y = a * at_x * at_x + b2 * at_x * near_y + c * near_y * near_y
+    known = (lean_x == lean_x) & (lean_y == lean_y) & (on_x == on_x) & (on_y == on_y)
+    limit = _limit(a, b2, c, reach, slack, one, max(-left, right), max(-top, bottom))
+    return known & (min(on_x, on_y) <= limit)
+
+
+@njit(inline="always", **_OPTIONS)
+def _limit(a: Any, b2: Any, c: Any, reach: Any, slack: Any, one: Any, far_x: Any, far_y: Any) -> Any:
+    """2 ln(255 opacity), and what an engine's rounding may add where the form's terms are largest and cancel worst."""
+    terms = a * far_x * far_x + abs(b2) * far_x * far_y + c * far_y * far_y
+    return reach + slack * (terms + abs(reach) + one)
+
+
+@njit(**_OPTIONS)
+def _append_block(
+    state: Any, order: Any, begin: int, count: int, side: int, columns: int, eps: float, tiles: Any, rows: Any, end: int
+) -> int:
+    """Append the pairs of a block to `tiles` and `rows`; returns their new number."""
+    for k in range(count):
+        row, end = order[begin + k], max(end, 0)
+        left, right = int(state[_LEFT + k]), int(state[_RIGHT + k])
+        top, bottom = int(state[_TOP + k]), int(state[_BOTTOM + k])
+        if right - left <= 2 and bottom - top <= 2:
+            corner = top * columns + left
+            for j in range(4):
+                tiles[end], rows[end] = corner + (j & 1) + (j >> 1) * columns, row
+                end += state[_HIT + j * BLOCK + k] > 0
+        else:
+            start, end = end, _test_box(state, k, (left, right, top, bottom), side, columns, eps, tiles, end)
+            rows[start:end] = row
+    return end
+
+
+@njit(**_OPTIONS)
+def _test_box(
+    state: Any, k: int, box: tuple[int, int, int, int], side: int, columns: int, eps: float, tiles: Any, end: int
+) -> int:
+    """Append the tiles of the block's Gaussian k, whose box may be of any size; returns their new number."""
+    kind = state.dtype.type
+    half, length, one, slack = kind(0.5), kind(side - 1), kind(1), kind(8 * eps)
+    x, y, a, b, c = state[_X + k], state[_Y + k], state[_A + k], state[_B + k], state[_C + k]
+    form = a, b + b, c, -b / a, -b / c, state[_REACH + k], slack, one
+    left, right, top, bottom = box
+    far_x = max(x - (left * side + half), right * side - half - x)
+    far_y = max(y - (top * side + half), bottom * side - half - y)
+    ellipse = 0.0, 0.0, 0.0, 0.0, 0.0
+    if right - left > _WIDE:
+        limit = np.float64(_limit(a, b + b, c, state[_REACH + k], slack, one, kind(far_x), kind(far_y)))
+        ellipse = _enlarge(np.float64(a), np.float64(b), np.float64(c), limit, np.float64(state[_REACH + k]))
+    count = 0
+    for tile_y in range(top, bottom):
+        start, stop = _cut(ellipse, np.float64(x), tile_y * side + 0.5 - np.float64(y), left, right, side)
+        for tile_x in range(start, stop):
+            state[_TILE_X + max(count, 0)], state[_TILE_Y + max(count, 0)] = tile_x, tile_y
+            count += 1
+            if count == BLOCK:
+                end = _append_touched(state, count, form, x, y, columns, length, tiles, end)
+                count = 0
+    return _append_touched(state, count, form, x, y, columns, length, tiles, end)
+
+
+@njit(**_OPTIONS)
+def _append_touched(
+    state: Any, count: int, form: Any, x: Any, y: Any, columns: int, length: Any, tiles: Any, end: int
+) -> int:
+    """Append those of the first `count` tiles in the planes that one Gaussian touches; returns their new number."""
+    one = form[7]
+    size, half = length + one, one / (one + one)
+    for i in range(count):
+        left, top = state[_TILE_X + i] * size + half - x, state[_TILE_Y + i] * size + half - y
+        state[_TOUCHED + i] = one if _touches(form, left, top, length) else one - one
+    for i in range(count):
+        tiles[max(end, 0)] = int(state[_TILE_Y + i]) * columns + int(state[_TILE_X + i])
+        end += state[_TOUCHED + i] > 0
+    return end
+
+
+@njit(**_OPTIONS)
+def _enlarge(a: float, b: float, c: float, limit: float, reach: float) -> tuple[float, float, float, float, float]:
+    """The ellipse a x^2 + 2 b x y + c y^2 = level that holds every tile that is touched, given the largest limit of any.
+
+    Returns:
+        a, b, the determinant, the level, and y of the rightmost point; all 0 where there is no telling.
+    """
+    det = a * c - b * b
+    # Beyond this level rounding, at most half of what the limit allows for it, cannot bring a tile below the limit.
+    level = (2 * limit - reach) * (1 + _ROUNDING)
+    if not (a > 0 and c > 0 and det > _FLAT * a * c and 0 < level < _HUGE):
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    lean = -b / c * math.sqrt(c * level / det)
+    return (a, b, det, level, lean) if abs(lean) < _HUGE else (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@njit(**_OPTIONS)
+def _cut(
+    ellipse: tuple[float, float, float, float, float], x: float, top: float, left: int, right: int, side: int
+) -> tuple[int, int]:
+    """Cut a row of tiles, [left, right), to those that the ellipse touches.
+
+    At height d_y over the mean the ellipse reaches from (-b d_y - root) / a to (-b d_y + root) / a with
+    root^2 = a level - d_y^2 det. Its rightmost point is at d_y = lean, its leftmost at -lean; where these lie beside the
+    row, the row's points furthest right and left are on the side that is nearer.
+
+    Args:
+        ellipse: from `_enlarge`.
+        x: of the mean, pixels.
+        top: the row's first pixel centres, relative to the mean.
+        left: first tile.
+        right: one past the last tile.
+        side: of a tile, pixels.
+    """
+    a, b, det, level, lean = ellipse
+    if not det > 0:
+        return left, right
+    bottom = top + (side - 1)
+    high, low = min(max(lean, top), bottom), min(max(-lean, top), bottom)
+    root_high, root_low = a * level - high * high * det, a * level - low * low * det
+    if not (root_high >= 0 and root_low >= 0):
+        return left, left
+    reach_right = (-b * high + math.sqrt(root_high)) / a
+    reach_left = (-b * low - math.sqrt(root_low)) / a
+    begin = (x + reach_left - _ROUNDING * (1 + abs(reach_left)) + 0.5 - side) / side  # its last pixel centre
+    end = (x + reach_right + _ROUNDING * (1 + abs(reach_right)) - 0.5) / side  # its first
+    start, stop = left, right
+    if begin > left:
+        start = math.ceil(min(begin, np.float64(right)))
+    if end < right - 1:
+        stop = int(max(end, -1.0) + 1)
+    return start, stop

@@ -1,0 +1,234 @@
+"""The GPU engine: compositing by Triton kernels, float32, any number of channels.
+
+Nothing here waits for the GPU: sizes come from shapes, and where each pixel stopped is handed from the forward to the
+backward pass as a tensor. Programs add their gradients to a Gaussian's by atomics, in the order in which they happen to
+finish: two runs of the backward pass, and of `accumulate`, agree to rounding, not to the bit. The forward pass does.
+
+With TRITON_INTERPRET=1 in the environment before triton is imported, the same kernels run on CPU tensors, slowly.
+"""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, NamedTuple
+
+import torch
+import triton
+from torch import Tensor
+
+from .kernels import accumulate_kernel, composite_kernel
+from .kernels_backward import differentiate_kernel
+
+__all__ = ["accumulate", "backward", "devices", "forward"]
+
+INTERPRETED = not isinstance(composite_kernel, triton.JITFunction)
+"""Whether triton was told to interpret: the kernels then run in numpy, on the CPU."""
+
+PRECISION = "tf32x3"
+"""How matrix products round: tensor cores multiply numbers of 11 bits (tf32), which alone would be wrong by 5e-4. Three
+products of high and low parts have float32's accuracy, still on the tensor cores. The interpreter works in float32."""
+
+
+class Launch(NamedTuple):
+    """How a kernel is cut into programs; see `triton_kernels`."""
+
+    pixels: int  # most pixels of a program
+    chunk: int  # Gaussians at a time
+    block: int  # most channels at a time
+    warps: int  # for `pixels` pixels; fewer pixels get fewer warps
+
+
+LAUNCHES = {
+    # Nothing is shared between the programs of a tile but the loading of Gaussians: small ones, several on a processor.
+    "composite": Launch(pixels=128, chunk=16, block=64, warps=4),
+    # A program adds to a Gaussian once: a whole tile of 16 x 16 pixels, for the fewest atomics. The values of a pixel's
+    # block of channels stay in its thread's registers.
+    "accumulate": Launch(pixels=256, chunk=16, block=64, warps=8),
+    # As above. More channels at a time, or more Gaussians, and registers no longer suffice.
+    "differentiate": Launch(pixels=256, chunk=16, block=32, warps=8),
+}
+"""A warp has 32 threads: warps * 32 = pixels, so each thread holds a chunk of one pixel, and no running product or sum
+crosses threads. A chunk of 16 is the shortest axis that tensor-core products take. Chosen such that, compiled for sm_80,
+sm_90 and sm_100, registers (at most 255 a thread) hardly spill, and shared memory stays below the 99 KB of the smaller
+GPUs (see tests/splat/test_triton_gpu.py). Not tuned by timing: none of this has been timed on a GPU."""
+
+SMALLEST = 16
+"""Least size of an axis of a tensor-core product: less is padded."""
+
+
+DTYPES = (torch.float32,)
+PROOFS = ("cpu",)
+"""Where the engine runs only to show that it is right: triton's interpreter is slow."""
+
+
+def devices() -> tuple[str, ...]:
+    """Device types the engine runs on: "cuda", and "cpu" where triton interprets."""
+    return ("cuda", "cpu") if INTERPRETED else ("cuda",)
+
+
+def forward(
+    means2d: Tensor,  # [M, 2]
+    conics: Tensor,  # [M, 3]
+    opacities: Tensor,  # [M]
+    features: Tensor,  # [N, D]
+    background: Tensor,  # [D]
+    index: Tensor | None,  # [M] int64
+    rows: Tensor,  # [P] int32 or int64
+    offsets: Tensor,  # [T + 1] int32 or int64
+    width: int,
+    height: int,
+    tile_size: int,
+) -> tuple[Tensor, Tensor, Tensor]:  # maps [H, W, D], alphas [H, W], trace [2 * H * W] int32
+    """Composite as `contract` promises.
+
+    `trace` is for the backward pass: how many Gaussians of its tile's list each pixel passed before it stopped, and the
+    bits of its final transmittance, of which 1 - alpha would keep few digits behind what is opaque.
+
+    Raises:
+        ValueError: if the tensors are not float32, or not on a device that the kernels run on.
+    """
+    _check(means2d=means2d, conics=conics, opacities=opacities, features=features, background=background)
+    D = features.shape[1]
+    maps, alphas = features.new_empty(height, width, D), features.new_empty(height, width)
+    trace = torch.empty(2, height, width, dtype=torch.int32, device=features.device)
+    stops, lights = trace[0], trace[1].view(torch.float32)
+    if len(rows) == 0:
+        stops.zero_()
+        lights.fill_(1.0)
+        return maps.copy_(background.expand_as(maps)), alphas.zero_(), trace.view(-1)
+    options = launch_options("composite", D, tile_size)
+    grid = _programs(options, width, height), -(-D // options["BLOCK"])
+    with _on(means2d):
+        composite_kernel[grid](
+            means2d, conics, opacities, features, background, index, rows, offsets,
+            maps, alphas, stops, lights, width, height, -(-width // tile_size), D, **options,
+        )  # fmt: skip
+    return maps, alphas, trace.view(-1)
+
+
+def backward(
+    grad_maps: Tensor,  # [H, W, D]
+    grad_alphas: Tensor,  # [H, W]
+    wanted: tuple[bool, bool, bool, bool, bool],
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    background: Tensor,
+    index: Tensor | None,
+    rows: Tensor,
+    offsets: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+    maps: Tensor,
+    alphas: Tensor,
+    trace: Tensor,
+) -> list[Tensor]:
+    """Gradients of means2d, conics, opacities, features and background; one not `wanted` is an empty tensor.
+
+    Args:
+        grad_maps: gradient of the loss in the maps.
+        grad_alphas: gradient of the loss in the alphas.
+        wanted: which of the five gradients are asked for.
+        means2d: this and all up to `tile_size`: as given to `forward`.
+        maps: this and the rest: as `forward` returned them.
+
+    Raises:
+        ValueError: as `forward`.
+    """
+    _check(grad_maps=grad_maps, grad_alphas=grad_alphas, means2d=means2d, features=features)
+    of_splats, of_features = any(wanted[:3]), bool(wanted[3])
+    trace = trace.view(2, height, width)
+    stops, lights = trace[0], trace[1].view(torch.float32)
+    values = (means2d, conics, opacities, features)
+    computed = (of_splats, of_splats, of_splats, of_features)
+    grads = [torch.zeros_like(v) if c else v.new_empty(0) for v, c in zip(values, computed, strict=True)]
+    if (of_splats or of_features) and len(rows):
+        D = features.shape[1]
+        options = launch_options("differentiate", D, tile_size)
+        with _on(means2d):
+            differentiate_kernel[(_programs(options, width, height),)](
+                means2d, conics, opacities, features, index, rows, offsets, maps, alphas, stops,
+                grad_maps.contiguous(), grad_alphas.contiguous(), *grads,
+                width, height, -(-width // tile_size), D, **options, OF_SPLATS=of_splats, OF_FEATURES=of_features,
+            )  # fmt: skip
+    grads.append(torch.einsum("hwd,hw->d", grad_maps, lights) if wanted[4] else background.new_empty(0))
+    return [grad if want else grad.new_empty(0) for grad, want in zip(grads, wanted, strict=True)]
+
+
+def accumulate(
+    means2d: Tensor,  # [M, 2]
+    conics: Tensor,  # [M, 3]
+    opacities: Tensor,  # [M]
+    pixels: Tensor,  # [H, W, D]
+    rows: Tensor,
+    offsets: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+) -> tuple[Tensor, Tensor]:  # sums [M, D], weights [M]
+    """weights^T · pixels, and the sum of each Gaussian's weights, in one walk over the view.
+
+    Raises:
+        ValueError: as `forward`.
+    """
+    _check(means2d=means2d, conics=conics, opacities=opacities, pixels=pixels)
+    M, D = len(opacities), pixels.shape[2]
+    sums, weights = pixels.new_zeros(M, D), pixels.new_zeros(M)
+    if len(rows):
+        options = launch_options("accumulate", D, tile_size)
+        grid = _programs(options, width, height), -(-D // options["BLOCK"])
+        with _on(means2d):
+            accumulate_kernel[grid](
+                means2d, conics, opacities, pixels.contiguous(), rows, offsets, sums, weights,
+                width, height, -(-width // tile_size), D, **options,
+            )  # fmt: skip
+    return sums, weights
+
+
+def launch_options(kernel: str, channels: int, tile_size: int) -> dict[str, Any]:
+    """The sizes a kernel is compiled for, and its warps.
+
+    Args:
+        kernel: a key of `LAUNCHES`.
+        channels: how many there are.
+        tile_size: side of a tile, pixels; a tile of more than the table's pixels is shared by several programs.
+    """
+    launch = LAUNCHES[kernel]
+    pixels = min(launch.pixels, max(SMALLEST, triton.next_power_of_2(tile_size**2)))
+    return {
+        "SIDE": tile_size,
+        "PARTS": -(-(tile_size**2) // pixels),
+        "PIXELS": pixels,
+        "CHUNK": launch.chunk,
+        "BLOCK": min(launch.block, max(SMALLEST, triton.next_power_of_2(channels))),
+        "PRECISION": "ieee" if INTERPRETED else PRECISION,
+        "num_warps": max(1, launch.warps * pixels // launch.pixels),
+        "num_stages": 1,  # loading a block of channels ahead takes registers that the backward pass does not have
+        "enable_fp_fusion": True,  # a * b + c in one instruction
+    }
+
+
+def _programs(options: dict[str, Any], width: int, height: int) -> int:
+    side = options["SIDE"]
+    return -(-width // side) * -(-height // side) * options["PARTS"]
+
+
+def _on(tensor: Tensor) -> AbstractContextManager[Any]:
+    """Triton launches on the current GPU: make it the tensor's."""
+    return torch.cuda.device(tensor.device) if tensor.is_cuda else nullcontext()
+
+
+def _check(**tensors: Tensor) -> None:
+    for name, value in tensors.items():
+        if value.dtype != torch.float32:
+            raise ValueError(
+                f"{name}: expected torch.float32 for engine 'triton', got {value.dtype}; convert it with "
+                ".to(torch.float32), or use engine='numba' or engine='reference'"
+            )
+        if value.device.type not in devices():
+            raise ValueError(
+                f"{name}: expected a tensor on {' or '.join(devices())} for engine 'triton', got one on {value.device}; "
+                "move it with .to('cuda'), or set TRITON_INTERPRET=1 before Python starts"
+            )

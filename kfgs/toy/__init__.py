@@ -1,0 +1,5 @@
+"""The toy room: a small scene that the package makes itself, with exact truth and a noisy teacher."""
+
+from .room_folder import ToyConfig, make_toy_room
+
+__all__ = ["ToyConfig", "make_toy_room"]

@@ -1,0 +1,127 @@
+"""Cameras that walk around the toy room, and pictures of it: colour, exact z-depth and exact labels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..cameras.camera import Camera
+from .geometry import Array, Solid, cast, normals, occluded, pixel_rays
+from .room import CLASSES, ROOM
+from .texture import Noise, evaluate
+
+_LIGHTS = (((-0.4, 0.3, 2.75), 0.42), ((2.2, -1.6, 2.6), 0.26))  # position (metres), strength
+_AMBIENT = 0.42
+_SPLIT = 2  # colour samples per pixel and axis
+
+
+class View(NamedTuple):
+    """One rendered view."""
+
+    image: NDArray[np.uint8]  # [H, W, 3]
+    depth: Array  # [H, W] z-depth at the pixel's centre, metres
+    labels: NDArray[np.uint8]  # [H, W] class index
+    solids: NDArray[np.int64]  # [H, W] index of the solid
+
+
+def look_at(position: Array, target: Array, roll: float) -> Array:  # [4, 4] world to camera
+    """The pose (x right, y down, z forward) at `position` looking at `target`; z is up in the world, roll in radians."""
+    forward = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    c, s = np.cos(roll), np.sin(roll)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([c * right + s * down, c * down - s * right, forward])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ position
+    return viewmat
+
+
+def intrinsics(height: int, width: int) -> Array:  # [3, 3]
+    """The toy camera's K: 71 degrees wide, fx != fy, principal point off the centre by (+3.5, -2.5) / 256 widths.
+
+    Both are deliberate: code that assumes a centred or square-pixel camera fails visibly on this scene.
+    """
+    unit = width / 256.0
+    fx = 180.0 * unit
+    return np.array([[fx, 0, width / 2 + 3.5 * unit], [0, 1.02 * fx, height / 2 - 2.5 * unit], [0, 0, 1.0]])
+
+
+def orbit(train_views: int, test_views: int, size: tuple[int, int]) -> tuple[list[Camera], list[bool]]:
+    """Cameras in the order of the walk, named `view_000.png` and so on, and which of them are for testing.
+
+    Training cameras divide the walk evenly; each test camera stands half-way between two of them. The walk goes round
+    the room twice, once higher and looking up, once lower and looking down, so that most surfaces are seen often.
+    """
+    steps = [(i / train_views, False) for i in range(train_views)]
+    steps += [((j * train_views // test_views + 0.5) / train_views, True) for j in range(test_views)]
+    cameras = []
+    for number, (turn, _) in enumerate(sorted(steps)):
+        a = 4 * np.pi * turn
+        lift = np.sin(a / 2)  # above 0 in the first round, below in the second
+        position = np.array([2.15 * np.cos(a), 1.75 * np.sin(a), 1.5 + 0.2 * np.sin(3 * a + 0.5) + 0.25 * lift])
+        height = 1.0 + 0.3 * np.sin(2 * a + 0.4) + 0.95 * lift
+        target = np.array([0.55 * np.cos(2 * a + 1.0), 0.45 * np.sin(3 * a), height])
+        viewmat = look_at(position, target - 0.35 * position * [1, 1, 0], 0.05 * float(np.sin(5 * a)))
+        name = f"view_{number:03d}.png"
+        K = torch.from_numpy(intrinsics(*size))
+        cameras.append(Camera(torch.from_numpy(viewmat), K, width=size[1], height=size[0], name=name))
+    return cameras, [test for _, test in sorted(steps)]
+
+
+def surface_color(
+    solids: Sequence[Solid],
+    noise: Noise,
+    points: Array,  # [N, 3]
+    which: NDArray[np.int64],  # [N]
+    footprint: Array,  # [N] metres a pixel covers
+    lit: Array,  # [N, L] 1 where a light reaches, 0 in its shadow
+) -> Array:  # [N, 3] in [0, 1]
+    """Texture times a matte shading by the room's lights; it does not depend on who looks."""
+    color = np.zeros((len(points), 3))
+    for i in np.unique(which):
+        rows = np.flatnonzero(which == i)
+        solid, p = solids[i], points[rows]
+        n = normals(solid, p)
+        axis = np.argmax(np.abs(n @ solid.rotation()), axis=-1)
+        light = np.full(len(rows), _AMBIENT)
+        for k, (position, strength) in enumerate(_LIGHTS):
+            way = np.array(position) - p
+            cosine = (way * n).sum(-1) / np.linalg.norm(way, axis=-1)
+            light += strength * (0.35 + 0.65 * np.maximum(cosine, 0.0)) * (0.35 + 0.65 * lit[rows, k])
+        corner = np.clip(p[:, 2] / 0.25, 0.0, 1.0)  # a little darker towards the floor
+        light *= np.where(np.abs(n[:, 2]) < 0.9, 0.8 + 0.2 * corner, 1.0)
+        color[rows] = evaluate(solid.texture, noise, solid.to_local(p), axis, footprint[rows]) * light[:, None]
+    return np.clip(color, 0.0, 1.0)
+
+
+def light_reaches(solids: Sequence[Solid], points: Array) -> Array:  # [N, 3] -> [N, L]
+    """1 where nothing stands between a point and each light, else 0; the room's own shell casts no shadow."""
+    casters = [s for s in solids if s.label not in ("wall", "floor", "ceiling", "rug", "picture")]
+    return np.stack([~occluded(casters, np.array(p), points) for p, _ in _LIGHTS], axis=-1).astype(float)
+
+
+def render(solids: Sequence[Solid], noise: Noise, camera: Camera) -> View:
+    """Render one view: depth and labels at pixel centres, colour averaged over 2 x 2 samples per pixel."""
+    depth, index = cast(solids, camera)
+    if not np.isfinite(depth).all():
+        raise AssertionError(f"{camera.name}: a ray leaves the room {ROOM}")  # the room is closed: our own bug
+    origin, rays = pixel_rays(camera)
+    lit = light_reaches(solids, (origin + rays * depth[..., None]).reshape(-1, 3)).reshape(*camera.size, -1)
+    lit = lit.repeat(_SPLIT, axis=0).repeat(_SPLIT, axis=1)
+
+    fine = camera.resized(camera.height * _SPLIT, camera.width * _SPLIT)
+    fine_depth, fine_index = cast(solids, fine)
+    _, fine_rays = pixel_rays(fine)
+    points = origin + fine_rays * fine_depth[..., None]
+    footprint = fine_depth / float(camera.K[0, 0])
+    color = surface_color(
+        solids, noise, points.reshape(-1, 3), fine_index.ravel(), footprint.ravel(), lit.reshape(-1, lit.shape[-1])
+    )
+    color = color.reshape(camera.height, _SPLIT, camera.width, _SPLIT, 3).mean((1, 3))
+    classes = np.array([CLASSES.index(solid.label) for solid in solids], np.uint8)
+    return View(np.round(color * 255).astype(np.uint8), depth, classes[index], index)

@@ -1,0 +1,215 @@
+"""A furnished room that the package makes itself: a small scene with exact ground truth and a noisy teacher.
+
+The folder has the layout of a real scene (`images`, `sparse/0`, `labels`, `classes.json`, `text.npy`, `split.json`,
+`features`) and, beside it, what no real scene has: `depth` and `surface.npz`.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from .._check import check_range
+from .._files import atomic_folder, read_json, write_json
+from ..cameras.camera import Camera
+from .colmap import write_model
+from .geometry import Array, Solid, normals, sample_surface, visible
+from .render import View, light_reaches, orbit, render, surface_color
+from .room import CLASSES, build_room
+from .teacher import class_embeddings, teacher_features
+from .texture import Noise
+
+VERSION = 4  # of the generator: a folder written by another version is not reused
+POINT_NOISE = 0.01  # metres, standard deviation of the sparse points around the surface
+PIXEL_NOISE = 0.4  # pixels, standard deviation of their observations
+
+
+@dataclass(frozen=True)
+class ToyConfig:
+    """What the toy room is made with; equal configurations give bit-identical folders on one machine."""
+
+    seed: int = 0
+    """Textures, hues, how the chairs stand, embeddings, and every error of the teacher."""
+    train_views: int = 48
+    """Training cameras, evenly spaced on two rounds through the room."""
+    test_views: int = 12
+    """Test cameras, each half-way between two training cameras; at most `train_views`."""
+    size: tuple[int, int] = (192, 256)
+    """(height, width) of the images, pixels."""
+    feature_size: tuple[int, int] = (72, 96)
+    """(height, width) of the feature maps."""
+    feature_dim: int = 512
+    """D, channels of features and embeddings."""
+    surface_points: int = 60_000
+    """Ground-truth points, uniform by area over all that some training camera sees."""
+    sparse_points: int = 20_000
+    """Points of the COLMAP model, outliers included."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "size", tuple(self.size))
+        object.__setattr__(self, "feature_size", tuple(self.feature_size))
+        counts = {"seed": (self.seed, 0), "train_views": (self.train_views, 2), "test_views": (self.test_views, 1)}
+        counts |= {"feature_dim": (self.feature_dim, 16), "surface_points": (self.surface_points, 100)}
+        counts |= {"sparse_points": (self.sparse_points, 10)}
+        for name, size in (("size", self.size), ("feature_size", self.feature_size)):
+            if len(size) != 2:
+                raise ValueError(f"{name}: expected (height, width), got {size!r}; give two whole numbers")
+            counts |= {f"{name}[{i}]": (n, 8) for i, n in enumerate(size)}
+        for name, (value, low) in counts.items():
+            if not isinstance(value, int):
+                raise TypeError(f"{name}: expected a whole number, got {value!r}; give an int")
+            check_range(name, value, low)
+        if self.test_views > self.train_views:
+            raise ValueError(
+                f"test_views: expected at most train_views = {self.train_views} (each test camera stands between two "
+                f"training cameras), got {self.test_views}; give more train_views"
+            )
+        if self.sparse_points > self.surface_points:
+            raise ValueError(
+                f"sparse_points: expected at most surface_points = {self.surface_points} (they are drawn from them), "
+                f"got {self.sparse_points}; lower it"
+            )
+        if any(f > s for f, s in zip(self.feature_size, self.size, strict=True)):
+            raise ValueError(
+                f"feature_size: expected at most size = {self.size}, got {self.feature_size}; features are coarser "
+                "than images"
+            )
+
+
+def make_toy_room(path: str | Path, config: ToyConfig | None = None, *, progress: bool = False) -> Path:
+    """Render a furnished room of 6 x 5 x 2.9 metres and write it as a scene folder.
+
+    **Convention**: metres, z up, floor at z = 0; cameras, pixels and the sparse model follow COLMAP; label images hold
+    the index into `classes.json` (255, void, never occurs here). The principal point is off the centre and fx != fy.
+
+    Files: `images/<stem>.png`, `labels/<stem>.png` (uint8), `depth/<stem>.npy` (float32 z-depth, metres),
+    `features/<stem>_fmap_CxHxW.pt` (float16 [D, h, w], every view), `sparse/0` (COLMAP binary, all views),
+    `classes.json`, `text.npy` (float32 [C, D], unit rows), `split.json` (stems of `train` and `test`), `surface.npz`
+    (`points` [P, 3] and `normals` [P, 3] float32, `labels` [P] uint8, `seen` [P] = number of training views) and
+    `toy.json` (configuration and version).
+
+    Args:
+        path: the folder to make. It appears whole or not at all. If it holds a toy room of the same configuration, that
+            one is returned untouched.
+        config: what to make; the default takes about half a minute on two CPU cores and 120 MB of disk.
+        progress: show a bar over the views.
+
+    Returns:
+        `path`.
+
+    Raises:
+        FileExistsError: if `path` exists and holds anything else.
+    """
+    path, config = Path(path), config or ToyConfig()
+    about = {"version": VERSION, "config": json.loads(json.dumps(asdict(config)))}
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        _check_same(path, about)
+        return path
+    solids = build_room(config.seed)
+    noise = Noise(np.random.default_rng([config.seed, 3]))
+    cameras, testing = orbit(config.train_views, config.test_views, config.size)
+    with atomic_folder(path) as folder:
+        for name in ("images", "labels", "depth", "features"):
+            (folder / name).mkdir()
+        embeddings = class_embeddings(config.feature_dim, config.seed)
+        for camera in tqdm(cameras, desc="toy room", disable=not progress):
+            view = render(solids, noise, camera)
+            _write_view(folder, Path(camera.name).stem, view, embeddings, config)
+        stems = [Path(camera.name).stem for camera in cameras]
+        split = {
+            "train": [stem for stem, test in zip(stems, testing, strict=True) if not test],
+            "test": [stem for stem, test in zip(stems, testing, strict=True) if test],
+        }
+        write_json(folder / "split.json", split)
+        write_json(folder / "classes.json", list(CLASSES))
+        np.save(folder / "text.npy", embeddings)
+        _write_geometry(folder, solids, noise, cameras, np.array(testing), config)
+        write_json(folder / "toy.json", about)
+    return path
+
+
+def _check_same(path: Path, about: dict[str, Any]) -> None:
+    """Raise FileExistsError unless `path` is a toy room described by `about`."""
+    found: Any = None
+    if (path / "toy.json").is_file():
+        found = read_json(path / "toy.json")
+    if found != about:
+        what = f"one made with {found}" if found is not None else "other files"
+        raise FileExistsError(
+            f"{path}: expected no folder, an empty one or a toy room made with {about}, got {what}; "
+            "choose another path or delete it"
+        )
+
+
+def _write_view(folder: Path, stem: str, view: View, embeddings: NDArray[np.float32], config: ToyConfig) -> None:
+    """Image, labels, depth and features of one view; a view's errors depend on the seed and its stem alone."""
+    from skimage.io import imsave
+
+    imsave(folder / "images" / f"{stem}.png", view.image, check_contrast=False)
+    imsave(folder / "labels" / f"{stem}.png", view.labels, check_contrast=False)
+    np.save(folder / "depth" / f"{stem}.npy", view.depth.astype(np.float32))
+    rng = np.random.default_rng([config.seed, 4, zlib.crc32(stem.encode())])
+    features = teacher_features(view.labels, view.image, embeddings, config.feature_size, rng)
+    torch.save(torch.from_numpy(features), folder / "features" / f"{stem}_fmap_CxHxW.pt")
+
+
+def _visible_surface(
+    solids: Sequence[Solid], cameras: Sequence[Camera], count: int, rng: np.random.Generator
+) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.bool_]]:
+    """`count` points uniform by area over what some camera sees: points, normals, solid [P], seen by camera [P, C]."""
+    areas = np.array([solid.area() for solid in solids])
+    found: list[tuple[Array, Array, NDArray[np.int64], NDArray[np.bool_]]] = []
+    have, batch = 0, count
+    while have < count:
+        shares = rng.multinomial(batch, areas / areas.sum())
+        which = np.repeat(np.arange(len(solids)), shares)
+        points = np.concatenate([sample_surface(s, int(n), rng) for s, n in zip(solids, shares, strict=True)])
+        outward = np.concatenate([normals(s, points[which == i]) for i, s in enumerate(solids)])
+        seen = np.stack([visible(solids, camera, points, outward) for camera in cameras], axis=-1)
+        rows = rng.permutation(np.flatnonzero(seen.any(-1)))
+        found.append((points[rows], outward[rows], which[rows], seen[rows]))
+        have += len(rows)
+        batch = max(int(1.1 * (count - have) * batch / max(len(rows), 1)), count // 20)
+    points, outward, which, seen = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
+    return points, outward, which, seen
+
+
+def _write_geometry(
+    folder: Path,
+    solids: Sequence[Solid],
+    noise: Noise,
+    cameras: Sequence[Camera],
+    testing: NDArray[np.bool_],  # [C]
+    config: ToyConfig,
+) -> None:
+    """`surface.npz`, and the sparse model: some of its points, noisy and observed, with a few far outliers."""
+    rng = np.random.default_rng([config.seed, 6])
+    training = [camera for camera, test in zip(cameras, testing, strict=True) if not test]
+    points, outward, which, seen = _visible_surface(solids, training, config.surface_points, rng)
+    classes = np.array([CLASSES.index(solid.label) for solid in solids], np.uint8)
+    np.savez(
+        folder / "surface.npz",
+        points=points.astype(np.float32),
+        normals=outward.astype(np.float32),
+        labels=classes[which],
+        seen=seen.sum(-1).astype(np.uint16),
+    )
+    chance = np.minimum(seen.sum(-1), 8.0) + 1e-3  # SfM finds what many views share
+    rows = rng.choice(len(points), config.sparse_points, replace=False, p=chance / chance.sum())
+    near, sides, owner = points[rows], outward[rows], which[rows]
+    color = surface_color(solids, noise, near, owner, np.full(len(rows), 0.01), light_reaches(solids, near))
+    observed = np.stack([visible(solids, camera, near, sides) for camera in cameras], axis=-1)
+    placed = near + POINT_NOISE * rng.standard_normal(near.shape)
+    outliers = max(1, len(rows) // 200)
+    placed[:outliers] *= rng.uniform(3.0, 20.0, (outliers, 1))  # mismatches triangulate far behind the walls
+    errors = PIXEL_NOISE * rng.standard_normal((*observed.shape, 2))
+    write_model(folder / "sparse" / "0", cameras, placed, np.round(color * 255).astype(np.uint8), observed, errors)

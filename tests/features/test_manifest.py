@@ -1,0 +1,124 @@
+import json
+import re
+
+import pytest
+
+from kfgs.features.folder import FeatureFolder
+from kfgs.features.manifest import Manifest, MapRecord, read_manifest
+
+RECORD = MapRecord("sub/a.npy", (3, 4, 5), 248, 17, "d" * 64, "a.png", "e" * 64, 0.25)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    Manifest({"name": "t", "options": {"size": [3, 4]}}, {"sub/a": RECORD}, discarded=True).save(tmp_path)
+    return tmp_path
+
+
+WAY_OUT = "delete it to use the maps without it, or delete it and run `kfgs features` with --overwrite, which makes them again"
+
+
+def nested(levels: int) -> dict:
+    found: dict = {}
+    for _ in range(levels):
+        found = {"a": found}
+    return found
+
+
+def change(folder, **values) -> None:
+    """Put other values into the one record, or into the manifest."""
+    about = json.loads((folder / "features.json").read_text())
+    for name, value in values.items():
+        (about if name in about else about["maps"]["sub/a"])[name] = value
+    (folder / "features.json").write_text(json.dumps(about))
+
+
+def test_what_is_saved_comes_back(folder):
+    found = read_manifest(folder)
+    assert found == Manifest({"name": "t", "options": {"size": [3, 4]}}, {"sub/a": RECORD}, discarded=True)
+    assert found.files(folder) == {folder / "sub" / "a.npy"}
+    assert found.gone(folder) == {"sub/a": folder / "sub" / "a.npy"}
+    (folder / "sub").mkdir()
+    (folder / "sub" / "a.npy").touch()
+    assert found.gone(folder) == {}
+    assert read_manifest(folder / "sub") is None
+    change(folder, seconds=1)  # a whole number is a number
+    assert read_manifest(folder).maps["sub/a"].seconds == 1
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"file": 5}, "sub/a: file is a int"),
+        ({"file": "../../etc/passwd"}, "sub/a: file '../../etc/passwd' is no name within the folder"),
+        ({"file": "/etc/passwd"}, "sub/a: file '/etc/passwd' is no name within the folder"),
+        ({"file": ""}, "sub/a: file '.' is no name within the folder"),
+        ({"file": "a\0b"}, "is no name within the folder"),
+        ({"shape": [1]}, "sub/a: shape [1] is not three positive whole numbers"),
+        ({"shape": ["a", 2, 3]}, "sub/a: shape ['a', 2, 3] is not three"),
+        ({"shape": [True, 2, 3]}, "sub/a: shape [True, 2, 3] is not three"),
+        ({"shape": [1, 0, 3]}, "sub/a: shape [1, 0, 3] is not three"),
+        ({"shape": [1.0, 2, 3]}, "sub/a: shape [1.0, 2, 3] is not three"),
+        ({"shape": "abc"}, "sub/a: shape is a str"),
+        ({"bytes": "x"}, "sub/a: bytes is a str"),
+        ({"bytes": True}, "sub/a: bytes is a bool"),
+        ({"bytes": -1}, "sub/a: bytes and seconds cannot be -1 and 0.25"),
+        ({"mtime_ns": None}, "sub/a: mtime_ns is a NoneType"),
+        ({"digest": 7}, "sub/a: digest is a int"),
+        ({"image": []}, "sub/a: image is a list"),
+        ({"image_digest": 7}, "sub/a: image_digest is a int"),
+        ({"seconds": float("nan")}, "sub/a: bytes and seconds cannot be 248 and nan"),
+        ({"maps": {"a": []}}, "a: a record is a list"),
+        ({"maps": {"a": {}}}, "a: file is missing"),
+        ({"maps": []}, "maps is a list"),
+        ({"teacher": [["a", 1]]}, "teacher is a list"),
+        ({"discarded": 1}, "discarded is a int"),
+        ({"seconds": 10**400}, "sub/a: bytes and seconds cannot be 248 and 100000"),
+        ({"bytes": 10**400}, "sub/a: bytes and seconds cannot be 100000"),
+        ({"shape": [10**400, 2, 3]}, "sub/a: shape [100000"),
+        ({"maps": {"a\n\x1b[31m": []}}, r"a\n\x1b[31m: a record is a list"),
+        ({"teacher": {"name": "t", "options": {"scale": float("inf")}}}, "teacher holds NaN or infinity"),
+        ({"teacher": nested(100)}, "or is nested too deeply"),
+    ],
+)
+def test_what_kfgs_never_wrote_is_refused_in_a_line_that_names_the_file(folder, values, words):
+    change(folder, **values)
+    for read in (read_manifest, FeatureFolder):
+        with pytest.raises(ValueError, match=re.escape(words)) as caught:
+            read(folder)
+        text = str(caught.value)
+        assert text.startswith(f"{folder / 'features.json'}: expected a manifest of kfgs, but it is damaged (")
+        assert text.endswith(f"; {WAY_OUT}")
+        assert text.isprintable()  # no line ends, no control characters
+        assert len(text) < 500 + len(str(folder))
+
+
+@pytest.mark.parametrize("text", ["[]", "{}", '{"format": "kfgs-features/9"}'])
+def test_another_format_is_named(tmp_path, text):
+    (tmp_path / "features.json").write_text(text)
+    with pytest.raises(ValueError, match=r"features\.json: expected format 'kfgs-features/1', got something else"):
+        read_manifest(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", "expected a JSON file, but it cannot be parsed (Expecting property name"),
+        ("[" * 100_000 + "]" * 100_000, "expected a manifest of kfgs, but it is nested too deeply"),
+        ('{"seconds": ' + "1" * 5000 + "}", "expected a JSON file, but it cannot be parsed (Exceeds the limit"),
+    ],
+)
+def test_what_is_no_json_says_the_way_out(tmp_path, text, words):
+    (tmp_path / "features.json").write_text(text)
+    with pytest.raises(ValueError, match=re.escape(words)) as caught:
+        read_manifest(tmp_path)
+    assert str(caught.value).startswith(f"{tmp_path / 'features.json'}: expected a ")
+    assert str(caught.value).endswith(f"; {WAY_OUT}")
+
+
+def test_an_identity_that_is_deep_but_sane_is_kept(folder):
+    change(folder, teacher=nested(99))
+    found = read_manifest(folder)
+    assert found.teacher == nested(99)
+    found.save(folder)
+    assert read_manifest(folder) == found

@@ -1,0 +1,654 @@
+"""The numba engine beyond the contract that `test_engines.py` asks of every engine: its blocks, runs and threads."""
+
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import oracles_splat as oracle
+import pytest
+import torch
+from cases_splat import TOLERANCE, assert_close_but_for_thresholds, random_splats, splats_from
+from torch.utils.data import DataLoader
+
+numba = pytest.importorskip("numba")
+
+from kfgs.splat import Tiles, accumulate_pixels, bin_tiles, composite  # noqa: E402
+from kfgs.splat.engines.cpu import engine as numba_cpu  # noqa: E402
+from kfgs.splat.engines.cpu import square as numba_square  # noqa: E402
+from kfgs.splat.engines.cpu.simd import bits, load  # noqa: E402
+from kfgs.splat.engines.cpu.square import (  # noqa: E402
+    BLOCK,
+    BLOCKS,
+    CHUNK,
+    LANES,
+    PIXELS,
+    SIDE,
+    STATE,
+    X,
+    Y,
+    pack_rows,
+    row_length,
+    start_square,
+    touched_blocks,
+    weigh_pixels,
+)
+from kfgs.splat.engines.cpu.threads import run_bands  # noqa: E402
+
+DTYPES = [torch.float32, torch.float64]
+every_dtype = pytest.mark.parametrize("dtype", DTYPES)
+every_width = pytest.mark.parametrize("channels", [1, 4, 5, 10, 11, 26, 27, 33])
+"""On both sides of: a few channels, one pass, two passes, registers at all."""
+
+forks = pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="this system does not fork")
+
+
+def _needles(M, width, height, dtype, seed=3):
+    """Gaussians from a twentieth of a pixel to 200 pixels, up to 4000 times longer than wide, in all directions."""
+    g = torch.Generator().manual_seed(seed)
+    angle = torch.rand(M, generator=g, dtype=torch.float64) * torch.pi
+    sigmas = 10 ** (torch.rand(M, 2, generator=g, dtype=torch.float64) * 3.6 - 1.3)
+    axes = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], 1).view(M, 2, 2) * sigmas[:, None]
+    means = torch.rand(M, 2, generator=g, dtype=torch.float64) * torch.tensor([width, height])
+    depths, opacities = torch.rand(2, M, generator=g, dtype=torch.float64)
+    return splats_from(means, axes @ axes.mT, 1 + depths, 0.05 + 0.9 * opacities, dtype)
+
+
+def _composite(projected, features, width, height, tile_size=16, **options):
+    tiles = bin_tiles(projected, width, height, tile_size)
+    inputs = (projected.means2d, projected.conics, projected.opacities, features)
+    return composite(*inputs, tiles, engine="numba", **options)
+
+
+def _gradients(projected, features, width, height, tiles=None, engine="numba", index=None):
+    """All outputs and gradients under fixed cotangents."""
+    leaves = [v.clone().requires_grad_() for v in (projected.means2d, projected.conics, projected.opacities, features)]
+    background = torch.linspace(-1, 1, features.shape[1], dtype=features.dtype).requires_grad_()
+    tiles = tiles or bin_tiles(projected, width, height)
+    outputs = composite(*leaves, tiles, background=background, index=index, engine=engine)
+    g = torch.Generator().manual_seed(1)
+    cotangents = [torch.randn(v.shape, generator=g, dtype=torch.float64).to(v.dtype) for v in outputs]
+    return [*(v.detach() for v in outputs), *torch.autograd.grad(outputs, [*leaves, background], cotangents)]
+
+
+def _everywhere(M, width, height, tile_size):
+    """Tiles that each list all Gaussians, in the order of their numbers."""
+    count = -(-width // tile_size) * -(-height // tile_size)
+    return Tiles(
+        torch.arange(M, dtype=torch.int32).repeat(count), M * torch.arange(count + 1), width, height, tile_size
+    )
+
+
+@pytest.fixture
+def many_bands(monkeypatch):
+    """Small frames are cut into bands, too."""
+    monkeypatch.setattr(numba_cpu, "BAND", 64, raising=False)
+
+
+@pytest.fixture
+def two_threads(many_bands):
+    """Torch, and with it the engine, on two threads."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(threads)
+
+
+# blocks ---------------------------------------------------------------------------------------------------------------
+
+
+def _pack(projected, dtype):
+    values = [v.to(dtype) for v in (projected.means2d, projected.conics, projected.opacities)]
+    splats = tuple(v.contiguous().view(-1).numpy() for v in values)
+    rows = np.full(len(values[2]) * row_length(0), np.nan, splats[0].dtype)
+    pack_rows(0, 1, splats, splats[0][:0], 0, np.empty(0, np.int64), rows)
+    return rows, [v.double().numpy() for v in values]
+
+
+@numba.njit
+def _look(rows, length, box, epsilon, touched, drawn):
+    """The blocks that each Gaussian is said to touch, and the pixels of each block where it is drawn, as bits."""
+    state, corners = np.empty(STATE, rows.dtype), np.empty(2 * BLOCKS, rows.dtype)
+    start_square(state, corners, box)
+    for m in range(len(touched)):
+        touched[m] = touched_blocks(rows, m * length, corners, epsilon)
+        for block in range(BLOCKS):
+            x, y = load(state, X + block * LANES), load(state, Y + block * LANES)
+            _, _, _, alpha = weigh_pixels(rows, m * length, x, y)
+            drawn[m, block] = bits(alpha > 0)
+
+
+def _touched_and_drawn(rows, left, top):
+    """[M, 16] truth and [M, 16, 16] truth, for the square that begins at a pixel."""
+    M = len(rows) // row_length(0)
+    touched, drawn = np.zeros(M, np.uint32), np.zeros((M, BLOCKS), np.uint32)
+    _look(rows, row_length(0), (left, top, left + SIDE, top + SIDE), np.finfo(rows.dtype).eps, touched, drawn)
+    return touched[:, None] >> np.arange(BLOCKS) & 1 == 1, drawn[:, :, None] >> np.arange(LANES) & 1 == 1
+
+
+@every_dtype
+def test_touched_blocks_are_those_with_a_drawn_pixel_and_few_more(dtype):
+    left, top, M = 16, 16, 600
+    rows, values = _pack(_needles(M, 48, 48, dtype), dtype)
+    touched, drawn = _touched_and_drawn(rows, left, top)
+    expected, wasted = 0, 0
+    for m, (mean, conic, opacity) in enumerate(zip(*values, strict=True)):
+        for block in range(BLOCKS):
+            x, y = left + block % BLOCK * BLOCK + 0.5 - mean[0], top + block // BLOCK * BLOCK + 0.5 - mean[1]
+            smallest = oracle.smallest_in_rectangle(conic, x, x + BLOCK - 1, y, y + BLOCK - 1)
+            reach = oracle.reach(opacity)
+            if smallest <= reach:
+                expected += 1
+                assert touched[m, block], f"Gaussian {m}: block {block} is missing"
+            elif smallest > reach * 1.05 + 0.05:
+                wasted += touched[m, block]
+        assert not (drawn[m].any(axis=1) & ~touched[m]).any()
+    assert expected > 1000
+    assert drawn.sum() > 10_000
+    assert wasted <= (0.02 if dtype == torch.float32 else 0) * expected
+
+
+def test_drawn_pixels_are_those_of_the_equation():
+    left, top, M = 16, 32, 150
+    rows, values = _pack(_needles(M, 48, 64, torch.float64, seed=4), torch.float64)
+    _, drawn = _touched_and_drawn(rows, left, top)
+    expected = np.zeros((M, BLOCKS, LANES), bool)
+    for m, splat in enumerate(zip(*values, strict=True)):
+        for i in range(SIDE):
+            for j in range(SIDE):
+                alpha = oracle.alpha_at(left + j + 0.5, top + i + 0.5, *splat)
+                expected[m, i // BLOCK * BLOCK + j // BLOCK, i % BLOCK * BLOCK + j % BLOCK] = alpha > 0
+    assert expected.sum() > 1000
+    np.testing.assert_array_equal(drawn, expected)
+
+
+@every_dtype
+def test_no_pixel_outside_of_touched_blocks_is_drawn_however_it_rounds(dtype):
+    """Every Gaussian has alpha on 1/255, but for rounding, at the centre of pixel (20, 20), where its tip is.
+
+    That pixel is the first one of a block, or the last: the tip looks into the block from outside.
+    """
+    M = 20_000
+    projected = _needles(M, 40, 40, torch.float64, seed=8)
+    a, b, c = projected.conics.to(dtype).double().unbind(1)
+    g = torch.Generator().manual_seed(2)
+    length = 3.2 * torch.rand(M, generator=g)
+    along = torch.linalg.eigh(torch.stack([a, b, b, c], dim=1).view(M, 2, 2)).eigenvectors[..., 0]
+    size = (a * along[:, 0] ** 2 + 2 * b * along.prod(dim=1) + c * along[:, 1] ** 2).sqrt()
+    means2d = (20.5 + along * (length / size)[:, None]).to(dtype)
+    dx, dy = (20.5 - means2d.double()).unbind(1)
+    opacities = torch.exp((a * dx * dx + 2 * b * dx * dy + c * dy * dy) / 2) / 255
+    rows, _ = _pack(projected._replace(means2d=means2d, opacities=opacities), dtype)
+    on_edge = 0
+    for left, top in ((20, 20), (5, 5), (20, 5), (5, 20), (13, 9), (17, 17)):
+        touched, drawn = _touched_and_drawn(rows, left, top)
+        assert not (drawn.any(axis=2) & ~touched).any(axis=1).any()
+        i, j = 20 - top, 20 - left
+        on_edge += drawn[:, i // BLOCK * BLOCK + j // BLOCK, i % BLOCK * BLOCK + j % BLOCK].sum()
+    assert 0.1 < on_edge / (6 * M) < 0.9  # the case is what it is meant to be: some are drawn there, some are not
+
+
+BROKEN = {
+    "conic has NaN in a": ("conics", [float("nan"), 0.1, 0.3]),
+    "conic has NaN in b": ("conics", [0.2, float("nan"), 0.3]),
+    "conic has NaN in c": ("conics", [0.2, 0.1, float("nan")]),
+    "conic has no bound": ("conics", [float("inf"), 0.0, float("inf")]),
+    "all zero": ("conics", [0.0, 0.0, 0.0]),
+    "indefinite": ("conics", [0.2, 0.5, 0.3]),
+    "negative definite": ("conics", [-0.2, 0.0, -0.3]),
+    "flat": ("conics", [0.0, 0.0, 0.3]),
+    "x is NaN": ("means2d", [float("nan"), 8.0]),
+    "y is NaN": ("means2d", [8.0, float("nan")]),
+    "infinitely far": ("means2d", [float("inf"), 8.0]),
+    "opacity is NaN": ("opacities", float("nan")),
+    "opacity is negative": ("opacities", -0.5),
+    "opacity is 0": ("opacities", 0.0),
+}
+
+
+@every_dtype
+@pytest.mark.parametrize("channels", [3, 40])
+@pytest.mark.parametrize(
+    "broken",
+    BROKEN,
+)
+def test_a_broken_gaussian_is_not_drawn_and_changes_no_gradient(broken, channels, dtype):
+    M, width, height = 20, 21, 19
+    projected, features = random_splats(M + 1, width, height, seed=5, dtype=dtype, channels=channels)
+    name, value = BROKEN[broken]
+    values = getattr(projected, name).clone()
+    values[7] = torch.tensor(value, dtype=dtype)
+    projected = projected._replace(**{name: values})
+    everyone = _everywhere(M + 1, width, height, 16)
+    whole = everyone.rows.view(-1, M + 1)
+    others = Tiles(
+        whole[whole != 7].contiguous(), M * torch.arange(len(everyone.offsets)), width, height, 16
+    )  # without the broken one
+    expected = _gradients(projected, features, width, height, others)
+    actual = _gradients(projected, features, width, height, everyone)
+    for i, (a, b) in enumerate(zip(actual, expected, strict=True)):
+        if 2 <= i < 6:  # means2d, conics, opacities, features
+            assert (a[7] == 0).all(), f"gradient {i - 2} of the broken one: {a[7]}"
+            a, b = (torch.cat([v[:7], v[8:]]) for v in (a, b))
+        torch.testing.assert_close(a, b, rtol=0, atol=0)
+
+
+# against the oracle ---------------------------------------------------------------------------------------------------
+
+
+@every_dtype
+@every_width
+def test_needles_and_blobs_agree_with_the_equations(channels, dtype):
+    width, height = 37, 29
+    projected = _needles(40, width, height, dtype, seed=channels)
+    g = torch.Generator().manual_seed(0)
+    features = torch.randn(40, channels, generator=g, dtype=torch.float64).to(dtype)
+    background = torch.linspace(-1, 2, channels, dtype=dtype)
+    maps, alphas = _composite(projected, features, width, height, background=background)
+    values = (projected.means2d, projected.conics, projected.depths, projected.opacities, features, background)
+    *values, background = (v.double().numpy() for v in values)
+    expected = oracle.composite(*values, width, height, background)
+    assert maps.dtype == alphas.dtype == dtype
+    # float32: with sigma 0.05 the power's terms reach 1e5 and cancel, so that alpha carries an error of 1e5 * 6e-8
+    tolerance = TOLERANCE[dtype] if dtype == torch.float64 else 2e-3
+    for actual, truth in zip((maps, alphas[..., None]), expected, strict=True):
+        truth = torch.from_numpy(truth).reshape(actual.shape)
+        assert_close_but_for_thresholds(actual, truth, tolerance=tolerance, band=0.05)
+
+
+@every_width
+def test_float32_follows_float64(channels):
+    projected, features = random_splats(80, 45, 31, seed=channels, channels=channels, opacities=(0.2, 0.8))
+    exact = _gradients(projected, features, 45, 31)
+    single = projected._replace(**{n: getattr(projected, n).float() for n in projected._fields if n != "index"})
+    rounded = _gradients(single, features.float(), 45, 31)
+    for a, b in zip(rounded, exact, strict=True):
+        # an alpha that falls on the other side of 1/255 moves a gradient by 0.004 of one pixel's
+        assert (a.double() - b).abs().max() <= 2e-4 * (1 + b.abs().max())
+
+
+@pytest.mark.parametrize(
+    ("tile_size", "channels", "fast"),
+    [
+        *((5, 1, False), (8, 5, False), (16, 1, True), (32, 4, True), (5, 5, True), (8, 10, True), (16, 11, True)),
+        *((32, 26, True), (5, 27, True), (8, 33, True), (16, 33, True), (32, 10, True), (16, 4, True)),
+    ],
+)
+@pytest.mark.parametrize("shared", [False, True], ids=["own features", "by index"])
+def test_gradcheck(tile_size, channels, fast, shared):
+    """With an index, Gaussians share rows of features, in no order, and some rows belong to nobody."""
+    M, N = 10, 7
+    projected, features = random_splats(M, 11, 9, seed=4, opacities=(0.2, 0.8), sigma=(1.5, 4.0), channels=channels)
+    index = torch.tensor([3, 0, 0, 5, 3, 6, 1, 0, 2, 6]) if shared else None
+    tiles = _everywhere(M, 11, 9, tile_size)
+    inputs = [projected.means2d, projected.conics, projected.opacities, features[: N if shared else M]]
+    inputs = [v.clone().requires_grad_() for v in (*inputs, torch.linspace(-1, 1, channels).double())]
+
+    def run(*inputs):
+        return composite(*inputs[:4], tiles, background=inputs[4], index=index, engine="numba")
+
+    # a Gaussian is cut off at 1/255, where central differences see a step: keep the step far smaller than the density's
+    assert torch.autograd.gradcheck(run, inputs, eps=1e-7, atol=1e-5, rtol=1e-4, fast_mode=fast)
+
+
+@pytest.mark.parametrize("channels", [3, 40])
+def test_rising_index_is_that_of_the_selected_rows(channels, many_bands):
+    """Rising numbers are worked on by many bands, others by one: the result is the same."""
+    projected, features = random_splats(60, 33, 21, seed=6, channels=channels)
+    index = torch.arange(60) * 2 + 1
+    table = torch.full((122, channels), 7.0).double()
+    table[index] = features
+    plain = _gradients(projected, features, 33, 21)
+    for order in (torch.arange(60), torch.arange(60).flip(0)):  # the rows of features, rising and falling
+        shuffled = torch.full_like(table, 7.0)
+        shuffled[index[order]] = features
+        chosen = _gradients(projected, shuffled, 33, 21, index=index[order])
+        gradient = chosen[5]
+        chosen[5] = gradient[index[order]]
+        for a, b in zip(chosen, plain, strict=True):
+            torch.testing.assert_close(a, b, rtol=0, atol=0)
+        assert int((gradient != 0).any(dim=1).sum()) <= 60
+
+
+@every_dtype
+def test_clamped_and_skipped_gaussians_have_no_shape_gradient(dtype):
+    """Flat over the tile: the first is clamped to 0.99, the second drawn, the third too faint, the fourth stopped."""
+    means2d, conics = torch.full((4, 2), 8.0, dtype=dtype), torch.tensor([[1e-13, 0, 1e-13]], dtype=dtype).repeat(4, 1)
+    opacities = torch.tensor([0.995, 0.5, 0.003, 0.98999], dtype=dtype)
+    features = torch.tensor([[2.0], [3.0], [5.0], [7.0]], dtype=dtype)
+    tiles = Tiles(torch.arange(4, dtype=torch.int32), torch.tensor([0, 4]), 16, 16, 16)
+    leaves = [v.requires_grad_() for v in (means2d, conics, opacities, features)]
+    maps, alphas = composite(*leaves, tiles, engine="numba")
+    grads = torch.autograd.grad(maps.sum() + 10 * alphas.sum(), leaves)
+    torch.testing.assert_close(grads[2][[0, 2, 3]], torch.zeros(3, dtype=dtype), rtol=0, atol=0)
+    assert (grads[0][[0, 2, 3]] == 0).all()
+    assert (grads[1][[0, 2, 3]] == 0).all()
+    # the second: 256 pixels times T = 0.01 times (its feature + 10)
+    torch.testing.assert_close(grads[2][1].item(), 256 * 0.01 * 13, rtol=1e-4, atol=0)
+    expected = 256 * torch.tensor([[0.99], [0.005], [0], [0]], dtype=dtype)
+    torch.testing.assert_close(grads[3], expected, rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize(("channels", "narrow"), [(1, 0), (3, 0), (11, 0), (26, 0), (27, 100), (33, 100), (70, 100)])
+def test_few_and_many_channels_are_done_alike(channels, narrow, monkeypatch):
+    """The kernels for few channels and those for many, on what both can do."""
+    projected, features = random_splats(300, 45, 37, seed=7, channels=channels)
+    expected = _gradients(projected, features, 45, 37)
+    monkeypatch.setattr(numba_cpu, "NARROW", narrow)
+    for a, b in zip(_gradients(projected, features, 45, 37), expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("channels", [1, 4, 15, 16, 17, 33])
+def test_pixels_are_accumulated_by_weight(channels):
+    projected, _ = random_splats(150, 30, 23, seed=8)
+    weights, _ = _composite(projected, torch.eye(150).double(), 30, 23)  # [H, W, M]
+    pixels = torch.randn(23, 30, channels, generator=torch.Generator().manual_seed(2)).double()
+    splats = projected.means2d, projected.conics, projected.opacities
+    sums, own = accumulate_pixels(*splats, pixels, bin_tiles(projected, 30, 23), engine="numba")
+    torch.testing.assert_close(sums, torch.einsum("hwm,hwd->md", weights, pixels), rtol=0, atol=1e-11)
+    torch.testing.assert_close(own, weights.sum((0, 1)), rtol=0, atol=1e-11)
+
+
+# long lists -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("channels", [3, 20, 40])
+@pytest.mark.parametrize("count", [CHUNK - 1, CHUNK, CHUNK + 1, 3 * CHUNK + 5])
+def test_lists_longer_than_a_chunk(count, channels):
+    projected, features = random_splats(
+        count, 13, 11, seed=count, opacities=(0.01, 0.03), sigma=(2.0, 9.0), channels=channels
+    )
+    tiles = _everywhere(count, 13, 11, 16)
+    ours = _gradients(projected, features, 13, 11, tiles)
+    reference = _gradients(projected, features, 13, 11, tiles, engine="reference")
+    assert float(ours[1].min()) > 0
+    assert float(ours[1].max()) < 0.99  # no pixel stops
+    for a, b in zip(ours, reference, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("channels", [3, 20, 40])
+@pytest.mark.parametrize("stop", [CHUNK - 1, CHUNK, CHUNK + 1, 2 * CHUNK + 17])
+def test_stop_in_the_middle_of_a_long_list(stop, channels):
+    """Faint Gaussians, then one pair that is opaque everywhere but in a corner, then more that are seen there only."""
+    count, width, height = 4 * CHUNK, 13, 11
+    projected, features = random_splats(
+        count, width, height, seed=9, opacities=(0.005, 0.02), sigma=(4.0, 9.0), channels=channels
+    )
+    opaque = torch.tensor([stop, stop + 1])
+    means2d, conics, opacities = (getattr(projected, n).clone() for n in ("means2d", "conics", "opacities"))
+    means2d[opaque], conics[opaque], opacities[opaque] = 0.0, torch.tensor([0.02, 0.0, 0.02]).double(), 5.0
+    projected = projected._replace(means2d=means2d, conics=conics, opacities=opacities)
+    tiles = _everywhere(count, width, height, 16)
+    ours = _gradients(projected, features, width, height, tiles)
+    reference = _gradients(projected, features, width, height, tiles, engine="reference")
+    assert 0 < float((ours[1] > 0.99).double().mean()) < 1
+    for a, b in zip(ours, reference, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-9)
+
+
+def test_nothing_is_looked_at_behind_what_is_opaque():
+    count, opaque = 5 * CHUNK, CHUNK + 3
+    means2d, conics = torch.full((count, 2), 8.0), torch.tensor([[1e-13, 0, 1e-13]]).repeat(count, 1)
+    opacities, features = torch.full((count,), 0.005), torch.ones(count, 1)
+    opacities[opaque : opaque + 3] = 0.98
+    inputs = means2d, conics, opacities, features, torch.zeros(1), None
+    tiles = _everywhere(count, 16, 16, 16)
+    _, alphas, trace = numba_cpu.forward(*inputs, tiles.rows, tiles.offsets, 16, 16, 16)
+    assert float(alphas.min()) > 0.999
+    looked_at = trace[-count - 1]  # one tile of one square: how many, and then the blocks of each
+    assert int(looked_at) == 2 * CHUNK
+    features = torch.full((count, 1), float("nan"))  # what is behind is not even read
+    features[: 2 * CHUNK] = 1
+    maps, _ = composite(means2d, conics, opacities, features, tiles, engine="numba")
+    torch.testing.assert_close(maps[..., 0], alphas)
+
+
+# threads --------------------------------------------------------------------------------------------------------------
+
+
+def _many(dtype=torch.float32, channels=9):
+    projected, features = random_splats(700, 150, 110, seed=9, channels=channels, dtype=dtype)
+    return projected, features, 150, 110
+
+
+@every_dtype
+@pytest.mark.parametrize("channels", [9, 33])
+def test_reruns_are_bit_equal_for_any_number_of_threads(dtype, channels, many_bands):
+    threads = torch.get_num_threads()
+    results = []
+    try:
+        for n in (1, 2, 5, 2):
+            torch.set_num_threads(n)
+            results.append(_gradients(*_many(dtype, channels)))
+            projected, _, width, height = _many(dtype)
+            pixels = torch.linspace(-1, 1, width * height * 3, dtype=dtype).view(height, width, 3)
+            splats = projected.means2d, projected.conics, projected.opacities
+            results[-1] += accumulate_pixels(*splats, pixels, bin_tiles(projected, width, height), engine="numba")
+    finally:
+        torch.set_num_threads(threads)
+    for other in results[1:]:
+        for a, b in zip(results[0], other, strict=True):
+            assert torch.equal(a, b)
+
+
+def test_may_be_called_from_several_threads_at_once(many_bands):
+    expected = _gradients(*_many())
+    with ThreadPoolExecutor(4) as pool:
+        for result in pool.map(lambda _: _gradients(*_many()), range(8)):
+            for a, b in zip(result, expected, strict=True):
+                assert torch.equal(a, b)
+
+
+def test_bands_cover_all_tiles_once_and_do_not_depend_on_threads(many_bands):
+    projected, _, width, height = _many()
+    tiles = bin_tiles(projected, width, height)
+    views = []
+    threads = torch.get_num_threads()
+    try:
+        for n in (1, 5):
+            torch.set_num_threads(n)
+            views.append(numba_cpu._view(tiles.rows, tiles.offsets, width, height, 16))
+    finally:
+        torch.set_num_threads(threads)
+    bounds = views[0].bounds
+    np.testing.assert_array_equal(bounds, views[1].bounds)
+    assert (bounds[0], bounds[-1]) == (0, len(tiles.offsets) - 1)
+    assert (np.diff(bounds) >= 0).all()
+    assert len(bounds) == numba_cpu.BANDS + 1
+    pairs = np.diff(tiles.offsets.numpy()[bounds])
+    assert pairs.max() <= 3 * pairs.mean()
+
+
+@pytest.mark.parametrize("channels", [3, 40])
+def test_bands_change_nothing_but_rounding(channels, monkeypatch):
+    results = []
+    for pairs in (1 << 40, 500, 10):  # of a band at least
+        monkeypatch.setattr(numba_cpu, "BAND", pairs, raising=False)
+        results.append(_gradients(*_many(torch.float64, channels)))
+    for other in results[1:]:
+        for a, b in zip(results[0], other, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-11)
+
+
+@every_dtype
+@pytest.mark.parametrize("channels", [3, 20, 40])
+def test_what_was_in_memory_before_is_never_read(channels, dtype, monkeypatch, many_bands):
+    projected, features, width, height = _many(dtype, channels)
+    pixels = torch.linspace(-1, 1, width * height * channels, dtype=dtype).view(height, width, channels)
+    splats = projected.means2d, projected.conics, projected.opacities
+
+    def run():
+        tiles = bin_tiles(projected, width, height)
+        return [
+            *_gradients(projected, features, width, height, tiles),
+            *accumulate_pixels(*splats, pixels, tiles, engine="numba"),
+        ]
+
+    def poisoned(like, *shape):
+        return like.new_full(shape, float("nan") if like.is_floating_point() else -1)
+
+    expected = run()
+    monkeypatch.setattr(numba_cpu, "take", poisoned)
+    for a, b in zip(run(), expected, strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("tiles", [1, 2, 40])
+def test_bands_of_few_tiles(tiles):
+    view = numba_cpu._view(torch.zeros(0, dtype=torch.int32), torch.zeros(tiles + 1).long(), 16 * tiles, 16, 16)
+    assert (view.bounds[0], view.bounds[-1]) == (0, tiles)
+    assert (np.diff(view.bounds) >= 0).all()
+
+
+def test_each_band_runs_once_and_gets_the_arguments(two_threads):
+    seen = []
+    run_bands(lambda band, *rest: seen.append((band, rest)), 9, "a", 2)
+    assert sorted(seen) == [(band, ("a", 2)) for band in range(9)]
+    run_bands(lambda band: seen.append(band), 0)
+    assert len(seen) == 9
+
+
+@pytest.mark.parametrize("where", [0, 3])
+def test_error_of_a_band_reaches_the_caller(where, two_threads):
+    def broken(band):
+        time.sleep(0.005)
+        if band == where:
+            raise RuntimeError(f"band {where}")
+
+    with pytest.raises(RuntimeError, match=f"band {where}"):
+        run_bands(broken, 4)
+    run_bands(lambda band: None, 4)  # and the threads are still there
+
+
+# processes ------------------------------------------------------------------------------------------------------------
+
+
+def _in_fork(work, seconds=20):
+    """What `work` returns in a forked child, as JSON; the child is ended if it hangs."""
+    read, write = os.pipe()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # from Python 3.12 on: a fork of a process with threads
+        child = os.fork()
+    if child == 0:
+        try:
+            os.write(write, json.dumps(work()).encode())
+        finally:
+            os._exit(0)
+    os.close(write)
+    deadline = time.monotonic() + seconds
+    while os.waitpid(child, os.WNOHANG) == (0, 0):
+        if time.monotonic() > deadline:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            pytest.fail(f"the forked child hangs for more than {seconds} s")
+        time.sleep(0.01)
+    with os.fdopen(read, "rb") as pipe:
+        return json.loads(pipe.read())
+
+
+def _splats(seed=0):
+    return random_splats(700, 150, 110, seed=seed, channels=9, dtype=torch.float32)
+
+
+def _frame(seed=0):
+    return _composite(*_splats(seed), 150, 110)[0]
+
+
+@forks
+def test_a_forked_child_composites_on_its_own_threads(two_threads):
+    """With tiles of its parent: torch's own threads do not survive a fork, and binning asks torch for logarithms."""
+    projected, features = _splats()
+    tiles = bin_tiles(projected, 150, 110)
+    inputs = projected.means2d, projected.conics, projected.opacities, features
+    expected, _ = composite(*inputs, tiles, engine="numba")
+
+    def work():
+        maps, _ = composite(*inputs, tiles, engine="numba")
+        return [torch.get_num_threads(), bool((maps.numpy() == expected.numpy()).all())]
+
+    assert _in_fork(work) == [2, True]
+    assert torch.equal(composite(*inputs, tiles, engine="numba")[0], expected)  # and the parent goes on
+
+
+@forks
+def test_a_forked_child_on_one_thread_does_all(two_threads):
+    """What torch needs in a forked child, and what its own workers do."""
+    expected = _frame()
+    torch.ones(1_000_000).add_(1)  # wakes torch's own threads
+
+    def work():
+        torch.set_num_threads(1)
+        return torch.equal(_frame(), expected)
+
+    assert _in_fork(work)
+    assert torch.equal(_frame(), expected)
+
+
+class _Frames(torch.utils.data.Dataset):
+    def __len__(self):
+        return 4
+
+    def __getitem__(self, i):
+        return _frame(i)
+
+
+@forks
+def test_workers_of_a_data_loader_composite_too(two_threads):
+    expected = [_frame(i) for i in range(4)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        loader = DataLoader(_Frames(), batch_size=None, num_workers=2, multiprocessing_context="fork", timeout=60)
+        frames = list(loader)
+    for frame, truth in zip(frames, expected, strict=True):
+        assert torch.equal(frame, truth)
+
+
+WARM = """
+import json, sys
+import torch
+sys.path.insert(0, {tests!r})
+from cases_splat import random_splats
+from kfgs.splat import Tiles, composite
+
+projected, features = random_splats(20, 20, 16, seed=0, dtype=torch.float32)
+tiles = Tiles(torch.arange(20, dtype=torch.int32).repeat(2), 20 * torch.arange(3), 20, 16, 16)
+inputs = [v.requires_grad_() for v in (projected.means2d, projected.conics, projected.opacities, features)]
+maps, alphas = composite(*inputs, tiles, engine="numba")
+(maps.sum() + alphas.sum()).backward()
+
+from numba.core.dispatcher import Dispatcher
+
+modules = [module for name, module in sorted(sys.modules.items()) if name.startswith("kfgs.splat.engines.numba")]
+kernels = {{id(v): v for module in modules for v in vars(module).values() if isinstance(v, Dispatcher)}}
+print(json.dumps([
+    sorted(k.__name__ for k in kernels.values() if k.overloads and k.stats.cache_hits),
+    sorted(k.__name__ for k in kernels.values() if k.stats.cache_misses or k.overloads and not k.stats.cache_hits),
+]))
+"""
+
+
+def test_a_warm_start_compiles_nothing():
+    """A fresh process takes every kernel of a frame and its backward pass from the cache."""
+    root = Path(__file__).parents[2]
+    command = [sys.executable, "-c", WARM.format(tests=str(root / "tests"))]
+    for _ in range(2):  # the first may have to fill the cache
+        done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=True, timeout=300)
+        loaded, built = json.loads(done.stdout)
+        if not built:
+            break
+    assert built == []
+    assert {"pack_rows", "composite_narrow", "differentiate_narrow", "gather_gradients"} <= set(loaded)
+
+
+def test_a_block_is_a_vector():
+    assert PIXELS == SIDE * SIDE == BLOCKS * LANES
+    assert BLOCK * BLOCK == LANES == numba_square.BLOCKS

@@ -1,0 +1,169 @@
+"""The compiled binning against the functions of torch, which it equals to the bit, and against every pixel centre."""
+
+import numpy as np
+import pytest
+import torch
+from cases_splat import splats_from
+
+from kfgs.splat import bin_tiles
+
+numba = pytest.importorskip("numba")
+
+from kfgs.splat.engines.cpu import tiles as numba_tiles  # noqa: E402
+from kfgs.splat.engines.cpu import tiles_kernels as kernels  # noqa: E402
+
+DTYPES = [torch.float32, torch.float64]
+NAN, INF = float("nan"), float("inf")
+
+
+def _splats(seed, dtype, M=80, width=90, height=60):
+    """Gaussians of every shape, from far below a pixel to far beyond the picture, in and around it; some equally deep."""
+    g = np.random.default_rng(seed)
+    means = torch.from_numpy(g.uniform(-0.2, 1.2, (M, 2)) * [width, height])
+    means[::7] = means[::7].round() + torch.from_numpy(g.choice([0.0, 0.5], (len(means[::7]), 1)))  # on edges, centres
+    angle = torch.from_numpy(g.uniform(0, np.pi, M))
+    sigmas = torch.from_numpy(10 ** g.uniform(-2, 1.2, (M, 2)))
+    sigmas[::3, 0] = torch.from_numpy(10 ** g.uniform(0, 4, len(sigmas[::3])))  # needles, and some huge
+    sigmas[::15, 1] = sigmas[::15, 0]
+    axes = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], 1).view(M, 2, 2) * sigmas[:, None]
+    axes[::5] = torch.diag_embed(sigmas[::5])  # along the axes
+    opacities = torch.from_numpy(np.where(g.random(M) < 0.2, g.uniform(1, 1.3, M) / 255, g.uniform(0.01, 1, M)))
+    depths = torch.from_numpy(g.choice([*g.uniform(0.2, 10, 20), 1.0], M))
+    return splats_from(means, axes @ axes.mT + 0.3 * torch.eye(2), depths, opacities, dtype)
+
+
+def _same(projected, width, height, tile_size):
+    expected = bin_tiles(projected, width, height, tile_size, engine="reference")
+    actual = bin_tiles(projected, width, height, tile_size, engine="numba")
+    assert (actual.rows.dtype, actual.offsets.dtype) == (torch.int32, torch.int64)
+    return torch.equal(actual.rows, expected.rows) and torch.equal(actual.offsets, expected.offsets)
+
+
+def _pairs(tiles):
+    tile = torch.repeat_interleave(torch.arange(len(tiles.offsets) - 1), tiles.offsets.diff())
+    return set(zip(tile.tolist(), tiles.rows.tolist(), strict=True))
+
+
+@pytest.mark.parametrize("tile_size", [1, 5, 8, 16, 32, 100])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_lists_are_those_of_torch_to_the_bit(dtype, tile_size):
+    for seed in range(60 if tile_size > 1 else 5):
+        g = np.random.default_rng(seed)
+        width, height = (int(n) for n in g.integers(1, 200, 2))
+        assert _same(_splats(seed, dtype, 80, width, height), width, height, tile_size), f"seed {seed}"
+
+
+@pytest.mark.parametrize("M", [1, 63, 64, 65, 5000])
+def test_any_number_of_gaussians_fills_the_blocks(M):
+    assert _same(_splats(M, torch.float32, M), 90, 60, 16)
+
+
+@pytest.mark.parametrize("tile_size", [5, 8, 16, 32])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_no_pixel_loses_a_gaussian(dtype, tile_size):
+    width, height, columns = 90, 60, -(-90 // tile_size)
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    tile = (y // tile_size).astype(int) * columns + (x // tile_size).astype(int)
+    shown = 0
+    for seed in range(12):
+        projected = _splats(seed, dtype)
+        pairs = _pairs(bin_tiles(projected, width, height, tile_size, engine="numba"))
+        for row in range(len(projected.depths)):
+            (mx, my), (a, b, c) = projected.means2d[row].double().tolist(), projected.conics[row].double().tolist()
+            dx, dy = x - mx, y - my
+            alpha = float(projected.opacities[row]) * np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
+            for t in np.unique(tile[alpha >= 1 / 255]):
+                assert (t, row) in pairs, f"seed {seed}, Gaussian {row}, tile {t}"
+                shown += 1
+    assert shown > 1000
+
+
+def _order(depths):
+    return numba_tiles.depth_order(torch.as_tensor(depths)).tolist()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_depths_are_sorted_like_torch_sorts(dtype):
+    g = torch.Generator().manual_seed(0)
+    special = torch.tensor([0.0, -0.0, NAN, INF, -INF, -NAN, 1e-45, -1e-45, 3e38, -3e38, 1.0, 1.0], dtype=dtype)
+    for size in (0, 1, 2, 3000):
+        plain = torch.randn(size, generator=g, dtype=dtype) * 10 ** torch.randint(-30, 30, (size,), generator=g)
+        depths = torch.cat([plain, plain[: size // 3], special[: size * 12]])
+        depths = depths[torch.randperm(len(depths), generator=g)]
+        assert _order(depths) == torch.sort(depths, stable=True).indices.tolist()
+
+
+def test_equal_depths_stay_in_order_and_every_bit_counts():
+    assert _order([2.0, 1.0, 2.0, 1.0]) == [1, 3, 0, 2]
+    for dtype in (np.float32, np.float64):
+        one = np.ones(1, dtype)
+        up = np.nextafter(one, np.inf).astype(dtype)
+        assert _order(np.concatenate([up, one, -one, -up])) == [3, 2, 1, 0]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_threads_and_shares_do_not_matter(dtype, monkeypatch):
+    projected, threads = _splats(1, dtype, 700), torch.get_num_threads()
+    before = bin_tiles(projected, 90, 60, engine="reference")
+    try:
+        for share in (1, 50, 64, 300, 8192):
+            monkeypatch.setattr(numba_tiles, "_SHARE", share)
+            for count in (1, 2, 5):
+                torch.set_num_threads(count)
+                after = bin_tiles(projected, 90, 60, engine="numba")
+                assert torch.equal(after.rows, before.rows)
+                assert torch.equal(after.offsets, before.offsets)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_pairs_outgrow_their_first_memory():
+    """150 Gaussians over all of 900 tiles: far more than the four pairs each that memory is first taken for."""
+    M, one = 150, torch.ones(150).double()
+    covs = 1e4**2 * torch.eye(2).double().repeat(M, 1, 1)
+    projected = splats_from(torch.full((M, 2), 50.0).double(), covs, one, 0.9 * one, torch.float32)
+    tiles = bin_tiles(projected, 240, 240, 8, engine="numba")
+    assert len(tiles.rows) == 900 * M
+    assert (tiles.rows.view(900, M) == torch.arange(M)).all()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_malformed_gaussians_are_as_harmless_as_in_torch(dtype):
+    odd = torch.tensor([NAN, INF, -INF, 0.0, -1.0, 1e30, -1e30, 1e-30], dtype=dtype)
+    for seed in range(60):
+        projected = [v.clone() for v in _splats(seed, dtype)]
+        g = torch.Generator().manual_seed(seed)
+        for value in projected[:5]:
+            flat = value.view(-1)
+            where = torch.randint(len(flat), (12,), generator=g)
+            flat[where] = odd[torch.randint(len(odd), (12,), generator=g)]
+        tiles = bin_tiles(type(_splats(0, dtype))(*projected), 90, 60, engine="numba")
+        assert int(tiles.offsets[-1]) == len(tiles.rows)
+        assert (tiles.offsets.diff() >= 0).all()
+        assert ((tiles.rows >= 0) & (tiles.rows < 80)).all()
+        assert _same(type(_splats(0, dtype))(*projected), 90, 60, 16), f"seed {seed}"
+
+
+def _visited(conic, mean, opacity, tiles):
+    """How many of tiles x tiles tiles of 16 pixels are looked at, once a long Gaussian's rows are cut."""
+    a, b, c = conic
+    reach = 2 * np.log(255 * opacity)
+    ellipse = kernels._enlarge(a, b, c, reach + 1e-4, reach)
+    assert ellipse[2] > 0
+    return sum(stop - start for start, stop in (
+        kernels._cut(ellipse, mean, 16 * tile + 0.5 - mean, 0, tiles, 16) for tile in range(tiles)
+    ))  # fmt: skip
+
+
+@pytest.mark.parametrize("angle", [0.02, 0.4, np.pi / 4, 1.2, 1.55, 2.5])
+def test_a_needle_costs_as_many_tests_as_it_crosses_tiles(angle):
+    for tiles in (16, 64, 256):
+        mean = 8.0 * tiles
+        along = torch.tensor([np.cos(angle), np.sin(angle)]) * 4 * tiles
+        cov = along[:, None] * along + 0.3 * torch.eye(2)
+        one = torch.ones(1).double()
+        projected = splats_from(torch.full((1, 2), mean).double(), cov[None], one, 0.9 * one, torch.float64)
+        found = bin_tiles(projected, 16 * tiles, 16 * tiles, engine="numba").rows
+        visited = _visited(projected.conics[0].tolist(), mean, 0.9, tiles)
+        assert len(found) <= visited <= len(found) + 4
+        assert visited < 3.5 * tiles  # of tiles^2

@@ -1,0 +1,180 @@
+"""The Triton engine: interpreted on the CPU, compiled for GPUs that are not there, and run on one that is."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cases_triton
+import pytest
+import torch
+
+triton = pytest.importorskip("triton", reason="the Triton engine needs `pip install triton`")
+
+from kfgs.splat import accumulate_pixels, composite  # noqa: E402
+from kfgs.splat.engines.triton import engine as triton_gpu  # noqa: E402 - only where triton is installed
+
+ROOT = Path(__file__).resolve().parents[2]
+LIMITS = dict.fromkeys(("maps", "alphas"), 1e-5) | dict.fromkeys((*cases_triton.GRADS, "sums", "weights"), 1e-4)
+FRAME_LIMITS = dict.fromkeys(("map", "alpha"), 1e-5) | dict.fromkeys((*cases_triton.OF_FRAME, "means2d"), 1e-4)
+"""Largest errors against the reference engine in float64: of values of about 1, and relative to the largest gradient."""
+
+every_case = pytest.mark.parametrize("case", cases_triton.CASES)
+
+
+def _report(*arguments, interpret=False):
+    """What the script says, in a process where triton has not been imported yet."""
+    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
+    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+    if interpret:
+        environment["TRITON_INTERPRET"] = "1"
+    command = [sys.executable, "-W", "error", str(ROOT / "tests" / "cases_triton.py"), *arguments]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def _assert_agrees(facts, limits=LIMITS):
+    assert "failed" not in facts, facts["failed"]
+    assert set(limits) <= set(facts)
+    errors = {name: facts[name] for name in limits}
+    assert {name: error for name, error in errors.items() if not error <= limits[name]} == {}
+    assert [name for name, fact in facts.items() if name not in limits and fact is not True] == []
+
+
+def _assert_operator(said):
+    assert "failed" not in said, said["failed"]
+    assert len(said) == 9
+    assert {check: answer for check, answer in said.items() if answer != "SUCCESS"} == {}
+
+
+@pytest.fixture(scope="module")
+def interpreted():
+    return _report("run", "cpu", interpret=True)
+
+
+@every_case
+def test_interpreted_kernels_agree_with_the_reference(interpreted, case):
+    _assert_agrees(interpreted[case])
+
+
+def test_interpreted_frame_agrees_with_the_reference(interpreted):
+    _assert_agrees(interpreted["frame"], FRAME_LIMITS)
+
+
+def test_interpreted_operator_passes_opcheck(interpreted):
+    _assert_operator(interpreted["operator"])
+
+
+@pytest.fixture(scope="module")
+def on_gpu():
+    return _report("run", "cuda")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+class TestOnGpu:
+    @every_case
+    def test_agrees_with_the_reference(self, on_gpu, case):
+        _assert_agrees(on_gpu[case])
+
+    def test_frame_agrees_with_the_reference(self, on_gpu):
+        _assert_agrees(on_gpu["frame"], FRAME_LIMITS)
+
+    def test_operator_passes_opcheck(self, on_gpu):
+        _assert_operator(on_gpu["operator"])
+
+    def test_is_what_auto_takes(self):
+        inputs, index, tiles, *_ = cases_triton.make_scene(cases_triton.CASES["indexed"], "cuda")
+        auto, named = (composite(*inputs[:4], tiles, index=index, engine=engine) for engine in ("auto", "triton"))
+        assert all(torch.equal(a, b) for a, b in zip(auto, named, strict=True))
+
+    def test_does_not_wait_for_the_gpu(self):
+        inputs, index, tiles, *cotangents = cases_triton.make_scene(cases_triton.CASES["indexed"], "cuda")
+        inputs = [value.requires_grad_() for value in inputs]
+        torch.cuda.set_sync_debug_mode("error")
+        try:
+            outputs = composite(*inputs[:4], tiles, background=inputs[4], index=index, engine="triton")
+            torch.autograd.grad(outputs, inputs, cotangents)
+            accumulate_pixels(*inputs[:3], cotangents[0], tiles, engine="triton")
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+
+
+# compiled for GPUs that are not there ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    return _report("compile")
+
+
+@pytest.mark.parametrize("build", cases_triton.BUILDS)
+def test_kernels_compile_ahead_of_time(compiled, build):
+    facts = compiled[build]
+    assert "failed" not in facts, facts["failed"]
+    assert facts["cubin"] > 1000
+    assert facts["products"], "expected a product on the tensor cores"
+    assert facts["shared"] <= 99 * 1024  # what a program may have on GPUs of sm_86, sm_89 and sm_120
+    if "stack" in facts:
+        assert facts["stack"] <= 128, "registers spill"  # bytes; without care for them it was over a thousand
+
+
+@pytest.mark.parametrize(("capability", "product"), [(80, "mma.sync"), (90, "wgmma.mma_async"), (100, "tcgen05.mma")])
+def test_wide_compositing_uses_the_tensor_cores_of_each_generation(compiled, capability, product):
+    assert compiled[f"composite, 512 channels, sm_{capability}"]["products"] == [product]
+
+
+# the host side --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("tile_size", "parts", "pixels", "warps"),
+    [(1, 1, 16, 1), (5, 1, 32, 1), (8, 1, 64, 2), (12, 1, 256, 8), (16, 1, 256, 8), (32, 4, 256, 8), (20, 2, 256, 8)],
+)
+def test_a_tile_is_cut_into_programs(tile_size, parts, pixels, warps):
+    options = triton_gpu.launch_options("differentiate", 3, tile_size)
+    assert (options["PARTS"], options["PIXELS"], options["num_warps"]) == (parts, pixels, warps)
+    assert parts * pixels >= tile_size**2
+
+
+@pytest.mark.parametrize(("channels", "block"), [(1, 16), (16, 16), (17, 32), (40, 64), (512, 64)])
+def test_channels_are_cut_into_blocks(channels, block):
+    assert triton_gpu.launch_options("composite", channels, 16)["BLOCK"] == block
+
+
+def test_devices():
+    assert triton_gpu.devices()[0] == "cuda"
+    assert ("cpu" in triton_gpu.devices()) == (os.environ.get("TRITON_INTERPRET") == "1")
+
+
+def _on_cpu(dtype):
+    """Arguments of `forward`, `backward` and `accumulate`."""
+    splats = [torch.zeros(1, n, dtype=dtype) for n in (2, 3)] + [torch.zeros(1, dtype=dtype)]
+    inputs = [*splats, torch.zeros(1, 4, dtype=dtype), torch.zeros(4, dtype=dtype)]
+    lists = (torch.zeros(1, dtype=torch.int32), torch.tensor([0, 1]), 6, 5, 16)
+    maps, alphas = torch.zeros(5, 6, 4, dtype=dtype), torch.zeros(5, 6, dtype=dtype)
+    return {
+        "forward": (*inputs, None, *lists),
+        "backward": (maps, alphas, (True,) * 5, *inputs, None, *lists, maps, alphas, alphas.int()),
+        "accumulate": (*splats, maps, *lists),
+    }
+
+
+@pytest.mark.parametrize(
+    ("function", "first"), [("forward", "means2d"), ("backward", "grad_maps"), ("accumulate", "means2d")]
+)
+def test_float64_is_refused(function, first):
+    message = (
+        rf"{first}: expected torch.float32 for engine 'triton', got torch.float64; convert it with "
+        r"\.to\(torch.float32\), or use engine='numba' or engine='reference'"
+    )
+    with pytest.raises(ValueError, match=message):
+        getattr(triton_gpu, function)(*_on_cpu(torch.float64)[function])
+
+
+@pytest.mark.skipif("cpu" in triton_gpu.devices(), reason="triton interprets in this process")
+@pytest.mark.parametrize("function", ["forward", "backward", "accumulate"])
+def test_cpu_tensors_need_the_interpreter(function):
+    with pytest.raises(ValueError, match=r"expected a tensor on cuda for engine 'triton', got one on cpu; move it"):
+        getattr(triton_gpu, function)(*_on_cpu(torch.float32)[function])

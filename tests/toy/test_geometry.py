@@ -1,0 +1,133 @@
+import numpy as np
+import pytest
+import torch
+from oracles_toy import first_hit
+
+from kfgs.cameras.camera import Camera
+from kfgs.toy.geometry import Solid, cast, intersect, normals, occluded, pixel_rays, sample_surface, visible
+from kfgs.toy.texture import Texture
+
+SKIN = Texture("plaster", ((0.5, 0.5, 0.5), (0.6, 0.6, 0.6)))
+
+
+def solid(shape="box", center=(0.0, 0.0, 0.0), half=(1.0, 1.0, 1.0), yaw=0.0) -> Solid:
+    return Solid(shape, center, half, yaw, "wall", SKIN)
+
+
+def camera(height=12, width=16) -> Camera:
+    K = torch.tensor([[15.0, 0, 8.7], [0, 14.0, 5.4], [0, 0, 1]], dtype=torch.float64)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[2, 3] = 6.0  # looks along +z from z = -6
+    return Camera(viewmat, K, width, height)
+
+
+def test_ray_enters_an_ellipsoid_at_its_radius():
+    t = intersect(
+        solid("ellipsoid", (5.0, 0.0, 0.0), (2.0, 1.0, 1.0)), np.zeros(3), np.array([[1.0, 0, 0], [0, 1.0, 0]])
+    )
+    assert t[0] == pytest.approx(3.0)
+    assert np.isinf(t[1])
+
+
+def test_ray_enters_a_turned_box_at_its_edge():
+    turned = solid(center=(5.0, 0.0, 0.0), half=(1.0, 1.0, 1.0), yaw=np.pi / 4)
+    t = intersect(turned, np.zeros(3), np.array([[1.0, 0, 0]]))
+    assert t[0] == pytest.approx(5.0 - np.sqrt(2))
+
+
+def test_solids_behind_or_around_the_origin_are_not_hit():
+    behind = solid(center=(-5.0, 0.0, 0.0))
+    assert np.isinf(intersect(behind, np.zeros(3), np.array([[1.0, 0, 0]]))).all()
+    assert np.isinf(intersect(solid("ellipsoid"), np.zeros(3), np.array([[1.0, 0, 0]]))).all()
+
+
+def test_cast_equals_stepping_along_every_ray():
+    solids = [
+        solid("box", (0.3, -0.2, 0.5), (0.8, 0.5, 0.4), 0.5),
+        solid("ellipsoid", (-1.0, 0.6, -0.5), (0.6, 0.9, 0.5), -0.7),
+        solid("box", (0.0, 0.0, 3.0), (8.0, 8.0, 0.3), 0.0),
+        solid("ellipsoid", (0.5, 0.4, -3.5), (0.5, 0.4, 0.3), 0.2),
+    ]
+    view = camera()
+    depth, index = cast(solids, view)
+    origin, rays = pixel_rays(view)
+    for row, column in [(r, c) for r in range(0, 12, 3) for c in range(0, 16, 2)]:
+        t, hit = first_hit(solids, origin, rays[row, column], far=10.0, step=0.02)
+        assert index[row, column] == hit
+        assert depth[row, column] == pytest.approx(t, abs=1e-9)
+    assert set(np.unique(index)) == {0, 1, 2, 3}
+
+
+def test_pixel_rays_go_through_pixel_centres():
+    view = camera()
+    origin, rays = pixel_rays(view)
+    assert np.allclose(origin, [0, 0, -6])
+    assert np.allclose(rays[2, 3], [(3.5 - 8.7) / 15.0, (2.5 - 5.4) / 14.0, 1.0])
+
+
+@pytest.mark.parametrize("shape", ["box", "ellipsoid"])
+def test_normals_are_unit_outward_and_across_the_surface(shape):
+    body = solid(shape, (1.0, 2.0, 3.0), (0.5, 1.0, 2.0), 0.6)
+    points = sample_surface(body, 400, np.random.default_rng(0))
+    n = normals(body, points)
+    assert np.allclose(np.linalg.norm(n, axis=1), 1.0)
+    steps = body.to_local(points + 1e-4 * n), body.to_local(points - 1e-4 * n)
+    if shape == "box":
+        size = [np.max(np.abs(p) - body.half, axis=1) for p in steps]
+    else:
+        size = [((p / body.half) ** 2).sum(1) - 1.0 for p in steps]
+    assert (size[0] > 0).all()
+    assert (size[1] < 0).all()
+
+
+def test_points_on_a_box_fall_on_faces_by_area():
+    body = solid(half=(0.5, 1.0, 2.0))
+    local = sample_surface(body, 20_000, np.random.default_rng(1)) / body.half
+    faces = [int((local[:, axis] == side).sum()) for axis in range(3) for side in (-1, 1)]
+    expected = 20_000 * np.array([2.0, 2.0, 1.0, 1.0, 0.5, 0.5]) / 7.0
+    assert (np.abs(faces - expected) < 5 * np.sqrt(expected)).all()
+    assert body.area() == pytest.approx(28.0)
+
+
+def test_points_on_an_ellipsoid_are_uniform_by_area():
+    # For a spheroid of radii (a, a, c), c > a, the area with |z| < h is 2 pi a (h root(h) + c asin(e h / c) / e),
+    # root(h) = sqrt(1 - (e h / c)^2): the surface of revolution integrated in closed form; e is its eccentricity.
+    a, c, h = 0.5, 2.0, 1.2
+    e = np.sqrt(1 - (a / c) ** 2)
+    area = [2 * np.pi * a * (z * np.sqrt(1 - (e * z / c) ** 2) + c / e * np.arcsin(e * z / c)) for z in (h, c)]
+    body = solid("ellipsoid", half=(a, a, c))
+    points = sample_surface(body, 20_000, np.random.default_rng(2))
+    share = (np.abs(points[:, 2]) < h).mean()
+    assert share == pytest.approx(area[0] / area[1], abs=0.015)
+    assert body.area() == pytest.approx(area[1], rel=0.011)
+    assert solid("ellipsoid", half=(2.0, 2.0, 2.0)).area() == pytest.approx(16 * np.pi)
+
+
+def test_occlusion_stops_at_the_target():
+    wall = [solid(center=(5.0, 0, 0), half=(1.0, 1.0, 1.0))]
+    targets = np.array([[3.0, 0, 0], [4.0, 0, 0], [4.1, 0, 0], [9.0, 0, 0], [9.0, 5.0, 0], [-9.0, 0, 0]])
+    assert occluded(wall, np.zeros(3), targets).tolist() == [False, False, True, True, False, False]
+
+
+def test_a_camera_sees_what_its_own_rays_hit_and_nothing_else():
+    solids = [
+        solid("box", (0.3, -0.2, 0.5), (0.8, 0.5, 0.4), 0.5),
+        solid("ellipsoid", (-1.0, 0.6, -0.5), (0.6, 0.9, 0.5)),
+        solid("box", (0.0, 0.0, 3.0), (8.0, 8.0, 0.3), 0.0),
+    ]
+    view = camera()
+    depth, index = cast(solids, view)
+    origin, rays = pixel_rays(view)
+    for i, body in enumerate(solids):
+        points = (origin + rays * depth[..., None])[index == i]
+        n = normals(body, points)
+        assert visible(solids, view, points, n).all()
+        assert not visible(solids, view, points, -n).any()  # from behind
+    hidden = (origin + rays * intersect(solids[2], origin, rays)[..., None])[index != 2]
+    assert len(hidden) > 10
+    assert not visible(solids, view, hidden, normals(solids[2], hidden)).any()
+
+
+@pytest.mark.parametrize("shape", ["box", "ellipsoid"])
+def test_no_points_asked_none_given(shape):
+    assert sample_surface(solid(shape), 0, np.random.default_rng(0)).shape == (0, 3)
