@@ -13,8 +13,7 @@ import torch
 from ..cameras import Camera
 from ..cameras.similarity import Similarity, fit_similarity
 from ..scenes._pycolmap import quiet_pycolmap
-from ..scenes.errors import SceneError
-from ..scenes.names import file_stem, some
+from ..scenes.files import SceneError, file_stem, some
 from .clouds import Array
 
 MAX_ERROR = 0.03  # of the cameras' extent: two SfM runs of one scene differ by well below a hundredth

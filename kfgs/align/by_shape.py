@@ -13,7 +13,7 @@ from torch import Tensor
 
 from .._check import check_shapes
 from ..cameras.similarity import Similarity
-from ..scenes.errors import SceneError
+from ..scenes.files import SceneError
 from .by_cameras import Alignment
 from .close_fit import Cloud, Fit, fit_closely, orthonormal
 from .clouds import Array, bulk

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Container, Sequence
 from pathlib import Path, PurePosixPath
 
-from ..scenes.scene import IMAGE_SUFFIXES
+from ..scenes.files import IMAGE_SUFFIXES
 from .layouts import FEATURE_3DGS, LANGSPLAT, LAYOUTS, OWN, layout_of
 from .manifest import MANIFEST
 

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
-from .errors import SceneError
+from .files import SceneError
 
 with contextlib.suppress(ImportError):
     import PIL.Image  # noqa: F401  # see above: the order matters
@@ -35,7 +35,7 @@ def import_pycolmap() -> Any:
         import pycolmap
     except ImportError as error:
         raise ImportError(
-            "pycolmap: needed to read COLMAP models and to run SfM, but it cannot be imported; "
+            "pycolmap: needed to estimate cameras, to undistort and to align, but it cannot be imported; "
             f"run `pip install 'pycolmap>=4.0'` ({error})"
         ) from error
     # Its log library prints a stack for a process that is asked to end; what was there before does not.

@@ -7,37 +7,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
-from kornia.io import ImageLoadType, load_image
 from torch import Tensor
 
 from .._check import check_shapes
 from ..cameras.camera import NEAR, Camera
 from ..cameras.undistort import undistort
-from .errors import SceneError
-from .names import file_stem
+from .files import SceneError, file_stem, read_image
 
 NEAR_SHARE = 0.1  # of the extent: 3DGS's 0.2 is that of cameras 2 m about; in smaller frames the near plane follows
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")  # what kornia decodes
-
-
-def read_image(path: str | Path) -> Tensor:  # [H, W, 3] float32 in [0, 1]
-    """Read a PNG, JPEG, TIFF or WebP file; transparency is laid on white, EXIF orientation is ignored as COLMAP does.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        SceneError: if it cannot be decoded.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected an image there")
-    try:
-        image = load_image(str(path), ImageLoadType.RGB32)
-    except (ValueError, RuntimeError, OSError) as error:
-        raise SceneError(
-            f"{path}: expected a PNG, JPEG, TIFF or WebP image, but it cannot be decoded ({error}); "
-            "replace the file or take it out of the scene"
-        ) from error
-    return image.permute(1, 2, 0).contiguous()
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,9 +15,7 @@ from .._check import check_choice, check_range
 from .._files import atomic_folder
 from ._pycolmap import quiet_pycolmap, wrapped
 from .colmap import SUPPORTED_MODELS
-from .errors import SceneError
-from .files import list_images
-from .names import some
+from .files import SceneError, list_images, some
 
 OVERLAP = 10
 """Following images that each image of a video is compared with, and how many powers of two beyond (COLMAP's default)."""

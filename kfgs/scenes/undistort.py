@@ -6,8 +6,8 @@ from pathlib import Path
 
 from .._files import atomic_folder
 from ._pycolmap import quiet_pycolmap, wrapped
-from .colmap_check import check_model
-from .errors import SceneError
+from .colmap_model import read_model
+from .files import SceneError
 
 
 def undistort_scene(images: str | Path, model: str | Path, out: str | Path) -> Path:
@@ -35,7 +35,7 @@ def undistort_scene(images: str | Path, model: str | Path, out: str | Path) -> P
         raise SceneError(
             f"{out}: expected a new or empty folder for the undistorted scene, got one in use; choose another"
         )
-    check_model(model)
+    read_model(model)  # pycolmap must see no damaged file
     advice = "check the images, or run `colmap image_undistorter` yourself"
     with (
         atomic_folder(out) as folder,
