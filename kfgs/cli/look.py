@@ -68,7 +68,7 @@ def view(
         port: of the page; 0: a free one.
     """
     from ..viz.explorer import Exploration, ExploreOptions, Explorer
-    from ..viz.explorer.explore import check_place, find_place
+    from ..viz.explorer.entry import check_place, find_place
     from ..viz.headless import require
 
     check_folder("out", out)

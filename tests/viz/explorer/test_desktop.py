@@ -11,9 +11,9 @@ from cases_explorer import splat_file
 from kfgs.viz import available, headless
 from kfgs.viz.explorer import ExploreOptions, Explorer
 from kfgs.viz.explorer.desktop import Desktop, open_window
-from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.meaning import SplatMeaning
 from kfgs.viz.explorer.panel import WIDTH
+from kfgs.viz.explorer.state import Exploration
 
 pytestmark = pytest.mark.skipif(not available(), reason=headless.probe().reason)
 

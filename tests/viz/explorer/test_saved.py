@@ -9,8 +9,8 @@ from cases_explorer import classes as some_classes
 from kfgs.formats import read_splats
 from kfgs.labels import answers
 from kfgs.viz.explorer import saved
-from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.meaning import FieldMeaning
+from kfgs.viz.explorer.state import Exploration
 
 
 def test_a_selection_is_saved_and_read_again(tmp_path):

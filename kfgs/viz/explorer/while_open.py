@@ -1,21 +1,29 @@
-"""What makes a method of the explorer a verb: it works only while the explorer is open, for one thread at a time."""
+"""The decorator of the explorer's public methods: one thread at a time, and only while the explorer is open."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
-from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
+from threading import RLock
+from typing import Concatenate, ParamSpec, Protocol, TypeVar
 
-if TYPE_CHECKING:
-    from .explorer import Explorer
 
+class Closable(Protocol):
+    """An object with a lock that can be closed."""
+
+    lock: RLock  # type: ignore[valid-type]
+
+    @property
+    def closed(self) -> bool:
+        """Whether it is closed."""
+
+
+Owner = TypeVar("Owner", bound=Closable)
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
 
 
-def verb(
-    method: Callable[Concatenate[Explorer, Given], Result],
-) -> Callable[Concatenate[Explorer, Given], Result]:
+def while_open(method: Callable[Concatenate[Owner, Given], Result]) -> Callable[Concatenate[Owner, Given], Result]:
     """Let a method wait for those of other threads, and refuse a closed explorer before anything changes.
 
     Raises:
@@ -23,7 +31,7 @@ def verb(
     """
 
     @wraps(method)
-    def act(self: Explorer, /, *args: Given.args, **options: Given.kwargs) -> Result:
+    def act(self: Owner, /, *args: Given.args, **options: Given.kwargs) -> Result:
         with self.lock:
             if self.closed:
                 raise RuntimeError(

@@ -18,10 +18,9 @@ from ...labels.transfer_distance import positions
 from ..arrays import as_array
 from ..palette import palette
 from .carried import SPAN, Array, Carried
-from .facts import facts_of, lines_of
 from .meaning import Asked, Meaning
-from .picked import Describe, Picked, Side
-from .saved import save_parts
+from .picked import SPOKEN, Describe, Picked, Side
+from .saved import SelectedSide, save_sides
 from .side_colors import SideColors
 
 Show = Literal["labels", "rgb", "score", "latents"]
@@ -256,12 +255,45 @@ class Exploration:
         self._mark = None
 
     def facts(self) -> dict[str, Any]:
-        """The state in numbers and words, as JSON: question, gamma, lambda, and of each side how many are what."""
-        return facts_of(self)
+        """The state as JSON: question, gamma, lambda, and how many Gaussians of each side have which class.
+
+        Classes are [name, count] pairs in label order, because two classes may have the same name.
+        """
+        facts: dict[str, Any] = {
+            "words": None if self.asked is None else self.asked.words,
+            "gamma": self.gamma,
+            "gamma_how": self.gamma_how,
+            "by": self.meaning.by,
+        }
+        if "color" in self.sides:
+            facts |= {"lambda": self.distance, "lambda_how": self.distance_how}
+        for side in self.sides:
+            labels = self.labels(side)
+            counts = np.bincount(labels + 1, minlength=len(self.meaning.names) + 1)
+            facts[side] = {
+                "total": len(labels),
+                "selected": int(self.selected(side).sum()),
+                "classes": [[name, int(count)] for name, count in zip(self.meaning.names, counts[1:], strict=True)],
+                "none": int(counts[0]),
+            }
+        if "color" in self.sides:
+            facts["color"]["orphaned"] = facts["color"]["none"]
+        return facts
 
     def lines(self) -> list[str]:
         """The state for a person, in a few lines."""
-        return lines_of(self)
+        lines = []
+        if self.asked is not None:
+            lines.append(f"{self.asked.words!r}: score > {self.gamma:.3g} ({self.gamma_how})")
+        for side in self.sides:
+            total, chosen = len(self.cloud(side)), ""
+            if self.asked is not None:
+                chosen = f"{int(self.selected(side).sum()):,} of "
+            lines.append(f"{SPOKEN[side]}: {chosen}{total:,} Gaussians")
+        if "color" in self.sides:
+            orphaned = int((self.labels("color") < 0).sum())
+            lines.append(f"lambda {self.distance:.3g} ({self.distance_how}), {orphaned:,} out of reach")
+        return lines
 
     def save_selection(self, folder: str | Path) -> list[Path]:
         """Write what is selected: numbers as selection.json, the Gaussians of each side as selection_<side>.ply.
@@ -273,7 +305,24 @@ class Exploration:
         Raises:
             ValueError: if nothing is selected on any side.
         """
-        return save_parts(self, Path(folder))
+        sides = {
+            side: SelectedSide(
+                self.cloud(side),
+                self.selection(side),
+                torch.from_numpy(self.labels(side)),
+                torch.from_numpy(self.scores(side)),
+            )
+            for side in self.sides
+            if self.selected(side).any()
+        }
+        if not sides:
+            words = "no question is asked"
+            if self.asked is not None:
+                words = f"score > {self.gamma:.4g} for {self.asked.words!r}"
+            raise ValueError(
+                f"selection: expected at least one Gaussian, got none ({words}); ask first, or lower gamma"
+            )
+        return save_sides(sides, self.facts(), self.meaning.names, self.cameras, Path(folder))
 
     def selection(self, side: Side) -> Selection:
         """What is selected on a side, with scores (0 where nothing is known), gamma and how.

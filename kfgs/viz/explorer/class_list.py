@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from .exploration import Exploration
+    from .state import Exploration
 
 NO_CLASS = "no class"
 
 
-def listed(state: Exploration) -> list[tuple[int, str]]:
+def class_list(state: Exploration) -> list[tuple[int, str]]:
     """(label, name) of the classes in this scene, in label order, and last -1 for what has none.
 
     With a colour cloud -1 is always there: whether one of its Gaussians has a class depends on lambda.

@@ -14,11 +14,11 @@ from ...gaussians import Gaussians
 from ...labels import LabelSet
 from ..headless import has_display
 from .desktop import open_window
-from .exploration import Exploration
 from .explorer import Explorer
 from .meaning import FieldMeaning, Meaning, SplatMeaning
 from .notebook import close_earlier, in_notebook, show_in_notebook
 from .options import ExploreOptions
+from .state import Exploration
 from .web import require_web, serve
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ RADII = ((9.0, 5.0, (1.0, 1.0, 1.0)), (9.0, 2.5, (0.86, 0.0, 0.45)))
 SIDES = 48
 
 
-class Mark:
+class Ring:
     """A ring in one renderer; it vanishes while its place is behind the camera, where VTK would mirror it.
 
     Args:

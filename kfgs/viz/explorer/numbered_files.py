@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 @contextmanager
-def numbered(folder: Path, stem: str, suffix: str = "") -> Iterator[Path]:
+def numbered_path(folder: Path, stem: str, suffix: str = "") -> Iterator[Path]:
     """Make the first free `stem_001` of a folder, to be written over: a file, or without a suffix a folder.
 
     What was made goes again where writing fails.
