@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 
@@ -85,6 +85,14 @@ def check_whole(name: str, value: float, low: int, high: float = float("inf")) -
     if not isinstance(value, numbers.Integral) or isinstance(value, bool):
         raise ValueError(f"{name}: expected a whole number, got {value!r}; pass an int")
     check_range(name, int(value), low, high)
+
+
+def check_size(size: tuple[int, int]) -> None:
+    """Raise a ValueError unless `size` is (height, width) in whole pixels."""
+    if not isinstance(size, Sequence) or len(size) != 2:
+        raise ValueError(f"size: expected (height, width), got {size!r}; pass two whole numbers of pixels")
+    for axis, pixels in zip(("height", "width"), size, strict=True):
+        check_whole(f"size ({axis})", pixels, 1)
 
 
 def one_line(text: object, length: int = 60) -> str:

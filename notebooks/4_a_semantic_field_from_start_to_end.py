@@ -58,7 +58,7 @@ from kfgs import (
     uplift,
     viz,
 )
-from kfgs.cameras import resize_labels
+from kfgs.cameras import Orbit, estimate_up, orbit_cameras, resize_labels
 from kfgs.labels import classify
 from kfgs.pipeline import feature_colors, score_teacher, true_labels
 
@@ -188,8 +188,8 @@ print(f"{question}: {answer!r}")
 kinds = field.classify(classes).labels
 off = torch.tensor([-1, *(classes.index(name) for name in lid if classes.knows(name))])
 shown = ~torch.isin(kinds, off)
-orbit = viz.Orbit(frames=1, size=(300, 400), elevation_degrees=55, start_degrees=240, zoom=1.6)
-above = viz.orbit_cameras(field.gaussians.means[shown], orbit, up=viz.estimate_up(scene.cameras))[0]
+orbit = Orbit(frames=1, size=(300, 400), elevation_degrees=55, start_degrees=240, zoom=1.6)
+above = orbit_cameras(field.gaussians.means[shown], orbit, up=estimate_up(scene.cameras))[0]
 selected = torch.where(answer.mask, kinds, -1)
 clouds = [field.gaussians.replace(labels=label).select(shown) for label in (kinds, selected)]
 row = [viz.show_cloud(cloud)(above) for cloud in clouds]

@@ -36,6 +36,7 @@ from PIL import Image
 
 import kfgs
 from kfgs import viz
+from kfgs.cameras import Orbit, estimate_up, orbit_cameras
 from kfgs.labels import Component, InBox, OfClass, select_in_sphere
 from kfgs.pipeline import views_of_change
 
@@ -111,9 +112,9 @@ semantic = field.label(classes)
 labels = semantic.labels
 hidden = torch.tensor([-1, *(classes.index(name) for name in shell if classes.knows(name))])
 inside = semantic.select(~torch.isin(labels, hidden))
-up = viz.estimate_up(scene.cameras)
-orbit = viz.Orbit(frames=1, size=(450, 640), elevation_degrees=50, start_degrees=120, zoom=1.8)
-outside = viz.orbit_cameras(inside.means, orbit, up=up)[0]
+up = estimate_up(scene.cameras)
+orbit = Orbit(frames=1, size=(450, 640), elevation_degrees=50, start_degrees=120, zoom=1.8)
+outside = orbit_cameras(inside.means, orbit, up=up)[0]
 boxes = [one.box for one in things]
 plotter = viz.make_plotter(*outside.size, off_screen=True)
 viz.add_cloud(plotter, inside, color_by="label", style="gaussians")
@@ -187,7 +188,7 @@ near = select_in_sphere(colors.gaussians.means, things[0].centroid, radius).mask
 sources = semantic.select(select_in_sphere(semantic.means, things[0].centroid, radius).mask)
 shift = 2.2 * radius * up.to(semantic.means)
 whole = torch.cat([sources.means, colors.gaussians.means[near] + shift])
-side = viz.orbit_cameras(whole, replace(orbit, size=(480, 640), elevation_degrees=15, zoom=1.05), up=up)[0]
+side = orbit_cameras(whole, replace(orbit, size=(480, 640), elevation_degrees=15, zoom=1.05), up=up)[0]
 plotter = viz.make_plotter(*side.size, off_screen=True)
 viz.add_cloud(plotter, sources, options=viz.CloudOptions(point_size=5))
 viz.add_matches(

@@ -48,6 +48,7 @@ from kfgs import (
     transfer_labels,
     viz,
 )
+from kfgs.cameras import Orbit, estimate_up, orbit_cameras
 from kfgs.labels import select_where
 from kfgs.metrics import psnr
 from kfgs.pipeline import feature_colors
@@ -158,11 +159,11 @@ Image.fromarray(viz.picture_grid([[drawn, ours, 10 * error]], titles))
 # Pyramids with the true opening, each picture on its image plane, a roof on its upper edge: twelve of them, evenly chosen.
 
 # %%
-up = viz.estimate_up(cameras).float()
+up = estimate_up(cameras).float()
 hidden = torch.tensor([-1, *(classes.index(name) for name in shell if classes.knows(name))])
 inside = semantic.select(~torch.isin(semantic.labels, hidden))
-around = viz.Orbit(frames=8, size=(420, 640), elevation_degrees=40, zoom=1.3)
-outside = viz.orbit_cameras(inside.means, around, up=up)[1]
+around = Orbit(frames=8, size=(420, 640), elevation_degrees=40, zoom=1.3)
+outside = orbit_cameras(inside.means, around, up=up)[1]
 photographs = [scene.image(i) for i in scene.views("train")]
 size = 0.2 * scene.extent
 plotter = viz.make_plotter(*outside.size, off_screen=True)
@@ -284,7 +285,7 @@ Image.fromarray(view.screenshot())
 
 # %%
 view.close()
-orbit = viz.Orbit(frames=8, size=(165, 220), elevation_degrees=40, zoom=1.5)
+orbit = Orbit(frames=8, size=(165, 220), elevation_degrees=40, zoom=1.5)
 film = viz.save_turntable(out / "turntable.gif", inside, orbit=orbit, up=up, fps=5)
 print(f"{film.stat().st_size / 1000:.0f} kB")
 display.Image(film)

@@ -64,6 +64,7 @@ from kfgs import (
     run_sfm,
     viz,
 )
+from kfgs.cameras import Orbit, estimate_up, orbit_cameras
 from kfgs.scenes import list_images, read_image
 from kfgs.teachers import CallableTeacher, TeacherCost
 
@@ -95,9 +96,9 @@ print(scene)
 # `estimate_up` reads the latter from how the camera was held.
 
 # %%
-up = viz.estimate_up(scene.cameras)
-around = viz.Orbit(frames=8, size=(420, 640), elevation_degrees=40, zoom=1.25)
-outside = viz.orbit_cameras(scene.points, around, up=up)[1]
+up = estimate_up(scene.cameras)
+around = Orbit(frames=8, size=(420, 640), elevation_degrees=40, zoom=1.25)
+outside = orbit_cameras(scene.points, around, up=up)[1]
 size = 0.25 * scene.extent
 plotter = viz.make_plotter(*outside.size, off_screen=True)
 plotter.add_points(scene.points.numpy(), scalars=scene.colors.numpy(), rgb=True, point_size=5)

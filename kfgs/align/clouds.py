@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from ..scenes.points import robust_bounds
+from ..cameras.bounds import robust_bounds
 
 Array = np.ndarray[Any, Any]
 

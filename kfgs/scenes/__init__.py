@@ -1,10 +1,10 @@
 """Scenes: posed images and points, read from what COLMAP, nerfstudio, instant-ngp and Blender write, or estimated."""
 
+from ..cameras.bounds import Bounds, robust_bounds
 from .colmap import load_colmap
 from .colmap_model import ColmapModel, read_model
 from .files import SceneError, file_stem, list_images, natural_key, read_image
 from .load import load_scene
-from .points import Bounds, robust_bounds
 from .scene import Scene
 from .sfm import SfmConfig, SfmReport, run_sfm
 from .splits import make_split, read_split, split_every

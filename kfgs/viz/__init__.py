@@ -5,7 +5,7 @@ from .boxes import add_boxes, add_names, add_selections
 from .clouds import CloudOptions, add_cloud, recolor_cloud
 from .explorer import ExploreOptions, Explorer, explore
 from .field_colors import feature_colors
-from .flythrough import flythrough_cameras, save_flythrough
+from .films import save_flythrough, save_turntable
 from .frusta import add_camera_images, add_cameras
 from .headless import available, make_plotter
 from .legends import add_legend, add_scalar_bar
@@ -21,7 +21,6 @@ from .reports import CodebookRows, codebook_rows, plot_codebook_growth, plot_cod
 from .score_plot import plot_scores
 from .shows import show_cloud
 from .through import look_through
-from .turntable import Orbit, estimate_up, orbit_cameras, save_turntable
 
 __all__ = [
     "PALETTE",
@@ -31,7 +30,6 @@ __all__ = [
     "Explorer",
     "FeatureColors",
     "Matches",
-    "Orbit",
     "Page",
     "add_boxes",
     "add_camera_images",
@@ -45,17 +43,14 @@ __all__ = [
     "add_transfer",
     "available",
     "codebook_rows",
-    "estimate_up",
     "explore",
     "feature_colors",
-    "flythrough_cameras",
     "legend_column",
     "legend_strip",
     "linked_clouds",
     "look_through",
     "make_plotter",
     "match_states",
-    "orbit_cameras",
     "overlay_labels",
     "palette",
     "picture_grid",

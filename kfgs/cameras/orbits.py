@@ -1,32 +1,24 @@
-"""A turntable: the scene seen from a circle of cameras around its middle, as if it turned before the eye."""
+"""Cameras that go once around a scene, and the direction that is up in it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import cos, hypot, pi, radians, sin, tan
-from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from .._check import check_range, check_shapes, check_whole
-from ..cameras import Camera
-from ..gaussians import Gaussians
-from ..scenes.points import robust_bounds
-from .animation import Progress, check_size, save_animation
-from .shows import Show
+from .._check import check_range, check_shapes, check_size, check_whole
+from .bounds import robust_bounds
+from .camera import UP, Camera, unit_vector
 
-Array = np.ndarray[Any, Any]
 LEVEL = 0.05  # of all: less spread of the pictures' x axes than this, in their second direction, leaves "up" open
-UP = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Orbit:
-    """How the cameras of a turntable go round."""
+    """How cameras go around a scene."""
 
     frames: int = 72
     """Pictures of one round: every 5 degrees."""
@@ -84,7 +76,7 @@ def orbit_cameras(
     points: Tensor,  # [N, 3]
     orbit: Orbit | None = None,
     *,
-    up: Tensor | Sequence[float] | None = None,  # [3]
+    up: Tensor | Sequence[float] = UP,  # [3]
 ) -> list[Camera]:
     """Cameras on a circle of constant elevation around a cloud, all looking at its middle.
 
@@ -94,7 +86,7 @@ def orbit_cameras(
     Args:
         points: the cloud, usually `gaussians.means`.
         orbit: how they go round.
-        up: the world's up (`estimate_up`); None: +z. COLMAP's worlds often have none of their axes upward.
+        up: the world's up. COLMAP's worlds often have no axis that points up: pass `estimate_up(scene.cameras)`.
 
     Raises:
         ValueError: if there are no points, one is not finite, or `up` has no direction.
@@ -111,82 +103,22 @@ def orbit_cameras(
     center, radius = (bounds.low + bounds.high) / 2, float((bounds.high - bounds.low).norm()) / 2
     radius = radius or 1.0  # all in one place
     height, width = orbit.size
-    focal = height / 2 / tan(radians(orbit.fov_degrees) / 2)
-    half = min(height, width) / 2
-    distance = radius * hypot(focal, half) / half / orbit.zoom  # the sphere touches the nearer edges
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
+    half = min(height, width) / height * tan(radians(orbit.fov_degrees) / 2)  # tangent of half the narrower angle
+    distance = radius * hypot(1, half) / half / orbit.zoom  # the sphere touches the nearer edges
     near = max(distance - radius * (1 - orbit.cut), 1e-3 * distance)
-    east, north, zenith = _frame(up)
-    e = radians(orbit.elevation_degrees)
+    zenith = unit_vector("up", up)
+    axis = torch.eye(3, dtype=torch.float64)[int(zenith[0].abs() > 0.9)]  # azimuth 0 is x, or y where x is nearly up
+    north = torch.linalg.cross(zenith, axis)
+    north /= north.norm()
+    east, e = torch.linalg.cross(north, zenith), radians(orbit.elevation_degrees)
     cameras = []
     for number in range(orbit.frames):
         a = radians(orbit.start_degrees) + 2 * pi * number / orbit.frames
         outward = cos(e) * (cos(a) * east + sin(a) * north) + sin(e) * zenith
-        right = -sin(a) * east + cos(a) * north
-        R = torch.stack([right, torch.linalg.cross(-outward, right), -outward])  # x right, y down, z forward
-        viewmat = torch.eye(4, dtype=torch.float64)
-        viewmat[:3, :3], viewmat[:3, 3] = R, -R @ (center + distance * outward)
-        cameras.append(Camera(viewmat, K, width, height, name=f"orbit_{number:04d}", near=near))
+        cameras.append(
+            Camera.look_at(
+                center + distance * outward, center, up=zenith, fov_degrees=orbit.fov_degrees,
+                width=width, height=height, name=f"orbit_{number:04d}", near=near,
+            )
+        )  # fmt: skip
     return cameras
-
-
-def _frame(up: Tensor | Sequence[float] | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Right-handed horizontal axes and the vertical one; azimuth 0 is x where x is horizontal."""
-    vector = torch.as_tensor(UP if up is None else up).detach().double().cpu()
-    check_shapes(("up", vector, "3"))
-    length = float(vector.norm())
-    if not 0 < length < float("inf"):
-        raise ValueError(f"up: expected a vector with a direction, got {vector.tolist()}; for instance (0, 0, 1)")
-    zenith = vector / length
-    axis = torch.zeros(3, dtype=torch.float64)
-    axis[int(zenith[0].abs() > 0.9)] = 1.0  # x, or y where x is nearly up
-    east = axis - (axis @ zenith) * zenith
-    east = east / east.norm()
-    return east, torch.linalg.cross(zenith, east), zenith
-
-
-def save_turntable(
-    path: str | Path,
-    shows: Gaussians | Mapping[str, Gaussians | Show],
-    *,
-    orbit: Orbit | None = None,
-    up: Tensor | Sequence[float] | None = None,  # [3]
-    cameras: Sequence[Camera] | None = None,
-    fps: float = 15.0,
-    names: Sequence[str] | None = None,
-    progress: Progress | None = None,
-) -> Path:
-    """Write one round about a scene as a GIF or MP4 that can be played for ever.
-
-    A GIF takes about 60 kB a frame of 360x480 of textured colours, and 40 kB of labels: `orbit` bounds both.
-
-    Args:
-        path: a name that ends in .gif or .mp4.
-        shows: Gaussians, or several things by title, side by side (`save_animation`). The cameras go round the first
-            Gaussians among them.
-        orbit: how they go round.
-        up: the world's up.
-        cameras: the scene's own cameras, which tell where up is when `up` is None.
-        fps: frames per second.
-        names: class names for a legend below.
-        progress: called after each frame with (done, all).
-
-    Returns:
-        `path`.
-
-    Raises:
-        ValueError: if nothing can be shown, or there are no Gaussians to go round (pass `orbit_cameras` to
-            `save_animation` then).
-        ImportError: for .mp4, where imageio-ffmpeg is not installed.
-    """
-    things = shows.values() if isinstance(shows, Mapping) else [shows]
-    cloud = next((thing for thing in things if isinstance(thing, Gaussians)), None)
-    if cloud is None:
-        raise ValueError(
-            "shows: expected Gaussians to go round, got only functions; pass orbit_cameras(points) to save_animation"
-        )
-    if up is None and cameras:
-        up = estimate_up(cameras)
-    return save_animation(
-        path, shows, orbit_cameras(cloud.means, orbit, up=up), fps=fps, names=names, progress=progress
-    )

@@ -3,12 +3,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
-from kfgs.cameras import Camera, project_points
-from kfgs.gaussians import Gaussians
-from kfgs.viz.turntable import Orbit, estimate_up, orbit_cameras, save_turntable
+from kfgs.cameras import Camera, Orbit, estimate_up, orbit_cameras, project_points
 
+ORIGIN = torch.zeros(3, dtype=torch.float64)
 TILTED = torch.tensor([1.0, -2.0, 2.0], dtype=torch.float64) / 3
 
 
@@ -18,20 +16,10 @@ def cloud(n=4000, seed=0):
     return points * torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64) + torch.tensor([1.0, 2.0, 3.0])
 
 
-def looking(forward, up):
-    """A level camera at the origin."""
-    forward = forward / forward.norm()
-    right = torch.linalg.cross(forward, up)
-    right = right / right.norm()
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    return Camera(viewmat, torch.eye(3, dtype=torch.float64), 2, 2)
-
-
-@pytest.mark.parametrize("up", [None, TILTED])
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), TILTED])
 def test_cameras_go_round_the_middle_at_one_height_with_the_world_upright(up):
     middle = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    zenith = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) if up is None else up
+    zenith = torch.as_tensor(up, dtype=torch.float64)
     cameras = orbit_cameras(cloud(), Orbit(frames=8, elevation_degrees=30), up=up)
     centers = torch.stack([camera.center for camera in cameras])
     target = (
@@ -82,7 +70,8 @@ def test_up_is_found_from_level_cameras_however_far_down_they_look():
     east = torch.linalg.cross(TILTED, torch.tensor([1.0, 0, 0], dtype=torch.float64))
     north = torch.linalg.cross(TILTED, east)
     views = [
-        looking(math.cos(a) * east + math.sin(a) * north - 0.9 * a / 6 * TILTED, TILTED) for a in np.arange(0, 3, 0.2)
+        Camera.look_at(ORIGIN, math.cos(a) * east + math.sin(a) * north - 0.9 * a / 6 * TILTED, up=TILTED)
+        for a in np.arange(0, 3, 0.2)
     ]
     np.testing.assert_allclose(estimate_up(views), TILTED, atol=1e-9)
     mean = -torch.stack([view.viewmat[1, :3] for view in views]).mean(0)
@@ -90,23 +79,23 @@ def test_up_is_found_from_level_cameras_however_far_down_they_look():
 
 
 def test_up_of_cameras_that_look_one_way_is_their_own():
-    view = looking(torch.tensor([1.0, 0.0, -1.0], dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0]).double())
+    view = Camera.look_at(ORIGIN, (1, 0, -1))
     np.testing.assert_allclose(estimate_up([view] * 3), np.array([1, 0, 1]) / math.sqrt(2), atol=1e-9)
 
 
 def test_up_of_nothing_or_of_pictures_upside_down_is_refused():
     with pytest.raises(ValueError, match="cameras: expected at least one camera"):
         estimate_up([])
-    ahead, up = torch.tensor([1.0, 0, 0], dtype=torch.float64), torch.tensor([0, 0, 1.0], dtype=torch.float64)
+    views = [Camera.look_at(ORIGIN, (1, 0, 0), up=(0, 0, z)) for z in (1, -1)]
     with pytest.raises(ValueError, match="held upright, got 2 whose upper edges cancel"):
-        estimate_up([looking(ahead, up), looking(ahead, -up)])
+        estimate_up(views)
 
 
 @pytest.mark.parametrize(
     ("points", "up", "message"),
     [
-        (torch.zeros(0, 3), None, "points: expected at least one point"),
-        (torch.full((4, 3), math.nan), None, "points: expected finite positions, got 4 rows"),
+        (torch.zeros(0, 3), TILTED, "points: expected at least one point"),
+        (torch.full((4, 3), math.nan), TILTED, "points: expected finite positions, got 4 rows"),
         (torch.zeros(4, 3), (0.0, 0.0, 0.0), "up: expected a vector with a direction"),
         (torch.zeros(4, 3), (0.0, 1.0), r"up: expected \[3\]"),
     ],
@@ -131,39 +120,3 @@ def test_what_cannot_be_gone_round_is_refused(points, up, message):
 def test_an_orbit_out_of_range_is_refused(options, message):
     with pytest.raises(ValueError, match=message):
         Orbit(**options)
-
-
-def balls():
-    n = 40
-    means = cloud(n).float()
-    return Gaussians(
-        means, torch.eye(4)[:1].expand(n, 4), torch.full((n, 3), 0.2), torch.full((n,), 0.9), labels=torch.arange(n) % 3
-    )
-
-
-def test_a_turntable_is_written_and_turns(tmp_path):
-    level = [looking(torch.tensor(f).double(), torch.tensor([0, 1.0, 0]).double()) for f in ([1.0, 0, 0], [0, 0, 1.0])]
-    seen = []
-    path = save_turntable(
-        tmp_path / "turn.gif",
-        {"labels": balls(), "mine": lambda camera: seen.append(camera) or np.zeros((*camera.size, 3))},
-        orbit=Orbit(frames=4, size=(40, 50), elevation_degrees=10),
-        cameras=level,
-        names=["a", "b", "c"],
-    )
-    with Image.open(path) as film:
-        assert film.n_frames == 4
-        frames = []
-        for number in range(4):
-            film.seek(number)
-            frames.append(np.asarray(film.convert("RGB")).astype(int))
-    assert all((frame[20:50, :50].min() < 200) and np.ptp(frame) > 100 for frame in frames)  # not blank
-    assert np.abs(frames[0] - frames[1]).mean() > 1
-    heights = [float(camera.center[1]) for camera in seen]
-    assert np.ptp(heights) < 1e-6  # round the y axis, which the cameras say is up
-    assert heights[0] > 3
-
-
-def test_functions_alone_have_nothing_to_go_round(tmp_path):
-    with pytest.raises(ValueError, match="shows: expected Gaussians to go round"):
-        save_turntable(tmp_path / "a.gif", {"mine": lambda camera: np.zeros((*camera.size, 3))})

@@ -1,9 +1,8 @@
-"""A fly-through: the walk of the cameras that took a scene's pictures, smooth and at an even pace."""
+"""Cameras along a smooth path through given cameras, at an even pace."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,20 +11,16 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
-from .._check import check_whole
-from ..cameras import Camera
-from ..gaussians import Gaussians
-from .animation import Progress, check_size, save_animation
-from .shows import Show
+from .._check import check_size, check_whole
+from .camera import Camera
 
 Array = np.ndarray[Any, Any]
 SAME = 1e-9  # of the walk: two views in a row that are closer than this, in place and direction, are one
-KEYS = 40  # of a long walk: enough to follow it, too few to tremble with the hand
 STANDING = 1e-6  # of the coordinates: cameras on one tripod differ by the rounding of float32
 AROUND = 3  # keys of the other end before the start and after the end of a closed walk: the splines feel no further
 
 
-def flythrough_cameras(
+def path_cameras(
     cameras: Sequence[Camera],
     frames: int = 150,
     *,
@@ -48,7 +43,7 @@ def flythrough_cameras(
         closed: come back to the first camera, for a film that repeats.
 
     Returns:
-        Pinhole cameras, `fly_0000` and so on. Focal lengths and principal points run linearly between the keys; lens
+        Pinhole cameras, `path_0000` and so on. Focal lengths and principal points run linearly between the keys; lens
         distortion is left out, and the smallest `near` holds for all.
 
     Raises:
@@ -75,7 +70,7 @@ def flythrough_cameras(
         viewmat, K = np.eye(4), np.eye(3)
         viewmat[:3, :3], viewmat[:3, 3] = R[number], t[number]
         K[0, 0], K[1, 1], K[0, 2], K[1, 2] = lenses[number]
-        name = f"fly_{number:04d}"
+        name = f"path_{number:04d}"
         path.append(Camera(torch.from_numpy(viewmat), torch.from_numpy(K), width, height, name=name, near=near))
     return path
 
@@ -118,40 +113,3 @@ def _steps(places: Array, turns: Rotation) -> Array:  # [k - 1]
 def _numpy(values: Tensor) -> Array:
     array: Array = values.detach().double().cpu().numpy()
     return array
-
-
-def save_flythrough(
-    path: str | Path,
-    shows: Gaussians | Show | Mapping[str, Gaussians | Show],
-    cameras: Sequence[Camera],
-    *,
-    frames: int = 150,
-    size: tuple[int, int] | None = None,
-    fps: float = 15.0,
-    names: Sequence[str] | None = None,
-    progress: Progress | None = None,
-) -> Path:
-    """Write a flight along posed cameras as a GIF or MP4: of labels, of edited colours, or of both side by side.
-
-    For other keys or a closed walk pass `flythrough_cameras(...)` to `save_animation`.
-
-    Args:
-        path: a name that ends in .gif or .mp4.
-        shows: Gaussians, a function camera -> picture, or several by title, side by side (`save_animation`).
-        cameras: the scene's cameras in the order of the walk; at most about 40 of them become keys, evenly chosen.
-        frames: in all.
-        size: (height, width) in pixels of each picture; None: the first camera's.
-        fps: frames per second.
-        names: class names for a legend below.
-        progress: called after each frame with (done, all).
-
-    Returns:
-        `path`.
-
-    Raises:
-        ValueError: if nothing can be shown, or there are fewer than two different views.
-        ImportError: for .mp4, where imageio-ffmpeg is not installed.
-    """
-    every = max(1, round(len(cameras) / KEYS))
-    walk = flythrough_cameras(cameras, frames, every=every, size=size)
-    return save_animation(path, shows, walk, fps=fps, names=names, progress=progress)

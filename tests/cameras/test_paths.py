@@ -3,12 +3,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
-from kfgs.cameras import Camera, Distortion
-from kfgs.gaussians import Gaussians
-from kfgs.viz import palette
-from kfgs.viz.flythrough import flythrough_cameras, save_flythrough
+from kfgs.cameras import Camera, Distortion, path_cameras
 
 
 def camera(center, yaw=0.0, *, focal=50.0, size=(40, 60), near=0.2, distortion=None):
@@ -30,16 +26,16 @@ def centers(path):
 
 
 def test_between_two_views_the_path_is_straight_and_turns_evenly():
-    path = flythrough_cameras([camera((0, 1, 2)), camera((4, 1, 0), math.pi / 2)], 5)
+    path = path_cameras([camera((0, 1, 2)), camera((4, 1, 0), math.pi / 2)], 5)
     t = np.linspace(0, 1, 5)
     np.testing.assert_allclose(centers(path), np.outer(1 - t, (0, 1, 2)) + np.outer(t, (4, 1, 0)), atol=1e-9)
     np.testing.assert_allclose([yaw_of(view) for view in path], t * math.pi / 2, atol=1e-9)
-    assert [view.name for view in path] == [f"fly_{i:04d}" for i in range(5)]
+    assert [view.name for view in path] == [f"path_{i:04d}" for i in range(5)]
 
 
 def test_every_key_is_passed_and_a_steady_walk_stays_steady():
     keys = [camera((2.0 * i, 0.5, 0), 0.3 * i) for i in range(5)]
-    path = flythrough_cameras(keys, 9)
+    path = path_cameras(keys, 9)
     np.testing.assert_allclose(centers(path), [(i, 0.5, 0) for i in range(9)], atol=1e-9)
     for key, view in zip(keys, path[::2], strict=True):
         np.testing.assert_allclose(view.viewmat, key.viewmat, atol=1e-9)
@@ -47,13 +43,13 @@ def test_every_key_is_passed_and_a_steady_walk_stays_steady():
 
 def test_places_with_different_gaps_are_passed_at_one_pace():
     places = [0.0, 1.0, 4.0, 5.0, 9.0]
-    path = flythrough_cameras([camera((x, 0, 0)) for x in places], 19)
+    path = path_cameras([camera((x, 0, 0)) for x in places], 19)
     np.testing.assert_allclose(np.diff(centers(path)[:, 0]), 0.5, atol=1e-9)
 
 
 def test_a_closed_walk_round_a_circle_ends_a_step_before_its_start():
     keys = [camera((3 * math.sin(a), 0, -3 * math.cos(a)), -a) for a in np.arange(8) * math.pi / 4]
-    path = flythrough_cameras(keys, 24, closed=True)
+    path = path_cameras(keys, 24, closed=True)
     places = centers(path)
     np.testing.assert_allclose(places[0], (0, 0, -3), atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(places, axis=1), 3, rtol=3e-3)  # a cubic through every 45 degrees
@@ -66,31 +62,31 @@ def test_a_closed_walk_round_a_circle_ends_a_step_before_its_start():
 def test_a_closed_walk_may_name_its_start_twice_or_have_two_places_only():
     keys = [camera((math.sin(a), 0, math.cos(a)), a) for a in np.arange(4) * math.pi / 2]
     np.testing.assert_allclose(
-        centers(flythrough_cameras([*keys, keys[0]], 12, closed=True)),
-        centers(flythrough_cameras(keys, 12, closed=True)),
+        centers(path_cameras([*keys, keys[0]], 12, closed=True)),
+        centers(path_cameras(keys, 12, closed=True)),
     )
-    back = centers(flythrough_cameras([camera((0, 0, 0)), camera((1, 0, 0))], 4, closed=True))
+    back = centers(path_cameras([camera((0, 0, 0)), camera((1, 0, 0))], 4, closed=True))
     np.testing.assert_allclose(back[:, 0], [0, 0.5, 1, 0.5], atol=0.02)
 
 
 def test_views_that_stand_still_or_only_turn():
-    twice = flythrough_cameras([camera((0, 0, 0)), camera((0, 0, 0)), camera((1, 0, 0))], 3)
+    twice = path_cameras([camera((0, 0, 0)), camera((0, 0, 0)), camera((1, 0, 0))], 3)
     np.testing.assert_allclose(centers(twice)[:, 0], [0, 0.5, 1], atol=1e-9)
-    turning = flythrough_cameras([camera((1, 2, 3), yaw) for yaw in (0, 0.4, 1.2)], 4)
+    turning = path_cameras([camera((1, 2, 3), yaw) for yaw in (0, 0.4, 1.2)], 4)
     np.testing.assert_allclose(centers(turning), [(1, 2, 3)] * 4, atol=1e-9)
     np.testing.assert_allclose([yaw_of(view) for view in turning], [0, 0.4, 0.8, 1.2], atol=1e-6)
 
 
 def test_every_tenth_view_is_a_key_and_the_last_is_too():
     shaky = [camera((i, 0.3 * (-1) ** i, 0)) for i in range(18)]
-    path = centers(flythrough_cameras(shaky, 50, every=2))
+    path = centers(path_cameras(shaky, 50, every=2))
     assert path[:40, 1].min() > 0.25  # the even ones are all above ...
     np.testing.assert_allclose(path[-1], (17, -0.3, 0), atol=1e-9)  # ... and the last is below
 
 
 def test_lenses_run_linearly_and_sizes_are_the_askers():
     bent = camera((2, 0, 0), focal=70, near=0.05, distortion=Distortion("brown_conrady", (0.1, 0, 0, 0)))
-    path = flythrough_cameras([camera((0, 0, 0), focal=50), bent], 3, size=(20, 120))
+    path = path_cameras([camera((0, 0, 0), focal=50), bent], 3, size=(20, 120))
     for view, focal in zip(path, (50, 60, 70), strict=True):
         assert view.size == (20, 120)
         expected = [[2 * focal, 0, 62], [0, (focal + 1) / 2, 9.5], [0, 0, 1]]
@@ -111,26 +107,4 @@ def test_lenses_run_linearly_and_sizes_are_the_askers():
 )
 def test_what_is_no_walk_is_refused(keys, options, message):
     with pytest.raises(ValueError, match=message):
-        flythrough_cameras(keys, **options)
-
-
-def test_a_flight_past_labels_and_colours_is_written(tmp_path):
-    row = torch.tensor([[0.0, 0, 4], [2, 0, 4], [4, 0, 4]])
-    cloud = Gaussians(
-        row, torch.eye(4)[:1].expand(3, 4), torch.full((3, 3), 0.6), torch.full((3,), 0.95), labels=torch.arange(3)
-    )
-    path = save_flythrough(
-        tmp_path / "fly.gif",
-        {"labels": cloud, "mine": lambda camera: np.full((*camera.size, 3), 77, np.uint8)},
-        [camera((0.05 * i, 0, 0)) for i in range(81)],
-        frames=3,
-        size=(40, 60),
-    )
-    with Image.open(path) as film:
-        assert film.n_frames == 3
-        for label in range(3):  # the frame's own class is in its middle
-            film.seek(label)
-            frame = np.asarray(film.convert("RGB")).astype(int)
-            middle = frame[-6 - 21, 6 + 31]
-            assert np.abs(middle - (0.95 * palette(np.array(label)) + 0.05 * 255)).max() < 12
-            assert (np.abs(frame - 77).max(axis=-1) <= 8).sum() >= 40 * 60
+        path_cameras(keys, **options)
