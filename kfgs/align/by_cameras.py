@@ -12,8 +12,8 @@ import torch
 
 from ..cameras import Camera
 from ..cameras.similarity import Similarity, fit_similarity
-from ..scenes._pycolmap import quiet_pycolmap
 from ..scenes.files import SceneError, file_stem, some
+from ..scenes.pycolmap_import import quiet_pycolmap
 from .clouds import Array
 
 MAX_ERROR = 0.03  # of the cameras' extent: two SfM runs of one scene differ by well below a hundredth

@@ -1,5 +1,3 @@
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +17,6 @@ from messages import tells
 
 from kfgs.cameras.projection import camera_to_pixel
 from kfgs.scenes import SceneError, load_colmap
-from kfgs.scenes._pycolmap import quiet_pycolmap, wrapped
 from kfgs.scenes.colmap import SUPPORTED_MODELS, convert_intrinsics
 
 INTRINSICS = {
@@ -135,41 +132,6 @@ def test_a_name_too_long_for_the_disk_is_a_missing_file(tmp_path: Path) -> None:
     write_picture(tmp_path / "images/a.png")
     scene = load_colmap(write_text_model(tmp_path / "sparse", images=images), tmp_path / "images")
     assert [camera.name for camera in scene.cameras] == ["a.png"]
-
-
-def test_pycolmap_failures_become_scene_errors(tmp_path: Path) -> None:
-    with pytest.raises(SceneError, match=r"x: expected a model \(IndexError: unordered_map::at\); do this"):  # noqa: SIM117
-        with wrapped("x: expected a model", "do this"):
-            raise IndexError("unordered_map::at")
-    with pytest.raises(SceneError, match="MemoryError: no text"), wrapped("x", "y"):
-        raise MemoryError
-    with pytest.raises(KeyboardInterrupt), wrapped("x", "y"):
-        raise KeyboardInterrupt
-
-
-def test_the_log_level_is_put_back() -> None:
-    before = pycolmap.logging.minloglevel
-    with quiet_pycolmap():
-        assert pycolmap.logging.minloglevel == 3
-    assert pycolmap.logging.minloglevel == before
-
-
-def test_pillow_can_write_png_after_pycolmap(tmp_path: Path) -> None:
-    code = """
-import sys
-import kfgs.scenes
-assert "pycolmap" not in sys.modules, "kfgs.scenes must not load pycolmap before it is needed"
-import pycolmap
-import numpy as np
-from PIL import Image
-noise = np.random.default_rng(0).integers(0, 255, (700, 500, 3), dtype=np.uint8)
-noise[:, 100:300] = 7
-for i in range(3):
-    Image.fromarray(noise).save(f"{sys.argv[1]}/{i}.png")
-"""
-    pytest.importorskip("PIL")
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr[-500:]
 
 
 def test_room_0_projects_its_points_where_they_were_seen(shared_data: Path) -> None:

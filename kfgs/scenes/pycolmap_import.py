@@ -1,8 +1,8 @@
-"""The door to pycolmap: imported late, after Pillow, quietly, and with one kind of error.
+"""Import pycolmap late, after Pillow and without its log; turn its exceptions into a SceneError.
 
-Pillow's C module must be loaded **before** pycolmap: in the other order (pycolmap 4.2.1, Pillow 13.0.0, Linux wheels)
+Pillow's C module must be loaded **before** pycolmap. In the other order (pycolmap 4.2.1, Pillow 13.0.0, Linux wheels)
 the first PNG that Pillow writes corrupts the heap and aborts the process ("corrupted size vs. prev_size" in
-ImagingZipEncode). So Pillow, where it is installed, is loaded with this file, which every import of `kfgs.scenes` reads.
+ImagingZipEncode). So this file, which every import of `kfgs.scenes` reads, loads Pillow if it is installed.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from .files import SceneError
 with contextlib.suppress(ImportError):
     import PIL.Image  # noqa: F401  # see above: the order matters
 
-# What pycolmap raises on files that it cannot make sense of (a failed CHECK is a ValueError, a missing id an IndexError).
+# What pycolmap raises on input that it cannot use (a failed CHECK is a ValueError, a missing id an IndexError).
 FAILURES = (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OSError)
 
 _FATAL = 3  # glog's levels: 0 info, 1 warning, 2 error, 3 fatal
@@ -38,7 +38,7 @@ def import_pycolmap() -> Any:
             "pycolmap: needed to estimate cameras, to undistort and to align, but it cannot be imported; "
             f"run `pip install 'pycolmap>=4.0'` ({error})"
         ) from error
-    # Its log library prints a stack for a process that is asked to end; what was there before does not.
+    # pycolmap's log library prints a stack when the process receives SIGTERM; put the earlier handler back.
     if before is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, before)
     return pycolmap
@@ -46,7 +46,7 @@ def import_pycolmap() -> Any:
 
 @contextlib.contextmanager
 def quiet_pycolmap() -> Iterator[Any]:
-    """Pycolmap with its log silenced (what fails comes as an exception); the log level is put back afterwards."""
+    """Pycolmap without its log: failures come as exceptions. The log level is restored afterwards."""
     pycolmap = import_pycolmap()
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = _FATAL
@@ -57,12 +57,12 @@ def quiet_pycolmap() -> Iterator[Any]:
 
 
 @contextlib.contextmanager
-def wrapped(what: str, advice: str) -> Iterator[None]:
+def scene_errors(what: str, advice: str) -> Iterator[None]:
     """Turn pycolmap's exceptions into a SceneError that begins with `what` and ends with `advice`."""
     try:
         yield
     except SceneError:
         raise
     except FAILURES as error:
-        said = str(error).strip().splitlines()
-        raise SceneError(f"{what} ({type(error).__name__}: {said[0] if said else 'no text'}); {advice}") from error
+        lines = str(error).strip().splitlines()
+        raise SceneError(f"{what} ({type(error).__name__}: {lines[0] if lines else 'no text'}); {advice}") from error
