@@ -14,7 +14,7 @@ from ..cameras import Camera
 from ..cameras.similarity import Similarity, fit_similarity
 from ..scenes.files import SceneError, file_stem, some
 from ..scenes.pycolmap_import import quiet_pycolmap
-from .clouds import Array
+from .clouds import Array, nearest_rotation, to_similarity
 
 MAX_ERROR = 0.03  # of the cameras' extent: two SfM runs of one scene differ by well below a hundredth
 MAX_ANGLE = 15.0  # degrees between a camera's two orientations, after alignment
@@ -167,7 +167,7 @@ def _by_centers(A: Array, B: Array, size: float) -> Similarity | None:
     if found is None or not found["tgt_from_src"].scale > 0:
         return None
     fit = found["tgt_from_src"]
-    return _similarity(fit.scale, fit.rotation.matrix(), fit.translation)
+    return to_similarity(fit.scale, fit.rotation.matrix(), fit.translation)
 
 
 def _by_orientations(A: Array, B: Array, turns: Array, size: float) -> list[Similarity]:
@@ -175,8 +175,7 @@ def _by_orientations(A: Array, B: Array, turns: Array, size: float) -> list[Simi
     cosines = (np.einsum("iab,jab->ij", turns, turns) - 1) / 2
     near = cosines > np.cos(np.radians(MAX_ANGLE))
     row = near[int(near.sum(1).argmax())]
-    U, _, Vt = np.linalg.svd(turns[row].sum(0))  # chordal mean
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    R = nearest_rotation(turns[row].sum(0))
     turned = A[row] @ R.T  # [n, 3]
     i, j = np.triu_indices(int(row.sum()), 1)
     if len(i) == 0:
@@ -191,7 +190,7 @@ def _by_orientations(A: Array, B: Array, turns: Array, size: float) -> list[Simi
             shift = B[row][first] - scale * turned[first]
             fits = int((np.linalg.norm(scale * turned + shift - B[row], axis=1) < MAX_ERROR * size).sum())
             if fits > most:
-                best, most = _similarity(scale, R, shift), fits
+                best, most = to_similarity(scale, R, shift), fits
     return [] if best is None else [best]
 
 
@@ -216,11 +215,10 @@ def _refine(start: Similarity, A: Array, B: Array, turns: Array, size: float) ->
 
 def _fit_on_a_line(A: Array, B: Array, turns: Array) -> Similarity:
     """Rotation from the orientations, scale and translation from the centres."""
-    U, _, Vt = np.linalg.svd(turns.sum(0))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    R = nearest_rotation(turns.sum(0))
     a, b = (A - A.mean(0)) @ R.T, B - B.mean(0)
     scale = float((a * b).sum() / (a**2).sum())
-    return _similarity(scale, R, B.mean(0) - scale * R @ A.mean(0))
+    return to_similarity(scale, R, B.mean(0) - scale * R @ A.mean(0))
 
 
 def _on_a_line(points: Array) -> bool:
@@ -242,10 +240,6 @@ def _angles(similarity: Similarity, turns: Array) -> Array:
     """Degrees between each camera's own turn from frame to frame and the similarity's."""
     cosines = (np.einsum("vij,ij->v", turns, similarity.rotation.numpy()) - 1) / 2
     return np.degrees(np.arccos(np.clip(cosines, -1, 1)))
-
-
-def _similarity(scale: float, rotation: Array, translation: Array) -> Similarity:
-    return Similarity(float(scale), torch.from_numpy(np.array(rotation)), torch.from_numpy(np.array(translation)))
 
 
 def _extents(centers: Array) -> list[float]:

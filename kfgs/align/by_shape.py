@@ -15,8 +15,8 @@ from .._check import check_shapes
 from ..cameras.similarity import Similarity
 from ..scenes.files import SceneError
 from .by_cameras import Alignment
-from .close_fit import Cloud, Fit, fit_closely, orthonormal
-from .clouds import Array, bulk
+from .close_fit import Cloud, Fit, fit_closely
+from .clouds import Array, bulk, nearest_rotation, to_similarity
 from .starts import Moves, improve_on_grid, principal_axes, spread_rotations, thin
 
 ROTATIONS = 576  # evenly over all rotations: about 16 degrees from any rotation to the nearest, in the middle
@@ -114,9 +114,9 @@ def _starts(a: Array, b: Array, rng: np.random.Generator) -> list[Similarity]:
     order = np.argsort(-scores)[: 50 * BASINS]
     found = []
     for i in order:
-        R, s = orthonormal(moves.rotations[i]), float(moves.scales[i]) * radii[1] / radii[0]
+        R, s = nearest_rotation(moves.rotations[i]), float(moves.scales[i]) * radii[1] / radii[0]
         t = centers[1] + radii[1] * moves.translations[i] - s * R @ centers[0]
-        found.append(Similarity(s, torch.from_numpy(R), torch.from_numpy(t)))
+        found.append(to_similarity(s, R, t))
     return _different(found, centers[0], 2 * radii[1], BASINS)
 
 

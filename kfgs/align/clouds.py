@@ -1,14 +1,16 @@
-"""Clouds of points as frames are compared by: the bulk of a cloud, its spacing, nearest points."""
+"""What the alignments share: the bulk of a cloud, its spacing, nearest points, rotations and robust weights."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..cameras.bounds import robust_bounds
+from ..cameras.similarity import Similarity
 
 Array = np.ndarray[Any, Any]
 
@@ -39,3 +41,21 @@ def nearest(tree: cKDTree, places: Array, k: int = 1) -> tuple[Array, Array]:
     """Distances and indices of the k nearest points, [N] each, or [N, k] for more than one."""
     distances, indices = tree.query(places, k=k, workers=1)
     return np.asarray(distances), np.asarray(indices)
+
+
+def robust_weights(squares: Array, width: float) -> Array:
+    """Weights of squared distances (Geman-McClure): 1 at 0, a quarter at `width`, almost none far away."""
+    weights: Array = (width**2 / (width**2 + squares)) ** 2
+    return weights
+
+
+def nearest_rotation(matrix: Array) -> Array:  # [3, 3]
+    """The rotation nearest to a matrix; of a sum of rotations, their mean."""
+    U, _, Vt = np.linalg.svd(matrix)
+    rotation: Array = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    return rotation
+
+
+def to_similarity(scale: float, rotation: Array, translation: Array) -> Similarity:
+    """A `Similarity` from numpy arrays."""
+    return Similarity(float(scale), torch.from_numpy(np.array(rotation)), torch.from_numpy(np.array(translation)))

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from .clouds import Array, nearest
+from .clouds import Array, nearest, robust_weights
 
 GRID = 40  # cells a side of the lookup grid: 64,000 nearest points are found once, in a tenth of a second
 REACH = 2.6  # half a side of the grid, in radii of the cloud
@@ -122,8 +122,8 @@ def _improve(moves: Moves, p: Array, q: Array, to_x: _Lookup, to_y: _Lookup, wid
         back = (q - t[:, None]) @ R / s[:, None, None]  # [S, m, 3]
         onto, origin = to_y(moved), to_x(back)
         reach = float(widths[-1] if width is None else width)
-        ahead = _weights(_squares(moved - onto), reach)
-        behind = _weights(_squares(back - origin) * s[:, None] ** 2, reach)
+        ahead = robust_weights(_squares(moved - onto), reach)
+        behind = robust_weights(_squares(back - origin) * s[:, None] ** 2, reach)
         if width is None:
             one, other = ahead.mean(1), behind.mean(1)
             scores = 2 * one * other / np.maximum(one + other, 1e-12)
@@ -137,12 +137,6 @@ def _improve(moves: Moves, p: Array, q: Array, to_x: _Lookup, to_y: _Lookup, wid
 def _squares(vectors: Array) -> Array:
     squares: Array = np.einsum("snk,snk->sn", vectors, vectors)
     return squares
-
-
-def _weights(squares: Array, width: float) -> Array:
-    """Geman-McClure: 1 at 0, a quarter at `width`, nothing far away."""
-    weights: Array = (width**2 / (width**2 + squares)) ** 2
-    return weights
 
 
 def _fit(source: Array, target: Array, weights: Array) -> Moves:
