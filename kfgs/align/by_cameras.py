@@ -1,4 +1,4 @@
-"""The similarity between two frames of one scene, from the cameras that both know by name."""
+"""The similarity between two frames of one scene, from the cameras that have the same names in both."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MAX_ANGLE = 15.0  # degrees between a camera's two orientations, after alignment
 MIN_INLIERS = 0.5  # share of the common cameras that must fit
 TRIPOD = 0.01  # cameras closer together than this share of the extent stand at one place
 ROUNDING = 1e-4  # of the extent: poses in float32 may be off by that, where the frame stands far from its origin
-SIGMAS = 4.0  # at the end, cameras farther off than this (by the median) are left out
+SIGMAS = 4.0  # in the last fits, cameras farther off than this many median distances are left out
 PAIRS = 5_000  # pairs of cameras tried when their centres alone say too little
 
 
@@ -41,15 +41,15 @@ class Alignment:
     """Cameras (or points) that were compared."""
     how: str
     """What was done, in words."""
-    facts: dict[str, Any] = field(default_factory=dict)
-    """More numbers, such as the worst cameras by name; anything that JSON can hold."""
+    details: dict[str, Any] = field(default_factory=dict)
+    """More numbers, such as the worst cameras by name; JSON can hold all of them."""
 
     def __repr__(self) -> str:
-        return f"Alignment({self.words})"
+        return f"Alignment({self.summary})"
 
     @property
-    def words(self) -> str:
-        """One sentence for a person."""
+    def summary(self) -> str:
+        """One sentence: what was done, the scale, how many fit and how closely."""
         return (
             f"{self.how}: scale {self.similarity.scale:.6g}, {self.inliers} of {self.count} fit, rms {self.rms:.3g} "
             f"({self.rms / self.size:.2%} of the extent {self.size:.3g})"
@@ -65,23 +65,23 @@ class Alignment:
             "rms of extent": self.rms / self.size,
             "inliers": self.inliers,
             "count": self.count,
-            **self.facts,
+            **self.details,
         }
 
 
 def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
-    """The similarity between two reconstructions of one set of pictures, from the cameras they share by name.
+    """The similarity between two reconstructions of the same pictures, from the cameras that have the same names.
 
-    Robust: wrong poses are left out as long as half of the common cameras agree. Hypotheses come from the centres alone
-    (pycolmap's LO-RANSAC) and from the orientations with pairs of centres; the one that more cameras agree with, in
-    place and in orientation, is refined on its inliers by least squares.
+    Wrong poses are left out as long as half of the common cameras agree. Candidates come from the centres alone
+    (pycolmap's LO-RANSAC), and from the orientations with pairs of centres. The candidate that most cameras agree with, in
+    place and in orientation, is refined on these cameras by least squares.
 
     Args:
-        src: posed cameras in the source frame; distortion and intrinsics play no part.
+        src: posed cameras in the source frame; distortion and intrinsics are not used.
         dst: posed cameras in the destination frame.
 
     Returns:
-        The similarity from the source frame to the destination frame; `facts` names the cameras that fit worst.
+        The similarity from the source frame to the destination frame; `details` names the cameras that fit worst.
 
     Raises:
         SceneError: if fewer than two names are common, all common cameras stand at one place (no scale follows), or
@@ -109,17 +109,17 @@ def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
         )
     errors = _distances(similarity, A, B)
     worst = [names[i] for i in np.argsort(-errors)[:5]]
-    facts = {
+    details = {
         "worst cameras": {name: float(errors[names.index(name)]) for name in worst},
         "left out": [name for name, ok in zip(names, good, strict=True) if not ok],
         "median angle": float(np.median(_angles(similarity, turns)[good])),
     }
     rms = float(np.sqrt((errors[good] ** 2).mean()))
-    return Alignment(similarity, rms, size, int(good.sum()), len(pairs), "cameras of the same names", facts)
+    return Alignment(similarity, rms, size, int(good.sum()), len(pairs), "cameras of the same names", details)
 
 
 def common_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> list[tuple[Camera, Camera]]:
-    """Cameras of the same name in both, in the order of `src`; see `align_by_cameras` for what makes names equal."""
+    """Pairs of cameras of the same name, in the order of `src`; `align_by_cameras` says when names are the same."""
     keys = _keys(src, dst, lambda camera: PurePosixPath(file_stem(camera.name)).name)
     keys = keys or _keys(src, dst, lambda camera: file_stem(camera.name)) or ({}, {})
     pairs = [(camera, keys[1][key]) for key, camera in keys[0].items() if key in keys[1]]
@@ -138,7 +138,7 @@ def _keys(src: Sequence[Camera], dst: Sequence[Camera], key: Any) -> tuple[dict[
 
 
 def _best_fit(A: Array, B: Array, turns: Array, sizes: list[float]) -> tuple[Similarity | None, Array, float]:
-    """The similarity that most cameras agree with, those cameras, and the first of the sizes with which half of them do."""
+    """The similarity that most cameras agree with, these cameras, and the first size for which half of all cameras agree."""
     best: tuple[Similarity | None, Array, float] = (None, np.zeros(len(A), dtype=bool), sizes[0])
     for size in sizes:
         for start in (_by_centers(A, B, size), *_by_orientations(A, B, turns, size)):
@@ -157,7 +157,7 @@ def _least(A: Array) -> float:
 
 
 def _by_centers(A: Array, B: Array, size: float) -> Similarity | None:
-    """LO-RANSAC over triples of centres; None where they stand on a line or never fit."""
+    """LO-RANSAC over triples of centres; None if they stand on a line or none fits."""
     if len(A) < 3:
         return None
     with quiet_pycolmap() as pycolmap:
@@ -195,7 +195,7 @@ def _by_orientations(A: Array, B: Array, turns: Array, size: float) -> list[Simi
 
 
 def _refine(start: Similarity, A: Array, B: Array, turns: Array, size: float) -> tuple[Similarity, Array]:
-    """Least squares over the cameras that fit, twice more over those within a few medians; the fit and its inliers."""
+    """Least squares over the cameras that fit, repeated until they stay the same; gives the fit and these cameras."""
     similarity, limit = start, MAX_ERROR * size
     good = _good(similarity, A, B, turns, limit)
     for _ in range(10):
@@ -237,16 +237,16 @@ def _distances(similarity: Similarity, A: Array, B: Array) -> Array:
 
 
 def _angles(similarity: Similarity, turns: Array) -> Array:
-    """Degrees between each camera's own turn from frame to frame and the similarity's."""
+    """Degrees between the rotation of each camera from frame to frame and that of the similarity."""
     cosines = (np.einsum("vij,ij->v", turns, similarity.rotation.numpy()) - 1) / 2
     return np.degrees(np.arccos(np.clip(cosines, -1, 1)))
 
 
 def _extents(centers: Array) -> list[float]:
-    """How large the cameras' place may be, likeliest first.
+    """Estimates of the size of the region that the cameras stand in, the likeliest first.
 
-    Twice the median distance from the median centre: wrong poses do not move it. Twice the upper quartile: it holds where
-    half of the cameras stand on one tripod, and comes first where the median says so. Twice the largest where all do.
+    Usually twice the median distance from the median centre, which wrong poses do not change, then twice the upper quartile.
+    If half of the cameras stand on one tripod, the quartile comes first. If nearly all do, it is twice the largest distance.
     """
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     median, upper, largest = (2 * float(np.quantile(distances, q)) for q in (0.5, 0.75, 1.0))

@@ -1,4 +1,4 @@
-"""Two clouds that nearly lie on each other, brought closer: least squares on point-to-plane distances, both ways."""
+"""Refine a similarity between two clouds: least squares on point-to-plane distances, both ways."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ..cameras.similarity import Similarity
 from .clouds import Array, median_spacing, nearest, nearest_rotation, robust_weights, to_similarity
 from .starts import thin
 
-NEAR = 2.0  # a point fits when closer than so many spacings of the sparser cloud
+NEAR = 2.0  # a point fits if it is closer than this many spacings of the sparser cloud
 
 
 class Fit(NamedTuple):
-    """A similarity from one cloud to another, and how much of them it lays on each other."""
+    """A similarity from one cloud to another, and how well the clouds then fit."""
 
     similarity: Similarity
     quality: float  # harmonic mean of the two shares that fit
@@ -26,7 +26,7 @@ class Fit(NamedTuple):
 
 
 class Cloud(NamedTuple):
-    """Points with normals, and the tree that finds the nearest."""
+    """Points with normals, and a tree that finds the nearest."""
 
     points: Array  # [n, 3]
     normals: Array  # [n, 3]

@@ -18,7 +18,11 @@ SAMPLE = 20_000  # points of each cloud that are measured
 
 
 def bulk(name: str, points: Tensor, sample: int = SAMPLE) -> Array:
-    """The points within robust bounds, float64, evenly thinned, each place once; refuses NaN and fewer than two."""
+    """The points within robust bounds as float64, thinned to about `sample`, without duplicates.
+
+    Raises:
+        ValueError: if a position is not finite, or there are fewer than two points.
+    """
     values = points.detach().double().cpu()
     finite = values.isfinite().all(1)
     if not bool(finite.all()):
@@ -29,11 +33,11 @@ def bulk(name: str, points: Tensor, sample: int = SAMPLE) -> Array:
     if len(values) < 2:
         raise ValueError(f"{name}: expected at least two points, got {len(values)}; there is nothing to compare")
     kept: Array = values[robust_bounds(values, margin=0.0).inside].numpy() if len(values) > 100 else values.numpy()
-    return np.unique(kept[:: max(1, len(kept) // sample)], axis=0)  # no two at one place: the spacing is not 0
+    return np.unique(kept[:: max(1, len(kept) // sample)], axis=0)  # without duplicates, so that the spacing is not 0
 
 
 def median_spacing(tree: cKDTree) -> float:
-    """Median distance from a point to the next at another place."""
+    """Median distance from a point to the nearest other one."""
     return float(np.median(nearest(tree, np.asarray(tree.data)[:: max(1, tree.n // 5_000)], k=2)[0][:, 1]))
 
 
