@@ -1,6 +1,5 @@
 """Labels: classes of codewords, pixels and Gaussians, their transfer to the colour field, and edits (Sec. 3.4)."""
 
-from .answer import Answer, BestView, answer, answers, view_shares
 from .average import ViewAverage, average_views
 from .boxes import OrientedBox
 from .classify import (
@@ -11,16 +10,18 @@ from .classify import (
     select_by_category,
     select_by_query,
     select_like,
+    select_near,
 )
 from .color import parse_color
-from .components import component_distance, component_numbers, components, select_near
+from .components import component_distance, component_numbers
 from .edit import extract, recolor, remove
 from .edits import Duplicate, Edit, EditList, Extract, Insert, Move, Opacity, Recolor, Remove, Turn, join
 from .label_set import LabelSet, load_label_set, teacher_mismatch
 from .names import class_index, class_indices
+from .parts import BestView, Part, connected_parts, describe_selection, view_shares
 from .relevancy import CANONICAL, relevancy
 from .segment import label_pixels, nearest_codeword
-from .selection import Selection, select_by_label, select_in_box, select_in_sphere, select_where
+from .selection import Selection
 from .text_scores import LOGIT_SCALES, Score, select_by_similarity, text_scores
 from .threshold import similarity_threshold
 from .transfer import Transfer, transfer_labels
@@ -32,7 +33,6 @@ __all__ = [
     "CANONICAL",
     "LOGIT_SCALES",
     "AboveScore",
-    "Answer",
     "BestView",
     "Both",
     "Classification",
@@ -54,6 +54,7 @@ __all__ = [
     "OfIndex",
     "Opacity",
     "OrientedBox",
+    "Part",
     "Recolor",
     "Remove",
     "Score",
@@ -63,16 +64,15 @@ __all__ = [
     "ViewAverage",
     "Votes",
     "Where",
-    "answer",
-    "answers",
     "average_views",
     "class_index",
     "class_indices",
     "classify",
     "component_distance",
     "component_numbers",
-    "components",
+    "connected_parts",
     "default_distance",
+    "describe_selection",
     "extract",
     "join",
     "label_codewords",
@@ -84,14 +84,10 @@ __all__ = [
     "relevancy",
     "remove",
     "select_by_category",
-    "select_by_label",
     "select_by_query",
     "select_by_similarity",
-    "select_in_box",
-    "select_in_sphere",
     "select_like",
     "select_near",
-    "select_where",
     "similarity_threshold",
     "teacher_mismatch",
     "text_scores",

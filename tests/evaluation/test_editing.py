@@ -13,7 +13,7 @@ from PIL import Image
 
 from kfgs.evaluation import score_recolor, score_removal
 from kfgs.evaluation.scene_truth import SceneTruth
-from kfgs.labels.edit import recolor, remove
+from kfgs.labels import recolor, remove
 from kfgs.metrics import psnr
 from kfgs.scenes import load_scene
 from kfgs.splat import rasterize

@@ -9,7 +9,7 @@ import torch
 
 from ..._check import check_choice, check_range
 from ...formats.splat_file import SplatFile
-from .._plain import number_of
+from .._json import number_of
 from ..color import parse_color
 from ..edit import Mode, recolor
 from ..where import Where

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ...formats.splat_file import SplatFile
 from ...gaussians import Gaussians
-from .._plain import members_of
+from .._json import members_of
 from ..where import OfClass, Where
 
 SHOWN = 12  # classes listed in a message
@@ -35,7 +35,7 @@ class Edit(ABC):
 
     def to_json(self) -> dict[str, Any]:
         """Plain values that JSON can hold: `op`, and the fields."""
-        return {"op": self.op} | {name: _plain(value) for name, value in members_of(self).items()}
+        return {"op": self.op} | members_of(self)
 
 
 def as_where(value: Any) -> Where:
@@ -57,7 +57,7 @@ def selected(where: Where, splats: SplatFile, allow_empty: bool) -> Tensor:  # [
     Raises:
         ValueError: if nothing is selected and `allow_empty` is false; the message lists the classes present.
     """
-    mask = where.mask(splats.gaussians, splats.classes, splats.extra)
+    mask = where.mask(splats)
     if not allow_empty and not bool(mask.any()):
         raise ValueError(
             f"where: expected a selection of some of {len(splats)} Gaussians, got none from {where!r:.120}; "
@@ -91,9 +91,3 @@ def _present(splats: SplatFile) -> str:
 def class_name(classes: tuple[str, ...], index: int) -> str:
     """The name of a class; one without a name is called `class 7`."""
     return classes[index] if index < len(classes) else f"class {index}"
-
-
-def _plain(value: Any) -> Any:
-    if hasattr(value, "to_json"):
-        return value.to_json()
-    return list(value) if isinstance(value, tuple) else value

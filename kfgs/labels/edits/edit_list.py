@@ -9,7 +9,7 @@ from typing import Any
 
 from ..._files import read_json, write_json
 from ...formats.splat_file import SplatFile
-from .._plain import checked_object
+from .._json import checked_object
 from ..where import Where
 from .appearance import Opacity, Recolor
 from .base import Edit

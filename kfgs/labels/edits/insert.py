@@ -14,7 +14,7 @@ from ...cameras.similarity import Similarity
 from ...formats.splat_file import SplatFile
 from ...formats.table import read_splats
 from ...splat.transform import transform_gaussians
-from .._plain import number_of, numbers_of
+from .._json import number_of, numbers_of
 from .base import Edit
 from .merge import join
 

@@ -16,7 +16,7 @@ from ...cameras.similarity import Similarity
 from ...formats.splat_file import SplatFile
 from ...gaussians import Gaussians
 from ...splat.transform import transform_gaussians
-from .._plain import number_of, numbers_of, quaternion_of, rotation_matrix, unit
+from .._json import number_of, numbers_of, quaternion_of, rotation_matrix, unit
 from ..where import Where
 from .base import Edit, as_where, scatter, selected
 from .merge import join

@@ -13,7 +13,7 @@ from torch import Tensor
 from ..._check import check_range
 from ..._rows import check_finite
 from ...formats.splat_file import SplatFile
-from .._plain import number_of
+from .._json import number_of
 from ..where import Where
 from .base import Edit, as_where, selected
 

@@ -13,10 +13,10 @@ import torch
 from ..._files import write_json
 from ...formats import SplatFile, write_splats
 from ...formats.splat_file import SCORE
-from ...labels import answers
+from ...labels import connected_parts
 from ..frusta import evenly
 
-MOST_PARTS = 16  # listed: as many as `answers` draws in one rendering of a view
+MOST_PARTS = 16  # listed: as many as `connected_parts` draws in one rendering of a view
 MOST_VIEWS = 30  # compared, evenly chosen
 
 if TYPE_CHECKING:
@@ -56,7 +56,8 @@ def _parts(state: Exploration, side: Side) -> list[dict[str, Any]]:
     places = evenly(len(state.cameras), MOST_VIEWS).tolist() if state.cameras else []
     views = [state.cameras[place] for place in places]
     parts = [
-        part.to_json() for part in answers(state.cloud(side), state.selection(side), views or None, most=MOST_PARTS)
+        part.to_json()
+        for part in connected_parts(state.cloud(side), state.selection(side), views or None, most=MOST_PARTS)
     ]
     for part in parts:
         if part["best_view"] is not None:
