@@ -92,13 +92,15 @@ for selection in found.values():
 # %% [markdown]
 # ## Things, not a heap of Gaussians
 #
-# `connected_parts` takes a selection apart: connected parts, each with its box, its size and the view that shows it best. How near is
+# `connected_parts` takes a selection apart: each part has its box, its size and the view that shows it best. How near is
 # connected follows from the spacing of the Gaussians; this room's five chairs stand so close that two of them are one part,
 # until the first cell says 0.15 (metres here).
 
 # %%
 selection = found["relevancy"]
-print([one.count for one in kfgs.connected_parts(field.gaussians, selection)], "Gaussians each, with the default distance")
+print(
+    [one.count for one in kfgs.connected_parts(field.gaussians, selection)], "Gaussians each, with the default distance"
+)
 things = kfgs.connected_parts(field.gaussians, selection, cameras, distance=apart)
 for number, one in enumerate(things, start=1):
     print(f"{thing} {number}: {one!r}")

@@ -210,8 +210,8 @@ Image.fromarray(np.concatenate([sheet, legend]))
 # %% [markdown]
 # ## Ask
 #
-# A query is told from the other classes (the score is its relevancy) and cut at a gamma, which the result states. `connected_parts`
-# counts the connected parts: how many, where, how large, seen best from where. Sizes are in the units of the
+# A query is told from the other classes (the score is its relevancy) and cut at a gamma, which the result states.
+# `connected_parts` lists what was found: how many, where, how large, seen best from where. Sizes are in the units of the
 # reconstruction.
 
 # %%

@@ -12,9 +12,8 @@ from .classify import (
     select_like,
     select_near,
 )
-from .color import parse_color
+from .color import parse_color, recolor
 from .components import component_distance, component_numbers
-from .edit import extract, recolor, remove
 from .edits import Duplicate, Edit, EditList, Extract, Insert, Move, Opacity, Recolor, Remove, Turn, join
 from .label_set import LabelSet, load_label_set, teacher_mismatch
 from .names import class_index, class_indices
@@ -73,7 +72,6 @@ __all__ = [
     "connected_parts",
     "default_distance",
     "describe_selection",
-    "extract",
     "join",
     "label_codewords",
     "label_pixels",
@@ -82,7 +80,6 @@ __all__ = [
     "parse_color",
     "recolor",
     "relevancy",
-    "remove",
     "select_by_category",
     "select_by_query",
     "select_by_similarity",
