@@ -1,6 +1,5 @@
 """Labels: classes of codewords, pixels and Gaussians, their transfer to the colour field, and edits (Sec. 3.4)."""
 
-from .average import ViewAverage, average_views
 from .boxes import OrientedBox
 from .classify import (
     Classification,
@@ -18,14 +17,12 @@ from .edits import Duplicate, Edit, EditList, Extract, Insert, Move, Opacity, Re
 from .label_set import LabelSet, load_label_set, teacher_mismatch
 from .names import class_index, class_indices
 from .parts import BestView, Part, connected_parts, describe_selection, view_shares
-from .relevancy import CANONICAL, relevancy
+from .scores import CANONICAL, LOGIT_SCALES, Score, relevancy, select_by_similarity, similarity_threshold, text_scores
 from .segment import label_pixels, nearest_codeword
 from .selection import Selection
-from .text_scores import LOGIT_SCALES, Score, select_by_similarity, text_scores
-from .threshold import similarity_threshold
 from .transfer import Transfer, transfer_labels
 from .transfer_distance import default_distance
-from .vote import Votes, vote_labels
+from .views import ViewAverage, Votes, average_views, vote_labels
 from .where import AboveScore, Both, Component, Either, Everything, InBox, InSphere, Not, OfClass, OfIndex, Where
 
 __all__ = [

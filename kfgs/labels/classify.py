@@ -11,8 +11,8 @@ from torch import Tensor
 from .._check import check_shapes, check_whole
 from .._rows import EPS, check_finite, row_norms, unit_embeddings, unit_rows
 from .components import component_numbers
+from .scores import Score, select_by_similarity
 from .selection import Selection
-from .text_scores import Score, select_by_similarity
 
 CHUNK = 65_536  # rows per step: with 200 classes, 50 MB of similarities at a time
 
