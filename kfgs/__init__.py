@@ -37,7 +37,8 @@ _WHERE = {
     "Recolor": ".labels",
     "Remove": ".labels",
     "Selection": ".labels",
-    "answers": ".labels",
+    "OfClass": ".labels",
+    "connected_parts": ".labels",
     "transform_gaussians": ".splat",
     "ColorConfig": ".pipeline",
     "attach": ".pipeline",
@@ -96,10 +97,11 @@ if TYPE_CHECKING:
     from .gaussians import Gaussians as Gaussians
     from .labels import EditList as EditList
     from .labels import LabelSet as LabelSet
+    from .labels import OfClass as OfClass
     from .labels import Recolor as Recolor
     from .labels import Remove as Remove
     from .labels import Selection as Selection
-    from .labels import answers as answers
+    from .labels import connected_parts as connected_parts
     from .labels import load_label_set as load_label_set
     from .labels import transfer_labels as transfer_labels
     from .pipeline import ColorConfig as ColorConfig

@@ -52,7 +52,7 @@ from kfgs import (
     ColorConfig,
     FeatureFolder,
     FitConfig,
-    answers,
+    connected_parts,
     extract_features,
     fit_scene,
     label_set_from_examples,
@@ -211,13 +211,13 @@ Image.fromarray(np.concatenate([sheet, legend]))
 # %% [markdown]
 # ## Ask
 #
-# A query is told from the other classes (the score is its relevancy) and cut at a gamma, which the result states. `answers`
-# counts the connected parts: how many, where, how large, seen best from where. Sizes are in the units of the
+# A query is told from the other classes (the score is its relevancy) and cut at a gamma, which the result states.
+# `connected_parts` lists what was found: how many, where, how large, seen best from where. Sizes are in the units of the
 # reconstruction.
 
 # %%
 found = semantic.query(question, classes)
-things = answers(semantic.gaussians, found, cameras)
+things = connected_parts(semantic.gaussians, found, cameras)
 print(found)
 for thing in things:
     print(" ", thing)

@@ -24,7 +24,7 @@ from .._files import atomic_path
 from .._rows import EPS, row_norms, unit_rows
 from ..cameras import Camera, resize_map
 from ..gaussians import Gaussians
-from ..labels.average import sum_pixels
+from ..labels.views import sum_pixels
 from ..quant import FeatureMaps
 from ..quant.linear import LinearLatents, fit_linear_latents, principal_directions
 from ..quant.sampling import sample_grid

@@ -3,7 +3,7 @@ import pytest
 import torch
 from PIL import Image
 
-from kfgs.labels import Selection, select_by_similarity, select_where
+from kfgs.labels import Selection, select_by_similarity
 from kfgs.viz import palette, plot_scores, score_plot
 
 
@@ -71,7 +71,7 @@ def test_no_score_is_lost_and_gamma_is_an_edge(gamma):
 
 
 def test_equal_scores_are_drawn(tmp_path, figures):
-    plot_scores(select_where(torch.ones(7, dtype=torch.bool), "all"), tmp_path / "a.png")
+    plot_scores(Selection.of(torch.ones(7, dtype=torch.bool), "all"), tmp_path / "a.png")
     axes = figures[0].axes[0]
     assert bars(axes, 1)[2].sum() == 7
     assert len(axes.lines) == 0  # no threshold
@@ -94,7 +94,7 @@ def test_classes_of_the_selected_have_lines(tmp_path, figures):
 
 def test_only_the_classes_with_the_most_selected_have_lines(tmp_path, figures):
     labels = torch.arange(9).repeat_interleave(torch.arange(9, 0, -1))
-    everything = select_where(torch.ones(len(labels), dtype=torch.bool))
+    everything = Selection.of(torch.ones(len(labels), dtype=torch.bool))
     plot_scores(everything, tmp_path / "a.png", labels=labels)
     entries = [text.get_text() for text in figures[0].axes[0].get_legend().get_texts()]
     assert [entry for entry in entries if "class" in entry] == [f"class {k}: {9 - k} of {9 - k}" for k in range(5)]
@@ -102,8 +102,8 @@ def test_only_the_classes_with_the_most_selected_have_lines(tmp_path, figures):
 
 def test_wrong_input_is_named(tmp_path):
     with pytest.raises(ValueError, match="selection: expected the scores of at least one Gaussian, got none; ask"):
-        plot_scores(select_where(torch.zeros(0, dtype=torch.bool)), tmp_path / "a.png")
-    some = select_where(torch.ones(4, dtype=torch.bool))
+        plot_scores(Selection.of(torch.zeros(0, dtype=torch.bool)), tmp_path / "a.png")
+    some = Selection.of(torch.ones(4, dtype=torch.bool))
     with pytest.raises(ValueError, match=r"labels: expected \[N\] with N = 4 \(from selection.scores\), got \(3,\)"):
         plot_scores(some, tmp_path / "a.png", labels=torch.zeros(3, dtype=torch.int64))
     with pytest.raises(TypeError, match="labels: expected integers, got float32"):

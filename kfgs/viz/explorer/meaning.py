@@ -16,10 +16,10 @@ from ...formats.splat_file import SCORE
 from ...gaussians import Gaussians
 from ...labels import (
     LabelSet,
+    OfClass,
     Selection,
     class_index,
     class_indices,
-    select_by_label,
 )
 from ...labels.questions import class_rows, make_question
 from ..field_colors import feature_colors, learnt_colors
@@ -188,7 +188,7 @@ class SplatMeaning:
         """
         words = self.names[class_indices(words.strip(), self.names)[0]]
         if words not in self._answers:
-            member = select_by_label(self.gaussians, words, self.names).mask
+            member = OfClass(words).mask(self.gaussians, self.names)
             scores = torch.where(member, self.scores, 0)
             own = scores[member]
             low, high = (float(own.min()), float(own.max())) if len(own) else UNIT
