@@ -2,9 +2,9 @@ import json
 import re
 
 import pytest
+from messages import tells
 
-from kfgs.features.folder import FeatureFolder
-from kfgs.features.manifest import Manifest, MapRecord, read_manifest
+from kfgs.features import FeatureFolder, Manifest, MapRecord, read_manifest
 
 RECORD = MapRecord("sub/a.npy", (3, 4, 5), 248, 17, "d" * 64, "a.png", "e" * 64, 0.25)
 
@@ -36,11 +36,7 @@ def change(folder, **values) -> None:
 def test_what_is_saved_comes_back(folder):
     found = read_manifest(folder)
     assert found == Manifest({"name": "t", "options": {"size": [3, 4]}}, {"sub/a": RECORD}, discarded=True)
-    assert found.files(folder) == {folder / "sub" / "a.npy"}
-    assert found.gone(folder) == {"sub/a": folder / "sub" / "a.npy"}
     (folder / "sub").mkdir()
-    (folder / "sub" / "a.npy").touch()
-    assert found.gone(folder) == {}
     assert read_manifest(folder / "sub") is None
     change(folder, seconds=1)  # a whole number is a number
     assert read_manifest(folder).maps["sub/a"].seconds == 1
@@ -96,7 +92,7 @@ def test_what_kfgs_never_wrote_is_refused_in_a_line_that_names_the_file(folder, 
 @pytest.mark.parametrize("text", ["[]", "{}", '{"format": "kfgs-features/9"}'])
 def test_another_format_is_named(tmp_path, text):
     (tmp_path / "features.json").write_text(text)
-    with pytest.raises(ValueError, match=r"features\.json: expected format 'kfgs-features/1', got something else"):
+    with pytest.raises(ValueError, match=tells("features.json", "format 'kfgs-features/1'", WAY_OUT)):
         read_manifest(tmp_path)
 
 
@@ -104,7 +100,7 @@ def test_another_format_is_named(tmp_path, text):
     ("text", "words"),
     [
         ("{", "expected a JSON file, but it cannot be parsed (Expecting property name"),
-        ("[" * 100_000 + "]" * 100_000, "expected a manifest of kfgs, but it is nested too deeply"),
+        ("[" * 100_000 + "]" * 100_000, "(nested too deeply)"),
         ('{"seconds": ' + "1" * 5000 + "}", "expected a JSON file, but it cannot be parsed (Exceeds the limit"),
     ],
 )

@@ -2,12 +2,11 @@ import dataclasses
 
 import pytest
 import torch
+from messages import tells
 from PIL import Image
 
 from kfgs.cameras import Camera
-from kfgs.features import FeatureFolder
-from kfgs.features.extract import extract_features, pictures_of
-from kfgs.features.recompute import RecomputedMaps
+from kfgs.features import FeatureFolder, RecomputedMaps, extract_features, pictures_of
 from kfgs.quant import CodebookConfig, fit_codebook, quantize_maps, sample_grid
 from kfgs.scenes import Scene
 
@@ -150,7 +149,7 @@ def test_cleared_samples_are_gone_and_the_size_is_still_known(scene, tmp_path):
 
 def test_bad_input_is_refused_before_the_teacher_runs(scene, tmp_path):
     teacher = Mixer()
-    with pytest.raises(ValueError, match="pictures: expected at least one, got none"):
+    with pytest.raises(ValueError, match=tells("pictures", "at least one", "none")):
         RecomputedMaps(teacher, scene, [], tmp_path / "store")
     scene.image_paths[1].unlink()
     with pytest.raises(FileNotFoundError, match=r"view_1.png: no such file; expected the picture of view 'view_1'"):

@@ -1,0 +1,114 @@
+"""Which file of a folder is the map of which view: by the name of its picture, and by the manifest that kfgs writes."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path, PurePosixPath
+
+from ..scenes.names import some
+from ..scenes.scene import IMAGE_SUFFIXES
+from .layouts import FEATURE_3DGS, LAYOUTS, OWN, layout_of
+from .manifest import MapRecord, read_manifest
+
+
+class MapFinder:
+    """The rules of a folder of maps.
+
+    Args:
+        path: the folder.
+
+    Raises:
+        NotADirectoryError: if `path` is no folder.
+        ValueError: if its manifest is damaged.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        if not self.path.is_dir():
+            raise NotADirectoryError(f"path: expected a folder of feature maps, got {self.path}; check its name")
+        self.manifest = read_manifest(self.path)
+        self.records: dict[str, MapRecord] = self.manifest.maps if self.manifest else {}
+        self.own = frozenset(self.path / record.file for record in self.records.values())
+        """The files of the maps that kfgs wrote, including discarded ones."""
+
+    def without_record(self, files: Iterable[Path]) -> list[Path]:
+        """Maps in a folder of kfgs that its manifest does not list: its teacher need not have made them."""
+        return [] if self.manifest is None else [file for file in files if file not in self.own]
+
+    def discarded(self, stem: str) -> Path | None:
+        """Where a view's map was before it was discarded; None if it is there, or was never made or never discarded."""
+        if self.manifest is None or not self.manifest.discarded or stem not in self.records:
+            return None
+        file = self.path / self.records[stem].file
+        return None if file.is_file() else file
+
+    def listed(self, *, deep: bool = False) -> dict[str, list[Path]]:
+        """The maps in the folder by stem; of several files with one stem, the one to read comes first.
+
+        A file may also have the whole name of the picture (`rgb_1.png.npy`); the stem is `rgb_1` even then. Hidden files
+        are left out.
+
+        Args:
+            deep: look into subfolders too (not into hidden ones or links); the stem then starts with the subfolder.
+        """
+        found: dict[str, list[tuple[int, str, Path]]] = {}
+        for here, folders, names in os.walk(self.path):
+            folders[:] = sorted(name for name in folders if deep and not name.startswith("."))
+            for name in names:
+                file = Path(here) / name
+                layout = None if name.startswith(".") else layout_of(file, self.own)
+                if layout is None:
+                    continue
+                stem = file.relative_to(self.path).as_posix().removesuffix(layout.suffix)
+                ending = PurePosixPath(stem).suffix
+                if file not in self.own and ending.lower() in IMAGE_SUFFIXES and PurePosixPath(stem).stem:
+                    stem = stem.removesuffix(ending)
+                found.setdefault(stem, []).append((LAYOUTS.index(layout), name, file))
+        return {stem: [file for _, _, file in sorted(files)] for stem, files in found.items()}
+
+    def find(self, stems: Sequence[str]) -> dict[str, list[Path]]:
+        """Each view's map: an empty list if there is none, several files if it is not clear which one is meant.
+
+        A view's map is in the folder under the picture's stem; if the picture is in a subfolder, so is the map. If no view
+        has a map there, the last part of the stem is looked for in the folder and all its subfolders. A discarded map is
+        the file that it was.
+        """
+        gone = {stem: [file] for stem in stems if (file := self.discarded(stem)) is not None}
+        found = {stem: self.beside(stem) for stem in stems if stem not in gone}
+        if not all(found.values()):
+            present = self.listed(deep=True)
+            found = {stem: files or present.get(stem, [])[:1] for stem, files in found.items()}
+            if not any(found.values()):
+                bases = Counter(PurePosixPath(stem).name for stem in found)
+                by_base: dict[str, list[Path]] = {}
+                for stem, files in present.items():
+                    by_base.setdefault(PurePosixPath(stem).name, []).append(files[0])
+                found = {
+                    stem: by_base.get(base, []) if bases[base] == 1 else []
+                    for stem, base in ((stem, PurePosixPath(stem).name) for stem in found)
+                }
+        return {stem: gone[stem] if stem in gone else found[stem] for stem in stems}
+
+    def beside(self, stem: str) -> list[Path]:
+        """The file that is called `stem` and the suffix of a layout, in a list; an empty list if there is none."""
+        files = ((self.path / f"{stem}{layout.suffix}", layout) for layout in LAYOUTS)
+        return [file for file, layout in files if file.is_file() and layout_of(file, self.own) is layout][:1]
+
+    def explain_missing(self, stems: Sequence[str], missing: Sequence[str]) -> str:
+        """The message for views without a map: which views, and what the maps that are there are called."""
+        suffix = OWN.suffix if self.manifest else FEATURE_3DGS.suffix
+        named = some([stem + suffix for stem in missing])
+        text = f"expected a feature map for each of {len(stems)} views, {len(missing)} missing: {named}"
+        others = sorted(set(self.listed(deep=True)) - set(stems))
+        if self.manifest:  # its maps have the names of the pictures, so views are missing, and no name is wrong
+            hint = f"make them with `kfgs features ... --split all --out {self.path}` (or the split of these views)"
+        elif len(missing) == len(stems) and others:
+            return (
+                f"{text} (or {missing[0]}{OWN.suffix}); the maps there ({len(others)}) are called {some(others, 3)}, but the "
+                f"pictures {some(list(stems), 3)}: rename the maps to the names of the pictures"
+            )
+        else:
+            text, hint = f"{text} (or {missing[0]}{OWN.suffix})", "encode these views"
+        return f"{text}; {hint}, or leave them out of `stems`"
