@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from .._rows import EPS, row_norms
 from ..scenes.names import some
 from .finder import MapFinder
-from .layouts import FEATURE_3DGS, OWN, ROW_BLOCK, Reading, StoredMap, count_bad, fits_aspect, open_map, read_block
+from .layouts import FEATURE_3DGS, OWN, ROW_BLOCK, Reading, StoredMap, count_bad, fits_aspect, read_block
 from .manifest import MANIFEST
 
 HOLES = 0.5  # share of all-zero features from which a map gets a note
@@ -30,9 +30,9 @@ class FeatureReport:
     """The type of most maps' values: `float16`."""
     bytes: int = 0
     """Of all maps on disk."""
-    problems: dict[str, list[str]] = field(default_factory=dict)
+    problems: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     """Why a map cannot be used, by the file's name (if there is none, the name it should have)."""
-    notes: dict[str, list[str]] = field(default_factory=dict)
+    notes: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     """What to know about a file, or about the folder ('')."""
 
     @property
@@ -60,14 +60,6 @@ class FeatureReport:
             f"not: {' | '.join(first)}{more}; encode these views again or leave them out"
         )
 
-    def problem(self, name: str, text: str) -> None:
-        """Add a problem of a file."""
-        self.problems.setdefault(name, []).append(text)
-
-    def note(self, name: str, text: str) -> None:
-        """Add a note about a file, or about the folder ('')."""
-        self.notes.setdefault(name, []).append(text)
-
 
 def check_maps(finder: MapFinder, sizes: dict[str, Size], reading: Reading, *, values: bool) -> FeatureReport:
     """Look at the map of every view; see `FeatureFolder.check`.
@@ -86,17 +78,19 @@ def check_maps(finder: MapFinder, sizes: dict[str, Size], reading: Reading, *, v
     for stem, file in files.items():
         record = finder.records.get(stem)
         if record and file == finder.path / record.file and (doubt := record.doubt(file, read=values)):
-            report.note(names[stem], f"{doubt} since kfgs wrote it; `kfgs features` makes it again if it differs")
+            report.notes[names[stem]].append(
+                f"{doubt} since kfgs wrote it; `kfgs features` makes it again if it differs"
+            )
         try:
-            stored = open_map(file, replace(reading, size=sizes[stem]), finder.own)
+            stored = finder.open(stem, file, replace(reading, size=sizes[stem]))
         except (ValueError, TypeError) as error:
-            report.problem(names[stem], str(error).removeprefix(f"{file}: "))
+            report.problems[names[stem]].append(str(error).removeprefix(f"{file}: "))
             continue
         h, w, D = map(int, stored.shape)
         shapes[stem] = h, w, D
         kinds[str(stored.dtype).removeprefix("torch.")] += 1
         if str(stored.dtype).endswith(("float64", "f8")):
-            report.note(names[stem], "double precision, which is read as single")
+            report.notes[names[stem]].append("double precision, which is read as single")
         if values:
             _check_values(names[stem], stored, report)
     report.bytes = sum(file.stat().st_size for file in files.values())
@@ -108,9 +102,11 @@ def check_maps(finder: MapFinder, sizes: dict[str, Size], reading: Reading, *, v
     for stem, (h, w, D) in shapes.items():
         size, same = sizes[stem], (h, w) == common[:2]
         if channels != D:
-            report.problem(names[stem], f"expected {channels} channels, got {D}")
+            report.problems[names[stem]].append(f"expected {channels} channels, got {D}")
         if not same:
-            report.problem(names[stem], f"expected {common[0]} x {common[1]} cells as most maps have, got {h} x {w}")
+            report.problems[names[stem]].append(
+                f"expected {common[0]} x {common[1]} cells as most maps have, got {h} x {w}"
+            )
         if size is None or fits_aspect((h, w), size):
             continue
         turned = _turned((h, w, D), size)
@@ -118,13 +114,11 @@ def check_maps(finder: MapFinder, sizes: dict[str, Size], reading: Reading, *, v
             stretched.append(stem)
         else:
             text = f"expected the aspect of a picture of {size[0]} x {size[1]} pixels, got {h} x {w} cells"
-            report.problem(names[stem], text + turned)
+            report.problems[names[stem]].append(text + turned)
     if stretched:
-        report.note(
-            "",
-            f"maps of another aspect than their pictures: {len(stretched)} of {len(shapes)} ({some(stretched, 3)}), all of "
-            f"{common[0]} x {common[1]} cells; each is taken to cover its whole picture",
-        )
+        text = f"maps of another aspect than their pictures: {len(stretched)} of {len(shapes)} ({some(stretched, 3)})"
+        cells = f"{common[0]} x {common[1]} cells"
+        report.notes[""].append(f"{text}, all of {cells}; each is taken to cover its whole picture")
     return report
 
 
@@ -135,24 +129,26 @@ def _find(finder: MapFinder, stems: list[str], report: FeatureReport) -> dict[st
     missing = [stem for stem, files in found.items() if not files]
     for stem in missing:
         if finder.manifest is None:
-            report.problem(stem + FEATURE_3DGS.suffix, "missing, and no other layout of this view either")
+            report.problems[stem + FEATURE_3DGS.suffix].append("missing, and no other layout of this view either")
         else:
-            report.problem(stem + OWN.suffix, "missing; `kfgs features` with the --split of this view makes it")
+            report.problems[stem + OWN.suffix].append("missing; `kfgs features` with the --split of this view makes it")
     if len(missing) == len(stems):
-        report.note("", finder.explain_missing(stems, missing))
+        report.notes[""].append(finder.explain_missing(stems, missing))
     for stem, files in found.items():
         if len(files) > 1:
             names = ", ".join(file.relative_to(finder.path).as_posix() for file in files[:3])
-            report.problem(stem + FEATURE_3DGS.suffix, f"{len(files)} maps may be meant: {names}")
+            report.problems[stem + FEATURE_3DGS.suffix].append(f"{len(files)} maps may be meant: {names}")
     if discarded:
-        report.note("", f"maps that were discarded once index maps had been made: {len(discarded)} of {len(stems)}")
+        report.notes[""].append(
+            f"maps that were discarded once index maps had been made: {len(discarded)} of {len(stems)}"
+        )
     chosen = {stem: files[0] for stem, files in found.items() if len(files) == 1}
     for file in finder.without_record(chosen.values()):
         text = f"{MANIFEST} has no record of it: another program made it, or a process that was killed"
-        report.problem(file.relative_to(finder.path).as_posix(), text)
+        report.problems[file.relative_to(finder.path).as_posix()].append(text)
     others = sorted(set(finder.listed()) - set(stems)) if chosen else []
     if others:
-        report.note("", f"maps of none of these views: {len(others)} ({some(others, 3)})")
+        report.notes[""].append(f"maps of none of these views: {len(others)} ({some(others, 3)})")
     return chosen
 
 
@@ -161,12 +157,10 @@ def _turned(shape: Shape, size: tuple[int, int]) -> str:
     h, w, D = shape
     if fits_aspect((w, h), size):
         return " (transposed?)"
-    # [h, w, D] that is read as [D, h, w], or the other way round
-    return (
-        f" (axes of {D} channels in another order?)"
-        if any(fits_aspect((a, b), size) for a, b in ((D, h), (w, D)))
-        else ""
-    )
+    other = fits_aspect((D, h), size) or fits_aspect(
+        (w, D), size
+    )  # [h, w, D] read as [D, h, w], or the other way round
+    return f" (axes of {D} channels in another order?)" if other else ""
 
 
 def _check_values(name: str, stored: StoredMap, report: FeatureReport) -> None:
@@ -179,11 +173,11 @@ def _check_values(name: str, stored: StoredMap, report: FeatureReport) -> None:
             bad += count_bad(rows)
             zeros += int((row_norms(rows) <= EPS).sum())
     except ValueError as error:  # mask numbers beyond the masks
-        report.problem(name, str(error).rpartition(f"{name}: ")[2])
+        report.problems[name].append(str(error).rpartition(f"{name}: ")[2])
         return
     if bad:
-        report.problem(name, f"{bad} NaN or infinite values")
+        report.problems[name].append(f"{bad} NaN or infinite values")
     if zeros == h * w:
-        report.problem(name, "every feature is all-zero")
+        report.problems[name].append("every feature is all-zero")
     elif zeros >= HOLES * h * w:
-        report.note(name, f"{100 * zeros / (h * w):.0f} % of the features are all-zero: nothing is known there")
+        report.notes[name].append(f"{100 * zeros / (h * w):.0f} % of the features are all-zero: nothing is known there")

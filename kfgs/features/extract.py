@@ -16,9 +16,8 @@ from .._check import one_line
 from .._files import bytes_in_words, digest_file, seconds_in_words
 from ..scenes import Scene
 from ..teachers.protocol import Teacher, as_teacher, identify
-from .finder import MapFinder
-from .layouts import LAYOUTS, OWN, layout_of, map_file, write_npy_map
-from .manifest import MANIFEST, Manifest, MapRecord, plain_identity, read_manifest
+from .layouts import map_file, write_npy_map
+from .manifest import MANIFEST, Manifest, MapRecord, read_manifest
 from .pictures import Picture, Split, as_pictures
 from .writer import MapWriter, encode_half, locked
 
@@ -65,9 +64,7 @@ def extract_features(
     """
     folder, teacher, chosen = Path(folder), as_teacher(teacher), as_pictures(pictures, split, exist=True)
     with locked(folder):
-        identity = plain_identity(identify(teacher))
-        _make_room(folder, chosen, identity, overwrite=overwrite)
-        writer = MapWriter(folder, identity, chosen)
+        writer = MapWriter(folder, identify(teacher), chosen, overwrite=overwrite)
         digests = {picture.stem: digest_file(picture.path) for picture in chosen}
         doubts = {stem: writer.doubt(stem, digest) for stem, digest in digests.items()}
         todo = [picture for picture in chosen if doubts[picture.stem] is not None]
@@ -155,45 +152,20 @@ def _discardable(folder: Path, manifest: Manifest, stems: Sequence[str] | None) 
     return [file for file in records if file.is_file()]
 
 
-def _make_room(folder: Path, pictures: Sequence[Picture], identity: dict[str, object], *, overwrite: bool) -> None:
-    """Refuse maps of other programs and teachers, or give them up if `overwrite` says so."""
-    finder, files = MapFinder(folder), {picture.stem: map_file(folder, picture.stem) for picture in pictures}
-    finder.own |= set(files.values())
-    for stem in files:
-        for file in finder.beside(stem):
-            if LAYOUTS.index(layout_of(file, finder.own) or OWN) < LAYOUTS.index(OWN):
-                raise ValueError(
-                    f"folder: expected one without maps of other programs, got {file}, which would be read instead of ours; "
-                    "use another folder"
-                )
-    others = [file for file in files.values() if file.is_file()] if finder.manifest is None else []
-    if others and not overwrite:
-        raise ValueError(
-            f"folder: expected one without maps of other programs, got {others[0]} and no {MANIFEST}; use another "
-            "folder, or pass overwrite=True (--overwrite)"
-        )
-    if finder.manifest and overwrite and finder.manifest.teacher != identity:
-        for stem, record in finder.records.items():
-            if (file := folder / record.file) == map_file(folder, stem):
-                file.unlink(missing_ok=True)
-        Manifest(identity).save(folder)
-
-
 def _check_shape(
     name: str, picture: Picture, shape: tuple[int, ...], expected: tuple[int, ...], before: list[MapRecord]
 ) -> None:
     """Refuse a map with other channels than the map before, or another shape than pictures of this size have."""
-    for other in before:
-        if other.shape[2] != shape[2]:
-            raise ValueError(
-                f"teacher {name!r}: expected {other.shape[2]} channels for {picture.path} as in "
-                f"{one_line(other.file, 200)}, got {shape[2]}; use one teacher with the same options for all pictures"
-            )
-    if expected != shape:
-        raise ValueError(
-            f"teacher {name!r}: expected a map of (h, w, D) = {expected} for {picture.path} as for other pictures of its "
-            f"size, got {shape}; use the same options for all pictures"
-        )
+    if before and before[0].shape[2] != shape[2]:
+        what, where, got = f"{before[0].shape[2]} channels", f"in {one_line(before[0].file, 200)}", str(shape[2])
+    elif expected != shape:
+        what, where, got = f"a map of (h, w, D) = {expected}", "for other pictures of its size", str(shape)
+    else:
+        return
+    raise ValueError(
+        f"teacher {name!r}: expected {what} for {picture.path} as {where}, got {got}; use one teacher with the same options "
+        "for all pictures"
+    )
 
 
 def _outlook(found: int, left: int, name: str, records: list[MapRecord]) -> str:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from ..scenes.names import some
 from ..scenes.scene import IMAGE_SUFFIXES
-from .layouts import FEATURE_3DGS, LAYOUTS, OWN, layout_of
+from .layouts import FEATURE_3DGS, LAYOUTS, OWN, Reading, StoredMap, layout_of, open_map
 from .manifest import MapRecord, read_manifest
 
 
@@ -32,6 +33,18 @@ class MapFinder:
         self.records: dict[str, MapRecord] = self.manifest.maps if self.manifest else {}
         self.own = frozenset(self.path / record.file for record in self.records.values())
         """The files of the maps that kfgs wrote, including discarded ones."""
+
+    def record(self, stem: str, file: Path) -> MapRecord | None:
+        """The record of this very file of a view, which may have been discarded since; None if the file may have changed."""
+        record = self.records.get(stem)
+        if record is None or file != self.path / record.file:
+            return None
+        return None if file.is_file() and record.doubt(file, read=False) else record
+
+    def open(self, stem: str, file: Path, reading: Reading) -> StoredMap:  # [h, w, D]
+        """Map a view's file into memory, see `layouts.open_map`; a record tells the order of the axes."""
+        record = self.record(stem, file)
+        return open_map(file, replace(reading, channels=record.shape[2]) if record else reading, self.own)
 
     def without_record(self, files: Iterable[Path]) -> list[Path]:
         """Maps in a folder of kfgs that its manifest does not list: its teacher need not have made them."""

@@ -18,8 +18,8 @@ from ..scenes import Scene
 from .check import FeatureReport, check_maps
 from .finder import MapFinder
 from .langsplat import parse_level, rows_file
-from .layouts import LANGSPLAT, ROW_BLOCK, Reading, StoredMap, count_bad, layout_of, open_map, read_block
-from .manifest import MANIFEST, MapRecord
+from .layouts import LANGSPLAT, ROW_BLOCK, Reading, StoredMap, count_bad, layout_of, read_block
+from .manifest import MANIFEST
 from .pictures import Picture, Split, as_pictures, check_stems, pictures_of
 
 
@@ -28,11 +28,11 @@ class FeatureFolder(Sequence[Tensor]):
 
     `FeatureFolder(path).of(scene, "train")` has the maps of a scene's split, which is what `fit_scene` takes.
 
-    These layouts are known, and may be mixed: `<stem>_fmap_CxHxW.pt` (Feature 3DGS: a tensor [D, h, w]),
-    `<stem>_s.npy` beside `<stem>_f.npy` (LangSplat: mask numbers [4, H, W], and a feature per mask), and `<stem>.npy` or
-    `<stem>.safetensors` (an array [h, w, D]; one of [D, h, w] is recognised by `channels` or the picture's aspect). Half,
-    single or double precision. The picture's ending may follow the stem. If a picture is in a subfolder, its map is in a
-    subfolder of the same name; if no view has a map there, the last part of its name is looked for in all subfolders.
+    These layouts are known, and may be mixed: `<stem>_fmap_CxHxW.pt` (Feature 3DGS: a tensor [D, h, w]), `<stem>_s.npy`
+    beside `<stem>_f.npy` (LangSplat: mask numbers [4, H, W], and a feature per mask), and `<stem>.npy` or
+    `<stem>.safetensors` (an array [h, w, D]; one of [D, h, w] is recognised by `channels` or the picture's aspect). Values
+    have half, single or double precision. The picture's ending may follow the stem. The map of a picture in a subfolder is
+    in a subfolder of the same name; if no view has a map there, all subfolders are searched for the last part of its name.
     If kfgs filled the folder (it holds `features.json`), maps that other programs or a killed process left are refused.
 
     No map is kept in memory. Every map must have the same size; an all-zero feature means "unknown". Maps that kfgs wrote
@@ -172,7 +172,7 @@ class FeatureFolder(Sequence[Tensor]):
     @cached_property
     def shape(self) -> tuple[int, int, int]:
         """(h, w, D) of every map; opens the first file, without reading its values."""
-        record = self._record(0)
+        record = self._finder.record(self.stems[0], self.files[0])
         h, w, D = map(int, record.shape if record else self._open(0).shape)
         if self.channels is not None and self.channels != D:
             raise ValueError(
@@ -222,7 +222,7 @@ class FeatureFolder(Sequence[Tensor]):
         digested here, both files together, and the level and the stride are part of the name. If a map is LangSplat's or
         discarded, the caller could not compute all digests, so those that are not known are computed here as well.
         """
-        records = [self._record(i) for i in range(len(self))]
+        records = [self._finder.record(stem, file) for stem, file in zip(self.stems, self.files, strict=True)]
         if None in records and not self.has_masks and all(file.is_file() for file in self.files):
             return None
         result = []
@@ -242,23 +242,14 @@ class FeatureFolder(Sequence[Tensor]):
     def _is_masks(self, file: Path) -> bool:
         return file.is_file() and layout_of(file, self._finder.own) is LANGSPLAT
 
-    def _record(self, i: int) -> MapRecord | None:
-        """What the manifest says about this very file, or about a discarded one."""
-        record, file = self._finder.records.get(self.stems[i]), self.files[i]
-        if record is None or file != self.path / record.file:
-            return None
-        return None if file.is_file() and record.doubt(file, read=False) else record
-
     def _open(self, i: int) -> StoredMap:
-        file, record = self.files[i], self._record(i)
+        stem, file, size = self.stems[i], self.files[i], self.sizes[i] if self.sizes else None
         if not file.is_file():
             raise FileNotFoundError(
                 f"{file}: expected a feature map, but it was discarded once its index map had been made, or deleted "
                 "since; make it again with `kfgs features`"
             )
-        size = self.sizes[i] if self.sizes else None
-        reading = replace(self.reading, size=size, channels=record.shape[2] if record else self.channels)
-        return open_map(file, reading, self._finder.own)
+        return self._finder.open(stem, file, replace(self.reading, size=size))
 
     def _checked(self, i: int) -> StoredMap:
         """View i's map, if it has the size of the first."""

@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Callable, Container
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -45,18 +45,13 @@ class Reading:
     than the paper's maps."""
 
 
-@dataclass(frozen=True)
-class Layout:
+class Layout(NamedTuple):
     """One way to store a view's map."""
 
-    suffix: str
-    """What follows the picture's stem in the file's name."""
+    suffix: str  # what follows the picture's stem in the file's name
     axes: Axes
-    """The order of the axes."""
-    certain: bool
-    """Whether every program that writes these files uses that order."""
-    open: Callable[[Path, Reading], Any]
-    """Maps the file into memory."""
+    certain: bool  # whether every program that writes these files uses this order of the axes
+    open: Callable[[Path, Reading], Any]  # maps the file into memory
 
 
 def _open_torch(file: Path, _: Reading) -> Any:
@@ -123,11 +118,7 @@ def layout_of(file: Path, own: Container[Path] = ()) -> Layout | None:
     return next((one for one in LAYOUTS if one is not LANGSPLAT and file.name.endswith(one.suffix)), None)
 
 
-def open_map(
-    file: Path,
-    reading: Reading = Reading(),
-    own: Container[Path] = (),
-) -> StoredMap:  # [h, w, D]
+def open_map(file: Path, reading: Reading = Reading(), own: Container[Path] = ()) -> StoredMap:  # [h, w, D]
     """Map a file into memory without reading its values; its kind, its number of axes and their order are checked.
 
     Args:
@@ -140,9 +131,7 @@ def open_map(
         TypeError: if it holds anything but one tensor.
     """
     layout = layout_of(file, own)
-    if layout is None:
-        endings = ", ".join(layout.suffix for layout in LAYOUTS)
-        raise ValueError(f"{file}: expected a name that ends in one of {endings}, got {file.name!r}; rename the map")
+    assert layout is not None, f"{file} is no map"
     try:
         found = layout.open(file, reading)
     except Exception as error:  # a damaged pickle raises almost anything: struct.error, KeyError, EOFError, ...

@@ -45,18 +45,6 @@ class MapRecord:
         return "has changed" if read else "was copied or changed"
 
 
-_KINDS: dict[str, type | tuple[type, ...]] = {  # in JSON
-    "file": str,
-    "shape": list,
-    "bytes": int,
-    "mtime_ns": int,
-    "digest": str,
-    "image": str,
-    "image_digest": str,
-    "seconds": (int, float),
-}
-
-
 @dataclass(frozen=True, repr=False)
 class Manifest:
     """The maps of one teacher, by the stem of their picture. The maps may have been deleted since (`discarded`)."""
@@ -87,8 +75,9 @@ def read_manifest(folder: str | Path) -> Manifest | None:
         found = read_json(path)
         if not isinstance(found, dict) or found.get("format") != FORMAT:
             raise ValueError(f"expected format {FORMAT!r}, got something else")
-        kinds = {"teacher": dict, "maps": dict, "discarded": bool}
-        teacher, maps, discarded = (_entry(found, name, kind) for name, kind in kinds.items())
+        teacher, maps, discarded = (found.get(name) for name in ("teacher", "maps", "discarded"))
+        if not isinstance(teacher, dict) or not isinstance(maps, dict) or not isinstance(discarded, bool):
+            raise ValueError("teacher, maps or discarded is missing or of another type")
         if not _is_plain(teacher, LEVELS):
             raise ValueError("teacher holds NaN or infinity, or is nested too deeply")
         return Manifest(teacher, {stem: _read_record(stem, entry) for stem, entry in maps.items()}, discarded)
@@ -104,21 +93,22 @@ def read_manifest(folder: str | Path) -> Manifest | None:
 
 def _read_record(stem: str, found: Any) -> MapRecord:
     """One map's record from JSON; a ValueError says what is wrong with it."""
-    try:
-        if not isinstance(found, dict):
-            raise ValueError(f"a record is a {type(found).__name__}")
-        values = {name: _entry(found, name, kind) for name, kind in _KINDS.items()}
-        file, shape = PurePosixPath(values["file"]), values["shape"]
-        if not file.name or file.is_absolute() or ".." in file.parts or "\0" in str(file):
-            raise ValueError(f"file {str(file)[:80]!r} is no name within the folder")
-        if len(shape) != 3 or not all(type(size) is int and 0 < size <= LARGEST for size in shape):
-            raise ValueError(f"shape {str(shape)[:80]} is not three positive whole numbers")
-        if not all(0 <= values[name] <= LARGEST for name in ("bytes", "seconds")):  # NaN fails every comparison
-            numbers = f"{str(values['bytes'])[:30]} and {str(values['seconds'])[:30]}"
-            raise ValueError(f"bytes and seconds cannot be {numbers}")
-    except ValueError as error:
-        raise ValueError(f"{one_line(stem)}: {error}") from error
-    return MapRecord(**{**values, "shape": tuple(shape)})
+    found = found if isinstance(found, dict) else {}
+    file, shape = found.get("file"), found.get("shape")
+    path, sizes = PurePosixPath(str(file)), shape if isinstance(shape, list) else []
+    inside = path.name and not path.is_absolute() and ".." not in path.parts and "\0" not in str(file)
+    good = {
+        "file": isinstance(file, str) and inside,
+        "shape": len(sizes) == 3 and all(type(size) is int and 0 < size <= LARGEST for size in sizes),
+        "bytes": type(found.get("bytes")) is int and 0 <= found["bytes"] <= LARGEST,
+        "seconds": type(found.get("seconds")) in (int, float) and 0 <= found["seconds"] <= LARGEST,  # NaN fails
+        "mtime_ns": type(found.get("mtime_ns")) is int,
+        **{name: isinstance(found.get(name), str) for name in ("digest", "image", "image_digest")},
+    }
+    for name, is_good in good.items():
+        if not is_good:
+            raise ValueError(f"{one_line(stem)}: {name} cannot be {one_line(found.get(name, 'missing'))}")
+    return MapRecord(shape=tuple(sizes), **{name: found[name] for name in good if name != "shape"})
 
 
 def _is_plain(value: Any, levels: int) -> bool:
@@ -130,15 +120,6 @@ def _is_plain(value: Any, levels: int) -> bool:
     return levels > 0 and all(
         _is_plain(one, levels - 1) for one in (value.values() if isinstance(value, dict) else value)
     )
-
-
-def _entry(found: dict[str, Any], name: str, kind: type | tuple[type, ...]) -> Any:
-    if name not in found:
-        raise ValueError(f"{name} is missing")
-    value = found[name]
-    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-        raise ValueError(f"{name} is a {type(value).__name__}")
-    return value
 
 
 def plain_identity(identity: Mapping[str, Any]) -> dict[str, Any]:

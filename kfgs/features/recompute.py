@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,6 @@ class RecomputedMaps(Sequence[Tensor]):
         self.identity = plain_identity(identify(self.teacher))
         self._image_digests: dict[int, str] = {}
         self._sampled: dict[tuple[int, str], Path] = {}  # samples that this process made or checked
-        self._shape: tuple[int, int, int] | None = None
 
     def __len__(self) -> int:
         return len(self.pictures)
@@ -75,15 +75,13 @@ class RecomputedMaps(Sequence[Tensor]):
         """The pictures."""
         return [picture.path for picture in self.pictures]
 
-    @property
+    @cached_property
     def shape(self) -> tuple[int, int, int]:
         """(h, w, D) of the first map; runs the teacher unless samples of that map were stored."""
-        if self._shape is None:
-            records = [manifest.maps.get(self.stems[0]) for manifest in self._folders().values()]
-            made = [one.shape for one in records if one is not None and one.image_digest == self._image_digest(0)]
-            h, w, D = map(int, made[0] if made else self[0].shape)
-            self._shape = h, w, D
-        return self._shape
+        records = [manifest.maps.get(self.stems[0]) for manifest in self._folders().values()]
+        made = [one.shape for one in records if one is not None and one.image_digest == self._image_digest(0)]
+        h, w, D = map(int, made[0] if made else self[0].shape)
+        return h, w, D
 
     def digests(self) -> list[list[str]]:
         """[name, SHA-256] of what decides each map: the teacher's identity and the picture's bytes."""

@@ -14,8 +14,9 @@ from torch import Tensor
 
 from .._files import bytes_in_words, digest_file
 from ..teachers.protocol import Teacher, check_features
-from .layouts import map_file
-from .manifest import MANIFEST, Manifest, MapRecord, differences, plain_identity, read_manifest
+from .finder import MapFinder
+from .layouts import LAYOUTS, OWN, layout_of, map_file
+from .manifest import MANIFEST, Manifest, MapRecord, differences, plain_identity
 from .pictures import Picture
 
 try:
@@ -62,26 +63,53 @@ class MapWriter:
     Args:
         folder: of the maps.
         identity: of the teacher, see `identify`.
-        pictures: whose maps will be asked for.
+        pictures: whose maps will be written, or are there already.
+        overwrite: give up maps in the folder that another teacher or another program made.
 
     Raises:
         TypeError: if JSON cannot hold `identity`.
-        ValueError: if the folder holds maps of another teacher; the message says what differs.
+        ValueError: if the folder holds maps of another teacher (the message says what differs), or of other programs.
     """
 
-    def __init__(self, folder: Path, identity: Mapping[str, Any], pictures: Sequence[Picture]) -> None:
-        wanted, found = plain_identity(identity), read_manifest(folder)
-        if found is not None and found.teacher != wanted:
+    def __init__(
+        self, folder: Path, identity: Mapping[str, Any], pictures: Sequence[Picture], *, overwrite: bool = False
+    ) -> None:
+        wanted, finder, files = (
+            plain_identity(identity),
+            MapFinder(folder),
+            [map_file(folder, p.stem) for p in pictures],
+        )
+        finder.own |= set(files)
+        before = (file for picture in pictures for file in finder.beside(picture.stem) if file not in files)
+        if other := next(
+            (file for file in before if layout_of(file, finder.own) in LAYOUTS[: LAYOUTS.index(OWN)]), None
+        ):
             raise ValueError(
-                f"folder: expected maps of the same teacher as now, got others in {folder} "
-                f"({differences(found.teacher, wanted)}); use another folder, or pass overwrite=True "
-                f"(--overwrite) to give up its {len(found.maps)} maps"
+                f"folder: expected one without maps of other programs, got {other}, which would be read instead of ours; "
+                "use another folder"
             )
+        found = finder.manifest
+        if found is None and not overwrite and (other := next((file for file in files if file.is_file()), None)):
+            raise ValueError(
+                f"folder: expected one without maps of other programs, got {other} and no {MANIFEST}; use another "
+                "folder, or pass overwrite=True (--overwrite)"
+            )
+        if found is not None and found.teacher != wanted:
+            if not overwrite:
+                raise ValueError(
+                    f"folder: expected maps of the same teacher as now, got others in {folder} "
+                    f"({differences(found.teacher, wanted)}); use another folder, or pass overwrite=True "
+                    f"(--overwrite) to give up its {len(found.maps)} maps"
+                )
+            for stem in found.maps:
+                if (file := map_file(folder, stem)) in finder.own:  # never a file outside of the folder
+                    file.unlink(missing_ok=True)
+            found = None
         self.folder, self.manifest = folder, found or Manifest(wanted)
         self._missing = {stem for stem, one in self.manifest.maps.items() if not (folder / one.file).is_file()}
         if found is None:
             self.manifest.save(folder)  # from now on, a map without a record is one that a killed process left
-        for file in [folder / MANIFEST, *(map_file(folder, picture.stem) for picture in pictures)]:
+        for file in [folder / MANIFEST, *files]:
             if file.parent.is_dir():
                 literal = "".join(f"[{c}]" if c in "*?[" else c for c in file.name)
                 for left_over in file.parent.glob(f".{literal}.*"):

@@ -242,7 +242,7 @@ def test_only_what_kfgs_wrote_is_discarded(pictures, tmp_path):
     assert len(contents(folder)) == 3
     (tmp_path / "outside.npy").write_bytes(b"mine")
     whole = (folder / "features.json").read_text()
-    for name, said in (("../outside.npy", "no name within the folder"), ("b.npy", r"got another file in .*b\.npy")):
+    for name, said in (("../outside.npy", tells("file", "../outside")), ("b.npy", r"got another file in .*b\.npy")):
         about = json.loads(whole)
         about["maps"] = {"a": about["maps"]["a"] | {"file": name, "bytes": 4}}
         (folder / "features.json").write_text(json.dumps(about))
