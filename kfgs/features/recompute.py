@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -12,15 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._files import atomic_path, digest_file, digest_value
+from .._files import atomic_path, digest_file, digest_value, read_json, write_json
 from ..quant.sampling import SAMPLES, sample_grid
 from ..scenes import Scene
 from ..teachers.protocol import Teacher, as_teacher, identify
-from .extract import discard_maps
-from .layouts import map_file
-from .manifest import MANIFEST, Manifest, plain_identity, read_manifest
+from .manifest import plain_identity
 from .pictures import Split, as_pictures
-from .writer import MapWriter, encode_half, locked
+from .writer import encode_half
 
 
 class RecomputedMaps(Sequence[Tensor]):
@@ -53,11 +50,10 @@ class RecomputedMaps(Sequence[Tensor]):
         split: Split,
         store: str | Path,
     ) -> None:
-        self.teacher, self.store = as_teacher(teacher), Path(store)
-        self.pictures = as_pictures(scene, split, exist=True)
+        self.teacher, self.pictures = as_teacher(teacher), as_pictures(scene, split, exist=True)
         self.identity = plain_identity(identify(self.teacher))
+        self.store = Path(store) / f"samples-{digest_value(self.identity)[:12]}"
         self._image_digests: dict[int, str] = {}
-        self._sampled: dict[tuple[int, str], Path] = {}  # samples that this process made or checked
 
     def __len__(self) -> int:
         return len(self.pictures)
@@ -77,11 +73,9 @@ class RecomputedMaps(Sequence[Tensor]):
 
     @cached_property
     def shape(self) -> tuple[int, int, int]:
-        """(h, w, D) of the first map; runs the teacher unless samples of that map were stored."""
-        records = [manifest.maps.get(self.stems[0]) for manifest in self._folders().values()]
-        made = [one.shape for one in records if one is not None and one.image_digest == self._image_digest(0)]
-        h, w, D = map(int, made[0] if made else self[0].shape)
-        return h, w, D
+        """(h, w, D) of the first map; runs the teacher unless samples of that map have been stored."""
+        h, w, D = read_json(self._shape_file) if self._shape_file.is_file() else self[0].shape
+        return int(h), int(w), int(D)
 
     def digests(self) -> list[list[str]]:
         """[name, SHA-256] of what decides each map: the teacher's identity and the picture's bytes."""
@@ -116,49 +110,31 @@ class RecomputedMaps(Sequence[Tensor]):
             key: JSON that identifies what `change` does.
         """
         settings = {"step": None if step is None else list(step), "samples": samples if step is None else None}
-        about = plain_identity({**self.identity, "grid": {**settings, "change": key}})
-        folder = self.store / f"samples-{digest_value(about)[:12]}"
-        where = (i, folder.name)
-        if where not in self._sampled:
-            self._sampled[where] = self._make_samples(i, folder, about, (step, samples), change)
-        return torch.from_numpy(np.load(self._sampled[where], allow_pickle=False)).float()
+        about = plain_identity({"grid": {**settings, "change": key}, "image": self._image_digest(i)})
+        file = (
+            self.store / f"{self.stems[i]}-{digest_value(about)[:16]}.npy"
+        )  # the name says what the content depends on
+        try:
+            return torch.from_numpy(np.load(file, allow_pickle=False)).float()
+        except (OSError, EOFError, ValueError):  # not made yet, or damaged
+            features = self[i]
+        if i == 0:
+            write_json(self._shape_file, list(features.shape))
+        values = sample_grid(features if change is None else change(features), step, samples=samples)
+        half = values.half()
+        kept = half if torch.equal(half.float(), values) else values  # a changed map need not be of half precision
+        with atomic_path(file) as temporary:
+            np.save(temporary, kept.contiguous().numpy())
+        return values
 
     def clear(self) -> None:
-        """Delete the samples, once the codebook has been fitted. What is known about the maps stays."""
-        for folder in self._folders():
-            discard_maps(folder)
-        self._sampled.clear()
+        """Delete this teacher's samples, once the codebook has been fitted. The shape of the maps stays known."""
+        for file in self.store.rglob("*.npy"):
+            file.unlink()
 
-    def _folders(self) -> dict[Path, Manifest]:
-        """The folders of samples of this teacher, for any grid, and their manifests."""
-        found = {path.parent: read_manifest(path.parent) for path in sorted(self.store.glob(f"samples-*/{MANIFEST}"))}
-        mine = {**self.identity, "grid": None}
-        return {path: one for path, one in found.items() if one is not None and {**one.teacher, "grid": None} == mine}
-
-    def _make_samples(
-        self,
-        i: int,
-        folder: Path,
-        about: dict[str, Any],
-        grid: tuple[tuple[int, int] | None, int],
-        change: Callable[[Tensor], Tensor] | None,
-    ) -> Path:
-        """The file of the samples of map i, which is written unless it is there and of this picture."""
-        picture, target = self.pictures[i], map_file(folder, self.stems[i])
-        with locked(folder):
-            writer = MapWriter(folder, about, [picture])
-            if writer.doubt(picture.stem, self._image_digest(i)) is None:
-                return target
-            start, features = time.perf_counter(), self[i]
-            seconds = time.perf_counter() - start
-            h, w, D = map(int, features.shape)
-            values = sample_grid(features if change is None else change(features), grid[0], samples=grid[1])
-            half = values.half()
-            kept = half if torch.equal(half.float(), values) else values  # a changed map need not be of half precision
-            with atomic_path(target) as temporary:
-                np.save(temporary, kept.contiguous().numpy())
-            writer.add(picture, self._image_digest(i), target, (h, w, D), seconds)
-        return target
+    @property
+    def _shape_file(self) -> Path:
+        return self.store / f"shape-{self._image_digest(0)[:16]}.json"
 
     def _image_digest(self, i: int) -> str:
         if i not in self._image_digests:
