@@ -9,7 +9,7 @@ from pathlib import Path
 from .._rows import EPS, row_norms
 from ..scenes.names import some
 from .finder import MapFinder
-from .layouts import FEATURE_3DGS, OWN, ROW_BLOCK, Reading, StoredMap, count_bad, fits_aspect, read_block
+from .layouts import FEATURE_3DGS, OWN, Reading, StoredMap, count_bad, fits_aspect, read_rows
 from .manifest import MANIFEST
 
 HOLES = 0.5  # share of all-zero features from which a map gets a note
@@ -168,8 +168,7 @@ def _check_values(name: str, stored: StoredMap, report: FeatureReport) -> None:
     h, w, _ = stored.shape
     bad = zeros = 0
     try:
-        for start in range(0, h, ROW_BLOCK):
-            rows = read_block(stored, slice(start, start + ROW_BLOCK))
+        for rows in read_rows(stored):
             bad += count_bad(rows)
             zeros += int((row_norms(rows) <= EPS).sum())
     except ValueError as error:  # mask numbers beyond the masks

@@ -18,7 +18,7 @@ from ..scenes import Scene
 from .check import FeatureReport, check_maps
 from .finder import MapFinder
 from .langsplat import parse_level, rows_file
-from .layouts import LANGSPLAT, ROW_BLOCK, Reading, StoredMap, count_bad, layout_of, read_block
+from .layouts import LANGSPLAT, Reading, StoredMap, count_bad, layout_of, read_rows
 from .manifest import MANIFEST
 from .pictures import Picture, Split, as_pictures, check_stems, pictures_of
 
@@ -196,13 +196,7 @@ class FeatureFolder(Sequence[Tensor]):
         if isinstance(index, slice):
             sizes = None if self.sizes is None else self.sizes[index]
             return self._with(self.stems[index], sizes)
-        stored = self._checked(index)
-        values, bad = torch.empty(self.shape, dtype=torch.float32), 0
-        for start in range(0, self.shape[0], ROW_BLOCK):  # by rows, so that memory holds the values and nothing else
-            rows = slice(start, start + ROW_BLOCK)
-            bad += count_bad(read_block(stored, rows, out=values[rows]))
-        self._check_finite(index, bad)
-        return values
+        return self._read(index)
 
     def grid(self, i: int, step: tuple[int, int] | None, samples: int) -> Tensor:  # [n, D] float32
         """`quant.sample_grid(maps[i], step, samples=samples)`, reading no more of the file than these pixels.
@@ -210,10 +204,8 @@ class FeatureFolder(Sequence[Tensor]):
         Raises:
             ValueError: as when the whole map is read, but only the values that are read are checked.
         """
-        stored = self._checked(i)
-        values = read_block(stored, *grid_slices(*self.shape[:2], step, samples=samples))
-        self._check_finite(i, count_bad(values))
-        return values.reshape(-1, self.shape[2])
+        rows, columns = grid_slices(*self.shape[:2], step, samples=samples)
+        return self._read(i, rows, columns).reshape(-1, self.shape[2])
 
     def digests(self) -> list[list[str]] | None:
         """[file name, SHA-256] of each view's map if they are known without reading the maps, else None.
@@ -251,18 +243,18 @@ class FeatureFolder(Sequence[Tensor]):
             )
         return self._finder.open(stem, file, replace(self.reading, size=size))
 
-    def _checked(self, i: int) -> StoredMap:
-        """View i's map, if it has the size of the first."""
-        stored = self._open(i)
+    def _read(self, i: int, rows: slice = slice(None), columns: slice = slice(None)) -> Tensor:  # [h, w, D]
+        """Some rows and columns of view i's map, if it has the size of the first and they are finite."""
+        stored, (h, w, D) = self._open(i), self.shape
         if tuple(stored.shape) != self.shape:
             raise ValueError(
                 f"{self.files[i]}: expected a map of (h, w, D) = {self.shape} as in {self.files[0].name}, got "
                 f"{tuple(stored.shape)}; encode all views with the same settings"
             )
-        return stored
-
-    def _check_finite(self, i: int, bad: int) -> None:
+        values = torch.empty(len(range(h)[rows]), len(range(w)[columns]), D, dtype=torch.float32)
+        bad = sum(count_bad(block) for block in read_rows(stored, rows, columns, out=values))
         if bad:
             raise ValueError(
                 f"{self.files[i]}: expected finite features, got {bad} NaN or infinite values; encode it again"
             )
+        return values

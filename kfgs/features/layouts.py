@@ -6,7 +6,7 @@ import math
 import pickle
 import warnings
 import zipfile
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -160,23 +160,27 @@ def _reason(error: Exception) -> str:
     return text if isinstance(error, ValueError) and text else f"{type(error).__name__}: {text}"
 
 
-def read_block(
+def read_rows(
     stored: StoredMap,  # [h, w, D]
     rows: slice = slice(None),
     columns: slice = slice(None),
     out: Tensor | None = None,  # [rows, columns, D] float32
-) -> Tensor:  # [rows, columns, D] float32
-    """Copy some rows and columns of a map in single precision; only these are read from disk.
+) -> Iterator[Tensor]:  # each [at most ROW_BLOCK, columns, D] float32
+    """Copy some rows and columns of a map in single precision, a few rows at a time; only these are read from disk.
 
-    A value beyond the range of single precision becomes infinite.
+    A value beyond the range of single precision becomes infinite. With `out`, the copies are parts of it.
     """
-    block = stored[rows, columns]
-    out = torch.empty(tuple(block.shape), dtype=torch.float32) if out is None else out
-    if isinstance(block, Tensor):
-        return out.copy_(block)
-    with np.errstate(over="ignore"):
-        np.copyto(out.numpy(), block, casting="same_kind")
-    return out
+    chosen = range(int(stored.shape[0]))[rows]
+    for start in range(0, len(chosen), ROW_BLOCK):
+        part = chosen[start : start + ROW_BLOCK]
+        block = stored[part.start : part.stop : part.step, columns]
+        copy = torch.empty(tuple(block.shape), dtype=torch.float32) if out is None else out[start : start + ROW_BLOCK]
+        if isinstance(block, Tensor):
+            copy.copy_(block)
+        else:
+            with np.errstate(over="ignore"):
+                np.copyto(copy.numpy(), block, casting="same_kind")
+        yield copy
 
 
 def count_bad(values: Tensor) -> int:  # any shape, not empty

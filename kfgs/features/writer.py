@@ -74,20 +74,16 @@ class MapWriter:
     def __init__(
         self, folder: Path, identity: Mapping[str, Any], pictures: Sequence[Picture], *, overwrite: bool = False
     ) -> None:
-        wanted, finder, files = (
-            plain_identity(identity),
-            MapFinder(folder),
-            [map_file(folder, p.stem) for p in pictures],
-        )
+        wanted, finder = plain_identity(identity), MapFinder(folder)
+        files = {map_file(folder, picture.stem): picture.stem for picture in pictures}
         finder.own |= set(files)
-        before = (file for picture in pictures for file in finder.beside(picture.stem) if file not in files)
-        if other := next(
-            (file for file in before if layout_of(file, finder.own) in LAYOUTS[: LAYOUTS.index(OWN)]), None
-        ):
-            raise ValueError(
-                f"folder: expected one without maps of other programs, got {other}, which would be read instead of ours; "
-                "use another folder"
-            )
+        read_first = LAYOUTS[: LAYOUTS.index(OWN)]
+        for file in (file for stem in files.values() for file in finder.beside(stem)):
+            if layout_of(file, finder.own) in read_first:
+                raise ValueError(
+                    f"folder: expected one without maps of other programs, got {file}, which would be read instead of ours; "
+                    "use another folder"
+                )
         found = finder.manifest
         if found is None and not overwrite and (other := next((file for file in files if file.is_file()), None)):
             raise ValueError(
