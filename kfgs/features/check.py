@@ -9,8 +9,7 @@ from pathlib import Path
 from .._rows import EPS, row_norms
 from ..scenes.names import some
 from .finder import MapFinder
-from .layouts import FEATURE_3DGS, OWN, Reading, StoredMap, count_bad, fits_aspect, read_rows
-from .manifest import MANIFEST
+from .layouts import Reading, StoredMap, count_bad, fits_aspect, read_rows
 
 HOLES = 0.5  # share of all-zero features from which a map gets a note
 Shape = tuple[int, int, int]  # (h, w, D)
@@ -124,28 +123,18 @@ def check_maps(finder: MapFinder, sizes: dict[str, Size], reading: Reading, *, v
 
 def _find(finder: MapFinder, stems: list[str], report: FeatureReport) -> dict[str, Path]:
     """The one file of each view that has one; what is missing, unclear or superfluous goes into the report."""
-    discarded = [stem for stem in stems if finder.discarded(stem)]
-    found = finder.find([stem for stem in stems if stem not in discarded])
+    found = finder.find(stems)
+    for name, text in finder.faults(found).items():
+        report.problems[name].append(text)
     missing = [stem for stem, files in found.items() if not files]
-    for stem in missing:
-        if finder.manifest is None:
-            report.problems[stem + FEATURE_3DGS.suffix].append("missing, and no other layout of this view either")
-        else:
-            report.problems[stem + OWN.suffix].append("missing; `kfgs features` with the --split of this view makes it")
     if len(missing) == len(stems):
         report.notes[""].append(finder.explain_missing(stems, missing))
-    for stem, files in found.items():
-        if len(files) > 1:
-            names = ", ".join(file.relative_to(finder.path).as_posix() for file in files[:3])
-            report.problems[stem + FEATURE_3DGS.suffix].append(f"{len(files)} maps may be meant: {names}")
+    discarded = [stem for stem in stems if finder.discarded(stem)]
     if discarded:
         report.notes[""].append(
             f"maps that were discarded once index maps had been made: {len(discarded)} of {len(stems)}"
         )
-    chosen = {stem: files[0] for stem, files in found.items() if len(files) == 1}
-    for file in finder.without_record(chosen.values()):
-        text = f"{MANIFEST} has no record of it: another program made it, or a process that was killed"
-        report.problems[file.relative_to(finder.path).as_posix()].append(text)
+    chosen = {stem: files[0] for stem, files in found.items() if len(files) == 1 and stem not in discarded}
     others = sorted(set(finder.listed()) - set(stems)) if chosen else []
     if others:
         report.notes[""].append(f"maps of none of these views: {len(others)} ({some(others, 3)})")

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from ..scenes.names import some
 from ..scenes.scene import IMAGE_SUFFIXES
 from .layouts import FEATURE_3DGS, LAYOUTS, OWN, Reading, StoredMap, layout_of, open_map
-from .manifest import MapRecord, read_manifest
+from .manifest import MANIFEST, MapRecord, read_manifest
 
 
 class MapFinder:
@@ -45,10 +45,6 @@ class MapFinder:
         """Map a view's file into memory, see `layouts.open_map`; a record tells the order of the axes."""
         record = self.record(stem, file)
         return open_map(file, replace(reading, channels=record.shape[2]) if record else reading, self.own)
-
-    def without_record(self, files: Iterable[Path]) -> list[Path]:
-        """Maps in a folder of kfgs that its manifest does not list: its teacher need not have made them."""
-        return [] if self.manifest is None else [file for file in files if file not in self.own]
 
     def discarded(self, stem: str) -> Path | None:
         """Where a view's map was before it was discarded; None if it is there, or was never made or never discarded."""
@@ -108,6 +104,31 @@ class MapFinder:
         """The file that is called `stem` and the suffix of a layout, in a list; an empty list if there is none."""
         files = ((self.path / f"{stem}{layout.suffix}", layout) for layout in LAYOUTS)
         return [file for file, layout in files if file.is_file() and layout_of(file, self.own) is layout][:1]
+
+    def faults(self, found: dict[str, list[Path]]) -> dict[str, str]:
+        """What is wrong with the files that `find` returned, by the name of the file (if there is none, of the one expected).
+
+        A map without a record in a folder that kfgs filled is a fault: its teacher need not have made it.
+        """
+        faults = {}
+        for stem, files in found.items():
+            names = [file.relative_to(self.path).as_posix() for file in files]
+            expected = stem + (OWN if self.manifest else FEATURE_3DGS).suffix
+            if len(files) > 1:
+                text = (
+                    f"expected one map for view {stem!r}, got {len(files)}: {some(names, 3)}; name the subfolder itself"
+                )
+                faults[expected] = text
+            elif not files and self.manifest:
+                faults[expected] = "missing; `kfgs features` with the --split of this view makes it"
+            elif not files:
+                faults[expected] = "missing, and no other layout of this view either; encode it"
+            elif self.manifest and files[0] not in self.own:
+                faults[names[0]] = (
+                    f"expected a map that {MANIFEST} lists, as kfgs filled this folder, got one without a record; move it "
+                    "away if another program made it, then run `kfgs features`, which makes (or overwrites) it"
+                )
+        return faults
 
     def explain_missing(self, stems: Sequence[str], missing: Sequence[str]) -> str:
         """The message for views without a map: which views, and what the maps that are there are called."""

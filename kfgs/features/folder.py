@@ -19,7 +19,6 @@ from .check import FeatureReport, check_maps
 from .finder import MapFinder
 from .langsplat import parse_level, rows_file
 from .layouts import LANGSPLAT, Reading, StoredMap, count_bad, layout_of, read_rows
-from .manifest import MANIFEST
 from .pictures import Picture, Split, as_pictures, check_stems, pictures_of
 
 
@@ -152,21 +151,12 @@ class FeatureFolder(Sequence[Tensor]):
     def files(self) -> list[Path]:
         """The file of each view's map; the file that it was, if it has been discarded."""
         found = self._finder.find(self.stems)
-        for stem, files in found.items():
-            if len(files) > 1:
-                names = ", ".join(str(file.relative_to(self.path)) for file in files[:3])
-                raise ValueError(
-                    f"{self.path}: expected one map for view {stem!r}, got {len(files)}: {names}; name the subfolder itself"
-                )
         missing = [stem for stem, files in found.items() if not files]
         if missing:
             raise FileNotFoundError(f"{self.path}: {self._finder.explain_missing(self.stems, missing)}")
-        if others := self._finder.without_record(files[0] for files in found.values()):
-            raise ValueError(
-                f"{others[0]}: expected a map that {MANIFEST} lists, as kfgs filled this folder, got one without a record "
-                f"({len(others)} of {len(found)} views); move it away if another program made it, then run `kfgs features` "
-                "again, which makes these maps (it would overwrite this one)"
-            )
+        faults = self._finder.faults(found)
+        for name, text in faults.items():
+            raise ValueError(f"{self.path / name}: {text} ({len(faults)} of {len(found)} views)")
         return [files[0] for files in found.values()]
 
     @cached_property

@@ -75,7 +75,7 @@ def test_all_that_does_not_fit_is_reported_at_once_by_file(folder):
     ]
     assert report.problems["whole.npy"] == ["expected floating-point features, got int32; encode it again"]
     assert "cannot be read" in report.problems["junk_fmap_CxHxW.pt"][0]
-    assert report.problems["gone_fmap_CxHxW.pt"] == ["missing, and no other layout of this view either"]
+    assert report.problems["gone_fmap_CxHxW.pt"] == ["missing, and no other layout of this view either; encode it"]
     lines = str(report).splitlines()
     assert lines[0].startswith(f"{folder}: 3 of 11 views have a map that fits; 6 x 8 x 16 float16")
     assert len(lines) == 9
@@ -186,7 +186,9 @@ def test_several_files_of_one_view(folder):
         np.save(folder / name / "0001.npy", features(0).numpy())
     report = check(folder, pictures("0001"))
     problem = report.problems["0001_fmap_CxHxW.pt"]
-    assert problem == ["2 maps may be meant: left/0001.npy, right/0001.npy"]
+    assert problem == [
+        "expected one map for view '0001', got 2: left/0001.npy, right/0001.npy; name the subfolder itself"
+    ]
 
 
 def test_discarded_maps_are_a_note(tmp_path):
@@ -242,7 +244,7 @@ def test_a_map_without_a_record_among_kfgss_own_is_a_problem(tmp_path):
     report = check(tmp_path, pictures("a_s", "a_f", "b"))
     ((name, (text,)),) = report.problems.items()
     assert name == "b.npy"
-    assert text.startswith("features.json has no record of it")
+    assert text.startswith("expected a map that features.json lists")
     with pytest.raises(ValueError, match=tells("b.npy: expected a map that features.json lists")):
         FeatureFolder(tmp_path, ["a_s", "a_f", "b"])
 
