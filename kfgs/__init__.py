@@ -55,7 +55,6 @@ _WHERE = {
     "plan_scene": ".pipeline",
     "uplift": ".pipeline",
     "UpliftConfig": ".fields",
-    "check_feature_folder": ".features",
     "FieldConfig": ".fields",
     "GaussianParams": ".fields",
     "SemanticField": ".fields",
@@ -82,7 +81,6 @@ if TYPE_CHECKING:
     from .evaluation import score_views as score_views
     from .features import FeatureFolder as FeatureFolder
     from .features import RecomputedMaps as RecomputedMaps
-    from .features import check_feature_folder as check_feature_folder
     from .features import extract_features as extract_features
     from .features import pictures_of as pictures_of
     from .fields import FieldConfig as FieldConfig

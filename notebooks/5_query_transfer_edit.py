@@ -43,7 +43,7 @@ from kfgs.pipeline import views_of_change
 scene = kfgs.load_scene(folder).undistorted()
 classes = kfgs.load_label_set(names, text)
 cameras = [scene.cameras[i] for i in scene.views("train")]
-maps = kfgs.FeatureFolder(features, [scene.stem(i) for i in scene.views("train")])
+maps = kfgs.FeatureFolder(features).of(scene, "train")
 quick = kfgs.ColorConfig.quick()
 quick = replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000))
 own = kfgs.fit_color(scene, run, quick).gaussians  # notebook 4 looks at this step and the next

@@ -61,7 +61,7 @@ from kfgs.pipeline import feature_colors
 scene = load_scene(folder).undistorted()
 classes = load_label_set(names, text)
 cameras = [scene.cameras[i] for i in scene.views("train")]
-maps = FeatureFolder(features, [scene.stem(i) for i in scene.views("train")])
+maps = FeatureFolder(features).of(scene, "train")
 quick = ColorConfig.quick()
 color_config = replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000))
 color = fit_color(scene, run, color_config).gaussians

@@ -58,7 +58,6 @@ from kfgs import (
     label_set_from_examples,
     load_scene,
     make_label_set,
-    pictures_of,
     plan_scene,
     resize_map,
     run_sfm,
@@ -185,8 +184,8 @@ print(plan_scene(scene, teacher=TeacherCost.of_maps("colour words", map_size), c
 # it depends on has changed: run this notebook twice, and the second time takes seconds.
 
 # %%
-manifest = extract_features(teacher, pictures_of(scene, train), out / "features")
-maps = FeatureFolder(out / "features", [scene.stem(i) for i in train])
+manifest = extract_features(teacher, scene, out / "features", split="train")
+maps = FeatureFolder(out / "features").of(scene, "train")
 fitted = fit_scene(scene, maps, out / "run", config, report=print)
 semantic = fitted.field
 print(semantic.summary())

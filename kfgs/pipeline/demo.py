@@ -65,7 +65,7 @@ def run(
     scene = load_scene(folder)
     classes = load_label_set(folder / "classes.json", folder / "text.npy")
 
-    maps = FeatureFolder(folder / "features", [scene.stem(i) for i in scene.views("train")])
+    maps = FeatureFolder(folder / "features").of(scene, "train")
     colors = replace(ColorConfig.quick(), seed=config.seed)
     colored = fit_color(scene, out / "run", colors, report=say, progress=progress)
     quality = score_views(colored.gaussians, scene)

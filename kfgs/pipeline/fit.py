@@ -226,14 +226,14 @@ def _check_inputs(scene: Scene, views: Sequence[int], maps: Maps, config: FitCon
     if len(views) != len(maps):
         raise ValueError(
             f"maps: expected one teacher map per view of split {split!r} ({len(views)}), got {len(maps)}; "
-            "read them with FeatureFolder(path, stems of that split)"
+            f"read them with FeatureFolder(path).of(scene, {split!r})"
         )
     check_scene(scene)
     stems = getattr(maps, "stems", None)
     if stems is not None and [Path(stem).name for stem in stems] != [Path(scene.stem(i)).name for i in views]:
         raise ValueError(
             f"maps: expected the maps of the views of split {split!r} in their order ({scene.stem(views[0])}, "
-            f"...), got {stems[0]}, ...; read them with FeatureFolder(path, [scene.stem(i) for i in scene.views(split)])"
+            f"...), got {stems[0]}, ...; read them with FeatureFolder(path).of(scene, {split!r})"
         )
 
 
