@@ -113,6 +113,9 @@ class ConfusionMatrix:
         self.ignore = ignore
         self._counts = torch.zeros(classes, classes + 1, dtype=torch.int64)  # the last column: no prediction
 
+    def __repr__(self) -> str:
+        return f"ConfusionMatrix({self.classes} classes, {int(self._counts.sum()):,} pixels)"
+
     @property
     def matrix(self) -> Tensor:  # [C, C] int64
         """Counts of (truth, prediction) where there was a prediction."""

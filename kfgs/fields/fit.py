@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from .._card import short_repr
 from .._check import check_range
 from ..cameras import Camera
 from .checkpoint import identify_fit, read_checkpoint, write_checkpoint
@@ -32,6 +33,8 @@ class FieldFit:
 
     params: GaussianParams
     history: list[dict[str, Any]]
+
+    __repr__ = short_repr
 
 
 def fit_field(

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from .._card import html_card
 from .._check import check_choice, check_shapes
 from .._rows import unit_embeddings, unit_rows
 from ..cameras import Camera
@@ -134,6 +135,20 @@ class SemanticField:
 
     def __repr__(self) -> str:
         return f"SemanticField({self.method}: {len(self)} Gaussians, {self.channels} channels for {self.dim})"
+
+    def _repr_html_(self) -> str:
+        teacher = self.info.get("teacher")
+        facts = {
+            "method": self.method,
+            "Gaussians": len(self),
+            "channels": f"{self.channels} for {self.dim} of the teacher",
+            "codewords": None if self.codebook is None else self.codebook.size,
+            "training views": len(self.cameras) or None,
+            "size (as Table 1 counts it)": f"{self.storage() / MIB:.2f} MiB",
+            "teacher": teacher.get("name") if isinstance(teacher, dict) else None,
+            "folder": None if self.folder is None else str(self.folder),
+        }
+        return html_card("SemanticField", facts)
 
     # Maps
 

@@ -46,6 +46,10 @@ class Autoencoder:
         if width != self.dim:
             raise ValueError(f"decoder: expected {self.dim} output channels (the encoder's input), got {width}")
 
+    def __repr__(self) -> str:
+        widths = [self.dim, *(len(bias) for _, bias in (*self.encoder, *self.decoder))]
+        return f"Autoencoder({self.dim} channels to {self.latent} latents and back, widths {widths})"
+
     @property
     def dim(self) -> int:
         """Channels of a feature, D."""

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from .._card import html_card, short_repr, short_value
 from .._check import check_range, check_shapes
 from .._rows import EPS, row_norms, unit_rows
 from ._store import read_tensors, write_tensors
@@ -23,6 +24,9 @@ class Nearest(NamedTuple):
 
     codeword: Tensor  # [...] int64
     similarity: Tensor  # [...] cosine with that codeword, in [-1, 1] up to rounding
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 class Compared(NamedTuple):
@@ -94,6 +98,12 @@ class Codebook:
             raise ValueError(
                 f"codewords: expected finite rows that are not all-zero, got bad rows {bad[:8]}; leave them out"
             )
+
+    __repr__ = short_repr
+
+    def _repr_html_(self) -> str:
+        facts = {"codewords": self.size, "channels": self.dim, "numbers": short_value(self.codewords)}
+        return html_card("Codebook", facts)
 
     @property
     def size(self) -> int:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from .._card import short_repr
 from .._check import check_range, check_whole
 from .._rows import row_norms, unit_rows
 from .autoencoder import Autoencoder, Layer, mlp, unit_latents
@@ -82,6 +83,8 @@ class AutoencoderFit:
     """Eq. 10 of the finished autoencoder, mean over codewords."""
     min_latent_distance: float
     """Smallest Euclidean distance between two codewords' latents (infinite for one codeword)."""
+
+    __repr__ = short_repr
 
 
 def fit_autoencoder(

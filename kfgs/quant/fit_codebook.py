@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from .._card import short_repr
 from .._check import check_range, check_shapes, check_whole
 from .._rows import EPS, row_norms, unit_rows
 from .codebook import Codebook
@@ -121,6 +122,8 @@ class CodebookFit:
     """The similarity that `coverage` counts: `expand_below`, or what the data reached."""
     note: str | None
     """One line that says what to do when the book is full or covers too little; None if all is well."""
+
+    __repr__ = short_repr
 
 
 def fit_codebook(

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import check_range, check_shapes, check_whole
 from .._rows import unit_rows
 
@@ -34,6 +35,8 @@ class LinearLatents:
         gram = self.basis.detach().T @ self.basis.detach()
         if not bool((gram - torch.eye(sizes["d"]).to(gram)).abs().max() < 1e-3):
             raise ValueError("basis: expected orthonormal columns, got others; make one with fit_linear_latents")
+
+    __repr__ = short_repr
 
     @property
     def dim(self) -> int:

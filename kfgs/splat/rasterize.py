@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from .._card import html_card, short_value
 from ..cameras.camera import Camera
 from ..gaussians import Gaussians
 from .engines import composite
@@ -20,6 +21,20 @@ class Rendering(NamedTuple):
     map: Tensor  # [H, W, D] features, or red, green, blue
     alpha: Tensor  # [H, W] opacity in [0, 1): 1 - transmittance
     projected: Projected  # the visible Gaussians on the image plane
+
+    def __repr__(self) -> str:
+        return f"Rendering(map {short_value(self.map)}, {len(self.projected.index)} Gaussians in sight)"
+
+    def _repr_html_(self) -> str:
+        height, width, channels = self.map.shape
+        facts = {
+            "size": f"{width} x {height} pixels",
+            "channels": channels,
+            "numbers": short_value(self.map),
+            "covered": f"{float((self.alpha.detach() > 0.5).float().mean()):.1%} of the pixels are more than half opaque",
+            "Gaussians in sight": len(self.projected.index),
+        }
+        return html_card("Rendering", facts)
 
 
 def rasterize(

@@ -12,6 +12,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import check_range, check_shapes
 from .._files import atomic_path
 from .palette import palette
@@ -135,6 +136,8 @@ class FeatureColors:
     axes: Tensor  # [D, 3] principal directions, strongest first
     low: Tensor  # [3] projection that becomes 0
     high: Tensor  # [3] projection that becomes 255
+
+    __repr__ = short_repr
 
     @staticmethod
     def fit(

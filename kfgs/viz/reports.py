@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import check_shapes, check_whole
 from .._rows import unit_rows
 from ..labels import label_codewords
@@ -32,6 +33,9 @@ class CodebookRows(NamedTuple):
     labels: Tensor  # [R] int64, class of each
     similarity: Tensor  # [R, R] cosine between codewords
     words: tuple[tuple[tuple[int, float], ...], ...]  # R times the nearest classes, with their cosines, best first
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def codebook_rows(
