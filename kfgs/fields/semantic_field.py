@@ -8,11 +8,12 @@ from dataclasses import field as default
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from .._card import html_card
-from .._check import check_choice, check_shapes
+from .._check import as_tensor, check_choice, check_shapes
 from .._rows import unit_embeddings, unit_rows
 from ..cameras import Camera
 from ..gaussians import Gaussians
@@ -162,6 +163,7 @@ class SemanticField:
         latents: Tensor,  # [..., d]
     ) -> Tensor:  # [..., D]
         """Bring latents back to the teacher's space (Psi of Sec. 3.3.2, or B z); features are returned as they are."""
+        latents = as_tensor("latents", latents, floating=True)
         if latents.shape[-1] != self.channels:
             raise ValueError(
                 f"latents: expected [..., d] with d = {self.channels} (from gaussians), got {tuple(latents.shape)}; "
@@ -196,6 +198,7 @@ class SemanticField:
             ValueError: if there is no row, shapes disagree, or a row is all-zero.
         """
         check_choice("rule", rule, RULES)
+        rows = as_tensor("rows", rows, floating=True)
         check_rows("rows", rows, ("M",), self.dim)
         unit = unit_embeddings(rows, "rows").to(self.features)
         with torch.no_grad():
@@ -265,6 +268,8 @@ class SemanticField:
         Raises:
             ValueError: if there is no such class, shapes disagree, a row is all-zero, or an option is unknown.
         """
+        if not isinstance(target, str):
+            target = as_tensor("target", target, floating=True)
         if score == "cosine" and isinstance(negatives, str) and negatives == "auto":
             negatives = "none"
         compared = isinstance(negatives, str) and negatives != "none"  # from something that the classes' files hold
@@ -335,6 +340,7 @@ class SemanticField:
         Raises:
             ValueError: if the field has no codebook, or shapes disagree.
         """
+        embeddings = as_tensor("embeddings", embeddings, floating=True)
         check_rows("embeddings", embeddings, ("C",), self.dim)
         if self.codebook is None:
             raise ValueError("codebook: expected one, got None in this field; use classify or segment, which need none")
@@ -421,4 +427,11 @@ class SemanticField:
         return self.features if self.answers is None else self.answers
 
     def _rows(self, classes: Classes | None) -> Tensor:  # [C, D]
+        if isinstance(classes, str):
+            raise TypeError(
+                f"classes: expected a LabelSet or embeddings [C, {self.dim}], got the name {classes!r}; "
+                f"query({classes!r}) finds the Gaussians of one class"
+            )
+        if isinstance(classes, np.ndarray):
+            classes = as_tensor("classes", classes, floating=True)
         return class_rows(self.label_set() if classes is None else classes, self.dim, self.info)

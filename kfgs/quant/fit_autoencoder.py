@@ -113,10 +113,17 @@ def fit_autoencoder(
     Returns:
         The autoencoder, the history, the latents, and how many codewords are recovered.
 
+    Raises:
+        TypeError: if `codebook` is something else.
+
     Note:
         The released script compares unit outputs with codewords of any length (an error that cannot vanish), and uses
         running statistics that the decoder was not trained with.
     """
+    if not isinstance(codebook, Codebook):
+        raise TypeError(
+            f"codebook: expected a Codebook, got {type(codebook).__name__}; make one with Codebook(codewords)"
+        )
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     target = codebook.unit.detach()
     encoder = _linears((codebook.dim, *config.encoder, config.latent), generator, target)

@@ -11,7 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._card import short_repr
-from .._check import check_range, check_shapes, check_whole
+from .._check import as_tensor, check_range, check_shapes, check_whole
 from .._rows import EPS, row_norms, unit_rows
 from .codebook import Codebook
 from .evolve import admit, prune
@@ -366,7 +366,7 @@ def _samples(maps: FeatureMaps, i: int, config: CodebookConfig, dim: int | None 
         features = grid(i, config.grid_step, config.samples_of(len(maps)))
         check_shapes((f"maps.grid({i})", features, f"n {dim or 'D'}"))
     else:
-        feature_map = maps[i]  # once: this may read a file
+        feature_map = as_tensor(f"maps[{i}]", maps[i])  # once: this may read a file
         check_shapes((f"maps[{i}]", feature_map, f"h w {dim or 'D'}"))
         features = sample_grid(feature_map, config.grid_step, samples=config.samples_of(len(maps)))
     # row by row, whatever memory they come in: sums over another layout differ in their last bits
