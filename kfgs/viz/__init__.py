@@ -2,9 +2,9 @@
 
 from .animation import save_animation, save_frames
 from .boxes import add_boxes, add_names, add_selections
-from .clouds import CloudOptions, add_cloud, recolor_cloud
+from .clouds import CloudOptions, add_cloud, recolor_cloud, to_pyvista
 from .explorer import ExploreOptions, Explorer, explore
-from .field_colors import feature_colors
+from .field_colors import FeatureColors, feature_colors
 from .flythrough import flythrough_cameras, save_flythrough
 from .frusta import add_camera_images, add_cameras
 from .headless import available, make_plotter
@@ -13,9 +13,8 @@ from .legends import add_legend, add_scalar_bar
 from .linked import linked_clouds
 from .matches import Matches, add_matches, add_transfer, match_states
 from .page import Page, save_page
-from .pairs import picture_grid
 from .palette import PALETTE, palette
-from .pictures import FeatureColors, legend_column, legend_strip, overlay_labels, save_picture
+from .pictures import legend_column, legend_strip, overlay_labels, picture_grid, save_picture
 from .plots import plot_codebook_history, plot_confusion, plot_iou, plot_quality_storage, plot_training
 from .reports import CodebookRows, codebook_rows, plot_codebook_growth, plot_codebook_report
 from .shows import show_cloud
@@ -75,4 +74,5 @@ __all__ = [
     "save_picture",
     "save_turntable",
     "show_cloud",
+    "to_pyvista",
 ]

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 import torch
 
-from .._check import check_choice, check_shapes, check_whole
+from .._check import as_array, check_choice, check_shapes, check_whole
 from ..gaussians import Gaussians
 from ..labels import Transfer
-from .arrays import as_array
 from .frusta import evenly
 from .legends import add_legend
 from .meshes import draw_mesh
