@@ -19,7 +19,7 @@ from kfgs.gaussians import Gaussians
 from kfgs.labels import EditList, InBox, OfClass, Recolor, Remove, Where, connected_parts
 from kfgs.pipeline import render_color
 from kfgs.scenes import Scene, load_scene
-from kfgs.viz.pairs import picture_grid
+from kfgs.viz.pictures import picture_grid
 
 AROUND_CHAIR = 0.05  # metres around a chair's box: a cushion leans over its edge
 ABOVE_RUG = 0.03  # metres above which all in the boxes is taken for a rest of the chairs: the wall stands behind

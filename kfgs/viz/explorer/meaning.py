@@ -22,8 +22,7 @@ from ...labels import (
     class_indices,
 )
 from ...labels.questions import class_rows, make_question
-from ..field_colors import feature_colors, learnt_colors
-from ..pictures import FeatureColors
+from ..field_colors import FeatureColors, colors_of_features, feature_colors
 
 if TYPE_CHECKING:
     from ...fields import SemanticField
@@ -204,7 +203,7 @@ class SplatMeaning:
     def feature_colors(self) -> FeatureColors:
         """A projection fitted to the features of all Gaussians that have any."""
         assert self.gaussians.features is not None
-        return learnt_colors(self.gaussians.features)
+        return colors_of_features(self.gaussians.features)
 
 
 def _with_answers(field: SemanticField, cameras: Sequence[Camera]) -> tuple[SemanticField, str]:
