@@ -27,6 +27,11 @@ def pytest_collection_finish():
     gc.enable()
 
 
+def pytest_unconfigure():
+    """Libraries that count their objects at the end find none left over."""
+    gc.unfreeze()
+
+
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
