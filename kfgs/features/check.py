@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from .._rows import EPS, row_norms
-from ..scenes.names import some
+from ..scenes.files import some
 from .finder import MapFinder
 from .layouts import Reading, StoredMap, count_bad, fits_aspect, read_rows
 

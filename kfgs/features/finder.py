@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-from ..scenes.names import some
-from ..scenes.files import IMAGE_SUFFIXES
+from ..scenes.files import IMAGE_SUFFIXES, some
 from .layouts import FEATURE_3DGS, LAYOUTS, OWN, Reading, StoredMap, layout_of, open_map
 from .manifest import MANIFEST, MapRecord, read_manifest
 

@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from torch import Tensor
 
 from ..scenes import Scene, read_image
-from ..scenes.names import some
+from ..scenes.files import some
 
 Split = str | Sequence[str] | Sequence[int]
 """The name of a split, `all`, or a list of view names or indices."""

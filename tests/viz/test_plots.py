@@ -7,7 +7,7 @@ import torch
 from messages import tells
 from PIL import Image
 
-from kfgs.labels import select_where
+from kfgs.labels import Selection
 from kfgs.quant import fit_codebook
 from kfgs.viz import (
     palette,
@@ -200,7 +200,7 @@ DRAW = {
     "confusion": (1, lambda **to: plot_confusion(MATRIX, NAMES, **to)),
     "iou": (1, lambda **to: plot_iou(IOU, NAMES, reference=IOU, **to)),
     "quality": (1, lambda **to: plot_quality_storage({"ours": (13.0, 0.7)}, reference=TABLE_1, **to)),
-    "scores": (1, lambda **to: plot_scores(select_where(torch.tensor([True, False])), **to)),
+    "scores": (1, lambda **to: plot_scores(Selection.of(torch.tensor([True, False])), **to)),
     "distances": (1, lambda **to: plot_distances(np.array([0.1, 0.2]), 0.15, **to)),
 }
 
