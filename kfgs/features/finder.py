@@ -145,4 +145,4 @@ class MapFinder:
             )
         else:
             text, hint = f"{text} (or {missing[0]}{OWN.suffix})", "encode these views"
-        return f"{text}; {hint}, or leave them out of `stems`"
+        return f"{text}; {hint}, or leave these views out"
