@@ -169,7 +169,7 @@ def encode_half(teacher: Teacher, picture: Tensor, path: Path) -> Tensor:  # [H,
         for start in range(0, h, ROW_BLOCK):  # one block stays in the processor's cache
             block = features[:, start : start + ROW_BLOCK]
             rows = half[start : start + ROW_BLOCK].copy_(block.permute(1, 2, 0))
-            sums = rows.sum(-1, dtype=torch.float32)  # finite only if all values are; isfinite takes six times as long
+            sums = rows.float().sum(-1)  # finite only if all values are; isfinite takes six times as long
             finite &= torch.isfinite(sums).all()
             i, j = (sums == 0).nonzero(as_tuple=True)
             lost += int((~rows[i, j].any(-1) & block[:, i, j].any(0)).sum()) if len(i) else 0
