@@ -468,3 +468,10 @@ def test_a_map_that_repeats_a_few_bytes_is_refused(tmp_path):
     said = r"a_fmap_CxHxW\.pt: expected a feature map, .*its values are repeated by strides; save the tensor contiguous"
     with pytest.raises(ValueError, match=said):
         FeatureFolder(tmp_path, ["a"])[0]
+
+
+def test_stems_may_come_from_any_iterable(tmp_path):
+    for i, stem in enumerate("ab"):
+        np.save(tmp_path / f"{stem}.npy", features(i).numpy())
+    for stems in (("b", "a"), {"b": 1, "a": 2}, (stem for stem in "ba")):
+        assert FeatureFolder(tmp_path, stems).stems == ["b", "a"]
