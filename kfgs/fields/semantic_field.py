@@ -1,4 +1,4 @@
-"""The finished semantic field: Gaussians with latents, what turns latents into features, and the one rule of what is what."""
+"""The finished semantic field: Gaussians with latents, the decoder of latents, and the rule that gives each its class."""
 
 from __future__ import annotations
 
@@ -21,17 +21,8 @@ from ..labels.questions import Classes, Negatives, check_rows, class_rows, make_
 from ..metrics import MIB, semantic_storage_bytes
 from ..quant import Autoencoder, Codebook, LinearLatents
 from ..splat import Rendering, rasterize
+from . import parts
 from .answers import Answers, Seen, fused_answers
-from .parts import (
-    CHUNK,
-    blend_votes,
-    check_parts,
-    checked_classes,
-    info_lines,
-    label_latents,
-    label_rendered,
-    teacher_name,
-)
 from .remembered import recall_classes
 from .store import load_field, save_field
 
@@ -40,9 +31,9 @@ Rule = Literal["fused", "paper"]
 
 @dataclass(frozen=True, eq=False)
 class SemanticField:
-    """A scene's semantics in 3-D, and everything that is needed to ask it.
+    """A scene's semantics in 3-D, with all that is needed to classify, query and segment.
 
-    Latents are linear in the teacher's features (`linear`, what `uplift` makes), or one of the three rows of Table 1: with
+    Latents are linear in the teacher's features (`linear`, made by `uplift`), or one of the three rows of Table 1: with
     codebook and autoencoder d latents ("decouple+ADC+SC"), with the codebook alone features near codewords
     ("decouple+ADC"), with neither the teacher's features as they are ("just decouple").
 
@@ -69,7 +60,7 @@ class SemanticField:
     """Where it was loaded from."""
 
     def __post_init__(self) -> None:
-        check_parts(self.gaussians, self.codebook, self.autoencoder, self.linear, self.answers)
+        parts.check_parts(self.gaussians, self.codebook, self.autoencoder, self.linear, self.answers)
 
     @property
     def features(self) -> Tensor:  # [N, d]
@@ -114,7 +105,7 @@ class SemanticField:
             "codewords": None if self.codebook is None else self.codebook.size,
         }
         facts |= {"training views": len(self.cameras), "size as Table 1 counts it": f"{self.storage() / MIB:.2f} MiB"}
-        facts |= {"teacher": teacher_name(self.info), "folder": None if self.folder is None else str(self.folder)}
+        facts |= {"teacher": parts.teacher_name(self.info), "folder": None if self.folder is None else str(self.folder)}
         return html_card("SemanticField", facts)
 
     # Maps
@@ -135,7 +126,7 @@ class SemanticField:
         with torch.no_grad():
             if self.linear is not None and self._is_linear:
                 return self.linear.decode(latents)
-            return latents if self.autoencoder is None else self.autoencoder.decode(latents, chunk=CHUNK)
+            return latents if self.autoencoder is None else self.autoencoder.decode(latents, chunk=parts.CHUNK)
 
     def feature_map(self, camera: Camera) -> Tensor:  # [H, W, D]
         """The teacher's features as seen from a viewpoint. 512 channels at 640x480 take 630 MB."""
@@ -162,9 +153,9 @@ class SemanticField:
             if self.linear is not None and (rule == "fused" or self._is_linear):
                 return self.linear.cosines(self._own, unit)
             if self.codebook is None:
-                return torch.cat([unit_rows(part) @ unit.T for part in self.features.split(CHUNK)])
+                return torch.cat([unit_rows(part) @ unit.T for part in self.features.split(parts.CHUNK)])
             per_codeword = self.codebook.unit.to(unit) @ unit.T  # [K, M]
-            index = [self.codebook.quantize(self.decode(part)) for part in self.features.split(CHUNK)]
+            index = [self.codebook.quantize(self.decode(part)) for part in self.features.split(parts.CHUNK)]
             return per_codeword[torch.cat(index)] * self.features.any(dim=1)[:, None]
 
     def own_features(self, rows: Tensor) -> Tensor:  # [n] int64 -> [n, D]
@@ -183,8 +174,7 @@ class SemanticField:
         Returns:
             Labels [N], -1 where nothing is known of the Gaussian, and scores [N]. A tie goes to the lowest class.
         """
-        cosines = self.cosines(self._rows(classes), rule=rule)
-        scores, labels = cosines.max(dim=1)
+        scores, labels = self.cosines(self._rows(classes), rule=rule).max(dim=1)
         nothing = ~(self.known if rule == "fused" else self.features.any(dim=1))
         return Classification(labels.masked_fill(nothing, -1), scores.masked_fill(nothing, 0))
 
@@ -214,8 +204,7 @@ class SemanticField:
             threshold: gamma. None: 0.5 for a relevancy, else read off the scores; the result says how.
             negatives: what the target is compared with: "classes", "canonical" (words of the classes' table), "none", rows
                 [M, D], or "auto" as above.
-            score: "relevancy", "softmax" over target and negatives, or "cosine"; None: relevancy with negatives, else
-                cosine.
+            score: "relevancy", "softmax" over target and negatives, or "cosine". None: relevancy if there are negatives.
             logit_scale: of the softmax: "raw", "lseg", "clip", or a number that multiplies the cosines.
             rule: see `cosines`.
 
@@ -261,11 +250,11 @@ class SemanticField:
         check_choice("rule", rule, get_args(Rule))
         rows = self._rows(classes)
         if rule == "fused" and self._is_linear:
-            return blend_votes(self.gaussians, camera, self.cosines(rows), self.known)
+            return parts.blend_votes(self.gaussians, camera, self.cosines(rows), self.known)
         rendering = self.render(camera)
         if self.codebook is None or (rule == "fused" and self.autoencoder is None):
-            return label_rendered(rendering, self.decode, unit_embeddings(rows).to(self.features))
-        return label_latents(
+            return parts.label_rendered(rendering, self.decode, unit_embeddings(rows).to(self.features))
+        return parts.label_latents(
             rendering, self.codebook, self.codeword_labels(rows), self.autoencoder, exact=rule == "paper"
         )
 
@@ -312,8 +301,7 @@ class SemanticField:
     def storage(self) -> int:
         """Bytes as Table 1 counts them: every attribute of the Gaussians, and what decodes them, in float32.
 
-        The table counts no codebook without an autoencoder; we do, since labelling needs it. Fused answers of a trained field
-        are not counted.
+        Without an autoencoder, the table counts no codebook; we do: labelling needs it. Fused answers are not counted.
         """
         decoder = 0 if self.autoencoder is None else self.autoencoder.decoder_parameters
         codebook = 0 if self.codebook is None else self.codebook.codewords.numel()
@@ -326,7 +314,7 @@ class SemanticField:
         lines = [
             f"semantic field ({self.method}): {len(self)} Gaussians, {self.channels} channels for {self.dim}, {codewords}",
             f"  size as Table 1 counts it: {self.storage() / MIB:.2f} MiB",
-            *info_lines(self.info),
+            *parts.info_lines(self.info),
         ]
         return "\n".join(lines)
 
@@ -358,4 +346,4 @@ class SemanticField:
         return self.features if self.answers is None else self.answers
 
     def _rows(self, classes: Classes | None) -> Tensor:  # [C, D]
-        return class_rows(self.label_set() if classes is None else checked_classes(classes), self.dim, self.info)
+        return class_rows(self.label_set() if classes is None else parts.checked_classes(classes), self.dim, self.info)

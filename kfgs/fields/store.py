@@ -1,4 +1,4 @@
-"""A semantic field on disk: one folder with `field.safetensors` (numbers) and `field.json` (what they are)."""
+"""A semantic field on disk: one folder with `field.safetensors` (numbers) and `field.json` (their description)."""
 
 from __future__ import annotations
 

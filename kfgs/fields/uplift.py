@@ -190,7 +190,7 @@ def _average(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, Te
 
 
 def _correct(cloud: Gaussians, sums: Tensor, views: WorkingMaps, bar: Any) -> Tensor:  # [2, N, d + 1]
-    """One pass of SIRT: add to each Gaussian's feature the mean, by weight, of what its pixels lack, without the noise.
+    """One pass of SIRT: add to each Gaussian's feature the mean, by weight, of the difference at its pixels, without the noise.
 
     The even and the odd views make a reconstruction each, from their own maps alone. How well the two corrections agree
     among neighbours tells signal from noise (`_reliability`), and both take the reliable share.

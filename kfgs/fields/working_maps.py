@@ -22,7 +22,7 @@ from ..quant.sampling import sample_grid
 
 WORKING = 64
 """Directions in which maps are averaged at first. Those of room_0's maps hold 98.8 % of their energy, and what they leave out is
-noise of single pixels: the latents found among them keep a cosine above 0.99 with the average of all 512 channels."""
+noise of single pixels. The latents found among them keep a cosine above 0.99 with the average of all 512 channels."""
 LOOKED_AT = 32, 2_000  # views, and features of each, that the working directions are found in
 
 
@@ -37,7 +37,7 @@ def shrink_map(
 
 
 def shrink_camera(camera: Camera, divisor: int) -> Camera:
-    """The camera of `shrink_map`'s picture. Its pixels are divisor times as wide, exactly, whatever was dropped.
+    """The camera that sees the picture of `shrink_map`. Its pixels are exactly divisor times as wide.
 
     `Camera.resized` would squeeze the dropped pixels in instead, which moves everything by a fraction of a pixel.
     """
@@ -76,7 +76,9 @@ class WorkingMaps:
         self._basis = basis
 
     def __getitem__(self, i: int) -> tuple[Camera, Tensor, int, float]:
-        """The working camera, the map [h, w, d] (NaN where nothing is known), by what to shrink, and pixels per pixel."""
+        """The working camera, the map [h, w, d] (NaN where nothing is known), the divisor that brings a rendering to the map's
+        size, and how many of the camera's original pixels a working pixel covers.
+        """
         kept, shape = self._keep(i)
         h, w, _ = kept.shape
         camera = self._cameras[i]

@@ -30,7 +30,7 @@ class Nearest(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """What one look at each feature tells."""
+    """The best codeword of each feature, before the division by the feature's length."""
 
     codeword: Tensor  # [...] int64, of the largest product
     product: Tensor  # [...] of the feature with that unit row, in the rows' precision
@@ -138,7 +138,7 @@ class Codebook:
 
         Note:
             Ties go to the lowest index. An all-zero feature is equally (0) similar to all, and so gets index 0 with
-            similarity 0, by which it can be told.
+            similarity 0; the similarity shows which features were zero.
         """
         index, best, length = compare(self._checked(features), self.unit, chunk=chunk)
         shortest = max(EPS, torch.finfo(best.dtype).tiny)  # as in unit_rows
@@ -158,12 +158,12 @@ class Codebook:
         return Codebook(self.codewords.to(*args, **kwargs))
 
     def to_tensors(self) -> dict[str, Tensor]:
-        """What `from_tensors` needs to make this codebook again."""
+        """The tensors that `from_tensors` reads."""
         return {"codewords": self.codewords}
 
     @staticmethod
     def from_tensors(tensors: Mapping[str, Tensor]) -> Codebook:
-        """The codebook that `to_tensors` took apart; other names are ignored.
+        """A codebook from the tensors of `to_tensors`; other names are ignored.
 
         Raises:
             ValueError: if "codewords" is missing.

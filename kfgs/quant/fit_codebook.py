@@ -84,11 +84,11 @@ class CodebookConfig:
 
     @property
     def passes(self) -> int:
-        """How often each map is looked at."""
+        """How often each map is read."""
         return 1 if self.adaptive else self.epochs + 1
 
     def samples_of(self, maps: int) -> int:
-        """Most features that are looked at in each of so many maps when `grid_step` is None."""
+        """Most features taken from each of `maps` maps when `grid_step` is None."""
         return min(self.samples, -(-POOL // maps)) if self.adaptive else self.samples
 
     @staticmethod
@@ -104,7 +104,7 @@ class CodebookConfig:
 
 @dataclass(frozen=True, eq=False)
 class CodebookFit:
-    """A fitted codebook and how it came about."""
+    """A fitted codebook and its history."""
 
     codebook: Codebook
     history: list[dict[str, Any]] = field(repr=False)
@@ -219,7 +219,7 @@ def _pool(maps: FeatureMaps, config: CodebookConfig, progress: bool) -> Tensor: 
 
 
 def _note(config: CodebookConfig, size: int, full: bool, coverage: float, alpha: float) -> str | None:
-    """What a user should know and do, in one line."""
+    """One line for the user: what is wrong and what to do."""
     reached = f"{100 * coverage:.0f} % of the features are {alpha:.2f} similar to their codeword"
     if full:
         otherwise = "" if config.expand_below is None else ", or lower expand_below"

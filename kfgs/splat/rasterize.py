@@ -55,7 +55,7 @@ def rasterize(
         camera: a pinhole; undistort a picture from a distorting lens first.
         background: what shows through, zeros if None; one value per channel.
         engine: see `composite`.
-        near: smallest depth that is drawn, world units; None: the camera's.
+        near: smallest depth that is drawn, world units; None takes the camera's.
 
     Returns:
         The map, its opacity, and the projected Gaussians; differentiable in all tensors of `gaussians` and in

@@ -106,7 +106,7 @@ def _named(
 
 
 def _scale(name: str, values: Array, clim: tuple[float, float] | None) -> CloudColors:
-    """Colours of a scale; what is not finite is grey."""
+    """Colours of a scale; values that are not finite are grey."""
     from matplotlib import colormaps
 
     finite = np.isfinite(values)

@@ -16,7 +16,7 @@ from .._check import check_whole
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from .animation import Progress, check_size, save_animation
-from .shows import Show
+from .film_frames import Show
 
 Array = np.ndarray[Any, Any]
 SAME = 1e-9  # of the walk: two views in a row that are closer than this, in place and direction, are one

@@ -17,7 +17,7 @@ from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..scenes.points import robust_bounds
 from .animation import Progress, check_size, save_animation
-from .shows import Show
+from .film_frames import Show
 
 Array = np.ndarray[Any, Any]
 LEVEL = 0.05  # of all: less spread of the pictures' x axes than this, in their second direction, leaves "up" open
@@ -55,7 +55,7 @@ class Orbit:
 
 
 def estimate_up(cameras: Sequence[Camera]) -> Tensor:  # [3] float64, unit
-    """The direction that is up in the world, from the cameras that looked at it.
+    """Estimate the up direction of the world from the cameras.
 
     People hold cameras level: the pictures' x axes are horizontal, wherever they look and however far down, so up is the
     direction least along any of them (least eigenvector of sum x x^T), on the side of the pictures' upper edges. Where

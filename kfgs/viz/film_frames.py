@@ -1,4 +1,4 @@
-"""What an animation shows: pictures of clouds from any camera, drawn by kfgs's own rasteriser.
+"""The frames of an animation: pictures of clouds from any camera, drawn by kfgs's own rasteriser.
 
 Not by pyvista: the rasteriser needs neither a display nor OpenGL, and its pictures are those that scores are taken from.
 """
@@ -96,7 +96,7 @@ def draw_frame(
 
 
 def as_shows(shows: Gaussians | Show | Mapping[str, Gaussians | Show]) -> dict[str, Show]:
-    """Titles and what draws under them; one thing alone has the title ""."""
+    """A drawing function for each title; a single one has the title ""."""
     named = shows if isinstance(shows, Mapping) else {"": shows}
     if not named:
         raise ValueError("shows: expected at least one thing to show, got none; pass Gaussians or a function")
