@@ -8,11 +8,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from .._card import html_card, short_repr, short_value
-from .._check import as_tensor, check_range, check_shapes
+from .._check import as_array, as_tensor, check_range, check_shapes
 from .._rows import EPS, row_norms, unit_rows
 from ._store import read_tensors, write_tensors
 
@@ -106,10 +107,13 @@ class Codebook:
         facts = {"codewords": self.size, "channels": self.dim, "numbers": short_value(self.codewords)}
         return html_card("Codebook", facts)
 
+    def __len__(self) -> int:
+        return int(self.codewords.shape[0])
+
     @property
     def size(self) -> int:
-        """Number of codewords, K."""
-        return int(self.codewords.shape[0])
+        """Number of codewords, K; `len` is the same."""
+        return len(self)
 
     @property
     def dim(self) -> int:
@@ -152,6 +156,10 @@ class Codebook:
     ) -> Tensor:  # [...] int64
         """The index map M of Eq. 5: for each feature, t = argmax_e cos(f, f_e). Ties as in `nearest`."""
         return compare(self._checked(features), self.unit, chunk=chunk).codeword
+
+    def to_numpy(self) -> np.ndarray[Any, Any]:  # [K, D]
+        """The codewords as a NumPy array."""
+        return as_array(self.codewords)
 
     def to(self, *args: Any, **kwargs: Any) -> Codebook:
         """Move or convert the codewords as `Tensor.to` does."""
