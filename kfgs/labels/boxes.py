@@ -11,7 +11,7 @@ import torch
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
-from .._check import check_shapes
+from .._check import as_tensor, check_shapes
 from .._rows import check_finite
 
 ROUNDS = 3  # over the three faces; room_0's objects no longer change after two
@@ -63,6 +63,7 @@ class OrientedBox:
         Raises:
             ValueError: if there is no point, or one is not finite.
         """
+        points = as_tensor("points", points)
         check_shapes(("points", points, "N 3"))
         if len(points) == 0:
             raise ValueError("points: expected at least one, got none; select something first")
@@ -93,6 +94,7 @@ class OrientedBox:
 
     def contains(self, points: Tensor) -> Tensor:  # [N, 3] -> [N] bool
         """Which points lie inside or on the faces, in float64."""
+        points = as_tensor("points", points)
         check_shapes(("points", points, "N 3"))
         center, axes, half = (part.to(points.device, torch.float64) for part in (self.center, self.axes, self.half))
         return (_local(points.double(), center, axes).abs() <= half).all(dim=1)

@@ -12,7 +12,7 @@ import torch
 from .._files import bytes_in_words
 from ..features.manifest import read_manifest
 from ..fields.answers import MOST, PIXELS
-from ..fields.uplift import WORKING
+from ..fields.working_maps import WORKING
 from ..quant.sampling import choose_grid_step
 from ..scenes import Scene
 from ..teachers.costs import TeacherCost, check_weights, teacher_cost
