@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from scipy.sparse import coo_matrix
@@ -12,15 +10,13 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from .._check import check_range, check_shapes
-from .._rows import check_finite
+from .nearest import Array, positions
 
 NEIGHBOURS = 8  # of each point that are joined first
 NEIGHBOUR, QUANTILE = 4, 0.9  # a cloud's spacing: 90 % have their fourth neighbour within it
 SPACINGS = 1.5  # the default distance, in spacings of the selected: on room_0 2 joins the chairs, 1.2 breaks a sofa ...
 MOST_SPACINGS = 4.0  # ... and its bound, in spacings of all: a few specks across the room have a spacing of metres
 SAMPLE = 20_000  # Gaussians measured for a spacing
-
-Array = np.ndarray[Any, Any]
 
 
 def component_distance(
@@ -39,8 +35,8 @@ def component_distance(
         ValueError: if shapes disagree or a position is not finite.
     """
     check_shapes(("means", means, "N 3"), ("mask", mask, "N"))
-    check_finite("means", means)
-    own, all_of_them = _spacing(_positions(means[mask])), _spacing(_positions(means))
+    points = positions("means", means)
+    own, all_of_them = _spacing(points[mask.cpu().numpy()]), _spacing(points)
     chosen = min(SPACINGS * own, MOST_SPACINGS * all_of_them)
     return chosen if chosen > 0 else 1.0  # a single place: any distance joins what lies there
 
@@ -70,12 +66,12 @@ def component_numbers(
     check_shapes(("means", means, "N 3"), ("mask", mask, "N"))
     if mask.dtype != torch.bool:
         raise TypeError(f"mask: expected a boolean mask, got {mask.dtype}; compare first, as in labels == 3")
-    check_finite("means", means)
+    points = positions("means", means)
     numbers = torch.full(mask.shape, -1, dtype=torch.int64, device=mask.device)
     if distance is None:
         distance = component_distance(means, mask)
     check_range("distance", distance, 0, closed=(False, False))
-    found = radius_components(_positions(means[mask]), distance)
+    found = radius_components(points[mask.cpu().numpy()], distance)
     numbers[mask] = torch.from_numpy(found).to(mask.device)
     return numbers
 
@@ -130,11 +126,6 @@ def _spacing(points: Array) -> float:
     sample = places[:: max(1, -(-len(places) // SAMPLE))]
     near: Array = np.asarray(cKDTree(places).query(sample, k=k + 1, workers=-1)[0])
     return float(np.quantile(near[:, k], QUANTILE))
-
-
-def _positions(means: Tensor) -> Array:
-    points: Array = means.detach().cpu().double().numpy()
-    return points
 
 
 def _nearest_within(points: Array, asked: Array, distance: float, k: int = 1) -> tuple[Array, Array]:

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from .._card import html_card
 from .._check import check_shapes
 from .._rows import as_tensor, check_finite
-from ..formats.splat_file import SplatFile
-from ..gaussians import Gaussians
 from .boxes import OrientedBox
-
-Array = np.ndarray[Any, Any]
+from .nearest import Array, Cloud, means_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +78,7 @@ class Selection:
         """How it was made, with its threshold, for a person."""
         return self.how if self.threshold is None else f"score > {self.threshold:.4g} ({self.how})"
 
-    def points(self, cloud: SplatFile | Gaussians | Tensor | Array) -> Array:  # [n, 3] float64
+    def points(self, cloud: Cloud) -> Array:  # [n, 3] float64
         """The centres of the selected Gaussians as a numpy array, in world units.
 
         Args:
@@ -92,13 +87,12 @@ class Selection:
         Raises:
             ValueError: if the cloud has another number of Gaussians.
         """
-        gaussians = cloud.gaussians if isinstance(cloud, SplatFile) else cloud
-        means = as_tensor("cloud", gaussians.means if isinstance(gaussians, Gaussians) else gaussians)
+        means = means_of("cloud", cloud)
         check_shapes(("selection.mask", self.mask, "N"), ("cloud", means, "N 3"))
         points: Array = means[self.mask].detach().cpu().double().numpy()
         return points
 
-    def box(self, cloud: SplatFile | Gaussians | Tensor | Array) -> OrientedBox:
+    def box(self, cloud: Cloud) -> OrientedBox:
         """A small box around the centres of the selected Gaussians; `cloud` as in `points`.
 
         Raises:

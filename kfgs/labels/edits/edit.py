@@ -61,7 +61,7 @@ class OnSelection(Edit):
         if isinstance(where, str):
             where = OfClass(where)
         elif isinstance(where, Selection):
-            where = OfIndex(where.indices.tolist())
+            where = OfIndex(tuple(where.indices.tolist()))
         elif not isinstance(where, Where):
             raise TypeError(
                 f"where: expected a Where, such as OfClass('chair'), a Selection or a class name, got {where!r:.80}; "
