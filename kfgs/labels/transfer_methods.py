@@ -7,12 +7,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from .._rows import check_finite
 from ..gaussians import Gaussians
 from ..splat.covariance import covariance_3d
-from .nearest import Array, Near, Sources, means_of, positions
+from .nearest import Array, Cloud, Near, Sources, means_of, positions
 
 Method = Literal["nearest", "vote", "mahalanobis"]
 THIN = 1e-3  # "mahalanobis" treats a Gaussian as at least this share of its length thick
@@ -31,8 +30,8 @@ def make_rule(
     method: Method,
     sources: Sources,
     kept: Array,  # [n] int64, which of `src` each source is
-    src: Tensor | Gaussians,
-    dst: Tensor | Gaussians,
+    src: Cloud,
+    dst: Cloud,
     reach: float,  # lambda; for "mahalanobis" the deviations
 ) -> Callable[[Array, Near], Verdict]:
     """Which source gives the label, as a function of rows of the destinations [n] and the sources near them."""
@@ -117,7 +116,7 @@ def _mahalanobis_squares(offset: Array, covariances: Array) -> Array:  # [n, 3],
     return np.maximum(squares, 0)
 
 
-def _opacities(cloud: Tensor | Gaussians) -> Array:  # [N] float64, > 0
+def _opacities(cloud: Cloud) -> Array:  # [N] float64, > 0
     """The weight of each source: its opacity, or 1 if there are only positions."""
     if not isinstance(cloud, Gaussians):
         return np.ones(len(cloud))
@@ -126,7 +125,7 @@ def _opacities(cloud: Tensor | Gaussians) -> Array:  # [N] float64, > 0
     return values.clamp_min(TINY).numpy()
 
 
-def _covariances(name: str, cloud: Tensor | Gaussians) -> Array:  # [6, N]
+def _covariances(name: str, cloud: Cloud) -> Array:  # [6, N]
     """Covariances in float64, thick enough that rounding leaves their inverse accurate; zeros for positions.
 
     The rows are xx, xy, xz, yy, yz, zz of the symmetric matrices.
