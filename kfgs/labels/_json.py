@@ -116,7 +116,7 @@ def rotation_matrix(quaternion: Sequence[float]) -> Any:  # (w, x, y, z) -> [3, 
 
 
 def unit(values: Sequence[float]) -> list[float]:
-    """Divide a vector by its length, also where a square of its numbers would overflow or vanish. It must not be zero."""
+    """Divide a vector by its length, without overflow for huge or tiny numbers. It must not be all zeros."""
     largest = max(abs(value) for value in values)
     scaled = [value / largest for value in values]
     length = math.hypot(*scaled)

@@ -28,7 +28,7 @@ class Classification(NamedTuple):
     """The class of each feature and its cosine with that class."""
 
     labels: Tensor  # [N] int64, -1 = none
-    scores: Tensor  # [N] cosine with the winning class; 0 where there is none
+    scores: Tensor  # [N] cosine with the winning class; 0 if there is none
 
 
 def label_codewords(
@@ -144,10 +144,10 @@ def select_by_category(
         category: which class.
 
     Returns:
-        The Gaussians that `classify` gives this class; scores are the winner's cosine where it won and 0 elsewhere.
+        The Gaussians that `classify` gives this class; scores are its cosine for these and 0 for the others.
 
     Raises:
-        ValueError: as `classify`, or if there is no such class.
+        ValueError: as `classify`, or if `category` is not a class index.
     """
     found = classify(features, embeddings)
     check_whole("category", category, 0, len(embeddings) - 1)

@@ -1,4 +1,4 @@
-"""Number the connected parts of some Gaussians, such as the four chairs among all that is chair."""
+"""Number the connected parts of some Gaussians: the four chairs among all Gaussians of the class "chair"."""
 
 from __future__ import annotations
 
@@ -82,11 +82,11 @@ def radius_components(
 ) -> Array:  # [n] int64
     """Number the components of the graph that joins points at most `distance` apart, exactly.
 
-    `scipy.spatial.cKDTree.query_pairs` would list every such pair: 2 GB for 100,000 points with 600 neighbours each. Here
-    each point is joined to its 8 nearest. A pair that this leaves out has more than 8 neighbours on both sides. So the
-    points with more than 8 in range are asked for the nearest one of another part, until there is none. To ask all parts at
-    once, they are numbered and divided by one binary digit of the number after the other: two different numbers differ in
-    some digit.
+    `scipy.spatial.cKDTree.query_pairs` would list all near pairs, gigabytes for a dense cloud. Here each point
+    is joined to its 8 nearest. A pair that this leaves out has more than 8 neighbours on both sides. So for
+    the points with more than 8 in range the nearest point of another part is searched, until none is in range. To search
+    for all parts at once, parts are numbered and divided into two sets by each binary digit of the number: two different
+    numbers differ in some digit.
 
     Numbers follow size, the largest is 0; of equal ones, that with the lowest point.
 
@@ -118,7 +118,7 @@ def radius_components(
 
 
 def _spacing(points: Array) -> float:
-    """The distance within which 90 % of the places have their fourth neighbour (or the last of fewer); 0 for one place."""
+    """The distance within which 90 % of the places have their fourth neighbour (the last if there are fewer); 0 for one."""
     places = np.unique(points, axis=0)
     if len(places) < 2:
         return 0.0

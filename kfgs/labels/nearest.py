@@ -28,7 +28,7 @@ class Near(NamedTuple):
     """The sources looked at for n destinations, by distance, then by index."""
 
     distance: Array  # [n, k] float64, infinite where fewer than k are in range
-    source: Array  # [n, k] int64, an index of `Sources`; 0 where there is none
+    source: Array  # [n, k] int64, an index of `Sources`; 0 if there is none
 
     @property
     def hit(self) -> Array:  # [n, k] bool

@@ -31,11 +31,11 @@ class Selection:
     """
 
     mask: Tensor  # [N] bool
-    scores: Tensor  # [N] how well each fits: a cosine or a relevancy; 1 and 0 where a place or a label decides
+    scores: Tensor  # [N] how well each fits: a cosine or a relevancy; 1 and 0 if a place or a label decides
     threshold: float | None = None
     """Gamma of Sec. 3.4, the score that a selected Gaussian exceeds; None if there was no threshold, or several."""
     how: str = ""
-    """Where the threshold comes from, or what was combined."""
+    """How the threshold was found, or what was combined."""
 
     @classmethod
     def of(cls, mask: Tensor | Array, how: str = "given") -> Selection:  # mask: [N] bool
@@ -75,7 +75,7 @@ class Selection:
 
     @property
     def words(self) -> str:
-        """How it was made, with its threshold, for a person."""
+        """How it was made and its threshold, in words."""
         return self.how if self.threshold is None else f"score > {self.threshold:.4g} ({self.how})"
 
     def points(self, cloud: Cloud) -> Array:  # [n, 3] float64
@@ -101,7 +101,7 @@ class Selection:
         return OrientedBox.around(torch.from_numpy(self.points(cloud)))
 
     def within(self, mask: Tensor, how: str) -> Selection:  # mask: [N] bool
-        """The part of this selection under a mask: the same scores and threshold, one more reason."""
+        """The part of this selection under a mask, with the same scores and threshold; `how` is added to the words."""
         check_shapes(("selection.mask", self.mask, "N"), ("mask", mask, "N"))
         return Selection(self.mask & mask, self.scores, self.threshold, f"{self.how}; {how}" if self.how else how)
 
