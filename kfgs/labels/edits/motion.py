@@ -16,7 +16,8 @@ from ...cameras.similarity import Similarity
 from ...formats.splat_file import SplatFile
 from ...gaussians import Gaussians
 from ...splat.transform import transform_gaussians
-from .._json import number_of, numbers_of, quaternion_of, rotation_matrix, set_fields, unit
+from .._json import number_of, numbers_of, set_fields
+from ..boxes import quaternion_of, rotation_matrix, unit
 from .edit import OnSelection
 from .merge import join
 
