@@ -81,8 +81,8 @@ class Transfer:
 
     def __repr__(self) -> str:
         return (
-            f"Transfer({self.labelled} labelled, {self.orphaned} orphaned, {self.ambiguous} ambiguous, "
-            f"{self.method} within {self.distance:.4g}: {self.how})"
+            f"Transfer({self.labelled:,} of {len(self.labels):,} labelled ({self.method} within {self.distance:.4g}), "
+            f"{self.orphaned:,} orphaned, {self.ambiguous:,} ambiguous; lambda: {self.how})"
         )
 
 
