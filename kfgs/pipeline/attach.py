@@ -216,10 +216,10 @@ def _by_distance(
     facts = {
         "labelled by": "distance to the field's Gaussians",
         "method": transfer.method,
-        "score": _meaning(transfer),
+        "score": transfer.score_meaning,
         "ambiguous": transfer.ambiguous,
     }
-    return transfer.labels, _sureness(transfer), transfer, facts
+    return transfer.labels, transfer.scores, transfer, facts
 
 
 def _by_views(
@@ -241,23 +241,15 @@ def _by_views(
     open_ = votes.labels < 0
     carried = carry(colour, votes.labels, colour.select(open_))
     labels, scores = votes.labels.clone(), votes.shares.clone()
-    labels[open_], scores[open_] = carried.labels, _sureness(carried).to(scores)
+    labels[open_], scores[open_] = carried.labels, carried.scores.to(scores)
     facts = {
         "labelled by": f"votes of {len(cameras)} segmented views",
         "method": carried.method,
-        "score": f"share of the votes; where no view shows a Gaussian, {_meaning(carried)}, to those that have a class",
+        "score": f"share of the votes; where no view shows a Gaussian, {carried.score_meaning}, to those that have a class",
         "shown": int((~open_).sum()),
         "not shown": int(open_.sum()),
     }
     return labels, scores, carried, facts
-
-
-def _sureness(transfer: Transfer) -> Tensor:  # [N] in [0, 1]
-    """The score of labels that distance carried; 0 where there is none."""
-    if transfer.method != "nearest":
-        return transfer.shares
-    reach = max(transfer.distance, torch.finfo(transfer.distances.dtype).tiny)
-    return (1 - transfer.distances / reach).clamp_min(0.0)
 
 
 def _about(transfer: Transfer, by: By) -> str:
@@ -266,8 +258,3 @@ def _about(transfer: Transfer, by: By) -> str:
         return repr(transfer)
     count = len(transfer.labels)
     return f"of {count} that no view shows: {transfer!r}" if count else "there is none that no view shows"
-
-
-def _meaning(transfer: Transfer) -> str:
-    """What `_sureness` gives, in words."""
-    return "1 - distance / lambda" if transfer.method == "nearest" else "the label's share of the weights in range"
