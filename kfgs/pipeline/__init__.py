@@ -20,6 +20,7 @@ from .fit import FitConfig, FitResult, fit_scene, load_history
 from .fuse import uplift
 from .pictures import write_training_pictures
 from .plan import Plan, plan_scene
+from .plan_maps import NamedTeacher
 from .stages import Run, Stage
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "ColorResult",
     "FitConfig",
     "FitResult",
+    "NamedTeacher",
     "Plan",
     "Run",
     "Stage",
