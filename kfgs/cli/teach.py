@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -135,9 +136,8 @@ def plan(
         teacher=None
         if teacher is None and weights is None and not named
         else NamedTeacher(teacher or "lseg", weights, named),
-        config=config,
+        config=dataclasses.replace(config, device=device),
         dense=store,
-        device=device,
         features=scene_folder(scene) / "features" if features is None else features,
         run=run,
     )
@@ -153,7 +153,7 @@ def choose_teacher(name: str | None, weights: str | None, fast: bool, size: tupl
     Raises:
         ValueError: if none is named, or an option does not fit the teacher.
     """
-    from ..pipeline.device import training_device
+    from ..pipeline.train import training_device
     from ..teachers.load import load_teacher, teacher_names
 
     if name is None:

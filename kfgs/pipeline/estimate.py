@@ -12,7 +12,7 @@ from ..fields import FieldConfig
 from ..fields.answers import MOST
 from ..fields.uplift import WORKING
 from ..quant.sampling import choose_grid_step
-from .fit import FitConfig
+from .config import FitConfig
 from .trial import Timing
 
 Dense = Literal["keep", "discard", "recompute"]

@@ -16,10 +16,11 @@ from .._files import bytes_in_words, seconds_in_words
 from ..features import FeatureFolder
 from ..scenes import Scene
 from ..teachers import Teacher
-from .device import training_device
+from .config import FitConfig
 from .estimate import DENSE, Dense, Sizes, StagePlan, add, gaussian_counts, notes_on, plan_stages, training_bytes
-from .fit import FitConfig, finished_stages
+from .fit import finished_stages
 from .plan_maps import NamedTeacher, find_stored, run_teacher
+from .train import training_device
 from .trial import Timing, disk_free, memory_free, memory_now, time_color, time_fit
 
 FEATURES = "features"  # the folder of maps in a scene's, where `kfgs features` writes and `kfgs fit` reads
@@ -129,7 +130,6 @@ def plan_scene(
     teacher: Teacher | Callable[[Tensor], Tensor] | NamedTeacher | str | None = None,
     config: FitConfig | None = None,
     dense: Dense = "keep",
-    device: str | torch.device = "auto",
     features: str | Path | None = None,
     run: str | Path | None = None,
 ) -> Plan:
@@ -143,10 +143,9 @@ def plan_scene(
         scene: whose views of `config.split` are learnt from.
         teacher: makes the maps that are missing: a teacher, a function from [3, H, W] to [D, h, w], or a name, see
             `NamedTeacher`. None: whose maps exist, or else `lseg`.
-        config: the method and its options; those of `fit_scene` when not given.
+        config: the method and its options, and where teacher and field run; those of `fit_scene` when not given.
         dense: what becomes of the dense maps: `keep`, `discard` once the field is made of them, or `recompute` them
             instead of storing any.
-        device: where teacher and field run, see `training_device`.
         features: the folder of maps, in any layout that `FeatureFolder` reads; need not exist. Maps that are there are not
             made again, unless `dense` is `recompute`. None: `features` in the scene's folder.
         run: the folder of `fit_scene`; stages that are finished there count as done.
@@ -157,7 +156,8 @@ def plan_scene(
         FileNotFoundError: if the weights or a picture are not there.
     """
     check_choice("dense", dense, DENSE)
-    config, target = config or FitConfig(), training_device(device)
+    config = config or FitConfig()
+    target = training_device(config.device)
     if config.needs_maps and dense != "keep":
         raise ValueError(
             f"dense: expected 'keep' with mode 'decouple', whose field learns from the dense maps, got {dense!r}; keep them"
@@ -185,7 +185,7 @@ def plan_scene(
             sizes, made, name, said = run_teacher(scene, sizes, teacher, target, Path(place))
             notes += said
             maps = maps if made is None else made
-        sizes = _run_stages(straight, sizes, maps, target)
+        sizes = _run_stages(straight, sizes, maps)
     plan = Plan(
         title=_title(sizes, name, target),
         stages=tuple(plan_stages(sizes)),
@@ -200,7 +200,7 @@ def plan_scene(
     return replace(plan, disk_recomputed=add([stage.disk_bytes for stage in again]))
 
 
-def _run_stages(scene: Scene, sizes: Sizes, maps: FeatureFolder | None, device: torch.device) -> Sizes:
+def _run_stages(scene: Scene, sizes: Sizes, maps: FeatureFolder | None) -> Sizes:
     """Try the stages that are not done and fit into memory; sizes with what they took."""
     config, free, now = sizes.config, memory_free(), memory_now() or 0
     sizes = replace(sizes, base=now)
@@ -210,9 +210,9 @@ def _run_stages(scene: Scene, sizes: Sizes, maps: FeatureFolder | None, device: 
     fuse = config.method == "fuse"
     mean, last = gaussian_counts(config.color.field if fuse else config.field, sizes.points, full=fuse)
     if fuse and "color" not in sizes.done:
-        timings |= time_color(scene, config, round(mean), device)
+        timings |= time_color(scene, config, round(mean))
     if maps is not None and "uplift" not in sizes.done and "answers" not in sizes.done:
-        timings |= time_fit(scene, maps, config, last if fuse else round(mean), device)
+        timings |= time_fit(scene, maps, config, last if fuse else round(mean))
     return replace(sizes, timings=timings)
 
 

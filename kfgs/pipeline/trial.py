@@ -21,7 +21,8 @@ from ..fields import FieldConfig, GaussianParams
 from ..scenes import Scene
 from ..teachers import CallableTeacher, LSeg, LSegOptions, Teacher, as_teacher
 from .color import fit_color
-from .fit import FitConfig, fit_scene
+from .config import FitConfig
+from .fit import fit_scene
 from .stages import Stage
 
 STEPS = 20  # of training, in the longer of the two runs that are compared
@@ -92,20 +93,18 @@ def _one_run(teacher: Teacher, picture: Picture) -> tuple[Teacher, int]:
     return LSeg(teacher.network, once), runs
 
 
-def time_color(scene: Scene, config: FitConfig, gaussians: int, device: torch.device) -> dict[str, Timing]:
+def time_color(scene: Scene, config: FitConfig, gaussians: int) -> dict[str, Timing]:
     """Time the stage `color`, with so many Gaussians from the start."""
 
     def make(views: int, steps: int, folder: Path, report: Callable[[str], None]) -> list[Stage]:
         few = few_views(scene, config.split, views, gaussians)
         color = replace(config.color, split=config.split, max_points=None, field=_shortened(config.color.field, steps))
-        return fit_color(few, folder, color, device=device, report=report).stages
+        return fit_color(few, folder, color, device=config.device, report=report).stages
 
     return _time_twice(make, len(scene.views(config.split)), {"color"})
 
 
-def time_fit(
-    scene: Scene, maps: FeatureFolder, config: FitConfig, gaussians: int, device: torch.device
-) -> dict[str, Timing]:
+def time_fit(scene: Scene, maps: FeatureFolder, config: FitConfig, gaussians: int) -> dict[str, Timing]:
     """Time the stages that are made of maps.
 
     Args:
@@ -113,7 +112,6 @@ def time_fit(
         maps: the first stands for those of all views.
         config: as for `fit_scene`.
         gaussians: so many are trained from the start (method `paper`) or fused onto (`fuse`).
-        device: where the field is trained.
     """
     count = len(scene.views(config.split))
     # The adaptive codebook grows with all samples together, of which four views have too few to show it.
@@ -129,7 +127,7 @@ def time_fit(
             field=_shortened(config.field, steps),
         )
         splat = GaussianParams.from_points(few.points, 1).activated().detach() if config.method == "fuse" else None
-        return fit_scene(few, _OneMap(maps, views), folder, short, splat=splat, device=device, report=report).stages
+        return fit_scene(few, _OneMap(maps, views), folder, short, splat=splat, report=report).stages
 
     found = _time_twice(make, count, {"autoencoder", "field"})
     return {name: replace(one, each=one.each / denser) if name == "codebook" else one for name, one in found.items()}
