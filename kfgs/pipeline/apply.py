@@ -1,4 +1,4 @@
-"""What a finished field is used for: segmented views with scores and pictures, labelled Gaussians, labelled clouds."""
+"""Use a finished field: segment views, score them, label Gaussians and clouds, draw pictures of how the run went."""
 
 from __future__ import annotations
 

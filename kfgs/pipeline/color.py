@@ -1,4 +1,4 @@
-"""An ordinary 3DGS colour field of a scene, as a stage of a run folder: what labels are carried to, and what is edited."""
+"""Train an ordinary 3DGS colour field of a scene, as a stage of a run folder. Labels are carried to it, and it is edited."""
 
 from __future__ import annotations
 
@@ -138,8 +138,8 @@ class ColorResult:
 class Photos(Sequence[Tensor]):
     """The training pictures at their training size: read when first asked for, then kept as bytes.
 
-    A picture is [h, w, 3] float32 in [0, 1], NaN where nothing was recorded (the border of an undistorted one), be it in
-    part of the pixel. Bytes take a quarter of the memory: 0.9 MB for 639x479.
+    A picture is [h, w, 3] float32 in [0, 1]. A pixel is NaN if nothing was recorded in it or in a part of it (the border of an
+    undistorted picture). Bytes take a quarter of the memory: 0.9 MB for 639x479.
 
     Args:
         scene: whose pictures.

@@ -1,4 +1,4 @@
-"""The whole job on a room that the package makes itself, colours and edits too, with exact truth to score against."""
+"""Every step on a room that the package makes itself, with colours and edits, scored against exact ground truth."""
 
 from __future__ import annotations
 

@@ -22,6 +22,9 @@ GROWTH = {"low": 6.0, "high": 1.15}
 """How many times more Gaussians than points training is taken to end with, by the gradient from which it densifies: below 4e-4
 as in the paper (110.5k in Table 2, of the 18.5k points of room_0), above it as room_0 and the toy room with the CPU preset. How
 many there will be depends on the scene; `max_gaussians` is never exceeded."""
+MARGIN = 1.25
+"""By how much more memory is planned than a small run took: a long one fragments it (toy room, 100,000 Gaussians: 1.11 GB, small
+runs 1.00)."""
 TRAINING = 8
 """Copies of the Gaussians that are in memory while they are trained: values, gradients, Adam's two moments, and what a step makes
 of them."""
@@ -143,22 +146,23 @@ def _stage(sizes: Sizes, name: str, what: str, count: int, disk: tuple[int, int]
     timing = sizes.timings.get(name)
     if timing is None:  # too large to try
         return StagePlan(title, what, None, sizes.base + more, *disk)
-    peak = None if timing.peak is None else timing.peak + more
+    peak = None if timing.peak is None else round(MARGIN * timing.peak) + more
     return StagePlan(title, what, timing.seconds(count), peak, *disk)
 
 
 def _features(sizes: Sizes) -> StagePlan:
     """The teacher over all pictures without a map; its maps (or the samples that the codebook looks at) on disk."""
     missing, seconds = sizes.missing, sizes.picture_seconds
+    peak = None if sizes.teacher_peak is None else round(MARGIN * sizes.teacher_peak)
     what = f"{len(missing)} pictures"
     if seconds is not None:
         what += f", {seconds_in_words(seconds / max(1, len(missing)))} each"
     if sizes.dense == "recompute":
         disk = None if sizes.shape is None else HALF * sizes.count * sizes.samples * sizes.shape[2]
-        return StagePlan("features", f"{what}, samples stored", seconds, sizes.teacher_peak, disk, disk and 0)
+        return StagePlan("features", f"{what}, samples stored", seconds, peak, disk, disk and 0)
     disk = sizes.map_bytes(missing)
     kept = 0 if disk is not None and sizes.dense == "discard" else disk
-    return StagePlan("features", what, seconds, sizes.teacher_peak, disk, kept)
+    return StagePlan("features", what, seconds, peak, disk, kept)
 
 
 def _again(sizes: Sizes, stage: StagePlan) -> StagePlan:

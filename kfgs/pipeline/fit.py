@@ -1,7 +1,7 @@
-"""Teacher maps and posed images in, a saved semantic field out: fused in 3-D and then compressed, or as the paper's Figure 2.
+"""From teacher maps and posed images to a saved semantic field: fused in 3-D and then compressed, or as the paper's Figure 2.
 
-Each call is a stage of a run folder: finished stages are found again by the hash of their inputs, and the long one
-(the field) also resumes from its last checkpoint.
+Each step is a stage in the run folder. A finished stage is found again by the hash of its inputs; the long one (the field) also
+resumes from its last checkpoint.
 """
 
 from __future__ import annotations

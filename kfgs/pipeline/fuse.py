@@ -36,8 +36,8 @@ def find_geometry(
 ) -> tuple[Gaussians, str]:
     """The Gaussians to fuse onto, and where they come from.
 
-    Without a splat they are the colour field of the run, whose stage is found again; one that was trained by `fit_color` with
-    other options of the same scene, as `kfgs color` does, is taken as it is.
+    Without a splat they are the colour field of the run. Its stage is found again if it is there. A longer colour field of the
+    same scene, as `kfgs color` makes it in the same run folder, is taken instead.
     """
     if isinstance(splat, Gaussians):
         return splat, "given"

@@ -2,7 +2,7 @@
 
 A stage is a function that fills a folder. Its name and the JSON description of its inputs give a key; a folder with
 that key that is complete is used as it is, otherwise the stage is made in a temporary folder and moved into place in
-one step. So a killed run leaves only finished stages, and the same command starts where it stopped.
+one step. So a killed run leaves only finished stages, and the same command continues where it stopped.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from small_room import CONFIG, make_room
 from kfgs.features import FeatureFolder, extract_features, pictures_of, save_feature_map
 from kfgs.fields import FieldConfig
 from kfgs.pipeline import FitConfig, NamedTeacher, Plan, fit_color, fit_scene, plan_scene
-from kfgs.pipeline.estimate import GROWTH, Sizes, gaussian_counts, notes_on, plan_stages
+from kfgs.pipeline.estimate import GROWTH, MARGIN, Sizes, gaussian_counts, notes_on, plan_stages
 from kfgs.pipeline.trial import PeakMemory, Timing
 from kfgs.quant import CodebookConfig
 from kfgs.scenes import load_scene
@@ -57,7 +57,7 @@ def test_the_papers_90_views_take_15_9_gigabytes():
     assert stages(found)["index maps"].disk_bytes == 90 * 360 * 480
     assert maps / GB == pytest.approx(15.9, abs=0.05)
     assert found.disk_bytes == sum(stage.disk_bytes for stage in found.stages)
-    assert found.peak_bytes == max(stage.peak_bytes for stage in found.stages) == 3 * 10**9
+    assert found.peak_bytes == max(stage.peak_bytes for stage in found.stages) == round(MARGIN * 3 * 10**9)
     assert found.seconds == pytest.approx(sum(stage.seconds for stage in found.stages))
     assert found.fits
 
@@ -170,7 +170,7 @@ def test_too_little_memory_is_said():
     found = plan(sizes(), memory=10**9)
     assert found.fits is False
     assert re.search(
-        r"does not fit: needs 3\.0 GB of memory \(features\), 1\.0 GB free; ask for smaller", found.verdict
+        r"does not fit: needs 3\.[78] GB of memory \(features\), 1\.0 GB free; ask for smaller", found.verdict
     )
     assert plan(sizes(), memory=None).fits
 
