@@ -11,7 +11,7 @@ import torch
 
 from ..features import FeatureFolder, pictures_of, read_manifest, write_npy_map
 from ..scenes import Scene
-from ..teachers import TRANSFORMERS, LSeg, LSegConfig, LSegOptions, Teacher, as_teacher, load_teacher
+from ..teachers import TRANSFORMERS, LSeg, LSegConfig, LSegOptions, Teacher, as_teacher, load_teacher, teacher_names
 from ..teachers.lseg.network import LSegNetwork
 from .estimate import Sizes
 from .trial import EncodedPicture, memory_now, time_picture
@@ -34,24 +34,31 @@ class NamedTeacher:
     weights: str | Path | None = None
     options: dict[str, Any] = field(default_factory=dict)
 
-    def load(self) -> Teacher | None:
-        """The teacher; None if its weights are not named, or are a hub id that is not on this machine.
+    def load(self) -> tuple[Teacher | None, str | None]:
+        """The teacher, or None if its weights are not on this machine; and a note on that.
 
         Raises:
             ValueError, FileNotFoundError, ImportError: as `load_teacher` does.
         """
-        if self.weights is None and self.name == "lseg":
-            return _lseg_without_weights(self.options)
-        options, here = dict(self.options), self.weights is None or Path(self.weights).expanduser().exists()
-        if self.name in TRANSFORMERS and not here:
-            options["local_only"] = True
+        if self.without_weights:
+            return _lseg_without_weights(
+                self.options
+            ), "lseg is timed with meaningless weights, since no --weights are named"
+        why, options = f"{self.name} was not run, so no size or time of its maps is known:", dict(self.options)
+        if self.weights is None and self.name in teacher_names():
+            return None, f"{why} no weights are named; pass --weights PATH"
+        on_hub = self.name in TRANSFORMERS and not Path(str(self.weights)).expanduser().exists()
         try:
-            return load_teacher(self.name, self.weights, **options)
-        except ValueError:
-            known = ":" in self.name or self.name in ("lseg", "sam", *TRANSFORMERS)
-            if known and ((self.weights is None and ":" not in self.name) or "local_only" in options):
-                return None
-            raise
+            return load_teacher(self.name, self.weights, **options | ({"local_only": True} if on_hub else {})), None
+        except ValueError as error:
+            if not on_hub:
+                raise
+            return None, f"{why} {error}"
+
+    @property
+    def without_weights(self) -> bool:
+        """Whether it is LSeg, of which the time and the size of its maps are known without weights."""
+        return self.name == "lseg" and self.weights is None
 
 
 @dataclass(frozen=True)
@@ -107,17 +114,12 @@ def run_teacher(
 ) -> tuple[Sizes, FeatureFolder | None, str, list[str]]:
     """Let the teacher see a picture of each size: sizes with what that tells, its map, its name, and notes."""
     teacher = NamedTeacher("lseg") if teacher is None else teacher
-    notes, name = [], getattr(teacher, "name", None) or as_teacher(teacher).name
-    meaningless = isinstance(teacher, NamedTeacher) and teacher.weights is None and teacher.name == "lseg"
-    before = memory_now()
-    loaded = teacher
+    notes, name = list[str](), getattr(teacher, "name", None) or as_teacher(teacher).name
+    before, loaded = memory_now(), teacher
     if isinstance(teacher, NamedTeacher):
-        loaded = teacher.load()
-        if meaningless:
-            notes.append("lseg is timed with meaningless weights, since no --weights are named")
+        loaded, note = teacher.load()
+        notes += [] if note is None else [note]
         if loaded is None:
-            why = "no weights are named" if teacher.weights is None else f"{teacher.weights} is not on this machine"
-            notes.append(f"{name} was not run, since {why}: no size or time of its maps is known; pass --weights PATH")
             return sizes, None, name, notes
     loaded = loaded.to(device) if hasattr(loaded, "to") else loaded
     views, found = scene.views(sizes.config.split), dict[tuple[int, int], EncodedPicture]()
@@ -142,7 +144,7 @@ def run_teacher(
     extra = 0 if peak is None or before is None else max(0, peak - before)
     sizes = replace(sizes, shapes=shapes, picture_seconds=seconds, teacher_peak=peak, teacher_bytes=extra)
     place = folder / f"{largest[0]}x{largest[1]}"
-    if meaningless:
+    if isinstance(teacher, NamedTeacher) and teacher.without_weights:
         h, w, D = found[largest].shape
         place, generator = folder / "noise", torch.Generator().manual_seed(0)
         noise = torch.randn(h, w, RANK, generator=generator) @ torch.randn(RANK, D, generator=generator)

@@ -109,7 +109,7 @@ def time_fit(scene: Scene, maps: FeatureFolder, config: FitConfig, gaussians: in
 
     Args:
         scene: as for `fit_scene`.
-        maps: the first stands for those of all views.
+        maps: of some views; they stand for those of all.
         config: as for `fit_scene`.
         gaussians: so many are trained from the start (method `paper`) or fused onto (`fuse`).
     """
@@ -127,7 +127,7 @@ def time_fit(scene: Scene, maps: FeatureFolder, config: FitConfig, gaussians: in
             field=_shortened(config.field, steps),
         )
         splat = GaussianParams.from_points(few.points, 1).activated().detach() if config.method == "fuse" else None
-        return fit_scene(few, _OneMap(maps, views), folder, short, splat=splat, report=report).stages
+        return fit_scene(few, _FewMaps(maps, views), folder, short, splat=splat, report=report).stages
 
     found = _time_twice(make, count, {"autoencoder", "field"})
     return {name: replace(one, each=one.each / denser) if name == "codebook" else one for name, one in found.items()}
@@ -195,26 +195,24 @@ class _Peaks:
             self.found[name] = self._memory.bytes
 
 
-class _OneMap(Sequence[Tensor]):
-    """One stored map in the place of those of all views; it is read each time."""
+class _FewMaps(Sequence[Tensor]):
+    """So many views' maps, evenly spread over those that are stored; one stands for several if there are too few."""
 
     def __init__(self, maps: FeatureFolder, count: int) -> None:
-        self._maps, self._count = maps, count
-        self.files, self.shape = [maps.files[0]] * count, maps.shape
+        self._maps, self._chosen = maps, [i * len(maps) // count for i in range(count)]
+        self.files, self.shape = [maps.files[i] for i in self._chosen], maps.shape
 
     def __len__(self) -> int:
-        return self._count
+        return len(self._chosen)
 
     def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [h, w, D]
-        if not 0 <= i < self._count:
-            raise IndexError(i)
-        return self._maps[0]
+        return self._maps[self._chosen[i]]
 
     def digests(self) -> list[list[str]]:
-        return [[str(i), ""] for i in range(self._count)]
+        return [[str(i), ""] for i in range(len(self))]
 
     def grid(self, i: int, step: tuple[int, int] | None, samples: int) -> Tensor:  # [n, D]
-        return self._maps.grid(0, step, samples)
+        return self._maps.grid(self._chosen[i], step, samples)
 
 
 class PeakMemory:
