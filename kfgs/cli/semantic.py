@@ -126,7 +126,7 @@ def fit(
     from ..scenes import load_scene
 
     config = fit_config(preset, method, mode, seed, steps, max_gaussians, split)
-    config = dataclasses.replace(config, undistorted_features=undistorted_features)
+    config = dataclasses.replace(config, undistorted_features=undistorted_features, device=device)
     check_folder("out", out)
     if method == "paper":
         check_alone("splat", splat, "beside --method paper, which trains its own Gaussians")
@@ -151,7 +151,7 @@ def fit(
         maps = stored_maps(as_taken, loaded.views(split), features or scene_folder(scene) / "features", level)
         if discard_features:
             check_discard(maps, config)
-    result = fit_scene(loaded, maps, out, config, splat=splat, report=say, progress=True, device=device)
+    result = fit_scene(loaded, maps, out, config, splat=splat, report=say, progress=True)
     if teacher is not None:
         maps.clear()  # the samples; the stages made of them are found without
     say(result.field.summary())
@@ -252,6 +252,7 @@ def uplift(
         undistorted_features: the teacher saw undistorted pictures already, so its maps need no lens removed.
     """
     from ..fields import UpliftConfig
+    from ..pipeline import FitConfig
     from ..pipeline.fuse import uplift as uplift_scene
     from ..scenes import load_scene
 
@@ -262,9 +263,9 @@ def uplift(
         say(f"note: {note}")
     maps = stored_maps(as_taken, loaded.views(split), features or scene_folder(scene) / "features", level)
     cloud = open_field(splat).gaussians if (splat / "field.json").is_file() else open_splats("splat", splat).gaussians
-    config = UpliftConfig(max_gaussians=max_gaussians)
-    options: dict[str, Any] = {"split": split, "undistorted_features": undistorted_features, "folder": out}
-    found = uplift_scene(loaded, maps, cloud, config, progress=True, report=say, **options)
+    fused = UpliftConfig(max_gaussians=max_gaussians)
+    config = FitConfig(uplift=fused, split=split, undistorted_features=undistorted_features)
+    found = uplift_scene(loaded, maps, cloud, config, folder=out, progress=True, report=say)
     found.save(out)
     say(found.summary())
     wrote([out])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -80,7 +81,7 @@ def features(
 
 def plan(
     scene: SceneFolder,
-    teacher: str = "lseg",
+    teacher: str | None = None,
     weights: str | None = None,
     fast: bool = False,
     size: tuple[int, ...] = (),
@@ -92,17 +93,20 @@ def plan(
     store: Literal["keep", "discard", "recompute"] = "keep",
     images: Path | None = None,
     device: str = "auto",
+    features: Path | None = None,
+    run: Path | None = None,
     out: Path | None = None,
 ) -> None:
     """Predict disk, memory and minutes of `kfgs features` and `kfgs fit`, before either starts.
 
-    Maps that `kfgs features` has made already are counted.
+    Times are measured: the teacher sees one picture, and a few views and steps are tried. Maps that exist, and stages that
+    are finished, are counted.
 
     Args:
         scene: folder with images and a COLMAP model or transforms.json.
-        teacher: lseg, clip, siglip, ... as for `kfgs features`.
-        weights: as for `kfgs features`; a folder's config.json, or the name of a hub id, tells the teacher's size. When not
-            given a common size is taken, and a note says which.
+        teacher: lseg, clip, siglip, ... as for `kfgs features`; it is run on one picture if maps are missing. lseg when not
+            given.
+        weights: as for `kfgs features`. Nothing is downloaded. lseg needs none here.
         fast: as for `kfgs features`.
         size: as for `kfgs features`.
         preset: as for `kfgs fit`.
@@ -110,29 +114,34 @@ def plan(
         mode: as for `kfgs fit`.
         steps: as for `kfgs fit`.
         split: views to encode and to learn from.
-        store: what becomes of the dense maps: `keep` them; `discard` them when they are index maps (fit
+        store: what becomes of the dense maps: `keep` them; `discard` them when the field is made (fit
             --discard-features); `recompute` instead of storing (fit --teacher).
         images: folder of the pictures, if it is not SCENE/images.
         device: as for `kfgs fit`.
+        features: folder of maps that exist, in any layout that `kfgs fit` reads; SCENE/features when not given.
+        run: run folder of `kfgs fit` (its --out), whose finished stages count as done.
         out: also write the plan to this .json file.
     """
     from .._files import write_json
     from ..pipeline.plan import plan_scene
+    from ..pipeline.plan_maps import NamedTeacher
     from ..scenes import load_scene
 
     if out is not None:
         check_file("out", out)
+    if features is not None and not features.is_dir():
+        raise ValueError(f"features: expected a folder of maps, got {features}, which is none; leave --features out")
     config = fit_config(preset, method, mode, 0, steps, None, split)
-    loaded = load_scene(scene, images=images)
+    named = teacher_options(teacher or "lseg", fast, size)
     found = plan_scene(
-        loaded,
-        teacher=teacher,
-        weights=weights,
-        options=teacher_options(teacher, fast, size),
-        config=config,
+        load_scene(scene, images=images),
+        teacher=None
+        if teacher is None and weights is None and not named
+        else NamedTeacher(teacher or "lseg", weights, named),
+        config=dataclasses.replace(config, device=device),
         dense=store,
-        device=device,
-        folder=scene_folder(scene),
+        features=scene_folder(scene) / "features" if features is None else features,
+        run=run,
     )
     say(str(found))
     if out is not None:
@@ -146,7 +155,7 @@ def choose_teacher(name: str | None, weights: str | None, fast: bool, size: tupl
     Raises:
         ValueError: if none is named, or an option does not fit the teacher.
     """
-    from ..pipeline.device import training_device
+    from ..pipeline.train import training_device
     from ..teachers.load import load_teacher, teacher_names
 
     if name is None:
