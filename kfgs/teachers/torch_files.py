@@ -212,7 +212,8 @@ def _pickle_in_zip(file: BinaryIO) -> tuple[bytes, set[int]]:
 def _pickle_in_legacy(file: BinaryIO, head: bytes) -> tuple[bytes, PickleNames]:
     """The pickle of a file of torch < 1.6: it follows those of a magic number, a version and facts about the system."""
     if _LEGACY_MAGIC not in head[:32]:
-        raise TorchFileError("a plain pickle or a file of an unknown kind, not what torch.save writes")
+        what = "a plain pickle" if head.startswith(b"\x80") else "a file of an unknown kind"
+        raise TorchFileError(f"{what}, not what torch.save writes")
     with mmap(file.fileno(), 0, access=ACCESS_READ) as data:  # its read(n) reserves no more memory than there are bytes
         starts, names = [], []
         for _ in range(5):  # the last: the keys of the storages, whose values follow

@@ -187,7 +187,7 @@ KINDS = {
     "umlaut": ("Tür\n".encode() * 500, "a text file that begins 'T"),
     "json": (b'{"weight_map": {}}', "a JSON file .*index"),
     "blank": (b"  \n ", "a blank text file"),
-    "random": (b"\x07\x00\xfe\x13" * 40, "a plain pickle or a file of an unknown kind"),
+    "random": (b"\x07\x00\xfe\x13" * 40, "a file of an unknown kind"),
     "pickle": (pickle.dumps({"a": [1, 2]}), "a plain pickle"),
     "zip": (zip_of({"photo.txt": b"hello"}), r"a zip archive that torch.save did not write \(it holds photo.txt"),
     "no records": (zip_of({}), "an empty zip archive"),

@@ -160,6 +160,10 @@ def test_teacher_protocol_device_and_module() -> None:
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_repr_is_short_and_tells_the_options() -> None:
+    assert repr(tiny()) == f"LSeg({LSegOptions()}, device=cpu)"
+
+
 def test_follows_its_device() -> None:
     image = picture(50, 64)
     expected = with_text().encode_image(image)
