@@ -55,7 +55,7 @@ def weights_digest(path: str | Path) -> str:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Raise unless there is such a file; what goes wrong with it inside becomes one line that names it."""
+    """Raise unless the file exists. Errors inside become one line that names it."""
     try:
         if path.is_dir():
             raise TorchFileError("a folder", "name the file of weights in it")

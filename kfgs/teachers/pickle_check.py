@@ -1,8 +1,8 @@
-"""Check a pickle before torch reads it: what it names, and that reading it is about as much work as the file is long.
+"""Check a pickle before torch reads it: which classes it names, and whether reading it takes too much time or memory.
 
-`torch.load(weights_only=True)` runs nothing that a file names, but a few bytes can still make it work for ever or use up
-the memory: tuples in tuples whose hash visits 2^60 values, a set made of a tensor, one long list copied by 100,000 calls.
-This is a dry run. It follows the opcodes and keeps of each object how many values a walk through it would visit.
+`torch.load(weights_only=True)` runs nothing that a file names, but a few bytes can still make it run forever or fill the
+memory: nested tuples whose hash visits 2^60 values, a set made of a tensor, one long list copied by 100,000 calls. This is
+a dry run: it follows the opcodes and counts, for each object, how many values a walk through it would visit.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ _UNSAFE_BUILTINS = _words("eval exec compile open __import__ globals breakpoint 
 
 
 class UnsafePickleError(ValueError):
-    """A pickle names something that only an attack asks for; `args[0]` is its name."""
+    """A pickle names something that only a malicious pickle would contain; `args[0]` is the name."""
 
 
 class BrokenPickleError(ValueError):
-    """Bytes that are no pickle, not a whole one, or one that torch does not read."""
+    """Bytes that are not a pickle, or a pickle that is cut short, or one that torch does not read."""
 
 
 class OtherProtocolError(BrokenPickleError):
@@ -88,10 +88,10 @@ class _Value:
 
 @dataclass
 class PickleNames:
-    """What a pickle names beside torch's own functions, as `module.name`, in Python 3's spelling."""
+    """What a pickle calls besides the few functions of torch it needs: `module.name`, in Python 3's spelling."""
 
     called: set[str] = field(default_factory=set)
-    """What it calls; must be replaced by what ignores arguments, state and further calls."""
+    """Must be replaced by something that ignores arguments, state and further calls."""
     filled: dict[str, type] = field(default_factory=dict)
     """Those of them whose results get items, as a dict or a list does."""
 
@@ -99,7 +99,7 @@ class PickleNames:
 def check_pickle(source: ByteSource) -> PickleNames:
     """Raise unless torch can read the pickle at the position of `source` with work in proportion to its length.
 
-    `source` is left behind the pickle's last byte.
+    Afterwards `source` is at the first byte after the pickle.
 
     Raises:
         UnsafePickleError: if it names what runs commands, code or files, called or not.

@@ -1,4 +1,4 @@
-"""The one way to open torch files that other people wrote: nothing that they name is run or imported.
+"""The one way to open torch files that other people wrote. Nothing that they name is run or imported.
 
 `torch.load(weights_only=True)` refuses the files of Lightning, whose settings name its classes; `weights_only=False` runs
 whatever they say. Here torch reads with `weights_only=True`, and each class that a file names is replaced by one that does
@@ -70,7 +70,8 @@ class TorchFileError(ValueError):
 class Placeholder(type):
     """Stands for a class that a file names, which is not imported, and for its objects; `__name__` is the name.
 
-    It is a class of classes since torch makes objects and sets states only of classes that it was told.
+    It is a metaclass: torch makes objects, and gives them a state, only of classes on its list, and here the placeholder
+    of a class is its own object.
     """
 
     def __setstate__(cls, state: Any) -> None:
@@ -78,9 +79,9 @@ class Placeholder(type):
 
 
 def load_torch_file(path: Path) -> Any:
-    """The object in a file of `torch.save`, on the CPU; where the file names a class, there is a `Placeholder`.
+    """Read the object in a file of `torch.save`, on the CPU. Where the file names a class, there is a `Placeholder`.
 
-    Objects like dicts and lists (`defaultdict`, settings) become dicts and lists.
+    Objects that get items (`defaultdict`, settings that derive from dict or list) become dicts and lists.
 
     **Memory**: tensors in a zip archive (torch >= 1.6) are views of the file, mapped privately: pages are read when looked
     at, and writing to a tensor does not change the file. Older files are read whole.
@@ -97,10 +98,12 @@ def load_torch_file(path: Path) -> Any:
         if str(path).endswith(".safetensors"):  # torch goes by the name
             raise TorchFileError("a file that is named .safetensors, but is none", "rename it to .pt")
         if not head.startswith(_ZIP):
-            return _load(path, *_pickle_in_legacy(file, head), mapped=False)
+            found = _load(path, *_pickle_in_legacy(file, head), mapped=False)
+            _bare_tensors(found)
+            return found
         data, sizes = _pickle_in_zip(file)
         found = _load(path, data, check_pickle(io.BytesIO(data)), mapped=True)
-    if any(tensor.numel() and tensor.untyped_storage().nbytes() not in sizes for tensor in _tensors_in(found)):
+    if any(tensor.numel() and tensor.untyped_storage().nbytes() not in sizes for tensor in _bare_tensors(found)):
         raise TorchFileError("one with a tensor larger than its record in the archive: damaged")
     return found
 
@@ -163,7 +166,7 @@ def _load(path: Path, data: bytes, names: PickleNames, *, mapped: bool) -> Any:
 
 
 def _placeholder(name: str, like: type | None) -> Placeholder:
-    """What stands for the class `name`: a call changes nothing and gives itself, or a dict or list if that gets items."""
+    """What stands for the class `name`. A call returns the placeholder itself, or a dict or list if the file fills it."""
 
     def make(cls: Placeholder, *_: Any) -> Any:
         if like is None:
@@ -222,17 +225,24 @@ def _pickle_in_legacy(file: BinaryIO, head: bytes) -> tuple[bytes, PickleNames]:
         return data[starts[3] : starts[4]], names[3]
 
 
-def _tensors_in(found: Any) -> Iterator[Tensor]:
-    """The tensors in dicts, lists and tuples of any depth."""
+def _bare_tensors(found: Any) -> list[Tensor]:
+    """The tensors in dicts, lists and tuples of any depth.
+
+    Attributes that the file gives to dicts and tensors are removed: one named `values` would replace the method.
+    """
     seen: set[int] = set()
+    tensors = []
     rest = [found]
     while rest:
         value = rest.pop()
+        if isinstance(value, Tensor | dict):
+            getattr(value, "__dict__", {}).clear()
         if isinstance(value, Tensor):
-            yield value
+            tensors.append(value)
         elif isinstance(value, dict | list | tuple) and id(value) not in seen:
             seen.add(id(value))
             rest += value.values() if isinstance(value, dict) else value
+    return tensors
 
 
 def _reason(error: Exception) -> str:

@@ -258,6 +258,18 @@ def test_settings_are_read_with_placeholders(tmp_path: Path, kind: str, zipped: 
     assert found["settings"].__name__ == "argparse.Namespace"
 
 
+@pytest.mark.parametrize("container", [archive, legacy])
+def test_attributes_of_dicts_and_tensors_do_not_replace_their_methods(tmp_path: Path, container) -> None:
+    methods = dict.fromkeys(("values", "items", "get", "numel", "detach", "untyped_storage", "element_size"), Outer)
+    parameter = Call(torch._utils._rebuild_parameter_with_state, tensor(legacy=container is legacy), True, {}, methods)
+    state = Call(collections.OrderedDict, state=methods)
+    body = pickled([state, parameter])
+    (tmp_path / "a.pt").write_bytes(container(body, np.arange(4, dtype=np.float32).tobytes()))
+    empty, found = load_torch_file(tmp_path / "a.pt")
+    assert list(empty.values()) == []
+    assert found.detach().tolist() == [0, 1, 2, 3]
+
+
 def test_what_is_like_a_dict_or_a_list_is_one(tmp_path: Path) -> None:
     items = Items([1, 2])
     torch.save({"config": Config(), "items": items, "d": collections.defaultdict(list, a=[3])}, tmp_path / "a.pt")
