@@ -10,7 +10,7 @@ from typing import Any, Literal
 from .._files import bytes_in_words, seconds_in_words
 from ..fields import FieldConfig
 from ..fields.answers import MOST
-from ..fields.uplift import WORKING
+from ..fields.working_maps import WORKING
 from ..quant.sampling import choose_grid_step
 from .config import FitConfig
 from .trial import Timing
