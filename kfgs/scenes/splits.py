@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._check import check_choice
-from .._files import read_json
-from .files import SceneError, file_stem
+from .files import SceneError, file_stem, read_scene_json
 
 SplitRule = Literal["df3dgs", "holdout8", "all"]
 
@@ -88,14 +87,7 @@ def read_split(path: str | Path, stems: Sequence[str]) -> tuple[dict[str, list[i
         FileNotFoundError: if there is no such file.
         SceneError: if it is not such a file, no training view is in the scene, or a view is in both train and test.
     """
-    try:
-        value = read_json(path)
-    except ValueError as error:
-        raise SceneError(f"{error}; repair the file or remove it") from error
-    except RecursionError as error:
-        raise SceneError(
-            f"{path}: expected a JSON file, got brackets nested too deep; repair the file or remove it"
-        ) from error
+    value = read_scene_json(path, "repair the file or remove it")
     if not _is_split(value):
         raise SceneError(
             f'{path}: expected {{"train": [names], "test": [names]}}, got {str(value)[:80]}; '
