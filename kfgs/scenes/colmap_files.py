@@ -1,4 +1,4 @@
-"""The files of a COLMAP model, binary and text. Both hold the same fields in the same order, so one set of readers serves both.
+"""The files of a COLMAP model, binary and text. Both hold the same fields in the same order, so one reader serves both.
 
 A `Table` hands out the fields of one record after the other. It compares every count with what is left of the file before it
 is used, so memory is bounded by the size of the file.
