@@ -65,7 +65,7 @@ from kfgs.pipeline import feature_colors, score_teacher, true_labels
 scene = load_scene(folder).undistorted()
 classes = load_label_set(names, text)
 train, test = scene.views("train"), scene.views("test")
-maps = FeatureFolder(features, [scene.stem(i) for i in train])
+maps = FeatureFolder(features).of(scene, "train")
 print(scene)
 print(f"{len(maps)} maps of {tuple(maps[0].shape)}; {len(classes)} classes: {', '.join(classes.names)}")
 
@@ -136,7 +136,7 @@ print(f"every Gaussian kept: {every!r}")
 # counts, as in the other two.)
 
 # %%
-test_maps = FeatureFolder(features, [scene.stem(i) for i in test])
+test_maps = FeatureFolder(features).of(scene, "test")
 latents = feature_colors(field)(field.render(camera).map)
 row = [image, latents, as_colors(field.feature_map(camera)), as_colors(test_maps[k])]
 titles = ("photograph", f"{field.channels} latents", "decoded to 512", "teacher's 512")

@@ -39,7 +39,7 @@ from kfgs import (
     ColorConfig,
     FeatureFolder,
     FitConfig,
-    answers,
+    connected_parts,
     fit_color,
     fit_scene,
     load_label_set,
@@ -49,7 +49,7 @@ from kfgs import (
     viz,
 )
 from kfgs.cameras import Orbit, estimate_up, orbit_cameras
-from kfgs.labels import select_where
+from kfgs.labels import Selection
 from kfgs.metrics import psnr
 from kfgs.pipeline import feature_colors
 
@@ -61,7 +61,7 @@ from kfgs.pipeline import feature_colors
 scene = load_scene(folder).undistorted()
 classes = load_label_set(names, text)
 cameras = [scene.cameras[i] for i in scene.views("train")]
-maps = FeatureFolder(features, [scene.stem(i) for i in scene.views("train")])
+maps = FeatureFolder(features).of(scene, "train")
 quick = ColorConfig.quick()
 color_config = replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000))
 color = fit_color(scene, run, color_config).gaussians
@@ -185,20 +185,20 @@ Image.fromarray(plotter.screenshot(return_img=True))
 # %% [markdown]
 # ## Selections
 #
-# `answers` gives the connected parts of a selection: how many Gaussians, where, how large, seen best from where. Scores
+# `connected_parts` gives the connected parts of a selection: how many Gaussians, where, how large, seen best from where. Scores
 # light up on the left, and on the right the parts stand in their oriented boxes. The rest keeps its brightness where there
 # are colours: so the selection is carried to the colour cloud first, to half of lambda, so that parts stay crisp.
 # (Matches and the histogram of their distances, `add_matches` and `plot_distances`, are in notebook 5.)
 
 # %%
-parts = answers(semantic, found, cameras, distance=apart)
+parts = connected_parts(semantic, found, cameras, distance=apart)
 for part in parts:
     print(part)
 owner = torch.full((len(semantic),), -1)
 for number, part in enumerate(parts):
     owner[part.indices] = number
 carried = transfer_labels(semantic, owner, color, transfer.distance / 2).labels
-selections = {f"{word} {number + 1}": select_where(carried == number) for number in range(len(parts))}
+selections = {f"{word} {number + 1}": Selection.of(carried == number) for number in range(len(parts))}
 
 
 def draw_scores(plotter):

@@ -1,11 +1,15 @@
+import importlib
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
+from kfgs import Autoencoder, Camera, Codebook, Gaussians, SemanticField, rasterize
 from kfgs._card import LONGEST, html_card, short_repr, short_value
+from kfgs.quant import CodebookFit, LinearLatents, Nearest
 
 
 def test_a_card_escapes_everything_and_leaves_out_what_is_none():
@@ -56,3 +60,60 @@ def test_no_value_is_long():
         shown = short_value(value)
         assert len(shown) <= LONGEST
         assert "\n" not in shown
+
+
+PACKAGES = ["kfgs.quant", "kfgs.fields", "kfgs.splat", "kfgs.viz", "kfgs.gaussians", "kfgs.metrics"]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_public_class_with_tensors_has_a_line_of_its_own(package):
+    """The generated lines of dataclasses and named tuples print thousands of numbers."""
+    module = importlib.import_module(package)
+    for name in getattr(module, "__all__", vars(module)):
+        kind = getattr(module, name)
+        if isinstance(kind, type) and any(
+            "Tensor" in str(one) for one in vars(kind).get("__annotations__", {}).values()
+        ):
+            from_namedtuple = kind.__repr__.__module__ == "collections"
+            from_dataclass = hasattr(kind.__repr__, "__wrapped__")
+            assert not from_namedtuple, name
+            assert not from_dataclass, name
+
+
+def test_lines_stay_short_and_cards_are_tables():
+    book = Codebook(torch.rand(300, 512))
+    widths = [(512, 64), (64, 9), (9, 64), (64, 512)]
+    layers = [(torch.rand(out, width), torch.rand(out)) for width, out in widths]
+    autoencoder = Autoencoder(tuple(layers[:2]), tuple(layers[2:]), 0.0, 1.0)
+    cloud = Gaussians(torch.rand(50, 3), torch.rand(50, 4), torch.rand(50, 3), torch.rand(50), torch.rand(50, 9))
+    field = SemanticField(cloud, book, autoencoder, {"teacher": {"name": "<lseg>"}})
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 3.0
+    camera = Camera(viewmat, torch.tensor([[30.0, 0, 15], [0, 30, 10], [0, 0, 1]]), 30, 20)
+    rendering = rasterize(cloud, camera, engine="reference")
+    results = [
+        Nearest(torch.rand(900), torch.rand(900)),
+        CodebookFit(book, [{"a": 1.0}] * 99, torch.rand(9), 1, 1, 1, None),
+    ]
+    for thing in (
+        book,
+        autoencoder,
+        field,
+        rendering,
+        rendering.projected,
+        cloud,
+        LinearLatents(torch.eye(9)),
+        *results,
+    ):
+        assert len(repr(thing)) < 200
+        assert "tensor(" not in repr(thing)
+        assert "\n" not in repr(thing)
+    assert repr(autoencoder) == "Autoencoder(512 channels to 9 latents and back, widths [512, 64, 9, 64, 512])"
+    for card, facts in (
+        (field._repr_html_(), ("&lt;lseg&gt;", "decouple+ADC+SC", ">300<", "9 for 512")),
+        (book._repr_html_(), (">300<", "[300, 512] float32")),
+        (rendering._repr_html_(), ("30 x 20", "9")),
+    ):
+        assert card.startswith("<table>")
+        assert all(fact in card for fact in facts)
+        assert len(card) < 2_000

@@ -24,7 +24,7 @@ def edits_from_words(
     """The edits that some options ask for, in this order: what is removed later was still there to be recoloured.
 
     A class may be followed by a part of it: `chair/1` is the largest connected part of all that is chair, `chair/2` the
-    next, as `answers` lists them. Each edit counts them anew, in what the edits before left; all parts of one class that
+    next, as `connected_parts` lists them. Each edit counts them anew, in what the edits before left; all parts of one class that
     are removed are counted together. A class whose own name ends so can be edited in Python alone.
 
     Raises:

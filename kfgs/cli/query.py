@@ -57,7 +57,7 @@ def select(
         images: folder of the scene's pictures, if it is not SCENE/images.
     """
     from ..formats import SplatFile
-    from ..labels import answers
+    from ..labels import connected_parts
     from ..pipeline.apply import select_labelled
     from ..scenes import load_scene
 
@@ -86,7 +86,7 @@ def select(
         found = select_labelled(cloud, query, threshold)
         cameras = None if scene is None else load_scene(scene, images=images).undistorted().cameras
     say(f"{query}: {len(found)} of {len(cloud)} Gaussians, {found.words}")
-    things = answers(cloud.gaussians, found, cameras)
+    things = connected_parts(cloud.gaussians, found, cameras)
     for number, thing in enumerate(things, start=1):
         say(f"  {query}/{number}: {thing!r}" if counted else f"  {thing!r}")
     if out is not None:

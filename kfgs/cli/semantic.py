@@ -143,7 +143,7 @@ def fit(
         check_alone("discard-features", discard_features, "beside --teacher, which stores no dense maps")
         check_alone("undistorted-features", undistorted_features, "beside --teacher, which sees the pictures as taken")
         chosen = choose_teacher(teacher, weights, fast, size, device)
-        maps: Any = RecomputedMaps(chosen, as_taken, loaded.views(split), out / "teacher")
+        maps: Any = RecomputedMaps(chosen, as_taken, split, out / "teacher")
     else:
         check_alone("weights", weights, "without --teacher, whose they are")
         check_alone("size", size or None, "without --teacher, whose option it is")

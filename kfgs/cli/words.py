@@ -43,7 +43,7 @@ def text(
             canonical`.
     """
     from ..labels import CANONICAL
-    from ..labels.label_table import SUFFIX
+    from ..labels.label_set import SUFFIX
     from ..teachers.prompts import template_set
 
     if out.suffix != SUFFIX or out.is_dir():

@@ -16,11 +16,11 @@ from ...cameras import Camera
 from ...formats import SplatFile, write_splats
 from ...formats.splat_file import SCORE
 from ...gaussians import Gaussians
-from ...labels import Selection, answers
+from ...labels import Selection, connected_parts
 from ..frusta import evenly
 from .picked import SPOKEN, Side
 
-MOST_PARTS = 16  # listed: as many as `answers` draws in one rendering of a view
+MOST_PARTS = 16  # listed: as many as `connected_parts` draws in one rendering of a view
 MOST_VIEWS = 30  # compared, evenly chosen
 
 
@@ -62,7 +62,7 @@ def _parts(side: SelectedSide, cameras: Sequence[Camera]) -> list[dict[str, Any]
     """The connected parts, each with the view that shows it best: its index among all cameras."""
     places = evenly(len(cameras), MOST_VIEWS).tolist() if cameras else []
     views = [cameras[place] for place in places]
-    parts = [part.to_json() for part in answers(side.cloud, side.selection, views or None, most=MOST_PARTS)]
+    parts = [part.to_json() for part in connected_parts(side.cloud, side.selection, views or None, most=MOST_PARTS)]
     for part in parts:
         if part["best_view"] is not None:
             part["best_view"]["index"] = places[part["best_view"]["index"]]

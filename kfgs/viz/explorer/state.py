@@ -10,12 +10,11 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch
 
-from ..._check import check_choice, check_range, check_whole
+from ..._check import as_array, check_choice, check_range, check_whole
 from ...cameras import Camera
 from ...gaussians import Gaussians
 from ...labels import Selection, class_indices
 from ...labels.transfer_distance import positions
-from ..arrays import as_array
 from ..palette import palette
 from .carried import SPAN, Array, Carried
 from .meaning import Asked, Meaning

@@ -1,4 +1,4 @@
-"""Plain values for things that are saved as JSON: checks that name the place, and the form of a dataclass."""
+"""Dataclasses that are saved as JSON: checks of single values that name the argument, and reading and writing a dataclass."""
 
 from __future__ import annotations
 
@@ -6,26 +6,27 @@ import math
 import numbers
 from collections.abc import Sequence
 from dataclasses import MISSING, fields
-from typing import Any
+from typing import Any, TypeVar
 
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-NESTED = 32  # levels of one expression; a file that nests deeper is no one's work
+T = TypeVar("T")
+NESTED = 32  # levels of one expression; no person writes deeper ones
 
 
 def numbers_of(name: str, values: Any, count: int) -> tuple[float, ...]:
     """`count` finite numbers from a list, tuple, array or tensor, as a tuple.
 
     Raises:
-        TypeError: if it holds something else than numbers.
+        TypeError: if a value is not a number.
         ValueError: if there are more or fewer, or one is not finite.
     """
     plain = values.tolist() if hasattr(values, "tolist") else values
     if isinstance(plain, str) or not isinstance(plain, Sequence) or not all(is_number(value) for value in plain):
         raise TypeError(f"{name}: expected {count} numbers, got {values!r:.80}; write them as [x, y, ...]")
     if len(plain) != count or not all(math.isfinite(value) for value in plain):
-        raise ValueError(f"{name}: expected {count} finite numbers, got {values!r:.80}; give each axis one number")
+        raise ValueError(f"{name}: expected {count} finite numbers, got {values!r:.80}; give one number per axis")
     return tuple(float(value) for value in plain)
 
 
@@ -33,7 +34,7 @@ def number_of(name: str, value: Any) -> float:
     """One finite number, as a float.
 
     Raises:
-        TypeError: if it is no number.
+        TypeError: if it is not a number.
         ValueError: if it is not finite.
     """
     plain = value.item() if isinstance(value, Tensor) and value.ndim == 0 else value
@@ -45,17 +46,17 @@ def number_of(name: str, value: Any) -> float:
 
 
 def is_number(value: Any) -> bool:
-    """A real number that a float can hold; a bool is none."""
+    """Whether it is a real number that a float can hold; a bool is not."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         return False
     return not isinstance(value, numbers.Integral) or abs(int(value)) < 2**1000
 
 
 def checked_object(name: str, value: Any, kind: Any, tag: str) -> dict[str, Any]:
-    """The members of a JSON object, less its tag, if they are fields of a dataclass and none that it needs is missing.
+    """Check the members of a JSON object against the fields of a dataclass, and return them without the tag.
 
     Raises:
-        ValueError: if it is no object, a member is unknown, or one is missing; `name` says where in the file.
+        ValueError: if it is not an object, a member is unknown, or one is missing; `name` says where in the file.
     """
     if not isinstance(value, dict):
         raise ValueError(f"{name}: expected an object {{...}} with {tag!r}, got {value!r:.80}; write one")
@@ -75,9 +76,29 @@ def checked_object(name: str, value: Any, kind: Any, tag: str) -> dict[str, Any]
     return {key: value[key] for key in given}
 
 
+def build(name: str, kind: type[T], members: dict[str, Any]) -> T:
+    """Make a dataclass of what a file holds; an error begins with the place in the file."""
+    try:
+        return kind(**members)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}.{error}") from error
+
+
 def members_of(value: Any) -> dict[str, Any]:
-    """The fields of a dataclass by name, shallow: what `checked_object` reads back."""
-    return {member.name: getattr(value, member.name) for member in fields(value) if member.init}
+    """The fields of a dataclass by name, as values that JSON can hold: what `checked_object` reads."""
+    return {member.name: _plain(getattr(value, member.name)) for member in fields(value) if member.init}
+
+
+def _plain(value: Any) -> Any:
+    if hasattr(value, "to_json"):
+        return value.to_json()
+    return [_plain(part) for part in value] if isinstance(value, tuple) else value
+
+
+def set_fields(frozen: Any, **values: Any) -> None:
+    """Replace fields of a frozen dataclass by their checked form, from its own `__post_init__`."""
+    for name, value in values.items():
+        object.__setattr__(frozen, name, value)
 
 
 def quaternion_of(name: str, values: Any) -> tuple[float, ...]:
@@ -95,7 +116,7 @@ def rotation_matrix(quaternion: Sequence[float]) -> Any:  # (w, x, y, z) -> [3, 
 
 
 def unit(values: Sequence[float]) -> list[float]:
-    """Finite numbers that are not all zero, brought to length 1; neither the largest nor the smallest floats overflow."""
+    """Divide a vector by its length, also where a square of its numbers would overflow or vanish. It must not be zero."""
     largest = max(abs(value) for value in values)
     scaled = [value / largest for value in values]
     length = math.hypot(*scaled)

@@ -1,4 +1,4 @@
-"""The answer to "where is the chair?": how many Gaussians, where, how large, and from where it is best seen."""
+"""The connected parts of a selection ("the four chairs"): how many Gaussians, where, how large, which camera shows it best."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from ..gaussians import Gaussians
 from ..splat import rasterize
 from .boxes import OrientedBox
 from .components import component_numbers
-from .selection import Selection, select_where
+from .selection import Selection
 
 LONGEST = 160  # pixels of the longer side of the views that are compared; on room_0 shares change by 0.3 % of the picture at most
-TOGETHER = 16  # answers drawn in one rendering, as channels
-SPECK = 0.05  # a part with less than this share of the largest is no answer of its own
+TOGETHER = 16  # parts drawn in one rendering, as channels
+SPECK = 0.05  # parts with less than this share of the largest are left out
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,12 @@ class BestView:
 
     camera: str  # its name
     index: int  # its place among the cameras asked
-    share: float  # of the picture that the selection fills, in [0, 1): what hides it and what it lets through count
+    share: float  # of the picture that the selection fills, in [0, 1); what lies in front of it is not counted
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
-    """What a selection is, as numbers. Positions are those of the Gaussians' centres, in world units."""
+class Part:
+    """A part of a selection in numbers, or the whole of it. Positions are the Gaussians' centres, in world units."""
 
     indices: Tensor  # [n] int64, ascending
     score: float  # mean score of the selected
@@ -55,29 +55,29 @@ class Answer:
         return self.box.volume
 
     def selection(self, count: int) -> Selection:
-        """This answer as a selection of the cloud of `count` Gaussians that was selected in, for `add_selections` or `&`.
+        """This part as a selection in the cloud of `count` Gaussians that was selected in.
 
-        Scores are 1 inside and 0 outside, since a place decides what is part of an answer: which heap a Gaussian is
-        connected to, not how well it fits. The scores of the question come back through `selection & one.selection(count)`.
+        Scores are 1 inside and 0 outside, because the place decides which part a Gaussian belongs to.
+        `selection & part.selection(count)` has the scores of the selection.
 
         Raises:
-            ValueError: if an index does not fit into such a cloud.
+            ValueError: if the cloud has fewer Gaussians than the highest index needs.
         """
         check_whole("count", count, 1)
         if int(self.indices[-1]) >= count:
             raise ValueError(
-                f"count: expected more than {int(self.indices[-1])} (the answer's highest index), got {count}; pass len of "
+                f"count: expected more than {int(self.indices[-1])} (the part's highest index), got {count}; pass len of "
                 "the cloud that was selected in, not of a part of it"
             )
         mask = torch.zeros(count, dtype=torch.bool, device=self.indices.device)
         mask[self.indices] = True
-        return select_where(mask, self.how)
+        return Selection.of(mask, self.how)
 
     def __repr__(self) -> str:
         place = ", ".join(f"{x:.3g}" for x in self.centroid.tolist())
         size = " x ".join(f"{2 * x:.3g}" for x in self.box.half.tolist())
         view = "" if self.best_view is None else f", {self.best_view.share:.1%} of {self.best_view.camera!r}"
-        return f"Answer({self.count} Gaussians at ({place}), {size}, score {self.score:.3f}{view})"
+        return f"Part({self.count} Gaussians at ({place}), {size}, score {self.score:.3f}{view})"
 
     def to_json(self, indices: bool = True) -> dict[str, Any]:
         """Plain numbers, lists and strings; the list of Gaussians can be left out, as it may be long."""
@@ -94,19 +94,19 @@ class Answer:
         } | ({"indices": self.indices.tolist()} if indices else {})
 
 
-def answer(
+def describe_selection(
     gaussians: Gaussians,
     selection: Selection,
     cameras: Sequence[Camera] | None = None,
     *,
     engine: str = "auto",
-) -> Answer:
-    """Describe a selection as a whole; `answers` describes each of its connected parts.
+) -> Part:
+    """Describe a selection as a whole; `connected_parts` describes each of its connected parts.
 
     Args:
         gaussians: the cloud that was selected in.
         selection: at least one Gaussian.
-        cameras: views to choose the best one from, without distortion.
+        cameras: views without distortion, of which the best one is found.
         engine: compositing engine.
 
     Raises:
@@ -121,7 +121,7 @@ def answer(
     return _described(gaussians, selection, [selection.indices], [selection.how], cameras, engine)[0]
 
 
-def answers(
+def connected_parts(
     gaussians: Gaussians,
     selection: Selection,
     cameras: Sequence[Camera] | None = None,
@@ -130,16 +130,16 @@ def answers(
     smallest: int | None = None,
     most: int = 100,
     engine: str = "auto",
-) -> list[Answer]:
-    """One answer for each connected part of a selection ("the four chairs"), largest first.
+) -> list[Part]:
+    """Take a selection apart into its connected parts ("the four chairs"), largest first.
 
     Args:
         gaussians: the cloud that was selected in.
-        selection: perhaps empty: then there is no answer, and the list is empty.
-        cameras: as in `answer`.
-        distance: how far apart connected Gaussians may be, in world units; see `component_numbers`.
+        selection: if it is empty, so is the list.
+        cameras: as in `describe_selection`.
+        distance: Gaussians at most this far apart are connected, in world units; see `component_numbers`.
         smallest: parts of fewer Gaussians are left out; None leaves out those below 5 % of the largest.
-        most: how many answers at most.
+        most: how many parts at most.
         engine: compositing engine.
 
     Raises:
@@ -201,10 +201,10 @@ def _described(
     how: list[str],
     cameras: Sequence[Camera] | None,
     engine: str,
-) -> list[Answer]:
+) -> list[Part]:
     views = [None] * len(parts) if not cameras else _best_views(gaussians, parts, cameras, engine)
     return [
-        _answer(gaussians.means[part], selection.scores[part], part, view, why)
+        _part(gaussians.means[part], selection.scores[part], part, view, why)
         for part, view, why in zip(parts, views, how, strict=True)
     ]
 
@@ -219,10 +219,10 @@ def _best_views(
     ]
 
 
-def _answer(means: Tensor, scores: Tensor, indices: Tensor, view: BestView | None, how: str) -> Answer:
+def _part(means: Tensor, scores: Tensor, indices: Tensor, view: BestView | None, how: str) -> Part:
     check_finite("gaussians.means", means)
     points = means.detach().double()
-    return Answer(
+    return Part(
         indices=indices,
         score=float(scores.double().mean()),
         centroid=points.mean(dim=0),

@@ -156,3 +156,10 @@ def test_classes_of_one_name_are_counted_together():
     assert len(Remove("wall").apply(splats)) == 3
     with pytest.raises(ValueError, match=r"classes present are wall \(6\): select one of them"):
         Remove("plant").apply(splats)
+
+
+def test_a_selection_can_be_edited_as_well():
+    splats = scene()
+    chairs = OfClass("chair").select(splats)
+    assert Remove(chairs) == Remove(OfIndex([3, 4]))
+    assert places(Remove(chairs).apply(splats)) == places(Remove("chair").apply(splats))

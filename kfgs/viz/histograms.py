@@ -1,34 +1,38 @@
-"""The scores of a question (Sec. 3.4) as a histogram: where gamma cuts them, and where gamma comes from."""
+"""Histograms of Sec. 3.4: the scores of a query with gamma, and the distances of a transfer with lambda."""
 
 from __future__ import annotations
 
 import textwrap
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from torch import Tensor
 
-from .._check import check_shapes
+from .._check import as_array, check_range, check_shapes
 from ..labels import Selection
-from .arrays import as_array
-from .matches import REST, TAKEN
-from .palette import palette
-from .plots import INK, _figure, _save
+from .figures import INK, Array, axes_for, finish
+from .palette import PALETTE, palette
 
-Array = np.ndarray[Any, Any]
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 BINS = 80
+TAKEN, REST = tuple(PALETTE[4] / 255), (0.75, 0.75, 0.75)  # of bars: what is selected or in reach, and what is not
 STEEP = 5.0  # where the highest bin of the selected is so much lower than that of the rest, counts are drawn in logs
-CLASSES = 5  # of so many at most, those with the most selected, is a line drawn: more cannot be told apart
+CLASSES = 5  # at most so many classes get a line, those with the most selected: more cannot be told apart
 WIDE = 88  # letters of a line over the picture
+CLOSEST = 100  # distances below the median divided by this make the axis no longer
 
 
 def plot_scores(
     selection: Selection,
-    path: str | Path,
+    path: str | Path | None = None,
     *,
     labels: Tensor | None = None,  # [N] int64, -1 = none
-) -> None:
+    ax: Axes | None = None,
+) -> Figure:
     """Draw how many Gaussians have which score, the selected ones in blue, the rest in grey, and gamma.
 
     Colours are those of `plot_distances`; bins meet at gamma. The title says how many are selected and how gamma came
@@ -37,9 +41,10 @@ def plot_scores(
 
     Args:
         selection: what a query returned; without a threshold nothing is marked.
-        path: a .png file.
-        labels: classes of the same Gaussians. Each class that was selected from (the 5 most, at most) gets a line in its
-            colour, and says how many of its own were.
+        path: a .png file to write; None writes none.
+        labels: classes of the same Gaussians. The classes with selected Gaussians (at most 5, those with the most) get a line
+            in their colour; the legend says how many of each class are selected.
+        ax: axes to draw into; None makes a figure.
 
     Raises:
         ValueError: if there are no Gaussians, labels are not one for each, or the file is no .png.
@@ -51,8 +56,7 @@ def plot_scores(
         raise ValueError("selection: expected the scores of at least one Gaussian, got none; ask a cloud that has some")
     edges = score_bins(scores, selection.threshold)
     counts = [np.histogram(scores[part], edges)[0] for part in (~mask, mask)]
-    figure = _figure(7.0, 4.0)
-    axes = figure.add_subplot()
+    axes = axes_for(ax, 7.0, 4.0)
     for count, name, color in zip(counts, ("not selected", "selected"), (REST, TAKEN), strict=True):
         axes.bar(edges[:-1], count, np.diff(edges), align="edge", color=color, label=f"{name} {count.sum():,}")
     if labels is not None:
@@ -70,7 +74,7 @@ def plot_scores(
     axes.legend(frameon=False)
     axes.grid(alpha=0.3)
     axes.set_axisbelow(True)
-    _save(figure, path)
+    return finish(axes, path)
 
 
 def score_bins(scores: Array, threshold: float | None) -> Array:  # [N] -> [B + 1]
@@ -82,6 +86,60 @@ def score_bins(scores: Array, threshold: float | None) -> Array:  # [N] -> [B + 
     zero = low if threshold is None else threshold
     first, last = np.floor((low - zero) / width), np.ceil((high - zero) / width)
     return zero + width * np.arange(first - 1, last + 2)  # one empty bin on either side: no score is lost in rounding
+
+
+def plot_distances(
+    distances: Tensor | Array,  # [N] world units; infinite: no source in range
+    distance: float,
+    path: str | Path | None = None,
+    *,
+    ax: Axes | None = None,
+) -> Figure:
+    """Draw how far destinations are from their sources, with lambda marked, on a logarithmic axis; bins meet at lambda.
+
+    To see what lies beyond lambda too, pass the distances of a transfer with a larger one. Distances of 0, and below a
+    hundredth of the median, are drawn in the lowest bin.
+
+    Args:
+        distances: `Transfer.distances`.
+        distance: lambda, world units.
+        path: a .png file to write; None writes none.
+        ax: axes to draw into; None makes a figure.
+
+    Raises:
+        ValueError: if there are no distances, one is negative or not a number, or lambda is not positive.
+    """
+    values = as_array(distances, "distances")
+    check_shapes(("distances", values, "N"))
+    check_range("distance", distance, 0, closed=(False, False))
+    if values.size == 0 or not (values >= 0).all():
+        raise ValueError(
+            f"distances: expected at least one, none negative or NaN, got {values.size} with "
+            f"{int((~(values >= 0)).sum())} of them wrong; pass Transfer.distances"
+        )
+    found = values[np.isfinite(values)].astype(np.float64)
+    positive = found[found > 0]
+    nearest = max(float(positive.min()), float(np.median(positive)) / CLOSEST) if positive.size else distance
+    low = min(nearest, distance / 10)
+    high = max(float(found.max()) if found.size else distance, 2 * distance)
+    step = np.log(high / low) / BINS
+    first, last = np.floor(np.log(low / distance) / step), np.ceil(np.log(high / distance) / step)
+    edges = distance * np.exp(step * np.arange(first, last + 1))  # one of them is lambda exactly
+    counts, _ = np.histogram(np.clip(found, edges[0], edges[-1]), edges)
+    axes = axes_for(ax, 7.0, 4.0)
+    near = edges[:-1] < distance
+    widths = np.diff(edges)
+    for part, color, name in ((near, TAKEN, "within lambda"), (~near, REST, "beyond")):
+        axes.bar(edges[:-1][part], counts[part], widths[part], align="edge", color=color, label=name)
+    axes.axvline(distance, color="black", linewidth=1.5, label=f"lambda = {distance:.4g}")
+    axes.set(xscale="log", xlabel="distance to the source (world units)", ylabel="destinations")
+    closer = 100 * float((values < distance).mean())
+    axes.set_title(
+        f"{closer:.1f} % closer than lambda; {values.size - found.size:,} of {values.size:,} without a source"
+    )
+    axes.legend(frameon=False)
+    axes.grid(alpha=0.3)
+    return finish(axes, path)
 
 
 def _by_class(scores: Array, mask: Array, labels: Array, edges: Array) -> list[tuple[str, Any, Array]]:

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from kfgs.gaussians import Gaussians
-from kfgs.labels import extract, recolor, remove
+from kfgs.labels import recolor
 
 WEIGHTS = torch.tensor([0.2126, 0.7152, 0.0722], dtype=torch.float64)
 C0 = 0.28209479177387814  # 1 / (2 sqrt(pi))
@@ -19,17 +19,6 @@ def field(n=12, coefficients=4, seed=0):
         sh=(random(n, coefficients, 3) - 0.5) * 0.4,
         labels=torch.arange(n) % 3,
     )
-
-
-def test_remove_and_extract_divide_the_field():
-    gaussians = field()
-    mask = gaussians.labels == 1
-    kept, taken = remove(gaussians, mask), extract(gaussians, mask)
-    assert (len(kept), len(taken)) == (8, 4)
-    assert (taken.labels == 1).all()
-    assert not (kept.labels == 1).any()
-    assert taken.sh.equal(gaussians.sh[mask])
-    assert len(gaussians) == 12
 
 
 def luminance(colors):
@@ -180,17 +169,15 @@ def test_empty_mask_changes_nothing():
     gaussians = field()
     nothing = torch.zeros(12, dtype=torch.bool)
     assert recolor(gaussians, nothing, (1.0, 0.0, 0.0)).sh.equal(gaussians.sh)
-    assert len(remove(gaussians, nothing)) == 12
-    assert len(extract(gaussians, nothing)) == 0
 
 
 def test_wrong_input_is_named():
     gaussians = field()
     mask = gaussians.labels == 0
     with pytest.raises(TypeError, match="mask: expected a boolean mask, got torch.int64"):
-        remove(gaussians, gaussians.labels)
+        recolor(gaussians, gaussians.labels, "red")
     with pytest.raises(ValueError, match=r"mask: expected \[N\] with N = 12"):
-        extract(gaussians, mask[:5])
+        recolor(gaussians, mask[:5], "red")
     with pytest.raises(ValueError, match=r"gaussians.sh: expected spherical harmonics"):
         recolor(gaussians.replace(sh=None), mask, (1.0, 0.0, 0.0))
     with pytest.raises(ValueError, match=r"rgb: expected three numbers in \[0, 1\], got \(255, 0, 0\)"):

@@ -6,7 +6,7 @@ import torch
 
 from kfgs.cameras import Camera, Similarity
 from kfgs.gaussians import Gaussians
-from kfgs.labels import Selection, answer, answers, select_where, view_shares
+from kfgs.labels import Selection, connected_parts, describe_selection, view_shares
 from kfgs.splat import rasterize, transform_gaussians
 
 
@@ -44,9 +44,9 @@ def chosen(gaussians, n=9):
     return Selection(torch.arange(len(gaussians)) < n, scores, 0.05, "given")
 
 
-def test_one_answer_in_numbers():
+def test_a_selection_in_numbers():
     gaussians = scene()
-    found = answer(gaussians, chosen(gaussians, 5))
+    found = describe_selection(gaussians, chosen(gaussians, 5))
     assert found.count == 5
     assert found.indices.tolist() == [0, 1, 2, 3, 4]
     assert found.centroid.tolist() == pytest.approx([-1, 0.4, 4])
@@ -62,45 +62,48 @@ def test_one_answer_in_numbers():
     assert found.how == "given"
 
 
-def test_one_answer_for_each_part_largest_first():
+def test_parts_largest_first():
     gaussians = scene()
-    found = answers(gaussians, chosen(gaussians), distance=0.3)
+    found = connected_parts(gaussians, chosen(gaussians), distance=0.3)
     assert [one.indices.tolist() for one in found] == [[0, 1, 2, 3, 4], [5, 6, 7, 8]]
     assert [one.how for one in found] == ["given; part 1 of 2", "given; part 2 of 2"]
     assert found[1].centroid.tolist() == pytest.approx([1, 0.3, 4])
-    assert len(answers(gaussians, chosen(gaussians), distance=3.0)) == 1
-    assert len(answers(gaussians, chosen(gaussians), distance=0.3, most=1)) == 1
-    assert len(answers(gaussians, chosen(gaussians), distance=0.3, smallest=5)) == 1
+    assert len(connected_parts(gaussians, chosen(gaussians), distance=3.0)) == 1
+    assert len(connected_parts(gaussians, chosen(gaussians), distance=0.3, most=1)) == 1
+    assert len(connected_parts(gaussians, chosen(gaussians), distance=0.3, smallest=5)) == 1
 
 
-def test_specks_are_no_answers_unless_asked_for():
+def test_specks_are_left_out_unless_asked_for():
     n = 60
     gaussians = balls([*[[0.05 * i, 0.0, 4.0] for i in range(n)], [9.0, 9.0, 4.0], [9.05, 9.0, 4.0], [9.1, 9.0, 4.0]])
-    everything = select_where(torch.ones(n + 3, dtype=torch.bool))
-    assert [one.count for one in answers(gaussians, everything, distance=0.1)] == [60, 3]  # 5 % of 60 is kept
+    everything = Selection.of(torch.ones(n + 3, dtype=torch.bool))
+    assert [one.count for one in connected_parts(gaussians, everything, distance=0.1)] == [60, 3]  # 5 % of 60 is kept
     gaussians = gaussians.select(torch.arange(n + 2))
     everything = everything.mask[: n + 2]
-    assert [one.count for one in answers(gaussians, select_where(everything), distance=0.1)] == [60]
-    assert [one.count for one in answers(gaussians, select_where(everything), distance=0.1, smallest=1)] == [60, 2]
+    assert [one.count for one in connected_parts(gaussians, Selection.of(everything), distance=0.1)] == [60]
+    assert [one.count for one in connected_parts(gaussians, Selection.of(everything), distance=0.1, smallest=1)] == [
+        60,
+        2,
+    ]
 
 
-def test_nothing_selected_is_no_answer():
+def test_nothing_selected_has_no_parts():
     gaussians = scene()
     nothing = Selection(torch.zeros(10, dtype=torch.bool), torch.zeros(10), 0.7, "given")
-    assert answers(gaussians, nothing, [camera()]) == []
+    assert connected_parts(gaussians, nothing, [camera()]) == []
     with pytest.raises(
         ValueError, match=r"selection: expected at least one Gaussian, got none \(score > 0.7 \(given\)\)"
     ):
-        answer(gaussians, nothing)
+        describe_selection(gaussians, nothing)
 
 
 def test_the_nearer_camera_sees_it_best_and_the_one_behind_not_at_all():
     gaussians = scene()
     views = [camera(0, "far"), camera(1, "near"), camera(6, "away"), camera(0, "back", turned=True)]
-    found = answer(gaussians, chosen(gaussians), views)
+    found = describe_selection(gaussians, chosen(gaussians), views)
     assert (found.best_view.camera, found.best_view.index) == ("near", 1)
     assert 0.02 < found.best_view.share < 1
-    assert answer(gaussians, chosen(gaussians), views[2:]).best_view is None
+    assert describe_selection(gaussians, chosen(gaussians), views[2:]).best_view is None
     seen = view_shares(gaussians, [torch.arange(9)], views)
     assert seen[2:, 0].tolist() == [0, 0]
     assert 1.5 < seen[1, 0] / seen[0, 0] < 16 / 9  # (4 / 3)^2, less the low-pass filter
@@ -111,8 +114,8 @@ def test_the_best_view_is_the_same_in_every_frame(scale):
     gaussians, views = scene(), [camera(0, "far"), camera(1, "near")]
     moved = Similarity(scale, torch.eye(3), torch.tensor([1.0, -2.0, 3.0]))
     there = transform_gaussians(gaussians, moved)
-    expected = answer(gaussians, chosen(gaussians), views).best_view
-    found = answer(there, chosen(there), [moved.apply_to_camera(view) for view in views]).best_view
+    expected = describe_selection(gaussians, chosen(gaussians), views).best_view
+    found = describe_selection(there, chosen(there), [moved.apply_to_camera(view) for view in views]).best_view
     assert (found.camera, found.index) == ("near", 1)
     assert found.share == pytest.approx(expected.share, rel=1e-3)
 
@@ -148,10 +151,10 @@ def test_large_pictures_are_compared_small():
     assert view_shares(gaussians, parts, [large]).equal(view_shares(gaussians, parts, [small]))
 
 
-def test_answers_are_selections_of_the_whole_cloud():
+def test_parts_are_selections_of_the_whole_cloud():
     gaussians = scene()
     asked = chosen(gaussians)
-    left, right = (one.selection(len(gaussians)) for one in answers(gaussians, asked, distance=0.3))
+    left, right = (one.selection(len(gaussians)) for one in connected_parts(gaussians, asked, distance=0.3))
     assert left.indices.tolist() == [0, 1, 2, 3, 4]
     assert right.indices.tolist() == [5, 6, 7, 8]
     assert left.scores.tolist() == [1.0] * 5 + [0.0] * 5
@@ -161,15 +164,15 @@ def test_answers_are_selections_of_the_whole_cloud():
     again = asked & left  # the question's own scores
     assert again.mask.equal(left.mask)
     assert again.scores[:5].equal(asked.scores[:5])
-    assert answer(gaussians, again).score == pytest.approx(float(asked.scores[:5].mean()))
+    assert describe_selection(gaussians, again).score == pytest.approx(float(asked.scores[:5].mean()))
 
 
-def test_an_answer_fits_no_smaller_cloud():
+def test_a_part_fits_no_smaller_cloud():
     gaussians = scene()
-    one = answer(gaussians, chosen(gaussians, 5))
+    one = describe_selection(gaussians, chosen(gaussians, 5))
     assert len(one.selection(5).mask) == 5
     with pytest.raises(
-        ValueError, match=r"count: expected more than 4 \(the answer's highest index\), got 4; pass len of"
+        ValueError, match=r"count: expected more than 4 \(the part's highest index\), got 4; pass len of"
     ):
         one.selection(4)
     with pytest.raises(ValueError, match="count: expected a whole number, got 5.0"):
@@ -178,7 +181,7 @@ def test_an_answer_fits_no_smaller_cloud():
 
 def test_json_round_trip():
     gaussians = scene()
-    found = answer(gaussians, chosen(gaussians, 5), [camera(name="front")])
+    found = describe_selection(gaussians, chosen(gaussians, 5), [camera(name="front")])
     plain = json.loads(json.dumps(found.to_json(), allow_nan=False))
     assert plain["count"] == 5
     assert plain["indices"] == [0, 1, 2, 3, 4]
@@ -186,7 +189,7 @@ def test_json_round_trip():
     assert set(plain) - set(found.to_json(indices=False)) == {"indices"}
     assert "5 Gaussians at (-1, 0.4, 4)" in repr(found)
     assert "of 'front'" in repr(found)
-    assert answer(gaussians, chosen(gaussians)).to_json()["best_view"] is None
+    assert describe_selection(gaussians, chosen(gaussians)).to_json()["best_view"] is None
 
 
 def test_wrong_input_is_named():
@@ -194,11 +197,11 @@ def test_wrong_input_is_named():
     with pytest.raises(
         ValueError, match=r"selection.mask: expected \[N\] with N = 10 \(from gaussians.means\), got \(4,\)"
     ):
-        answer(gaussians, select_where(torch.ones(4, dtype=torch.bool)))
+        describe_selection(gaussians, Selection.of(torch.ones(4, dtype=torch.bool)))
     with pytest.raises(ValueError, match=r"selection.mask: expected \[N\] with N = 10"):
-        answers(gaussians, select_where(torch.ones(4, dtype=torch.bool)))
+        connected_parts(gaussians, Selection.of(torch.ones(4, dtype=torch.bool)))
     broken = gaussians.replace(means=gaussians.means.clone().index_fill_(0, torch.tensor([1]), math.nan))
     with pytest.raises(ValueError, match="means: expected finite numbers, got NaN or infinity in row 1"):
-        answer(broken, chosen(gaussians))
+        describe_selection(broken, chosen(gaussians))
     with pytest.raises(ValueError, match="most: expected a number in"):
-        answers(gaussians, chosen(gaussians), most=0)
+        connected_parts(gaussians, chosen(gaussians), most=0)
