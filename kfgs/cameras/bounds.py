@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import check_range, check_shapes
 
 
@@ -20,6 +21,9 @@ class Bounds(NamedTuple):
     """[3] upper corner."""
     inside: Tensor
     """[P] bool, which points lie in the box."""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def robust_bounds(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -43,6 +44,12 @@ class Similarity:
         object.__setattr__(self, "scale", float(self.scale))
         object.__setattr__(self, "rotation", exact_rotation("rotation", self.rotation))
         object.__setattr__(self, "translation", self.translation.detach().double().cpu().clone())
+
+    def __repr__(self) -> str:
+        cosine = (float(self.rotation.trace()) - 1) / 2
+        degrees = math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+        x, y, z = self.translation.tolist()
+        return f"Similarity(scale {self.scale:.6g}, rotation by {degrees:.4g} degrees, translation ({x:.4g}, {y:.4g}, {z:.4g}))"
 
     @staticmethod
     def identity() -> Similarity:

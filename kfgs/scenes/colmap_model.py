@@ -68,6 +68,9 @@ class ColmapModel:
     rigs: int
     """0 in the older layout of three files."""
 
+    def __repr__(self) -> str:
+        return f"ColmapModel({self.layout}, {len(self.cameras)} cameras, {len(self.images)} images, {len(self.points)} points)"
+
 
 def has_model(path: str | Path) -> bool:
     """Whether a folder holds a COLMAP cameras or images file, whole or not."""
