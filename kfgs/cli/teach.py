@@ -9,12 +9,12 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from .._check import one_line
-from .checks import check_alone, check_file, check_folder
-from .say import Method, Mode, Preset, fit_config, say, wrote
+from .files import check_alone, check_file, check_folder
+from .options import Level, Method, Mode, Preset, fit_config
+from .output import say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
-Level = Literal["default", "s", "m", "l"]  # of LangSplat: SAM's own choice of masks; subparts, parts, wholes
 MISFITS = 3  # maps named in notes
 SceneFolder = Annotated[Path, tyro.conf.Positional]
 

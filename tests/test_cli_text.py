@@ -11,14 +11,19 @@ from cases_words import DIM, TEACHER, letters
 from small_room import make_room
 
 from kfgs.cli import main
-from kfgs.cli.say import find_classes, load_classes
-from kfgs.cli.words import read_words, text
+from kfgs.cli.options import Classes, Teacher
+from kfgs.cli.text import read_words
+from kfgs.cli.text import text as text_command
 from kfgs.fields import SemanticField
 from kfgs.labels import load_label_set
 from kfgs.scenes import load_scene
 from kfgs.teachers.prompts import make_label_set
 
 LETTERS = ["--teacher", "cases_words:TEACHER"]
+
+
+def text(names, teacher, out, **options):
+    text_command(names, teacher=Teacher(teacher), out=out, **options)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +86,7 @@ def test_text_writes_a_table_with_its_origin(tmp_path, capsys):
     expected = make_label_set(TEACHER, ["wall", "chair;seat"], templates="a {}")
     assert found.embeddings.equal(expected.embeddings)
     assert found.negatives.equal(expected.negatives)
-    text("wall", "cases_words:TEACHER", out, negatives=False)
+    text("wall", "cases_words:TEACHER", out, no_negatives=True)
     assert load_label_set(out).negatives is None
 
 
@@ -132,34 +137,34 @@ def test_a_table_in_the_scene_is_found(field, room, truth, names, tmp_path, caps
     scene = tmp_path / "scene"
     shutil.copytree(room, scene, ignore=shutil.ignore_patterns("classes.json", "text.npy"))
     text(",".join(reversed(names)), "cases_words:TEACHER", scene / "text.safetensors")
-    assert load_classes(scene, None, None).names == tuple(reversed(names))
+    assert Classes(scene).load_classes().names == tuple(reversed(names))
     assert main(["select", "lamp", str(field), "--scene", str(scene)]) == 0
     assert "lamp: " in capsys.readouterr().out
     shutil.copy(room / "classes.json", scene)  # label pictures count as it does
-    assert load_classes(scene, None, None).names == tuple(names)
+    assert Classes(scene).load_classes().names == tuple(names)
     assert capsys.readouterr().out == ""
-    whole = load_classes(scene, None, scene / "text.safetensors")
+    whole = Classes(scene, text=scene / "text.safetensors").load_classes()
     assert whole.names == tuple(reversed(names))
     assert "note: labels count the classes of" in capsys.readouterr().out
     np.save(scene / "text.npy", np.ones((len(names), 3), np.float32))
-    assert load_classes(scene, None, None).embeddings.shape == (len(names), 3)  # the pair of old goes first
+    assert Classes(scene).load_classes().embeddings.shape == (len(names), 3)  # the pair of old goes first
 
 
 def test_where_classes_are_looked_for(tmp_path):
     scene, table, names, rows = (tmp_path / name for name in ("s", "t.safetensors", "c.json", "t.npy"))
-    assert find_classes(None, None, table) == (table,)
-    assert find_classes(None, table, None) == (table,)
-    assert find_classes(None, names, table) == (names, table)
-    assert find_classes(scene, None, None) == (scene / "classes.json", scene / "text.npy")
-    assert find_classes(scene, names, None) == (names, scene / "text.npy")
-    assert find_classes(scene, None, table) == (table,)
-    assert find_classes(None, None, rows) is None
+    assert Classes(text=table).files() == (table,)
+    assert Classes(classes=table).files() == (table,)
+    assert Classes(classes=names, text=table).files() == (names, table)
+    assert Classes(scene=scene).files() == (scene / "classes.json", scene / "text.npy")
+    assert Classes(scene=scene, classes=names).files() == (names, scene / "text.npy")
+    assert Classes(scene=scene, text=table).files() == (table,)
+    assert Classes(text=rows).files() is None
     with pytest.raises(ValueError, match="text: expected none beside the table"):
-        find_classes(None, table, rows)
+        Classes(classes=table, text=rows).files()
     with pytest.raises(
         ValueError, match="pass --classes and --text, or --scene, or --text alone with what `kfgs text`"
     ):
-        load_classes(None, names, None)
+        Classes(classes=names).load_classes()
 
 
 def test_any_phrase_with_a_teacher_and_no_table(field, truth, names, capsys):
@@ -238,11 +243,13 @@ def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
     made.save(table)
     assert main(["select", "lamp", str(field), "--text", str(table)]) == 0
     said = capsys.readouterr().out
-    assert "note: classes: expected text of the field's teacher (name 'letters'), got text of another ('clip')" in said
+    assert (
+        "note: --classes: expected text of the field's teacher (name 'letters'), got text of another ('clip')" in said
+    )
     assert main(["select", "palm", str(field), "--text", str(table), *LETTERS]) == 0
     said = capsys.readouterr().out
-    assert "note: text: expected a table by the query's teacher (name 'letters'" in said
-    assert "got one by another ('clip'); their spaces do not mix: take the table's teacher for the query" in said
+    assert "note: --text: expected a table by the query's teacher (name 'letters'" in said
+    assert "got one by another ('clip'); they cannot be compared: use the table's teacher for the query" in said
     assert "field's teacher" not in said  # the query is of the field's own
 
 
