@@ -19,6 +19,7 @@ _quiet = tyro.conf.arg(help_behavior_hint="")  # no "(default: None)" in the hel
 Given = Annotated[T | None, _quiet]  # None when the option is not given
 Flag = Annotated[bool, _quiet]
 Name = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
+Device = Annotated[str, tyro.conf.arg(metavar="NAME")]
 Several = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="TEXT")]
 
 Preset = Literal["cpu", "paper"]
@@ -39,7 +40,7 @@ class Views:
     images: Given[Path] = None
     """Folder of the pictures, if it is not SCENE/images."""
     split: Annotated[str, tyro.conf.arg(metavar="NAME")] = "train"
-    """Which views: train, test, or another split that SCENE/split.json names."""
+    """Which views: train, test, or another split that SCENE/split.json names; `kfgs features` also takes all."""
 
     def load(self, scene: Path) -> Any:
         """The scene as its pictures were taken; its notes are printed."""
@@ -98,7 +99,7 @@ class Training:
     """At most this many Gaussians; the preset's when not given."""
     seed: int = 0
     """Every random choice follows from it."""
-    device: Annotated[str, tyro.conf.arg(metavar="NAME")] = "auto"
+    device: Device = "auto"
     """auto (a GPU if there is one), cpu or cuda."""
 
 

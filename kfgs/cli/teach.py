@@ -4,72 +4,62 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-import tyro
+from typing import Any, Literal
 
 from .._check import one_line
 from .files import check_alone, check_file, check_folder
-from .options import Level, Method, Mode, Preset, fit_config
+from .options import Device, Flag, Given, Level, MapTeacher, Method, Mode, Preset, SceneFolder, Views, fit_config
 from .output import say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
 MISFITS = 3  # maps named in notes
-SceneFolder = Annotated[Path, tyro.conf.Positional]
 
 
 def features(
     scene: SceneFolder,
-    teacher: str | None = None,
-    weights: str | None = None,
-    out: Path | None = None,
-    split: str = "train",
-    fast: bool = False,
-    size: tuple[int, ...] = (),
-    images: Path | None = None,
-    device: str = "auto",
-    overwrite: bool = False,
-    check: Path | None = None,
-    level: Level | None = None,
+    *,
+    out: Given[Path] = None,
+    overwrite: Flag = False,
+    check: Given[Path] = None,
+    level: Given[Level] = None,
+    device: Device = "auto",
+    teacher: MapTeacher,
+    views: Views,
 ) -> None:
-    """Run a teacher over a scene's pictures, one at a time, and keep its maps; or look over maps that exist.
+    """Run a teacher over a scene's pictures and keep its feature maps; or check maps that exist.
 
-    A killed run goes on with the same command: finished pictures are not done again.
+    Pictures are done one at a time. A killed run goes on with the same command: finished pictures are not done again.
+
+    Examples:
+        kfgs features scene/ --teacher lseg --weights demo_e200.ckpt
+        kfgs features scene/ --teacher dinov2 --weights facebook/dinov2-small --out maps/
+        kfgs features scene/ --check maps/    # by Feature 3DGS, LangSplat, or in .npy or .safetensors
 
     Args:
-        scene: folder with images and a COLMAP model or transforms.json.
-        teacher: lseg, clip, siglip, ... (a wrong name lists them), or package.module:name of your own.
-        weights: checkpoint file (lseg, sam), or folder or hub id (the others).
-        out: folder for the maps; SCENE/features when not given.
-        split: views to encode; `all` for every view.
-        fast: one pass over each picture instead of the teacher's exact multi-scale evaluation (lseg).
-        size: HEIGHT WIDTH of the maps (lseg), or the long side in pixels that pictures are brought to (the others).
-        images: folder of the pictures, if it is not SCENE/images.
-        device: where the teacher runs: `auto` (a GPU if there is one), `cpu` or `cuda`.
-        overwrite: give up maps of another teacher, weights or options that lie there; without it they are an error.
-        check: look over this folder of maps instead (Feature 3DGS, LangSplat, .npy, .safetensors), and report every file
-            that does not fit.
-        level: which masks of LangSplat's maps are looked at: `default`, `s`, `m` or `l`; beside --check.
+        out: Folder for the maps; SCENE/features when not given.
+        overwrite: Replace maps of another teacher, other weights or other options; without it they are an error.
+        check: Check this folder of maps instead, and report every file that does not fit.
+        level: For --check: which masks of LangSplat's maps, default, subparts (s), parts (m) or wholes (l).
+        device: Where the teacher runs: auto (a GPU if there is one), cpu or cuda.
     """
     from ..features import extract_features, pictures_of
-    from ..scenes import load_scene
 
     if check is not None:
-        for name, given in (("teacher", teacher), ("weights", weights), ("out", out)):
+        for name, given in (("teacher", teacher.teacher), ("weights", teacher.weights), ("out", out)):
             check_alone(name, given, "beside --check, which encodes nothing")
-    loaded = load_scene(scene, images=images)
-    for note in loaded.notes:
-        say(f"note: {note}")
-    views = list(range(len(loaded))) if split == "all" else loaded.views(split)
+    loaded = views.load(scene)
+    chosen = list(range(len(loaded))) if views.split == "all" else loaded.views(views.split)
     if check is not None:
-        look_over(loaded, views, check, level)
+        look_over(loaded, chosen, check, level)
         return
     check_alone("level", level, "without --check; it is of LangSplat's maps")
     target = out if out is not None else scene_folder(scene) / "features"
     check_folder("out", target)
-    chosen = choose_teacher(teacher, weights, fast, size, device)
-    made = extract_features(chosen, pictures_of(loaded, views), target, overwrite=overwrite, report=say, progress=True)
+    network = choose_teacher(teacher.teacher, teacher.weights, teacher.fast, teacher.size, device)
+    made = extract_features(
+        network, pictures_of(loaded, chosen), target, overwrite=overwrite, report=say, progress=True
+    )
     shapes = sorted({" x ".join(map(str, record.shape)) for record in made.maps.values()})
     say(f"{len(made.maps)} maps of {', '.join(shapes)} by {teacher_words(made.teacher)}")
     say(f"next: kfgs fit {scene} --out run" + ("" if out is None else f" --features {out}"))
@@ -78,41 +68,34 @@ def features(
 
 def plan(
     scene: SceneFolder,
-    teacher: str = "lseg",
-    weights: str | None = None,
-    fast: bool = False,
-    size: tuple[int, ...] = (),
+    *,
     preset: Preset = "cpu",
     method: Method = "fuse",
-    mode: Mode | None = None,
-    steps: int | None = None,
-    split: str = "train",
+    mode: Given[Mode] = None,
+    steps: Given[int] = None,
     store: Literal["keep", "discard", "recompute"] = "keep",
-    images: Path | None = None,
-    device: str = "auto",
-    out: Path | None = None,
+    device: Device = "auto",
+    out: Given[Path] = None,
+    teacher: MapTeacher,
+    views: Views,
 ) -> None:
     """Predict disk, memory and minutes of `kfgs features` and `kfgs fit`, before either starts.
 
     Maps that `kfgs features` has made already are counted.
 
+    Examples:
+        kfgs plan scene/
+        kfgs plan scene/ --teacher clip --weights openai/clip-vit-base-patch16 --store discard
+
     Args:
-        scene: folder with images and a COLMAP model or transforms.json.
-        teacher: lseg, clip, siglip, ... as for `kfgs features`.
-        weights: as for `kfgs features`; a folder's config.json, or the name of a hub id, tells the teacher's size. When not
-            given a common size is taken, and a note says which.
-        fast: as for `kfgs features`.
-        size: as for `kfgs features`.
-        preset: as for `kfgs fit`.
-        method: as for `kfgs fit`.
-        mode: as for `kfgs fit`.
-        steps: as for `kfgs fit`.
-        split: views to encode and to learn from.
-        store: what becomes of the dense maps: `keep` them; `discard` them when they are index maps (fit
-            --discard-features); `recompute` instead of storing (fit --teacher).
-        images: folder of the pictures, if it is not SCENE/images.
-        device: as for `kfgs fit`.
-        out: also write the plan to this .json file.
+        preset: As for `kfgs fit`.
+        method: As for `kfgs fit`.
+        mode: As for `kfgs fit`.
+        steps: As for `kfgs fit`.
+        store: What becomes of the feature maps: keep them; discard them when they are index maps (kfgs fit
+            --discard-features); recompute instead of storing (kfgs fit --teacher).
+        device: As for `kfgs fit`.
+        out: Also write the plan to this .json file.
     """
     from .._files import write_json
     from ..pipeline.plan import plan_scene
@@ -120,13 +103,13 @@ def plan(
 
     if out is not None:
         check_file("out", out)
-    config = fit_config(preset, method, mode, 0, steps, None, split)
-    loaded = load_scene(scene, images=images)
+    config = fit_config(preset, method, mode, 0, steps, None, views.split)
+    loaded, name = load_scene(scene, images=views.images), teacher.teacher or "lseg"
     found = plan_scene(
         loaded,
-        teacher=teacher,
-        weights=weights,
-        options=teacher_options(teacher, fast, size),
+        teacher=name,
+        weights=teacher.weights,
+        options=teacher_options(name, teacher.fast, teacher.size),
         config=config,
         dense=store,
         device=device,
