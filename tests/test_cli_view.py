@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from cases_color import surface
-from cases_words import TEACHER
+from cases_text import TEACHER
 from PIL import Image
 from small_room import make_room
 
@@ -18,7 +18,7 @@ from kfgs.splat import rgb_to_sh0
 from kfgs.teachers.prompts import make_label_set
 from kfgs.viz import available, headless, palette
 
-LETTERS = ["--teacher", "cases_words:TEACHER"]
+LETTERS = ["--teacher", "cases_text:TEACHER"]
 
 
 @pytest.fixture(scope="module")

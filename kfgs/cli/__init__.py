@@ -148,7 +148,7 @@ def _shown_names(kind: Any) -> dict[str, str]:
 def _in_options(message: str, names: dict[str, str]) -> str:
     """A message about arguments as one about options: "splat_scene: expected ..." becomes "--splat-scene: expected ..."."""
     about, colon, rest = message.partition(": ")
-    arguments = about.split(", ")
+    arguments = about.replace("-", "_").split(", ")
     if not colon or not all(argument in names for argument in arguments):
         return message
     return ", ".join(names[argument] for argument in arguments) + colon + rest
