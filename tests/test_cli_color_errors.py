@@ -15,8 +15,8 @@ TWICE = ["--views", "view_001", "--views", "view_001.png"]
 ERRORS = {
     "attach": [
         (["{splat}", "{field}", "--scene", "{room}", "--out", "{o}.ply"], "FIELD: expected the folder that `kfgs fit`"),
-        (["{run}", "{splat}", "--scene", "{room}", "--out", "{o}.ply"], "a folder without one; pass {field}"),
-        (["{tmp}/no", "{splat}", "--scene", "{room}", "--out", "{o}.ply"], "no such folder; fit one with `kfgs fit`"),
+        (["{run}", "{splat}", "--scene", "{room}", "--out", "{o}.ply"], "a run folder; pass {field}"),
+        (["{tmp}/no", "{splat}", "--scene", "{room}", "--out", "{o}.ply"], "no such folder; make one with `kfgs fit`"),
         (
             ["{field}", "{field}", "--scene", "{room}", "--out", "{o}.ply"],
             "SPLATS: expected a splat file, got {field}, a",
@@ -64,7 +64,7 @@ ERRORS = {
         ),
         (["chair", "{tmp}/no.ply"], "{tmp}/no.ply: no such file"),
         (["chair", "{field}"], "pass --classes and --text, or --scene"),
-        (["chair", "{run}"], "SOURCE: expected a splat file, got {run}, a semantic field"),
+        (["chair", "{run}"], "a run folder; pass {field}"),
         (["chair", "{labelled}", "--threshold", "2"], "--threshold: expected a number in [0, 1], got 2"),
         (["chair", "{labelled}", "--threshold", "1", "--out", "{o}"], "QUERY: expected Gaussians to save, got none"),
         (["chair", "{labelled}", "--text", "x.npy"], "--text: expected none beside a splat, which has its own classes"),

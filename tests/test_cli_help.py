@@ -110,5 +110,13 @@ def test_messages_name_options_as_they_are_written():
     names = cli._shown_names(cli.COMMANDS["attach"])
     assert cli._in_options("splat_scene: expected", names) == "--splat-scene: expected"
     assert cli._in_options("field, text: expected: one", names) == "FIELD, --text: expected: one"
+    message = (
+        "scene: expected 9 images (min_registered = 0.9), got 3; pass single_camera=False, or lower min_registered"
+    )
+    names = cli._shown_names(cli.COMMANDS["sfm"])
+    expected = message.replace("min_registered", "--min-registered").replace(
+        "single_camera=False", "--no-single-camera"
+    )
+    assert cli._in_options(message, names) == expected
     for message in ("a.ply: no such file", "no colon", "splats, more: expected"):
         assert cli._in_options(message, names) == message

@@ -141,14 +141,17 @@ def _shown_names(kind: Any) -> dict[str, str]:
             found |= _shown_names(hint)
         elif name != "return":
             positional = tyro.conf.Positional in getattr(hint, "__metadata__", ())
-            found[name] = name.upper() if positional else "--" + name.replace("_", "-")
+            shown = name.upper() if positional else "--" + name.replace("_", "-")
+            found |= {name: shown, name.removeprefix("no_"): shown}
     return found
 
 
 def _in_options(message: str, names: dict[str, str]) -> str:
-    """A message about arguments as one about options: "splat_scene: expected ..." becomes "--splat-scene: expected ..."."""
+    """A message about arguments as one about options: "splat_scene: expected" becomes "--splat-scene: expected"."""
     about, colon, rest = message.partition(": ")
     arguments = about.replace("-", "_").split(", ")
-    if not colon or not all(argument in names for argument in arguments):
-        return message
-    return ", ".join(names[argument] for argument in arguments) + colon + rest
+    if colon and all(argument in names for argument in arguments):
+        about = ", ".join(names[argument] for argument in arguments)
+    for name in (name for name in names if "_" in name):  # in the text only names that are no English words
+        rest = re.sub(rf"\b{name}(=\w+)?\b", names[name], rest)
+    return about + colon + rest

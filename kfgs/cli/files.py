@@ -38,8 +38,13 @@ def check_alone(name: str, given: object, why: str) -> None:
     """Raise a ValueError if an option is given that would have no effect; None, or False for a flag: it is not given."""
     if given is None or given is False:
         return
-    shown = "it" if given is True else given
+    shown = "--" + name.replace("_", "-") if given is True else given
     raise ValueError(f"{name}: expected none {why}, got {shown}; leave it out")
+
+
+def is_field(path: Path) -> bool:
+    """Whether a path is a field folder, or a run folder with one in it (`open_field` then names that one)."""
+    return any((folder / "field.json").is_file() for folder in (path, path / "field"))
 
 
 def open_field(name: str, field: Path) -> Any:
@@ -52,8 +57,10 @@ def open_field(name: str, field: Path) -> Any:
 
     if not (field / "field.json").is_file():
         inside = field / "field"
-        hint = f"pass {inside}" if (inside / "field.json").is_file() else "fit one with `kfgs fit`"
         what = "a file" if field.is_file() else "a folder without one" if field.is_dir() else "no such folder"
+        hint = "make one with `kfgs fit`"
+        if is_field(inside):
+            what, hint = "a run folder", f"pass {inside}"
         raise ValueError(
             f"{name}: expected the folder that `kfgs fit` wrote (RUN/field, with field.json), got {field}, {what}; {hint}"
         )
@@ -68,12 +75,11 @@ def open_splats(name: str, path: Path, *, labelled: bool = False) -> Any:
     """
     from ..formats import read_splats
 
-    for folder in (path, path / "field"):
-        if (folder / "field.json").is_file():
-            raise ValueError(
-                f"{name}: expected a splat file, got {path}, a semantic field; pass a colour splat, for example what "
-                "`kfgs color` writes"
-            )
+    if is_field(path):
+        raise ValueError(
+            f"{name}: expected a splat file, got {path}, a semantic field; pass a colour splat, for example what "
+            "`kfgs color` writes"
+        )
     splats = read_splats(path)
     if labelled and splats.gaussians.labels is None:
         raise ValueError(f"{name}: expected a splat with classes, got {path} without; `kfgs attach` gives it some")

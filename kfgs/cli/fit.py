@@ -24,7 +24,7 @@ from .options import (
     fit_config,
 )
 from .output import say, wrote
-from .teach import check_discard, choose_teacher, scene_folder, stored_maps
+from .teach import check_discard, choose_teacher, stored_maps
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
@@ -54,6 +54,7 @@ def sfm(
     out: Path,
     matching: Literal["exhaustive", "sequential"] = "exhaustive",
     camera_model: str = "SIMPLE_RADIAL",
+    no_single_camera: Flag = False,
     min_registered: float = 0.9,
     seed: int = 0,
 ) -> None:
@@ -67,13 +68,20 @@ def sfm(
         images: Folder of photographs.
         out: Scene folder to make; OUT/sparse/0 receives the COLMAP model.
         matching: sequential for the frames of a video, exhaustive for everything else.
-        camera_model: COLMAP's name of the lens model; one camera for all images.
+        camera_model: COLMAP's name of the lens model.
+        no_single_camera: The photographs were taken with several cameras, or with changes of zoom.
         min_registered: Share of the images that must be placed; fewer is an error.
         seed: Every random choice follows from it.
     """
     from ..scenes import SfmConfig, run_sfm
 
-    config = SfmConfig(matching=matching, camera_model=camera_model, min_registered=min_registered, seed=seed)
+    config = SfmConfig(
+        matching=matching,
+        camera_model=camera_model,
+        single_camera=not no_single_camera,
+        min_registered=min_registered,
+        seed=seed,
+    )
     say(str(run_sfm(images, out, config=config, progress=True)))
     written = [out / "sparse" / "0"]
     beside = out / "images"
@@ -149,7 +157,7 @@ def fit(
         teacher.check_weights()
         check_alone("size", teacher.size or None, "without --teacher, whose option it is")
         check_alone("fast", teacher.fast, "without --teacher, whose option it is")
-        found = stored_maps(as_taken, chosen, maps.features or scene_folder(scene) / "features", maps.level)
+        found = stored_maps(as_taken, chosen, maps.folder(scene), maps.level)
         if discard_features:
             check_discard(found, config)
     result = fit_scene(loaded, found, out, config, splat=splat, report=say, progress=True, device=training.device)
@@ -191,8 +199,7 @@ def uplift(
     check_folder("out", out)
     as_taken = views.load(scene)
     loaded = as_taken.undistorted()
-    folder = maps.features or scene_folder(scene) / "features"
-    found = stored_maps(as_taken, loaded.views(views.split), folder, maps.level)
+    found = stored_maps(as_taken, loaded.views(views.split), maps.folder(scene), maps.level)
     cloud = (
         open_field("splat", splat).gaussians
         if (splat / "field.json").is_file()

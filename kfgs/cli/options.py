@@ -63,6 +63,16 @@ class Maps:
     undistorted_features: Flag = False
     """The teacher saw undistorted pictures, so no lens has to be removed from its maps."""
 
+    def folder(self, scene: Path) -> Path:
+        """The folder of maps of a scene (a folder, or a transforms.json); a ValueError if there is none."""
+        folder = self.features or (scene if scene.is_dir() else scene.parent) / "features"
+        if not folder.is_dir():
+            raise ValueError(
+                f"features: expected a folder of feature maps, got {folder}, which is none; name another, or make them with "
+                "`kfgs features`"
+            )
+        return folder
+
 
 @dataclass(frozen=True)
 class Teacher:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._check import check_range
-from .files import check_alone, check_folder, open_field, open_splats
+from .files import check_alone, check_folder, is_field, open_field, open_splats
 from .options import Classes, Given, Positional, Teacher
 from .output import say, say_counts, wrote
 from .text import ask
@@ -62,9 +62,9 @@ def select(
     if threshold is not None:
         check_range("threshold", threshold, 0, 1)
     classes.check_images()
-    is_field = (source / "field.json").is_file()
-    counted = not is_field and threshold is None  # parts are numbered as `kfgs edit` does
-    if is_field:
+    asked_by_text = is_field(source)
+    counted = not asked_by_text and threshold is None  # parts are numbered as `kfgs edit` does
+    if asked_by_text:
         field = classes.open_field("source", source)
         label_set, target = ask(query, classes, teacher, field)
         query = target if isinstance(target, str) else query
@@ -207,7 +207,8 @@ def label(
     gaussians = loaded.gaussians.replace(labels=labels)
     say(f"labelled by {how}")
     written = save_labelled(targets[0], gaussians, scores, label_set, rule=how)
-    say_counts(labels, label_set.names)
+    if query is None:
+        say_counts(labels, label_set.names)
     if carried is not None:
         moved, paths = label_cloud(gaussians, carried, targets[1], label_set, distance=distance)
         say(str(moved))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._check import check_range, check_whole
-from .files import check_alone, check_folder, open_splats
+from .files import check_alone, check_folder, is_field, open_splats
 from .options import Classes, Given, Positional, Teacher
 from .output import say, wrote
 from .text import note_other_teacher, text_encoder
@@ -118,7 +118,7 @@ def _meaning(source: Path, classes: Classes, teacher: Teacher) -> tuple[Any, lis
     """What can be asked, and the cameras of the scene (those that a field was trained on)."""
     from ..viz.explorer import FieldMeaning, SplatMeaning
 
-    if (source / "field.json").is_file() or not source.is_file():
+    if is_field(source) or not source.exists():
         field = classes.open_field("source", source)
         label_set, embed = _words_of(classes.of_field(field), teacher)
         return FieldMeaning(field, label_set, embed=embed), list(field.cameras)
