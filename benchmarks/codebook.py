@@ -56,11 +56,11 @@ def main() -> None:
     classes = load_label_set(args.scene / "classes.json", args.scene / "text.npy")
     train, test = scene.views("train"), scene.views("test")
     cameras, stems = {scene.stem(i): scene.cameras[i] for i in test}, [scene.stem(i) for i in test]
-    maps = FeatureFolder(args.maps, [scene.stem(i) for i in train])
+    maps = FeatureFolder(args.maps).of(scene, "train")
     truth = true_labels(scene, args.scene / args.truth, "test")
     splat = None if args.splat is None else read_splats(args.splat).gaussians
     seen_in_2d = all(any(args.maps.glob(f"{stem}[._]*")) for stem in stems)
-    test_maps = FeatureFolder(args.maps, stems) if seen_in_2d else None
+    test_maps = FeatureFolder(args.maps).of(scene, "test") if seen_in_2d else None
 
     def score_2d(change: Callable[[Tensor], Tensor]) -> float:
         assert test_maps is not None

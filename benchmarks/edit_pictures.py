@@ -16,10 +16,10 @@ from PIL import Image
 from kfgs import read_splats
 from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
-from kfgs.labels import EditList, InBox, OfClass, Recolor, Remove, Where, answers, select_by_label
+from kfgs.labels import EditList, InBox, OfClass, Recolor, Remove, Where, connected_parts
 from kfgs.pipeline import render_color
 from kfgs.scenes import Scene, load_scene
-from kfgs.viz.pairs import picture_grid
+from kfgs.viz.pictures import picture_grid
 
 AROUND_CHAIR = 0.05  # metres around a chair's box: a cushion leans over its edge
 ABOVE_RUG = 0.03  # metres above which all in the boxes is taken for a rest of the chairs: the wall stands behind
@@ -41,7 +41,7 @@ def draw(path: Path, scene: Scene, views: list[str], clouds: dict[str, Gaussians
 
 def removals(before: SplatFile) -> dict[str, Gaussians]:
     """The chairs by name, then all else in their boxes: cushions, and specks of them that carry another label."""
-    chairs = answers(before.gaussians, select_by_label(before.gaussians, "chair", before.classes))
+    chairs = connected_parts(before.gaussians, OfClass("chair").select(before))
     rug = before.gaussians.means[before.gaussians.labels == before.classes.index("rug")]  # the chairs stand on it
     lowest = float(rug[:, 2].median()) + ABOVE_RUG  # z points up; feet reach below their chair's Gaussians
     boxes: list[Where] = []
@@ -65,7 +65,7 @@ def removals(before: SplatFile) -> dict[str, Gaussians]:
 
 def recolors(before: SplatFile) -> dict[str, Gaussians]:
     """The plant by name, then with the petals in its box that carry another label."""
-    plant = answers(before.gaussians, select_by_label(before.gaussians, "plant", before.classes))[0]
+    plant = connected_parts(before.gaussians, OfClass("plant").select(before))[0]
     print(plant)
     low, high = plant.extent
     aside = torch.tensor([AROUND_PLANT, AROUND_PLANT, 0.0], dtype=low.dtype)  # below it stands its vase

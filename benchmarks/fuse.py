@@ -42,7 +42,7 @@ class Room:
     def __init__(self, folder: Path, maps: Path, truth: str) -> None:
         self.scene, self.folder = load_scene(folder).undistorted(), folder
         self.classes = load_label_set(folder / "classes.json", folder / "text.npy")
-        self.maps = FeatureFolder(maps, [self.scene.stem(i) for i in self.scene.views("train")])
+        self.maps = FeatureFolder(maps).of(self.scene, "train")
         self.truth = true_labels(self.scene, folder / truth, "test")
         self.labels = folder / truth
 

@@ -320,7 +320,7 @@ def main() -> None:
         print(f"{args.head}: {len(tokens):,} tokens, {right:.1%} right; {time.perf_counter() - start:.0f} s")
         return
     extract_features(
-        RealTeacher(args.weights, args.head), pictures_of(scene), args.out, report=print, progress=sys.stderr.isatty()
+        RealTeacher(args.weights, args.head), scene, args.out, "all", report=print, progress=sys.stderr.isatty()
     )
     print(f"{args.out}: {len(scene)} maps; {time.perf_counter() - start:.0f} s")
     report = score_maps(scene, args.out, args.scene / args.truth, classes)

@@ -25,8 +25,7 @@ from typing import Any
 import torch
 
 from kfgs.cameras import resize_map
-from kfgs.features import FeatureFolder
-from kfgs.features.extract import Picture, extract_features, pictures_of
+from kfgs.features import FeatureFolder, Picture, extract_features, pictures_of
 from kfgs.quant import Codebook, CodebookConfig, fit_codebook, quantize_maps
 from kfgs.scenes import load_scene
 

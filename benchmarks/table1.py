@@ -57,14 +57,14 @@ def main() -> None:
 
     scene = load_scene(args.scene).undistorted()
     classes = load_label_set(args.scene / "classes.json", args.scene / "text.npy")
-    train, test = scene.views("train"), scene.views("test")
-    maps = FeatureFolder(args.features, [scene.stem(i) for i in train])
+    test = scene.views("test")
+    maps = FeatureFolder(args.features).of(scene, "train")
     stems = [scene.stem(i) for i in test]
     truth = true_labels(scene, args.scene / args.truth, "test")
     report: dict[str, object] = {"machine": f"{platform.processor()}, {torch.get_num_threads()} threads"}
     rows = []
 
-    test_maps = FeatureFolder(args.features, stems)
+    test_maps = FeatureFolder(args.features).of(scene, "test")
     teacher = score_teacher(lambda stem: test_maps[stems.index(stem)], truth, classes, scene.cameras[test[0]].size)
     print(f"teacher on the same views: {teacher.miou}\n{teacher.accuracy}")
     report["teacher"] = teacher.to_json()

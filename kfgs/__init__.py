@@ -37,7 +37,8 @@ _WHERE = {
     "Recolor": ".labels",
     "Remove": ".labels",
     "Selection": ".labels",
-    "answers": ".labels",
+    "OfClass": ".labels",
+    "connected_parts": ".labels",
     "transform_gaussians": ".splat",
     "ColorConfig": ".pipeline",
     "attach": ".pipeline",
@@ -54,7 +55,6 @@ _WHERE = {
     "plan_scene": ".pipeline",
     "uplift": ".pipeline",
     "UpliftConfig": ".fields",
-    "check_feature_folder": ".features",
     "FieldConfig": ".fields",
     "GaussianParams": ".fields",
     "SemanticField": ".fields",
@@ -81,7 +81,6 @@ if TYPE_CHECKING:
     from .evaluation import score_views as score_views
     from .features import FeatureFolder as FeatureFolder
     from .features import RecomputedMaps as RecomputedMaps
-    from .features import check_feature_folder as check_feature_folder
     from .features import extract_features as extract_features
     from .features import pictures_of as pictures_of
     from .fields import FieldConfig as FieldConfig
@@ -96,10 +95,11 @@ if TYPE_CHECKING:
     from .gaussians import Gaussians as Gaussians
     from .labels import EditList as EditList
     from .labels import LabelSet as LabelSet
+    from .labels import OfClass as OfClass
     from .labels import Recolor as Recolor
     from .labels import Remove as Remove
     from .labels import Selection as Selection
-    from .labels import answers as answers
+    from .labels import connected_parts as connected_parts
     from .labels import load_label_set as load_label_set
     from .labels import transfer_labels as transfer_labels
     from .pipeline import ColorConfig as ColorConfig

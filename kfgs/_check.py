@@ -8,8 +8,14 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+PARTS = ("embeddings", "codewords", "map", "means", "gaussians")  # where our objects keep what is mostly meant
 
 
 def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> dict[str, int]:
@@ -42,7 +48,7 @@ def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> di
         if not hasattr(value, "shape"):
             raise TypeError(
                 f"{name}: expected a tensor of shape [{', '.join(map(str, axes))}], got {type(value).__name__}; "
-                "convert it with torch.as_tensor"
+                f"{_instead(value)}"
             )
         shape = tuple(value.shape)  # no int(): a size may be a symbol while torch.compile or torch.export traces
         wrong = len(shape) != len(axes)
@@ -59,6 +65,48 @@ def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> di
             if isinstance(axis, str) and axis not in sizes:
                 sizes[axis], bound_by[axis] = size, name
     return sizes
+
+
+def as_tensor(name: str, value: Any, *, floating: bool = False) -> Tensor:
+    """A tensor as it is, a NumPy array as the tensor that shares its memory; anything else is an error.
+
+    Args:
+        name: the argument, for the message.
+        value: what was passed.
+        floating: also require floating-point numbers.
+
+    Raises:
+        TypeError: if it is neither, or not of floating point; the message says what to pass instead.
+    """
+    if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
+        value = torch.as_tensor(value)
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}; {_instead(value)}")
+    if floating and not value.is_floating_point():
+        raise TypeError(f"{name}: expected floating-point numbers, got {value.dtype}; convert them with .float()")
+    return value
+
+
+def as_array(values: Any, name: str = "values") -> np.ndarray[Any, Any]:
+    """A tensor's values as a NumPy array, from any device and without its gradient; lists and arrays through NumPy.
+
+    Raises:
+        TypeError: if it is a text, or one of our objects that holds tensors.
+    """
+    if isinstance(values, Tensor):
+        array: np.ndarray[Any, Any] = values.detach().cpu().numpy()
+        return array
+    if isinstance(values, str) or any(hasattr(values, part) for part in PARTS):
+        raise TypeError(f"{name}: expected numbers, got {type(values).__name__}; {_instead(values)}")
+    return np.asarray(values)
+
+
+def _instead(value: object) -> str:
+    """What to pass in place of a value that is no tensor."""
+    if isinstance(value, str):
+        return f"pass the numbers, not the name {one_line(value)!r}: of a class its embedding, as in classes.embeddings"
+    part = next((part for part in PARTS if hasattr(value, part)), None)
+    return f"pass its .{part}" if part else "convert it with torch.as_tensor"
 
 
 def check_choice(name: str, value: object, choices: Iterable[object]) -> None:
@@ -85,6 +133,14 @@ def check_whole(name: str, value: float, low: int, high: float = float("inf")) -
     if not isinstance(value, numbers.Integral) or isinstance(value, bool):
         raise ValueError(f"{name}: expected a whole number, got {value!r}; pass an int")
     check_range(name, int(value), low, high)
+
+
+def check_size(size: tuple[int, int]) -> None:
+    """Raise a ValueError unless `size` is (height, width) in whole pixels."""
+    if not isinstance(size, Sequence) or len(size) != 2:
+        raise ValueError(f"size: expected (height, width), got {size!r}; pass two whole numbers of pixels")
+    for axis, pixels in zip(("height", "width"), size, strict=True):
+        check_whole(f"size ({axis})", pixels, 1)
 
 
 def one_line(text: object, length: int = 60) -> str:

@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from ._check import check_shapes
+from ._check import as_array, as_tensor, check_shapes
+
+Array = np.ndarray[Any, Any]
+ELSEWHERE = {
+    "save": "write_splats(path, gaussians) writes every splat format",
+    "load": "read_splats(path).gaussians reads every splat format",
+    "render": "rasterize(gaussians, camera) draws them",
+    "to_pyvista": "kfgs.viz.to_pyvista(gaussians) makes a point cloud for pyvista",
+}
+"""What is often looked for on `Gaussians`, and where it is: those packages build on this one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,7 +28,16 @@ class Gaussians:
 
     **Convention**: quaternions are (w, x, y, z) and need not be unit (they are normalised where used); scales are
     standard deviations in world units; labels are class indices with -1 = none. A semantic field carries `features`,
-    a colour field `sh`.
+    a colour field `sh`. NumPy arrays are accepted and become tensors that share their memory.
+
+    `gaussians[mask]` (or an index, a slice, a `Selection`) is a new, smaller cloud; `len` counts the Gaussians.
+
+    Example:
+        >>> cloud = Gaussians(torch.eye(3), torch.ones(3, 4), torch.ones(3, 3), torch.tensor([0.1, 0.5, 0.9]))
+        >>> cloud[cloud.opacities > 0.4]
+        Gaussians(2 Gaussians, torch.float32, cpu)
+        >>> cloud[-1].to_numpy()["means"].tolist()
+        [[0.0, 0.0, 1.0]]
     """
 
     means: Tensor  # [N, 3]
@@ -30,6 +49,13 @@ class Gaussians:
     labels: Tensor | None = None  # [N] int64, -1 = none
 
     def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not isinstance(value, Tensor | None):
+                object.__setattr__(self, name, as_tensor(name, value))
+        for name, value in self._tensors().items():
+            as_tensor(name, value, floating=name != "labels")
+        if self.labels is not None and self.labels.is_floating_point():
+            raise TypeError(f"labels: expected whole numbers, got {self.labels.dtype}; convert them with .long()")
         check_shapes(
             ("means", self.means, "N 3"),
             ("quats", self.quats, "N 4"),
@@ -55,6 +81,15 @@ class Gaussians:
             parts.append("labelled")
         return f"Gaussians({', '.join(parts)}, {self.means.dtype}, {self.means.device})"
 
+    def __getitem__(self, which: Any) -> Gaussians:
+        return self.select(which)
+
+    if not TYPE_CHECKING:  # so that a type checker still finds misspelt names
+
+        def __getattr__(self, name: str) -> Any:
+            hint = f"; {ELSEWHERE[name]}" if name in ELSEWHERE else ""
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}{hint}")
+
     def _tensors(self) -> dict[str, Tensor]:
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if value is not None}
@@ -63,11 +98,32 @@ class Gaussians:
         """A copy with some tensors exchanged."""
         return replace(self, **changes)
 
-    def select(self, which: Tensor) -> Gaussians:  # which: [N] bool or [n] int64
-        """The Gaussians under a mask or an index, as a new object."""
+    def select(self, which: Any) -> Gaussians:
+        """Some of the Gaussians as a new cloud; `gaussians[which]` is the same.
+
+        Args:
+            which: a mask [N], indices [n] in any order, a slice, one index, or an object with a `mask`, as a `Selection`.
+                Masks and indices may be tensors, NumPy arrays or lists.
+
+        Raises:
+            ValueError: if a mask is not [N].
+            TypeError: if it is neither a mask nor whole numbers.
+            IndexError: if there is no such Gaussian.
+        """
+        if isinstance(which, int | np.integer) and not isinstance(which, bool) and not -len(self) <= which < len(self):
+            raise IndexError(f"which: expected an index below {len(self)} (the number of Gaussians), got {which}")
+        if isinstance(which, slice):
+            which = torch.from_numpy(np.arange(*which.indices(len(self))))
+        elif not isinstance(which, Tensor):
+            which = torch.as_tensor(np.asarray(getattr(which, "mask", which)))
+            which = which.long() if which.numel() == 0 and which.dtype != torch.bool else which
         if which.dtype == torch.bool and which.shape != self.opacities.shape:
             raise ValueError(f"which: expected a mask [N] with N = {len(self)}, got {tuple(which.shape)}")
-        return Gaussians(**{name: value[which] for name, value in self._tensors().items()})
+        if which.is_floating_point():
+            raise TypeError(f"which: expected a mask or whole numbers, got {which.dtype}; compare first, as in x > 0.5")
+        index = which.to(self.means.device)
+        index = index.reshape(-1) if index.ndim == 0 else index
+        return Gaussians(**{name: value[index] for name, value in self._tensors().items()})
 
     def to(self, *args: Any, **kwargs: Any) -> Gaussians:
         """Move or convert the floating tensors as `Tensor.to` does; labels keep their integer type."""
@@ -79,6 +135,10 @@ class Gaussians:
     def detach(self) -> Gaussians:
         """The same values without their autograd history."""
         return Gaussians(**{name: value.detach() for name, value in self._tensors().items()})
+
+    def to_numpy(self) -> dict[str, Array]:
+        """The tensors that there are as NumPy arrays, by name: `means` [N, 3], ..., for trimesh, Open3D or pandas."""
+        return {name: as_array(value) for name, value in self._tensors().items()}
 
     @staticmethod
     def cat(parts: Sequence[Gaussians]) -> Gaussians:
@@ -97,3 +157,10 @@ class Gaussians:
                     "add or drop them with replace()"
                 )
         return Gaussians(**{name: torch.cat([part._tensors()[name] for part in parts]) for name in names})
+
+
+def check_gaussians(value: object, name: str = "gaussians") -> None:
+    """Raise a TypeError unless `value` is a cloud of Gaussians; the message says where it is, if `value` holds one."""
+    if not isinstance(value, Gaussians):
+        hint = "its .gaussians" if hasattr(value, "gaussians") else "Gaussians"
+        raise TypeError(f"{name}: expected Gaussians, got {type(value).__name__}; pass {hint}")

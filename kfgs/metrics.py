@@ -13,11 +13,9 @@ import kornia.metrics
 import torch
 from torch import Tensor
 
-from ._check import check_range, check_shapes
+from ._check import as_tensor, check_range, check_shapes
+from ._rows import unit_rows
 from .cameras.resample import to_bchw
-
-COSINE_EPSILON = 1e-8
-"""A feature not longer than this counts as all-zero, with cosine 0 to everything; the same as in `quant`."""
 
 MIB = 2**20
 """Bytes in the "MB" of Table 1."""
@@ -113,6 +111,9 @@ class ConfusionMatrix:
         self.ignore = ignore
         self._counts = torch.zeros(classes, classes + 1, dtype=torch.int64)  # the last column: no prediction
 
+    def __repr__(self) -> str:
+        return f"ConfusionMatrix({self.classes} classes, {int(self._counts.sum()):,} pixels)"
+
     @property
     def matrix(self) -> Tensor:  # [C, C] int64
         """Counts of (truth, prediction) where there was a prediction."""
@@ -158,7 +159,7 @@ def feature_cosine(
 ) -> Tensor:  # scalar
     """Mean cosine between corresponding feature vectors.
 
-    Each vector is divided by max(|x|, `COSINE_EPSILON`), so an all-zero vector counts as cosine 0, on either side.
+    Each vector is divided by max(|x|, 1e-8) (`unit_rows`), so an all-zero vector counts as cosine 0, on either side.
     Half precision is computed in float32.
 
     Raises:
@@ -168,14 +169,14 @@ def feature_cosine(
         >>> feature_cosine(torch.tensor([[2.0, 0.0], [0.0, 0.0]]), torch.tensor([[3.0, 0.0], [1.0, 0.0]]))
         tensor(0.5000)
     """
-    _check_same("features", features, target)
+    features, target = _alike("features", features, target)
     if features.numel() == 0:
         raise ValueError(
             f"features: expected at least one vector, got shape {tuple(features.shape)}; compare something"
         )
     # in half precision the epsilon would underflow to 0, and 0 / 0 is NaN
     wide = (x.to(torch.promote_types(x.dtype, torch.float32)) for x in (features, target))
-    rows = [torch.nn.functional.normalize(x, dim=-1, eps=COSINE_EPSILON) for x in wide]
+    rows = [unit_rows(x) for x in wide]
     return (rows[0] * rows[1]).sum(dim=-1).mean()
 
 
@@ -194,7 +195,7 @@ def psnr(
         >>> psnr(torch.zeros(4, 4, 3), torch.full((4, 4, 3), 0.1))
         tensor(20.)
     """
-    _check_same("image", image, target)
+    image, target = _alike("image", image, target)
     check_range("peak", peak, 0, closed=(False, False))
     return kornia.metrics.psnr(image, target, peak)
 
@@ -213,6 +214,7 @@ def ssim(
     Note:
         kornia's `eps` is set to 0: its default pulls dark pictures visibly below 1 even when they are equal.
     """
+    image, target = as_tensor("image", image), as_tensor("target", target)
     check_shapes(("image", image, "H W C"), ("target", target, "H W C"))
     check_range("peak", peak, 0, closed=(False, False))
     if min(image.shape[:2]) < SSIM_WINDOW:
@@ -266,7 +268,7 @@ def _scored_labels(
     pred: Tensor, target: Tensor, classes: int, ignore: int | Sequence[int]
 ) -> tuple[Tensor, Tensor]:  # [n], [n] int64
     """The pixels whose truth is known, flattened."""
-    _check_same("pred", pred, target)
+    pred, target = _alike("pred", pred, target)
     check_range("classes", classes, 1)
     for name, labels in (("pred", pred), ("target", target)):
         if labels.is_floating_point() or labels.is_complex() or labels.dtype == torch.bool:
@@ -301,8 +303,11 @@ def _check_labels(name: str, labels: Tensor, classes: int, advice: str) -> None:
         )
 
 
-def _check_same(name: str, value: Tensor, target: Tensor) -> None:
+def _alike(name: str, value: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Two tensors (or arrays) of one shape."""
+    value, target = as_tensor(name, value), as_tensor("target", target)
     if value.shape != target.shape:
         raise ValueError(
             f"target: expected the shape of {name}, {tuple(value.shape)}, got {tuple(target.shape)}; resize one of them"
         )
+    return value, target

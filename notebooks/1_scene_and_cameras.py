@@ -66,8 +66,9 @@ Image.fromarray(picture_grid([row for row in rows if len(row) == len(rows[0])], 
 # %%
 import pyvista as pv
 
+from kfgs.cameras import Orbit, estimate_up, orbit_cameras
 from kfgs.scenes import robust_bounds
-from kfgs.viz import Orbit, add_camera_images, add_cameras, estimate_up, look_through, make_plotter, orbit_cameras
+from kfgs.viz import add_camera_images, add_cameras, look_through, make_plotter
 
 pv.set_jupyter_backend("static")  # "server" lets you turn the scene: pip install "pyvista[jupyter]"
 

@@ -20,7 +20,7 @@ data = Path(os.environ.get("KFGS_NOTEBOOK_DATA", "data"))
 folder = make_toy_room(data / "room", ToyConfig(train_views=24, test_views=6))
 scene = load_scene(folder)  # yours: load_scene("my/scene").undistorted()
 train = scene.views("train")
-maps = FeatureFolder(folder / "features", [scene.stem(i) for i in train])
+maps = FeatureFolder(folder / "features").of(scene, "train")
 
 # %% [markdown]
 # ## Four Gaussians and a camera

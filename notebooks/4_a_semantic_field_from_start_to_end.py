@@ -58,14 +58,14 @@ from kfgs import (
     uplift,
     viz,
 )
-from kfgs.cameras import resize_labels
+from kfgs.cameras import Orbit, estimate_up, orbit_cameras, resize_labels
 from kfgs.labels import classify
 from kfgs.pipeline import feature_colors, score_teacher, true_labels
 
 scene = load_scene(folder).undistorted()
 classes = load_label_set(names, text)
 train, test = scene.views("train"), scene.views("test")
-maps = FeatureFolder(features, [scene.stem(i) for i in train])
+maps = FeatureFolder(features).of(scene, "train")
 print(scene)
 print(f"{len(maps)} maps of {tuple(maps[0].shape)}; {len(classes)} classes: {', '.join(classes.names)}")
 
@@ -136,7 +136,7 @@ print(f"every Gaussian kept: {every!r}")
 # counts, as in the other two.)
 
 # %%
-test_maps = FeatureFolder(features, [scene.stem(i) for i in test])
+test_maps = FeatureFolder(features).of(scene, "test")
 latents = feature_colors(field)(field.render(camera).map)
 row = [image, latents, as_colors(field.feature_map(camera)), as_colors(test_maps[k])]
 titles = ("photograph", f"{field.channels} latents", "decoded to 512", "teacher's 512")
@@ -188,8 +188,8 @@ print(f"{question}: {answer!r}")
 kinds = field.classify(classes).labels
 off = torch.tensor([-1, *(classes.index(name) for name in lid if classes.knows(name))])
 shown = ~torch.isin(kinds, off)
-orbit = viz.Orbit(frames=1, size=(300, 400), elevation_degrees=55, start_degrees=240, zoom=1.6)
-above = viz.orbit_cameras(field.gaussians.means[shown], orbit, up=viz.estimate_up(scene.cameras))[0]
+orbit = Orbit(frames=1, size=(300, 400), elevation_degrees=55, start_degrees=240, zoom=1.6)
+above = orbit_cameras(field.gaussians.means[shown], orbit, up=estimate_up(scene.cameras))[0]
 selected = torch.where(answer.mask, kinds, -1)
 clouds = [field.gaussians.replace(labels=label).select(shown) for label in (kinds, selected)]
 row = [viz.show_cloud(cloud)(above) for cloud in clouds]

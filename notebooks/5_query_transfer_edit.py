@@ -36,13 +36,14 @@ from PIL import Image
 
 import kfgs
 from kfgs import viz
-from kfgs.labels import Component, InBox, OfClass, select_in_sphere
+from kfgs.cameras import Orbit, estimate_up, orbit_cameras
+from kfgs.labels import Component, InBox, InSphere, OfClass
 from kfgs.pipeline import views_of_change
 
 scene = kfgs.load_scene(folder).undistorted()
 classes = kfgs.load_label_set(names, text)
 cameras = [scene.cameras[i] for i in scene.views("train")]
-maps = kfgs.FeatureFolder(features, [scene.stem(i) for i in scene.views("train")])
+maps = kfgs.FeatureFolder(features).of(scene, "train")
 quick = kfgs.ColorConfig.quick()
 quick = replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000))
 own = kfgs.fit_color(scene, run, quick).gaussians  # notebook 4 looks at this step and the next
@@ -92,14 +93,16 @@ for selection in found.values():
 # %% [markdown]
 # ## Things, not a heap of Gaussians
 #
-# `answers` takes a selection apart: connected parts, each with its box, its size and the view that shows it best. How near is
+# `connected_parts` takes a selection apart: each part has its box, its size and the view that shows it best. How near is
 # connected follows from the spacing of the Gaussians; this room's five chairs stand so close that two of them are one part,
 # until the first cell says 0.15 (metres here).
 
 # %%
 selection = found["relevancy"]
-print([one.count for one in kfgs.answers(field.gaussians, selection)], "Gaussians each, with the default distance")
-things = kfgs.answers(field.gaussians, selection, cameras, distance=apart)
+print(
+    [one.count for one in kfgs.connected_parts(field.gaussians, selection)], "Gaussians each, with the default distance"
+)
+things = kfgs.connected_parts(field.gaussians, selection, cameras, distance=apart)
 for number, one in enumerate(things, start=1):
     print(f"{thing} {number}: {one!r}")
 
@@ -111,9 +114,9 @@ semantic = field.label(classes)
 labels = semantic.labels
 hidden = torch.tensor([-1, *(classes.index(name) for name in shell if classes.knows(name))])
 inside = semantic.select(~torch.isin(labels, hidden))
-up = viz.estimate_up(scene.cameras)
-orbit = viz.Orbit(frames=1, size=(450, 640), elevation_degrees=50, start_degrees=120, zoom=1.8)
-outside = viz.orbit_cameras(inside.means, orbit, up=up)[0]
+up = estimate_up(scene.cameras)
+orbit = Orbit(frames=1, size=(450, 640), elevation_degrees=50, start_degrees=120, zoom=1.8)
+outside = orbit_cameras(inside.means, orbit, up=up)[0]
 boxes = [one.box for one in things]
 plotter = viz.make_plotter(*outside.size, off_screen=True)
 viz.add_cloud(plotter, inside, color_by="label", style="gaussians")
@@ -183,11 +186,11 @@ Image.fromarray(viz.picture_grid([row], titles, width=width))
 # %%
 strict = kfgs.transfer_labels(semantic, labels, colors.gaussians, 0.3 * carried.distance)
 radius = float(things[0].box.half.norm())
-near = select_in_sphere(colors.gaussians.means, things[0].centroid, radius).mask
-sources = semantic.select(select_in_sphere(semantic.means, things[0].centroid, radius).mask)
+near = InSphere(things[0].centroid, radius).mask(colors)
+sources = semantic.select(InSphere(things[0].centroid, radius).mask(semantic))
 shift = 2.2 * radius * up.to(semantic.means)
 whole = torch.cat([sources.means, colors.gaussians.means[near] + shift])
-side = viz.orbit_cameras(whole, replace(orbit, size=(480, 640), elevation_degrees=15, zoom=1.05), up=up)[0]
+side = orbit_cameras(whole, replace(orbit, size=(480, 640), elevation_degrees=15, zoom=1.05), up=up)[0]
 plotter = viz.make_plotter(*side.size, off_screen=True)
 viz.add_cloud(plotter, sources, options=viz.CloudOptions(point_size=5))
 viz.add_matches(

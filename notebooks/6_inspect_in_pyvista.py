@@ -39,7 +39,7 @@ from kfgs import (
     ColorConfig,
     FeatureFolder,
     FitConfig,
-    answers,
+    connected_parts,
     fit_color,
     fit_scene,
     load_label_set,
@@ -48,7 +48,8 @@ from kfgs import (
     transfer_labels,
     viz,
 )
-from kfgs.labels import select_where
+from kfgs.cameras import Orbit, estimate_up, orbit_cameras
+from kfgs.labels import Selection
 from kfgs.metrics import psnr
 from kfgs.pipeline import feature_colors
 
@@ -60,7 +61,7 @@ from kfgs.pipeline import feature_colors
 scene = load_scene(folder).undistorted()
 classes = load_label_set(names, text)
 cameras = [scene.cameras[i] for i in scene.views("train")]
-maps = FeatureFolder(features, [scene.stem(i) for i in scene.views("train")])
+maps = FeatureFolder(features).of(scene, "train")
 quick = ColorConfig.quick()
 color_config = replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000))
 color = fit_color(scene, run, color_config).gaussians
@@ -158,11 +159,11 @@ Image.fromarray(viz.picture_grid([[drawn, ours, 10 * error]], titles))
 # Pyramids with the true opening, each picture on its image plane, a roof on its upper edge: twelve of them, evenly chosen.
 
 # %%
-up = viz.estimate_up(cameras).float()
+up = estimate_up(cameras).float()
 hidden = torch.tensor([-1, *(classes.index(name) for name in shell if classes.knows(name))])
 inside = semantic.select(~torch.isin(semantic.labels, hidden))
-around = viz.Orbit(frames=8, size=(420, 640), elevation_degrees=40, zoom=1.3)
-outside = viz.orbit_cameras(inside.means, around, up=up)[1]
+around = Orbit(frames=8, size=(420, 640), elevation_degrees=40, zoom=1.3)
+outside = orbit_cameras(inside.means, around, up=up)[1]
 photographs = [scene.image(i) for i in scene.views("train")]
 size = 0.2 * scene.extent
 plotter = viz.make_plotter(*outside.size, off_screen=True)
@@ -184,20 +185,20 @@ Image.fromarray(plotter.screenshot(return_img=True))
 # %% [markdown]
 # ## Selections
 #
-# `answers` gives the connected parts of a selection: how many Gaussians, where, how large, seen best from where. Scores
+# `connected_parts` gives the connected parts of a selection: how many Gaussians, where, how large, seen best from where. Scores
 # light up on the left, and on the right the parts stand in their oriented boxes. The rest keeps its brightness where there
 # are colours: so the selection is carried to the colour cloud first, to half of lambda, so that parts stay crisp.
 # (Matches and the histogram of their distances, `add_matches` and `plot_distances`, are in notebook 5.)
 
 # %%
-parts = answers(semantic, found, cameras, distance=apart)
+parts = connected_parts(semantic, found, cameras, distance=apart)
 for part in parts:
     print(part)
 owner = torch.full((len(semantic),), -1)
 for number, part in enumerate(parts):
     owner[part.indices] = number
 carried = transfer_labels(semantic, owner, color, transfer.distance / 2).labels
-selections = {f"{word} {number + 1}": select_where(carried == number) for number in range(len(parts))}
+selections = {f"{word} {number + 1}": Selection.of(carried == number) for number in range(len(parts))}
 
 
 def draw_scores(plotter):
@@ -284,7 +285,7 @@ Image.fromarray(view.screenshot())
 
 # %%
 view.close()
-orbit = viz.Orbit(frames=8, size=(165, 220), elevation_degrees=40, zoom=1.5)
+orbit = Orbit(frames=8, size=(165, 220), elevation_degrees=40, zoom=1.5)
 film = viz.save_turntable(out / "turntable.gif", inside, orbit=orbit, up=up, fps=5)
 print(f"{film.stat().st_size / 1000:.0f} kB")
 display.Image(film)

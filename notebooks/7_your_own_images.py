@@ -52,18 +52,18 @@ from kfgs import (
     ColorConfig,
     FeatureFolder,
     FitConfig,
-    answers,
+    connected_parts,
     extract_features,
     fit_scene,
     label_set_from_examples,
     load_scene,
     make_label_set,
-    pictures_of,
     plan_scene,
     resize_map,
     run_sfm,
     viz,
 )
+from kfgs.cameras import Orbit, estimate_up, orbit_cameras
 from kfgs.scenes import list_images, read_image
 from kfgs.teachers import CallableTeacher, TeacherCost
 
@@ -95,9 +95,9 @@ print(scene)
 # `estimate_up` reads the latter from how the camera was held.
 
 # %%
-up = viz.estimate_up(scene.cameras)
-around = viz.Orbit(frames=8, size=(420, 640), elevation_degrees=40, zoom=1.25)
-outside = viz.orbit_cameras(scene.points, around, up=up)[1]
+up = estimate_up(scene.cameras)
+around = Orbit(frames=8, size=(420, 640), elevation_degrees=40, zoom=1.25)
+outside = orbit_cameras(scene.points, around, up=up)[1]
 size = 0.25 * scene.extent
 plotter = viz.make_plotter(*outside.size, off_screen=True)
 plotter.add_points(scene.points.numpy(), scalars=scene.colors.numpy(), rgb=True, point_size=5)
@@ -184,8 +184,8 @@ print(plan_scene(scene, teacher=TeacherCost.of_maps("colour words", map_size), c
 # it depends on has changed: run this notebook twice, and the second time takes seconds.
 
 # %%
-manifest = extract_features(teacher, pictures_of(scene, train), out / "features")
-maps = FeatureFolder(out / "features", [scene.stem(i) for i in train])
+manifest = extract_features(teacher, scene, out / "features", split="train")
+maps = FeatureFolder(out / "features").of(scene, "train")
 fitted = fit_scene(scene, maps, out / "run", config, report=print)
 semantic = fitted.field
 print(semantic.summary())
@@ -210,13 +210,13 @@ Image.fromarray(np.concatenate([sheet, legend]))
 # %% [markdown]
 # ## Ask
 #
-# A query is told from the other classes (the score is its relevancy) and cut at a gamma, which the result states. `answers`
-# counts the connected parts: how many, where, how large, seen best from where. Sizes are in the units of the
+# A query is told from the other classes (the score is its relevancy) and cut at a gamma, which the result states.
+# `connected_parts` lists what was found: how many, where, how large, seen best from where. Sizes are in the units of the
 # reconstruction.
 
 # %%
 found = semantic.query(question, classes)
-things = answers(semantic.gaussians, found, cameras)
+things = connected_parts(semantic.gaussians, found, cameras)
 print(found)
 for thing in things:
     print(" ", thing)

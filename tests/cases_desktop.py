@@ -8,9 +8,9 @@ from cases_explorer import NAMES, cloud, splat_file
 
 from kfgs.viz.explorer import ExploreOptions, Explorer
 from kfgs.viz.explorer.desktop import Desktop
-from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.meaning import SplatMeaning
 from kfgs.viz.explorer.panel import WIDTH
+from kfgs.viz.explorer.state import Exploration
 
 HEIGHT, CLOUDS = 420, 600  # pixels: of the window, and what the two clouds have of its width
 CHAIR = NAMES.index("chair")

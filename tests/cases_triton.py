@@ -34,8 +34,8 @@ class Case(NamedTuple):
 
     channels: int = 3
     tile_size: int = 16
-    count: int = 60  # Gaussians
-    size: tuple[int, int] = (40, 24)  # width, height
+    count: int = 40  # Gaussians
+    size: tuple[int, int] = (24, 18)  # width, height: the tiles of 16 at two sides are cut off
     rows_of_features: int | None = None  # index into that many rows, the last of which none shows
     opacities: tuple[float, ...] = (0.05, 0.95)  # range of random ones, or the stack's
     sigma: tuple[float, float] = (0.7, 6.0)
@@ -53,11 +53,11 @@ CASES = {
     "indexed": Case(9, rows_of_features=20, manners=True),
     "indexed, more rows than Gaussians": Case(40, rows_of_features=90),
     "tiles of 8": Case(tile_size=8),
-    "tiles of 5": Case(tile_size=5, size=(18, 13), count=40),
+    "tiles of 5": Case(tile_size=5, size=(18, 13)),
     "tiles of 2": Case(tile_size=2, size=(7, 5), count=20),
     "tiles of 12": Case(tile_size=12),
-    "tiles of 32": Case(9, tile_size=32),
-    "tiles of 32, wide": Case(70, tile_size=32),
+    "tiles of 32": Case(9, tile_size=32, size=(40, 24)),
+    "tiles of 32, wide": Case(70, tile_size=32, size=(40, 24), count=25),
     "rows int64, offsets int32": Case(integers=(torch.int64, torch.int32)),
     "many that stop": Case(count=150, size=(12, 9), opacities=(0.3, 0.6), sigma=(3.0, 30.0)),
     "many that do not stop": Case(count=100, size=(12, 9), opacities=(0.01, 0.03), sigma=(3.0, 30.0)),

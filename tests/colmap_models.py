@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from kornia.io import write_image
 
-from kfgs.scenes._pycolmap import import_pycolmap
+from kfgs.scenes.pycolmap_import import import_pycolmap, quiet_pycolmap
 
 pycolmap = import_pycolmap()
 
@@ -53,6 +53,12 @@ def write_model(folder: Path, names: list[str], *, text: bool = False, rigs: boo
         for name in ("rigs", "frames"):
             (folder / f"{name}.{'txt' if text else 'bin'}").unlink()
     return folder
+
+
+def read_with_pycolmap(folder: Path) -> object:
+    """A pycolmap.Reconstruction of a model on disk."""
+    with quiet_pycolmap():
+        return pycolmap.Reconstruction(str(folder))
 
 
 def write_picture(path: Path, height: int = 48, width: int = 64) -> Path:

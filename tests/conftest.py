@@ -1,5 +1,6 @@
 """Shared fixtures: where the real data lies, and a headless-safe environment for every test."""
 
+import gc
 import os
 import signal
 from pathlib import Path
@@ -15,6 +16,21 @@ if (
     signal.getsignal(signal.SIGINT) == signal.SIG_IGN
 ):  # a shell's background job: programs that tests start would inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+gc.disable()  # until all tests are collected: nothing is garbage before
+
+
+def pytest_collection_finish():
+    """Millions of objects live until the end (modules, 5,000 tests): gc.collect() would look at them in every test."""
+    gc.collect()
+    gc.freeze()
+    gc.enable()
+
+
+def pytest_unconfigure():
+    """Libraries that count their objects at the end find none left over."""
+    gc.unfreeze()
+
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -1,9 +1,7 @@
 """The engines' benchmark: its tables from numbers known in advance, and one run of the smallest configuration."""
 
+import importlib
 import json
-import os
-import subprocess
-import sys
 from itertools import dropwhile, takewhile
 from pathlib import Path
 
@@ -107,33 +105,22 @@ def test_curves_are_drawn(report_module, tmp_path):
 
 # a real run -----------------------------------------------------------------------------------------------------------
 
-RUN = """
-import sys
-from pathlib import Path
-sys.path.insert(0, sys.argv[1])
-import torch
-torch.set_num_threads(1)
-import engines, engines_runners
-engines_runners.PROTOTYPE = Path(sys.argv[2]) / "none"  # only what is part of kfgs: the peers may be there or not
-case, rates = engines.Case(200, 3, 32, 24), {}
-report = {"machine": engines.describe(), "quick": True, "repeats": 1, "peak": {}, "memory": []}
-report["peak"]["1"] = {"flops": 1e9, "bandwidth": 1e9}  # the real ones take 512 MiB
-report["slices"] = {"Gaussians": [list(case)]}
-report["steps"] = [engines.time_step(case, 1, 1)]
-report["cases"] = [engines.time_case(case, 1, 1, 20.0, rates), engines.time_case(case, 1, 1, 0.0, rates)]
-engines.save(report, Path(sys.argv[2]))
-"""
-
 
 @pytest.fixture(scope="module")
 def smallest_run(tmp_path_factory):
     """The report on 200 Gaussians in a picture of 32 x 24, as it comes back from the file, and the tables."""
     out = tmp_path_factory.mktemp("benchmark")
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(BENCHMARKS.parent)}
-    command = [sys.executable, "-c", RUN, str(BENCHMARKS), str(out)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    assert "training step, N=200 32x24x3, 1 threads: kfgs numba" in done.stdout
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(BENCHMARKS))
+        engines, runners = importlib.import_module("engines"), importlib.import_module("engines_runners")
+        patch.setattr(runners, "PROTOTYPE", out / "none")  # only what is part of kfgs: the peers may be there or not
+        case, rates = engines.Case(200, 3, 32, 24), {}
+        report = {"machine": engines.describe(), "quick": True, "repeats": 1, "peak": {}, "memory": []}
+        report["peak"]["1"] = {"flops": 1e9, "bandwidth": 1e9}  # the real ones take 512 MiB
+        report["slices"] = {"Gaussians": [list(case)]}
+        report["steps"] = [engines.time_step(case, 1, 1)]
+        report["cases"] = [engines.time_case(case, 1, 1, 20.0, rates), engines.time_case(case, 1, 1, 0.0, rates)]
+        engines.save(report, out)
     return json.loads((out / "engines.json").read_text()), (out / "engines.md").read_text()
 
 

@@ -1,10 +1,12 @@
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from messages import tells
 
-from kfgs._check import check_choice, check_range, check_shapes, check_whole
+from kfgs._check import as_array, as_tensor, check_choice, check_range, check_shapes, check_whole
 
 
 def test_sizes_are_returned_by_name():
@@ -95,3 +97,41 @@ def test_whole_numbers_are_integers(value):
         check_whole("epochs", value, 1)
     with pytest.raises(ValueError, match=r"epochs: expected a number in \[1, inf\), got 0"):
         check_whole("epochs", 0, 1)
+
+
+def test_arrays_become_tensors_that_share_their_memory():
+    array = np.zeros(3)
+    assert as_tensor("x", array, floating=True).dtype == torch.float64
+    as_tensor("x", array)[0] = 1
+    assert array[0] == 1
+    tensor = torch.ones(2)
+    assert as_tensor("x", tensor) is tensor
+
+
+@pytest.mark.parametrize(
+    ("value", "advice"),
+    [
+        ("chair", ("str", "'chair'", "embedding")),
+        ([1.0], ("list", "torch.as_tensor")),
+        (SimpleNamespace(codewords=1), ("SimpleNamespace", ".codewords")),
+        (np.array(["a"]), ("ndarray", "torch.as_tensor")),
+        (None, ("NoneType",)),
+    ],
+)
+def test_what_is_no_tensor_is_refused_with_advice(value, advice):
+    with pytest.raises(TypeError, match=tells("rows", *advice)):
+        as_tensor("rows", value)
+
+
+def test_whole_numbers_where_floating_point_is_needed():
+    with pytest.raises(TypeError, match=tells("rows", "int64", ".float()")):
+        as_tensor("rows", torch.arange(3), floating=True)
+
+
+def test_tensors_become_arrays():
+    assert as_array(torch.ones(2, requires_grad=True)).tolist() == [1, 1]
+    assert as_array([1, 2]).tolist() == [1, 2]
+    with pytest.raises(TypeError, match=tells("picture", "SimpleNamespace", ".map")):
+        as_array(SimpleNamespace(map=1), "picture")
+    with pytest.raises(TypeError, match=tells("picture", "str", "'a.png'")):
+        as_array("a.png", "picture")

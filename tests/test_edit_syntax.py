@@ -6,7 +6,7 @@ import torch
 from kfgs.cli.edit_syntax import Edits, inserted_files, parse_edits
 from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
-from kfgs.labels import answers, select_by_label
+from kfgs.labels import connected_parts
 from kfgs.labels.edits import Duplicate, Extract, Insert, Move, Opacity, Recolor, Remove, Turn
 from kfgs.labels.where import Component, Either, OfClass
 
@@ -87,11 +87,11 @@ def rows(*sizes):
 
 def test_parts_are_numbered_as_select_lists_them():
     cloud = rows(20, 60, 40, 60)
-    things = answers(cloud.gaussians, select_by_label(cloud.gaussians, "chair", cloud.classes))
+    things = connected_parts(cloud.gaussians, OfClass("chair").select(cloud))
     assert [thing.count for thing in things] == [60, 60, 40, 20]
     for number, thing in enumerate(things, start=1):
         (edit,) = read(remove=[f"Chair/{number}"])
-        assert torch.equal(edit.where.mask(cloud.gaussians, cloud.classes).nonzero()[:, 0], thing.indices)
+        assert torch.equal(edit.where.mask(cloud).nonzero()[:, 0], thing.indices)
 
 
 def test_parts_that_are_removed_are_counted_together():

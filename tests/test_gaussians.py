@@ -1,5 +1,10 @@
+import copy
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 import torch
+from messages import tells
 
 from kfgs.gaussians import Gaussians
 
@@ -114,3 +119,57 @@ def test_cat_refuses_nothing_and_mixtures():
         Gaussians.cat([])
     with pytest.raises(ValueError, match=r"parts\[1\]: expected the tensors .*'labels'.* as in parts\[0\], got"):
         Gaussians.cat([cloud(2), cloud(2, labelled=False)])
+
+
+@pytest.mark.parametrize(
+    "which",
+    [
+        torch.tensor([False, True, False, True]),
+        np.array([False, True, False, True]),
+        [1, 3],
+        np.array([1, -1]),
+        slice(1, None, 2),
+        SimpleNamespace(mask=torch.tensor([False, True, False, True])),
+    ],
+)
+def test_brackets_take_masks_indices_slices_and_selections(which):
+    gaussians = cloud(4, degree=1)
+    assert same(gaussians[which], gaussians.select(torch.tensor([1, 3])))
+
+
+def test_brackets_take_one_index_and_slices_like_a_list():
+    gaussians = cloud(4)
+    assert same(gaussians[-1], gaussians.select(torch.tensor([3])))
+    assert gaussians[::-1].labels.tolist() == [2, 1, 0, -1]
+    assert len(gaussians[3:1]) == len(gaussians[[]]) == 0
+    assert [len(one) for one in gaussians] == [1, 1, 1, 1]
+    with pytest.raises(IndexError, match=tells("which", 4, "got 4")):
+        gaussians[4]
+    with pytest.raises(TypeError, match=tells("which", "float32", "mask")):
+        gaussians[torch.rand(4)]
+
+
+def test_arrays_are_accepted_and_given():
+    gaussians = cloud(3, degree=1)
+    arrays = gaussians.to_numpy()
+    assert set(arrays) == {"means", "quats", "scales", "opacities", "features", "sh", "labels"}
+    assert all(isinstance(array, np.ndarray) for array in arrays.values())
+    assert same(Gaussians(**arrays), gaussians)
+
+
+def test_values_that_cannot_be_gaussians():
+    values = cloud(3, labelled=False).to_numpy()
+    with pytest.raises(TypeError, match=tells("means", "int64", ".float()")):
+        Gaussians(**values | {"means": np.zeros((3, 3), dtype=np.int64)})
+    with pytest.raises(TypeError, match=tells("labels", "float32", ".long()")):
+        Gaussians(**values, labels=torch.zeros(3))
+    with pytest.raises(TypeError, match=tells("quats", "str", "'wxyz'")):
+        Gaussians(**values | {"quats": "wxyz"})
+
+
+@pytest.mark.parametrize(("name", "where"), [("save", "write_splats"), ("to_pyvista", "kfgs.viz.to_pyvista")])
+def test_what_is_looked_for_here_is_pointed_to(name, where):
+    with pytest.raises(AttributeError, match=tells("Gaussians", name, where)):
+        getattr(cloud(1), name)
+    assert not hasattr(cloud(1), "nothing")
+    assert copy.copy(cloud(2)).labels.tolist() == [-1, 0]

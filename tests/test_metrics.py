@@ -5,9 +5,8 @@ import skimage.metrics
 import torch
 from oracles_metrics import mean_ssim, segmentation_scores
 
-from kfgs._rows import unit_rows
+from kfgs._rows import EPS, unit_rows
 from kfgs.metrics import (
-    COSINE_EPSILON,
     MIB,
     SSIM_PROTOCOL,
     ConfusionMatrix,
@@ -199,7 +198,7 @@ def test_zero_vector_counts_as_zero_and_never_nan():
 def test_cosine_shares_the_epsilon_of_the_codebook():
     generator = torch.Generator().manual_seed(0)
     a, b = (torch.randn(6, 4, dtype=torch.float64, generator=generator) for _ in range(2))
-    a[0] *= 0.5 * COSINE_EPSILON / a[0].norm()  # shorter than epsilon: its cosine is halved, not 1
+    a[0] *= 0.5 * EPS / a[0].norm()  # shorter than epsilon: its cosine is halved, not 1
     b[0] = a[0]
     torch.testing.assert_close(feature_cosine(a, b), (unit_rows(a) * unit_rows(b)).sum(-1).mean())
     assert float(feature_cosine(a[:1], b[:1])) == pytest.approx(0.25)

@@ -4,9 +4,7 @@ import ast
 import importlib
 import importlib.util
 import json
-import re
 import sys
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -46,46 +44,6 @@ def test_they_are_numbered_from_1():
     assert [int(path.name.split("_")[0]) for path in SOURCES] == list(range(1, len(SOURCES) + 1))
 
 
-def test_the_first_cell_says_what_how_long_and_what_it_needs(source):
-    """All in one form: `# N. Title`, paragraphs, and one that begins with the time on a CPU and says what is needed."""
-    first = jupytext.read(source, fmt="py:percent").cells[0]
-    assert first.cell_type == "markdown"
-    title, *_, last = first.source.split("\n\n")
-    assert re.fullmatch(rf"# {source.name.split('_')[0]}\. [A-Z][^\n]+", title)
-    last = " ".join(last.split())
-    assert re.match(r"About (a|half a|\d+) (minute|seconds?)\b.*\bCPU\b", last)
-    assert "Needs the extra `notebook`, no " in last
-
-
-def test_each_but_the_last_ends_with_the_next(source):
-    last = jupytext.read(source, fmt="py:percent").cells[-1]
-    following = SOURCES[SOURCES.index(source) + 1 :][:1]
-    for path in following:
-        assert last.cell_type == "markdown"
-        assert f"Next: [{path.stem}]({path.name})" in last.source
-
-
-@pytest.mark.parametrize("path", [*SOURCES, NOTEBOOKS / "README.md"], ids=lambda path: path.stem)
-def test_nothing_is_installed_that_lies_on_no_index(path):
-    """kfgs is installed from its clone: `pip install kfgs` finds nothing. Every extra named so exists."""
-    text = path.read_text(encoding="utf-8")
-    assert not re.search(r"pip install[^\n`]*\bkfgs\b", text)
-    declared = tomllib.loads((NOTEBOOKS.parent / "pyproject.toml").read_text(encoding="utf-8"))
-    extras = {extra for found in re.findall(r'"\.\[([^]]*)\]"', text) for extra in found.split(",")}
-    assert extras <= declared["project"]["optional-dependencies"].keys()
-
-
-def test_the_readme_makes_notebooks_that_name_their_kernel():
-    text = (NOTEBOOKS / "README.md").read_text(encoding="utf-8")
-    assert "jupytext --to ipynb --set-kernel python3 notebooks/[1-9]_*.py" in text
-    ignored = (NOTEBOOKS.parent / ".gitignore").read_text(encoding="utf-8").splitlines()
-    assert "/notebooks/*.ipynb" in ignored  # what it makes is no source
-
-
-def test_sources_have_no_header(source):
-    assert source.read_text(encoding="utf-8").startswith("# %% [markdown]\n")
-
-
 def test_one_cell_is_for_your_own_data_and_it_is_among_the_first(source):
     """A comment says so; only cells of imports may come before it."""
     cells = code_cells(source)
@@ -95,6 +53,7 @@ def test_one_cell_is_for_your_own_data_and_it_is_among_the_first(source):
 
 
 def test_cells_are_short_plain_python(source):
+    assert source.read_text(encoding="utf-8").startswith("# %% [markdown]\n")  # no header of jupytext's
     cells = jupytext.read(source, fmt="py:percent").cells
     for cell in cells:
         assert not cell.get("outputs"), "sources have no outputs"

@@ -1,4 +1,4 @@
-"""Alignment: the similarity between two frames of one scene, and whether two clouds share a frame."""
+"""The similarity (rotation, translation, scale) between two coordinate frames of one scene; whether two clouds share one."""
 
 from .by_cameras import Alignment, align_by_cameras
 from .by_shape import align_clouds

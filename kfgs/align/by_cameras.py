@@ -1,4 +1,4 @@
-"""The similarity between two frames of one scene, from the cameras that both know by name."""
+"""The similarity between two frames of one scene, from the cameras that have the same names in both."""
 
 from __future__ import annotations
 
@@ -12,17 +12,16 @@ import torch
 
 from ..cameras import Camera
 from ..cameras.similarity import Similarity, fit_similarity
-from ..scenes._pycolmap import quiet_pycolmap
-from ..scenes.errors import SceneError
-from ..scenes.names import file_stem, some
-from .clouds import Array
+from ..scenes.files import SceneError, file_stem, some
+from ..scenes.pycolmap_import import quiet_pycolmap
+from .clouds import Array, nearest_rotation, to_similarity
 
 MAX_ERROR = 0.03  # of the cameras' extent: two SfM runs of one scene differ by well below a hundredth
 MAX_ANGLE = 15.0  # degrees between a camera's two orientations, after alignment
 MIN_INLIERS = 0.5  # share of the common cameras that must fit
 TRIPOD = 0.01  # cameras closer together than this share of the extent stand at one place
 ROUNDING = 1e-4  # of the extent: poses in float32 may be off by that, where the frame stands far from its origin
-SIGMAS = 4.0  # at the end, cameras farther off than this (by the median) are left out
+SIGMAS = 4.0  # in the last fits, cameras farther off than this many median distances are left out
 PAIRS = 5_000  # pairs of cameras tried when their centres alone say too little
 
 
@@ -42,15 +41,15 @@ class Alignment:
     """Cameras (or points) that were compared."""
     how: str
     """What was done, in words."""
-    facts: dict[str, Any] = field(default_factory=dict)
-    """More numbers, such as the worst cameras by name; anything that JSON can hold."""
+    details: dict[str, Any] = field(default_factory=dict)
+    """More numbers, such as the worst cameras by name; JSON can hold all of them."""
 
     def __repr__(self) -> str:
-        return f"Alignment({self.words})"
+        return f"Alignment({self.summary})"
 
     @property
-    def words(self) -> str:
-        """One sentence for a person."""
+    def summary(self) -> str:
+        """One sentence: what was done, the scale, how many fit and how closely."""
         return (
             f"{self.how}: scale {self.similarity.scale:.6g}, {self.inliers} of {self.count} fit, rms {self.rms:.3g} "
             f"({self.rms / self.size:.2%} of the extent {self.size:.3g})"
@@ -66,23 +65,23 @@ class Alignment:
             "rms of extent": self.rms / self.size,
             "inliers": self.inliers,
             "count": self.count,
-            **self.facts,
+            **self.details,
         }
 
 
 def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
-    """The similarity between two reconstructions of one set of pictures, from the cameras they share by name.
+    """The similarity between two reconstructions of the same pictures, from the cameras that have the same names.
 
-    Robust: wrong poses are left out as long as half of the common cameras agree. Hypotheses come from the centres alone
-    (pycolmap's LO-RANSAC) and from the orientations with pairs of centres; the one that more cameras agree with, in
-    place and in orientation, is refined on its inliers by least squares.
+    Wrong poses are left out as long as half of the common cameras agree. Candidates come from the centres alone
+    (pycolmap's LO-RANSAC), and from the orientations with pairs of centres. The candidate that most cameras agree with, in
+    place and in orientation, is refined on these cameras by least squares.
 
     Args:
-        src: posed cameras in the source frame; distortion and intrinsics play no part.
+        src: posed cameras in the source frame; distortion and intrinsics are not used.
         dst: posed cameras in the destination frame.
 
     Returns:
-        The similarity from the source frame to the destination frame; `facts` names the cameras that fit worst.
+        The similarity from the source frame to the destination frame; `details` names the cameras that fit worst.
 
     Raises:
         SceneError: if fewer than two names are common, all common cameras stand at one place (no scale follows), or
@@ -110,17 +109,17 @@ def align_by_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> Alignment:
         )
     errors = _distances(similarity, A, B)
     worst = [names[i] for i in np.argsort(-errors)[:5]]
-    facts = {
+    details = {
         "worst cameras": {name: float(errors[names.index(name)]) for name in worst},
         "left out": [name for name, ok in zip(names, good, strict=True) if not ok],
         "median angle": float(np.median(_angles(similarity, turns)[good])),
     }
     rms = float(np.sqrt((errors[good] ** 2).mean()))
-    return Alignment(similarity, rms, size, int(good.sum()), len(pairs), "cameras of the same names", facts)
+    return Alignment(similarity, rms, size, int(good.sum()), len(pairs), "cameras of the same names", details)
 
 
 def common_cameras(src: Sequence[Camera], dst: Sequence[Camera]) -> list[tuple[Camera, Camera]]:
-    """Cameras of the same name in both, in the order of `src`; see `align_by_cameras` for what makes names equal."""
+    """Pairs of cameras of the same name, in the order of `src`; `align_by_cameras` says when names are the same."""
     keys = _keys(src, dst, lambda camera: PurePosixPath(file_stem(camera.name)).name)
     keys = keys or _keys(src, dst, lambda camera: file_stem(camera.name)) or ({}, {})
     pairs = [(camera, keys[1][key]) for key, camera in keys[0].items() if key in keys[1]]
@@ -139,7 +138,7 @@ def _keys(src: Sequence[Camera], dst: Sequence[Camera], key: Any) -> tuple[dict[
 
 
 def _best_fit(A: Array, B: Array, turns: Array, sizes: list[float]) -> tuple[Similarity | None, Array, float]:
-    """The similarity that most cameras agree with, those cameras, and the first of the sizes with which half of them do."""
+    """The similarity that most cameras agree with, these cameras, and the first size for which half of all cameras agree."""
     best: tuple[Similarity | None, Array, float] = (None, np.zeros(len(A), dtype=bool), sizes[0])
     for size in sizes:
         for start in (_by_centers(A, B, size), *_by_orientations(A, B, turns, size)):
@@ -158,7 +157,7 @@ def _least(A: Array) -> float:
 
 
 def _by_centers(A: Array, B: Array, size: float) -> Similarity | None:
-    """LO-RANSAC over triples of centres; None where they stand on a line or never fit."""
+    """LO-RANSAC over triples of centres; None if they stand on a line or none fits."""
     if len(A) < 3:
         return None
     with quiet_pycolmap() as pycolmap:
@@ -168,7 +167,7 @@ def _by_centers(A: Array, B: Array, size: float) -> Similarity | None:
     if found is None or not found["tgt_from_src"].scale > 0:
         return None
     fit = found["tgt_from_src"]
-    return _similarity(fit.scale, fit.rotation.matrix(), fit.translation)
+    return to_similarity(fit.scale, fit.rotation.matrix(), fit.translation)
 
 
 def _by_orientations(A: Array, B: Array, turns: Array, size: float) -> list[Similarity]:
@@ -176,8 +175,7 @@ def _by_orientations(A: Array, B: Array, turns: Array, size: float) -> list[Simi
     cosines = (np.einsum("iab,jab->ij", turns, turns) - 1) / 2
     near = cosines > np.cos(np.radians(MAX_ANGLE))
     row = near[int(near.sum(1).argmax())]
-    U, _, Vt = np.linalg.svd(turns[row].sum(0))  # chordal mean
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    R = nearest_rotation(turns[row].sum(0))
     turned = A[row] @ R.T  # [n, 3]
     i, j = np.triu_indices(int(row.sum()), 1)
     if len(i) == 0:
@@ -192,12 +190,12 @@ def _by_orientations(A: Array, B: Array, turns: Array, size: float) -> list[Simi
             shift = B[row][first] - scale * turned[first]
             fits = int((np.linalg.norm(scale * turned + shift - B[row], axis=1) < MAX_ERROR * size).sum())
             if fits > most:
-                best, most = _similarity(scale, R, shift), fits
+                best, most = to_similarity(scale, R, shift), fits
     return [] if best is None else [best]
 
 
 def _refine(start: Similarity, A: Array, B: Array, turns: Array, size: float) -> tuple[Similarity, Array]:
-    """Least squares over the cameras that fit, twice more over those within a few medians; the fit and its inliers."""
+    """Least squares over the cameras that fit, repeated until they stay the same; gives the fit and these cameras."""
     similarity, limit = start, MAX_ERROR * size
     good = _good(similarity, A, B, turns, limit)
     for _ in range(10):
@@ -217,11 +215,10 @@ def _refine(start: Similarity, A: Array, B: Array, turns: Array, size: float) ->
 
 def _fit_on_a_line(A: Array, B: Array, turns: Array) -> Similarity:
     """Rotation from the orientations, scale and translation from the centres."""
-    U, _, Vt = np.linalg.svd(turns.sum(0))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    R = nearest_rotation(turns.sum(0))
     a, b = (A - A.mean(0)) @ R.T, B - B.mean(0)
     scale = float((a * b).sum() / (a**2).sum())
-    return _similarity(scale, R, B.mean(0) - scale * R @ A.mean(0))
+    return to_similarity(scale, R, B.mean(0) - scale * R @ A.mean(0))
 
 
 def _on_a_line(points: Array) -> bool:
@@ -240,20 +237,16 @@ def _distances(similarity: Similarity, A: Array, B: Array) -> Array:
 
 
 def _angles(similarity: Similarity, turns: Array) -> Array:
-    """Degrees between each camera's own turn from frame to frame and the similarity's."""
+    """Degrees between the rotation of each camera from frame to frame and that of the similarity."""
     cosines = (np.einsum("vij,ij->v", turns, similarity.rotation.numpy()) - 1) / 2
     return np.degrees(np.arccos(np.clip(cosines, -1, 1)))
 
 
-def _similarity(scale: float, rotation: Array, translation: Array) -> Similarity:
-    return Similarity(float(scale), torch.from_numpy(np.array(rotation)), torch.from_numpy(np.array(translation)))
-
-
 def _extents(centers: Array) -> list[float]:
-    """How large the cameras' place may be, likeliest first.
+    """Estimates of the size of the region that the cameras stand in, the likeliest first.
 
-    Twice the median distance from the median centre: wrong poses do not move it. Twice the upper quartile: it holds where
-    half of the cameras stand on one tripod, and comes first where the median says so. Twice the largest where all do.
+    Usually twice the median distance from the median centre, which wrong poses do not change, then twice the upper quartile.
+    If half of the cameras stand on one tripod, the quartile comes first. If nearly all do, it is twice the largest distance.
     """
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     median, upper, largest = (2 * float(np.quantile(distances, q)) for q in (0.5, 0.75, 1.0))

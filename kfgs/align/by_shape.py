@@ -1,8 +1,8 @@
-"""The similarity between two clouds of one scene that have nothing in common but their shape.
+"""The similarity between two clouds of one scene, from their shape alone.
 
-Many starts, cheap first: a few thousand rotations and sizes are improved together on a lookup grid of nearest points
-(coarse), the best few basins by least squares on point-to-plane distances (fine), and the winner must leave the
-runner-up behind. Distances count both ways, so that neither shrinking one cloud into the other nor blowing it up pays.
+The search starts from a few thousand rotations and sizes. It improves all of them together on a lookup grid of nearest points
+(coarse), then the best few by least squares on point-to-plane distances (fine). The best fit must be clearly better than the
+second best. Distances count both ways, so shrinking one cloud into the other, or enlarging it, brings no advantage.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from torch import Tensor
 
 from .._check import check_shapes
 from ..cameras.similarity import Similarity
-from ..scenes.errors import SceneError
+from ..scenes.files import SceneError
 from .by_cameras import Alignment
-from .close_fit import Cloud, Fit, fit_closely, orthonormal
-from .clouds import Array, bulk
+from .close_fit import Cloud, Fit, fit_closely
+from .clouds import Array, bulk, nearest_rotation, to_similarity
 from .starts import Moves, improve_on_grid, principal_axes, spread_rotations, thin
 
 ROTATIONS = 576  # evenly over all rotations: about 16 degrees from any rotation to the nearest, in the middle
 SIZES = (0.75, 0.87, 1.0, 1.15, 1.33)  # around the ratio of the clouds' radii, which partial overlap distorts
-BASINS, FINALISTS = 8, 3  # starts that are refined, and those that are refined on all points
+BASINS, FINALISTS = 8, 3  # starts that are refined, and starts that are refined on more points
 COARSE, FINE, FULL = 300, 3_000, 10_000  # points of each cloud
 MIN_FIT = 0.6  # of the points, both ways (harmonic mean)
 MARGIN = 0.6  # of what the best leaves unfit, the runner-up must leave more than 1 / MARGIN times as much
@@ -33,7 +33,7 @@ def align_clouds(
     *,
     generator: torch.Generator | None = None,
 ) -> Alignment:
-    """Find rotation, translation and scale that lay one cloud onto another of the same scene, without any names.
+    """Find the rotation, translation and scale that lay one cloud onto another of the same scene.
 
     The clouds may differ in density, noise and floaters, and overlap in part (about three quarters of each in the
     other). A point fits when it is closer to the other cloud than 2 spacings of the sparser one; `quality` is the
@@ -42,14 +42,14 @@ def align_clouds(
     Args:
         src: points in the source frame, finite; leave out Gaussians too faint to see.
         dst: points in the destination frame.
-        generator: draws the points that the search looks at; None stands for seed 0.
+        generator: draws the points that the search uses; None: seed 0.
 
     Returns:
-        The similarity from the source frame to the destination frame; `facts` holds both shares, the quality, and that
-        of the best other fit (another rotation, size or place).
+        The similarity from the source frame to the destination frame; `details` holds both shares, the quality, and the
+        quality of the best other fit (another rotation, size or place).
 
     Raises:
-        SceneError: if nothing fits well, or two different fits are about equally good (a symmetric scene).
+        SceneError: if nothing fits well, or two different fits are about equally good (the scene is symmetric).
         ValueError: if shapes disagree, there are too few points, or a number is not finite.
 
     Note:
@@ -73,7 +73,7 @@ def align_clouds(
     best = fits[0]
     runner_up = max((fit.quality for fit in fits if fit.similarity in starts[1:]), default=0.0)
     _check_fit(best, runner_up)
-    facts = {
+    details = {
         "source points that fit": best.shares[0],
         "destination points that fit": best.shares[1],
         "quality": best.quality,
@@ -81,7 +81,7 @@ def align_clouds(
     }
     inliers = round(best.shares[0] * len(x.points) + best.shares[1] * len(y.points))
     how = f"shape of the clouds (quality {best.quality:.2f}, next best {runner_up:.2f})"
-    return Alignment(best.similarity, best.rms, size, inliers, len(x.points) + len(y.points), how, facts)
+    return Alignment(best.similarity, best.rms, size, inliers, len(x.points) + len(y.points), how, details)
 
 
 def _check_fit(best: Fit, runner_up: float) -> None:
@@ -114,9 +114,9 @@ def _starts(a: Array, b: Array, rng: np.random.Generator) -> list[Similarity]:
     order = np.argsort(-scores)[: 50 * BASINS]
     found = []
     for i in order:
-        R, s = orthonormal(moves.rotations[i]), float(moves.scales[i]) * radii[1] / radii[0]
+        R, s = nearest_rotation(moves.rotations[i]), float(moves.scales[i]) * radii[1] / radii[0]
         t = centers[1] + radii[1] * moves.translations[i] - s * R @ centers[0]
-        found.append(Similarity(s, torch.from_numpy(R), torch.from_numpy(t)))
+        found.append(to_similarity(s, R, t))
     return _different(found, centers[0], 2 * radii[1], BASINS)
 
 

@@ -1,4 +1,4 @@
-"""Two clouds that nearly lie on each other, brought closer: least squares on point-to-plane distances, both ways."""
+"""Refine a similarity between two clouds: least squares on point-to-plane distances, both ways."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from ..cameras.similarity import Similarity
-from .clouds import Array, median_spacing, nearest
+from .clouds import Array, median_spacing, nearest, nearest_rotation, robust_weights, to_similarity
 from .starts import thin
 
-NEAR = 2.0  # a point fits when closer than so many spacings of the sparser cloud
+NEAR = 2.0  # a point fits if it is closer than this many spacings of the sparser cloud
 
 
 class Fit(NamedTuple):
-    """A similarity from one cloud to another, and how much of them it lays on each other."""
+    """A similarity from one cloud to another, and how well the clouds then fit."""
 
     similarity: Similarity
     quality: float  # harmonic mean of the two shares that fit
@@ -26,7 +26,7 @@ class Fit(NamedTuple):
 
 
 class Cloud(NamedTuple):
-    """Points with normals, and the tree that finds the nearest."""
+    """Points with normals, and a tree that finds the nearest."""
 
     points: Array  # [n, 3]
     normals: Array  # [n, 3]
@@ -58,20 +58,19 @@ def fit_closely(a: Cloud, b: Cloud, start: Similarity, reaches: Array) -> Fit:
         P = np.concatenate([moved, moved[j]])
         Q = np.concatenate([b.points[i], b.points])
         n = np.concatenate([b.normals[i], a.normals[j] @ R.T])
-        w = np.concatenate([_weight(d, reach) / len(d), _weight(e * s, reach) / len(e)])
+        w = np.concatenate([robust_weights(d**2, reach) / len(d), robust_weights((e * s) ** 2, reach) / len(e)])
         center = P.mean(0)
         A = np.concatenate([np.cross(P - center, n), n, ((P - center) * n).sum(1)[:, None]], axis=1)  # [., 7]
         system = (A * w[:, None]).T @ A
         damping = 1e-4 * np.diag(np.maximum(np.diag(system), 1e-12 * np.trace(system)))
         x = np.linalg.solve(system + damping, (A * w[:, None]).T @ ((Q - P) * n).sum(1))
-        turn, factor = _rotation_vector(x[:3]), float(np.exp(np.clip(x[6], -0.1, 0.1)))
+        turn, factor = Rotation.from_rotvec(x[:3]).as_matrix(), float(np.exp(np.clip(x[6], -0.1, 0.1)))
         t = factor * turn @ (t - center) + center + x[3:6]
-        R, s = orthonormal(turn @ R), s * factor
-    similarity = Similarity(s, torch.from_numpy(R), torch.from_numpy(t))
-    return judge(a, b, similarity)
+        R, s = nearest_rotation(turn @ R), s * factor
+    return _judge(a, b, to_similarity(s, R, t))
 
 
-def judge(a: Cloud, b: Cloud, similarity: Similarity) -> Fit:
+def _judge(a: Cloud, b: Cloud, similarity: Similarity) -> Fit:
     """How much of each cloud fits under a similarity."""
     d = nearest(b.tree, similarity.apply(torch.from_numpy(a.points)).numpy())[0]
     e = nearest(a.tree, similarity.inverse().apply(torch.from_numpy(b.points)).numpy())[0] * similarity.scale
@@ -80,21 +79,3 @@ def judge(a: Cloud, b: Cloud, similarity: Similarity) -> Fit:
     quality = 2 * shares[0] * shares[1] / max(sum(shares), 1e-12)
     near = np.concatenate([d[d < reach], e[e < reach]])
     return Fit(similarity, quality, shares, float(np.sqrt((near**2).mean())) if len(near) else float("inf"))
-
-
-def _weight(distances: Array, reach: float) -> Array:
-    """Geman-McClure: 1 at 0, a quarter at `reach`, nothing far away."""
-    weight: Array = (reach**2 / (reach**2 + distances**2)) ** 2
-    return weight
-
-
-def _rotation_vector(vector: Array) -> Array:
-    matrix: Array = Rotation.from_rotvec(vector).as_matrix()
-    return matrix
-
-
-def orthonormal(matrix: Array) -> Array:  # [3, 3]
-    """The rotation nearest to a matrix."""
-    U, _, Vt = np.linalg.svd(matrix)
-    turned: Array = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    return turned

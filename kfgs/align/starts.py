@@ -1,4 +1,4 @@
-"""Many rough alignments of two clouds at once: starts over all rotations, improved together on a lookup grid."""
+"""Many rough alignments of two clouds at once: starts from all rotations, improved together on a lookup grid."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from .clouds import Array, nearest
+from .clouds import Array, nearest, robust_weights
 
-GRID = 40  # cells a side of the lookup grid: 64,000 nearest points are found once, in a tenth of a second
+GRID = 40  # cells along a side of the lookup grid: 64,000 nearest points, found once in a tenth of a second
 REACH = 2.6  # half a side of the grid, in radii of the cloud
-STEPS, FIRST, KEPT = 14, 7, 4  # of the improvement; after the first seven only the best quarter goes on
-WIDE, NARROW = 0.5, 0.08  # the distances, in radii, at which a pair counts a quarter: first and last step
-BLOCK = 200  # starts at a time
+STEPS, FIRST, KEPT = 14, 7, 4  # steps; after the first 7 only the best quarter (1 in 4) continues
+WIDE, NARROW = 0.5, 0.08  # in radii: the distance at which a pair has weight 1/4, in the first and the last step
+BLOCK = 200  # starts that are improved at a time
 
 
 class Moves(NamedTuple):
@@ -33,7 +33,7 @@ class Moves(NamedTuple):
 
 
 def spread_rotations(count: int) -> Array:  # [count, 3, 3]
-    """Rotations spread evenly over all rotations (super-Fibonacci spirals, Alexa 2022)."""
+    """Rotations that cover all rotations evenly (super-Fibonacci spirals, Alexa 2022)."""
     s = np.arange(count) + 0.5
     inner, outer = np.sqrt(s / count), np.sqrt(1 - s / count)
     a, b = 2 * np.pi * s / np.sqrt(2), 2 * np.pi * s / 1.533751168755204288118041
@@ -51,13 +51,13 @@ def principal_axes(x: Array, y: Array) -> Array:  # [4, 3, 3]
 
 
 def thin(points: Array, count: int, rng: np.random.Generator) -> Array:
-    """About `count` points, evenly over the surface: means of the cells of a grid that is made as coarse as it takes."""
+    """About `count` points, evenly over the surface: the means of the cells of a grid, whose cell size is found by bisection."""
     if len(points) <= count:
         return points
     low, size = points.min(0), float(np.ptp(points, axis=0).max())
     fine, coarse = 0.0, size
     cells = points
-    for _ in range(12):  # bisection of the cell's size
+    for _ in range(12):
         cell = (fine + coarse) / 2
         key = np.floor((points - low) / cell).astype(np.int64) @ np.array([1, 1 << 20, 1 << 40])
         _, inverse, counts = np.unique(key, return_inverse=True, return_counts=True)
@@ -93,7 +93,7 @@ def improve_on_grid(
     count: int,
     rng: np.random.Generator,
 ) -> tuple[Moves, Array]:
-    """Improve every start by pairs of nearest points, both ways, weighted down with distance; and score the results.
+    """Improve every start by pairs of nearest points, both ways, that count less the farther they are apart; score the results.
 
     Returns:
         The improved moves from x to y and their scores in [0, 1]: how much of either cloud lies on the other.
@@ -102,7 +102,7 @@ def improve_on_grid(
     p, q = (cloud[rng.permutation(len(cloud))[:count]].astype(np.float32) for cloud in (x, y))
     scores = np.zeros(0)
     for widths in np.split(np.geomspace(WIDE, NARROW, STEPS), [FIRST]):
-        if len(scores):  # the second half of the steps is for the better part of the starts
+        if len(scores):  # the second half of the steps is for the best starts only
             moves = Moves(*(part[np.argsort(-scores)[: max(1, len(scores) // KEPT)]] for part in moves))
         blocks = [Moves(*(part[i : i + BLOCK] for part in moves)) for i in range(0, len(moves.scales), BLOCK)]
         results = [
@@ -122,8 +122,8 @@ def _improve(moves: Moves, p: Array, q: Array, to_x: _Lookup, to_y: _Lookup, wid
         back = (q - t[:, None]) @ R / s[:, None, None]  # [S, m, 3]
         onto, origin = to_y(moved), to_x(back)
         reach = float(widths[-1] if width is None else width)
-        ahead = _weights(_squares(moved - onto), reach)
-        behind = _weights(_squares(back - origin) * s[:, None] ** 2, reach)
+        ahead = robust_weights(_squares(moved - onto), reach)
+        behind = robust_weights(_squares(back - origin) * s[:, None] ** 2, reach)
         if width is None:
             one, other = ahead.mean(1), behind.mean(1)
             scores = 2 * one * other / np.maximum(one + other, 1e-12)
@@ -139,14 +139,8 @@ def _squares(vectors: Array) -> Array:
     return squares
 
 
-def _weights(squares: Array, width: float) -> Array:
-    """Geman-McClure: 1 at 0, a quarter at `width`, nothing far away."""
-    weights: Array = (width**2 / (width**2 + squares)) ** 2
-    return weights
-
-
 def _fit(source: Array, target: Array, weights: Array) -> Moves:
-    """Umeyama's similarity for every row, but with the scale as the ratio of spreads: noise in either cloud is alike."""
+    """Umeyama's similarity for every row. The scale is the ratio of the spreads, which treats noise in both clouds alike."""
     w = (weights / np.maximum(weights.sum(1, keepdims=True), 1e-12))[:, None]  # [S, 1, n]
     a, b = (w @ source)[:, 0], (w @ target)[:, 0]  # [S, 3]
     cross = (target * w.transpose(0, 2, 1)).transpose(0, 2, 1) @ source - b[:, :, None] * a[:, None]

@@ -1,8 +1,10 @@
-"""Posed cameras, projection, lens distortion and resampling, carried by kornia."""
+"""Posed cameras, paths of cameras, projection, lens distortion and resampling, carried by kornia."""
 
 from .camera import Camera, Distortion
 from .distortion import fold_radius
 from .kornia_camera import from_kornia, to_kornia
+from .orbits import Orbit, estimate_up, orbit_cameras
+from .paths import path_cameras
 from .projection import camera_to_pixel, project_points, projection_jacobian, unproject_depth, world_to_camera
 from .resample import resize_labels, resize_map
 from .similarity import Similarity, fit_similarity
@@ -11,11 +13,15 @@ from .undistort import undistort, undistort_labels
 __all__ = [
     "Camera",
     "Distortion",
+    "Orbit",
     "Similarity",
     "camera_to_pixel",
+    "estimate_up",
     "fit_similarity",
     "fold_radius",
     "from_kornia",
+    "orbit_cameras",
+    "path_cameras",
     "project_points",
     "projection_jacobian",
     "resize_labels",

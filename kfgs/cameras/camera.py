@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import numbers
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -17,6 +18,9 @@ COEFFICIENTS = {"brown_conrady": (4, 5, 8), "kannala_brandt": (4,)}
 
 NEAR = 0.2
 """World units: the smallest depth that 3DGS draws, meant for scenes of metres."""
+
+UP = (0.0, 0.0, 1.0)
+"""What is up in a world unless the caller says otherwise."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +100,64 @@ class Camera:
                 "viewmat: expected a rotation, got a reflection (determinant -1); check the axes' handedness"
             )
 
+    @staticmethod
+    def look_at(
+        eye: Tensor | Sequence[float],  # [3]
+        target: Tensor | Sequence[float],  # [3]
+        *,
+        up: Tensor | Sequence[float] = UP,  # [3]
+        fov_degrees: float = 60.0,
+        width: int = 640,
+        height: int = 480,
+        name: str = "",
+        near: float = NEAR,
+    ) -> Camera:
+        """A camera at `eye` with `target` in the middle of its picture, held upright.
+
+        Args:
+            eye: where the camera stands, world units. A floating-point tensor decides dtype and device of the matrices.
+            target: what it looks at.
+            up: the world's up, which is up in the picture too. COLMAP's worlds often have no axis that points up: pass
+                `estimate_up(scene.cameras)`.
+            fov_degrees: vertical field of view, in (0, 180); pixels are square.
+            width: pixels.
+            height: pixels.
+            name: the camera's name.
+            near: the smallest depth that is drawn, world units.
+
+        Raises:
+            ValueError: if eye and target are at one place, or `up` is the direction of view, which leaves the roll open.
+
+        Example:
+            >>> camera = Camera.look_at((0, -4, 0), (0, 0, 0), fov_degrees=90, width=64, height=48)
+            >>> camera.center.tolist(), camera.K[0].tolist()
+            ([0.0, -4.0, 0.0], [24.0, 0.0, 32.0])
+        """
+        check_range("fov_degrees", fov_degrees, 0, 180, closed=(False, False))
+        like = eye if isinstance(eye, Tensor) and eye.is_floating_point() else torch.zeros(())
+        place, aim = (torch.as_tensor(value).detach().double().cpu() for value in (eye, target))
+        check_shapes(("eye", place, "3"), ("target", aim, "3"))
+        forward, zenith = unit_vector("target - eye", aim - place), unit_vector("up", up)
+        right = torch.linalg.cross(forward, zenith)
+        if float(right.norm()) < 1e-6:
+            raise ValueError(
+                f"up: expected another direction than that of the view, got {zenith.tolist()} for a view along "
+                f"{forward.tolist()}; give the direction that shall be up in the picture, such as (0, 1, 0)"
+            )
+        right = right / right.norm()
+        R = torch.stack([right, torch.linalg.cross(forward, right), forward])  # x right, y down, z forward
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[:3, :3], viewmat[:3, 3] = R, -R @ place
+        focal = height / 2 / math.tan(math.radians(fov_degrees) / 2)
+        K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float64)
+        return Camera(viewmat.to(like), K.to(like), width, height, name, near=near)
+
+    def __repr__(self) -> str:
+        x, y, z = self.center.tolist()
+        fov = 2 * math.degrees(math.atan(self.height / 2 / float(self.K[1, 1])))
+        lens = "" if self.distortion is None else f", {self.distortion.model}"
+        return f"Camera({self.name!r}, {self.width}x{self.height}, fov {fov:.1f}, at ({x:.4g}, {y:.4g}, {z:.4g}){lens})"
+
     @property
     def size(self) -> tuple[int, int]:
         """(height, width) in pixels."""
@@ -127,3 +189,13 @@ class Camera:
     def to(self, *args: Any, **kwargs: Any) -> Camera:
         """Move or convert the matrices as `Tensor.to` does."""
         return replace(self, viewmat=self.viewmat.to(*args, **kwargs), K=self.K.to(*args, **kwargs))
+
+
+def unit_vector(name: str, vector: Tensor | Sequence[float]) -> Tensor:  # [3] float64
+    """The direction of a vector; `name` is the argument an error speaks of."""
+    values = torch.as_tensor(vector).detach().double().cpu()
+    check_shapes((name, values, "3"))
+    length = float(values.norm())
+    if not 0 < length < math.inf:
+        raise ValueError(f"{name}: expected a vector with a direction, got {values.tolist()}; for instance (0, 0, 1)")
+    return values / length

@@ -110,11 +110,11 @@ def check_parts(splats: Any, edits: Iterable[Any]) -> None:
     import torch
 
     from ..labels import component_numbers
-    from ..labels.answer import SPECK
+    from ..labels.parts import SPECK
 
     for part in (part for edit in edits for part in _parts(getattr(edit, "where", None))):
         name = part.where.name
-        mask = part.where.mask(splats.gaussians, splats.classes, splats.extra)
+        mask = part.where.mask(splats)
         numbers = component_numbers(splats.gaussians.means, mask, part.distance)
         sizes = torch.bincount(numbers[mask])
         count = int((sizes >= SPECK * sizes[0]).sum()) if len(sizes) else 0

@@ -7,7 +7,6 @@ import os
 from pathlib import Path
 from typing import Any, Literal
 
-from .._check import check_whole
 from .files import check_alone, check_folder, open_field, open_splats
 from .options import (
     Flag,
@@ -152,7 +151,7 @@ def fit(
             "undistorted_features", maps.undistorted_features, "beside --teacher, which sees the pictures as taken"
         )
         network = choose_teacher(teacher.teacher, teacher.weights, teacher.fast, teacher.size, training.device)
-        found: Any = RecomputedMaps(network, as_taken, chosen, out / "teacher")
+        found: Any = RecomputedMaps(network, as_taken, views.split, out / "teacher")
     else:
         teacher.check_weights()
         check_alone("size", teacher.size or None, "without --teacher, whose option it is")
@@ -234,6 +233,7 @@ def color(
             for a GPU).
         pictures: How many of the views held out are drawn beside their photographs.
     """
+    from .._check import check_whole
     from ..evaluation.color import score_views
     from ..pipeline import write_report
     from ..pipeline.color import ColorConfig, fit_color

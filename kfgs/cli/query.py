@@ -6,7 +6,6 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
-from .._check import check_range
 from .files import check_alone, check_folder, is_field, open_field, open_splats
 from .options import Classes, Given, Positional, Teacher
 from .output import say, say_counts, wrote
@@ -51,8 +50,9 @@ def select(
         score: relevancy (against the most similar negative), softmax (over query and negatives) or cosine (field only).
             auto: relevancy, or cosine with --negatives none.
     """
+    from .._check import check_range
     from ..formats import SplatFile
-    from ..labels import answers
+    from ..labels import connected_parts
     from ..pipeline.apply import select_labelled
 
     if not source.exists() and Path(query).exists():
@@ -79,7 +79,7 @@ def select(
         found = select_labelled(cloud, query, threshold)
         cameras = None if classes.scene is None else classes.load_scene().undistorted().cameras
     say(f"{query}: {len(found)} of {len(cloud)} Gaussians, {found.words}")
-    things = answers(cloud.gaussians, found, cameras)
+    things = connected_parts(cloud.gaussians, found, cameras)
     for number, thing in enumerate(things, start=1):
         say(f"  {query}/{number}: {thing!r}" if counted else f"  {thing!r}")
     if out is not None:

@@ -8,7 +8,6 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal
 
-from .._check import check_whole
 from .edit_syntax import Edits, check_parts, inserted_files, parse_edits
 from .files import check_alone, check_file, check_target, open_splats
 from .options import Classes, Flag, Given, Positional, SceneOption, Several
@@ -115,6 +114,7 @@ def edit(
             changes.
         pictures: How many views to show if none is named.
     """
+    from .._check import check_whole
     from ..formats import write_splats
     from ..labels.edits import EditList
     from ..pipeline.compare import views_of_edits, write_comparison

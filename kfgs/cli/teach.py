@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
-from .._check import one_line
 from .files import check_alone, check_file, check_folder
 from .options import Device, Flag, Given, Level, MapTeacher, Method, Mode, Preset, SceneFolder, Views, fit_config
 from .output import say, wrote
@@ -43,23 +42,23 @@ def features(
         level: For --check: which masks of LangSplat's maps, default, subparts (s), parts (m) or wholes (l).
         device: Where the teacher runs: auto (a GPU if there is one), cpu or cuda.
     """
-    from ..features import extract_features, pictures_of
+    from ..features import FeatureFolder, extract_features
 
     if check is not None:
         for name, given in (("teacher", teacher.teacher), ("weights", teacher.weights), ("out", out)):
             check_alone(name, given, "beside --check, which encodes nothing")
+    else:
+        check_alone("level", level, "without --check; it is of LangSplat's maps")
     loaded = views.load(scene)
-    chosen = list(range(len(loaded))) if views.split == "all" else loaded.views(views.split)
     if check is not None:
-        look_over(loaded, chosen, check, level)
+        found = FeatureFolder(check, level=level or "default").check(loaded, views.split)
+        say(str(found))
+        found.raise_if_bad()
         return
-    check_alone("level", level, "without --check; it is of LangSplat's maps")
     target = out if out is not None else scene_folder(scene) / "features"
     check_folder("out", target)
     network = choose_teacher(teacher.teacher, teacher.weights, teacher.fast, teacher.size, device)
-    made = extract_features(
-        network, pictures_of(loaded, chosen), target, overwrite=overwrite, report=say, progress=True
-    )
+    made = extract_features(network, loaded, target, views.split, overwrite=overwrite, report=say, progress=True)
     shapes = sorted({" x ".join(map(str, record.shape)) for record in made.maps.values()})
     say(f"{len(made.maps)} maps of {', '.join(shapes)} by {teacher_words(made.teacher)}")
     say(f"next: kfgs fit {scene} --out run" + ("" if out is None else f" --features {out}"))
@@ -162,51 +161,36 @@ def teacher_options(name: str, fast: bool, size: tuple[int, ...]) -> dict[str, A
     return options
 
 
-def look_over(scene: Any, views: list[int], folder: Path, level: Level | None) -> None:
-    """Report every map of a folder that does not fit the scene's views; a ValueError counts them."""
-    from ..features import check_feature_folder
-
-    pictures = [(scene.stem(i), scene.cameras[i].size) for i in views]
-    report = check_feature_folder(folder, pictures, level=level or "default")
-    say(str(report))
-    report.raise_if_bad()
-
-
 def stored_maps(scene: Any, views: list[int], folder: Path, level: Level | None) -> Any:
-    """The maps of some views of a scene as taken; those whose headers do not look like their pictures' are named."""
-    from ..features import FeatureFolder, check_feature_folder
-    from ..features.langsplat import INDEX
+    """The maps of some views of a scene, with a note for each whose shape does not fit its picture."""
+    from ..features import FeatureFolder
 
-    stems, sizes = [scene.stem(i) for i in views], [scene.cameras[i].size for i in views]
-    maps = FeatureFolder(folder, stems, sizes=sizes, level=level or "default")
-    if not any(file.name.endswith(INDEX) for file in maps.files):
+    maps = FeatureFolder(folder, level=level or "default").of(scene, views)
+    if not maps.has_masks:
         check_alone("level", level, f"beside {folder}, whose maps are not LangSplat's")
-    pictures = list(zip(stems, sizes, strict=True))
-    report = check_feature_folder(folder, pictures, values=False, level=level or "default")
-    for name, texts in list(report.problems.items())[:MISFITS]:
+    problems = maps.check(values=False).problems
+    for name, texts in list(problems.items())[:MISFITS]:
         say(f"note: {name}: {'; '.join(texts)}")
-    if len(report.problems) > MISFITS:
+    if len(problems) > MISFITS:
         option = "" if level is None else f" --level {level}"
-        say(
-            f"note: and {len(report.problems) - MISFITS} more; `kfgs features SCENE --check {folder}{option}` lists them"
-        )
+        say(f"note: and {len(problems) - MISFITS} more; `kfgs features SCENE --check {folder}{option}` lists them")
     return maps
 
 
 def check_discard(maps: Any, config: Any) -> None:
-    """Refuse to delete dense maps that nothing would stand for: before the work, not after it.
+    """Refuse to delete dense maps that nothing could replace, before the work rather than after it.
 
     Raises:
-        ValueError: if the mode makes no index maps, or kfgs did not make the maps as they are and could not make them again.
+        ValueError: if the mode makes no index maps, or kfgs did not make these maps and so could not make them again.
     """
-    from ..features import check_discardable
+    from ..features import discard_maps
 
     if config.needs_maps:
         raise ValueError(
             "discard-features: expected a mode that makes index maps (adc or adc+sc), got decouple, which learns from the "
             "dense maps themselves; leave it out"
         )
-    check_discardable(maps.path, maps.stems)
+    discard_maps(maps.path, maps.stems, dry_run=True)
 
 
 def scene_folder(scene: Path) -> Path:
@@ -216,6 +200,8 @@ def scene_folder(scene: Path) -> Path:
 
 def teacher_words(identity: dict[str, Any]) -> str:
     """A teacher's identity in a few words: `lseg (weights 3f2a...)`."""
+    from .._check import one_line
+
     weights, options = identity.get("weights"), identity.get("options")
     words = [one_line(identity.get("name", "unknown"))]
     words += [f"weights {one_line(weights)[:12]}"] if weights else []

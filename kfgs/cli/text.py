@@ -49,7 +49,7 @@ def text(
         field: The field folder in which the examples are shown.
     """
     from ..labels import CANONICAL
-    from ..labels.label_table import SUFFIX
+    from ..labels.label_set import SUFFIX
     from ..teachers.prompts import template_set
 
     if out.suffix != SUFFIX or out.is_dir():

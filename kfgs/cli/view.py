@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from .._check import check_range, check_whole
 from .files import check_alone, check_folder, is_field, open_splats
 from .options import Classes, Given, Positional, Teacher
 from .output import say, wrote
@@ -67,8 +66,9 @@ def view(
             browser.
         out: Folder for the pictures and selections that are saved while looking.
     """
+    from .._check import check_range, check_whole
     from ..viz.explorer import Exploration, ExploreOptions, Explorer
-    from ..viz.explorer.explore import check_place, find_place
+    from ..viz.explorer.entry import check_place, find_place
     from ..viz.headless import require
 
     check_folder("out", out)

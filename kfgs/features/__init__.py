@@ -1,11 +1,12 @@
 """Feature maps on disk: written by a teacher, or found as other programs left them."""
 
-from .extract import Picture, check_discardable, discard_maps, extract_features, pictures_of
-from .folder import FeatureFolder, save_feature_map
-from .layouts import write_npy_map
+from .check import FeatureReport
+from .extract import discard_maps, extract_features
+from .folder import FeatureFolder
+from .layouts import save_feature_map, write_npy_map
 from .manifest import Manifest, MapRecord, read_manifest
+from .pictures import Picture, pictures_of
 from .recompute import RecomputedMaps
-from .report import FeatureReport, check_feature_folder
 
 __all__ = [
     "FeatureFolder",
@@ -14,8 +15,6 @@ __all__ = [
     "MapRecord",
     "Picture",
     "RecomputedMaps",
-    "check_discardable",
-    "check_feature_folder",
     "discard_maps",
     "extract_features",
     "pictures_of",

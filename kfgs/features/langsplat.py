@@ -1,4 +1,4 @@
-"""Maps of LangSplat and its kin: an index of masks per pixel, and one feature per mask, put together when read."""
+"""Maps of LangSplat: a mask number per pixel and a feature per mask, combined when they are read."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ LEVELS = ("default", "s", "m", "l")  # SAM's own choice of masks; subparts, part
 
 
 class MaskFeatures:
-    """A map [h, w, D] that is looked up where it is read: the feature of the mask that a pixel lies in.
+    """A map [h, w, D] in which a pixel has the feature of its mask; only what is read is looked up.
 
-    A pixel in no mask (index -1) has an all-zero feature: nothing known.
+    A pixel in no mask (index -1) has an all-zero feature, which means "unknown".
 
     Args:
         file: `<stem>_s.npy`, whole numbers [L, H, W] (LangSplat keeps them as floats), beside `<stem>_f.npy`, floats
             [M, D]; -1 is no mask.
         level: which of the L sets of masks.
-        stride: one cell per so many pixels; the map is [round(H / stride), round(W / stride), D], and a cell has the
-            feature of the pixel at its centre. None: the least one that leaves at most `CELLS` cells.
+        stride: pixels per cell; the map is [round(H / stride), round(W / stride), D], and a cell has the feature of the
+            pixel at its centre. None: the least stride with at most `CELLS` cells.
 
     Raises:
         FileNotFoundError: if `<stem>_f.npy` is missing.
@@ -35,8 +35,7 @@ class MaskFeatures:
     def __init__(self, file: Path, level: int = 0, stride: int | None = None) -> None:
         if stride is not None:
             check_whole("stride", stride, 1)
-        self.file = file
-        partner = file.with_name(file.name.removesuffix(INDEX) + ROWS)
+        self.file, partner = file, rows_file(file)
         index = np.load(file, mmap_mode="r", allow_pickle=False)
         if index.ndim != 3 or 0 in index.shape or index.dtype.kind not in "iuf":
             raise ValueError(f"expected mask numbers [4, H, W], got {index.dtype} {index.shape}")
@@ -60,7 +59,7 @@ class MaskFeatures:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """That of the features."""
+        """The type of the features."""
         return self._rows.dtype
 
     def __getitem__(self, key: tuple[slice, slice]) -> NDArray[Any]:  # [rows, columns, D]
@@ -75,8 +74,13 @@ class MaskFeatures:
         return self._rows[index.astype(np.int64)]  # -1 is the last row, the zeros
 
 
+def rows_file(file: Path) -> Path:
+    """The file with the masks' features that belongs to a file of mask numbers."""
+    return file.with_name(file.name.removesuffix(INDEX) + ROWS)
+
+
 def parse_level(level: int | str) -> int:
-    """The number of a level of masks given by number or by name.
+    """The number of a level of masks, from its number or its name.
 
     Raises:
         ValueError: if there is no such level.
@@ -90,7 +94,7 @@ def parse_level(level: int | str) -> int:
 
 
 def _finest_stride(height: int, width: int) -> int:
-    """The least stride that leaves at most `CELLS` cells of a picture."""
+    """The least stride with at most `CELLS` cells of a picture."""
     stride = 1
     while _cells(height, stride) * _cells(width, stride) > CELLS:
         stride += 1

@@ -1,4 +1,4 @@
-"""How a map of features lies on disk: the table of layouts, opened without reading the values, and our own written."""
+"""How one map of features is stored: the table of layouts, opening a file without reading its values, and writing."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import math
 import pickle
 import warnings
 import zipfile
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -21,60 +21,37 @@ from .._check import check_shapes
 from .._files import atomic_path
 from .langsplat import INDEX, ROWS, MaskFeatures
 
+StoredMap = Tensor | NDArray[Any] | MaskFeatures
+"""A map [h, w, D] on disk: a tensor or an array that is mapped into memory, or one that is looked up when read."""
 Axes = Literal["h w D", "D h w"]
 
 WIDTHS = frozenset((128, 256, 384, 512, 768, 1024, 1152, 1280, 1536))
-"""Channels of encoders: a first axis of such a size, and a last one that is none, hints at [D, h, w]."""
+"""Numbers of channels of known encoders. A first axis of one of these sizes, and a last axis of none, hints at [D, h, w]."""
 ROW_BLOCK = 32  # rows of a map converted at a time: 30 MB in single precision at 480 x 512 channels
-
-
-class StoredMap(Protocol):
-    """A map [h, w, D] that lies on disk: a tensor or an array mapped into memory, or one put together when read."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(h, w, D)."""
-        ...
-
-    @property
-    def dtype(self) -> Any:
-        """The kind of floats on disk."""
-        ...
-
-    def __getitem__(self, key: tuple[slice, slice], /) -> Any:
-        """Some rows and columns."""
-        ...
 
 
 @dataclass(frozen=True)
 class Reading:
-    """How a map is to be read, where its file does not say it alone."""
+    """How to read a map whose file does not say it alone."""
 
     channels: int | None = None
-    """D, if it is known: tells [h, w, D] from [D, h, w]."""
+    """D, if it is known: distinguishes [h, w, D] from [D, h, w]."""
     size: tuple[int, int] | None = None
     """(H, W) of the view's picture, if it is known: the map has its aspect."""
     level: int = 0
     """Which of LangSplat's four sets of masks (`langsplat.LEVELS`)."""
     stride: int | None = None
-    """One cell per so many pixels of LangSplat's masks, which are as large as the picture; None: as many as needed to
-    have no more cells than the paper's maps."""
+    """Pixels per cell of LangSplat's masks, which are as large as the picture; None: the least stride with no more cells
+    than the paper's maps."""
 
 
-@dataclass(frozen=True)
-class Layout:
-    """One way to keep a view's map on disk."""
+class Layout(NamedTuple):
+    """One way to store a view's map."""
 
-    suffix: str
-    """What follows the picture's stem in the file's name."""
+    suffix: str  # what follows the picture's stem in the file's name
     axes: Axes
-    """The order of the axes."""
-    certain: bool
-    """Whether every writer of such files keeps that order."""
-    open: Callable[[Path, Reading], Any]
-    """Maps the file into memory."""
-    partner: str = ""
-    """The suffix of a second file that must lie beside the first."""
+    certain: bool  # whether every program that writes these files uses this order of the axes
+    open: Callable[[Path, Reading], Any]  # maps the file into memory
 
 
 def _open_torch(file: Path, _: Reading) -> Any:
@@ -97,7 +74,7 @@ def _open_torch(file: Path, _: Reading) -> Any:
 
 
 def _open_numpy(file: Path, _: Reading) -> Any:
-    with np.errstate(over="ignore"):  # a header may ask for any size; one beyond the file's is refused
+    with np.errstate(over="ignore"):  # a header may state any size; one larger than the file is refused
         return np.load(file, mmap_mode="r", allow_pickle=False)
 
 
@@ -114,61 +91,47 @@ def _open_langsplat(file: Path, reading: Reading) -> Any:
 
 
 FEATURE_3DGS = Layout("_fmap_CxHxW.pt", "D h w", True, _open_torch)  # LSeg's in half, SAM's in single precision
-LANGSPLAT = Layout(INDEX, "h w D", True, _open_langsplat, partner=ROWS)
-OWN = Layout(".npy", "h w D", False, _open_numpy)  # kfgs's, also of other programs
-LAYOUTS = (  # the first that a view has is read
-    FEATURE_3DGS,
-    LANGSPLAT,
-    OWN,
-    Layout(".safetensors", "h w D", False, _open_safetensors),
-)
+LANGSPLAT = Layout(INDEX, "h w D", True, _open_langsplat)  # beside a second file with the features of the masks
+OWN = Layout(".npy", "h w D", False, _open_numpy)  # kfgs's layout, which other programs use too
+LAYOUTS = (FEATURE_3DGS, LANGSPLAT, OWN, Layout(".safetensors", "h w D", False, _open_safetensors))
+"""If a view has several maps, the first of this order is read."""
+
+
+def map_file(folder: Path, stem: str) -> Path:
+    """The file that kfgs writes a view's map to."""
+    return folder / f"{stem}{OWN.suffix}"
 
 
 def layout_of(file: Path, own: Container[Path] = ()) -> Layout | None:
-    """The first layout whose suffix the file's name ends in, and whose partner lies beside it; None if there is none.
+    """The layout of a file by its name; None if it is no map, or only the second file of LangSplat's two.
 
     Args:
         file: the map.
-        own: maps that kfgs wrote, by its manifest: they are `OWN`, and no partners, whatever their pictures are called.
+        own: maps that kfgs wrote, according to the manifest: their layout is `OWN`, whatever their pictures are called.
     """
     if file in own:
         return OWN
-    for layout in LAYOUTS:
-        if file.name.endswith(layout.suffix) and (not layout.partner or _has_partner(file, layout, own)):
+    for suffix, other, layout in ((INDEX, ROWS, LANGSPLAT), (ROWS, INDEX, None)):
+        partner = file.with_name(file.name.removesuffix(suffix) + other)
+        if file.name.endswith(suffix) and partner not in own and partner.is_file():
             return layout
-    return None
+    return next((one for one in LAYOUTS if one is not LANGSPLAT and file.name.endswith(one.suffix)), None)
 
 
-def _has_partner(file: Path, layout: Layout, own: Container[Path]) -> bool:
-    partner = partner_of(file, layout)
-    return partner not in own and partner.is_file()
-
-
-def partner_of(file: Path, layout: Layout) -> Path:
-    """The second file of a map that is kept in two."""
-    return file.with_name(file.name.removesuffix(layout.suffix) + layout.partner)
-
-
-def open_map(
-    file: Path,
-    reading: Reading = Reading(),
-    own: Container[Path] = (),
-) -> StoredMap:  # [h, w, D]
-    """A file's map, mapped into memory rather than read; its kind, its number of axes and their order are checked.
+def open_map(file: Path, reading: Reading = Reading(), own: Container[Path] = ()) -> StoredMap:  # [h, w, D]
+    """Map a file into memory without reading its values; its kind, its number of axes and their order are checked.
 
     Args:
         file: the map.
-        reading: how it is to be read.
+        reading: how to read it.
         own: maps that kfgs wrote, see `layout_of`.
 
     Raises:
-        ValueError: if the file cannot be read, or is no map of floats, or the order of its axes is in doubt.
-        TypeError: if it holds something else than one tensor.
+        ValueError: if the file cannot be read, is no map of floats, or the order of its axes is not clear.
+        TypeError: if it holds anything but one tensor.
     """
     layout = layout_of(file, own)
-    if layout is None:
-        endings = ", ".join(layout.suffix for layout in LAYOUTS)
-        raise ValueError(f"{file}: expected a name that ends in one of {endings}, got {file.name!r}; rename the map")
+    assert layout is not None, f"{file} is no map"
     try:
         found = layout.open(file, reading)
     except Exception as error:  # a damaged pickle raises almost anything: struct.error, KeyError, EOFError, ...
@@ -192,40 +155,44 @@ def open_map(
 
 
 def _reason(error: Exception) -> str:
-    """An error's first sentence, with its kind where it is not one of a value."""
+    """An error's first sentence, with its type unless it is a ValueError."""
     text = str(error).split(". ")[0].strip()[:120]
     return text if isinstance(error, ValueError) and text else f"{type(error).__name__}: {text}"
 
 
-def read_block(
+def read_rows(
     stored: StoredMap,  # [h, w, D]
     rows: slice = slice(None),
     columns: slice = slice(None),
     out: Tensor | None = None,  # [rows, columns, D] float32
-) -> Tensor:  # [rows, columns, D] float32
-    """Some rows and columns of a map in single precision, in memory of their own; only they are read from disk.
+) -> Iterator[Tensor]:  # each [at most ROW_BLOCK, columns, D] float32
+    """Copy some rows and columns of a map in single precision, a few rows at a time; only these are read from disk.
 
-    A value beyond the range of single precision becomes infinite.
+    A value beyond the range of single precision becomes infinite. With `out`, the copies are parts of it.
     """
-    block = stored[rows, columns]
-    out = torch.empty(tuple(block.shape), dtype=torch.float32) if out is None else out
-    if isinstance(block, Tensor):
-        return out.copy_(block)
-    with np.errstate(over="ignore"):
-        np.copyto(out.numpy(), block, casting="same_kind")
-    return out
+    chosen = range(int(stored.shape[0]))[rows]
+    for start in range(0, len(chosen), ROW_BLOCK):
+        part = chosen[start : start + ROW_BLOCK]
+        block = stored[part.start : part.stop : part.step, columns]
+        copy = torch.empty(tuple(block.shape), dtype=torch.float32) if out is None else out[start : start + ROW_BLOCK]
+        if isinstance(block, Tensor):
+            copy.copy_(block)
+        else:
+            with np.errstate(over="ignore"):
+                np.copyto(copy.numpy(), block, casting="same_kind")
+        yield copy
 
 
 def count_bad(values: Tensor) -> int:  # any shape, not empty
-    """NaN and infinite values, without a copy of the tensor if there are none (its extremes then are finite)."""
+    """Count NaN and infinite values; if the extremes are finite there are none, and the tensor is not copied."""
     low, high = values.aminmax()  # NaN if any value is
     return 0 if math.isfinite(low) and math.isfinite(high) else int((~torch.isfinite(values)).sum())
 
 
 def find_axes(name: str, shape: tuple[int, ...], reading: Reading = Reading()) -> Axes:
-    """The order of the axes of a map that may be [h, w, D], as kfgs writes it, or [D, h, w], as encoders give it.
+    """The order of the axes of a map: [h, w, D], as kfgs writes it, or [D, h, w], as encoders return it.
 
-    Known channels decide, then the picture's aspect; where both orders fit, or nothing is known, it is [h, w, D].
+    A known number of channels decides, then the picture's aspect. If both orders fit, or nothing is known, it is [h, w, D].
 
     Raises:
         ValueError: if nothing is known, and the sizes look like [D, h, w].
@@ -244,8 +211,8 @@ def find_axes(name: str, shape: tuple[int, ...], reading: Reading = Reading()) -
     stretched, plain = max(first / middle, middle / first) > 3, max(middle / last, last / middle) <= 3
     if reading.channels is None and first in WIDTHS and last not in WIDTHS and (last > 64 or (stretched and plain)):
         raise ValueError(
-            f"{name}: expected a map [h, w, D], got {shape}, which may also be [D, h, w], and nothing tells which; "
-            "say the number of channels, or save it as [h, w, D]"
+            f"{name}: expected a map [h, w, D], got {shape}, which may also be [D, h, w]; give the number of channels "
+            "or the size of the picture, or save it as [h, w, D]"
         )
     return "h w D"
 
@@ -265,12 +232,12 @@ def write_npy_map(
     path: str | Path,
     features: Tensor | NDArray[Any],  # [h, w, D]
 ) -> Path:
-    """Write one view's map as kfgs keeps it: a `.npy` file, float16 [h, w, D], whole or absent.
+    """Write one view's map as kfgs stores it: a `.npy` file, float16 [h, w, D], atomically.
 
-    The map is converted a few rows at a time, so no copy of it is made in memory.
+    The map is converted a few rows at a time, so memory holds no copy of it.
 
     Raises:
-        ValueError: if `features` is not [h, w, D], or not finite once it is float16 (largest value 65504).
+        ValueError: if `features` is not [h, w, D], or not finite in float16 (largest value 65504).
     """
     check_shapes(("features", features, "h w D"))
     target = Path(path)
@@ -284,10 +251,32 @@ def write_npy_map(
             else:
                 with np.errstate(over="ignore"):
                     half = torch.from_numpy(np.array(rows, np.float16, order="C"))
-            if count_bad(half):
-                raise ValueError(
-                    f"features: expected finite values below 65504 (they are stored as float16), got others for "
-                    f"{target.name!r}; normalise the rows"
-                )
+            _check_half(half, target.name)
             file.write(half.numpy().astype("<f2", copy=False).data)
     return target
+
+
+def save_feature_map(path: str | Path, stem: str, features: Tensor) -> Path:  # features: [h, w, D]
+    """Write one view's map in the layout of Feature 3DGS: `<stem>_fmap_CxHxW.pt`, float16 [D, h, w], atomically.
+
+    Raises:
+        ValueError: if `features` is not [h, w, D], or not finite in float16 (largest value 65504).
+    """
+    check_shapes(("features", features, "h w D"))
+    h, w, D = features.shape
+    half = torch.empty(D, h, w, dtype=torch.float16)
+    for i in range(h):  # row by row, which transposes in the cache: 0.3 s instead of 5 s at 360 x 480 x 512
+        half[:, i] = features[i].detach().to(torch.float16).T.contiguous()
+    _check_half(half, stem)
+    target = Path(path) / f"{stem}{FEATURE_3DGS.suffix}"
+    with atomic_path(target) as temporary:
+        torch.save(half, temporary)
+    return target
+
+
+def _check_half(half: Tensor, name: str) -> None:
+    if count_bad(half):
+        raise ValueError(
+            f"features: expected finite values below 65504 (they are stored as float16), got others for {name!r}; "
+            "normalise the rows"
+        )

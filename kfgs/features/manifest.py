@@ -1,25 +1,27 @@
-"""What a folder of feature maps says about itself: which teacher made them, of which pictures, and what was written."""
+"""The manifest of a folder of feature maps: which teacher made them, from which pictures, and what was written."""
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from dataclasses import field as default
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from .._check import one_line
-from .._files import read_json, write_json
+from .._files import digest_file, read_json, write_json
 
 MANIFEST = "features.json"
 FORMAT = "kfgs-features/1"
-LARGEST = 2**63 - 1  # of a number in a record: file systems and tensors know none beyond it
-LEVELS = 100  # of dicts and lists within a teacher's identity, which needs about three
+LARGEST = 2**63 - 1  # largest number in a record: file systems and tensors have none beyond it
+LEVELS = 100  # deepest nesting of a teacher's identity, which needs about three levels
 
 
 @dataclass(frozen=True)
 class MapRecord:
-    """One map that was written, and the picture it was made of."""
+    """One map that was written, and the picture it was made from."""
 
     file: str  # name of the map within the folder: "rgb_1.npy"
     shape: tuple[int, int, int]  # (h, w, D)
@@ -30,35 +32,30 @@ class MapRecord:
     image_digest: str  # SHA-256 of the picture's file
     seconds: float  # that the teacher took
 
+    def doubt(self, file: Path, *, read: bool = True) -> str | None:
+        """Why `file` is not the recorded map, in words; None if it is.
 
-_KINDS: dict[str, type | tuple[type, ...]] = {  # in JSON
-    "file": str,
-    "shape": list,
-    "bytes": int,
-    "mtime_ns": int,
-    "digest": str,
-    "image": str,
-    "image_digest": str,
-    "seconds": (int, float),
-}
+        If only its time is another, the file was copied, touched or changed; `read` finds out, else it counts as changed.
+        """
+        info = file.stat()
+        if info.st_size != self.bytes:
+            return f"has changed ({info.st_size} bytes instead of {self.bytes})"
+        if info.st_mtime_ns == self.mtime_ns or (read and digest_file(file) == self.digest):
+            return None
+        return "has changed" if read else "was copied or changed"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Manifest:
-    """The maps of one teacher, by the stem of their picture. Maps may have been deleted since (`discarded`)."""
+    """The maps of one teacher, by the stem of their picture. The maps may have been deleted since (`discarded`)."""
 
     teacher: dict[str, Any]  # teachers.identify
     maps: dict[str, MapRecord] = default(default_factory=dict)
-    discarded: bool = False  # the maps were deleted on purpose, once index maps had been made of them
+    discarded: bool = False  # maps were deleted on purpose, after index maps had been made from them
 
-    def files(self, folder: Path) -> frozenset[Path]:
-        """The maps that are recorded, which a folder of this manifest holds, or held."""
-        return frozenset(folder / record.file for record in self.maps.values())
-
-    def gone(self, folder: Path) -> dict[str, Path]:
-        """By stem, where the maps were that have been discarded."""
-        files = {stem: folder / record.file for stem, record in self.maps.items()} if self.discarded else {}
-        return {stem: file for stem, file in files.items() if not file.is_file()}
+    def __repr__(self) -> str:
+        name, discarded = one_line(self.teacher.get("name", "unknown")), ", discarded" if self.discarded else ""
+        return f"Manifest({len(self.maps)} maps by {name}{discarded})"
 
     def save(self, folder: Path) -> None:
         """Write `features.json`, atomically."""
@@ -66,54 +63,56 @@ class Manifest:
 
 
 def read_manifest(folder: str | Path) -> Manifest | None:
-    """The manifest of a folder of maps; None if it has none, as those of other programs.
+    """The manifest of a folder of maps; None if it has none, because another program wrote the maps.
 
     Raises:
-        ValueError: if there is one that is damaged, or of another version.
+        ValueError: if the manifest is damaged, or of another version.
     """
     path = Path(folder) / MANIFEST
     if not path.is_file():
         return None
-    hint = "delete it to use the maps without it, or delete it and run `kfgs features` with --overwrite, which makes them again"
     try:
         found = read_json(path)
-    except ValueError as error:
-        raise ValueError(f"{error}; {hint}") from error
-    except RecursionError as error:
-        raise ValueError(f"{path}: expected a manifest of kfgs, but it is nested too deeply; {hint}") from error
-    if not isinstance(found, dict) or found.get("format") != FORMAT:
-        raise ValueError(f"{path}: expected format {FORMAT!r}, got something else; {hint}")
-    try:
-        kinds = {"teacher": dict, "maps": dict, "discarded": bool}
-        teacher, maps, discarded = (_entry(found, name, kind) for name, kind in kinds.items())
+        if not isinstance(found, dict) or found.get("format") != FORMAT:
+            raise ValueError(f"expected format {FORMAT!r}, got something else")
+        teacher, maps, discarded = (found.get(name) for name in ("teacher", "maps", "discarded"))
+        if not isinstance(teacher, dict) or not isinstance(maps, dict) or not isinstance(discarded, bool):
+            raise ValueError("teacher, maps or discarded is missing or of another type")
         if not _is_plain(teacher, LEVELS):
             raise ValueError("teacher holds NaN or infinity, or is nested too deeply")
         return Manifest(teacher, {stem: _read_record(stem, entry) for stem, entry in maps.items()}, discarded)
-    except ValueError as error:
-        raise ValueError(f"{path}: expected a manifest of kfgs, but it is damaged ({error}); {hint}") from error
+    except (ValueError, RecursionError) as error:
+        deep = isinstance(error, RecursionError)
+        raise ValueError(
+            f"{path}: expected a manifest of kfgs, but it is damaged "
+            f"({'nested too deeply' if deep else str(error).removeprefix(f'{path}: ')}); "
+            "delete it to use the maps without it, or delete it and run `kfgs features` with --overwrite, which makes them "
+            "again"
+        ) from error
 
 
 def _read_record(stem: str, found: Any) -> MapRecord:
-    """One map's record out of JSON; a ValueError tells what in it cannot be."""
-    if not isinstance(found, dict):
-        raise ValueError(f"{one_line(stem)}: a record is a {type(found).__name__}")
-    try:
-        values = {name: _entry(found, name, kind) for name, kind in _KINDS.items()}
-    except ValueError as error:
-        raise ValueError(f"{one_line(stem)}: {error}") from error
-    file, shape = PurePosixPath(values["file"]), values["shape"]
-    if not file.name or file.is_absolute() or ".." in file.parts or "\0" in str(file):
-        raise ValueError(f"{one_line(stem)}: file {str(file)[:80]!r} is no name within the folder")
-    if len(shape) != 3 or not all(type(size) is int and 0 < size <= LARGEST for size in shape):
-        raise ValueError(f"{one_line(stem)}: shape {str(shape)[:80]} is not three positive whole numbers")
-    if not all(0 <= values[name] <= LARGEST for name in ("bytes", "seconds")):  # NaN fails every comparison
-        numbers = f"{str(values['bytes'])[:30]} and {str(values['seconds'])[:30]}"
-        raise ValueError(f"{one_line(stem)}: bytes and seconds cannot be {numbers}")
-    return MapRecord(**{**values, "shape": tuple(shape)})
+    """One map's record from JSON; a ValueError says what is wrong with it."""
+    found = found if isinstance(found, dict) else {}
+    file, shape = found.get("file"), found.get("shape")
+    path, sizes = PurePosixPath(str(file)), shape if isinstance(shape, list) else []
+    inside = path.name and not path.is_absolute() and ".." not in path.parts and "\0" not in str(file)
+    good = {
+        "file": isinstance(file, str) and inside,
+        "shape": len(sizes) == 3 and all(type(size) is int and 0 < size <= LARGEST for size in sizes),
+        "bytes": type(found.get("bytes")) is int and 0 <= found["bytes"] <= LARGEST,
+        "seconds": type(found.get("seconds")) in (int, float) and 0 <= found["seconds"] <= LARGEST,  # NaN fails
+        "mtime_ns": type(found.get("mtime_ns")) is int,
+        **{name: isinstance(found.get(name), str) for name in ("digest", "image", "image_digest")},
+    }
+    for name, is_good in good.items():
+        if not is_good:
+            raise ValueError(f"{one_line(stem)}: {name} cannot be {one_line(found.get(name, 'missing'))}")
+    return MapRecord(shape=tuple(sizes), **{name: found[name] for name in good if name != "shape"})
 
 
 def _is_plain(value: Any, levels: int) -> bool:
-    """Whether a value out of JSON can be written back: finite numbers, and not nested deeper than `levels`."""
+    """Whether a value from JSON can be written back: its numbers are finite, and it is nested at most `levels` deep."""
     if isinstance(value, float):
         return math.isfinite(value)
     if not isinstance(value, dict | list):
@@ -123,10 +122,34 @@ def _is_plain(value: Any, levels: int) -> bool:
     )
 
 
-def _entry(found: dict[str, Any], name: str, kind: type | tuple[type, ...]) -> Any:
-    if name not in found:
-        raise ValueError(f"{name} is missing")
-    value = found[name]
-    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-        raise ValueError(f"{name} is a {type(value).__name__}")
-    return value
+def plain_identity(identity: Mapping[str, Any]) -> dict[str, Any]:
+    """A teacher's identity as it comes back from a JSON file: tuples are lists.
+
+    Raises:
+        TypeError: if JSON cannot hold it.
+    """
+    try:
+        return dict(json.loads(json.dumps(dict(identity), allow_nan=False)))
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"teacher.identity: expected plain values that JSON can hold, got {identity!r} ({error}); leave out the rest"
+        ) from error
+
+
+def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
+    """Where two identities differ: `weights: 'a81f...' there, '77c0...' now`."""
+
+    def short(value: Any) -> str:
+        # one identity comes from a file, so nothing in it is shown raw; JSON is escaped already
+        text = one_line(value, 1000) if isinstance(value, str) else json.dumps(value)
+        return text if len(text) <= 40 else text[:12] + "..."
+
+    parts = []
+    for key in dict.fromkeys([*old, *new]):
+        a, b = old.get(key), new.get(key)
+        if isinstance(a, dict) and isinstance(b, dict) and a != b:
+            parts.append(differences(a, b))
+        elif a != b:
+            there, now = (short(side[key]) if key in side else "none" for side in (old, new))
+            parts.append(f"{one_line(key)}: {there} there, {now} now")
+    return "; ".join(parts)

@@ -1,9 +1,9 @@
-"""Maps that are made anew whenever they are asked for: twice the teacher's time, and no dense map on disk."""
+"""Maps that the teacher makes again whenever they are asked for: twice its time, and no dense map on disk."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -11,51 +11,49 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._files import atomic_path, digest_file, digest_value
+from .._files import atomic_path, digest_file, digest_value, read_json, write_json
 from ..quant.sampling import SAMPLES, sample_grid
 from ..scenes import Scene
 from ..teachers.protocol import Teacher, as_teacher, identify
-from .extract import check_pictures, discard_maps, pictures_of
-from .manifest import MANIFEST, Manifest, read_manifest
-from .map_store import MapStore, encode_half, locked, map_file, plain_identity, sweep
+from .manifest import plain_identity
+from .pictures import Split, as_pictures
+from .writer import encode_half
 
 
 class RecomputedMaps(Sequence[Tensor]):
     """A teacher's maps of some pictures: item i runs the teacher, and nothing dense is stored.
 
-    A map is rounded to half precision as `extract_features` would, so that everything made of it is the same, bit for
-    bit, as from a folder of maps. What `fit_codebook` looks at again and again, a grid of samples per map, is stored when
-    it is first asked for (29 MB for a picture of 360x480x512, a sixth of the map), so that a fit runs the teacher twice
-    per picture: once for the samples and once for the index maps.
+    A map is rounded to half precision as in `extract_features`, so that everything made from it is the same, bit for bit,
+    as from a folder of maps. `fit_codebook` looks at a grid of samples per map again and again; these are stored when they
+    are first asked for (29 MB for a picture of 360x480x512, a sixth of the map). So a fit runs the teacher twice per
+    picture: once for the samples and once for the index maps.
 
     Args:
         teacher: sees each picture, [3, H, W] RGB in [0, 1]; a teacher, or a function to [D, h, w] (see `as_teacher`).
-        scene: whose pictures; the teacher sees them as they lie on disk, see `pictures_of`.
-        views: which of its views, in the order of the maps.
-        store: folder for the samples; made when the first is written. What a killed process left there is used.
+        scene: whose pictures; the teacher sees them as they are on disk, see `pictures_of`.
+        split: the name of a split, `all`, or a list of view names or indices.
+        store: folder for the samples; made when the first is written. Samples that a killed process left are used.
 
     Raises:
-        TypeError: if `teacher` is none, or its identity is no JSON.
+        TypeError: if `teacher` is no teacher, or JSON cannot hold its identity.
         ValueError: if there are no views.
         FileNotFoundError: if a picture is missing.
     """
 
     recomputed = True
-    """A look at a map costs a run of the teacher: training on raw maps (`decouple`) is out of the question."""
+    """Looking at a map runs the teacher, so training on raw maps (`decouple`) would take far too long."""
 
     def __init__(
         self,
         teacher: Teacher | Callable[[Tensor], Tensor],
         scene: Scene,
-        views: Sequence[int],
+        split: Split,
         store: str | Path,
     ) -> None:
-        self.teacher, self.pictures, self.store = as_teacher(teacher), pictures_of(scene, views), Path(store)
-        check_pictures(self.pictures, self.store)
+        self.teacher, self.pictures = as_teacher(teacher), as_pictures(scene, split, exist=True)
         self.identity = plain_identity(identify(self.teacher))
+        self.store = Path(store) / f"samples-{digest_value(self.identity)[:12]}"
         self._image_digests: dict[int, str] = {}
-        self._sampled: dict[tuple[int, str], Path] = {}  # samples that were found good in this process
-        self._shape: tuple[int, int, int] | None = None
 
     def __len__(self) -> int:
         return len(self.pictures)
@@ -73,27 +71,24 @@ class RecomputedMaps(Sequence[Tensor]):
         """The pictures."""
         return [picture.path for picture in self.pictures]
 
-    @property
+    @cached_property
     def shape(self) -> tuple[int, int, int]:
-        """(h, w, D) of the first map; runs the teacher unless samples of that map have been made."""
-        if self._shape is None:
-            self._shape = self._recorded_shape() or tuple(map(int, self[0].shape))  # type: ignore[assignment]
-        assert self._shape is not None
-        return self._shape
+        """(h, w, D) of the first map; runs the teacher unless samples of that map have been stored."""
+        h, w, D = read_json(self._shape_file) if self._shape_file.is_file() else self[0].shape
+        return int(h), int(w), int(D)
 
     def digests(self) -> list[list[str]]:
         """[name, SHA-256] of what decides each map: the teacher's identity and the picture's bytes."""
         return [
-            [picture.stem, digest_value({"teacher": self.identity, "image": self._image_digest(i)})]
-            for i, picture in enumerate(self.pictures)
+            [stem, digest_value({"teacher": self.identity, "image": self._image_digest(i)})]
+            for i, stem in enumerate(self.stems)
         ]
 
     def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [h, w, D] float32
-        path = self.pictures[i].path
-        return encode_half(self.teacher, self.pictures[i].read(), path).float()
+        return encode_half(self.teacher, self.pictures[i].read(), self.pictures[i].path).float()
 
     def grid(self, i: int, step: tuple[int, int] | None = None, samples: int = SAMPLES) -> Tensor:  # [n, D] float32
-        """`sample_grid(self[i], step, samples=samples)`, from the store where it has been asked for before."""
+        """`sample_grid(self[i], step, samples=samples)`, from the store if it has been asked for before."""
         return self.grid_after(i, step, samples, change=None, key=None)
 
     def grid_after(
@@ -105,78 +100,41 @@ class RecomputedMaps(Sequence[Tensor]):
         change: Callable[[Tensor], Tensor] | None,
         key: Any,
     ) -> Tensor:  # [n, D] float32
-        """`grid` of maps that are changed on their way, as by removing a lens.
+        """`grid` of maps that are changed first, for instance by removing lens distortion.
 
         Args:
             i: which map.
             step: of the grid.
             samples: most features to take when `step` is None.
             change: [h, w, D] -> [h, w, D].
-            key: JSON that tells what `change` does.
+            key: JSON that identifies what `change` does.
         """
         settings = {"step": None if step is None else list(step), "samples": samples if step is None else None}
-        about = plain_identity({**self.identity, "grid": {**settings, "change": key}})
-        folder = self.store / f"samples-{digest_value(about)[:12]}"
-        where = (i, folder.name)
-        if where not in self._sampled:
-            self._sampled[where] = self._make_samples(i, folder, about, (step, samples), change)
-        values = torch.from_numpy(np.load(self._sampled[where], allow_pickle=False))
-        return values.float()
+        about = plain_identity({"grid": {**settings, "change": key}, "image": self._image_digest(i)})
+        file = (
+            self.store / f"{self.stems[i]}-{digest_value(about)[:16]}.npy"
+        )  # the name says what the content depends on
+        try:
+            return torch.from_numpy(np.load(file, allow_pickle=False)).float()
+        except (OSError, EOFError, ValueError):  # not made yet, or damaged
+            features = self[i]
+        if i == 0:
+            write_json(self._shape_file, list(features.shape))
+        values = sample_grid(features if change is None else change(features), step, samples=samples)
+        half = values.half()
+        kept = half if torch.equal(half.float(), values) else values  # a changed map need not be of half precision
+        with atomic_path(file) as temporary:
+            np.save(temporary, kept.contiguous().numpy())
+        return values
 
     def clear(self) -> None:
-        """Delete the samples, once the codebook has been fitted. What is known about the maps stays."""
-        for folder in self._folders():
-            discard_maps(folder)
-        self._sampled.clear()
+        """Delete this teacher's samples, once the codebook has been fitted. The shape of the maps stays known."""
+        for file in self.store.rglob("*.npy"):
+            file.unlink()
 
-    def _folders(self) -> dict[Path, Manifest]:
-        """The folders of samples of this teacher, whatever their grid, and what they say."""
-        found = {path.parent: read_manifest(path.parent) for path in sorted(self.store.glob(f"samples-*/{MANIFEST}"))}
-        mine = {**self.identity, "grid": None}
-        return {
-            folder: one for folder, one in found.items() if one is not None and {**one.teacher, "grid": None} == mine
-        }
-
-    def _recorded_shape(self) -> tuple[int, int, int] | None:
-        for manifest in self._folders().values():
-            record = manifest.maps.get(self.pictures[0].stem)
-            if record is not None and record.image_digest == self._image_digest(0):
-                return record.shape
-        return None
-
-    def _make_samples(
-        self,
-        i: int,
-        folder: Path,
-        about: dict[str, Any],
-        grid: tuple[tuple[int, int] | None, int],
-        change: Callable[[Tensor], Tensor] | None,
-    ) -> Path:
-        """The file of the samples of map i, which is written if it is not there or not of this picture."""
-        picture, target = self.pictures[i], map_file(folder, self.pictures[i].stem)
-        with locked(folder):
-            store = MapStore.open(folder, about)
-            sweep(folder, [target])
-            if store.doubt(picture.stem, self._image_digest(i)) is None:
-                return target
-            start = time.perf_counter()
-            features = self[i]
-            seconds = time.perf_counter() - start
-            h, w, D = map(int, features.shape)
-            values = sample_grid(features if change is None else change(features), grid[0], samples=grid[1])
-            half = values.half()
-            kept = half if torch.equal(half.float(), values) else values  # a changed map need not be of half precision
-            with atomic_path(target) as temporary:
-                np.save(temporary, kept.contiguous().numpy())
-            store.add(
-                picture.stem,
-                target,
-                shape=(h, w, D),
-                image=picture.path.name,
-                image_digest=self._image_digest(i),
-                seconds=round(seconds, 3),
-            )
-        return target
+    @property
+    def _shape_file(self) -> Path:
+        return self.store / f"shape-{self._image_digest(0)[:16]}.json"
 
     def _image_digest(self, i: int) -> str:
         if i not in self._image_digests:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .._card import short_repr
 from .._rows import EPS, row_norms, unit_rows
 from ..cameras import Camera
 from ..gaussians import Gaussians
@@ -30,6 +31,9 @@ class Seen(NamedTuple):
     pixels: Tensor  # [N] how many pixels it fills, in all training views together
     agreement: Tensor  # [N] in [0, 1]: length of the mean of the unit features that it was shown with
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 class Answers(NamedTuple):
     """Each Gaussian's fused feature."""
@@ -37,6 +41,9 @@ class Answers(NamedTuple):
     latents: Tensor  # [N, e], all-zero where no view shows the Gaussian
     linear: LinearLatents
     seen: Seen
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def fused_answers(

@@ -9,6 +9,7 @@ import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 
+from .._card import short_repr
 from .config import FieldConfig
 from .params import GaussianParams
 
@@ -21,6 +22,9 @@ class GradientStatistics(NamedTuple):
 
     total: Tensor  # [N]
     views: Tensor  # [N], how many saw it
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
     @staticmethod
     def zeros(params: GaussianParams) -> GradientStatistics:
@@ -50,6 +54,9 @@ class Densified(NamedTuple):
     params: GaussianParams
     source: Tensor  # [N'] int64: row of the old cloud
     fresh: Tensor  # [N'] bool: a new Gaussian, not the old one itself
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def densify(

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import check_shapes
 from .._files import read_json
 from .._rows import EPS, row_norms, unit_rows
@@ -44,6 +45,8 @@ class Mask:
     view: str | Camera
     mask: Tensor  # [H, W] bool, of the view's size
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False)
 class Picked:
@@ -51,6 +54,8 @@ class Picked:
 
     indices: Sequence[int] | Tensor
     """Which, or a mask [N]."""
+
+    __repr__ = short_repr
 
 
 Example = Clicks | Box | Mask | Picked

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from .._card import short_repr
 from .._check import check_range
 from ..cameras import Camera
 from .checkpoint import identify_fit, read_checkpoint, write_checkpoint
@@ -32,6 +33,8 @@ class FieldFit:
 
     params: GaussianParams
     history: list[dict[str, Any]]
+
+    __repr__ = short_repr
 
 
 def fit_field(
@@ -71,6 +74,7 @@ def fit_field(
         The fitted params, and the history.
 
     Raises:
+        TypeError: if `params` is something else.
         ValueError: if counts or shapes disagree, a camera has distortion, the checkpoint belongs to another fit, or no
             Gaussian is left.
         FloatingPointError: if the loss is no longer finite.
@@ -101,6 +105,9 @@ def fit_field(
 
 
 def _check_views(params: GaussianParams, cameras: Sequence[Camera], targets: Sequence[Tensor]) -> None:
+    if not isinstance(params, GaussianParams):
+        hint = "GaussianParams.from_gaussians or GaussianParams.from_points makes them"
+        raise TypeError(f"params: expected GaussianParams, got {type(params).__name__}; {hint}")
     if len(params) == 0:
         raise ValueError("params: expected at least one Gaussian, got none; start from GaussianParams.from_points")
     if len(cameras) == 0 or len(cameras) != len(targets):

@@ -8,6 +8,7 @@ import torch
 from kornia.geometry.conversions import rotation_matrix_to_quaternion
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import check_range, check_shapes, check_whole
 from ..gaussians import Gaussians
 from ..quant import spherical_kmeans
@@ -30,6 +31,9 @@ class Merged(NamedTuple):
     gaussians: Gaussians  # M, with features
     weights: Tensor  # [M] sums of their members' weights
     source: Tensor  # [N] int64, the merged Gaussian of each old one; -1 = dropped
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def merge_gaussians(

@@ -8,10 +8,12 @@ from dataclasses import field as default
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from .._check import check_choice, check_shapes
+from .._card import html_card
+from .._check import as_tensor, check_choice, check_shapes
 from .._rows import unit_embeddings, unit_rows
 from ..cameras import Camera
 from ..gaussians import Gaussians
@@ -135,6 +137,20 @@ class SemanticField:
     def __repr__(self) -> str:
         return f"SemanticField({self.method}: {len(self)} Gaussians, {self.channels} channels for {self.dim})"
 
+    def _repr_html_(self) -> str:
+        teacher = self.info.get("teacher")
+        facts = {
+            "method": self.method,
+            "Gaussians": len(self),
+            "channels": f"{self.channels} for {self.dim} of the teacher",
+            "codewords": None if self.codebook is None else self.codebook.size,
+            "training views": len(self.cameras) or None,
+            "size (as Table 1 counts it)": f"{self.storage() / MIB:.2f} MiB",
+            "teacher": teacher.get("name") if isinstance(teacher, dict) else None,
+            "folder": None if self.folder is None else str(self.folder),
+        }
+        return html_card("SemanticField", facts)
+
     # Maps
 
     def render(self, camera: Camera, *, engine: str = "auto") -> Rendering:
@@ -147,6 +163,7 @@ class SemanticField:
         latents: Tensor,  # [..., d]
     ) -> Tensor:  # [..., D]
         """Bring latents back to the teacher's space (Psi of Sec. 3.3.2, or B z); features are returned as they are."""
+        latents = as_tensor("latents", latents, floating=True)
         if latents.shape[-1] != self.channels:
             raise ValueError(
                 f"latents: expected [..., d] with d = {self.channels} (from gaussians), got {tuple(latents.shape)}; "
@@ -181,6 +198,7 @@ class SemanticField:
             ValueError: if there is no row, shapes disagree, or a row is all-zero.
         """
         check_choice("rule", rule, RULES)
+        rows = as_tensor("rows", rows, floating=True)
         check_rows("rows", rows, ("M",), self.dim)
         unit = unit_embeddings(rows, "rows").to(self.features)
         with torch.no_grad():
@@ -250,6 +268,8 @@ class SemanticField:
         Raises:
             ValueError: if there is no such class, shapes disagree, a row is all-zero, or an option is unknown.
         """
+        if not isinstance(target, str):
+            target = as_tensor("target", target, floating=True)
         if score == "cosine" and isinstance(negatives, str) and negatives == "auto":
             negatives = "none"
         compared = isinstance(negatives, str) and negatives != "none"  # from something that the classes' files hold
@@ -320,6 +340,7 @@ class SemanticField:
         Raises:
             ValueError: if the field has no codebook, or shapes disagree.
         """
+        embeddings = as_tensor("embeddings", embeddings, floating=True)
         check_rows("embeddings", embeddings, ("C",), self.dim)
         if self.codebook is None:
             raise ValueError("codebook: expected one, got None in this field; use classify or segment, which need none")
@@ -406,4 +427,11 @@ class SemanticField:
         return self.features if self.answers is None else self.answers
 
     def _rows(self, classes: Classes | None) -> Tensor:  # [C, D]
+        if isinstance(classes, str):
+            raise TypeError(
+                f"classes: expected a LabelSet or embeddings [C, {self.dim}], got the name {classes!r}; "
+                f"query({classes!r}) finds the Gaussians of one class"
+            )
+        if isinstance(classes, np.ndarray):
+            classes = as_tensor("classes", classes, floating=True)
         return class_rows(self.label_set() if classes is None else classes, self.dim, self.info)

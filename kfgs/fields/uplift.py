@@ -19,12 +19,13 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from tqdm import tqdm
 
+from .._card import short_repr
 from .._check import check_range, check_shapes, check_whole
 from .._files import atomic_path
 from .._rows import EPS, row_norms, unit_rows
 from ..cameras import Camera, resize_map
 from ..gaussians import Gaussians
-from ..labels.average import sum_pixels
+from ..labels.views import sum_pixels
 from ..quant import FeatureMaps
 from ..quant.linear import LinearLatents, fit_linear_latents, principal_directions
 from ..quant.sampling import sample_grid
@@ -87,6 +88,8 @@ class Uplifted:
     agreement: Tensor  # [N] in [0, 1]
     """Length of the mean of the unit features that it was shown with: 1 where all pixels said the same, 0 = never shown. Of
     merged Gaussians the mean of their members'."""
+
+    __repr__ = short_repr
 
 
 def uplift_maps(

@@ -1,7 +1,5 @@
 """Labels: classes of codewords, pixels and Gaussians, their transfer to the colour field, and edits (Sec. 3.4)."""
 
-from .answer import Answer, BestView, answer, answers, view_shares
-from .average import ViewAverage, average_views
 from .boxes import OrientedBox
 from .classify import (
     Classification,
@@ -11,28 +9,26 @@ from .classify import (
     select_by_category,
     select_by_query,
     select_like,
+    select_near,
 )
-from .color import parse_color
-from .components import component_distance, component_numbers, components, select_near
-from .edit import extract, recolor, remove
+from .color import parse_color, recolor
+from .components import component_distance, component_numbers
 from .edits import Duplicate, Edit, EditList, Extract, Insert, Move, Opacity, Recolor, Remove, Turn, join
 from .label_set import LabelSet, load_label_set, teacher_mismatch
 from .names import class_index, class_indices
-from .relevancy import CANONICAL, relevancy
+from .parts import BestView, Part, connected_parts, describe_selection, view_shares
+from .scores import CANONICAL, LOGIT_SCALES, Score, relevancy, select_by_similarity, similarity_threshold, text_scores
 from .segment import label_pixels, nearest_codeword
-from .selection import Selection, select_by_label, select_in_box, select_in_sphere, select_where
-from .text_scores import LOGIT_SCALES, Score, select_by_similarity, text_scores
-from .threshold import similarity_threshold
+from .selection import Selection
 from .transfer import Transfer, transfer_labels
 from .transfer_distance import default_distance
-from .vote import Votes, vote_labels
+from .views import ViewAverage, Votes, average_views, vote_labels
 from .where import AboveScore, Both, Component, Either, Everything, InBox, InSphere, Not, OfClass, OfIndex, Where
 
 __all__ = [
     "CANONICAL",
     "LOGIT_SCALES",
     "AboveScore",
-    "Answer",
     "BestView",
     "Both",
     "Classification",
@@ -54,6 +50,7 @@ __all__ = [
     "OfIndex",
     "Opacity",
     "OrientedBox",
+    "Part",
     "Recolor",
     "Remove",
     "Score",
@@ -63,17 +60,15 @@ __all__ = [
     "ViewAverage",
     "Votes",
     "Where",
-    "answer",
-    "answers",
     "average_views",
     "class_index",
     "class_indices",
     "classify",
     "component_distance",
     "component_numbers",
-    "components",
+    "connected_parts",
     "default_distance",
-    "extract",
+    "describe_selection",
     "join",
     "label_codewords",
     "label_pixels",
@@ -82,16 +77,11 @@ __all__ = [
     "parse_color",
     "recolor",
     "relevancy",
-    "remove",
     "select_by_category",
-    "select_by_label",
     "select_by_query",
     "select_by_similarity",
-    "select_in_box",
-    "select_in_sphere",
     "select_like",
     "select_near",
-    "select_where",
     "similarity_threshold",
     "teacher_mismatch",
     "text_scores",

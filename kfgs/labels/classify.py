@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -9,8 +10,9 @@ from torch import Tensor
 
 from .._check import check_shapes, check_whole
 from .._rows import EPS, check_finite, row_norms, unit_embeddings, unit_rows
+from .components import component_numbers
+from .scores import Score, select_by_similarity
 from .selection import Selection
-from .text_scores import Score, select_by_similarity
 
 CHUNK = 65_536  # rows per step: with 200 classes, 50 MB of similarities at a time
 
@@ -177,6 +179,67 @@ def select_like(
             "take them from this cloud"
         )
     return select_by_query(features, unit_rows(features[rows]).mean(dim=0), threshold, negatives)
+
+
+def select_near(
+    means: Tensor,  # [N, 3]
+    point: Sequence[float] | Tensor,  # [3]
+    *,
+    labels: Tensor | None = None,  # [N] int64
+    features: Tensor | None = None,  # [N, D]
+    threshold: float | None = None,
+    distance: float | None = None,
+) -> Selection:
+    """Select the thing at a point (a click): the Gaussians that are like the nearest one and connected with it.
+
+    Alike are, with `labels`, those with the same label; with `features`, those more similar to it than `threshold`.
+
+    Args:
+        means: positions of all N Gaussians.
+        point: a place in the world, such as the one under the mouse.
+        labels: a class for each Gaussian; give these or features.
+        features: decoded features.
+        threshold: gamma, a cosine; only with features. None as in `select_by_query`.
+        distance: see `component_numbers`.
+
+    Returns:
+        The connected part with the nearest Gaussian in it (of equally near ones the lowest index).
+
+    Raises:
+        ValueError: if neither or both of labels and features are given, the nearest Gaussian has no label or an all-zero
+            feature, there is no Gaussian, shapes disagree, or a number is not finite.
+    """
+    check_shapes(("means", means, "N 3"), ("labels", labels, "N"), ("features", features, "N D"))
+    if (labels is None) == (features is None):
+        raise ValueError(
+            "labels, features: expected one of them, got none or both; labels say which Gaussians are alike"
+        )
+    nearest = _nearest(means, point)
+    if labels is not None:
+        label = int(labels[nearest])
+        if label < 0:
+            raise ValueError(
+                f"labels: expected a label at the nearest Gaussian, got {label} (none) at {nearest}; click elsewhere, or "
+                "pass features"
+            )
+        alike = Selection.of(labels == label, f"label {label}")
+    else:
+        assert features is not None
+        alike = select_like(features, nearest, threshold)
+        if not bool(alike.mask[nearest]):  # a threshold of 1 refuses even itself, as scores are compared strictly
+            alike = Selection(alike.mask | (alike.scores >= alike.scores[nearest]), alike.scores, None, alike.words)
+    numbers = component_numbers(means, alike.mask, distance)
+    return alike.within(numbers == numbers[nearest], f"connected with Gaussian {nearest}, the nearest to the point")
+
+
+def _nearest(means: Tensor, point: Sequence[float] | Tensor) -> int:
+    place = torch.as_tensor(point, dtype=torch.float64, device=means.device)
+    check_shapes(("point", place, "3"))
+    check_finite("point", place)
+    check_finite("means", means)
+    if len(means) == 0:
+        raise ValueError("means: expected at least one Gaussian, got none; load a cloud that is not empty")
+    return int(((means.double() - place) ** 2).sum(dim=1).argmin())
 
 
 def _best(features: Tensor, similarity: Tensor) -> Classification:

@@ -1,16 +1,23 @@
-"""Colours for recolouring: read from text, and spread over an object's light and dark without losing its shading."""
+"""Give Gaussians one hue and keep their shading; colours are read from text."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from PIL import ImageColor
 from torch import Tensor
 
+from .._check import check_choice, check_shapes
+from .._rows import as_tensor
+from ..gaussians import Gaussians
+from ..splat.sh import rgb_to_sh0, sh0_to_rgb
+
+Mode = Literal["tint", "hue"]
+MODES: tuple[Mode, ...] = get_args(Mode)
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709 weights of R, G, B, on display values: what blending is linear in
-DARK = 1 / 255  # below one 8-bit step an object's luminance says nothing about its shading
+DARK = 1 / 255  # an object darker than one 8-bit step has no shading
 
 
 def parse_color(color: str | Sequence[float] | Tensor, name: str = "rgb") -> tuple[float, float, float]:
@@ -22,7 +29,7 @@ def parse_color(color: str | Sequence[float] | Tensor, name: str = "rgb") -> tup
         name: the argument that errors speak of.
 
     Raises:
-        ValueError: if it is no such colour, or has an alpha channel.
+        ValueError: if it is not a colour, or has an alpha channel.
 
     Example:
         >>> parse_color("#ff0080") == parse_color("rgb(255, 0, 128)") == (1.0, 0.0, 128 / 255)
@@ -44,6 +51,77 @@ def parse_color(color: str | Sequence[float] | Tensor, name: str = "rgb") -> tup
     if not numbers or len(plain) != 3 or not all(0 <= value <= 1 for value in plain):
         raise ValueError(f"{name}: expected three numbers in [0, 1], got {color!r:.80}; divide 8-bit colours by 255")
     return float(plain[0]), float(plain[1]), float(plain[2])
+
+
+def recolor(
+    gaussians: Gaussians,
+    mask: Tensor,  # [N] bool
+    rgb: str | Sequence[float] | Tensor,  # [3] in [0, 1]
+    mode: Mode = "tint",
+) -> Gaussians:
+    """Give the Gaussians under the mask one hue and keep their shading.
+
+    Each Gaussian's luminance L (of its view-independent colour) is replaced by a colour T(L) on a curve from black over
+    the shades of `rgb` to white (`color.Shades`), and its view-dependent luminance follows the curve's slope there:
+    `color(v) = T(L) + T'(L) (L(v) - L)`. That is linear in the spherical harmonics, so it holds from every direction,
+    and blending keeps it. Alpha, and with it the geometry, stays.
+
+    - `"tint"` paints it: the object's middle luminance (the median by visible area) becomes `rgb`, and ratios of
+      luminance stay, as if the albedo changed under the same light. If the middle is below 1/255 there is no shading to
+      keep and the colour is flat. White leaves no room above it: what was brighter than the middle becomes white too.
+    - `"hue"` keeps luminance from every direction and changes hue and saturation only: a dark plant stays dark. If a
+      channel lies outside [0, 1] before or after, the renderer's clamp changes what is seen, and luminance with it.
+
+    Args:
+        gaussians: a colour field (with `sh`).
+        mask: which Gaussians to paint.
+        rgb: the colour, in the same (display) space as the photographs; text as `parse_color` reads it.
+        mode: what stays, see above.
+
+    Raises:
+        ValueError: if there is no `sh`, the mask has another length, or `rgb` is not a colour.
+        TypeError: if the mask is not boolean.
+
+    Note:
+        The old hues are lost: a red flower on a green stem becomes one hue. Select them apart to keep two.
+        Luminance is Rec. 709 luma of display values. The paper says only "color modification".
+    """
+    mask = as_tensor("mask", mask)
+    check_shapes(("gaussians.means", gaussians.means, "N 3"), ("mask", mask, "N"))
+    if mask.dtype != torch.bool:
+        raise TypeError(f"mask: expected a boolean mask, got {mask.dtype}; compare first, as in labels == 3")
+    check_choice("mode", mode, MODES)
+    if gaussians.sh is None:
+        raise ValueError(
+            "gaussians.sh: expected spherical harmonics [N, K, 3], got None; pass the colour field, not the semantic one"
+        )
+    target = gaussians.sh.new_tensor(parse_color(rgb))
+    if not bool(mask.any()):
+        return gaussians
+    sh = gaussians.sh[mask]
+    weights = sh.new_tensor(LUMINANCE)
+    luminance = sh0_to_rgb(sh[:, 0]) @ weights  # [n], may be slightly negative: 3DGS clamps after summing
+    middle = _middle(luminance.detach(), gaussians.opacities[mask].detach(), gaussians.scales[mask].detach())
+    painted = torch.zeros_like(sh)
+    if mode == "tint" and float(middle) < DARK:
+        painted[:, 0] = rgb_to_sh0(target)
+    else:
+        shades = same_luminance(target) if mode == "hue" else tint(target, middle)
+        colors, slopes = shades(luminance)
+        painted[:, 0] = rgb_to_sh0(colors)
+        painted[:, 1:] = (sh[:, 1:] @ weights)[..., None] * slopes[:, None]
+    recoloured = gaussians.sh.clone()
+    recoloured[mask] = painted
+    return gaussians.replace(sh=recoloured)
+
+
+def _middle(luminance: Tensor, opacities: Tensor, scales: Tensor) -> Tensor:  # [n], [n], [n, 3] -> []
+    """The median luminance, weighted by how much of a picture each Gaussian can cover."""
+    sides = scales.topk(2, dim=1).values
+    weights = (opacities * sides[:, 0] * sides[:, 1]).double()
+    order = luminance.argsort()
+    reached = weights[order].cumsum(0)
+    return luminance[order][int(torch.searchsorted(reached, reached[-1] / 2).clamp(max=len(order) - 1))]
 
 
 class Shades(NamedTuple):

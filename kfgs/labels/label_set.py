@@ -1,7 +1,8 @@
-"""The classes of a scene and their text embeddings, in memory and as they lie beside its images."""
+"""The classes of a scene and their text embeddings, in memory and in a file."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as default
@@ -10,11 +11,17 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor
 
-from .._files import read_json
-from .label_table import SUFFIX, LabelTable, read_label_table, write_label_table
+from .._card import html_card
+from .._files import atomic_path, read_json
+from .._rows import as_tensor
 from .names import class_index, class_indices
+
+KIND, VERSION = "label set", "1"  # of the metadata's "kfgs" and "version"
+SUFFIX = ".safetensors"
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,12 +38,18 @@ class LabelSet:
     names: tuple[str, ...]
     embeddings: Tensor  # [C, D], of any length
     negatives: Tensor | None = None  # [M, D]
-    """What a query is told from where no other classes are known: LERF's canonical words."""
+    """LERF's canonical words: what a query is compared with if no other classes are known."""
     negative_names: tuple[str, ...] = ()
     info: dict[str, Any] = default(default_factory=dict)
     """Where the rows come from, as JSON: `teacher` (`teachers.identify`), `templates`, `synonyms`."""
 
     def __post_init__(self) -> None:
+        if isinstance(self.names, str):
+            raise TypeError(
+                f"names: expected a list of class names, got the text {self.names!r:.80}; put it into a list"
+            )
+        object.__setattr__(self, "names", tuple(self.names))
+        object.__setattr__(self, "embeddings", as_tensor("embeddings", self.embeddings))
         if self.embeddings.ndim != 2 or len(self.names) != len(self.embeddings):
             raise ValueError(
                 f"embeddings: expected [C, D] with C = {len(self.names)} (one row per name), "
@@ -57,8 +70,19 @@ class LabelSet:
         return len(self.names)
 
     def __repr__(self) -> str:
-        shown = ", ".join(self.names[:5]) + (", ..." if len(self) > 5 else "")
-        return f"LabelSet({len(self)} classes: {shown}; {self.dim} channels)"
+        return f"LabelSet({len(self)} classes: {self._shown(5)}; {self.dim} channels)"
+
+    def _repr_html_(self) -> str:
+        facts = {
+            "classes": f"{len(self)}: {self._shown(12)}",
+            "embeddings": self.embeddings,
+            "negatives": self.negatives,
+        }
+        teacher = self.info.get("teacher")
+        return html_card("LabelSet", facts | {"teacher": teacher.get("name") if isinstance(teacher, dict) else None})
+
+    def _shown(self, count: int) -> str:
+        return ", ".join(self.names[:count]) + (", ..." if len(self) > count else "")
 
     @property
     def dim(self) -> int:
@@ -77,7 +101,7 @@ class LabelSet:
             return False
 
     def select(self, names: Sequence[str]) -> LabelSet:
-        """The named classes alone, in the order given; labels count anew from 0.
+        """The named classes alone, in the order given; labels are numbered from 0 in this order.
 
         Raises:
             ValueError: if one is unknown (the message offers near ones), or named twice.
@@ -88,7 +112,7 @@ class LabelSet:
         return replace(self, names=tuple(self.names[row] for row in rows), embeddings=self.embeddings[rows])
 
     def with_class(self, name: str, embedding: Tensor) -> LabelSet:  # embedding: [D]
-        """These classes and one more at the end, so that their labels stay.
+        """These classes and one more at the end. The labels of the others stay.
 
         Raises:
             ValueError: if the name is taken, or the row has another number of channels.
@@ -107,8 +131,22 @@ class LabelSet:
         Raises:
             ValueError: if the name does not end in .safetensors, or `info` is not JSON.
         """
-        table = LabelTable(self.names, self.embeddings, self.negatives, self.negative_names, self.info)
-        write_label_table(path, table)
+        path = Path(path)
+        if path.suffix != SUFFIX:
+            raise ValueError(f"path: expected a file name that ends in {SUFFIX}, got {path}; give another name")
+        try:
+            info = json.dumps(self.info, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"info: expected what JSON can hold, got {error}; use strings and finite numbers"
+            ) from error
+        parts = {"embeddings": self.embeddings} | ({} if self.negatives is None else {"negatives": self.negatives})
+        names = {name: json.dumps(getattr(self, name)) for name in ("names", "negative_names")}
+        with atomic_path(path) as temporary:
+            tensors = {
+                name: rows.detach().to("cpu", torch.float32).contiguous().clone() for name, rows in parts.items()
+            }
+            save_file(tensors, temporary, metadata={"kfgs": KIND, "version": VERSION, "info": info} | names)
 
 
 def load_label_set(classes: str | Path, embeddings: str | Path | None = None) -> LabelSet:
@@ -121,12 +159,12 @@ def load_label_set(classes: str | Path, embeddings: str | Path | None = None) ->
 
     Raises:
         FileNotFoundError: if a file is missing.
-        ValueError: if a file is not what it should be, the counts differ, or embeddings are missing or one too many.
+        ValueError: if a file has another content, the counts differ, or embeddings are missing or given twice.
     """
     if Path(classes).suffix == SUFFIX:
         if embeddings is not None:
             raise ValueError(f"embeddings: expected none beside the table {classes}, got {embeddings}; leave it out")
-        return LabelSet(*read_label_table(classes))
+        return _read_table(Path(classes))
     names = read_json(classes)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or not names:
         raise ValueError(
@@ -138,16 +176,16 @@ def load_label_set(classes: str | Path, embeddings: str | Path | None = None) ->
             "`kfgs text` made in place of both"
         )
     if Path(embeddings).suffix == SUFFIX:
-        return LabelSet(*read_label_table(embeddings)).select(names)
+        return _read_table(Path(embeddings)).select(names)
     return LabelSet(tuple(names), torch.from_numpy(_read_rows(Path(embeddings), len(names), classes)))
 
 
 def teacher_mismatch(field: dict[str, Any], words: dict[str, Any]) -> str | None:
-    """One line where a field was distilled from another teacher than the one that embedded the words; else None.
+    """A message if a field was distilled from another teacher than the one that embedded the words; else None.
 
-    Two encoders may well have the same number of channels and nothing else in common: of the 61 words that CLIP ViT-B/16
-    (COCO-Stuff) and ViT-B/32 (LVIS) both embedded, none is the other's nearest. Only the name and the weights are
-    compared, as other options (window, scales) do not concern text.
+    Two encoders may have the same number of channels and nothing else in common: of the 61 words that CLIP ViT-B/16
+    (COCO-Stuff) and ViT-B/32 (LVIS) both embedded, no pair of embeddings of one word was nearest to each other. Only the
+    name and the weights are compared; other options (window, scales) do not concern text.
 
     Args:
         field: `info` of a SemanticField.
@@ -164,11 +202,11 @@ def teacher_mismatch(field: dict[str, Any], words: dict[str, Any]) -> str | None
 
 
 def teacher_difference(one: dict[str, Any], other: dict[str, Any]) -> tuple[str, Any, Any] | None:
-    """Whether two things come from different teachers: ("name" or "weights", the one's, the other's), or None.
+    """What differs between two teachers, "name" or "weights", with both values; None if nothing is known to differ.
 
     Args:
-        one: `info` of a LabelSet or a SemanticField.
-        other: of another; where either does not tell its teacher, nothing is known to differ.
+        one: `info` of a LabelSet or a SemanticField. It may not name its teacher: then nothing is known to differ.
+        other: `info` of another one.
     """
     ours, theirs = one.get("teacher"), other.get("teacher")
     if not isinstance(ours, dict) or not isinstance(theirs, dict):
@@ -182,6 +220,31 @@ def teacher_difference(one: dict[str, Any], other: dict[str, Any]) -> tuple[str,
 
 def _shape(rows: Tensor | None) -> tuple[int, ...] | None:
     return None if rows is None else tuple(rows.shape)
+
+
+def _read_table(path: Path) -> LabelSet:
+    """Read what `LabelSet.save` wrote."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected a table of words there, which `kfgs text` makes")
+    try:
+        with safe_open(path, framework="pt") as file:
+            found = file.metadata() or {}
+            if (found.get("kfgs"), found.get("version")) != (KIND, VERSION):
+                raise ValueError(
+                    f"{path}: expected a kfgs {KIND}, version {VERSION}, got {found.get('kfgs') or 'other tensors'} "
+                    f"{found.get('version', '')}; make one with `kfgs text`"
+                )
+            parts = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 (no mapping)
+        names, negative_names, info = (json.loads(found[key]) for key in ("names", "negative_names", "info"))
+        fields = tuple(names), parts["embeddings"], parts.get("negatives"), tuple(negative_names), {**info}
+    except (SafetensorError, KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(
+            f"{path}: expected a kfgs {KIND}, but it cannot be read ({error}); make it again with `kfgs text`"
+        ) from error
+    for name, rows in parts.items():
+        if rows.ndim != 2 or not torch.isfinite(rows).all():
+            raise ValueError(f"{path}: expected finite rows of {name}, got others; make it again with `kfgs text`")
+    return LabelSet(*fields)
 
 
 def _read_rows(path: Path, count: int, classes: str | Path) -> Any:  # [C, D] float32

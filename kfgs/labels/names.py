@@ -1,4 +1,4 @@
-"""From a class name to its labels, with a helpful refusal."""
+"""From a class name to its labels; an unknown name gives an error that offers near ones."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def class_index(name: str, names: Sequence[str]) -> int:
 
 
 def class_indices(name: str, names: Sequence[str]) -> tuple[int, ...]:
-    """The labels of a class, ascending: classes are the same when their names are, so there may be several.
+    """The labels of a class, ascending. There are several if several classes have the same name.
 
-    A name is looked up exactly, then whatever its case; it must then fit names of one spelling only.
+    A name is looked up exactly, then without regard to case, if only one spelling fits.
 
     Raises:
         ValueError: if there is no such class; the message offers the nearest names.
@@ -63,7 +63,7 @@ def class_indices(name: str, names: Sequence[str]) -> tuple[int, ...]:
 
 
 def class_of(argument: str, value: Any) -> str | int:
-    """A class as it is asked for: a name, or an index, -1 for none; `argument` is what an error speaks of.
+    """Check a class that a user asks for: a name, or an index, -1 for none. Errors name the `argument`.
 
     Raises:
         ValueError: if it is neither, or less than -1.
@@ -75,15 +75,11 @@ def class_of(argument: str, value: Any) -> str | int:
     return int(plain)
 
 
-def labelled(
-    labels: Tensor,  # [N] int64
-    asked: Sequence[str | int],
-    classes: Sequence[str],
-) -> Tensor:  # [N] bool
-    """Which labels are of one of the classes asked for, by index or by name (see `class_indices`).
+def labelled(labels: Tensor, asked: str | int, classes: Sequence[str]) -> Tensor:  # [N] int64 -> [N] bool
+    """Which labels are of a class, by index or by name (see `class_indices`).
 
     Raises:
-        ValueError: if a name is unknown.
+        ValueError: if the name is unknown.
     """
-    wanted = [index for one in asked for index in (class_indices(one, classes) if isinstance(one, str) else (one,))]
+    wanted = class_indices(asked, classes) if isinstance(asked, str) else (asked,)
     return torch.isin(labels, torch.tensor(wanted, dtype=torch.int64, device=labels.device))

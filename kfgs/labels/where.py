@@ -1,37 +1,46 @@
-"""Selections that can be written down: expressions over classes, places and scores that give a mask when asked.
+"""Questions that select Gaussians: by class, place, index or score, and their combinations. They are saved as JSON.
 
-A `Selection` is a mask of one cloud; a `Where` is the question, which can be saved and asked again of another cloud.
+A `Where` is a question about any cloud. Asked of one cloud it gives a `Selection`: `OfClass("chair").select(splats)`.
 """
 
 from __future__ import annotations
 
+import operator
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from .._check import check_range, check_whole
+from .._rows import check_finite
+from ..formats.splat_file import SplatFile
 from ..gaussians import Gaussians
-from ._plain import NESTED, checked_object, members_of, number_of, numbers_of, quaternion_of, rotation_matrix
+from ._json import (
+    NESTED,
+    build,
+    checked_object,
+    members_of,
+    number_of,
+    numbers_of,
+    quaternion_of,
+    rotation_matrix,
+    set_fields,
+)
 from .components import component_numbers
+from .label_set import LabelSet
 from .names import class_of, labelled
-
-
-class _Cloud(NamedTuple):
-    gaussians: Gaussians
-    classes: Sequence[str]
-    extra: Mapping[str, Any]
+from .selection import Selection
 
 
 class Where(ABC):
-    """A question that every Gaussian answers with yes or no.
+    """A question that selects some Gaussians of a cloud.
 
-    `a & b`, `a | b`, `a - b` and `~a` combine questions. `to_json` gives plain values, `Where.from_json` reads them, and
-    equal questions compare equal.
+    `a & b`, `a | b`, `a - b` and `~a` combine questions as they combine selections. `to_json` gives plain values,
+    `Where.from_json` reads them, and equal questions compare equal.
 
     Example:
         >>> (OfClass("chair") - InSphere((0, 0, 0), 1.0)).to_json()["kind"]
@@ -40,24 +49,32 @@ class Where(ABC):
 
     kind: ClassVar[str]
 
-    def mask(
-        self, gaussians: Gaussians, classes: Sequence[str] = (), extra: Mapping[str, Any] | None = None
-    ) -> Tensor:  # [N] bool
-        """Which Gaussians answer yes.
+    def select(self, cloud: SplatFile | Gaussians, classes: Sequence[str] | LabelSet = ()) -> Selection:
+        """Ask a cloud.
 
         Args:
-            gaussians: N Gaussians.
-            classes: the name of each class index in `gaussians.labels`.
-            extra: further columns, N values each, as in `SplatFile.extra`.
+            cloud: a splat with its class names and columns, or Gaussians alone.
+            classes: with Gaussians, the name of each class index in their labels.
 
         Raises:
             ValueError: if the cloud lacks what is asked for: labels, a class, a column, an index.
+            TypeError: if it is neither a splat nor Gaussians.
         """
-        return self._ask(_Cloud(gaussians, classes, extra or {}))
+        if isinstance(cloud, Gaussians):
+            cloud = SplatFile(cloud, classes=classes.names if isinstance(classes, LabelSet) else tuple(classes))
+        if not isinstance(cloud, SplatFile):
+            raise TypeError(
+                f"cloud: expected a SplatFile or Gaussians, got {type(cloud).__name__}; pass the cloud itself"
+            )
+        return self._ask(cloud)
+
+    def mask(self, cloud: SplatFile | Gaussians, classes: Sequence[str] | LabelSet = ()) -> Tensor:  # [N] bool
+        """`select(...).mask` alone."""
+        return self.select(cloud, classes).mask
 
     @abstractmethod
-    def _ask(self, cloud: _Cloud) -> Tensor:  # [N] bool
-        """The mask; what a new kind of question has to say."""
+    def _ask(self, cloud: SplatFile) -> Selection:
+        """The selection; each kind of question defines it."""
 
     def __and__(self, other: Where) -> Where:
         return Both(_parts(Both, self) + _parts(Both, other)) if isinstance(other, Where) else NotImplemented
@@ -73,8 +90,7 @@ class Where(ABC):
 
     def to_json(self) -> dict[str, Any]:
         """Plain values that JSON can hold: `kind`, and the fields."""
-        members = {name: _plain(value) for name, value in members_of(self).items()}
-        return {"kind": self.kind} | {name: value for name, value in members.items() if value is not None}
+        return {"kind": self.kind} | {name: value for name, value in members_of(self).items() if value is not None}
 
     @staticmethod
     def from_json(value: Any, name: str = "where") -> Where:
@@ -96,8 +112,9 @@ class Everything(Where):
 
     kind: ClassVar[str] = "everything"
 
-    def _ask(self, cloud: _Cloud) -> Tensor:  # [N] bool
-        return torch.ones(len(cloud.gaussians), dtype=torch.bool, device=cloud.gaussians.means.device)
+    def _ask(self, cloud: SplatFile) -> Selection:
+        mask = torch.ones(len(cloud), dtype=torch.bool, device=cloud.gaussians.means.device)
+        return Selection.of(mask, "everything")
 
 
 @dataclass(frozen=True)
@@ -106,30 +123,30 @@ class OfClass(Where):
 
     kind: ClassVar[str] = "class"
     name: str | int
-    """A name, looked up exactly, then whatever its case; or an index, -1 for those without a label.
+    """A name, looked up exactly, then without regard to case; or an index, -1 for those without a label.
 
-    Where several classes have that name, all of them are meant. An unknown name is an error; an index that no Gaussian
+    If several classes have that name, it means all of them. An unknown name is an error; an index that no Gaussian
     carries selects nothing.
     """
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "name", class_of("name", self.name))
+        set_fields(self, name=class_of("name", self.name))
 
-    def _ask(self, cloud: _Cloud) -> Tensor:  # [N] bool
+    def _ask(self, cloud: SplatFile) -> Selection:
         if cloud.gaussians.labels is None:
             raise ValueError(
                 f"gaussians.labels: expected labels to find class {self.name!r} by, got None; attach a semantic field "
                 "first, or select by a box or a sphere"
             )
-        return labelled(cloud.gaussians.labels, (self.name,), cloud.classes)
+        return Selection.of(labelled(cloud.gaussians.labels, self.name, cloud.classes), f"label {self.name}")
 
 
 @dataclass(frozen=True)
 class InBox(Where):
-    """The Gaussians whose centres lie in a box, faces included.
+    """The Gaussians whose centres lie in a box, faces included. For an `OrientedBox` see `OrientedBox.contains`.
 
     With a rotation R the box is first laid out along the axes and then turned about its own centre c: a point x is inside
-    when c + R^T (x - c) lies between `min` and `max`.
+    if c + R^T (x - c) lies between `min` and `max`.
     """
 
     kind: ClassVar[str] = "box"
@@ -138,42 +155,42 @@ class InBox(Where):
     max: tuple[float, ...]
     """The greatest x, y, z."""
     rotation: tuple[float, ...] | None = None
-    """A quaternion (w, x, y, z), normalised where used; None for no turn."""
+    """A quaternion (w, x, y, z) of any length; None for no rotation."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "min", numbers_of("min", self.min, 3))
-        object.__setattr__(self, "max", numbers_of("max", self.max, 3))
+        set_fields(self, min=numbers_of("min", self.min, 3), max=numbers_of("max", self.max, 3))
         if any(low > high for low, high in zip(self.min, self.max, strict=True)):
             raise ValueError(f"max: expected no less than min {self.min} on every axis, got {self.max}; swap them")
         if self.rotation is not None:
-            object.__setattr__(self, "rotation", quaternion_of("rotation", self.rotation))
+            set_fields(self, rotation=quaternion_of("rotation", self.rotation))
 
-    def _ask(self, cloud: _Cloud) -> Tensor:  # [N] bool
-        points = cloud.gaussians.means.detach().double()
+    def _ask(self, cloud: SplatFile) -> Selection:
+        points = _points(cloud)
         low, high = points.new_tensor(self.min), points.new_tensor(self.max)
         if self.rotation is not None:
             center = (low + high) / 2
             R = points.new_tensor(rotation_matrix(self.rotation).tolist())
             points = (points - center) @ R + center  # rows: R^T (x - c)
-        return ((points >= low) & (points <= high)).all(dim=1)
+        size = " x ".join(f"{b - a:.4g}" for a, b in zip(self.min, self.max, strict=True))
+        return Selection.of(((points >= low) & (points <= high)).all(dim=1), f"in a box of {size}")
 
 
 @dataclass(frozen=True)
 class InSphere(Where):
-    """The Gaussians whose centres are no farther than `radius` from `center`, world units."""
+    """The Gaussians whose centres are at most `radius` from `center`, world units."""
 
     kind: ClassVar[str] = "sphere"
     center: tuple[float, ...]
     radius: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "center", numbers_of("center", self.center, 3))
-        object.__setattr__(self, "radius", number_of("radius", self.radius))
+        set_fields(self, center=numbers_of("center", self.center, 3), radius=number_of("radius", self.radius))
         check_range("radius", self.radius, 0, closed=(False, False))
 
-    def _ask(self, cloud: _Cloud) -> Tensor:  # [N] bool
-        points = cloud.gaussians.means.detach().double()
-        return (points - points.new_tensor(self.center)).norm(dim=1) <= self.radius
+    def _ask(self, cloud: SplatFile) -> Selection:
+        points = _points(cloud)
+        inside = (points - points.new_tensor(self.center)).norm(dim=1) <= self.radius
+        return Selection.of(inside, f"within {self.radius:.4g} of ({', '.join(f'{x:.4g}' for x in self.center)})")
 
 
 @dataclass(frozen=True)
@@ -182,7 +199,7 @@ class OfIndex(Where):
 
     kind: ClassVar[str] = "index"
     indices: tuple[int, ...]
-    """Ascending, without repetition; any order, an int tensor or a boolean mask will do to make one."""
+    """Ascending, without repetition; made from numbers in any order, an int tensor, or a boolean mask."""
 
     def __post_init__(self) -> None:
         given: Any = self.indices
@@ -193,9 +210,9 @@ class OfIndex(Where):
             raise TypeError(f"indices: expected a list of whole numbers, got {plain!r:.80}; write it as [4, 7]")
         for index in plain:
             check_whole("indices", index, 0, 2**62)
-        object.__setattr__(self, "indices", tuple(sorted({int(index) for index in plain})))
+        set_fields(self, indices=tuple(sorted({int(index) for index in plain})))
 
-    def _ask(self, cloud: _Cloud) -> Tensor:  # [N] bool
+    def _ask(self, cloud: SplatFile) -> Selection:
         if self.indices and self.indices[-1] >= len(cloud.gaussians):
             raise ValueError(
                 f"indices: expected indices below {len(cloud.gaussians)} (the number of Gaussians), got {self.indices[-1]}; "
@@ -203,27 +220,29 @@ class OfIndex(Where):
             )
         mask = torch.zeros(len(cloud.gaussians), dtype=torch.bool, device=cloud.gaussians.means.device)
         mask[torch.tensor(self.indices, dtype=torch.int64, device=mask.device)] = True
-        return mask
+        return Selection.of(mask, "by index")
 
 
 @dataclass(frozen=True)
 class AboveScore(Where):
-    """The Gaussians with more than `threshold` in a column: how sure their label is, unless another column is named."""
+    """The Gaussians with more than `threshold` in a column of the splat; `score` says how sure their label is."""
 
     kind: ClassVar[str] = "score"
     threshold: float
     column: str = "score"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "threshold", number_of("threshold", self.threshold))
+        set_fields(self, threshold=number_of("threshold", self.threshold))
         if not isinstance(self.column, str):
             raise TypeError(f"column: expected the name of a column, got {self.column!r:.80}; write it as a string")
 
-    def _ask(self, cloud: _Cloud) -> Tensor:  # [N] bool
+    def _ask(self, cloud: SplatFile) -> Selection:
         if self.column not in cloud.extra:
             has = ", ".join(cloud.extra) or "none"
             raise ValueError(f"column: expected one of the cloud's columns ({has}), got {self.column!r}; name another")
-        return torch.as_tensor(cloud.extra[self.column] > self.threshold).to(cloud.gaussians.means.device)
+        values = torch.as_tensor(cloud.extra[self.column]).to(cloud.gaussians.means.device)
+        scores = values.to(torch.promote_types(values.dtype, torch.float32)).nan_to_num()
+        return Selection(values > self.threshold, scores, self.threshold, f"column {self.column}")
 
 
 @dataclass(frozen=True)
@@ -233,7 +252,7 @@ class Component(Where):
     kind: ClassVar[str] = "component"
     where: Where
     distance: float | None = None
-    """Gaussians closer than this are connected, world units; None takes it from the cloud's spacing."""
+    """Gaussians at most this far apart are connected, world units; None takes `component_distance`."""
     rank: int = 0
     """0 is the largest part, 1 the next; a rank past the last part selects nothing."""
 
@@ -241,14 +260,15 @@ class Component(Where):
         _check_where("where", self.where)
         check_whole("rank", self.rank, 0)
         if self.distance is not None:
-            object.__setattr__(self, "distance", number_of("distance", self.distance))
+            set_fields(self, distance=number_of("distance", self.distance))
             check_range("distance", self.distance, 0, closed=(False, False))
 
-    def _ask(self, cloud: _Cloud) -> Tensor:  # [N] bool
-        mask = self.where._ask(cloud)
-        if not bool(mask.any()):
-            return mask
-        return component_numbers(cloud.gaussians.means, mask, self.distance) == self.rank
+    def _ask(self, cloud: SplatFile) -> Selection:
+        found = self.where._ask(cloud)
+        if len(found) == 0:
+            return found
+        numbers = component_numbers(cloud.gaussians.means, found.mask, self.distance)
+        return found.within(numbers == self.rank, f"part {self.rank + 1} of {int(numbers.max()) + 1}")
 
 
 @dataclass(frozen=True)
@@ -261,7 +281,7 @@ class Not(Where):
     def __post_init__(self) -> None:
         _check_where("where", self.where)
 
-    def _ask(self, cloud: _Cloud) -> Tensor:  # [N] bool
+    def _ask(self, cloud: SplatFile) -> Selection:
         return ~self.where._ask(cloud)
 
 
@@ -274,7 +294,7 @@ class _Several(Where):
             raise ValueError(f"parts: expected at least one Where, got {self.parts!r:.80}; use Everything() for all")
         for part in self.parts:
             _check_where("parts", part)
-        object.__setattr__(self, "parts", tuple(self.parts))
+        set_fields(self, parts=tuple(self.parts))
 
 
 @dataclass(frozen=True)
@@ -283,8 +303,8 @@ class Both(_Several):
 
     kind: ClassVar[str] = "both"
 
-    def _ask(self, cloud: _Cloud) -> Tensor:  # [N] bool
-        return reduce(torch.logical_and, (part._ask(cloud) for part in self.parts))
+    def _ask(self, cloud: SplatFile) -> Selection:
+        return reduce(operator.and_, (part._ask(cloud) for part in self.parts))
 
 
 @dataclass(frozen=True)
@@ -293,8 +313,8 @@ class Either(_Several):
 
     kind: ClassVar[str] = "either"
 
-    def _ask(self, cloud: _Cloud) -> Tensor:  # [N] bool
-        return reduce(torch.logical_or, (part._ask(cloud) for part in self.parts))
+    def _ask(self, cloud: SplatFile) -> Selection:
+        return reduce(operator.or_, (part._ask(cloud) for part in self.parts))
 
 
 KINDS: dict[str, type[Where]] = {
@@ -312,10 +332,9 @@ def _parts(kind: type[Both] | type[Either], where: Where) -> tuple[Where, ...]:
     return where.parts if isinstance(where, kind) else (where,)  # a & b & c is one Both of three
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, Where):
-        return value.to_json()
-    return [_plain(part) for part in value] if isinstance(value, tuple) else value
+def _points(cloud: SplatFile) -> Tensor:  # [N, 3] float64
+    check_finite("gaussians.means", cloud.gaussians.means)
+    return cloud.gaussians.means.detach().double()
 
 
 def _read(value: Any, name: str, depth: int) -> Where:
@@ -329,7 +348,4 @@ def _read(value: Any, name: str, depth: int) -> Where:
         members["where"] = _read(members["where"], f"{name}.where", depth + 1)
     if isinstance(members.get("parts"), list):
         members["parts"] = tuple(_read(p, f"{name}.parts[{i}]", depth + 1) for i, p in enumerate(members["parts"]))
-    try:
-        return KINDS[kind](**members)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}.{error}") from error
+    return build(name, KINDS[kind], members)

@@ -23,7 +23,7 @@ from ..formats.ply_3dgs import columns_from_gaussians
 from ..formats.sidecar import write_names
 from ..formats.splat_file import SCORE, SplatFile
 from ..gaussians import Gaussians
-from ..labels import LabelSet, Selection, Transfer, classify, select_by_label, transfer_labels
+from ..labels import LabelSet, OfClass, Selection, Transfer, classify, transfer_labels
 from ..labels.questions import class_rows
 from ..scenes import Scene
 from ..viz import overlay_labels, palette, save_picture
@@ -143,7 +143,7 @@ def select_labelled(splats: SplatFile, name: str, threshold: float | None = None
         ValueError: if the splat has no labels or no such class, or there are no scores to compare with a threshold.
     """
     score = splats.extra.get(SCORE)
-    found = select_by_label(splats.gaussians, name, splats.classes)
+    found = OfClass(name).select(splats)
     if score is None:
         if threshold is not None:
             raise ValueError(f"threshold: expected a splat with the column {SCORE!r}, got none; leave it out")

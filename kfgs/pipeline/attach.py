@@ -165,19 +165,21 @@ def _common_frame(
     if frame is not None:
         assert cameras is not None
         alignment = align_by_cameras(cameras, frame)
-        return alignment.similarity, alignment, f"aligned by {alignment.words}"
+        return alignment.similarity, alignment, f"aligned by {alignment.summary}"
     clouds = [_solid(gaussians.means, gaussians.opacities) for gaussians in (field.gaussians, splats.gaussians)]
     check = frames_agree(*clouds)
     if check.agree:
-        return Similarity.identity(), None, check.words
+        return Similarity.identity(), None, check.summary
     try:
         alignment = align_clouds(*clouds)
     except SceneError as error:
         raise SceneError(f"{error} (frame=Similarity.identity() says that both share one frame)") from error
     if _stays(clouds[0], alignment):
-        words = f"at first {check.words}; but of all frames their own fits best, by the {alignment.how}: they share it"
+        words = (
+            f"at first {check.summary}; but of all frames their own fits best, by the {alignment.how}: they share it"
+        )
         return Similarity.identity(), None, words
-    return alignment.similarity, alignment, f"{check.words}; aligned by {alignment.words}"
+    return alignment.similarity, alignment, f"{check.summary}; aligned by {alignment.summary}"
 
 
 def _stays(means: Tensor, alignment: Alignment) -> bool:  # [N, 3]

@@ -165,20 +165,27 @@ def fit_color(
             view is in the split.
     """
     config = config or ColorConfig.paper()
-    views = scene.views(config.split)
+    scene.views(config.split)  # refuses a split without views
     check_scene(scene)
-    run = Run(Path(folder), report)
     options = {"progress": progress, "callback": callback}
-    params = _color_stage(run, scene, views, config, training_device(device), options)
-    result = ColorResult(params.activated().detach(), Path(folder) / "color.ply", run.stages)
-    if not _is_saved(result):
+    return make_color(Run(Path(folder), report), scene, config, training_device(device), options)
+
+
+def make_color(
+    run: Run, scene: Scene, config: ColorConfig, device: torch.device, options: dict[str, Any]
+) -> ColorResult:
+    """The colour stage of a run, and the PLY file of its Gaussians. `options` are `progress` and `callback` of `fit_field`."""
+    params = _color_stage(run, scene, scene.views(config.split), config, device, options)
+    result = ColorResult(params.activated().detach(), run.folder / "color.ply", run.stages)
+    if not run.look_only and not _is_saved(result):
         write_splats(result.path, result.gaussians)
     return result
 
 
 def find_color(run: Run, scene: Scene, config: ColorConfig) -> Gaussians | None:
-    """The Gaussians of the longest finished colour stage of the same scene that is longer than these options ask for, as
-    `kfgs color` makes it in the same run; None if there is none.
+    """The Gaussians of the longest colour stage in the run, if it is of this scene and longer than `config` asks for.
+
+    `kfgs color` makes it in the same run. None if there is none.
     """
     views = scene.views(config.split)
     wanted = json.loads(json.dumps(_inputs(run, scene, views, config) | {"config": None}))

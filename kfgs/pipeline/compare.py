@@ -14,7 +14,7 @@ from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..splat import rasterize
 from ..viz import save_picture
-from ..viz.pairs import picture_grid
+from ..viz.pictures import picture_grid
 
 PREVIEW = 96  # pixels: width of the renderings that choose the viewpoints
 VISIBLE = 8 / 255  # a pixel has changed when some channel did by more than this

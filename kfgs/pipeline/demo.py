@@ -15,7 +15,7 @@ from ..features import FeatureFolder
 from ..formats import SplatFile, write_splats
 from ..formats.ply import write_ply
 from ..gaussians import Gaussians
-from ..labels import EditList, OfClass, Recolor, Remove, answers, parse_color, select_by_label, transfer_labels
+from ..labels import EditList, OfClass, Recolor, Remove, connected_parts, parse_color, transfer_labels
 from ..scenes import Scene, load_scene
 from ..toy.room_folder import ToyConfig, make_toy_room
 from .apply import (
@@ -65,7 +65,7 @@ def run(
     scene = load_scene(folder)
     classes = load_label_set(folder / "classes.json", folder / "text.npy")
 
-    maps = FeatureFolder(folder / "features", [scene.stem(i) for i in scene.views("train")])
+    maps = FeatureFolder(folder / "features").of(scene, "train")
     colors = replace(ColorConfig.quick(), seed=config.seed)
     colored = fit_color(scene, out / "run", colors, report=say, progress=progress)
     quality = score_views(colored.gaussians, scene)
@@ -123,10 +123,8 @@ def _edit_colors(
     """Attach the classes to the colours, remove the chairs and recolour the plants; the files and the scores."""
     splats = attach(fitted.field, SplatFile(colors), classes).splats
     written = write_splats(out / "color.ply", splats).paths
-    for thing in answers(
-        splats.gaussians, select_by_label(splats.gaussians, REMOVED, classes.names), fitted.field.cameras
-    ):
-        say(f"  {REMOVED}: {thing!r}")
+    for part in connected_parts(splats.gaussians, OfClass(REMOVED).select(splats), fitted.field.cameras):
+        say(f"  {REMOVED}: {part!r}")
     rgb = parse_color(PAINT)
     edits = {"removed": EditList((Remove(OfClass(REMOVED)),)), "recolored": EditList((Recolor(OfClass(PAINTED), rgb),))}
     after = {name: edit.apply(splats) for name, edit in edits.items()}

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from dataclasses import field as default
 from importlib.metadata import version
@@ -20,6 +21,7 @@ from torch import Tensor
 
 from .._check import check_choice
 from .._files import digest_value, read_json, write_json
+from ..cameras import Camera
 from ..fields import (
     FieldConfig,
     FieldFit,
@@ -43,12 +45,12 @@ from ..quant import (
     quantize_maps,
 )
 from ..scenes import Scene
-from .color import ColorConfig
+from .color import ColorConfig, find_color
 from .device import training_device
 from .digests import describe_lens, digest_scene, stage_generator
 from .fuse import answers_stage, find_geometry, uplift_stage
 from .maps import KnownFeatures, Maps, UndistortedMaps, check_readable, map_digests, map_shape
-from .stages import Run, Stage
+from .stages import Run, Stage, UnfinishedError
 from .train import check_scene, field_stage
 
 Method = Literal["fuse", "paper"]
@@ -121,96 +123,94 @@ class FitResult:
         return sum(stage.seconds for stage in self.stages)
 
 
-def _lens_digest(maps: Maps) -> str | None:
-    if not isinstance(maps, UndistortedMaps):
-        return None
-    return digest_value([describe_lens(lens) for lens in maps.lenses])
+@dataclass(frozen=True)
+class _Job:
+    """One call of `fit_scene`: what all of its stages need."""
+
+    run: Run
+    scene: Scene
+    views: list[int]
+    maps: Maps
+    features: dict[str, Any]
+    """What decides the maps, as JSON."""
+    config: FitConfig
+    device: torch.device
+    options: dict[str, Any]
+    """`progress` and `callback` of what is trained."""
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """Of the views."""
+        return [self.scene.cameras[i] for i in self.views]
+
+    def generator(self, stage: str) -> torch.Generator:
+        """The random numbers of a stage."""
+        return stage_generator(self.config.seed, stage)
 
 
-def _codebook_stage(
-    run: Run, maps: Maps, features: dict[str, Any], config: FitConfig, options: dict[str, Any]
-) -> tuple[Codebook, Stage]:
+def _codebook_stage(job: _Job) -> tuple[Codebook, Stage]:
     """Adaptive Data Compression, Sec. 3.3.1: the codebook S."""
+    run, config = job.run, job.config
 
     def make(folder: Path) -> None:
-        check_readable(maps, "the codebook")
-        fit = fit_codebook(maps, config.codebook, generator=stage_generator(config.seed, "codebook"), **options)
+        check_readable(job.maps, "the codebook")
+        fit = fit_codebook(job.maps, config.codebook, generator=job.generator("codebook"), **job.options)
         fit.codebook.save(folder / "codebook.safetensors")
         if fit.note is not None and run.report is not None:
             run.report(f"note: {fit.note}")
         write_json(folder / "history.json", fit.history)
 
-    inputs = {"features": features, "config": asdict(config.codebook), "seed": config.seed}
+    inputs = {"features": job.features, "config": asdict(config.codebook), "seed": config.seed}
     stage = run.stage("codebook", inputs, make)
     return Codebook.load(stage.folder / "codebook.safetensors"), stage
 
 
-def _index_stage(
-    run: Run, maps: Maps, features: dict[str, Any], codebook: Codebook, upstream: Stage, progress: bool
-) -> tuple[IndexMaps, Stage]:
+def _index_stage(job: _Job, codebook: Codebook, upstream: Stage) -> tuple[IndexMaps, Stage]:
     """Quantisation, Eq. 5: the index map M of every view; a killed one goes on with the view it was at."""
-    inputs = {"features": features, "codebook": upstream.key}
-    scratch = run.scratch("index_maps", inputs)
+    inputs = {"features": job.features, "codebook": upstream.key}
+    scratch, progress = job.run.scratch("index_maps", inputs), bool(job.options["progress"])
 
     def make(folder: Path) -> None:
-        check_readable(maps, "quantisation")
-        quantize_maps(maps, codebook, progress=progress, scratch=scratch).save(folder / "index_maps.safetensors")
+        check_readable(job.maps, "quantisation")
+        quantize_maps(job.maps, codebook, progress=progress, scratch=scratch).save(folder / "index_maps.safetensors")
 
-    stage = run.stage("index_maps", inputs, make)
+    stage = job.run.stage("index_maps", inputs, make)
     shutil.rmtree(scratch, ignore_errors=True)
     return IndexMaps.load(stage.folder / "index_maps.safetensors"), stage
 
 
-def _autoencoder_stage(
-    run: Run, codebook: Codebook, upstream: Stage, config: FitConfig, options: dict[str, Any]
-) -> tuple[Autoencoder, Stage]:
+def _autoencoder_stage(job: _Job, codebook: Codebook, upstream: Stage) -> tuple[Autoencoder, Stage]:
     """Semantic Compression, Sec. 3.3.2: encoder E and decoder Psi."""
+    config = job.config
 
     def make(folder: Path) -> None:
-        fit = fit_autoencoder(
-            codebook, config.autoencoder, generator=stage_generator(config.seed, "autoencoder"), **options
-        )
+        fit = fit_autoencoder(codebook, config.autoencoder, generator=job.generator("autoencoder"), **job.options)
         fit.autoencoder.save(folder / "autoencoder.safetensors")
         write_json(folder / "history.json", fit.history)
 
     inputs = {"codebook": upstream.key, "config": asdict(config.autoencoder), "seed": config.seed}
-    stage = run.stage("autoencoder", inputs, make)
+    stage = job.run.stage("autoencoder", inputs, make)
     return Autoencoder.load(stage.folder / "autoencoder.safetensors"), stage
 
 
-def _field_stage(
-    run: Run,
-    scene: Scene,
-    views: Sequence[int],
-    targets: Sequence[Tensor],
-    inputs: dict[str, Any],
-    config: FitConfig,
-    device: torch.device,
-    options: dict[str, Any],
-) -> tuple[GaussianParams, Stage]:
+def _field_stage(job: _Job, targets: Sequence[Tensor], inputs: dict[str, Any]) -> GaussianParams:
     """The decoupled field, Sec. 3.2: Gaussians whose rendered latents follow the targets (Eq. 4)."""
+    scene, config = job.scene, job.config
     inputs = inputs | {
-        "scene": digest_scene(scene, views),
+        "scene": digest_scene(scene, job.views),
         "extent": float(scene.extent),
         "config": asdict(config.field),
         "seed": config.seed,
     }
 
     def train(checkpoint: Path) -> FieldFit:
-        generator = stage_generator(config.seed, "field")
+        generator = job.generator("field")
         start = GaussianParams.from_points(scene.points, int(targets[0].shape[-1]), generator=generator)
-        return fit_field(
-            start.map(lambda value: value.to(device)),
-            [scene.cameras[i] for i in views],
-            targets,
-            config.field,
-            extent=scene.extent,
-            generator=generator,
-            checkpoint=checkpoint,
-            **options,
-        )
+        start = start.map(lambda value: value.to(job.device))
+        options: dict[str, Any] = {"generator": generator, "checkpoint": checkpoint, **job.options}
+        return fit_field(start, job.cameras, targets, config.field, extent=scene.extent, **options)
 
-    return field_stage(run, "field", inputs, train)
+    return field_stage(job.run, "field", inputs, train)[0]
 
 
 def _check_inputs(scene: Scene, views: Sequence[int], maps: Maps, config: FitConfig) -> None:
@@ -226,14 +226,14 @@ def _check_inputs(scene: Scene, views: Sequence[int], maps: Maps, config: FitCon
     if len(views) != len(maps):
         raise ValueError(
             f"maps: expected one teacher map per view of split {split!r} ({len(views)}), got {len(maps)}; "
-            "read them with FeatureFolder(path, stems of that split)"
+            f"read them with FeatureFolder(path).of(scene, {split!r})"
         )
     check_scene(scene)
     stems = getattr(maps, "stems", None)
     if stems is not None and [Path(stem).name for stem in stems] != [Path(scene.stem(i)).name for i in views]:
         raise ValueError(
             f"maps: expected the maps of the views of split {split!r} in their order ({scene.stem(views[0])}, "
-            f"...), got {stems[0]}, ...; read them with FeatureFolder(path, [scene.stem(i) for i in scene.views(split)])"
+            f"...), got {stems[0]}, ...; read them with FeatureFolder(path).of(scene, {split!r})"
         )
 
 
@@ -271,34 +271,19 @@ def fit_scene(
     """
     config = config or FitConfig()
     target_device = training_device(device)
-    views = scene.views(config.split)
-    _check_inputs(scene, views, maps, config)
+    _check_inputs(scene, scene.views(config.split), maps, config)
     if splat is not None and config.method == "paper":
         raise ValueError("splat: expected none for method 'paper', which trains its own Gaussians; leave it out")
-    run = Run(Path(folder), report)
-    options: dict[str, Any] = {"progress": progress, "callback": callback}
-    teacher = getattr(maps, "identity", None)
-    lenses = [] if scene.lenses is None else [scene.lenses[i] for i in views]
-    if lenses and not config.undistorted_features:
-        maps = UndistortedMaps(maps, lenses)
-    features = {"files": map_digests(run, maps), "lenses": _lens_digest(maps)}
-    cameras = [scene.cameras[i] for i in views]
-    if config.method == "fuse":
-        color = replace(config.color, seed=config.seed, split=config.split)
-        geometry, where = find_geometry(run, scene, splat, color, target_device, options)
-        found = uplift_stage(run, geometry, cameras, maps, features, config.uplift, config.seed, progress)
-        about: dict[str, Any] = {"geometry": where}
-    else:
-        found = _paper_stages(run, scene, views, maps, features, config, target_device, options)
-        found = answers_stage(run, found, cameras)
-        about = {"mode": config.mode}
+    run, teacher = Run(Path(folder), report), getattr(maps, "identity", None)
+    job = _job(run, scene, maps, config, target_device, {"progress": progress, "callback": callback})
+    found, about = _make_field(job, splat)
     done = FitResult(found, Path(folder), run.stages)
     info = {
         "method": config.method,
         **about,
         "seed": config.seed,
-        "views": [camera.name for camera in cameras],
-        "teacher_map": list(map_shape(maps)),
+        "views": [camera.name for camera in job.cameras],
+        "teacher_map": list(map_shape(job.maps)),
         **({"teacher": teacher} if teacher else {}),
         **({} if scene.folder is None else remember(scene.folder, done.field_path)),
         "seconds": {stage.name: round(stage.seconds, 3) for stage in run.stages},
@@ -310,33 +295,69 @@ def fit_scene(
     return done
 
 
-def _paper_stages(
-    run: Run,
-    scene: Scene,
-    views: Sequence[int],
-    maps: Maps,
-    features: dict[str, Any],
-    config: FitConfig,
-    device: torch.device,
-    options: dict[str, Any],
-) -> SemanticField:
+def _make_field(job: _Job, splat: Gaussians | SplatFile | str | Path | None) -> tuple[SemanticField, dict[str, Any]]:
+    """All stages of a method: the field, and what `field.json` tells about how it was made."""
+    config = job.config
+    if config.method == "paper":
+        return answers_stage(job.run, _paper_stages(job), job.cameras), {"mode": config.mode}
+    geometry, where = find_geometry(job.run, job.scene, splat, _color_config(config), job.device, job.options)
+    progress = bool(job.options["progress"])
+    inputs = {"features": job.features, "config": asdict(config.uplift), "seed": config.seed}
+    found = uplift_stage(job.run, geometry, job.cameras, job.maps, config.uplift, inputs, progress)
+    return found, {"geometry": where}
+
+
+def _paper_stages(job: _Job) -> SemanticField:
     """Figure 2: codebook, index maps, autoencoder, and Gaussians trained on what they make of the maps."""
-    codebook, autoencoder = None, None
-    targets: Sequence[Tensor] = KnownFeatures(maps)
-    if config.mode == "decouple":
-        inputs: dict[str, Any] = {"mode": config.mode, "features": features}
+    codebook, autoencoder, mode = None, None, job.config.mode
+    targets: Sequence[Tensor] = KnownFeatures(job.maps)
+    if mode == "decouple":
+        inputs: dict[str, Any] = {"mode": mode, "features": job.features}
     else:
-        codebook, made = _codebook_stage(run, maps, features, config, options)
-        index_maps, indexed = _index_stage(run, maps, features, codebook, made, bool(options["progress"]))
-        inputs = {"mode": config.mode, "index_maps": indexed.key}
+        codebook, made = _codebook_stage(job)
+        index_maps, indexed = _index_stage(job, codebook, made)
+        inputs = {"mode": mode, "index_maps": indexed.key}
         targets = LatentMaps(index_maps, codebook.codewords)
-        if config.mode == "adc+sc":
-            autoencoder, compressed = _autoencoder_stage(run, codebook, made, config, options)
+        if mode == "adc+sc":
+            autoencoder, compressed = _autoencoder_stage(job, codebook, made)
             inputs["autoencoder"] = compressed.key
             with torch.no_grad():
                 targets = LatentMaps(index_maps, autoencoder.encode(codebook.codewords))
-    params, _ = _field_stage(run, scene, views, targets, inputs, config, device, options)
-    return SemanticField(params.activated().detach(), codebook, autoencoder)
+    return SemanticField(_field_stage(job, targets, inputs).activated().detach(), codebook, autoencoder)
+
+
+def _job(run: Run, scene: Scene, maps: Maps, config: FitConfig, device: torch.device, options: dict[str, Any]) -> _Job:
+    views = scene.views(config.split)
+    lenses = [] if scene.lenses is None else [scene.lenses[i] for i in views]
+    straight = UndistortedMaps(maps, lenses) if lenses and not config.undistorted_features else maps
+    removed = None if straight is maps else digest_value([describe_lens(lens) for lens in lenses])
+    features = {"files": map_digests(run, straight), "lenses": removed}
+    return _Job(run, scene, views, straight, features, config, device, options)
+
+
+def finished_stages(scene: Scene, maps: Maps | None, folder: str | Path, config: FitConfig) -> set[str]:
+    """The names of the stages that `fit_scene` would find in a run folder and not make again; nothing is written.
+
+    Args:
+        scene: as for `fit_scene`.
+        maps: as for `fit_scene`; None if there are none yet: then only a stage without maps can be found.
+        folder: the run folder, which need not exist.
+        config: as for `fit_scene`.
+    """
+    run, device = Run(Path(folder), look_only=True), torch.device("cpu")
+    options = {"progress": False, "callback": None}
+    with suppress(UnfinishedError):
+        if maps is not None:
+            _make_field(_job(run, scene, maps, config, device, options), None)
+        elif config.method == "fuse":
+            find_geometry(run, scene, None, _color_config(config), device, options)
+    names = {stage.name for stage in run.stages}
+    longer = config.method == "fuse" and find_color(run, scene, _color_config(config)) is not None
+    return names | {"color"} if longer else names
+
+
+def _color_config(config: FitConfig) -> ColorConfig:
+    return replace(config.color, seed=config.seed, split=config.split)
 
 
 def _is_saved(field: SemanticField, path: Path) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from ..formats import SplatFile, read_splats
 from ..gaussians import Gaussians
 from ..quant import LinearLatents
 from ..scenes import Scene
-from .color import ColorConfig, find_color, fit_color
+from .color import ColorConfig, find_color, make_color
 from .digests import digest_tensors, stage_generator
 from .maps import Maps, UndistortedMaps, check_readable
 from .stages import Run
@@ -48,9 +47,7 @@ def find_geometry(
         return read_splats(splat).gaussians, str(splat)
     found = find_color(run, scene, config)
     if found is None:
-        made = fit_color(scene, run.folder, config, report=run.report, device=device, **options)
-        run.stages.extend(made.stages)
-        found = made.gaussians
+        found = make_color(run, scene, config, device, options).gaussians
     return found, "trained on the pictures"
 
 
@@ -59,26 +56,26 @@ def uplift_stage(
     geometry: Gaussians,
     cameras: Sequence[Camera],
     maps: Maps,
-    features: dict[str, Any],
     config: UpliftConfig,
-    seed: int,
+    inputs: dict[str, Any],
     progress: bool,
 ) -> SemanticField:
-    """Fuse the maps onto the Gaussians, merge and compress, as a stage of a run."""
+    """Fuse the maps onto the Gaussians, merge and compress, as a stage of a run.
+
+    `inputs` says what decides the result beside Gaussians and cameras: `features` (the maps), `config` and `seed`.
+    """
     inputs = {
         "geometry": digest_tensors(*(getattr(geometry, name) for name in SHAPE)),
         "cameras": _digest_cameras(cameras),
-        "features": features,
-        "config": asdict(config),
-        "seed": seed,
+        **inputs,
     }
-
-    scratch = run.scratch("uplift", {"features": features, "cameras": inputs["cameras"], "pixels": config.pixels})
+    pictures = {"features": inputs["features"], "cameras": inputs["cameras"], "pixels": config.pixels}
+    scratch = run.scratch("uplift", pictures)
 
     def make(folder: Path) -> None:
         check_readable(maps, "the uplift")
         options: dict[str, Any] = {"scratch": scratch, "progress": progress, "report": run.report}
-        generator = stage_generator(seed, "uplift")
+        generator = stage_generator(inputs["seed"], "uplift")
         found = uplift_maps(geometry.to("cpu"), cameras, maps, config, generator=generator, **options)
         cloud = found.gaussians
         tensors = {name: getattr(cloud, name) for name in (*SHAPE, "features")}

@@ -1,8 +1,9 @@
-"""Teacher maps on their way into a run: the lens removed where the scene's was, unknown pixels marked."""
+"""Teacher maps as a run uses them: lens distortion removed if it was removed from the scene, unknown pixels marked."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -17,10 +18,10 @@ from .stages import Run
 
 
 class Maps(Protocol):
-    """Teacher maps on disk, one file per view, read when asked for; an all-zero feature says "nothing known".
+    """Teacher maps, one per view, read when they are asked for; an all-zero feature means "unknown".
 
-    Four more members are used where they exist: `identity`, JSON that tells which teacher made them; `digests() ->
-    list[list[str]] | None`, what decides each map, when that is known without reading the files; `shape`, (h, w, D) without
+    Four more members are used if they exist: `identity`, JSON that says which teacher made them; `digests() ->
+    list[list[str]] | None`, what decides each map, if that is known without reading the files; `shape`, (h, w, D) without
     reading values; and `grid(i, step, samples)`, see `fit_codebook`.
     """
 
@@ -36,9 +37,9 @@ class Maps(Protocol):
 
 
 class UndistortedMaps:
-    """Maps of the pictures as they were taken, brought to the undistorted views of a scene.
+    """Maps of the pictures as they were taken, changed into maps of the undistorted views of a scene.
 
-    Where the lens saw nothing, the feature becomes all-zero.
+    Where the lens saw nothing, the feature is all-zero.
 
     Args:
         maps: one per view, of the distorted pictures.
@@ -65,28 +66,24 @@ class UndistortedMaps:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(h, w, D) of every map, as the maps say it; a lens changes no size."""
+        """(h, w, D) of every map; removing distortion changes no size."""
         return map_shape(self.maps)
 
     def digests(self) -> list[list[str]] | None:
-        """What decides each map before the lens is removed; None if the maps cannot tell."""
+        """What decides each map before its distortion is removed; None if the maps do not know."""
         return _own_digests(self.maps)
 
     def __getitem__(self, i: int, /) -> Tensor:  # [h, w, D]
         return self._straighten(i, self.maps[i])
 
     def grid(self, i: int, step: tuple[int, int] | None = None, samples: int = SAMPLES) -> Tensor:  # [n, D]
-        """`sample_grid(self[i], step, samples=samples)`, looking only at these pixels where the view has no lens."""
-        lens, has = self.lenses[i], {name for name in ("grid", "grid_after") if hasattr(self.maps, name)}
-        if lens.distortion is None and "grid" in has:
-            return self.maps.grid(i, step, samples)  # type: ignore[attr-defined, no-any-return]
-        if "grid_after" in has:  # maps that are made anew keep their samples
-
-            def change(features: Tensor) -> Tensor:
-                return self._straighten(i, features)
-
-            key = describe_lens(lens)
-            return self.maps.grid_after(i, step, samples, change=change, key=key)  # type: ignore[attr-defined, no-any-return]
+        """`sample_grid(self[i], step, samples=samples)`; if the view has no distortion, only these pixels are read."""
+        lens = self.lenses[i]
+        if lens.distortion is None and hasattr(self.maps, "grid"):
+            return self.maps.grid(i, step, samples)  # type: ignore[no-any-return]
+        if hasattr(self.maps, "grid_after"):  # recomputed maps, which store these samples
+            change, key = partial(self._straighten, i), describe_lens(lens)
+            return self.maps.grid_after(i, step, samples, change=change, key=key)  # type: ignore[no-any-return]
         return sample_grid(self[i], step, samples=samples)
 
     def _straighten(self, i: int, features: Tensor) -> Tensor:  # [h, w, D] -> [h, w, D]
@@ -98,7 +95,7 @@ class UndistortedMaps:
 
 
 class KnownFeatures(Sequence[Tensor]):
-    """Raw maps as targets of a field (`decouple`): pixels without a feature are NaN, which the loss leaves out."""
+    """Raw maps as targets of a field (`decouple`): unknown pixels are NaN, which the loss leaves out."""
 
     def __init__(self, maps: Maps) -> None:
         self.maps = maps
@@ -112,19 +109,19 @@ class KnownFeatures(Sequence[Tensor]):
 
 
 def map_digests(run: Run, maps: Maps) -> list[list[str]]:
-    """[file name, SHA-256] of each map: as the maps say, which may have been discarded since, or else of their files."""
+    """[file name, SHA-256] of each map: from the maps if they know (they may have been discarded), else from the files."""
     known = _own_digests(maps)
     return run.digests(maps.files) if known is None else known
 
 
 def map_shape(maps: Maps) -> tuple[int, int, int]:
-    """(h, w, D) of the first map, without reading it where the maps can tell."""
+    """(h, w, D) of the first map, without reading it if the maps know their shape."""
     h, w, D = maps.shape if hasattr(maps, "shape") else maps[0].shape
     return int(h), int(w), int(D)
 
 
 def check_readable(maps: Maps, stage: str) -> None:
-    """Refuse to begin a stage that looks at maps which have been discarded.
+    """Refuse to begin a stage that reads maps if some of them have been discarded.
 
     Raises:
         FileNotFoundError: if a file is gone.

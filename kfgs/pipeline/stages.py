@@ -33,6 +33,10 @@ class Stage:
     reused: bool
 
 
+class UnfinishedError(Exception):
+    """A stage is not in the run folder, and `Run.look_only` says not to make it."""
+
+
 @dataclass
 class Run:
     """The stages of one run folder, in the order they were asked for.
@@ -49,6 +53,8 @@ class Run:
     folder: Path
     report: Callable[[str], None] | None = None
     stages: list[Stage] = field(default_factory=list)
+    look_only: bool = False
+    """Make and write nothing: a stage that is not finished raises `UnfinishedError`, and files are not digested."""
 
     def stage(self, name: str, inputs: dict[str, Any], make: Callable[[Path], float | None]) -> Stage:
         """Return the finished stage of these inputs, making it if it is not there.
@@ -60,13 +66,16 @@ class Run:
 
         Raises:
             ValueError: if a folder of that key is damaged.
+            UnfinishedError: if the stage is not there, and `look_only` is True.
         """
         key = _key(name, inputs)
         target = self.folder / "stages" / f"{name}-{key}"
         if (target / STAGE_FILE).is_file():
             about = read_json(target / STAGE_FILE)
             if about.get("inputs") != json.loads(json.dumps(inputs)):
-                raise ValueError(f"{target}: expected the stage of these inputs, found another's; delete the folder")
+                raise ValueError(
+                    f"{target}: expected the stage of these inputs, found the inputs of another stage; delete it"
+                )
             if about.get("files") != _sizes(target):
                 raise ValueError(
                     f"{target}: expected the files {about.get('files')} (name: bytes), found {_sizes(target)}; the stage "
@@ -74,6 +83,8 @@ class Run:
                 )
             done = Stage(name, key, target, float(about["seconds"]), True)
             self._say(f"{name}: found in {target.name} (made in {done.seconds:.1f} s)")
+        elif self.look_only:
+            raise UnfinishedError(name)
         else:
             self._say(f"{name}: working")
             start = time.perf_counter()
@@ -94,7 +105,10 @@ class Run:
         return self.folder / "unfinished" / f"{name}-{_key(name, inputs)}"
 
     def digests(self, paths: Sequence[Path]) -> list[list[str]]:
-        """[file name, SHA-256] of each file, in the order given; a file that has not changed is not read again."""
+        """[file name, SHA-256] of each file, in the order given; a file that has not changed is not read again.
+
+        With `look_only`, a file that would have to be read gets "unknown", which is the digest of no finished stage.
+        """
         cache_path = self.folder / "digests.json"
         cache: dict[str, Any] = read_json(cache_path) if cache_path.is_file() else {}
         result, changed = [], False
@@ -103,6 +117,9 @@ class Run:
             mark = [info.st_size, info.st_mtime_ns, info.st_ctime_ns]
             known = cache.get(str(path.resolve()))
             if known is None or known[:-1] != mark:
+                if self.look_only:
+                    result.append([path.name, "unknown"])
+                    continue
                 known = [*mark, digest_file(path)]
                 cache[str(path.resolve())] = known
                 changed = True

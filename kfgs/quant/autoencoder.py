@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._check import check_range, check_shapes
+from .._check import as_tensor, check_range, check_shapes
 from .._rows import unit_rows
 from ._store import read_tensors, write_tensors
 
@@ -45,6 +45,10 @@ class Autoencoder:
             width = int(weight.shape[0])
         if width != self.dim:
             raise ValueError(f"decoder: expected {self.dim} output channels (the encoder's input), got {width}")
+
+    def __repr__(self) -> str:
+        widths = [self.dim, *(len(bias) for _, bias in (*self.encoder, *self.decoder))]
+        return f"Autoencoder({self.dim} channels to {self.latent} latents and back, widths {widths})"
 
     @property
     def dim(self) -> int:
@@ -139,6 +143,7 @@ class Autoencoder:
         return ((unit - self.low) / (self.high - self.low)).clamp(0, 1)
 
     def _by_chunk(self, name: str, x: Tensor, width: int, chunk: int, function: Any) -> Tensor:
+        x = as_tensor(name, x, floating=True)
         if x.ndim < 1 or x.shape[-1] != width:
             raise ValueError(
                 f"{name}: expected [..., {width}] (from the autoencoder's weights), got {tuple(x.shape)}; "

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import check_shapes, check_whole
 from .._rows import EPS, row_norms, unit_rows
 
@@ -18,6 +19,9 @@ class Clusters(NamedTuple):
 
     centres: Tensor  # [K, D] unit rows
     group: Tensor  # [n] int64, the group of each feature
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def spherical_kmeans(

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .._check import check_range, check_shapes
+from .._card import html_card, short_repr, short_value
+from .._check import as_tensor, check_range, check_shapes
 from .._rows import EPS, row_norms, unit_rows
 from ._store import read_tensors, write_tensors
 
@@ -23,6 +24,9 @@ class Nearest(NamedTuple):
 
     codeword: Tensor  # [...] int64
     similarity: Tensor  # [...] cosine with that codeword, in [-1, 1] up to rounding
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 class Compared(NamedTuple):
@@ -82,6 +86,7 @@ class Codebook:
     codewords: Tensor  # [K, D]
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "codewords", as_tensor("codewords", self.codewords))
         check_shapes(("codewords", self.codewords, "K D"))
         if self.size < 1 or not self.codewords.is_floating_point():
             raise ValueError(
@@ -94,6 +99,12 @@ class Codebook:
             raise ValueError(
                 f"codewords: expected finite rows that are not all-zero, got bad rows {bad[:8]}; leave them out"
             )
+
+    __repr__ = short_repr
+
+    def _repr_html_(self) -> str:
+        facts = {"codewords": self.size, "channels": self.dim, "numbers": short_value(self.codewords)}
+        return html_card("Codebook", facts)
 
     @property
     def size(self) -> int:
@@ -115,8 +126,7 @@ class Codebook:
         features: Tensor,  # [..., D]
     ) -> Tensor:  # [..., K]
         """Cosine similarity of each feature with each codeword; 0 for an all-zero feature. Differentiable."""
-        self._check_features(features)
-        return unit_rows(features.to(self.unit.dtype)) @ self.unit.T
+        return unit_rows(self._checked(features).to(self.unit.dtype)) @ self.unit.T
 
     def nearest(
         self,
@@ -130,8 +140,7 @@ class Codebook:
             Ties go to the lowest index. An all-zero feature is equally (0) similar to all, and so gets index 0 with
             similarity 0, by which it can be told.
         """
-        self._check_features(features)
-        index, best, length = compare(features, self.unit, chunk=chunk)
+        index, best, length = compare(self._checked(features), self.unit, chunk=chunk)
         shortest = max(EPS, torch.finfo(best.dtype).tiny)  # as in unit_rows
         return Nearest(index, (best / length.clamp_min(shortest)).to(best.dtype))
 
@@ -142,8 +151,7 @@ class Codebook:
         chunk: int = CHUNK,
     ) -> Tensor:  # [...] int64
         """The index map M of Eq. 5: for each feature, t = argmax_e cos(f, f_e). Ties as in `nearest`."""
-        self._check_features(features)
-        return compare(features, self.unit, chunk=chunk).codeword
+        return compare(self._checked(features), self.unit, chunk=chunk).codeword
 
     def to(self, *args: Any, **kwargs: Any) -> Codebook:
         """Move or convert the codewords as `Tensor.to` does."""
@@ -178,9 +186,11 @@ class Codebook:
         """
         return Codebook.from_tensors(read_tensors(path, kind="codebook"))
 
-    def _check_features(self, features: Tensor) -> None:
+    def _checked(self, features: Tensor) -> Tensor:
+        features = as_tensor("features", features)
         if features.ndim < 1 or features.shape[-1] != self.dim:
             raise ValueError(
                 f"features: expected [..., D] with D = {self.dim} (from codewords), got {tuple(features.shape)}; "
                 "pass features of the teacher that the codebook was fitted to"
             )
+        return features

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from .._card import short_repr
 from .._check import check_range, check_whole
 from .._rows import row_norms, unit_rows
 from .autoencoder import Autoencoder, Layer, mlp, unit_latents
@@ -83,6 +84,8 @@ class AutoencoderFit:
     min_latent_distance: float
     """Smallest Euclidean distance between two codewords' latents (infinite for one codeword)."""
 
+    __repr__ = short_repr
+
 
 def fit_autoencoder(
     codebook: Codebook,
@@ -110,10 +113,17 @@ def fit_autoencoder(
     Returns:
         The autoencoder, the history, the latents, and how many codewords are recovered.
 
+    Raises:
+        TypeError: if `codebook` is something else.
+
     Note:
         The released script compares unit outputs with codewords of any length (an error that cannot vanish), and uses
         running statistics that the decoder was not trained with.
     """
+    if not isinstance(codebook, Codebook):
+        raise TypeError(
+            f"codebook: expected a Codebook, got {type(codebook).__name__}; make one with Codebook(codewords)"
+        )
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     target = codebook.unit.detach()
     encoder = _linears((codebook.dim, *config.encoder, config.latent), generator, target)

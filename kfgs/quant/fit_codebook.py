@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from .._check import check_range, check_shapes, check_whole
+from .._card import short_repr
+from .._check import as_tensor, check_range, check_shapes, check_whole
 from .._rows import EPS, row_norms, unit_rows
 from .codebook import Codebook
 from .evolve import admit, prune
@@ -121,6 +122,8 @@ class CodebookFit:
     """The similarity that `coverage` counts: `expand_below`, or what the data reached."""
     note: str | None
     """One line that says what to do when the book is full or covers too little; None if all is well."""
+
+    __repr__ = short_repr
 
 
 def fit_codebook(
@@ -363,7 +366,7 @@ def _samples(maps: FeatureMaps, i: int, config: CodebookConfig, dim: int | None 
         features = grid(i, config.grid_step, config.samples_of(len(maps)))
         check_shapes((f"maps.grid({i})", features, f"n {dim or 'D'}"))
     else:
-        feature_map = maps[i]  # once: this may read a file
+        feature_map = as_tensor(f"maps[{i}]", maps[i])  # once: this may read a file
         check_shapes((f"maps[{i}]", feature_map, f"h w {dim or 'D'}"))
         features = sample_grid(feature_map, config.grid_step, samples=config.samples_of(len(maps)))
     # row by row, whatever memory they come in: sums over another layout differ in their last bits

@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._check import check_range, check_shapes, check_whole
+from .._card import short_repr
+from .._check import as_tensor, check_range, check_shapes, check_whole
 from .._rows import unit_rows
 
 NOISE = 1e-10  # of the first eigenvalue: what float32 rounding puts into a direction that the data do not have
@@ -35,6 +36,8 @@ class LinearLatents:
         if not bool((gram - torch.eye(sizes["d"]).to(gram)).abs().max() < 1e-3):
             raise ValueError("basis: expected orthonormal columns, got others; make one with fit_linear_latents")
 
+    __repr__ = short_repr
+
     @property
     def dim(self) -> int:
         """Channels of a feature, D."""
@@ -50,7 +53,7 @@ class LinearLatents:
         features: Tensor,  # [..., D]
     ) -> Tensor:  # [..., d]
         """The latents of features: Bᵀ f, the least-squares ones."""
-        _check_last("features", features, self.dim)
+        features = _checked("features", features, self.dim)
         return features @ self.basis.to(features)
 
     def decode(
@@ -58,7 +61,7 @@ class LinearLatents:
         latents: Tensor,  # [..., d]
     ) -> Tensor:  # [..., D]
         """The features of latents, B z, as long as the latents are."""
-        _check_last("latents", latents, self.latent)
+        latents = _checked("latents", latents, self.latent)
         return latents @ self.basis.T.to(latents)
 
     def cosines(
@@ -67,7 +70,7 @@ class LinearLatents:
         rows: Tensor,  # [C, D] unit rows
     ) -> Tensor:  # [..., C]
         """The cosine of each decoded feature with some unit rows; 0 for an all-zero latent. No feature is made."""
-        _check_last("latents", latents, self.latent)
+        latents = _checked("latents", latents, self.latent)
         return unit_rows(latents) @ (rows.to(latents) @ self.basis.to(latents)).T
 
     def to(self, *args: Any, **kwargs: Any) -> LinearLatents:
@@ -118,6 +121,7 @@ def fit_linear_latents(
     Raises:
         ValueError: if shapes disagree, an option is out of range, a number is not finite, or there is nothing but zeros.
     """
+    features = as_tensor("features", features, floating=True)
     sizes = check_shapes(("features", features, "n D"), ("weights", weights, "n"))
     check_range("keep", keep, 0, 1, closed=(False, True))
     check_whole("minimum", minimum, 1)
@@ -138,9 +142,11 @@ def fit_linear_latents(
     return LinearLatents(vectors[:, :count].to(features))
 
 
-def _check_last(name: str, values: Tensor, channels: int) -> None:
+def _checked(name: str, values: Tensor, channels: int) -> Tensor:
+    values = as_tensor(name, values, floating=True)
     if values.ndim < 1 or values.shape[-1] != channels:
         raise ValueError(
             f"{name}: expected [..., {channels}] (from the basis), got {tuple(values.shape)}; pass what belongs to the same "
             "field"
         )
+    return values

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import check_shapes
 from .._rows import EPS, row_norms
 
@@ -17,6 +18,9 @@ class BalancedLoss(NamedTuple):
     loss: Tensor  # []
     gradient: Tensor  # [K, D], zero for a codeword without features
     counts: Tensor  # [K] int64, features of each codeword
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def class_balanced_loss(

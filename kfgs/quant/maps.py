@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from .._check import check_shapes
+from .._check import as_tensor, check_shapes
 from .._files import atomic_path
 from .._rows import EPS
 from ._store import read_tensors, write_tensors
@@ -124,6 +124,9 @@ class LatentMaps(Sequence[Tensor]):
         self.index_maps, self.latents = index_maps, latents
         self._rows = torch.cat([latents, torch.full_like(latents[:1], torch.nan)])
 
+    def __repr__(self) -> str:
+        return f"LatentMaps({len(self)} maps, {self.latents.shape[1]} channels)"
+
     def __len__(self) -> int:
         return len(self.index_maps)
 
@@ -171,7 +174,7 @@ def quantize_maps(
 
 
 def _quantize_map(maps: FeatureMaps, i: int, codebook: Codebook) -> NDArray[np.uint16]:  # [h, w]
-    feature_map = maps[i]  # once: this may read a file
+    feature_map = as_tensor(f"maps[{i}]", maps[i])  # once: this may read a file
     check_shapes((f"maps[{i}]", feature_map, f"h w {codebook.dim}"))
     index, _, length = compare(feature_map, codebook.unit)
     if not bool(torch.isfinite(length).all()):

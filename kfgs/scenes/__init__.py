@@ -1,13 +1,11 @@
 """Scenes: posed images and points, read from what COLMAP, nerfstudio, instant-ngp and Blender write, or estimated."""
 
+from ..cameras.bounds import Bounds, robust_bounds
 from .colmap import load_colmap
-from .colmap_check import ModelSummary, check_model
-from .errors import SceneError
-from .files import list_images
+from .colmap_model import ColmapModel, read_model
+from .files import SceneError, file_stem, list_images, natural_key, read_image
 from .load import load_scene
-from .names import file_stem, natural_key
-from .points import Bounds, robust_bounds
-from .scene import Scene, read_image
+from .scene import Scene
 from .sfm import SfmConfig, SfmReport, run_sfm
 from .splits import make_split, read_split, split_every
 from .transforms import load_transforms
@@ -15,12 +13,11 @@ from .undistort import undistort_scene
 
 __all__ = [
     "Bounds",
-    "ModelSummary",
+    "ColmapModel",
     "Scene",
     "SceneError",
     "SfmConfig",
     "SfmReport",
-    "check_model",
     "file_stem",
     "list_images",
     "load_colmap",
@@ -29,6 +26,7 @@ __all__ = [
     "make_split",
     "natural_key",
     "read_image",
+    "read_model",
     "read_split",
     "robust_bounds",
     "run_sfm",

@@ -8,9 +8,8 @@ from typing import Literal
 
 from .._check import check_choice
 from .colmap import load_colmap
-from .colmap_check import has_model
-from .errors import SceneError
-from .names import some
+from .colmap_model import has_model
+from .files import SceneError, some
 from .scene import Scene
 from .splits import choose_split, make_split, read_split
 from .transforms import load_transforms

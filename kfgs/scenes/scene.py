@@ -2,47 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from operator import index
 from pathlib import Path
 
 import torch
-from kornia.io import ImageLoadType, load_image
 from torch import Tensor
 
+from .._card import html_card
 from .._check import check_shapes
 from ..cameras.camera import NEAR, Camera
 from ..cameras.undistort import undistort
-from .errors import SceneError
-from .names import file_stem
+from .files import SceneError, file_stem, read_image
 
 NEAR_SHARE = 0.1  # of the extent: 3DGS's 0.2 is that of cameras 2 m about; in smaller frames the near plane follows
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")  # what kornia decodes
-
-
-def read_image(path: str | Path) -> Tensor:  # [H, W, 3] float32 in [0, 1]
-    """Read a PNG, JPEG, TIFF or WebP file; transparency is laid on white, EXIF orientation is ignored as COLMAP does.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        SceneError: if it cannot be decoded.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected an image there")
-    try:
-        image = load_image(str(path), ImageLoadType.RGB32)
-    except (ValueError, RuntimeError, OSError) as error:
-        raise SceneError(
-            f"{path}: expected a PNG, JPEG, TIFF or WebP image, but it cannot be decoded ({error}); "
-            "replace the file or take it out of the scene"
-        ) from error
-    return image.permute(1, 2, 0).contiguous()
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
     """V posed views of one place. Images are read when asked for, one at a time.
+
+    `scene.select("train").cameras` and `.image_paths` are those of one split; `scene.image(i)` is a picture.
 
     **Convention**: world to camera, pixel centres on halves (`Camera`); world units are the file's. Views are in
     natural order of their names where a loader made the scene.
@@ -89,6 +70,20 @@ class Scene:
     def __repr__(self) -> str:
         splits = ", ".join(f"{name} {len(views)}" for name, views in self.splits.items())
         return f"Scene({len(self)} views, {len(self.points)} points, splits: {splits or 'none'})"
+
+    def _repr_html_(self) -> str:
+        sizes = sorted({f"{camera.width}x{camera.height}" for camera in self.cameras})
+        facts = {
+            "folder": None if self.folder is None else str(self.folder),
+            "views": len(self),
+            **{f"split {name}": len(views) for name, views in self.splits.items()},
+            "pixels": ", ".join(sizes[:3]) + (f" and {len(sizes) - 3} more sizes" if len(sizes) > 3 else ""),
+            "lens": "distorted: use scene.undistorted()" if self.distorted else "pinhole",
+            "points": len(self.points),
+            "extent": f"{self.extent:.4g} world units" if len(self) else None,
+            **{f"note {i}": note for i, note in enumerate(self.notes, 1)},
+        }
+        return html_card("Scene", facts)
 
     def stem(self, i: int) -> str:
         """The name of view `i` without its suffix: what feature and label files are called."""
@@ -169,11 +164,11 @@ class Scene:
         near = min(NEAR, NEAR_SHARE * replace(self, splits={}).extent) or NEAR  # 0: all in one point, no length
         return replace(self, cameras=[replace(camera, near=near) for camera in self.cameras])
 
-    def select(self, which: str | Sequence[str] | Sequence[int]) -> Scene:
-        """The scene with some of its views; points stay, splits keep their names.
+    def select(self, which: str | Iterable[str] | Iterable[int]) -> Scene:
+        """The scene with some of its views, in the order given; points stay, splits keep their names.
 
         Args:
-            which: the name of a split, or a list of view names (with or without suffix), or of indices.
+            which: the name of a split, such as "train"; or names of views (with or without suffix), or their indices.
 
         Raises:
             ValueError: if a split or a view is unknown.
@@ -188,16 +183,19 @@ class Scene:
             splits={name: sorted(place[i] for i in views if i in place) for name, views in self.splits.items()},
         )
 
-    def _resolve(self, which: str | Sequence[str] | Sequence[int]) -> list[int]:
+    def _resolve(self, which: str | Iterable[str] | Iterable[int]) -> list[int]:
         if isinstance(which, str):
             if which not in self.splits:
-                raise ValueError(f"which: expected one of the splits {sorted(self.splits)}, got {which!r}")
+                raise ValueError(
+                    f"which: expected one of the splits {sorted(self.splits)}, got {which!r}; pass a list to select views "
+                    "by name"
+                )
             return list(self.splits[which])
         by_name = {camera.name: i for i, camera in enumerate(self.cameras)}
         by_name |= {self.stem(i): i for i in range(len(self))}
         indices: list[int] = []
         for view in which:
-            i = by_name.get(view) if isinstance(view, str) else view
+            i = by_name.get(view) if isinstance(view, str) else index(view)  # also numpy's and torch's integers
             if i is None or not 0 <= i < len(self):
                 raise ValueError(
                     f"which: expected names or indices of the scene's {len(self)} views, got {view!r}; "

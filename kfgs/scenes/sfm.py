@@ -13,11 +13,9 @@ from tqdm import tqdm
 
 from .._check import check_choice, check_range
 from .._files import atomic_folder
-from ._pycolmap import quiet_pycolmap, wrapped
 from .colmap import SUPPORTED_MODELS
-from .errors import SceneError
-from .files import list_images
-from .names import some
+from .files import SceneError, list_images, some
+from .pycolmap_import import quiet_pycolmap, scene_errors
 
 OVERLAP = 10
 """Following images that each image of a video is compared with, and how many powers of two beyond (COLMAP's default)."""
@@ -111,7 +109,9 @@ def run_sfm(
     with (
         tempfile.TemporaryDirectory(prefix="kfgs-sfm-") as scratch,
         quiet_pycolmap() as pycolmap,
-        wrapped(f"{images}: expected images that pycolmap can register", "check the images and the free disk space"),
+        scene_errors(
+            f"{images}: expected images that pycolmap can register", "check the images and the free disk space"
+        ),
         tqdm(disable=not progress, unit="image") as bar,
     ):
         run = _Run(pycolmap, images, names, Path(scratch), config, bar)

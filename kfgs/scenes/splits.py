@@ -8,8 +8,7 @@ from typing import Any, Literal
 
 from .._check import check_choice
 from .._files import read_json
-from .errors import SceneError
-from .names import file_stem
+from .files import SceneError, file_stem
 
 SplitRule = Literal["df3dgs", "holdout8", "all"]
 

@@ -21,9 +21,8 @@ from torch import Tensor
 from .._files import read_json
 from ..cameras.camera import Camera, Distortion
 from ..formats.ply import points_from_columns, read_ply
-from .errors import SceneError
-from .names import natural_key, some
-from .scene import IMAGE_SUFFIXES, Scene, read_image
+from .files import IMAGE_SUFFIXES, SceneError, is_file, natural_key, read_image, some
+from .scene import Scene
 
 _PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
@@ -157,20 +156,12 @@ def _find_image(reader: _Reader, listed: str) -> Path | None:
     if "\0" in listed:
         return None
     for candidate in _candidates(reader, listed):
-        if candidate.suffix.lower() in IMAGE_SUFFIXES and _is_file(candidate):
+        if candidate.suffix.lower() in IMAGE_SUFFIXES and is_file(candidate):
             return candidate
         for suffix in IMAGE_SUFFIXES:
-            if candidate.name and _is_file(with_suffix := candidate.with_name(candidate.name + suffix)):
+            if candidate.name and is_file(with_suffix := candidate.with_name(candidate.name + suffix)):
                 return with_suffix
     return None
-
-
-def _is_file(path: Path) -> bool:
-    """Is there such a file? Not under a name that is too long for the disk, over which `is_file` stumbles."""
-    try:
-        return path.is_file()
-    except OSError:
-        return False
 
 
 def _name(reader: _Reader, file: Path) -> str:
@@ -307,7 +298,7 @@ def _points(reader: _Reader, top: dict[str, Any]) -> tuple[Tensor, Tensor, list[
             "no points: this transforms.json names no ply_file_path; a field needs some to start from (`kfgs sfm` finds them)"
         ]
     file = reader.root / listed if isinstance(listed, str) and "\0" not in listed else None
-    if file is None or not _normal(file).is_relative_to(_normal(reader.root)) or not _is_file(file):
+    if file is None or not _normal(file).is_relative_to(_normal(reader.root)) or not is_file(file):
         return *nothing, [f"no points: ply_file_path {listed!r:.200} is no file inside {reader.root}"]
     try:
         columns = read_ply(file)

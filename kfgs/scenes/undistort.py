@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from .._files import atomic_folder
-from ._pycolmap import quiet_pycolmap, wrapped
-from .colmap_check import check_model
-from .errors import SceneError
+from .colmap_model import read_model
+from .files import SceneError
+from .pycolmap_import import quiet_pycolmap, scene_errors
 
 
 def undistort_scene(images: str | Path, model: str | Path, out: str | Path) -> Path:
@@ -35,12 +35,12 @@ def undistort_scene(images: str | Path, model: str | Path, out: str | Path) -> P
         raise SceneError(
             f"{out}: expected a new or empty folder for the undistorted scene, got one in use; choose another"
         )
-    check_model(model)
+    read_model(model)  # pycolmap must see no damaged file
     advice = "check the images, or run `colmap image_undistorter` yourself"
     with (
         atomic_folder(out) as folder,
         quiet_pycolmap() as pycolmap,
-        wrapped(f"{model}: expected a scene that pycolmap can undistort", advice),
+        scene_errors(f"{model}: expected a scene that pycolmap can undistort", advice),
     ):
         pycolmap.undistort_images(str(folder), str(model), str(images))
         written = folder / "sparse"

@@ -8,6 +8,7 @@ import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import check_range
 from ..cameras.camera import Camera
 from ..cameras.projection import camera_to_pixel, projection_jacobian, world_to_camera
@@ -30,6 +31,9 @@ class Projected(NamedTuple):
     opacities: Tensor  # [M]
     extents: Tensor  # [M, 2] half-widths of the box outside of which alpha < 1/255, pixels; no gradient
     index: Tensor  # type: ignore[assignment]  # [M] int64, which of the N Gaussians
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def project(

@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from .._card import html_card, short_value
 from ..cameras.camera import Camera
-from ..gaussians import Gaussians
+from ..gaussians import Gaussians, check_gaussians
 from .engines import composite
 from .project import Projected, project
 from .sh import evaluate_sh
@@ -20,6 +21,20 @@ class Rendering(NamedTuple):
     map: Tensor  # [H, W, D] features, or red, green, blue
     alpha: Tensor  # [H, W] opacity in [0, 1): 1 - transmittance
     projected: Projected  # the visible Gaussians on the image plane
+
+    def __repr__(self) -> str:
+        return f"Rendering(map {short_value(self.map)}, {len(self.projected.index)} Gaussians in sight)"
+
+    def _repr_html_(self) -> str:
+        height, width, channels = self.map.shape
+        facts = {
+            "size": f"{width} x {height} pixels",
+            "channels": channels,
+            "numbers": short_value(self.map),
+            "covered": f"{float((self.alpha.detach() > 0.5).float().mean()):.1%} of the pixels are more than half opaque",
+            "Gaussians in sight": len(self.projected.index),
+        }
+        return html_card("Rendering", facts)
 
 
 def rasterize(
@@ -47,8 +62,9 @@ def rasterize(
         `background`. Without a visible Gaussian the map is the background.
 
     Raises:
-        ValueError: if there is nothing to render with, the camera has distortion, or `background` has another number of
-            channels.
+        TypeError: if `gaussians` or `camera` is something else.
+        ValueError: if there is nothing to render with, tensors differ in dtype or device, the camera has distortion, or
+            `background` has another number of channels.
         ImportError: if a named engine is missing.
 
     Example:
@@ -65,6 +81,7 @@ def rasterize(
         >>> rendering.map.shape, rendering.alpha[1, 1] > rendering.alpha[0, 0]
         (torch.Size([4, 4, 2]), tensor(True))
     """
+    _check_arguments(gaussians, camera)
     if gaussians.features is None and gaussians.sh is None:
         raise ValueError("gaussians: expected features or sh to render, got neither; add them with gaussians.replace()")
     projected = project(gaussians, camera, near=near, engine=engine)
@@ -73,6 +90,21 @@ def rasterize(
     features, index = _seen(gaussians, camera, projected)
     maps, alphas = composite(*splats, features, tiles, background=background, index=index, engine=engine)
     return Rendering(maps, alphas, projected)
+
+
+def _check_arguments(gaussians: Gaussians, camera: Camera) -> None:
+    check_gaussians(gaussians)
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}; take one of scene.cameras")
+    means = gaussians.means
+    shown = "sh" if gaussians.features is None else "features"
+    for name in ("quats", "scales", "opacities", shown):
+        value = getattr(gaussians, name)
+        if value is not None and (value.dtype, value.device) != (means.dtype, means.device):
+            raise ValueError(
+                f"gaussians.{name}: expected {means.dtype} on {means.device} (from gaussians.means), got {value.dtype} on "
+                f"{value.device}; convert all of them with gaussians.to({means.device.type!r}, torch.float32)"
+            )
 
 
 def _seen(gaussians: Gaussians, camera: Camera, projected: Projected) -> tuple[Tensor, Tensor | None]:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import check_range, check_shapes
 from .engines import ops
 from .engines.contract import ALPHA_MIN
@@ -26,6 +27,9 @@ class Tiles(NamedTuple):
     width: int  # pixels
     height: int  # pixels
     tile_size: int  # pixels
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
     @property
     def grid(self) -> tuple[int, int]:

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ..cameras.similarity import Similarity
-from ..gaussians import Gaussians
+from ..gaussians import Gaussians, check_gaussians
 from .sh import rotate_sh
 
 
@@ -17,6 +17,9 @@ def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussia
     Means move, quaternions are turned (q' = q_R q, keeping their length), scales grow by s, spherical harmonics turn with
     R (`rotate_sh`). Opacities, features and labels stay as they are. dtype and device are kept; differentiable.
 
+    Raises:
+        TypeError: if an argument is something else.
+
     Example:
         >>> from kfgs.cameras import Similarity
         >>> one = Gaussians(torch.ones(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3), torch.ones(1))
@@ -24,6 +27,12 @@ def transform_gaussians(gaussians: Gaussians, similarity: Similarity) -> Gaussia
         >>> moved.means, moved.scales
         (tensor([[3., 3., 4.]]), tensor([[3., 3., 3.]]))
     """
+    check_gaussians(gaussians)
+    if not isinstance(similarity, Similarity):
+        raise TypeError(
+            f"similarity: expected a Similarity, got {type(similarity).__name__}; make one from a 4 x 4 matrix with "
+            "Similarity.from_matrix"
+        )
     return gaussians.replace(
         means=similarity.apply(gaussians.means),
         quats=_turn(gaussians.quats, similarity.rotation),

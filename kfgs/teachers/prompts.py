@@ -11,7 +11,7 @@ from torch import Tensor
 from .._check import check_shapes
 from .._rows import EPS, row_norms, unit_rows
 from ..labels.label_set import LabelSet
-from ..labels.relevancy import CANONICAL
+from ..labels.scores import CANONICAL
 from .protocol import PROMPTS_AT_ONCE, Teacher, as_teacher, identify
 
 _CLIP7 = (

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from ..scenes._pycolmap import import_pycolmap
+from ..scenes.pycolmap_import import import_pycolmap
 from .geometry import Array, project
 
 

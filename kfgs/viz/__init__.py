@@ -2,26 +2,23 @@
 
 from .animation import save_animation, save_frames
 from .boxes import add_boxes, add_names, add_selections
-from .clouds import CloudOptions, add_cloud, recolor_cloud
+from .clouds import CloudOptions, add_cloud, recolor_cloud, to_pyvista
 from .explorer import ExploreOptions, Explorer, explore
-from .field_colors import feature_colors
-from .flythrough import flythrough_cameras, save_flythrough
+from .field_colors import FeatureColors, feature_colors
+from .films import save_flythrough, save_turntable
 from .frusta import add_camera_images, add_cameras
 from .headless import available, make_plotter
+from .histograms import plot_distances, plot_scores
 from .legends import add_legend, add_scalar_bar
 from .linked import linked_clouds
-from .matches import Matches, add_matches, add_transfer, match_states, plot_distances
+from .matches import Matches, add_matches, add_transfer, match_states
 from .page import Page, save_page
-from .pairs import picture_grid
 from .palette import PALETTE, palette
-from .pictures import FeatureColors, legend_column, legend_strip, overlay_labels, save_picture
-from .plots import plot_codebook_history, plot_confusion, plot_iou, plot_training
-from .quality import plot_quality_storage
+from .pictures import legend_column, legend_strip, overlay_labels, picture_grid, save_picture
+from .plots import plot_codebook_history, plot_confusion, plot_iou, plot_quality_storage, plot_training
 from .reports import CodebookRows, codebook_rows, plot_codebook_growth, plot_codebook_report
-from .score_plot import plot_scores
 from .shows import show_cloud
 from .through import look_through
-from .turntable import Orbit, estimate_up, orbit_cameras, save_turntable
 
 __all__ = [
     "PALETTE",
@@ -31,7 +28,6 @@ __all__ = [
     "Explorer",
     "FeatureColors",
     "Matches",
-    "Orbit",
     "Page",
     "add_boxes",
     "add_camera_images",
@@ -45,17 +41,14 @@ __all__ = [
     "add_transfer",
     "available",
     "codebook_rows",
-    "estimate_up",
     "explore",
     "feature_colors",
-    "flythrough_cameras",
     "legend_column",
     "legend_strip",
     "linked_clouds",
     "look_through",
     "make_plotter",
     "match_states",
-    "orbit_cameras",
     "overlay_labels",
     "palette",
     "picture_grid",
@@ -76,4 +69,5 @@ __all__ = [
     "save_picture",
     "save_turntable",
     "show_cloud",
+    "to_pyvista",
 ]

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from .._check import check_range, check_whole
+from .._check import check_range
 from .._files import atomic_path
 from ..cameras import Camera
 from ..gaussians import Gaussians
@@ -44,7 +44,7 @@ def save_animation(
         path: a name that ends in .gif or .mp4. The file appears whole or not at all.
         shows: Gaussians (coloured by their labels, else by their harmonics), a function camera -> [H, W, 3] (such as
             `show_cloud` makes), or several of them by title, which are shown side by side.
-        cameras: one per frame, all of one size (`orbit_cameras`, `flythrough_cameras`).
+        cameras: one per frame, all of one size (`kfgs.cameras.orbit_cameras`, `path_cameras`).
         fps: frames per second, at most 50 in a GIF, which counts hundredths of a second.
         names: class names; when given, the classes of the labelled Gaussians are listed below every frame. Labelled
             Gaussians are those passed as such, not inside functions.
@@ -58,7 +58,7 @@ def save_animation(
         ImportError: for .mp4, where imageio-ffmpeg is not installed.
     """
     if not cameras:
-        raise ValueError("cameras: expected at least one camera, got none; make some with orbit_cameras")
+        raise ValueError("cameras: expected at least one camera, got none; make some with kfgs.cameras.orbit_cameras")
     sizes = sorted({camera.size for camera in cameras})
     if len(sizes) > 1:
         raise ValueError(f"cameras: expected one size for all frames, got {sizes}; make them equal with resized()")
@@ -75,14 +75,6 @@ def save_animation(
                 progress(done, len(cameras))
 
     return _write(path, frames(), fps, strip)
-
-
-def check_size(size: tuple[int, int]) -> None:
-    """Raise a ValueError unless `size` is (height, width) in whole pixels."""
-    if not isinstance(size, Sequence) or len(size) != 2:
-        raise ValueError(f"size: expected (height, width), got {size!r}; pass two whole numbers of pixels")
-    for axis, pixels in zip(("height", "width"), size, strict=True):
-        check_whole(f"size ({axis})", pixels, 1)
 
 
 def _blank(camera: Camera) -> Array:

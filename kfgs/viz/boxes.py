@@ -142,7 +142,7 @@ def add_selections(
     for number, (name, selection) in enumerate(selections.items()):
         if not isinstance(selection, Selection):
             raise TypeError(
-                f"selections[{name!r}]: expected a Selection, got {type(selection).__name__}; select_where(mask) makes one"
+                f"selections[{name!r}]: expected a Selection, got {type(selection).__name__}; Selection.of(mask) makes one"
             )
         check_shapes(("gaussians.means", gaussians.means, "N 3"), (f"selections[{name!r}].mask", selection.mask, "N"))
         if not selection:

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._check import check_choice, check_range, check_shapes
-from ..gaussians import Gaussians
+from .._check import as_array, check_choice, check_range, check_shapes
+from ..gaussians import Gaussians, check_gaussians
 from ..splat.sh import evaluate_sh, sh0_to_rgb
-from .arrays import as_array
+from .field_colors import FeatureColors, colors_of_features
 from .palette import UNLABELLED, palette
-from .pictures import FeatureColors, as_bytes
+from .pictures import as_bytes
 
 Array = np.ndarray[Any, Any]
 ColorBy = Literal["label", "rgb", "view", "opacity", "feature"]
@@ -31,7 +31,7 @@ class CloudColors(NamedTuple):
 
 def cloud_colors(
     gaussians: Gaussians,
-    color_by: ColorBy | Tensor | Array,
+    color_by: ColorBy | Tensor | Array | None,
     feature_colors: FeatureColors | None = None,
     clim: tuple[float, float] | None = None,
 ) -> CloudColors:
@@ -41,13 +41,15 @@ def cloud_colors(
         ValueError: if what to colour by is missing, or of another size.
         TypeError: if an array is neither of integers nor of floats, or there are no Gaussians but what holds some.
     """
-    if not isinstance(gaussians, Gaussians):
-        hint = "its .gaussians" if hasattr(gaussians, "gaussians") else "Gaussians"
-        raise TypeError(f"gaussians: expected Gaussians, got {type(gaussians).__name__}; pass {hint}")
+    check_gaussians(gaussians)
+    if color_by is None:
+        color_by = _what_there_is(gaussians)
+        if color_by == "feature" and feature_colors is None and gaussians.features is not None:
+            feature_colors = colors_of_features(gaussians.features)
     if isinstance(color_by, str):
         check_choice("color_by", color_by, get_args(ColorBy))
         return _named(gaussians, color_by, feature_colors, clim)
-    values = as_array(color_by) if isinstance(color_by, Tensor) else np.asarray(color_by)
+    values = as_array(color_by, "color_by")
     if values.ndim == 2:
         check_shapes(("gaussians", gaussians.opacities, "N"), ("color_by", values, "N 3"))
         return CloudColors(as_bytes(values), "rgb", None, None)
@@ -59,6 +61,15 @@ def cloud_colors(
             f"color_by: expected labels (integers) or scores (floats), got {values.dtype}; convert it first"
         )
     return CloudColors(palette(values), "label", values.astype(np.int64), None)
+
+
+def _what_there_is(gaussians: Gaussians) -> ColorBy:
+    """What to colour by if the caller does not say: classes, else colours, else features."""
+    if gaussians.labels is not None:
+        return "label"
+    if gaussians.sh is not None:
+        return "rgb"
+    return "opacity" if gaussians.features is None else "feature"
 
 
 def seen_from(gaussians: Gaussians, center: Array) -> Array:  # center: [3] -> [N, 3] uint8

@@ -13,15 +13,14 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 from torch import Tensor
 
-from .._check import check_choice, check_range, check_shapes
+from .._check import as_array, check_choice, check_range, check_shapes
 from ..cameras.camera import NEAR
 from ..gaussians import Gaussians
-from .arrays import as_array
 from .cloud_colors import CloudColors, ColorBy, cloud_colors, seen_from
 from .ellipsoids import ellipsoids
+from .field_colors import FeatureColors
 from .gaussian_actor import Moving, as_gaussians
 from .meshes import draw_mesh
-from .pictures import FeatureColors
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -63,7 +62,7 @@ def add_cloud(
     plotter: pv.Plotter,
     gaussians: Gaussians,
     *,
-    color_by: ColorBy | Tensor | Array = "label",
+    color_by: ColorBy | Tensor | Array | None = None,
     style: Style = "points",
     feature_colors: FeatureColors | None = None,
     clim: tuple[float, float] | None = None,
@@ -80,7 +79,8 @@ def add_cloud(
         gaussians: what to draw.
         color_by: `label` (the palette), `rgb` (`sh` without its dependence on the view), `view` (`sh` as seen from where
             the camera stands; Gaussians only), `opacity`, `feature` (through `feature_colors`); or one value for each
-            Gaussian: integers [N] are labels, floats [N] scores (not finite: grey), [N, 3] colours.
+            Gaussian: integers [N] are labels, floats [N] scores (not finite: grey), [N, 3] colours. None: labels if there are
+            any, else rgb, else features (in colours of this cloud alone), else opacity.
         style: `points` is quick and can be exported to HTML; `gaussians` is VTK's EWA splatting, the picture that kfgs's
             own rasteriser makes; `ellipsoids` are closed surfaces, for at most 100,000.
         feature_colors: the scene's projection of features to colours.
@@ -104,13 +104,7 @@ def add_cloud(
             f"color_by: expected 'rgb' for style {style!r}, got 'view'; only 'gaussians' follow the camera"
         )
     colors = cloud_colors(gaussians, color_by, feature_colors, clim)
-    import pyvista as pv
-
-    if style == "ellipsoids":
-        cloud = _surfaces(gaussians, options)
-    else:
-        cloud = pv.PolyData(as_array(gaussians.means).astype(np.float32))
-        cloud["index"] = np.arange(len(gaussians))
+    cloud = _surfaces(gaussians, options) if style == "ellipsoids" else _points(gaussians)
     _fill(cloud, gaussians, colors)
     if style == "points":
         return draw_mesh(
@@ -122,12 +116,38 @@ def add_cloud(
         actor = draw_mesh(plotter, cloud, scalars="rgb", rgb=True, ambient=0.45, diffuse=0.6, opacity=options.opacity)
         actor.prop.interpolation = "Phong"
         return actor
-    quats = as_array(gaussians.quats).astype(np.float64)
     cloud["opacity"] *= np.float32(options.opacity)
-    cloud["scale"] = as_array(gaussians.scales).astype(np.float32)
-    cloud["quat"] = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
+    _add_shapes(cloud, gaussians)
     follow = partial(seen_from, gaussians) if by_view else None
     return as_gaussians(plotter, cloud, sort=options.sort, moving=options.moving, near=options.near, colors_from=follow)
+
+
+def to_pyvista(
+    gaussians: Gaussians,
+    color_by: ColorBy | Tensor | Array | None = None,
+    *,
+    feature_colors: FeatureColors | None = None,
+) -> pv.PolyData:
+    """A cloud as a point cloud of pyvista: one point for each Gaussian, whatever it holds as named arrays.
+
+    The arrays are `index`, `rgb` (uint8), `opacity`, `scale` (standard deviations), `quat` (w, x, y, z), and, where there are
+    any, `label` and what `color_by` shows (`score`). `to_pyvista(cloud).plot(scalars="rgb", rgb=True)` shows it;
+    `add_cloud` draws true Gaussians.
+
+    Args:
+        gaussians: what to convert.
+        color_by: what `rgb` stands for, as in `add_cloud`.
+        feature_colors: the scene's projection of features to colours.
+
+    Raises:
+        ValueError: if what to colour by is missing.
+        TypeError: if these are no Gaussians, or values to colour by are neither integers nor floats.
+    """
+    colors = cloud_colors(gaussians, color_by, feature_colors)
+    cloud = _points(gaussians)
+    _fill(cloud, gaussians, colors)
+    _add_shapes(cloud, gaussians)
+    return cloud
 
 
 def recolor_cloud(
@@ -162,6 +182,20 @@ def recolor_cloud(
             )
         cloud.point_data["opacity"] = opacities.astype(np.float32)[index]
     cloud.point_data["rgb"] = colors[index]
+
+
+def _points(gaussians: Gaussians) -> pv.PolyData:
+    import pyvista as pv
+
+    cloud = pv.PolyData(as_array(gaussians.means).astype(np.float32))
+    cloud["index"] = np.arange(len(gaussians))
+    return cloud
+
+
+def _add_shapes(cloud: pv.PolyData, gaussians: Gaussians) -> None:
+    quats = as_array(gaussians.quats).astype(np.float64)
+    cloud["scale"] = as_array(gaussians.scales).astype(np.float32)
+    cloud["quat"] = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
 
 
 def _surfaces(gaussians: Gaussians, options: CloudOptions) -> pv.PolyData:

@@ -9,9 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._check import check_range, check_shapes, check_whole
+from .._check import as_array, check_range, check_shapes, check_whole
 from ..cameras import Camera, resize_map
-from .arrays import as_array
 from .meshes import draw_mesh
 from .pictures import as_bytes
 

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .._check import check_whole
-from ..cameras import Camera
+from ..cameras import Camera, estimate_up
 from ..gaussians import Gaussians
 from .cloud_colors import ColorBy
 from .clouds import Style, add_cloud
 from .headless import make_plotter
 from .legends import add_legend, letters
 from .through import look_through
-from .turntable import estimate_up
 
 if TYPE_CHECKING:
     import pyvista as pv

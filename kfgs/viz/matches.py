@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from .._check import check_choice, check_range, check_shapes, check_whole
+from .._check import as_array, check_choice, check_shapes, check_whole
 from ..gaussians import Gaussians
 from ..labels import Transfer
-from .arrays import as_array
 from .frusta import evenly
 from .legends import add_legend
 from .meshes import draw_mesh
-from .palette import PALETTE, palette
-from .plots import _figure, _save
+from .palette import palette
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -27,9 +23,6 @@ LINES = 500  # more transfer lines than this hide what they show
 MATCHED, AMBIGUOUS, ORPHANED = 0, 1, 2
 STATE_NAMES = ("matched", "ambiguous", "orphaned")
 STATE_COLORS = (1, 5, 7)  # in `PALETTE`: sky blue, which recedes, vermillion and deep blue; far apart for every eye
-TAKEN, REST = tuple(PALETTE[4] / 255), (0.75, 0.75, 0.75)  # of bars: what is selected or in reach, and what is not
-BINS = 80
-CLOSEST = 100  # times smaller than the median: what is closer still makes no axis longer
 
 
 class Matches(NamedTuple):
@@ -145,58 +138,6 @@ def add_transfer(
     lines.cell_data["distance"] = as_array(transfer.distances)[chosen]
     lines.cell_data["rgb"] = palette(labels) if color_by == "label" else _state_colors(states)
     return draw_mesh(plotter, lines, scalars="rgb", rgb=True, line_width=line_width, lighting=False)
-
-
-def plot_distances(
-    distances: Tensor | Array,  # [N] world units; infinite: no source in range
-    distance: float,
-    path: str | Path,
-) -> None:
-    """Draw how far destinations are from their sources, with lambda marked, on a logarithmic axis; bins meet at lambda.
-
-    To see what lies beyond lambda too, pass the distances of a transfer with a larger one. Distances of 0, and below a
-    hundredth of the median, are drawn in the lowest bin.
-
-    Args:
-        distances: `Transfer.distances`.
-        distance: lambda, world units.
-        path: a .png file.
-
-    Raises:
-        ValueError: if there are no distances, one is negative or not a number, or lambda is not positive.
-    """
-    values = as_array(distances) if isinstance(distances, Tensor) else np.asarray(distances)
-    check_shapes(("distances", values, "N"))
-    check_range("distance", distance, 0, closed=(False, False))
-    if values.size == 0 or not (values >= 0).all():
-        raise ValueError(
-            f"distances: expected at least one, none negative or NaN, got {values.size} with "
-            f"{int((~(values >= 0)).sum())} such; pass Transfer.distances"
-        )
-    found = values[np.isfinite(values)].astype(np.float64)
-    positive = found[found > 0]
-    nearest = max(float(positive.min()), float(np.median(positive)) / CLOSEST) if positive.size else distance
-    low = min(nearest, distance / 10)
-    high = max(float(found.max()) if found.size else distance, 2 * distance)
-    step = np.log(high / low) / BINS
-    first, last = np.floor(np.log(low / distance) / step), np.ceil(np.log(high / distance) / step)
-    edges = distance * np.exp(step * np.arange(first, last + 1))  # one of them is lambda exactly
-    counts, _ = np.histogram(np.clip(found, edges[0], edges[-1]), edges)
-    figure = _figure(7.0, 4.0)
-    axes = figure.add_subplot()
-    near = edges[:-1] < distance
-    widths = np.diff(edges)
-    for part, color, name in ((near, TAKEN, "within lambda"), (~near, REST, "beyond")):
-        axes.bar(edges[:-1][part], counts[part], widths[part], align="edge", color=color, label=name)
-    axes.axvline(distance, color="black", linewidth=1.5, label=f"lambda = {distance:.4g}")
-    axes.set(xscale="log", xlabel="distance to the source (world units)", ylabel="destinations")
-    closer = 100 * float((values < distance).mean())
-    axes.set_title(
-        f"{closer:.1f} % closer than lambda; {values.size - found.size:,} of {values.size:,} without a source"
-    )
-    axes.legend(frameon=False)
-    axes.grid(alpha=0.3)
-    _save(figure, path)
 
 
 def _state_colors(states: Array) -> Array:  # [N] -> [N, 3] uint8

@@ -1,22 +1,23 @@
-"""Flat pictures of a scene: labels over a photograph with a legend, feature maps as colours, PNG files."""
+"""Flat pictures: labels over a photograph, legends, pictures in rows and columns, PNG files."""
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from PIL import Image, ImageDraw, ImageFont
+from PIL.Image import Resampling
 from torch import Tensor
 
-from .._check import check_range, check_shapes
+from .._check import as_array, check_range, check_shapes
 from .._files import atomic_path
 from .palette import palette
 
 Array = np.ndarray[Any, Any]
+GAP = 6  # pixels between pictures of a grid
 LEGEND_INK, LEGEND_PAPER = (20, 20, 20), (255, 255, 255)
 
 
@@ -45,7 +46,7 @@ def overlay_labels(
     """
     check_shapes(("image", image, "H W 3"), ("labels", labels, "H W"))
     check_range("alpha", alpha, 0, 1)
-    photo, classes = np.clip(_array(image).astype(np.float64), 0, 1), _array(labels)
+    photo, classes = np.clip(as_array(image, "image").astype(np.float64), 0, 1), as_array(labels, "labels")
     blended = (1 - alpha) * photo + alpha * palette(classes) / 255
     if boundaries:
         from skimage.segmentation import find_boundaries
@@ -95,7 +96,7 @@ def _draw_legend(
     labels: Tensor | Array, names: Sequence[str], width: int | None, size: int, height: int | None = None
 ) -> Array:
     """Entries from left to right, wrapped at `width`; without a width one per line, in columns up to `height`."""
-    present = [int(label) for label in np.unique(_array(labels))]
+    present = [int(label) for label in np.unique(as_array(labels, "labels"))]
     check_names(present, names)
     font = ImageFont.load_default(size=size)
     gap, line = size // 2, round(size * 1.6)
@@ -123,68 +124,6 @@ def _draw_legend(
     return np.asarray(strip)
 
 
-@dataclass(frozen=True, eq=False)
-class FeatureColors:
-    """One linear projection of features to RGB for a whole scene: equal features have equal colours in every view.
-
-    Fit it once, on the codewords or on the Gaussians' features, and never on a frame: the principal axes of a single
-    view change from view to view, and the colours with them.
-    """
-
-    mean: Tensor  # [D]
-    axes: Tensor  # [D, 3] principal directions, strongest first
-    low: Tensor  # [3] projection that becomes 0
-    high: Tensor  # [3] projection that becomes 255
-
-    @staticmethod
-    def fit(
-        features: Tensor,  # [N, D]
-    ) -> FeatureColors:
-        """Principal axes of the features; the range is their 1st to 99th percentile along each.
-
-        Each axis points to the side where its largest entry is positive, so that refitting gives the same colours.
-        With fewer than three channels, or on an axis without spread, the missing colours stay in the middle.
-
-        Raises:
-            ValueError: if there are no features or one is not finite.
-        """
-        check_shapes(("features", features, "N D"))
-        rows = features.detach().double()
-        if len(rows) == 0 or not bool(torch.isfinite(rows).all()):
-            raise ValueError(
-                f"features: expected at least one row of finite numbers, got {tuple(features.shape)} with "
-                f"{int((~torch.isfinite(rows)).sum())} not finite; remove such rows first"
-            )
-        mean = rows.mean(dim=0)
-        covariance = torch.cov(rows.T, correction=0).reshape(rows.shape[1], rows.shape[1])
-        axes = torch.linalg.eigh(covariance).eigenvectors.flip(-1)[:, :3]
-        largest = axes.gather(0, axes.abs().argmax(dim=0, keepdim=True))
-        axes = torch.nn.functional.pad(axes * largest.sign(), (0, 3 - axes.shape[1]))
-        projected = ((rows - mean) @ axes).cpu().numpy()
-        low, high = torch.from_numpy(np.percentile(projected, [1, 99], axis=0)).to(rows.device)
-        flat = (high - low) <= 1e-9 * mean.norm().clamp_min(1)
-        return FeatureColors(mean, axes, torch.where(flat, -1, low), torch.where(flat, 1, high))
-
-    def __call__(
-        self,
-        features: Tensor,  # [..., D], usually a map [H, W, D]
-    ) -> Array:  # [..., 3] uint8
-        """Colour features; projections outside the fitted range are clipped.
-
-        Raises:
-            ValueError: if D is not the fitted number of channels.
-        """
-        if features.shape[-1:] != self.mean.shape:
-            raise ValueError(
-                f"features: expected [..., D] with D = {len(self.mean)} (from fit), got {tuple(features.shape)}; "
-                "fit on features of the same kind"
-            )
-        axes = self.axes / (self.high - self.low)
-        offset = self.mean @ axes + self.low / (self.high - self.low)
-        unit = features.detach() @ axes.to(features) - offset.to(features)
-        return _to_bytes(unit.cpu().numpy())
-
-
 def save_picture(
     path: str | Path,
     picture: Tensor | Array,  # [H, W], [H, W, 3] or [H, W, 4]; uint8, or floats in [0, 1]
@@ -194,7 +133,7 @@ def save_picture(
     Raises:
         ValueError: if the name does not end in .png, or the array is no picture.
     """
-    target, values = Path(path), _array(picture)
+    target, values = Path(path), as_array(picture, "picture")
     if target.suffix.lower() != ".png":
         raise ValueError(f"path: expected a name that ends in .png, got {target.name!r}; rename it")
     if values.dtype != np.uint8 and not np.issubdtype(values.dtype, np.floating):
@@ -208,9 +147,67 @@ def save_picture(
         Image.fromarray(np.ascontiguousarray(data)).save(temporary, format="PNG")
 
 
+def picture_grid(
+    rows: Sequence[Sequence[Tensor | Array]],  # each [H, W, 3] in [0, 1] or uint8
+    titles: Sequence[str] = (),
+    *,
+    width: int | None = None,
+) -> Array:  # [h, w, 3] uint8
+    """Lay pictures out in rows, with a title over each column.
+
+    Args:
+        rows: R rows of C pictures, of one size unless a `width` is given.
+        titles: C titles, or none.
+        width: pixels across each picture; the height follows from the shape of the first one, and all others are brought
+            to that size: a feature map in colours beside its photograph, or small pictures of large photographs.
+            Shrinking averages, enlarging repeats pixels, so that a coarse map looks as coarse as it is.
+
+    Raises:
+        ValueError: if there is no picture, rows or titles differ in number, pictures in size without a `width`, or `width`
+            is no positive whole number.
+
+    Example:
+        >>> photo, coarse = np.zeros((60, 80, 3)), np.ones((6, 8, 3))
+        >>> picture_grid([[photo, coarse]], width=40).shape  # two of 30 x 40, and 6 pixels around each
+        (42, 98, 3)
+    """
+    if not rows or not rows[0] or len({len(row) for row in rows}) != 1:
+        raise ValueError(
+            f"rows: expected rows of equally many pictures, got {[len(row) for row in rows]}; fill them up"
+        )
+    if titles and len(titles) != len(rows[0]):
+        raise ValueError(f"titles: expected {len(rows[0])} (one per column), got {len(titles)}; give one for each")
+    named = [(f"rows[{i}][{j}]", picture, "H W 3") for i, row in enumerate(rows) for j, picture in enumerate(row)]
+    for one in named:
+        check_shapes(one)
+    pictures = [[as_bytes(picture) for picture in row] for row in rows]
+    if width is not None:
+        pictures = _resize_alike(pictures, width)
+    height, width = pictures[0][0].shape[:2]
+    for (name, picture, _), shown in zip(named, (picture for row in pictures for picture in row), strict=True):
+        if shown.shape[:2] != (height, width):
+            raise ValueError(
+                f"{name}: expected [H, W, 3] with H = {height}, W = {width} (from rows[0][0]), got {tuple(picture.shape)}; "
+                f"say picture_grid(..., width={width}) to resize"
+            )
+    letters = max(12, width // 28)  # pixels
+    head = (letters * 3 // 2 if titles else 0) + GAP
+    columns = len(rows[0])
+    sheet = np.full((head + len(rows) * (height + GAP), GAP + columns * (width + GAP), 3), 255, np.uint8)
+    for i, row in enumerate(pictures):
+        for j, picture in enumerate(row):
+            top, left = head + i * (height + GAP), GAP + j * (width + GAP)
+            sheet[top : top + height, left : left + width] = picture
+    canvas = Image.fromarray(sheet)
+    draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(size=letters)
+    for j, title in enumerate(titles):
+        draw.text((GAP + j * (width + GAP) + width / 2, head / 2), title, fill=LEGEND_INK, font=font, anchor="mm")
+    return np.asarray(canvas)
+
+
 def as_bytes(picture: Tensor | Array) -> Array:
     """A picture in uint8: floats are clipped to [0, 1], bytes stay as they are."""
-    values = _array(picture)
+    values = as_array(picture, "picture")
     return values if values.dtype == np.uint8 else _to_bytes(values)
 
 
@@ -225,10 +222,23 @@ def check_names(labels: Sequence[int], names: Sequence[str]) -> None:
         )
 
 
-def _array(values: Tensor | Array) -> Array:
-    return values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)
-
-
 def _to_bytes(unit: Array) -> Array:
     """[0, 1] -> 0..255, rounded; NaN becomes black."""
     return np.asarray(np.round(np.clip(np.nan_to_num(unit, nan=0.0), 0, 1) * 255), dtype=np.uint8)
+
+
+def _resize_alike(pictures: list[list[Array]], width: int) -> list[list[Array]]:
+    """All pictures `width` pixels wide and in the proportions of the first."""
+    if not isinstance(width, numbers.Integral) or width < 1:
+        raise ValueError(
+            f"width: expected a positive whole number of pixels, got {width!r}; pass an integer such as 320"
+        )
+    if not all(picture.size for row in pictures for picture in row):
+        raise ValueError("rows: expected pictures of at least one pixel, got an empty one; leave it out")
+    high, wide = pictures[0][0].shape[:2]
+    size = int(width), max(1, round(high * int(width) / wide))  # Pillow's order
+    # a box filter is the mean of the pixels covered, and where fewer than one is covered the pixel itself
+    return [
+        [np.asarray(Image.fromarray(np.ascontiguousarray(p)).resize(size, Resampling.BOX)) for p in row]
+        for row in pictures
+    ]

@@ -1,4 +1,8 @@
-"""Curves and tables as PNG files, drawn with matplotlib (which pyvista brings) away from its global state."""
+"""Training curves, confusion, IoU by class, and quality against storage, drawn with matplotlib.
+
+Every function returns its figure, draws into the caller's axes if given some (`ax`), and writes a PNG file only if given a
+path.
+"""
 
 from __future__ import annotations
 
@@ -7,78 +11,97 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from .._check import check_shapes
-from .._files import atomic_path
-from .palette import PALETTE, palette
+from .._check import as_array, check_shapes
+from .figures import (
+    INK,
+    LINES,
+    Array,
+    Row,
+    add_legend_below,
+    axes_for,
+    check_class_names,
+    count_from_zero,
+    draw_curve,
+    finish,
+    is_number,
+    panels_for,
+)
+from .palette import palette
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Row = Mapping[str, Any]
-Array = np.ndarray[Any, Any]
 STEPS = ("step", "iteration", "epoch")  # what may run along the bottom
 CLOCK = ("seconds",)  # a nearly straight line, which tells nothing about how training went
 COUNTS = {"size", "added", "pruned", "count", "gaussians"}  # recorded numbers that are whole, drawn from zero
-LINES = PALETTE[[4, 5, 2, 6, 1, 0]] / 255  # the darker ones of Okabe and Ito read well as lines
-INK = (0.08, 0.08, 0.08)
-DPI = 110
 
 
-def plot_codebook_history(history: Sequence[Row], path: str | Path) -> None:
+def plot_codebook_history(
+    history: Sequence[Row], path: str | Path | None = None, *, ax: Sequence[Axes] | Array | None = None
+) -> Figure:
     """Draw how the codebook grew (Sec. 3.3.1): its size, and what else each round of growth or epoch recorded.
 
     Args:
         history: `CodebookFit.history`: one row per round of growth, or per epoch of the paper's method (with a loss).
-        path: a .png file.
+        path: a .png file to write; None writes none.
+        ax: axes to draw into, one for each recorded number; None makes a figure.
 
     Raises:
-        ValueError: if the history is empty or has no numbers.
+        ValueError: if the history is empty or has no numbers, or there are too few axes.
     """
-    _plot_rows(history, path, first="size", title="Codebook")
+    return _plot_rows(history, path, ax, first="size", title="Codebook")
 
 
-def plot_training(history: Sequence[Row], path: str | Path, *, leave_out: Sequence[str] = CLOCK) -> None:
+def plot_training(
+    history: Sequence[Row],
+    path: str | Path | None = None,
+    *,
+    leave_out: Sequence[str] = CLOCK,
+    ax: Sequence[Axes] | Array | None = None,
+) -> Figure:
     """Draw every number that a training recorded against its step: the loss first, one panel each.
 
     Args:
         history: rows with `step` (or `iteration`, or `epoch`) and numbers, for instance `FieldFit.history`.
-        path: a .png file.
+        path: a .png file to write; None writes none.
         leave_out: numbers not to draw; () draws all.
+        ax: axes to draw into, one for each number; None makes a figure.
 
     Raises:
-        ValueError: if the history is empty or has no numbers.
+        ValueError: if the history is empty or has no numbers, or there are too few axes.
     """
     rows = [{key: value for key, value in row.items() if key not in leave_out} for row in history]
-    _plot_rows(rows, path, first="loss", title="Training")
+    return _plot_rows(rows, path, ax, first="loss", title="Training")
 
 
 def plot_confusion(
     matrix: Tensor | Array,  # [C, C] counts
     names: Sequence[str],  # C
-    path: str | Path,
+    path: str | Path | None = None,
     *,
     misses: Tensor | Array | None = None,  # [C] counts
-) -> None:
+    ax: Axes | None = None,
+) -> Figure:
     """Draw a confusion matrix: rows are true classes, in per cent of each row; classes that never occur are left out.
 
     Args:
         matrix: counts of (truth, prediction), for instance `ConfusionMatrix.matrix`.
         names: class names.
-        path: a .png file.
+        path: a .png file to write; None writes none.
         misses: pixels of each class that were predicted as none (`ConfusionMatrix.misses`); where there are any, they
             get a last column and count in their row.
+        ax: axes to draw into; None makes a figure.
 
     Raises:
         ValueError: if the matrix is not square, or names or misses are not one per class.
     """
     check_shapes(("matrix", matrix, "C C"), ("misses", misses, "C"))
-    counts = _numbers(matrix)
-    _check_names(names, len(counts), "matrix")
-    missed = np.zeros(len(counts)) if misses is None else _numbers(misses)
+    counts = as_array(matrix, "matrix").astype(np.float64)
+    check_class_names(names, len(counts), "matrix")
+    missed = np.zeros(len(counts)) if misses is None else as_array(misses, "misses").astype(np.float64)
     kept = np.flatnonzero(counts.sum(axis=0) + counts.sum(axis=1) + missed)
     labels = [names[int(i)] for i in kept]
     counts = counts[np.ix_(kept, kept)]
@@ -86,8 +109,7 @@ def plot_confusion(
         counts = np.column_stack([counts, missed[kept]])
     share = 100 * counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     side = max(4.0, 0.42 * len(kept) + 2)
-    figure = _figure(side + 0.8, side)
-    axes = figure.add_subplot()
+    axes = axes_for(ax, side + 0.8, side)
     image = axes.imshow(share, cmap="cividis", vmin=0, vmax=100)  # cividis reads the same for colour-blind eyes
     axes.set_xticks(range(share.shape[1]), [*labels, "no class"][: share.shape[1]], rotation=90)
     axes.set_yticks(range(len(kept)), labels)
@@ -96,44 +118,45 @@ def plot_confusion(
         if value >= 1:
             color = "black" if value > 55 else "white"
             axes.text(j, i, f"{value:.0f}", ha="center", va="center", fontsize=8, color=color)
-    figure.colorbar(image, ax=axes, fraction=0.046)
-    _save(figure, path)
+    axes.figure.colorbar(image, ax=axes, fraction=0.046)
+    return finish(axes, path)
 
 
 def plot_iou(
     iou: Tensor | Array,  # [C] in [0, 1], NaN where a class does not occur
     names: Sequence[str],  # C
-    path: str | Path,
+    path: str | Path | None = None,
     *,
     reference: Tensor | Array | None = None,  # [C] as iou
     reference_name: str = "reference",
     title: str = "Intersection over union by class (%)",
-) -> None:
+    ax: Axes | None = None,
+) -> Figure:
     """Draw the IoU of each class as a bar in its colour, the best first, with the mean as a line; in per cent.
 
-    The mean is over the classes that occur, as in `ConfusionMatrix.miou`; classes that do not (NaN) are left out, and
-    said to be. Equal classes stay in class order.
+    The mean is over the classes that occur, as in `ConfusionMatrix.miou`. Classes that do not (NaN) are left out; the label
+    of the axis says how many. Equal classes stay in class order.
 
     Args:
         iou: for instance `ConfusionMatrix.iou()` or `SegmentationReport.iou`.
         names: class names.
-        path: a .png file.
+        path: a .png file to write; None writes none.
         reference: what to compare with, marked on each bar: the 2-D teacher's own IoU, or another method's.
         reference_name: what the legend calls it.
         title: over the picture.
+        ax: axes to draw into; None makes a figure.
 
     Raises:
         ValueError: if names or reference are not one per class, a value lies outside [0, 1], or no class occurs.
     """
     check_shapes(("iou", iou, "C"), ("reference", reference, "C"))
     values = 100 * _shares("iou", iou)
-    _check_names(names, len(values), "iou")
+    check_class_names(names, len(values), "iou")
     shown = np.flatnonzero(~np.isnan(values))
     if len(shown) == 0:
         raise ValueError(f"iou: expected a class that occurs, got {len(values)} NaN; was anything scored?")
     shown = shown[np.argsort(-values[shown], kind="stable")]
-    figure = _figure(7.2, 0.3 * len(shown) + 1.5)
-    axes, rows = figure.add_subplot(), np.arange(len(shown))
+    axes, rows = axes_for(ax, 7.2, 0.3 * len(shown) + 1.5), np.arange(len(shown))
     axes.barh(rows, values[shown], color=palette(shown) / 255, edgecolor=INK, linewidth=0.6, height=0.75)
     for row, value in enumerate(values[shown]):
         axes.text(101, row, f"{value:.1f}", va="center", fontsize=9)
@@ -151,89 +174,120 @@ def plot_iou(
     axes.set_xticks(range(0, 101, 20))
     axes.grid(axis="x", alpha=0.3)
     axes.set_axisbelow(True)
-    figure.legend(loc="outside lower center", ncols=2, frameon=False)
-    _save(figure, path)
+    add_legend_below(axes, own=ax is None)
+    return finish(axes, path)
 
 
-def _plot_rows(history: Sequence[Row], path: str | Path, *, first: str, title: str) -> None:
+def plot_quality_storage(
+    points: Mapping[str, tuple[float, float]],
+    path: str | Path | None = None,
+    *,
+    reference: Mapping[str, tuple[float, float]] | None = None,
+    ax: Axes | None = None,
+) -> Figure:
+    """Draw segmentation quality against size: mIoU in per cent over MiB (logarithmic), every point with its name.
+
+    Args:
+        points: name to (storage in MiB, mIoU in [0, 1]).
+        path: a .png file to write; None writes none.
+        reference: published points to compare with, drawn hollow: for instance rows of Table 1, whose "MB" are MiB.
+        ax: axes to draw into; None makes a figure.
+
+    Raises:
+        ValueError: if there is no point, a size is not positive and finite, or an mIoU lies outside [0, 1].
+    """
+    groups = [(points, LINES[0], "o", "measured"), (reference or {}, "none", "s", "reference")]
+    if not points and not reference:
+        raise ValueError("points: expected at least one name with (MiB, mIoU), got none; pass what was measured")
+    axes = axes_for(ax, 7.6, 5.2)
+    places: list[tuple[str, float, float]] = []
+    for group, color, marker, label in groups:
+        if not group:
+            continue
+        rows = [(name, *_quality_point(name, pair)) for name, pair in group.items()]
+        _, x, y = zip(*rows, strict=True)
+        axes.scatter(x, y, s=55, color=color, edgecolor=INK, linewidth=1.1, marker=marker, label=label, zorder=3)
+        places += rows
+    axes.set_xscale("log")
+    axes.margins(x=0.3, y=0.12)
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.set(xlabel="storage in MiB", ylabel="mIoU in %", title="Quality against storage")
+    axes.grid(alpha=0.3, which="both")
+    if points and reference:
+        add_legend_below(axes, own=ax is None)
+    figure = finish(axes, None)
+    figure.draw_without_rendering()  # the layout decides where points are
+    if ax is None:
+        figure.set_layout_engine("none")
+    _name_points(axes, places)
+    return finish(axes, path)
+
+
+def _plot_rows(
+    history: Sequence[Row], path: str | Path | None, ax: Sequence[Axes] | Array | None, *, first: str, title: str
+) -> Figure:
     """One panel per recorded number; counts start at zero."""
     if not history:
         raise ValueError("history: expected at least one row, got none; was anything trained?")
     step = next((name for name in STEPS if name in history[0]), None)
     keys = [key for key in dict.fromkeys(key for row in history for key in row) if key not in STEPS]
-    keys = [key for key in keys if any(_is_number(row.get(key)) for row in history)]
+    keys = [key for key in keys if any(is_number(row.get(key)) for row in history)]
     if not keys:
         raise ValueError(f"history: expected rows with numbers to draw, got keys {sorted(history[0])}")
     keys.sort(key=lambda key: key != first)  # stable: the others keep their order
     columns = min(3, len(keys))
     lines = -(-len(keys) // columns)
-    figure = _figure(4.2 * columns, 2.9 * lines + 0.4)
-    for panel, key in enumerate(keys):
-        x = [i if step is None else row[step] for i, row in enumerate(history) if _is_number(row.get(key))]
-        y = [row[key] for row in history if _is_number(row.get(key))]
-        axes = figure.add_subplot(lines, columns, panel + 1)
-        _curve(axes, x, y, panel)
+    panels, own = panels_for(ax, len(keys), columns, 4.2 * columns, 2.9 * lines + 0.4)
+    for panel, (axes, key) in enumerate(zip(panels, keys, strict=True)):
+        x = [i if step is None else row[step] for i, row in enumerate(history) if is_number(row.get(key))]
+        y = [row[key] for row in history if is_number(row.get(key))]
+        draw_curve(axes, x, y, panel)
         axes.set(xlabel=step or "row", title=key)
         if key in COUNTS:
-            _from_zero(axes, y)
-    figure.suptitle(title)
-    _save(figure, path)
-
-
-def _curve(axes: Axes, x: Sequence[float], y: Sequence[float], panel: int, **options: Any) -> None:
-    marker = "o" if len(x) < 40 else None
-    style = {"color": LINES[panel % len(LINES)], "marker": marker, "markersize": 3, "linewidth": 1.5}
-    axes.plot(x, y, clip_on=False, zorder=3, **style | options)  # zeros are seen on the frame
-    axes.grid(alpha=0.3)
-    if all(float(value).is_integer() for value in x):
-        axes.locator_params(axis="x", integer=True)
-
-
-def _from_zero(axes: Axes, y: Sequence[float]) -> None:
-    """Whole numbers upwards from zero, with room above the highest, also where all of them are zero."""
-    axes.set_ylim(0, 1.06 * max(1, *y))
-    axes.locator_params(axis="y", integer=True)
-
-
-def _numbers(values: Tensor | Array) -> Array:
-    """As float64 in numpy."""
-    return (values.detach().cpu().numpy() if isinstance(values, torch.Tensor) else np.asarray(values)).astype(
-        np.float64
-    )
+            count_from_zero(axes, y)
+    if own:
+        panels[0].figure.suptitle(title)
+    return finish(panels[0], path)
 
 
 def _shares(name: str, values: Tensor | Array) -> Array:
     """Fractions, NaN allowed."""
-    shares = _numbers(values)
+    shares = as_array(values, name).astype(np.float64)
     if (wrong := shares[(shares < 0) | (shares > 1)]).size:
         raise ValueError(f"{name}: expected fractions in [0, 1] or NaN, got {wrong[0]:g}; divide per cents by 100")
     return shares
 
 
-def _check_names(names: Sequence[str], count: int, source: str) -> None:
-    if len(names) != count:
+def _quality_point(name: str, pair: tuple[float, float]) -> tuple[float, float]:
+    """(MiB, per cent) of one point, checked."""
+    mib, miou = pair
+    if not (0 < mib < float("inf") and 0 <= miou <= 1):
         raise ValueError(
-            f"names: expected {count} class names (from {source}), got {len(names)}; pass one name for each class"
+            f"points[{name!r}]: expected (MiB above 0, mIoU in [0, 1]), got ({mib!r}, {miou!r}); "
+            "give sizes in MiB and mIoU as a fraction, in this order"
         )
+    return float(mib), 100 * float(miou)
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _figure(width: float, height: float) -> Figure:
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError("plots need matplotlib, which pyvista brings; run: pip install matplotlib") from error
-    figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _save(figure: Figure, path: str | Path) -> None:
-    if Path(path).suffix.lower() != ".png":
-        raise ValueError(f"path: expected a name that ends in .png, got {Path(path).name!r}; rename it")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", bbox_inches="tight")  # else the label beside a square picture is cut
+def _name_points(axes: Axes, places: Sequence[tuple[str, float, float]]) -> None:
+    """Write each name beside its point, on the first side where it covers neither a point nor an earlier name."""
+    spots = axes.transData.transform([(x, y) for _, x, y in places])
+    frame = axes.get_window_extent()
+    taken: list[Any] = []
+    sides = [((8, 0), "left", "center"), ((-8, 0), "right", "center"), ((0, 8), "center", "bottom")]
+    sides += [((0, -8), "center", "top"), ((8, 9), "left", "bottom"), ((8, -9), "left", "top")]
+    for name, x, y in places:
+        tried = []
+        for offset, ha, va in sides:
+            text = axes.annotate(name, (x, y), offset, textcoords="offset points", ha=ha, va=va, fontsize=9)
+            box = text.get_window_extent()
+            covered = sum(box.overlaps(other) for other in taken) + int(box.count_contains(spots))
+            outside = box.x0 < frame.x0 or box.x1 > frame.x1
+            tried.append((covered + 2 * outside, text, box))
+            text.set_visible(False)
+        _, text, box = min(tried, key=lambda entry: entry[0])  # the first of equally good ones
+        text.set_visible(True)
+        taken.append(box)
+        for _, other, _ in tried:
+            if other is not text:
+                other.remove()

@@ -10,14 +10,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import check_shapes, check_whole
 from .._rows import unit_rows
 from ..labels import label_codewords
+from .figures import (
+    INK,
+    LINES,
+    Row,
+    check_class_names,
+    count_from_zero,
+    draw_curve,
+    finish,
+    is_number,
+    new_figure,
+    panels_for,
+)
 from .palette import palette
-from .plots import INK, LINES, Row, _check_names, _curve, _figure, _from_zero, _is_number, _save
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 SHOWN = 150
 """Most codewords in one report: more rows than that are too small to read, or the picture too large to open."""
@@ -32,6 +45,9 @@ class CodebookRows(NamedTuple):
     labels: Tensor  # [R] int64, class of each
     similarity: Tensor  # [R, R] cosine between codewords
     words: tuple[tuple[tuple[int, float], ...], ...]  # R times the nearest classes, with their cosines, best first
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def codebook_rows(
@@ -73,22 +89,23 @@ def plot_codebook_report(
     codewords: Tensor,  # [K, D]
     names: Sequence[str],  # C
     embeddings: Tensor,  # [C, D]
-    path: str | Path,
+    path: str | Path | None = None,
     *,
     usage: Tensor | None = None,  # [K] int
     history: Sequence[Row] = (),
     words: int = 3,
-) -> None:
+) -> Figure:
     """Draw a codebook in one figure: similarity matrix, usage, nearest words of each codeword, and growth below.
 
     Rows are codewords, ordered by their class (the nearest text, Sec. 3.4) and within it by usage; a class has its
-    colour of `palette`. Usage is logarithmic; a codeword that nothing uses is marked "unused".
+    colour of `palette`. Usage is logarithmic; a codeword that nothing uses is marked "unused". The figure's size follows from
+    the number of codewords, so it takes no `ax`.
 
     Args:
         codewords: the codebook S, for instance `Codebook.codewords`.
         names: class names, for instance `LabelSet.names`.
         embeddings: one row per class, for instance `LabelSet.embeddings`.
-        path: a .png file.
+        path: a .png file to write; None writes none.
         usage: features of each codeword (`CodebookFit.usage`); without it that panel is left out.
         history: `CodebookFit.history`; without it the growth is left out.
         words: how many nearest classes of each codeword to name.
@@ -97,14 +114,14 @@ def plot_codebook_report(
         ValueError: if shapes or names disagree, or the history has no `size`.
     """
     check_shapes(("embeddings", embeddings, "C D"))
-    _check_names(names, len(embeddings), "embeddings")
+    check_class_names(names, len(embeddings), "embeddings")
     rows = codebook_rows(codewords, embeddings, usage=usage, words=words)
     side = max(3.6, ROW * len(rows.codewords))
     longest = max(len(_words(row, names)) for row in rows.words)
     widths = [side, 0.0 if usage is None else 1.8, 0.6 + 0.056 * longest]
     panels = [width for width in widths if width]
     heights = [side + 0.9, 2.7] if history else [side + 0.9]
-    figure = _figure(sum(panels) + 2.6, sum(heights))
+    figure = new_figure(sum(panels) + 2.6, sum(heights))
     parts: Any = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)
     upper, lower = parts[0, 0], parts[-1, 0]
     first, *others = upper.subplots(1, len(panels), width_ratios=panels, sharey=True)
@@ -118,30 +135,38 @@ def plot_codebook_report(
     figure.suptitle(f"Codebook: {count}")
     if history:
         _draw_growth(lower.subplots(1, 3), {"": history})
-    _save(figure, path)
+    return finish(first, path)
 
 
 def plot_codebook_growth(
-    histories: Mapping[str, Sequence[Row]],
-    path: str | Path,
-) -> None:
+    histories: Mapping[str, Sequence[Row]] | Sequence[Row],
+    path: str | Path | None = None,
+    *,
+    ax: Sequence[Axes] | np.ndarray[Any, Any] | None = None,
+) -> Figure:
     """Draw how codebooks grew, scene by scene (Figure 6): their size, what was added and pruned, and the coverage.
 
     Args:
-        histories: scene name to `CodebookFit.history`.
-        path: a .png file.
+        histories: scene name to `CodebookFit.history`, or one history alone.
+        path: a .png file to write; None writes none.
+        ax: three axes to draw into; None makes a figure.
 
     Raises:
-        ValueError: if there is no scene, or a history has no `size`.
+        ValueError: if there is no scene, a history has no `size`, or there are fewer than three axes.
     """
+    if not isinstance(histories, Mapping):
+        histories = {"": histories}
     if not histories:
         raise ValueError("histories: expected at least one scene, got none; pass {name: CodebookFit.history}")
-    figure = _figure(12.6, 3.6)
-    axes = figure.subplots(1, 3)
+    axes, own = panels_for(ax, 3, 3, 12.6, 3.6)
     _draw_growth(axes, histories)
     if any(histories):
-        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right upper", frameon=False)
-    _save(figure, path)
+        lines, names = axes[0].get_legend_handles_labels()
+        if own:
+            finish(axes[0], None).legend(lines, names, loc="outside right upper", frameon=False)
+        else:
+            axes[0].legend(lines, names, frameon=False)
+    return finish(axes[0], path)
 
 
 def _draw_similarity(axes: Axes, rows: CodebookRows, names: Sequence[str]) -> None:
@@ -195,29 +220,29 @@ def _draw_words(axes: Axes, rows: CodebookRows, names: Sequence[str]) -> None:
         axes.annotate(_words(words, names), (0, row), (35, 0), **beside)
 
 
-def _draw_growth(axes: np.ndarray[Any, Any], histories: Mapping[str, Sequence[Row]]) -> None:
+def _draw_growth(axes: Sequence[Axes], histories: Mapping[str, Sequence[Row]]) -> None:
     """Size, what came and went (pruned dashed), and coverage, over epochs."""
     drawn: list[list[float]] = [[], [], []]
     for i, (name, history) in enumerate(histories.items()):
-        if not any(_is_number(row.get("size")) for row in history):
+        if not any(is_number(row.get("size")) for row in history):
             argument = f"histories[{name!r}]" if name else "history"
             raise ValueError(
                 f"{argument}: expected rows with epoch and size, got {list(history)[:1]}; pass CodebookFit.history"
             )
         color = LINES[i] if len(histories) <= len(LINES) else palette(np.array(i)) / 255
         for panel, key in ((0, "size"), (1, "added"), (1, "pruned"), (2, "coverage")):
-            points = [(row.get("epoch", at), row[key]) for at, row in enumerate(history) if _is_number(row.get(key))]
+            points = [(row.get("epoch", at), row[key]) for at, row in enumerate(history) if is_number(row.get(key))]
             if points:
                 x, y = zip(*points, strict=True)
                 style = "--" if key == "pruned" else "-"
                 label = name if panel != 1 else key
-                _curve(axes[panel], x, y, i, color=color, linestyle=style, label=label)
+                draw_curve(axes[panel], x, y, i, color=color, linestyle=style, label=label)
                 drawn[panel] += y
     for panel, title in enumerate(("size K", "codewords added and pruned (dashed)", "coverage")):
         axes[panel].set(title=title, xlabel="epoch")
         axes[panel].title.set_fontsize(10)
         if panel < 2:
-            _from_zero(axes[panel], drawn[panel])
+            count_from_zero(axes[panel], drawn[panel])
     axes[2].set_ylim(0, 1.03)
 
 

@@ -16,9 +16,9 @@ from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels.color import parse_color
 from ..splat import rasterize
-from .pairs import picture_grid
+from .field_colors import FeatureColors
 from .palette import palette
-from .pictures import FeatureColors, as_bytes, legend_strip
+from .pictures import as_bytes, legend_strip, picture_grid
 
 Array = np.ndarray[Any, Any]
 Show = Callable[[Camera], Any]

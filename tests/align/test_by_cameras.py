@@ -64,8 +64,8 @@ def test_thirty_percent_of_wrong_poses_change_nothing():
     found = align_by_cameras(cameras, others)
     assert_same(found.similarity, true)
     assert found.inliers == 14
-    assert sorted(found.facts["left out"]) == [f"view_{i}" for i in range(6)]
-    assert set(found.facts["worst cameras"]) <= {f"view_{i}" for i in range(6)}
+    assert sorted(found.details["left out"]) == [f"view_{i}" for i in range(6)]
+    assert set(found.details["worst cameras"]) <= {f"view_{i}" for i in range(6)}
 
 
 def test_noisy_centers_give_the_least_squares_fit():

@@ -29,7 +29,7 @@ def test_finds_rotation_scale_and_place(seed):
     assert left.scale == pytest.approx(1, abs=0.01)
     center = torch.tensor([[2.0, 1.5, 1.0]]).double()
     assert float((left.apply(center) - center).norm()) < 0.03  # of a room of 5.4 metres
-    assert found.facts["quality"] > found.facts["best other fit"] + 0.1
+    assert found.details["quality"] > found.details["best other fit"] + 0.1
     assert found.rms < 0.1 * true.scale
 
 

@@ -17,8 +17,8 @@ def test_two_samples_of_one_surface_agree(counts):
     check = frames_agree(surface(counts[0], 0), surface(counts[1], 1))
     assert check.agree
     assert min(check.near) > 0.8  # uniform points: 1 - 0.5^4 = 0.94 within twice the median spacing
-    assert "agree" in check.words
-    assert "disagree" not in check.words
+    assert "agree" in check.summary
+    assert "disagree" not in check.summary
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
@@ -41,7 +41,7 @@ def test_the_verdict_does_not_depend_on_the_unit(factor):
 def test_another_frame_disagrees(change):
     check = frames_agree(surface(4_000, 0), change.apply(surface(4_000, 1)))
     assert not check.agree
-    assert "disagree" in check.words
+    assert "disagree" in check.summary
 
 
 def test_a_part_agrees_with_the_whole():

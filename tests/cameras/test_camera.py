@@ -4,8 +4,9 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from messages import tells
 
-from kfgs.cameras import Camera, Distortion, undistort
+from kfgs.cameras import Camera, Distortion, project_points, undistort
 
 K = torch.tensor([[70.0, 0.0, 50.0], [0.0, 66.0, 30.5], [0.0, 0.0, 1.0]])
 
@@ -126,3 +127,49 @@ def test_sizes_are_stored_as_integers() -> None:
     camera = Camera(torch.eye(4), torch.eye(3), 64.0, np.int64(48))
     assert [type(side) for side in (camera.width, camera.height)] == [int, int]
     assert camera.size == (48, 64)
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0.0, -1.0, 0.0), torch.tensor([3.0, -2.0, 1.0])])
+def test_look_at_puts_the_target_in_the_middle_and_up_at_the_top(up):
+    eye, target = torch.tensor([1.0, -4.0, 2.5], dtype=torch.float64), torch.tensor([0.5, 1.0, -0.5]).double()
+    camera = Camera.look_at(eye, target, up=up, fov_degrees=50, width=120, height=80, name="a", near=0.1)
+    assert (camera.size, camera.name, camera.near, camera.K.dtype) == ((80, 120), "a", 0.1, torch.float64)
+    torch.testing.assert_close(camera.center, eye)
+    above = target + 0.1 * torch.as_tensor(up).double()
+    xy, depth, visible = project_points(camera, torch.stack([target, above]))
+    assert visible.all()
+    torch.testing.assert_close(xy[0], torch.tensor([60.0, 40.0]).double())  # the middle
+    assert float(depth[0]) == pytest.approx(float((target - eye).norm()))
+    assert float(xy[1, 0]) == pytest.approx(60)  # straight above it ...
+    assert float(xy[1, 1]) < 39.5  # ... and y counts downward
+
+
+def test_look_at_sees_the_field_of_view_that_was_asked_for():
+    camera = Camera.look_at((0, -4, 0), (0, 0, 0), fov_degrees=90, width=200, height=100)
+    assert camera.viewmat.dtype == torch.float32
+    edges = torch.tensor([[0.0, 0, 4], [0, 0, -4], [8, 0, 0], [-8, 0, 0]])  # 45 degrees up and down; twice that aside
+    xy, _, _ = project_points(camera, edges)
+    torch.testing.assert_close(xy, torch.tensor([[100.0, 0], [100, 100], [200, 50], [0, 50]]), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "parts"),
+    [
+        (((1, 2, 3), (1, 2, 3)), {}, ("target - eye", "direction", "[0.0, 0.0, 0.0]")),
+        (((0, 0, 0), (0, 0, -5)), {}, ("up", "direction", "[0.0, 0.0, 1.0]", "such as (0, 1, 0)")),
+        (((0, 0, 0), (1, 0, 0)), {"up": (0, 0, 0)}, ("up", "direction", "[0.0, 0.0, 0.0]")),
+        (((0, 0), (1, 0, 0)), {}, ("eye", "[3]", "(2,)")),
+        (((0, 0, 0), (1, 0, 0)), {"fov_degrees": 180}, ("fov_degrees", "180")),
+        (((0, 0, 0), (1, 0, 0)), {"width": 0}, ("width", "0")),
+    ],
+)
+def test_what_cannot_be_looked_at_is_refused(arguments, options, parts):
+    with pytest.raises(ValueError, match=tells(*parts)):
+        Camera.look_at(*arguments, **options)
+
+
+def test_a_camera_shows_itself_in_one_line():
+    camera = Camera.look_at((0, -4, 0.5), (0, 0, 0.5), fov_degrees=90, width=64, height=48, name="a.png")
+    assert repr(camera) == "Camera('a.png', 64x48, fov 90.0, at (0, -4, 0.5))"
+    lens = Distortion("brown_conrady", (-0.1, 0, 0, 0))
+    assert repr(replace(camera, distortion=lens)).endswith("), brown_conrady)")

@@ -13,7 +13,7 @@ from PIL import Image
 
 from kfgs.evaluation import score_recolor, score_removal
 from kfgs.evaluation.scene_truth import SceneTruth
-from kfgs.labels.edit import recolor, remove
+from kfgs.labels import recolor
 from kfgs.metrics import psnr
 from kfgs.scenes import load_scene
 from kfgs.splat import rasterize
@@ -43,7 +43,7 @@ def mask(room, cloud):
 
 @pytest.mark.parametrize("name", ["chair", "rug", "picture"])  # free-standing, on the floor, flat on a wall
 def test_removal_by_true_labels_is_near_one(room, cloud, mask, name):
-    report = score_removal(cloud, remove(cloud, mask[name]), room, name)
+    report = score_removal(cloud, cloud.select(~mask[name]), room, name)
     assert report.gone_pixels > 0.97
     assert report.gone_points > 0.97
     assert report.untouched_off_border > 0.97
@@ -69,7 +69,7 @@ def test_removing_everything_leaves_nothing(room, cloud):
 
 
 def test_removing_a_wrong_class_fails(room, cloud, mask):
-    report = score_removal(cloud, remove(cloud, mask["table"]), room, "chair")
+    report = score_removal(cloud, cloud.select(~mask["table"]), room, "chair")
     assert report.gone_pixels < 0.05
     assert report.gone_points < 0.05
     assert report.untouched_pixels < 0.95
@@ -80,7 +80,7 @@ def test_removing_a_wrong_class_fails(room, cloud, mask):
 def test_removing_half_scores_half(room, cloud, mask):
     """By place: the rug's half with x > 0.05, its centre. A pixel or a point is either gone or it is not."""
     half = mask["rug"] & (cloud.means[:, 0] > 0.05)
-    report = score_removal(cloud, remove(cloud, half), room, "rug")
+    report = score_removal(cloud, cloud.select(~half), room, "rug")
     points, of_class = SceneTruth.open(room, "rug", "test").surface()
     share = float((points[of_class][:, 0] > 0.05).double().mean())
     assert abs(report.gone_points - share) < 0.03
@@ -89,7 +89,7 @@ def test_removing_half_scores_half(room, cloud, mask):
 
 
 def test_a_class_that_looks_as_before_is_not_removed(room, cloud, mask):
-    report = score_removal(cloud, remove(cloud, mask["rug"]), room, "rug")
+    report = score_removal(cloud, cloud.select(~mask["rug"]), room, "rug")
     perfect = {"gone_pixels": 1.0, "gone_points": 1.0, "untouched_pixels": 1.0, "kept_points": 1.0}
     assert dataclasses.replace(report, **perfect).passed
     assert not dataclasses.replace(report, **perfect, changed_pixels=0.5).passed
@@ -98,7 +98,7 @@ def test_a_class_that_looks_as_before_is_not_removed(room, cloud, mask):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_fields_on_a_gpu_score_the_same(room, cloud, mask):
-    after = remove(cloud, mask["chair"])
+    after = cloud.select(~mask["chair"])
     here, there = (score_removal(cloud.to(d), after.to(d), room, "chair").to_json() for d in ("cpu", "cuda"))
     assert there == pytest.approx(here, abs=0.01)
     after = recolor(cloud, mask["chair"], BLUE)
@@ -108,14 +108,14 @@ def test_fields_on_a_gpu_score_the_same(room, cloud, mask):
 
 
 def test_an_object_that_was_not_there_is_no_success(room, cloud, mask):
-    without = remove(cloud, mask["chair"])
+    without = cloud.select(~mask["chair"])
     report = score_removal(without, without, room, "chair")
     assert report.measured_pixels < 0.05
     assert not report.passed
 
 
 def test_a_report_is_plain_json(room, cloud, mask):
-    report = score_removal(cloud, remove(cloud, mask["rug"]), room, "rug")
+    report = score_removal(cloud, cloud.select(~mask["rug"]), room, "rug")
     plain = json.loads(json.dumps(report.to_json(), allow_nan=False))
     assert plain["protocol"].startswith("kfgs-removal/1: ")
     assert plain["name"] == "rug"

@@ -12,13 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from PIL import Image
 
 import kfgs
-from kfgs.features.extract import Picture, check_discardable, discard_maps, extract_features
-from kfgs.features.folder import FeatureFolder
-from kfgs.features.manifest import Manifest, read_manifest
-from kfgs.features.map_store import LOCK
+from kfgs.cameras import Camera
+from kfgs.features import FeatureFolder, Manifest, Picture, discard_maps, extract_features, read_manifest
+from kfgs.features.writer import LOCK
+from kfgs.scenes import Scene
 
 STEMS = ["a", "b", "sub/c"]
 
@@ -102,7 +103,7 @@ def test_a_changed_picture_a_damaged_and_a_missing_map_are_made_again_and_named(
     extract_features(again, pictures, folder, report=lines.append)
     assert len(again.calls) == 3
     assert "a: the picture has changed; making it again" in lines[1]
-    assert f"b: its map has {len(whole['b.npy']) - 7} bytes instead of {len(whole['b.npy'])}" in lines[2]
+    assert f"b: its map has changed ({len(whole['b.npy']) - 7} bytes instead of {len(whole['b.npy'])})" in lines[2]
     assert "sub/c: its map is gone" in lines[3]
     found = contents(folder)
     assert found["a.npy"] != whole["a.npy"]
@@ -159,7 +160,7 @@ def test_maps_of_other_programs_are_left_alone(pictures, tmp_path):
 CHILD = """
 import os, sys, time, torch
 from pathlib import Path
-from kfgs.features.extract import Picture, extract_features
+from kfgs.features import Picture, extract_features
 
 class Slow:
     name = "slow"
@@ -241,7 +242,7 @@ def test_only_what_kfgs_wrote_is_discarded(pictures, tmp_path):
     assert len(contents(folder)) == 3
     (tmp_path / "outside.npy").write_bytes(b"mine")
     whole = (folder / "features.json").read_text()
-    for name, said in (("../outside.npy", "no name within the folder"), ("b.npy", r"got another file in .*b\.npy")):
+    for name, said in (("../outside.npy", tells("file", "../outside")), ("b.npy", r"got another file in .*b\.npy")):
         about = json.loads(whole)
         about["maps"] = {"a": about["maps"]["a"] | {"file": name, "bytes": 4}}
         (folder / "features.json").write_text(json.dumps(about))
@@ -260,13 +261,13 @@ def test_a_map_of_the_same_length_that_changed_stops_the_deletion_and_a_copied_o
     extract_features(Counting(), pictures, folder)
     whole = contents(folder)
     (folder / "b.npy").write_bytes(whole["b.npy"][:-1] + b"\x01")
-    for refuse in (discard_maps, check_discardable):
+    for dry_run in (False, True):
         with pytest.raises(ValueError, match=r"as they were written, got another file in .*b.npy; move it away"):
-            refuse(folder)
+            discard_maps(folder, dry_run=dry_run)
     assert len(contents(folder)) == 3
     (folder / "b.npy").write_bytes(whole["b.npy"])
     os.utime(folder / "b.npy", (1, 1))
-    check_discardable(folder)
+    assert discard_maps(folder, dry_run=True) == sum(map(len, whole.values()))
     assert len(contents(folder)) == 3
     assert discard_maps(folder) == sum(map(len, whole.values()))
 
@@ -298,13 +299,13 @@ def test_only_the_maps_of_the_views_that_are_named_are_discarded(pictures, tmp_p
 def test_views_without_a_record_are_named_before_any_is_deleted(pictures, tmp_path):
     folder = tmp_path / "maps"
     extract_features(Counting(), pictures, folder)
-    for ask in (discard_maps, check_discardable):
-        with pytest.raises(ValueError, match=r"stems: expected views .*, got 'x', which .*features.json .* \(1 of 2\)"):
-            ask(folder, ["a", "x"])
-        with pytest.raises(TypeError, match="stems: expected a list of image stems, got the text 'ab'"):
-            ask(folder, "ab")
+    for dry_run in (False, True):
+        with pytest.raises(ValueError, match=tells("stems", "'x'", "features.json", "(1 of 2)", "by hand")):
+            discard_maps(folder, ["a", "x"], dry_run=dry_run)
+        with pytest.raises(TypeError, match=tells("stems", "list", "'ab'")):
+            discard_maps(folder, "ab", dry_run=dry_run)
         with pytest.raises(ValueError, match=r"expected maps that kfgs made \(with features.json\), got none"):
-            ask(tmp_path / "images", ["a"])
+            discard_maps(tmp_path / "images", ["a"], dry_run=dry_run)
     assert len(contents(folder)) == 3
     assert discard_maps(folder, []) == 0
     assert len(contents(folder)) == 3
@@ -322,7 +323,7 @@ def test_foreign_maps_that_were_given_up_do_not_pass_for_ours_when_the_call_dies
     with pytest.raises(KeyboardInterrupt):
         extract_features(_Broken(dies), pictures, folder, overwrite=True)  # at the second
     assert np.load(folder / "b.npy").max() == 7
-    with pytest.raises(ValueError, match=r"b\.npy: expected a map that features.json tells of"):
+    with pytest.raises(ValueError, match=tells("b.npy: expected a map that features.json lists")):
         FeatureFolder(folder, ["a", "b"])
     extract_features(Counting(), pictures, folder)
     assert FeatureFolder(folder, ["a", "b"])[1].max() < 7
@@ -389,7 +390,10 @@ class _Broken(Counting):
             r"above 6e-8 .*float16\) for .*b.png, got 4 that become all-zero; scale them",
         ),
         (lambda f: f[:3], r"expected 5 channels for .*b.png as in a.npy, got 3; use one teacher"),
-        (lambda f: f[:, 1:], r"\(h, w, D\) = \(3, 4, 5\) for .*b.png as for other pictures of 6 x 8, got \(2, 4, 5\)"),
+        (
+            lambda f: f[:, 1:],
+            r"\(h, w, D\) = \(3, 4, 5\) for .*b.png as for other pictures of its size, got \(2, 4, 5\)",
+        ),
         (lambda f: f[None], r"expected floats \[D, h, w\] for one picture, got torch.float32 \(1, 5, 3, 4\)"),
     ],
 )
@@ -463,9 +467,9 @@ def test_a_folder_that_cannot_be_written_to_is_named(pictures, tmp_path):
 
 def test_bad_requests_are_refused_before_any_work(pictures, tmp_path):
     teacher = Counting()
-    with pytest.raises(ValueError, match="pictures: expected at least one, got none"):
+    with pytest.raises(ValueError, match=tells("pictures", "at least one", "none")):
         extract_features(teacher, [], tmp_path / "maps")
-    with pytest.raises(ValueError, match="expected each stem once, got 'a' twice; rename"):
+    with pytest.raises(ValueError, match=tells("pictures", "each stem once", "a", "rename")):
         extract_features(teacher, [pictures[0], pictures[0]], tmp_path / "maps")
     for stem in ("../a", "/a", ""):
         with pytest.raises(ValueError, match="expected a name within the folder of maps, got"):
@@ -487,11 +491,11 @@ def test_an_identity_of_tuples_is_the_same_after_a_round_trip(pictures, tmp_path
     assert len(teacher.calls) == 3
 
 
-def test_a_bar_shows_each_picture_and_the_time_left(pictures, tmp_path, capsys):
+def test_a_bar_shows_each_picture(pictures, tmp_path, capsys):
     extract_features(Counting(), pictures, tmp_path / "maps", progress=True)
     shown = capsys.readouterr().err
     assert "3/3" in shown
-    assert "sub/c, about 0 s left" in shown
+    assert "sub/c" in shown
 
 
 def test_features_that_are_all_zero_stay_so_and_small_ones_are_kept(pictures, tmp_path):
@@ -500,3 +504,58 @@ def test_features_that_are_all_zero_stay_so_and_small_ones_are_kept(pictures, tm
     found = np.load(tmp_path / "maps" / "b.npy")
     assert not found[:, 1].any()
     assert found[:, [0, 2, 3]].any(-1).all()
+
+
+@pytest.fixture
+def scene(pictures):
+    cameras = [Camera(torch.eye(4), torch.eye(3), 8, 6, name=f"{picture.stem}.png") for picture in pictures]
+    paths = [picture.path for picture in pictures]
+    return Scene(
+        cameras, paths, torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8), {"train": [0, 2], "test": [1]}
+    )
+
+
+@pytest.mark.parametrize(
+    ("split", "stems"),
+    [
+        ({}, ["a", "sub/c"]),
+        ({"split": "train"}, ["a", "sub/c"]),
+        ({"split": "test"}, ["b"]),
+        ({"split": "all"}, STEMS),
+        ({"split": [2, 1]}, ["sub/c", "b"]),
+        ({"split": ["b", "a.png"]}, ["b", "a"]),
+    ],
+)
+def test_a_scene_and_a_split_name_the_views_to_encode_and_to_read(split, stems, scene, pictures, tmp_path):
+    manifest = extract_features(Counting(), scene, tmp_path / "maps", **split)
+    assert list(manifest.maps) == stems
+    maps = FeatureFolder(tmp_path / "maps").of(scene, **split)
+    assert (maps.stems, maps.sizes) == (stems, [(6, 8)] * len(stems))
+    chosen = [next(picture for picture in pictures if picture.stem == stem) for stem in stems]
+    extract_features(Counting(), chosen, tmp_path / "listed")
+    assert contents(tmp_path / "maps") == contents(tmp_path / "listed")
+
+
+def test_views_that_a_scene_does_not_have_are_named(scene, pictures, tmp_path):
+    for wrong in ("val", ["x"], [7]):
+        with pytest.raises(ValueError, match=tells(wrong if isinstance(wrong, str) else wrong[0])):
+            extract_features(Counting(), scene, tmp_path / "maps", split=wrong)
+    for wrong in ("scene", tmp_path, ["a"]):
+        with pytest.raises(TypeError, match=tells("pictures", "Scene", type(wrong).__name__, "load_scene")):
+            extract_features(Counting(), wrong, tmp_path / "maps")
+    with pytest.raises(ValueError, match=tells("split", "list of pictures", "'test'")):
+        extract_features(Counting(), pictures, tmp_path / "maps", split="test")
+    extract_features(Counting(), scene, tmp_path / "maps")
+    with pytest.raises(FileNotFoundError, match=tells("1 views", "b.npy", "kfgs features")):
+        FeatureFolder(tmp_path / "maps").of(scene, "test")
+
+
+def test_what_a_notebook_shows_of_a_folder_is_short(scene, tmp_path):
+    folder = tmp_path / "maps"
+    manifest = extract_features(Counting(), scene, folder)
+    assert repr(manifest) == "Manifest(2 maps by counting)"
+    assert repr(FeatureFolder(folder)) == f"FeatureFolder({str(folder)!r})"
+    assert repr(FeatureFolder(folder).of(scene)) == f"FeatureFolder({str(folder)!r}, 2 views)"
+    discard_maps(folder)
+    assert repr(read_manifest(folder)) == "Manifest(2 maps by counting, discarded)"
+    assert "\n" not in repr(Manifest({"name": "a\nb"}))

@@ -2,9 +2,9 @@ import json
 import re
 
 import pytest
+from messages import tells
 
-from kfgs.features.folder import FeatureFolder
-from kfgs.features.manifest import Manifest, MapRecord, read_manifest
+from kfgs.features import FeatureFolder, Manifest, MapRecord, read_manifest
 
 RECORD = MapRecord("sub/a.npy", (3, 4, 5), 248, 17, "d" * 64, "a.png", "e" * 64, 0.25)
 
@@ -36,11 +36,7 @@ def change(folder, **values) -> None:
 def test_what_is_saved_comes_back(folder):
     found = read_manifest(folder)
     assert found == Manifest({"name": "t", "options": {"size": [3, 4]}}, {"sub/a": RECORD}, discarded=True)
-    assert found.files(folder) == {folder / "sub" / "a.npy"}
-    assert found.gone(folder) == {"sub/a": folder / "sub" / "a.npy"}
     (folder / "sub").mkdir()
-    (folder / "sub" / "a.npy").touch()
-    assert found.gone(folder) == {}
     assert read_manifest(folder / "sub") is None
     change(folder, seconds=1)  # a whole number is a number
     assert read_manifest(folder).maps["sub/a"].seconds == 1
@@ -49,42 +45,42 @@ def test_what_is_saved_comes_back(folder):
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"file": 5}, "sub/a: file is a int"),
-        ({"file": "../../etc/passwd"}, "sub/a: file '../../etc/passwd' is no name within the folder"),
-        ({"file": "/etc/passwd"}, "sub/a: file '/etc/passwd' is no name within the folder"),
-        ({"file": ""}, "sub/a: file '.' is no name within the folder"),
-        ({"file": "a\0b"}, "is no name within the folder"),
-        ({"shape": [1]}, "sub/a: shape [1] is not three positive whole numbers"),
-        ({"shape": ["a", 2, 3]}, "sub/a: shape ['a', 2, 3] is not three"),
-        ({"shape": [True, 2, 3]}, "sub/a: shape [True, 2, 3] is not three"),
-        ({"shape": [1, 0, 3]}, "sub/a: shape [1, 0, 3] is not three"),
-        ({"shape": [1.0, 2, 3]}, "sub/a: shape [1.0, 2, 3] is not three"),
-        ({"shape": "abc"}, "sub/a: shape is a str"),
-        ({"bytes": "x"}, "sub/a: bytes is a str"),
-        ({"bytes": True}, "sub/a: bytes is a bool"),
-        ({"bytes": -1}, "sub/a: bytes and seconds cannot be -1 and 0.25"),
-        ({"mtime_ns": None}, "sub/a: mtime_ns is a NoneType"),
-        ({"digest": 7}, "sub/a: digest is a int"),
-        ({"image": []}, "sub/a: image is a list"),
-        ({"image_digest": 7}, "sub/a: image_digest is a int"),
-        ({"seconds": float("nan")}, "sub/a: bytes and seconds cannot be 248 and nan"),
-        ({"maps": {"a": []}}, "a: a record is a list"),
-        ({"maps": {"a": {}}}, "a: file is missing"),
-        ({"maps": []}, "maps is a list"),
-        ({"teacher": [["a", 1]]}, "teacher is a list"),
-        ({"discarded": 1}, "discarded is a int"),
-        ({"seconds": 10**400}, "sub/a: bytes and seconds cannot be 248 and 100000"),
-        ({"bytes": 10**400}, "sub/a: bytes and seconds cannot be 100000"),
-        ({"shape": [10**400, 2, 3]}, "sub/a: shape [100000"),
-        ({"maps": {"a\n\x1b[31m": []}}, r"a\n\x1b[31m: a record is a list"),
-        ({"teacher": {"name": "t", "options": {"scale": float("inf")}}}, "teacher holds NaN or infinity"),
-        ({"teacher": nested(100)}, "or is nested too deeply"),
+        ({"file": 5}, ["sub/a", "file", "5"]),
+        ({"file": "../../etc/passwd"}, ["sub/a", "file", "../../etc/passwd"]),
+        ({"file": "/etc/passwd"}, ["sub/a", "file", "/etc/passwd"]),
+        ({"file": ""}, ["sub/a", "file"]),
+        ({"file": "a\0b"}, ["sub/a", "file", r"a\x00b"]),
+        ({"shape": [1]}, ["sub/a", "shape", "[1]"]),
+        ({"shape": ["a", 2, 3]}, ["sub/a", "shape", "2, 3]"]),
+        ({"shape": [True, 2, 3]}, ["sub/a", "shape", "[True, 2, 3]"]),
+        ({"shape": [1, 0, 3]}, ["sub/a", "shape", "[1, 0, 3]"]),
+        ({"shape": [1.0, 2, 3]}, ["sub/a", "shape", "[1.0, 2, 3]"]),
+        ({"shape": "abc"}, ["sub/a", "shape", "abc"]),
+        ({"bytes": "x"}, ["sub/a", "bytes", "x"]),
+        ({"bytes": True}, ["sub/a", "bytes", "True"]),
+        ({"bytes": -1}, ["sub/a", "bytes", "-1"]),
+        ({"mtime_ns": None}, ["sub/a", "mtime_ns", "None"]),
+        ({"digest": 7}, ["sub/a", "digest", "7"]),
+        ({"image": []}, ["sub/a", "image", "[]"]),
+        ({"image_digest": 7}, ["sub/a", "image_digest", "7"]),
+        ({"seconds": float("nan")}, ["sub/a", "seconds", "nan"]),
+        ({"maps": {"a": []}}, ["a", "missing"]),
+        ({"maps": {"a": {}}}, ["a", "file", "missing"]),
+        ({"maps": []}, ["maps"]),
+        ({"teacher": [["a", 1]]}, ["teacher"]),
+        ({"discarded": 1}, ["discarded"]),
+        ({"seconds": 10**400}, ["sub/a", "seconds", "100000"]),
+        ({"bytes": 10**400}, ["sub/a", "bytes", "100000"]),
+        ({"shape": [10**400, 2, 3]}, ["sub/a", "shape", "[100000"]),
+        ({"maps": {"a\n\x1b[31m": []}}, [r"a\n\x1b[31m"]),
+        ({"teacher": {"name": "t", "options": {"scale": float("inf")}}}, ["teacher", "infinity"]),
+        ({"teacher": nested(100)}, ["teacher", "nested"]),
     ],
 )
 def test_what_kfgs_never_wrote_is_refused_in_a_line_that_names_the_file(folder, values, words):
     change(folder, **values)
     for read in (read_manifest, FeatureFolder):
-        with pytest.raises(ValueError, match=re.escape(words)) as caught:
+        with pytest.raises(ValueError, match=tells(*words)) as caught:
             read(folder)
         text = str(caught.value)
         assert text.startswith(f"{folder / 'features.json'}: expected a manifest of kfgs, but it is damaged (")
@@ -96,7 +92,7 @@ def test_what_kfgs_never_wrote_is_refused_in_a_line_that_names_the_file(folder, 
 @pytest.mark.parametrize("text", ["[]", "{}", '{"format": "kfgs-features/9"}'])
 def test_another_format_is_named(tmp_path, text):
     (tmp_path / "features.json").write_text(text)
-    with pytest.raises(ValueError, match=r"features\.json: expected format 'kfgs-features/1', got something else"):
+    with pytest.raises(ValueError, match=tells("features.json", "format 'kfgs-features/1'", WAY_OUT)):
         read_manifest(tmp_path)
 
 
@@ -104,7 +100,7 @@ def test_another_format_is_named(tmp_path, text):
     ("text", "words"),
     [
         ("{", "expected a JSON file, but it cannot be parsed (Expecting property name"),
-        ("[" * 100_000 + "]" * 100_000, "expected a manifest of kfgs, but it is nested too deeply"),
+        ("[" * 100_000 + "]" * 100_000, "(nested too deeply)"),
         ('{"seconds": ' + "1" * 5000 + "}", "expected a JSON file, but it cannot be parsed (Exceeds the limit"),
     ],
 )

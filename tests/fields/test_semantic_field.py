@@ -10,6 +10,7 @@ import oracles_uplift
 import pytest
 import torch
 from cases_splat import a_camera, gaussians_before
+from messages import tells
 from safetensors.torch import save_file
 
 from kfgs import Camera, Gaussians
@@ -506,3 +507,26 @@ def test_wrong_embeddings(mode):
         made.query(torch.ones(5))
     with pytest.raises(ValueError, match=r"latents: expected \[\.\.\., d\]"):
         made.decode(torch.ones(2, 99))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_arrays_do_what_tensors_do(mode):
+    made, rows = field(mode), embeddings()
+    assert torch.equal(made.classify(rows.numpy()).labels, made.classify(rows).labels)
+    assert torch.equal(made.segment(camera(), rows.numpy()), made.segment(camera(), rows))
+    assert torch.equal(made.query(rows[1].numpy()).mask, made.query(rows[1]).mask)
+    assert torch.equal(made.cosines(rows.numpy()), made.cosines(rows))
+    assert torch.equal(made.decode(made.features.numpy()), made.decode(made.features))
+    assert len(made.gaussians[made.query(rows[0])]) == 1
+
+
+def test_names_and_whole_numbers_in_the_place_of_embeddings():
+    made = field()
+    with pytest.raises(TypeError, match=tells("classes", "LabelSet", "'chair'", "query")):
+        made.classify("chair")
+    with pytest.raises(TypeError, match=tells("rows", "'chair'", "embedding")):
+        made.cosines("chair")
+    with pytest.raises(TypeError, match=tells("target", "int64", ".float()")):
+        made.query(torch.ones(DIM, dtype=torch.int64))
+    with pytest.raises(TypeError, match=tells("camera", "Gaussians", "scene.cameras")):
+        made.render(made.gaussians)

@@ -1,12 +1,14 @@
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
 import torch
 from oracles_selection import components as oracle
 
-from kfgs.labels import component_distance, component_numbers, components, select_near, select_where
-from kfgs.labels.radius_graph import radius_components
+from kfgs.gaussians import Gaussians
+from kfgs.labels import Selection, component_distance, component_numbers, connected_parts, select_near
+from kfgs.labels.components import radius_components
 
 
 def clumps(n, heaps, spread, seed):
@@ -20,7 +22,7 @@ def clumps(n, heaps, spread, seed):
 @pytest.mark.parametrize("distance", [0.02, 0.1, 0.3, 1.0])
 @pytest.mark.parametrize("seed", range(6))
 def test_the_same_parts_as_a_flood_fill(distance, seed, monkeypatch):
-    monkeypatch.setattr("kfgs.labels.radius_graph.BLOCK", (7, 4_000_000)[seed % 2])
+    monkeypatch.setattr("kfgs.labels.components.NEIGHBOURS", (1, 8)[seed % 2])
     points = clumps(160, 12, (0.02, 0.2)[seed % 2], seed)
     expected = oracle(points, distance)
     numbers = radius_components(points, distance)
@@ -43,6 +45,29 @@ def test_two_dense_heaps_just_in_range_are_one():
 def test_two_dense_heaps_in_one_cell_are_one():
     heap = np.random.default_rng(0).uniform(0, 1e-4, (30, 3))
     assert radius_components(np.concatenate([heap, heap + np.array([0.1, 0, 0])]), 1.0).max() == 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_crowded_heaps_that_touch_in_a_chain(seed):
+    """Far more than 8 points per heap, heaps in a row: some pairs of heaps join, others stay apart."""
+    rng = np.random.default_rng(seed)
+    starts = np.cumsum(rng.choice([0.25, 0.6], 14))
+    points = (starts[:, None, None] * np.array([1.0, 0, 0]) + rng.uniform(0, 0.1, (14, 20, 3))).reshape(-1, 3)
+    points = points[rng.permutation(len(points))]
+    numbers = radius_components(points, 0.2)
+    assert 1 < numbers.max() + 1 < 14
+    assert [np.flatnonzero(numbers == i).tolist() for i in range(numbers.max() + 1)] == oracle(points, 0.2)
+
+
+def test_memory_stays_bounded_where_thousands_lie_in_range():
+    """20,000 points, all pairs in range: 200 million pairs would take 3 GB."""
+    points = np.random.default_rng(0).uniform(0, 1, (20_000, 3))
+    tracemalloc.start()
+    try:
+        assert radius_components(points, 2.0).max() == 0
+        assert tracemalloc.get_traced_memory()[1] < 50e6
+    finally:
+        tracemalloc.stop()
 
 
 def test_far_outliers_do_not_overflow_the_grid():
@@ -68,19 +93,24 @@ def grid(origin, n=5, step=0.1):
     return torch.stack([x, y, torch.zeros_like(x)], dim=-1).reshape(-1, 3) + torch.tensor(origin)
 
 
+def balls(means):
+    n = len(means)
+    return Gaussians(means, torch.ones(n, 4), torch.full((n, 3), 0.1), torch.full((n,), 0.5))
+
+
 def test_parts_of_a_selection_largest_first():
     means = torch.cat([grid([0.0, 0, 0], n=3), grid([2.0, 0, 0], n=5), grid([4.0, 0, 0], n=4)])
     mask = torch.ones(9 + 25 + 16, dtype=torch.bool)
     mask[-1] = False
-    chosen = select_where(mask, "all but one")
-    parts = components(means, chosen)
-    assert [len(part) for part in parts] == [25, 15, 9]
+    cloud, chosen = balls(means), Selection.of(mask, "all but one")
+    parts = connected_parts(cloud, chosen)
+    assert [part.count for part in parts] == [25, 15, 9]
     assert parts[0].indices.tolist() == list(range(9, 34))
     assert parts[1].how == "all but one; part 2 of 3"
-    assert [len(part) for part in components(means, chosen, smallest=10)] == [25, 15]
-    assert [len(part) for part in components(means, chosen, most=1)] == [25]
-    assert [len(part) for part in components(means, chosen, distance=3.0)] == [49]
-    assert components(means, select_where(torch.zeros_like(mask))) == []
+    assert [part.count for part in connected_parts(cloud, chosen, smallest=10)] == [25, 15]
+    assert [part.count for part in connected_parts(cloud, chosen, most=1)] == [25]
+    assert [part.count for part in connected_parts(cloud, chosen, distance=3.0)] == [49]
+    assert connected_parts(cloud, Selection.of(torch.zeros_like(mask))) == []
 
 
 def test_default_distance_follows_the_selection():
@@ -129,10 +159,12 @@ def test_wrong_input_is_named():
         component_numbers(means, mask.long())
     with pytest.raises(ValueError, match=r"distance: expected a number in \(0, inf\), got 0"):
         component_numbers(means, mask, 0)
-    with pytest.raises(ValueError, match=r"selection.mask: expected \[N\] with N = 4 \(from means\), got \(3,\)"):
-        components(means, select_where(mask[:3]))
+    with pytest.raises(
+        ValueError, match=r"selection.mask: expected \[N\] with N = 4 \(from gaussians.means\), got \(3,\)"
+    ):
+        connected_parts(balls(means), Selection.of(mask[:3]))
     with pytest.raises(ValueError, match="smallest: expected a number in"):
-        components(means, select_where(mask), smallest=0)
+        connected_parts(balls(means), Selection.of(mask), smallest=0)
     with pytest.raises(ValueError, match="labels, features: expected one of them, got none or both"):
         select_near(means, [0, 0, 0])
     with pytest.raises(ValueError, match=r"labels: expected a label at the nearest Gaussian, got -1 \(none\) at"):

@@ -7,7 +7,7 @@ import torch
 from kfgs.cameras import Similarity
 from kfgs.formats import SplatFile, read_splats, write_splats
 from kfgs.gaussians import Gaussians
-from kfgs.labels import Insert, join, select_by_label
+from kfgs.labels import Insert, OfClass, join
 from kfgs.splat import evaluate_sh, transform_gaussians
 
 
@@ -56,7 +56,7 @@ def test_classes_of_one_name_become_one_where_they_are_joined():
     assert into_twice.classes == ("chair", "wall", "chair")  # labels of the first stay what they were
     assert into_twice.gaussians.labels.tolist() == [0, 1, 2, 1, 0]
     for both in (into_plain, into_twice):
-        assert len(select_by_label(both.gaussians, "chair", both.classes)) == 3
+        assert len(OfClass("chair").select(both)) == 3
 
 
 def test_classes_without_names():

@@ -207,7 +207,7 @@ PLAIN = {"scale": 1, "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "translation
         ({"op": "remove"}, r"edits\[0\]: expected 'where' for op 'remove', got none; add it"),
         (
             {"op": "remove", "where": "a", "gorw": 1},
-            r"edits\[0\]: expected op 'remove' with where, grow, .* got 'gorw'",
+            r"edits\[0\]: expected op 'remove' with where, .*grow, got 'gorw'",
         ),
         ({"op": "remove", "where": 3}, r"edits\[0\].where: expected a Where"),
         ({"op": "remove", "where": {"kind": "no"}}, r"edits\[0\].where: expected a selection whose 'kind'"),

@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from safetensors.torch import save_file
 
 from kfgs.labels import LabelSet, classify, load_label_set, teacher_mismatch
@@ -185,3 +186,20 @@ def test_a_thousand_real_words_come_back_from_a_table(shared_data, tmp_path):
     assert classify(rows[[names.index("rocking_chair")]].float(), chairs.embeddings).labels.item() == chairs.index(
         "rocking_chair"
     )
+
+
+def test_names_as_a_list_and_rows_as_an_array():
+    words = LabelSet(["wall", "chair"], np.eye(2, dtype=np.float32))
+    assert words.names == ("wall", "chair")
+    assert words.embeddings.equal(torch.eye(2))
+    with pytest.raises(TypeError, match=tells("names", "'wall'", "list")):
+        LabelSet("wall", torch.eye(4))
+    with pytest.raises(TypeError, match=tells("embeddings", "'wall'")):
+        LabelSet(("wall",), "wall")
+
+
+def test_a_card_in_a_notebook():
+    shown = LabelSet(tuple(map(str, range(30))), torch.eye(30), info={"teacher": {"name": "clip"}})._repr_html_()
+    assert "30: 0, 1, 2" in shown
+    assert "clip" in shown
+    assert len(shown) < 900

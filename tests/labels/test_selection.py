@@ -4,9 +4,11 @@ import operator
 import numpy as np
 import pytest
 import torch
+from messages import tells
 
+from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
-from kfgs.labels import Selection, select_by_label, select_in_box, select_in_sphere, select_where
+from kfgs.labels import AboveScore, InBox, InSphere, OfClass, OrientedBox, Selection
 
 
 def some(seed, n=40):
@@ -26,7 +28,7 @@ def test_what_a_selection_knows():
     assert len(chosen) == 2
     assert chosen.indices.tolist() == [1, 2]
     assert repr(chosen) == "Selection(2 of 3 Gaussians: score > 0.5 (given))"
-    assert not select_where(torch.zeros(3, dtype=torch.bool))  # empty is false
+    assert not Selection.of(torch.zeros(3, dtype=torch.bool))  # empty is false
 
 
 @pytest.mark.parametrize(
@@ -68,7 +70,7 @@ def test_laws_of_the_algebra():
 
 def test_a_place_cuts_a_query_and_leaves_its_scores():
     query = some(3)
-    place = select_where(torch.arange(40) < 20)
+    place = Selection.of(torch.arange(40) < 20)
     inside = query & place
     assert inside.indices.equal(query.indices[query.indices < 20])
     assert inside.scores[:20].equal(query.scores[:20])
@@ -83,27 +85,83 @@ def test_within_keeps_scores_and_threshold():
     assert part.indices.tolist() == [i for i in query.indices.tolist() if i < 10]
 
 
-def test_by_label_index_name_or_several():
+def test_of_a_class_by_index_or_name():
     gaussians, names = cloud([0, 1, -1, 2, 1]), ("wall", "chair", "lamp")
-    assert select_by_label(gaussians, 1).indices.tolist() == [1, 4]
-    assert select_by_label(gaussians, "chair", names).indices.tolist() == [1, 4]
-    assert select_by_label(gaussians, ["lamp", 0], names).indices.tolist() == [0, 3]
-    assert select_by_label(gaussians, -1).indices.tolist() == [2]
-    assert len(select_by_label(gaussians, [])) == 0
-    assert select_by_label(gaussians, "CHAIR", names).indices.tolist() == [1, 4]
-    assert select_by_label(gaussians, "chair", ("wall", "chair", "chair")).indices.tolist() == [1, 3, 4]
-    for one in (np.int64(1), torch.tensor(1), np.array([1]), [torch.tensor(1)], {1}):
-        assert select_by_label(gaussians, one).indices.tolist() == [1, 4]
-    scores = torch.linspace(0, 1, 5)
-    assert select_by_label(gaussians, 1, scores=scores).scores.equal(scores)
+    assert OfClass(1).select(gaussians).indices.tolist() == [1, 4]
+    assert OfClass("chair").select(gaussians, names).indices.tolist() == [1, 4]
+    assert (OfClass("lamp") | OfClass(0)).select(gaussians, names).indices.tolist() == [0, 3]
+    assert OfClass(-1).select(gaussians).indices.tolist() == [2]
+    assert OfClass("CHAIR").select(gaussians, names).indices.tolist() == [1, 4]
+    assert OfClass("chair").select(gaussians, ("wall", "chair", "chair")).indices.tolist() == [1, 3, 4]
+    found = OfClass("chair").select(SplatFile(gaussians, classes=names))
+    assert (found.indices.tolist(), found.scores.tolist()) == ([1, 4], [0, 1, 0, 0, 1])
+    assert (found.threshold, found.how) == (None, "label chair")
+    for one in (np.int64(1), torch.tensor(1)):
+        assert OfClass(one).select(gaussians).indices.tolist() == [1, 4]
+
+
+def placed(means):
+    n = len(means)
+    return Gaussians(means, torch.ones(n, 4), torch.ones(n, 3), torch.full((n,), 0.5))
 
 
 def test_box_and_sphere_hold_their_faces():
-    means = torch.tensor([[0.0, 0, 0], [1, 1, 1], [1.001, 0, 0], [0.5, 0.25, -0.001]])
-    assert select_in_box(means, ([0, 0, 0], [1, 1, 1])).mask.tolist() == [True, True, False, False]
-    assert select_in_sphere(means, [0, 0, 0], 1.0).mask.tolist() == [True, False, False, True]
-    assert select_in_sphere(means, torch.tensor([1.0, 1, 1]), 0).indices.tolist() == [1]
-    assert select_in_box(means, ([0, 0, 0], [1, 1, 1])).how == "in a box of 1 x 1 x 1"
+    means = placed(torch.tensor([[0.0, 0, 0], [1, 1, 1], [1.001, 0, 0], [0.5, 0.25, -0.001]]))
+    assert InBox([0, 0, 0], [1, 1, 1]).mask(means).tolist() == [True, True, False, False]
+    assert InSphere([0, 0, 0], 1.0).mask(means).tolist() == [True, False, False, True]
+    assert InSphere(torch.tensor([1.0, 1, 1]), 1e-9).select(means).indices.tolist() == [1]
+    assert InBox([0, 0, 0], [1, 1, 1]).select(means).how == "in a box of 1 x 1 x 1"
+
+
+def test_a_question_gives_the_same_as_its_parts_combined():
+    splats = SplatFile(cloud([0, 1, -1, 2, 1]), {"score": np.array([0.1, 0.9, 0.2, np.nan, 0.3])}, ("a", "b", "c"))
+    box, sure = InBox((0, 0, 0), (8, 8, 8)), AboveScore(0.25)
+    asked, combined = (
+        ((OfClass("b") & sure) - box).select(splats),
+        (OfClass("b").select(splats) & sure.select(splats)) - box.select(splats),
+    )
+    assert asked.mask.equal(combined.mask)
+    assert asked.scores.equal(combined.scores)
+    assert asked.indices.tolist() == [4]
+    assert sure.select(splats).scores.tolist() == pytest.approx([0.1, 0.9, 0.2, 0.0, 0.3])
+    assert sure.select(splats).threshold == 0.25
+
+
+def test_points_and_box_of_a_class_in_two_lines():
+    splats = SplatFile(cloud([0, 1, -1, 2, 1]), classes=("wall", "chair", "lamp"))
+    chair = OfClass("chair").select(splats)
+    points, box = chair.points(splats), chair.box(splats)
+    assert isinstance(points, np.ndarray)
+    assert points.tolist() == [[3, 4, 5], [12, 13, 14]]
+    assert box.center.tolist() == pytest.approx([7.5, 8.5, 9.5])
+    assert box.half.tolist() == pytest.approx([4.5 * math.sqrt(3), 0, 0], abs=1e-6)
+    for same in (splats.gaussians, splats.gaussians.means, splats.gaussians.means.numpy()):
+        assert np.array_equal(chair.points(same), points)
+    with pytest.raises(ValueError, match=tells("cloud", "N = 5", "(4, 3)")):
+        chair.points(torch.zeros(4, 3))
+    with pytest.raises(ValueError, match=tells("points", "at least one")):
+        OfClass(7).select(splats).box(splats)
+
+
+def test_arrays_are_taken_and_text_gets_advice():
+    chosen = Selection(np.array([True, False]), np.array([0.5, 0.25]))
+    assert chosen.scores.dtype == torch.float64
+    assert chosen & Selection.of(np.array([True, True]))
+    with pytest.raises(TypeError, match=tells("mask", "'chair'", "OfClass")):
+        Selection.of("chair")
+    with pytest.raises(TypeError, match=tells("cloud", "Tensor")):
+        OfClass("chair").select(torch.zeros(3, 3))
+
+
+def test_a_selection_shows_itself_in_short():
+    long = some(0)
+    for seed in range(1, 40):
+        long = long | some(seed)
+    assert len(repr(long)) < 250
+    shown = some(0)._repr_html_()
+    assert shown.startswith("<table>")
+    assert "of 40 Gaussians" in shown
+    assert "Selection" in Selection.of(torch.zeros(3, dtype=torch.bool))._repr_html_()
 
 
 def test_wrong_input_is_named():
@@ -115,30 +173,29 @@ def test_wrong_input_is_named():
     with pytest.raises(TypeError, match="other: expected a Selection, got Tensor; make one"):
         a - a.mask
     with pytest.raises(TypeError, match="mask: expected a boolean mask, got torch.float32"):
-        select_where(torch.ones(3))
+        Selection.of(torch.ones(3))
     with pytest.raises(ValueError, match=r"scores: expected \[N\] with N = 3 \(from mask\), got \(4,\)"):
         Selection(torch.ones(3, dtype=torch.bool), torch.ones(4))
     with pytest.raises(ValueError, match="scores: expected finite numbers, got NaN or infinity in row 1"):
         Selection(torch.ones(2, dtype=torch.bool), torch.tensor([0.0, math.nan]))
     with pytest.raises(ValueError, match="class: expected one of wall, chair, got 'chiar'; did you mean 'chair'?"):
-        select_by_label(gaussians, "chiar", ("wall", "chair"))
-    for wrong in (1.5, [1, 2.0], True, None):
-        with pytest.raises(ValueError, match="label: expected a whole number, got .*; pass an int"):
-            select_by_label(gaussians, wrong)
-    with pytest.raises(ValueError, match=r"label: expected a number in \[-1, .*got -2"):
-        select_by_label(gaussians, -2)
+        OfClass("chiar").select(gaussians, ("wall", "chair"))
+    for wrong in (1.5, [1, 2.0], True, None, b"chair"):
+        with pytest.raises(ValueError, match="name: expected a whole number, got .*; pass an int"):
+            OfClass(wrong)
+    with pytest.raises(ValueError, match=r"name: expected a number in \[-1, .*got -2"):
+        OfClass(-2)
     with pytest.raises(ValueError, match="gaussians.labels: expected labels"):
-        select_by_label(gaussians.replace(labels=None), 1)
+        OfClass(1).select(gaussians.replace(labels=None))
     with pytest.raises(ValueError, match="half: expected half edges >= 0"):
-        select_in_box(torch.zeros(1, 3), ([0, 0, 1], [1, 1, 0]))
-    with pytest.raises(ValueError, match=r"radius: expected a number in \[0, inf\), got -1"):
-        select_in_sphere(torch.zeros(1, 3), [0, 0, 0], -1)
-    with pytest.raises(ValueError, match="center: expected finite numbers"):
-        select_in_sphere(torch.zeros(1, 3), [0, math.nan, 0], 1)
-    with pytest.raises(ValueError, match="means: expected finite numbers, got NaN or infinity in row 1"):
-        select_in_sphere(torch.tensor([[0.0, 0, 0], [math.nan, 0, 0]]), [0, 0, 0], 1)
-
-
-def test_a_name_in_bytes_is_refused():
-    with pytest.raises((TypeError, ValueError), match="label: expected"):
-        select_by_label(cloud([0, 1]), b"chair", ("wall", "chair"))
+        OrientedBox.between([0, 0, 1], [1, 1, 0])
+    with pytest.raises(ValueError, match=tells("max", "min")):
+        InBox([0, 0, 1], [1, 1, 0])
+    with pytest.raises(ValueError, match=r"radius: expected a number in \(0, inf\), got -1"):
+        InSphere([0, 0, 0], -1)
+    with pytest.raises(ValueError, match="center: expected 3 finite numbers"):
+        InSphere([0, math.nan, 0], 1)
+    broken = placed(torch.tensor([[0.0, 0, 0], [math.nan, 0, 0]]))
+    for where in (InSphere([0, 0, 0], 1), InBox([0, 0, 0], [1, 1, 1])):
+        with pytest.raises(ValueError, match="means: expected finite numbers, got NaN or infinity in row 1"):
+            where.select(broken)

@@ -5,6 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
 from kfgs.labels import (
     AboveScore,
@@ -35,7 +36,7 @@ def cloud(n=60, seed=0):
 
 
 def ask(where, gaussians, extra=None):
-    return where.mask(gaussians, CLASSES, extra).tolist()
+    return where.mask(SplatFile(gaussians, extra or {}, CLASSES)).tolist()
 
 
 def test_class_by_name_by_index_and_none():
@@ -128,7 +129,7 @@ def test_component_is_the_largest_connected_part_or_the_next():
 
 
 def test_a_part_far_down_the_list_is_found():
-    n = 250  # parts of one Gaussian each, more than `components` returns
+    n = 250  # parts of one Gaussian each, more than `connected_parts` returns
     g = Gaussians(
         means=torch.arange(n, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0, 0]),
         quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),

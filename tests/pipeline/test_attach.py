@@ -189,7 +189,7 @@ def test_the_clouds_find_the_frame(monkeypatch):
     assert "disagree" in attached.words[0]
     assert "shape of the clouds" in attached.words[0]
     assert accuracy(attached.labels, a_splat()) > 0.95
-    assert attached.alignment.facts["quality"] > 0.7
+    assert attached.alignment.details["quality"] > 0.7
 
 
 def test_views_label_as_well_where_the_splats_frame_is_small():

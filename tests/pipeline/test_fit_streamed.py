@@ -7,9 +7,7 @@ import torch
 from small_room import CONFIG, config, make_room
 
 from kfgs.cameras import Distortion
-from kfgs.features import FeatureFolder
-from kfgs.features.extract import discard_maps, extract_features, pictures_of
-from kfgs.features.recompute import RecomputedMaps
+from kfgs.features import FeatureFolder, RecomputedMaps, discard_maps, extract_features, pictures_of
 from kfgs.pipeline import Run, fit_scene
 from kfgs.pipeline.maps import UndistortedMaps, map_digests, map_shape
 from kfgs.quant import sample_grid

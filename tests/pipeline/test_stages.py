@@ -1,8 +1,9 @@
 import json
 
 import pytest
+from messages import tells
 
-from kfgs.pipeline.stages import Run
+from kfgs.pipeline.stages import Run, UnfinishedError
 
 
 def _maker(calls: list[str], name: str):
@@ -55,7 +56,7 @@ def test_a_stage_of_other_inputs_under_the_same_key_is_refused(tmp_path):
     stage = run.stage("a", {"x": 1}, lambda folder: None)
     about = json.loads((stage.folder / "stage.json").read_text())
     (stage.folder / "stage.json").write_text(json.dumps(about | {"inputs": {"x": 2}}))
-    with pytest.raises(ValueError, match="found another's; delete the folder"):
+    with pytest.raises(ValueError, match=tells("expected the stage of these inputs", "delete it")):
         run.stage("a", {"x": 1}, lambda folder: None)
 
 
@@ -95,3 +96,20 @@ def test_reports_say_what_was_made_and_what_was_found(tmp_path):
     Run(tmp_path, lines.append).stage("a", {}, lambda folder: None)
     Run(tmp_path, lines.append).stage("a", {}, lambda folder: None)
     assert [line.split(" in ")[0] for line in lines] == ["a: working", "a: done", "a: found"]
+
+
+def test_looking_makes_and_writes_nothing(tmp_path):
+    picture = tmp_path / "a.png"
+    picture.write_text("picture")
+    calls: list[str] = []
+    made = Run(tmp_path / "run").stage("a", {"x": 1}, _maker(calls, "one"))
+    before = sorted((tmp_path / "run").rglob("*"))
+    run = Run(tmp_path / "run", look_only=True)
+    assert run.stage("a", {"x": 1}, _maker(calls, "two")).key == made.key
+    assert run.digests([picture]) == [["a.png", "unknown"]]
+    with pytest.raises(UnfinishedError):
+        run.stage("a", {"x": 2}, _maker(calls, "three"))
+    assert sorted((tmp_path / "run").rglob("*")) == before
+    assert calls == ["one"]
+    known = Run(tmp_path / "run").digests([picture])
+    assert run.digests([picture]) == known

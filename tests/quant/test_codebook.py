@@ -1,9 +1,10 @@
 import oracles_quant as oracle
 import pytest
 import torch
+from messages import tells
 
 from kfgs._rows import EPS, unit_rows
-from kfgs.quant import Codebook, IndexMaps
+from kfgs.quant import Codebook, IndexMaps, fit_autoencoder
 from kfgs.quant.codebook import compare
 
 
@@ -153,3 +154,14 @@ def test_every_feature_gets_the_first_largest_product_whatever_the_size(size):
     assert found.codeword.max() < size
     torch.testing.assert_close(found.length, features.double().square().sum(dim=1).sqrt())
     assert found.product[0] < 0
+
+
+def test_arrays_are_accepted_and_names_refused():
+    rows = random_rows(6, 4)
+    book, same = Codebook(rows[:3]), Codebook(rows[:3].numpy())
+    assert torch.equal(same.quantize(rows.numpy()), book.quantize(rows))
+    assert torch.equal(same.similarity(rows.numpy()), book.similarity(rows))
+    with pytest.raises(TypeError, match=tells("features", "'chair'", "embedding")):
+        book.quantize("chair")
+    with pytest.raises(TypeError, match=tells("codebook", "Tensor", "Codebook(codewords)")):
+        fit_autoencoder(rows)

@@ -1,17 +1,23 @@
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from colmap_models import build_model, pycolmap, write_model, write_picture, write_text_model
+from colmap_models import (
+    IMAGES,
+    build_model,
+    pycolmap,
+    read_with_pycolmap,
+    write_model,
+    write_picture,
+    write_text_model,
+)
+from messages import tells
 
 from kfgs.cameras.projection import camera_to_pixel
 from kfgs.scenes import SceneError, load_colmap
-from kfgs.scenes._pycolmap import quiet_pycolmap, wrapped
-from kfgs.scenes.colmap import SUPPORTED_MODELS, convert_intrinsics, read_reconstruction
+from kfgs.scenes.colmap import SUPPORTED_MODELS, convert_intrinsics
 
 INTRINSICS = {
     "SIMPLE_PINHOLE": [50.0, 31, 25],
@@ -114,44 +120,23 @@ def test_the_wrong_image_folder_is_an_error(tmp_path: Path) -> None:
         load_colmap(model, tmp_path / "nowhere")
 
 
-def test_pycolmap_failures_become_scene_errors(tmp_path: Path) -> None:
-    with pytest.raises(SceneError, match=r"x: expected a model \(IndexError: unordered_map::at\); do this"):  # noqa: SIM117
-        with wrapped("x: expected a model", "do this"):
-            raise IndexError("unordered_map::at")
-    with pytest.raises(SceneError, match="MemoryError: no text"), wrapped("x", "y"):
-        raise MemoryError
-    with pytest.raises(KeyboardInterrupt), wrapped("x", "y"):
-        raise KeyboardInterrupt
+def test_a_pose_that_is_no_rotation_is_named(tmp_path: Path) -> None:
+    model = write_text_model(tmp_path / "sparse", images="1 0.65 0.8 0 0 0 0 0 1 a.png\n\n", points3D="")
+    write_picture(tmp_path / "images/a.png")
+    with pytest.raises(SceneError, match=tells("sparse, image a.png", "rotation", "write the model again")):
+        load_colmap(model, tmp_path / "images")
 
 
-def test_the_log_level_is_put_back() -> None:
-    before = pycolmap.logging.minloglevel
-    with quiet_pycolmap():
-        assert pycolmap.logging.minloglevel == 3
-    assert pycolmap.logging.minloglevel == before
-
-
-def test_pillow_can_write_png_after_pycolmap(tmp_path: Path) -> None:
-    code = """
-import sys
-import kfgs.scenes
-assert "pycolmap" not in sys.modules, "kfgs.scenes must not load pycolmap before it is needed"
-import pycolmap
-import numpy as np
-from PIL import Image
-noise = np.random.default_rng(0).integers(0, 255, (700, 500, 3), dtype=np.uint8)
-noise[:, 100:300] = 7
-for i in range(3):
-    Image.fromarray(noise).save(f"{sys.argv[1]}/{i}.png")
-"""
-    pytest.importorskip("PIL")
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr[-500:]
+def test_a_name_too_long_for_the_disk_is_a_missing_file(tmp_path: Path) -> None:
+    images = IMAGES.replace("b.png", "b" * 300 + ".png")
+    write_picture(tmp_path / "images/a.png")
+    scene = load_colmap(write_text_model(tmp_path / "sparse", images=images), tmp_path / "images")
+    assert [camera.name for camera in scene.cameras] == ["a.png"]
 
 
 def test_room_0_projects_its_points_where_they_were_seen(shared_data: Path) -> None:
     folder = shared_data / "room_0"
-    scene, model = load_colmap(folder / "sparse/0", folder / "images"), read_reconstruction(folder / "sparse/0")
+    scene, model = load_colmap(folder / "sparse/0", folder / "images"), read_with_pycolmap(folder / "sparse/0")
     assert len(scene.cameras) == 180
     assert scene.points.shape == (18543, 3)
     image = next(image for image in model.images.values() if image.name == "rgb_100.png")

@@ -1,6 +1,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from colmap_models import write_picture
@@ -119,8 +120,10 @@ def test_select_by_split_name_stem_and_index(tmp_path: Path) -> None:
     assert chosen.splits == {"train": [1], "test": [0]}
     assert chosen.image_paths[0].name == "rgb_10.png"
     assert len(scene.select([2])) == 1
+    for order in (range(1, 3), torch.tensor([1, 2]), np.array([1, 2])):
+        assert scene.select(order).splits == {"train": [0], "test": [1]}
     for which, message in (
-        ("val", r"one of the splits \['test', 'train'\], got 'val'"),
+        ("val", r"one of the splits \['test', 'train'\], got 'val'; pass a list to select views by name"),
         (["rgb_1"], "got 'rgb_1'; names are like 'rgb_0.png'"),
         ([3], "got 3"),
         ([-1], "got -1"),
@@ -141,3 +144,12 @@ def test_scenes_are_checked(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="names that differ before the suffix .* got 'a' twice"):
         replace(scene, cameras=[_camera("a.png"), _camera("a.jpg"), _camera("b.png")])
     assert repr(scene) == "Scene(3 views, 2 points, splits: train 2, test 1)"
+
+
+def test_a_scene_shows_its_facts_in_a_notebook(tmp_path: Path) -> None:
+    scene = replace(_scene(tmp_path, LENS), folder=Path("<b>rooms</b>"), notes=("2 images have no pose",))
+    card = scene._repr_html_()
+    for fact in ("&lt;b&gt;rooms", "split train", "64x48", "distorted", "1.1 world units", "2 images have no pose"):
+        assert fact in card
+    assert "pinhole" in scene.undistorted()._repr_html_()
+    assert "extent" not in scene.select([])._repr_html_()

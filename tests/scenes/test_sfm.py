@@ -10,7 +10,7 @@ from oracles_alignment import align_similarity
 from tqdm import tqdm
 
 from kfgs.scenes import SceneError, SfmConfig, load_scene, read_image, run_sfm
-from kfgs.scenes._pycolmap import import_pycolmap
+from kfgs.scenes.pycolmap_import import import_pycolmap
 from kfgs.scenes.sfm import SfmReport, _require_one_model, _Run, sequential_pairs
 
 WIDTH = 320

@@ -1,4 +1,4 @@
-"""Every CPU engine against float64 brute force, over thousands of random scenes with near-degenerate Gaussians.
+"""Every CPU engine against float64 brute force, over a thousand random scenes with near-degenerate Gaussians.
 
 What is compared, with u the rounding unit of the engine's dtype:
 
@@ -31,7 +31,7 @@ MAPS = {torch.float32: 1e-5, torch.float64: 1e-10}
 GRADIENTS = {torch.float32: 1e-4, torch.float64: 1e-8}
 UNIT = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}
 BLOCK = 50  # scenes in one test
-BLOCKS = {"numba": 40, "reference": 3}  # 2,000 scenes of the engine that people get; float64 takes a tenth
+BLOCKS = {"numba": 20, "reference": 3}  # 1,000 scenes of the engine that people get; float64 takes a tenth
 RESULTS = ("maps", "alphas", *oracle.Gradients._fields, "sums", "weights")
 CHANNELS = (1, 3, 9, 10, 11, 16, 27, 40)
 KINDS = ("ordinary", "needle", "huge", "tiny", "opaque", "faint", "outside")
@@ -251,7 +251,7 @@ def test_float64_is_as_accurate_as_its_rounding(engine, block):
 def test_reruns_are_bit_equal_on_one_thread_and_on_two(engine):
     """The reference's reruns too, but not its threads: torch's matrix product cuts its sums by their number."""
     before = torch.get_num_threads()
-    for case in map(_case, range(20_000, 20_000 + (30 if engine in BLOCKS else 2))):
+    for case in map(_case, range(20_000, 20_000 + {"numba": 30, "reference": 5}.get(engine, 2))):
         cotangents = _cotangents(oracle.composite(case.scene, UNIT[torch.float32]), case.scene, case.seed)
         runs = []
         try:

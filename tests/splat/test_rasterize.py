@@ -1,9 +1,11 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import oracles_splat as oracle
 import pytest
 import torch
 from cases_splat import TOLERANCE, a_camera, gaussians_before
+from messages import tells
 from scipy.spatial.transform import Rotation
 
 from kfgs.cameras.camera import Camera, Distortion
@@ -207,3 +209,18 @@ def test_background_has_one_value_per_channel():
     camera = a_camera()
     with pytest.raises(ValueError, match=r"background: expected \[D\] with D = 3 \(from features\), got \(4,\)"):
         rasterize(gaussians_before(camera, 3, seed=0), camera, background=torch.zeros(4).double())
+
+
+def test_arguments_of_another_kind_and_mixed_types_are_named():
+    camera = a_camera()
+    gaussians = gaussians_before(camera, 4, seed=0)
+    with pytest.raises(TypeError, match=tells("gaussians", "SimpleNamespace", ".gaussians")):
+        rasterize(SimpleNamespace(gaussians=gaussians), camera)
+    with pytest.raises(TypeError, match=tells("camera", "str", "scene.cameras")):
+        rasterize(gaussians, "view_0")
+    for name in ("quats", "scales", "opacities", "features"):
+        mixed = gaussians.replace(**{name: getattr(gaussians, name).float()})
+        with pytest.raises(
+            ValueError, match=tells(f"gaussians.{name}", "float64", "got torch.float32", "gaussians.to(")
+        ):
+            rasterize(mixed, camera)

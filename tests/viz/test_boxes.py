@@ -3,7 +3,7 @@ import pytest
 import torch
 from cases_viz import data, some_gaussians, some_plotter
 
-from kfgs.labels import OrientedBox, select_where
+from kfgs.labels import OrientedBox, Selection
 from kfgs.viz import palette
 from kfgs.viz.boxes import add_boxes, add_names, add_selections
 
@@ -66,7 +66,7 @@ def test_no_name_is_left_out_where_boxes_are_close():
 
 def test_selections_have_colours_and_boxes_of_their_own(plotter):
     gaussians = some_gaussians()
-    low, high = select_where(gaussians.means[:, 0] < -0.5, "low"), select_where(gaussians.means[:, 0] > 0.5, "high")
+    low, high = Selection.of(gaussians.means[:, 0] < -0.5, "low"), Selection.of(gaussians.means[:, 0] > 0.5, "high")
     drawn = add_selections(plotter, gaussians, {"low": low, "high": high})
     labels = np.where(low.mask, 0, np.where(high.mask, 1, -1))
     np.testing.assert_array_equal(data(drawn.cloud)["label"], labels)
@@ -82,7 +82,7 @@ def test_selections_have_colours_and_boxes_of_their_own(plotter):
 
 def test_what_nobody_selected_keeps_the_brightness_of_its_colour(plotter):
     gaussians = some_gaussians()
-    some = select_where(gaussians.means[:, 0] < 0, "left")
+    some = Selection.of(gaussians.means[:, 0] < 0, "left")
     rgb = data(add_selections(plotter, gaussians, {"left": some}).cloud)["rgb"]
     np.testing.assert_array_equal(rgb[some.mask], np.tile(palette(np.array([0])), (len(some), 1)))
     rest = rgb[~some.mask.numpy()].astype(int)
@@ -96,7 +96,7 @@ def test_what_nobody_selected_keeps_the_brightness_of_its_colour(plotter):
 def test_what_cannot_be_boxed_is_named(plotter):
     gaussians = some_gaussians()
     box = OrientedBox.between([0] * 3, [1] * 3)
-    none = select_where(torch.zeros(60, dtype=torch.bool), "nothing")
+    none = Selection.of(torch.zeros(60, dtype=torch.bool), "nothing")
     with pytest.raises(ValueError, match="boxes: expected at least one"):
         add_boxes(plotter, [])
     with pytest.raises(ValueError, match=r"labels: expected 1 \(one per box\), got 2"):
@@ -108,8 +108,8 @@ def test_what_cannot_be_boxed_is_named(plotter):
     with pytest.raises(ValueError, match="selections\\['chair'\\]: expected at least one selected Gaussian, got none"):
         add_selections(plotter, gaussians, {"chair": none})
     with pytest.raises(
-        TypeError, match=r"selections\['chair'\]: expected a Selection, got Tensor; select_where\(mask\)"
+        TypeError, match=r"selections\['chair'\]: expected a Selection, got Tensor; Selection.of\(mask\)"
     ):
         add_selections(plotter, gaussians, {"chair": none.mask})
     with pytest.raises(ValueError, match="mask: expected .* with N = 60"):
-        add_selections(plotter, gaussians, {"chair": select_where(torch.ones(59, dtype=torch.bool), "all")})
+        add_selections(plotter, gaussians, {"chair": Selection.of(torch.ones(59, dtype=torch.bool), "all")})

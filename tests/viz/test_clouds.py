@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 from cases_viz import data, some_camera, some_gaussians, some_plotter
+from messages import tells
 
 from kfgs.cameras import Camera, project_points
 from kfgs.cameras.camera import Distortion
@@ -15,6 +16,7 @@ from kfgs.viz import (
     add_transfer,
     look_through,
     palette,
+    to_pyvista,
 )
 from kfgs.viz.clouds import CloudOptions, recolor_cloud
 
@@ -213,3 +215,30 @@ def test_opacities_are_exchanged_with_the_colours():
             recolor_cloud(actor, colors, 2 * opacities)
         with pytest.raises(ValueError, match=r"opacities: expected \[N\] with N = 60"):
             recolor_cloud(actor, colors, opacities[1:])
+
+
+def test_what_there_is_decides_the_colours_when_nothing_is_asked_for():
+    cloud = some_gaussians(30)
+    labelled = cloud.replace(labels=torch.arange(30) % 3)
+    plain = cloud.replace(sh=None, labels=None, features=None)
+    with_features = plain.replace(features=torch.rand(30, 5))
+    assert np.array_equal(to_pyvista(labelled)["rgb"], palette(labelled.labels))
+    colored = labelled.replace(labels=None)
+    assert np.array_equal(to_pyvista(colored)["rgb"], to_pyvista(colored, "rgb")["rgb"])
+    fitted = FeatureColors.fit(with_features.features)
+    expected = to_pyvista(with_features, "feature", feature_colors=fitted)["rgb"]
+    assert np.array_equal(to_pyvista(with_features)["rgb"], expected)
+    assert np.array_equal(to_pyvista(plain)["rgb"], to_pyvista(plain, "opacity")["rgb"])
+
+
+def test_a_point_cloud_holds_what_the_gaussians_hold():
+    cloud = some_gaussians(30).replace(labels=torch.arange(30) - 1)
+    points = to_pyvista(cloud[5:], torch.rand(25))
+    assert points.n_points == 25
+    np.testing.assert_array_equal(points.points, cloud.means[5:].numpy())
+    np.testing.assert_array_equal(points["label"], cloud.labels[5:])
+    np.testing.assert_allclose(points["scale"], cloud.scales[5:])
+    np.testing.assert_allclose(np.linalg.norm(points["quat"], axis=1), 1, rtol=1e-6)
+    assert {"index", "rgb", "opacity", "score"} <= set(points.point_data)
+    with pytest.raises(TypeError, match=tells("gaussians", "str")):
+        to_pyvista("cloud.ply")

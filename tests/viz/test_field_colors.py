@@ -4,14 +4,16 @@ import numpy as np
 import pytest
 import torch
 from cases_explorer import MODES, cameras, classes, field
+from messages import tells
 
 from kfgs._rows import unit_rows
 from kfgs.fields import SemanticField
 from kfgs.gaussians import Gaussians
 from kfgs.quant import Autoencoder, Codebook, fit_linear_latents
+from kfgs.splat import Rendering
 from kfgs.viz import FeatureColors, feature_colors
-from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.meaning import FieldMeaning
+from kfgs.viz.explorer.state import Exploration
 
 WORDS = torch.tensor([[2.0, 0, 0, 0, 0], [0, 3, 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 1, 1]])
 CODER = Autoencoder(
@@ -103,3 +105,13 @@ def test_the_explorer_has_the_colours_of_rendered_views(mode):
     learnt = made.features.any(dim=1).numpy()
     assert 0 < learnt.sum() < len(made)
     np.testing.assert_array_equal(state.colors("semantic")[learnt], feature_colors(made)(made.features)[learnt])
+
+
+def test_arrays_are_accepted_and_other_things_named():
+    rows = torch.rand(40, 6)
+    colors, same = FeatureColors.fit(rows), FeatureColors.fit(rows.numpy())
+    np.testing.assert_array_equal(same(rows.numpy()), colors(rows))
+    with pytest.raises(TypeError, match=tells("features", "Rendering", ".map")):
+        colors(Rendering(rows, rows, None))
+    with pytest.raises(TypeError, match=tells("field", "Gaussians", "FeatureColors.fit")):
+        feature_colors(gaussians(rows))

@@ -206,7 +206,7 @@ import numpy
 from kfgs.formats import SplatFile
 from kfgs.viz import available, linked_clouds, make_plotter
 from kfgs.viz.explorer import explore
-from kfgs.viz.explorer.exploration import Exploration
+from kfgs.viz.explorer.state import Exploration
 from kfgs.viz.explorer.explorer import Explorer
 from kfgs.viz.explorer.meaning import SplatMeaning
 {CLOUD}

@@ -2,12 +2,11 @@ import numpy as np
 import pytest
 import torch
 from cases_viz import data, some_gaussians, some_plotter
-from matplotlib.axes import Axes
 from oracles_palette import worst_distance
 
 from kfgs.labels import transfer_labels
 from kfgs.viz import add_transfer, palette
-from kfgs.viz.matches import STATE_COLORS, add_matches, match_states, plot_distances
+from kfgs.viz.matches import STATE_COLORS, add_matches, match_states
 
 
 @pytest.fixture
@@ -104,35 +103,3 @@ def test_legend_counts_states_and_says_how_many_lines_are_drawn(monkeypatch, plo
         ["matched 2", "ambiguous 1", "orphaned 2"],
         ["matched 2 (1 line in 1.5)", "ambiguous 1 (1 line in 1.5)", "orphaned 2"],
     ]
-
-
-def test_histogram_counts_every_distance_and_marks_lambda(tmp_path, monkeypatch):
-    bars, lines, named = [], [], []
-    real_bar, real_line = Axes.bar, Axes.axvline
-    monkeypatch.setattr(
-        Axes,
-        "bar",
-        lambda self, x, h, *a, **k: (bars.append((x, h)), named.append(k["label"]), real_bar(self, x, h, *a, **k))[2],
-    )
-    monkeypatch.setattr(Axes, "axvline", lambda self, x, **k: (lines.append(x), real_line(self, x, **k))[1])
-    distances = torch.cat([torch.logspace(-3, 0, 300), torch.zeros(2), torch.full((5,), float("inf"))])
-    plot_distances(distances, 0.1, tmp_path / "distances.png")
-    assert lines == [0.1]
-    assert named == ["within lambda", "beyond"]
-    (near_x, near), (far_x, far) = bars
-    assert near.sum() + far.sum() == 302
-    assert near_x.max() < 0.1 <= far_x.min()
-    assert near.sum() == int((distances < 0.1).sum())  # bins meet at lambda
-    from PIL import Image
-
-    picture = np.asarray(Image.open(tmp_path / "distances.png").convert("RGB")).reshape(-1, 3)
-    for color in (palette(np.array(4)), [191, 191, 191]):
-        assert (picture == color).all(axis=1).sum() > 500
-
-
-def test_wrong_distances_are_named(tmp_path):
-    for values in ([], [0.1, -0.1], [float("nan")]):
-        with pytest.raises(ValueError, match="distances: expected at least one, none negative or NaN"):
-            plot_distances(np.array(values), 0.1, tmp_path / "a.png")
-    with pytest.raises(ValueError, match=r"distance: expected a number in \(0"):
-        plot_distances(np.ones(3), 0.0, tmp_path / "a.png")

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from kfgs.viz.pairs import GAP, picture_grid
+from kfgs.viz.pictures import GAP, picture_grid
 
 
 def test_each_picture_lies_where_its_row_and_column_say():

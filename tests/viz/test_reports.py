@@ -12,14 +12,6 @@ BOOK = torch.tensor([[0.0, 3, 4], [5, 0, 0], [0, 2, 0], [3, 4, 0], [0, 1, 1], [0
 USAGE = torch.tensor([7, 90, 0, 40, 1000, 8])
 
 
-@pytest.fixture
-def figures(monkeypatch):
-    drawn = []
-    save = reports._save
-    monkeypatch.setattr(reports, "_save", lambda figure, path: (drawn.append(figure), save(figure, path))[1])
-    return drawn
-
-
 def history(sizes):
     return [{"epoch": i, "size": k, "added": k // 2, "pruned": i, "coverage": 0.1 * i} for i, k in enumerate(sizes)]
 
@@ -42,18 +34,20 @@ def test_words_are_the_nearest_classes_best_first():
     assert all(len(words) == 3 for words in codebook_rows(BOOK, WORDS, words=9).words)  # there are no more classes
 
 
-def test_large_codebook_shows_its_most_used_rows(monkeypatch, tmp_path, figures):
+def test_large_codebook_shows_its_most_used_rows(monkeypatch, tmp_path):
     monkeypatch.setattr(reports, "SHOWN", 4)
     assert sorted(codebook_rows(BOOK, WORDS, usage=USAGE).codewords.tolist()) == [1, 3, 4, 5]
     assert sorted(codebook_rows(BOOK, WORDS).codewords.tolist()) == [0, 1, 2, 3]
-    plot_codebook_report(BOOK, NAMES, WORDS, tmp_path / "a.png", usage=USAGE)
-    assert figures[0].get_suptitle() == "Codebook: 6 codewords, the most used 4 shown"
+    figure = plot_codebook_report(BOOK, NAMES, WORDS, tmp_path / "a.png", usage=USAGE)
+    assert figure.get_suptitle() == "Codebook: 6 codewords, the most used 4 shown"
 
 
-def test_report_draws_what_the_rows_hold(tmp_path, figures):
-    plot_codebook_report(BOOK, NAMES, WORDS, tmp_path / "report.png", usage=USAGE, history=history([3, 6]), words=2)
+def test_report_draws_what_the_rows_hold(tmp_path):
+    figure = plot_codebook_report(
+        BOOK, NAMES, WORDS, tmp_path / "report.png", usage=USAGE, history=history([3, 6]), words=2
+    )
     rows = codebook_rows(BOOK, WORDS, usage=USAGE, words=2)
-    upper, lower = figures[0].subfigs
+    upper, lower = figure.subfigs
     matrix, usage, words = upper.axes[:3]
     np.testing.assert_allclose(matrix.images[0].get_array(), rows.similarity)
     assert [tick.get_text() for tick in matrix.get_xticklabels()] == NAMES
@@ -70,24 +64,24 @@ def test_report_draws_what_the_rows_hold(tmp_path, figures):
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
 
 
-def test_report_without_usage_and_history_has_two_panels(tmp_path, figures):
-    plot_codebook_report(BOOK[:1], NAMES, WORDS, tmp_path / "a.png")
-    titles = [axes.get_title(loc=loc) for axes in figures[0].subfigs[0].axes for loc in ("center", "left")]
+def test_report_without_usage_and_history_has_two_panels(tmp_path):
+    figure = plot_codebook_report(BOOK[:1], NAMES, WORDS, tmp_path / "a.png")
+    titles = [axes.get_title(loc=loc) for axes in figure.subfigs[0].axes for loc in ("center", "left")]
     assert [title for title in titles if title] == [
         "similarity of codewords, by class",
         "codeword: nearest words (cosine)",
     ]
 
 
-def test_growth_has_a_curve_per_scene(tmp_path, figures):
+def test_growth_has_a_curve_per_scene(tmp_path):
     scenes = {"room 0": history([3, 6, 9]), "office 3": history([4, 4])}
-    plot_codebook_growth(scenes, tmp_path / "growth.png")
-    size, turnover, coverage = figures[0].axes
+    figure = plot_codebook_growth(scenes, tmp_path / "growth.png")
+    size, turnover, coverage = figure.axes
     np.testing.assert_allclose(size.lines[0].get_xydata(), [(0, 3), (1, 6), (2, 9)])
     np.testing.assert_allclose(size.lines[1].get_xydata(), [(0, 4), (1, 4)])
     assert [line.get_linestyle() for line in turnover.lines] == ["-", "--", "-", "--"]  # added, pruned of each
     assert size.get_ylim()[0] == turnover.get_ylim()[0] == coverage.get_ylim()[0] == 0
-    assert [text.get_text() for text in figures[0].legends[0].get_texts()] == ["room 0", "office 3"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["room 0", "office 3"]
     assert len({tuple(line.get_color()) for line in size.lines}) == 2
 
 

@@ -9,13 +9,11 @@ from typing import Any
 
 from ..._files import read_json, write_json
 from ...formats.splat_file import SplatFile
-from .._plain import checked_object
+from .._json import build, checked_object
 from ..where import Where
-from .appearance import Opacity, Recolor
-from .base import Edit
+from .edit import Edit, Extract, Opacity, Recolor, Remove
 from .insert import Insert, read_similarity, read_source
 from .motion import Duplicate, Move, Turn
-from .presence import Extract, Remove
 
 FORMAT, VERSION = "kfgs.edits", 1
 OPS: dict[str, type[Edit]] = {op.op: op for op in (Remove, Extract, Recolor, Opacity, Move, Duplicate, Insert)}
@@ -25,8 +23,8 @@ OPS: dict[str, type[Edit]] = {op.op: op for op in (Remove, Extract, Recolor, Opa
 class EditList:
     """Edits that are applied one after the other, each to what the one before left.
 
-    Nothing is changed in place: `then`, `undo` and `redo` give new lists, `apply` a new cloud. Classes are asked for anew
-    by every edit, so `Remove` after `Insert` sees what was inserted.
+    Nothing is changed in place: `then`, `undo` and `redo` give new lists, `apply` a new cloud. Every edit selects in what
+    the edits before it left, so `Remove` after `Insert` sees what was inserted.
 
     Example:
         >>> edits = EditList().then(Recolor("plant", "#c04040")).then(Remove("chair"))
@@ -37,7 +35,7 @@ class EditList:
     edits: tuple[Edit, ...] = ()
     """What `apply` does, in order."""
     undone: tuple[Edit, ...] = ()
-    """What `redo` brings back, the last one first."""
+    """What `redo` brings back, starting with the last."""
 
     def __post_init__(self) -> None:
         for name in ("edits", "undone"):
@@ -57,7 +55,7 @@ class EditList:
         return iter(self.edits)
 
     def then(self, edit: Edit) -> EditList:
-        """The list with one more edit; what was undone is forgotten."""
+        """The list with one more edit. Undone edits can no longer be redone."""
         return EditList((*self.edits, edit))
 
     def undo(self) -> EditList:
@@ -85,7 +83,7 @@ class EditList:
 
         Raises:
             ValueError: if an edit cannot be done; the message says which.
-            FileNotFoundError: if a file to insert is not there.
+            FileNotFoundError: if a file to insert is missing.
         """
         for i, edit in enumerate(self.edits):
             try:
@@ -97,8 +95,8 @@ class EditList:
     def save(self, path: str | Path) -> Path:
         """Write the list as JSON, undone edits included.
 
-        Files to insert are named relative to the JSON file where they lie in its folder or below, else in full; the
-        latter are only read back with `load(path, anywhere=True)`.
+        Files to insert that lie in the folder of the JSON file or below are named relative to it. Others are named in full,
+        and `load` reads them only with `anywhere=True`.
 
         Raises:
             ValueError: if an insert holds a cloud in memory.
@@ -124,7 +122,7 @@ class EditList:
 
         Raises:
             FileNotFoundError: if there is no such file, or a file to insert is missing.
-            ValueError: if it is no such JSON, of another version, or an edit in it is not one that kfgs knows; the
+            ValueError: if it is another kind of file or of another version, or an edit in it is unknown or wrong; the
                 message names the place in the file.
         """
         path = Path(path)
@@ -182,16 +180,10 @@ def _read(value: Any, name: str, folder: Path, anywhere: bool) -> Edit:
         members["source"] = read_source(members["source"], f"{name}.source", folder, anywhere)
     if "similarity" in members:
         members["similarity"] = read_similarity(members["similarity"], f"{name}.similarity")
-    try:
-        return OPS[op](**members)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}.{error}") from error
+    return build(name, OPS[op], members)
 
 
 def _read_turn(value: dict[str, Any], name: str) -> Turn:
     if set(value) != {"axis", "degrees"}:
         raise ValueError(f"{name}: expected axis and degrees, got {', '.join(value) or 'nothing'}; write both")
-    try:
-        return Turn(**value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}.{error}") from error
+    return build(name, Turn, value)

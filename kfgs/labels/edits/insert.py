@@ -14,14 +14,14 @@ from ...cameras.similarity import Similarity
 from ...formats.splat_file import SplatFile
 from ...formats.table import read_splats
 from ...splat.transform import transform_gaussians
-from .._plain import number_of, numbers_of
-from .base import Edit
+from .._json import number_of, numbers_of
+from .edit import Edit
 from .merge import join
 
 
 @dataclass(frozen=True, eq=False)
 class Insert(Edit):
-    """Add the Gaussians of another splat file behind those of the scene; see `join` for what happens where they differ.
+    """Add the Gaussians of another splat file after those of the scene; `join` says what happens to labels and columns.
 
     The file is read when the edit is applied. Two inserts are equal when they name the same file, relative to the working
     folder or in full, and the same place.
@@ -77,7 +77,7 @@ class Insert(Edit):
         return {"op": self.op, "source": os.fspath(self.source), "similarity": _similarity_json(self.similarity)}
 
     def seen_from(self, folder: Path) -> Insert:
-        """The same edit with its path as it is written in a file of that folder: relative if it lies in it."""
+        """The same edit with its path relative to the folder if it lies in it, else in full."""
         if isinstance(self.source, SplatFile):
             return self
         path, folder = Path(self.source).resolve(), folder.resolve()
@@ -86,10 +86,10 @@ class Insert(Edit):
 
 
 def read_similarity(value: Any, name: str) -> Similarity | None:
-    """What `Insert.to_json` wrote.
+    """Read what `Insert.to_json` wrote.
 
     Raises:
-        ValueError: if it is no such object, or no similarity.
+        ValueError: if it is something else, or not a similarity.
     """
     if value is None:
         return None
@@ -110,7 +110,7 @@ def read_source(value: Any, name: str, folder: Path, anywhere: bool) -> Path:
     """The file that a saved edit names, which by default must lie in the folder of the edits or below it.
 
     Raises:
-        ValueError: if it is no path, leads out of the folder (an absolute path, `..`, a link), or is a folder without a
+        ValueError: if it is not a path, leads out of the folder (an absolute path, `..`, a link), or is a folder without a
             `meta.json` (an unpacked SOG).
         FileNotFoundError: if there is no such file.
     """

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from ...formats.splat_file import SplatFile
 from ...gaussians import Gaussians
-from .base import class_name
 
 _ALWAYS = ("means", "quats", "scales", "opacities")
 
@@ -17,10 +16,10 @@ def join(first: SplatFile, second: SplatFile) -> SplatFile:
     """The Gaussians of two clouds, those of the first in front; the first gives dtype, device and `info`.
 
     - Spherical harmonics: the lower degree is filled up with zeros, which changes no colour.
-    - Labels: classes are the same when their names are, so what the second calls by a name that the first has (twice,
-      maybe) gets its lowest label there; new names that occur are added behind those of the first. A class without a name
-      is called `class 7` as soon as the other cloud has names; when neither has names, indices are kept.
-    - What one cloud lacks: labels are -1 (none), features 0 (like nothing), extra columns 0.
+    - Labels: classes with the same name are the same class. If the first cloud has the name twice, the lowest label is
+      used. New names that occur are added after those of the first. A class without a name is called `class 7` if the
+      other cloud has names; if neither has names, indices are kept.
+    - What one cloud lacks: labels become -1 (none), features 0, extra columns 0.
 
     Raises:
         ValueError: if one has colours and the other has none, or their features have different channels.
@@ -86,3 +85,8 @@ def _joined_labels(first: SplatFile, second: SplatFile) -> tuple[Tensor | None, 
             classes.append(name)
         renamed[new == label] = classes.index(name)
     return torch.cat([old, renamed]), tuple(classes)
+
+
+def class_name(classes: tuple[str, ...], index: int) -> str:
+    """The name of a class; one without a name is called `class 7`."""
+    return classes[index] if index < len(classes) else f"class {index}"

@@ -16,11 +16,9 @@ from ...cameras.similarity import Similarity
 from ...formats.splat_file import SplatFile
 from ...gaussians import Gaussians
 from ...splat.transform import transform_gaussians
-from .._plain import number_of, numbers_of, quaternion_of, rotation_matrix, unit
-from ..where import Where
-from .base import Edit, as_where, scatter, selected
+from .._json import number_of, numbers_of, quaternion_of, rotation_matrix, set_fields, unit
+from .edit import OnSelection
 from .merge import join
-from .presence import check_flag
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
@@ -35,8 +33,7 @@ class Turn:
 
     def __post_init__(self) -> None:
         axis: Any = AXES.get(self.axis, self.axis) if isinstance(self.axis, str) else self.axis
-        object.__setattr__(self, "axis", numbers_of("axis", axis, 3))
-        object.__setattr__(self, "degrees", number_of("degrees", self.degrees))
+        set_fields(self, axis=numbers_of("axis", axis, 3), degrees=number_of("degrees", self.degrees))
         if not any(self.axis):
             raise ValueError("axis: expected a direction, got (0, 0, 0); name 'x', 'y', 'z' or a vector")
 
@@ -51,10 +48,9 @@ class Turn:
 
 
 @dataclass(frozen=True)
-class _Motion(Edit):
+class _Motion(OnSelection):
     """What `Move` and `Duplicate` share: x' = scale R (x - pivot) + pivot + translation."""
 
-    where: Where
     translation: tuple[float, ...] = (0.0, 0.0, 0.0)
     """World units."""
     rotation: Turn | tuple[float, ...] | None = None
@@ -63,22 +59,18 @@ class _Motion(Edit):
     """> 0"""
     pivot: str | tuple[float, ...] = "centroid"
     """The point that turning and resizing leave in place: `"centroid"` (the mean of the selected positions, weighted by
-    opacity; the plain mean where every opacity is 0) or (x, y, z)."""
-    allow_empty: bool = False
-    """False: an empty selection is an error."""
+    opacity; the plain mean if every opacity is 0) or (x, y, z)."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "where", as_where(self.where))
-        object.__setattr__(self, "translation", numbers_of("translation", self.translation, 3))
-        object.__setattr__(self, "rotation", _rotation(self.rotation))
-        object.__setattr__(self, "scale", number_of("scale", self.scale))
+        super().__post_init__()
+        set_fields(self, translation=numbers_of("translation", self.translation, 3), rotation=_rotation(self.rotation))
+        set_fields(self, scale=number_of("scale", self.scale))
         check_range("scale", self.scale, 0, closed=(False, False))
         if isinstance(self.pivot, str):
             if self.pivot != "centroid":
                 raise ValueError(f"pivot: expected 'centroid' or [x, y, z], got {self.pivot!r:.80}; give the point")
         else:
-            object.__setattr__(self, "pivot", numbers_of("pivot", self.pivot, 3))
-        check_flag("allow_empty", self.allow_empty)
+            set_fields(self, pivot=numbers_of("pivot", self.pivot, 3))
 
     def similarity(self, gaussians: Gaussians) -> Similarity:
         """The motion of the selected Gaussians in world axes."""
@@ -95,18 +87,21 @@ class _Motion(Edit):
 
 @dataclass(frozen=True)
 class Move(_Motion):
-    """Move, turn and resize Gaussians; their scales and the directions of their colours go along."""
+    """Move, turn and resize Gaussians, with their scales and the directions of their colours."""
 
     op: ClassVar[str] = "move"
 
     def apply(self, splats: SplatFile) -> SplatFile:
         """See `Edit.apply`."""
-        mask = selected(self.where, splats, self.allow_empty)
+        mask = self.selected(splats)
         if not bool(mask.any()):
             return splats
         part = splats.gaussians.select(mask)
         moved = transform_gaussians(part, self.similarity(part))
-        return splats.replace(gaussians=scatter(splats.gaussians, mask, moved))
+        rows = {name: values.clone() for name, values in vars(splats.gaussians).items() if values is not None}
+        for name, values in rows.items():
+            values[mask] = getattr(moved, name)
+        return splats.replace(gaussians=Gaussians(**rows))
 
 
 @dataclass(frozen=True)
@@ -117,13 +112,12 @@ class Duplicate(_Motion):
 
     def apply(self, splats: SplatFile) -> SplatFile:
         """See `Edit.apply`."""
-        mask = selected(self.where, splats, self.allow_empty)
+        mask = self.selected(splats)
         if not bool(mask.any()):
             return splats
         copy = splats.select(mask)
-        return join(
-            splats, copy.replace(gaussians=transform_gaussians(copy.gaussians, self.similarity(copy.gaussians)))
-        )
+        moved = transform_gaussians(copy.gaussians, self.similarity(copy.gaussians))
+        return join(splats, copy.replace(gaussians=moved))
 
 
 def _rotation(value: Any) -> Turn | tuple[float, ...] | None:

@@ -1,14 +1,14 @@
 """The explorer: both clouds side by side, asked in words, in a window, a browser or a notebook."""
 
 from .desktop import open_window
-from .exploration import Exploration, Show
-from .explore import explore
+from .entry import explore
 from .explorer import Explorer
+from .hit_test import Sight, gaussian_at, neighbours_of, views_seeing
 from .meaning import Asked, FieldMeaning, Meaning, SplatMeaning
 from .notebook import show_in_notebook
 from .options import ExploreOptions
-from .pick import Sight, gaussian_at, neighbours_of, views_seeing
 from .picked import Picked, Side
+from .state import Exploration, Show
 from .web import serve
 
 __all__ = [

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..._check import error_line
 from ..headless import has_display
-from .listed import listed
+from .class_list import class_list
 from .pane import PanelPane
 from .panel import PanelView, Slider, Spot
 from .query_line import QueryLine
@@ -68,7 +68,7 @@ class Desktop:
         self._pressed: tuple[int, int] | None = None  # on a cloud
         self._applied = self._took = 0.0  # when the clouds followed a slider, and how long that took
         self._calling = False
-        self._classes = listed(explorer.state)
+        self._classes = class_list(explorer.state)
         self.pane = PanelPane(explorer.plotter, self.view)
         interactor = explorer.plotter.iren.interactor
         self._tags = {
@@ -136,8 +136,8 @@ class Desktop:
 
     # ---- verbs
 
-    def call(self, verb: Callable[[], str | None]) -> None:
-        """Call a verb, and say what it did or what went wrong, which VTK's event loop would swallow.
+    def call(self, action: Callable[[], str | None]) -> None:
+        """Call a action, and say what it did or what went wrong, which VTK's event loop would swallow.
 
         There is one frame at the end: pyvista draws one for each actor that is added or removed.
         """
@@ -145,7 +145,7 @@ class Desktop:
         self.note = self.error = ""
         self._calling = plotter.suppress_rendering = True
         try:
-            self.note = verb() or ""
+            self.note = action() or ""
         except Exception as error:  # the window stays, whatever it is
             self.error = error_line(error)
         finally:
@@ -201,15 +201,15 @@ class Desktop:
         if not (last or self._took <= BUSY or began - self._applied > self._took):
             self.pane.refresh()
             return
-        verb = self.explorer.set_gamma if slider.name == "gamma" else self.explorer.set_distance
+        action = self.explorer.set_gamma if slider.name == "gamma" else self.explorer.set_distance
         if last:
             self._drag = self._handle = None
-        self.call(lambda: verb(value))
+        self.call(lambda: action(value))
         self._applied = perf_counter()
         self._took = self._applied - began
 
     def _on_change(self) -> None:
-        """A verb was called, by this window, which refreshes the panel afterwards, or by a program."""
+        """A action was called, by this window, which refreshes the panel afterwards, or by a program."""
         if not self._calling:
             self.pane.refresh()
 

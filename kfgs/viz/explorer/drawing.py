@@ -20,9 +20,9 @@ from ..legends import add_legend, add_scalar_bar
 from ..linked import add_title
 from ..meshes import draw_mesh
 from ..stand_ins import FAINT
-from .exploration import check_number
-from .mark import Mark
-from .pick import gaussian_at
+from .hit_test import gaussian_at
+from .ring import Ring
+from .state import check_number
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -56,7 +56,7 @@ class Pane:
         self._points: list[Any] | None = None  # what is clearly seen, the rest, and few of the first
         self._said: Any = None
         self._notes: list[Any] = []
-        self._mark = Mark(self.renderer)
+        self._mark = Ring(self.renderer)
 
     def draw(
         self,

@@ -1,4 +1,4 @@
-"""The explorer: one state, one drawing, and the verbs that a window, a page or a notebook calls."""
+"""The explorer: one state, one drawing, and the methods that a window, a page or a notebook calls."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from ..linked import look_over, upwards
 from ..pictures import save_picture
 from ..through import camera_of, fitted, look_through
 from .drawing import Drawn, Pane
-from .exploration import Exploration, Show
 from .first_frame import FirstFrame
 from .meaning import Asked
-from .numbered import numbered
+from .numbered_files import numbered_path
 from .options import ExploreOptions, Style
 from .picked import Picked, Side
-from .verb import verb
+from .state import Exploration, Show
+from .while_open import while_open
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -38,11 +38,11 @@ HIGHLIGHT = np.array((255, 120, 0))  # lies over a selection in its own colours,
 
 
 class Explorer:
-    """Both clouds side by side, and verbs that change what is asked, shown and picked.
+    """Both clouds side by side, and methods that change what is asked, shown and picked.
 
-    Each verb changes `state`, draws, and then calls the listeners. Nothing opens by itself: `plotter` draws with and
-    without a display. Verbs of several threads wait for each other, but OpenGL is of one thread: once a picture was drawn,
-    call them from the thread that drew it. Every verb of a closed explorer raises a RuntimeError.
+    Each method changes `state`, draws, and then calls the listeners. Nothing opens by itself: `plotter` draws with and
+    without a display. Calls from several threads wait for each other, but OpenGL belongs to one thread: after the first
+    picture, call the methods from the thread that drew it. A closed explorer raises a RuntimeError.
 
     Args:
         exploration: the state.
@@ -91,7 +91,7 @@ class Explorer:
             self.close()
             raise
 
-    @verb
+    @while_open
     def ask(self, words: str | None) -> Asked | None:
         """Ask for a class or a phrase; what answers lights up, the rest is faint. None or "" drops the question.
 
@@ -102,7 +102,7 @@ class Explorer:
         self._changed()
         return self.state.asked
 
-    @verb
+    @while_open
     def set_gamma(self, gamma: float) -> None:
         """Select what scores above gamma.
 
@@ -112,7 +112,7 @@ class Explorer:
         self.state.set_gamma(gamma)
         self._changed()
 
-    @verb
+    @while_open
     def set_distance(self, distance: float) -> None:
         """Let labels travel to colour Gaussians closer than this lambda, world units.
 
@@ -122,7 +122,7 @@ class Explorer:
         self.state.set_distance(distance)
         self._changed()
 
-    @verb
+    @while_open
     def set_show(self, show: Show) -> None:
         """Choose what the colours stand for.
 
@@ -132,7 +132,7 @@ class Explorer:
         self.state.set_show(show)
         self._changed()
 
-    @verb
+    @while_open
     def set_hidden(self, labels: Iterable[int | str]) -> None:
         """Hide classes, by label (-1: what has none) or by name; all others are drawn.
 
@@ -142,7 +142,7 @@ class Explorer:
         self.state.set_hidden(labels)
         self._changed()
 
-    @verb
+    @while_open
     def set_style(self, style: Style) -> None:
         """Draw Gaussians or points; `auto`: points if a frame of Gaussians takes over 1 s.
 
@@ -160,7 +160,7 @@ class Explorer:
         """How the clouds are drawn now."""
         return self._style
 
-    @verb
+    @while_open
     def pick(self, x: float, y: float) -> Picked | None:
         """Point at what is seen at a place of the window; None (and no mark) where that is the background.
 
@@ -181,7 +181,7 @@ class Explorer:
         self._changed()
         return picked
 
-    @verb
+    @while_open
     def look_from(self, camera: Camera) -> None:
         """Look through a posed camera: all that it sees, in its own proportions.
 
@@ -195,7 +195,7 @@ class Explorer:
             self.plotter.camera.SetUseExplicitAspectRatio(False)  # the window may be resized
         self._moved()
 
-    @verb
+    @while_open
     def reset_view(self) -> None:
         """Look from where the first view was."""
         if self._camera is not None:
@@ -207,7 +207,7 @@ class Explorer:
             look_over(self.plotter, self.state.cloud("semantic"), upwards(self.state.cameras))
             self._moved()
 
-    @verb
+    @while_open
     def screenshot(self, path: str | Path | None = None) -> Array:  # [H, W, 3] uint8
         """The picture of now; with a path also as a PNG file."""
         listed = self._listed
@@ -221,21 +221,21 @@ class Explorer:
             save_picture(path, picture)
         return picture
 
-    @verb
+    @while_open
     def save_picture(self) -> Path:
         """Write the picture of now as the next numbered file of `options.out`."""
-        with numbered(self.options.out, "picture", ".png") as path:
+        with numbered_path(self.options.out, "picture", ".png") as path:
             self.screenshot(path)
         return path
 
-    @verb
+    @while_open
     def save_selection(self) -> list[Path]:
         """Write numbers and Gaussians of what is selected into the next numbered folder of `options.out`.
 
         Raises:
             ValueError: if nothing is selected.
         """
-        with numbered(self.options.out, "selection") as folder:
+        with numbered_path(self.options.out, "selection") as folder:
             return self.state.save_selection(folder)
 
     def lines(self) -> list[str]:
@@ -253,7 +253,7 @@ class Explorer:
             self._draw()
 
     def listen(self, callback: Callable[[], None]) -> None:
-        """Have a function called after each change. It may call verbs, but not wait for those of another thread."""
+        """Have a function called after each change. It may call methods of the explorer, but not wait for other threads."""
         self._listeners.append(callback)
 
     @property
@@ -312,7 +312,7 @@ class Explorer:
 
     def _draw(self) -> None:
         """Bring what is drawn up to the state, without a frame: pyvista draws one for each thing that is added."""
-        with self.lock:  # a face may ask for it while a verb of another thread is at work
+        with self.lock:  # a face may ask for it while another thread calls a method
             before = self.plotter.suppress_rendering
             self.plotter.suppress_rendering = True
             try:

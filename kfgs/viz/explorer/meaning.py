@@ -16,14 +16,13 @@ from ...formats.splat_file import SCORE
 from ...gaussians import Gaussians
 from ...labels import (
     LabelSet,
+    OfClass,
     Selection,
     class_index,
     class_indices,
-    select_by_label,
 )
 from ...labels.questions import class_rows, make_question
-from ..field_colors import feature_colors, learnt_colors
-from ..pictures import FeatureColors
+from ..field_colors import FeatureColors, colors_of_features, feature_colors
 
 if TYPE_CHECKING:
     from ...fields import SemanticField
@@ -188,7 +187,7 @@ class SplatMeaning:
         """
         words = self.names[class_indices(words.strip(), self.names)[0]]
         if words not in self._answers:
-            member = select_by_label(self.gaussians, words, self.names).mask
+            member = OfClass(words).mask(self.gaussians, self.names)
             scores = torch.where(member, self.scores, 0)
             own = scores[member]
             low, high = (float(own.min()), float(own.max())) if len(own) else UNIT
@@ -204,7 +203,7 @@ class SplatMeaning:
     def feature_colors(self) -> FeatureColors:
         """A projection fitted to the features of all Gaussians that have any."""
         assert self.gaussians.features is not None
-        return learnt_colors(self.gaussians.features)
+        return colors_of_features(self.gaussians.features)
 
 
 def _with_answers(field: SemanticField, cameras: Sequence[Camera]) -> tuple[SemanticField, str]:

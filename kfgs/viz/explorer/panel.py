@@ -27,7 +27,7 @@ class Spot(NamedTuple):
     """Something in the panel that can be clicked."""
 
     kind: str  # question, slider, show, style, do, box, name, all
-    value: Any  # which one: a slider's name, a verb, a label
+    value: Any  # which one: a slider's name, a action, a label
     box: Box
 
     def holds(self, x: float, y: float) -> bool:
@@ -83,9 +83,9 @@ class PanelView:
     """Rows of classes above the first one shown."""
     lines: Sequence[str] = ()
     note: str = ""
-    """What the last verb did."""
+    """What the last action did."""
     error: str = ""
-    """What the last verb complained of."""
+    """What the last action complained of."""
     keys: Sequence[str] = ()
 
 

@@ -10,8 +10,8 @@ from ...cameras import Camera
 from ...gaussians import Gaussians
 from ..frusta import evenly
 from .carried import Carried
+from .hit_test import Sight, neighbours_of, views_seeing
 from .meaning import Asked, Meaning
-from .pick import Sight, neighbours_of, views_seeing
 
 Side = Literal["semantic", "color"]
 SPOKEN: dict[Side, str] = {"semantic": "semantic", "color": "colour"}

@@ -11,8 +11,9 @@ from scipy.spatial import cKDTree
 from ...gaussians import Gaussians
 from ...splat import sh0_to_rgb
 from ..cloud_colors import cloud_colors
+from ..field_colors import FeatureColors
 from ..palette import UNLABELLED
-from ..pictures import FeatureColors, as_bytes
+from ..pictures import as_bytes
 from .carried import Array, Carried
 from .picked import Side
 

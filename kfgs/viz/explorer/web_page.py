@@ -14,7 +14,7 @@ import numpy as np
 
 from ..._check import error_line
 from ..palette import palette
-from .listed import listed
+from .class_list import class_list
 from .web_mouse import make_mouse
 from .web_picture import Pictures, make_delivery
 
@@ -154,8 +154,8 @@ class ExplorerPage:
         self._queue("ask", lambda: self.explorer.ask(said or None))
 
     def _on_set_number(self, name: object, text: object) -> None:
-        verb = {"gamma": self.explorer.set_gamma, "distance": self.explorer.set_distance}[str(name)]
-        self._queue(str(name), lambda: verb(_number(str(name), text)))
+        action = {"gamma": self.explorer.set_gamma, "distance": self.explorer.set_distance}[str(name)]
+        self._queue(str(name), lambda: action(_number(str(name), text)))
 
     def _on_set_show(self, value: object) -> None:
         self._queue("show", lambda: self.explorer.set_show(value))  # type: ignore[arg-type]
@@ -172,7 +172,7 @@ class ExplorerPage:
         self._queue(f"hide {label!r}", action)
 
     def _on_hide_all(self, hidden: object) -> None:
-        labels = [label for label, _ in listed(self.explorer.state)] if hidden else []
+        labels = [label for label, _ in class_list(self.explorer.state)] if hidden else []
         self._queue("hide", lambda: self.explorer.set_hidden(labels))
 
     def _on_pick(self, across: object, down: object) -> None:
@@ -263,7 +263,7 @@ class ExplorerPage:
 
     def _classes(self) -> list[dict[str, Any]]:
         state = self.explorer.state
-        rows, labels = listed(state), state.labels("semantic")
+        rows, labels = class_list(state), state.labels("semantic")
         colors = palette(np.array([label for label, _ in rows], dtype=np.int64))
         counts = [int((labels == label).sum()) for label, _ in rows]
         return [

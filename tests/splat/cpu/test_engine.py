@@ -25,12 +25,12 @@ from kfgs.splat.engines.cpu import engine as numba_cpu  # noqa: E402
 from kfgs.splat.engines.cpu import square as numba_square  # noqa: E402
 from kfgs.splat.engines.cpu.simd import bits, load  # noqa: E402
 from kfgs.splat.engines.cpu.square import (  # noqa: E402
-    BLOCK,
+    BLOCK_SIDE,
     BLOCKS,
     CHUNK,
     LANES,
     PIXELS,
-    SIDE,
+    SQUARE_SIDE,
     STATE,
     X,
     Y,
@@ -89,7 +89,7 @@ def _everywhere(M, width, height, tile_size):
 @pytest.fixture
 def many_bands(monkeypatch):
     """Small frames are cut into bands, too."""
-    monkeypatch.setattr(numba_cpu, "BAND", 64, raising=False)
+    monkeypatch.setattr(numba_cpu, "PAIRS_PER_BAND", 64)
 
 
 @pytest.fixture
@@ -129,7 +129,14 @@ def _touched_and_drawn(rows, left, top):
     """[M, 16] truth and [M, 16, 16] truth, for the square that begins at a pixel."""
     M = len(rows) // row_length(0)
     touched, drawn = np.zeros(M, np.uint32), np.zeros((M, BLOCKS), np.uint32)
-    _look(rows, row_length(0), (left, top, left + SIDE, top + SIDE), np.finfo(rows.dtype).eps, touched, drawn)
+    _look(
+        rows,
+        row_length(0),
+        (left, top, left + SQUARE_SIDE, top + SQUARE_SIDE),
+        np.finfo(rows.dtype).eps,
+        touched,
+        drawn,
+    )
     return touched[:, None] >> np.arange(BLOCKS) & 1 == 1, drawn[:, :, None] >> np.arange(LANES) & 1 == 1
 
 
@@ -141,8 +148,11 @@ def test_touched_blocks_are_those_with_a_drawn_pixel_and_few_more(dtype):
     expected, wasted = 0, 0
     for m, (mean, conic, opacity) in enumerate(zip(*values, strict=True)):
         for block in range(BLOCKS):
-            x, y = left + block % BLOCK * BLOCK + 0.5 - mean[0], top + block // BLOCK * BLOCK + 0.5 - mean[1]
-            smallest = oracle.smallest_in_rectangle(conic, x, x + BLOCK - 1, y, y + BLOCK - 1)
+            x, y = (
+                left + block % BLOCK_SIDE * BLOCK_SIDE + 0.5 - mean[0],
+                top + block // BLOCK_SIDE * BLOCK_SIDE + 0.5 - mean[1],
+            )
+            smallest = oracle.smallest_in_rectangle(conic, x, x + BLOCK_SIDE - 1, y, y + BLOCK_SIDE - 1)
             reach = oracle.reach(opacity)
             if smallest <= reach:
                 expected += 1
@@ -161,10 +171,11 @@ def test_drawn_pixels_are_those_of_the_equation():
     _, drawn = _touched_and_drawn(rows, left, top)
     expected = np.zeros((M, BLOCKS, LANES), bool)
     for m, splat in enumerate(zip(*values, strict=True)):
-        for i in range(SIDE):
-            for j in range(SIDE):
+        for i in range(SQUARE_SIDE):
+            for j in range(SQUARE_SIDE):
                 alpha = oracle.alpha_at(left + j + 0.5, top + i + 0.5, *splat)
-                expected[m, i // BLOCK * BLOCK + j // BLOCK, i % BLOCK * BLOCK + j % BLOCK] = alpha > 0
+                block = i // BLOCK_SIDE * BLOCK_SIDE + j // BLOCK_SIDE
+                expected[m, block, i % BLOCK_SIDE * BLOCK_SIDE + j % BLOCK_SIDE] = alpha > 0
     assert expected.sum() > 1000
     np.testing.assert_array_equal(drawn, expected)
 
@@ -191,7 +202,9 @@ def test_no_pixel_outside_of_touched_blocks_is_drawn_however_it_rounds(dtype):
         touched, drawn = _touched_and_drawn(rows, left, top)
         assert not (drawn.any(axis=2) & ~touched).any(axis=1).any()
         i, j = 20 - top, 20 - left
-        on_edge += drawn[:, i // BLOCK * BLOCK + j // BLOCK, i % BLOCK * BLOCK + j % BLOCK].sum()
+        on_edge += drawn[
+            :, i // BLOCK_SIDE * BLOCK_SIDE + j // BLOCK_SIDE, i % BLOCK_SIDE * BLOCK_SIDE + j % BLOCK_SIDE
+        ].sum()
     assert 0.1 < on_edge / (6 * M) < 0.9  # the case is what it is meant to be: some are drawn there, some are not
 
 
@@ -341,7 +354,7 @@ def test_few_and_many_channels_are_done_alike(channels, narrow, monkeypatch):
     """The kernels for few channels and those for many, on what both can do."""
     projected, features = random_splats(300, 45, 37, seed=7, channels=channels)
     expected = _gradients(projected, features, 45, 37)
-    monkeypatch.setattr(numba_cpu, "NARROW", narrow)
+    monkeypatch.setattr(numba_cpu, "NARROW_CHANNELS", narrow)
     for a, b in zip(_gradients(projected, features, 45, 37), expected, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-11)
 
@@ -463,7 +476,7 @@ def test_bands_cover_all_tiles_once_and_do_not_depend_on_threads(many_bands):
     np.testing.assert_array_equal(bounds, views[1].bounds)
     assert (bounds[0], bounds[-1]) == (0, len(tiles.offsets) - 1)
     assert (np.diff(bounds) >= 0).all()
-    assert len(bounds) == numba_cpu.BANDS + 1
+    assert len(bounds) == numba_cpu.MOST_BANDS + 1
     pairs = np.diff(tiles.offsets.numpy()[bounds])
     assert pairs.max() <= 3 * pairs.mean()
 
@@ -472,7 +485,7 @@ def test_bands_cover_all_tiles_once_and_do_not_depend_on_threads(many_bands):
 def test_bands_change_nothing_but_rounding(channels, monkeypatch):
     results = []
     for pairs in (1 << 40, 500, 10):  # of a band at least
-        monkeypatch.setattr(numba_cpu, "BAND", pairs, raising=False)
+        monkeypatch.setattr(numba_cpu, "PAIRS_PER_BAND", pairs)
         results.append(_gradients(*_many(torch.float64, channels)))
     for other in results[1:]:
         for a, b in zip(results[0], other, strict=True):
@@ -497,7 +510,7 @@ def test_what_was_in_memory_before_is_never_read(channels, dtype, monkeypatch, m
         return like.new_full(shape, float("nan") if like.is_floating_point() else -1)
 
     expected = run()
-    monkeypatch.setattr(numba_cpu, "take", poisoned)
+    monkeypatch.setattr(numba_cpu, "take_memory", poisoned)
     for a, b in zip(run(), expected, strict=True):
         assert torch.equal(a, b)
 
@@ -650,5 +663,5 @@ def test_a_warm_start_compiles_nothing():
 
 
 def test_a_block_is_a_vector():
-    assert PIXELS == SIDE * SIDE == BLOCKS * LANES
-    assert BLOCK * BLOCK == LANES == numba_square.BLOCKS
+    assert PIXELS == SQUARE_SIDE * SQUARE_SIDE == BLOCKS * LANES
+    assert BLOCK_SIDE * BLOCK_SIDE == LANES == numba_square.BLOCKS

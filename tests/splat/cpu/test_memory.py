@@ -13,18 +13,18 @@ pytest.importorskip("numba")
 
 from kfgs.splat import bin_tiles, composite
 from kfgs.splat.engines.cpu import memory as numba_memory
-from kfgs.splat.engines.cpu.memory import LINE, take
+from kfgs.splat.engines.cpu.memory import CACHE_LINE, take_memory
 
 LIKE = torch.empty(0)
 SIZE = 5000
-"""Numbers taken at once: 20 kB, far above the SMALL of these tests."""
+"""Numbers taken at once: 20 kB, far above the SMALLEST_KEPT of these tests."""
 
 
 @pytest.fixture(autouse=True)
 def _nothing_kept(monkeypatch):
     """Each test begins with nothing kept, and even little is."""
     monkeypatch.setattr(numba_memory, "_kept", numba_memory._Kept())
-    monkeypatch.setattr(numba_memory, "SMALL", 1024)
+    monkeypatch.setattr(numba_memory, "SMALLEST_KEPT", 1024)
 
 
 def _kept_bytes():
@@ -36,34 +36,34 @@ def _kept_bytes():
 def test_dtype_shape_and_alignment(dtype, shape):
     like = torch.empty(3, dtype=dtype, requires_grad=dtype.is_floating_point)
     for _ in range(3):  # new, and handed out again
-        tensor = take(like, *shape)
+        tensor = take_memory(like, *shape)
         assert (tensor.dtype, tensor.shape, tensor.device) == (dtype, shape, like.device)
         assert tensor.is_contiguous()
         assert not tensor.requires_grad
-        assert tensor.numel() < SIZE or tensor.data_ptr() % LINE == 0
+        assert tensor.numel() < SIZE or tensor.data_ptr() % CACHE_LINE == 0
         tensor.fill_(1)
         assert tensor.sum() == tensor.numel()
         del tensor
 
 
 def test_memory_is_handed_out_again_once_it_is_free():
-    first = take(LIKE, SIZE)
+    first = take_memory(LIKE, SIZE)
     place = first.data_ptr()
     del first
-    second = take(LIKE, SIZE)
+    second = take_memory(LIKE, SIZE)
     assert second.data_ptr() == place
-    third = take(LIKE, SIZE)
+    third = take_memory(LIKE, SIZE)
     assert third.data_ptr() != place
     del second
-    assert take(LIKE, 50, 100).data_ptr() == place  # the same bytes in another shape
-    assert take(torch.empty(0, dtype=torch.float64), SIZE // 2).data_ptr() == place  # and of another type
+    assert take_memory(LIKE, 50, 100).data_ptr() == place  # the same bytes in another shape
+    assert take_memory(torch.empty(0, dtype=torch.float64), SIZE // 2).data_ptr() == place  # and of another type
     assert len(numba_memory._kept.buffers) == 2
 
 
 class _Saves(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x):
-        mine = take(x, SIZE).fill_(2)
+        mine = take_memory(x, SIZE).fill_(2)
         ctx.save_for_backward(mine)
         return x * 2
 
@@ -94,121 +94,121 @@ HOLDERS = {
 
 @pytest.mark.parametrize("held", HOLDERS)
 def test_memory_in_use_is_not_handed_out(held):
-    tensor = take(LIKE, SIZE).fill_(1)
+    tensor = take_memory(LIKE, SIZE).fill_(1)
     place = tensor.data_ptr()
     holder = HOLDERS[held](tensor)
     del tensor
     gc.collect()
-    others = [take(LIKE, SIZE).fill_(7) for _ in range(3)]
+    others = [take_memory(LIKE, SIZE).fill_(7) for _ in range(3)]
     assert place not in [other.data_ptr() for other in others]
     del holder
     gc.collect()
-    assert take(LIKE, SIZE).data_ptr() == place
+    assert take_memory(LIKE, SIZE).data_ptr() == place
 
 
 def test_memory_saved_for_backward_is_not_handed_out():
     x = torch.ones(3, requires_grad=True)
     y = _Saves.apply(x)
     for _ in range(3):
-        take(LIKE, SIZE).fill_(7)
+        take_memory(LIKE, SIZE).fill_(7)
     (grad,) = torch.autograd.grad(y.sum(), x)
     assert grad.tolist() == [2, 2, 2]
     del y  # the graph held the one, and the loop filled another again and again
-    assert len({take(LIKE, SIZE).data_ptr() for _ in range(9)}) == 2
+    assert len({take_memory(LIKE, SIZE).data_ptr() for _ in range(9)}) == 2
 
 
 def test_a_copy_does_not_hold_memory():
-    tensor = take(LIKE, SIZE).fill_(3)
+    tensor = take_memory(LIKE, SIZE).fill_(3)
     place = tensor.data_ptr()
     copies = tensor.clone(), pickle.loads(pickle.dumps(tensor)), tensor.tolist()
     del tensor
-    assert take(LIKE, SIZE).fill_(7).data_ptr() == place
+    assert take_memory(LIKE, SIZE).fill_(7).data_ptr() == place
     assert (copies[0] == 3).all()
 
 
 def test_memory_much_larger_or_too_small_is_left_alone():
-    place = take(LIKE, 4 * SIZE).data_ptr()
-    small = take(LIKE, SIZE)
+    place = take_memory(LIKE, 4 * SIZE).data_ptr()
+    small = take_memory(LIKE, SIZE)
     assert not place <= small.data_ptr() < place + 16 * SIZE
     del small
-    assert take(LIKE, 2 * SIZE + 1000).data_ptr() == place  # more than half of it
+    assert take_memory(LIKE, 2 * SIZE + 1000).data_ptr() == place  # more than half of it
     assert len(numba_memory._kept.buffers) == 2
 
 
 def test_little_memory_comes_from_torch():
-    take(LIKE, 255)
+    take_memory(LIKE, 255)
     assert numba_memory._kept.buffers == []
-    take(LIKE, 256)
+    take_memory(LIKE, 256)
     assert len(numba_memory._kept.buffers) == 1
 
 
 def test_no_more_is_kept_than_allowed(monkeypatch):
-    monkeypatch.setattr(numba_memory, "KEPT", 50_000)  # two buffers of 20 kB
-    tensors = [take(LIKE, SIZE).fill_(i) for i in range(5)]
+    monkeypatch.setattr(numba_memory, "MOST_KEPT", 50_000)  # two buffers of 20 kB
+    tensors = [take_memory(LIKE, SIZE).fill_(i) for i in range(5)]
     assert 2 * 4 * SIZE <= _kept_bytes() <= 50_000
     for i, tensor in enumerate(tensors):  # those that are no longer kept still belong to their owners
         assert (tensor == i).all()
     assert len({tensor.data_ptr() for tensor in tensors}) == 5
     latest = {tensor.data_ptr() for tensor in tensors[3:]}
     del tensors, tensor
-    assert {take(LIKE, SIZE).data_ptr()} <= latest
-    large = take(LIKE, 20_000).fill_(9)  # alone more than what may be kept
+    assert {take_memory(LIKE, SIZE).data_ptr()} <= latest
+    large = take_memory(LIKE, 20_000).fill_(9)  # alone more than what may be kept
     assert (large == 9).all()
     assert 2 * 4 * SIZE <= _kept_bytes() <= 50_000  # and does not drive the others out
 
 
 def test_memory_is_handed_back_on_request():
-    mine = take(LIKE, SIZE).fill_(3)
+    mine = take_memory(LIKE, SIZE).fill_(3)
     numba_memory.free_memory()
     assert numba_memory._kept.buffers == []
-    take(LIKE, SIZE).fill_(7)
+    take_memory(LIKE, SIZE).fill_(7)
     assert (mine == 3).all()  # what is in use stays
 
 
 def test_nothing_is_kept_where_references_are_not_counted(monkeypatch):
     monkeypatch.setattr(numba_memory, "_COUNTS", False)
-    assert take(LIKE, SIZE).shape == (SIZE,)
+    assert take_memory(LIKE, SIZE).shape == (SIZE,)
     assert numba_memory._kept.buffers == []
 
 
 def test_what_was_used_last_is_kept_longest(monkeypatch):
-    monkeypatch.setattr(numba_memory, "KEPT", 50_000)
-    first, second = take(LIKE, SIZE), take(LIKE, SIZE)
+    monkeypatch.setattr(numba_memory, "MOST_KEPT", 50_000)
+    first, second = take_memory(LIKE, SIZE), take_memory(LIKE, SIZE)
     place = first.data_ptr()
     del first
-    again = take(LIKE, SIZE)
+    again = take_memory(LIKE, SIZE)
     assert again.data_ptr() == place
-    third = take(LIKE, SIZE)  # the second makes room
+    third = take_memory(LIKE, SIZE)  # the second makes room
     del again
-    assert take(LIKE, SIZE).data_ptr() == place
+    assert take_memory(LIKE, SIZE).data_ptr() == place
     assert len({place, second.data_ptr(), third.data_ptr()}) == 3
 
 
 def test_each_thread_has_its_own():
-    place = take(LIKE, SIZE).data_ptr()
+    place = take_memory(LIKE, SIZE).data_ptr()
     found = []
 
     def other():
-        found.append(take(LIKE, SIZE).fill_(1))
+        found.append(take_memory(LIKE, SIZE).fill_(1))
         del found[0]
-        found.append(take(LIKE, SIZE).data_ptr())
+        found.append(take_memory(LIKE, SIZE).data_ptr())
         found.append(len(numba_memory._kept.buffers))
 
     thread = threading.Thread(target=other)
     thread.start()
     thread.join()
     assert found[1] == 1
-    assert take(LIKE, SIZE).data_ptr() == place
+    assert take_memory(LIKE, SIZE).data_ptr() == place
     assert len(numba_memory._kept.buffers) == 1
 
 
 def test_memory_outlives_the_thread_that_took_it():
     found = []
-    thread = threading.Thread(target=lambda: found.append(take(LIKE, SIZE).fill_(5)))
+    thread = threading.Thread(target=lambda: found.append(take_memory(LIKE, SIZE).fill_(5)))
     thread.start()
     thread.join()
     gc.collect()
-    others = [take(LIKE, SIZE).fill_(7) for _ in range(3)]
+    others = [take_memory(LIKE, SIZE).fill_(7) for _ in range(3)]
     assert (found[0] == 5).all()
     assert found[0].data_ptr() not in [other.data_ptr() for other in others]
 

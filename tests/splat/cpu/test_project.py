@@ -201,7 +201,7 @@ def test_threads_and_shares_and_order_do_not_matter(dtype, monkeypatch):
 
 
 @pytest.mark.parametrize("N", [1, 63, 64, 65, 128])
-def test_any_number_of_gaussians_fills_the_blocks(N):
+def test_any_number_of_gaussians_fills_the_batches(N):
     camera = a_camera()
     gaussians = gaussians_before(camera, N, seed=N, spread=0.9)
     (actual, actual_grads), (expected, expected_grads) = (_run(gaussians, camera, e) for e in ("numba", "reference"))
@@ -273,10 +273,10 @@ def test_inputs_may_be_strided():
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="reads x86-64 assembly")
-def test_blocks_are_vectorised_and_stay_in_float32():
+def test_batches_are_vectorised_and_stay_in_float32():
     matrix = np.eye(4, dtype=np.float32)
     lens = numba_project_math.make_lens(matrix, matrix[:3, :3], 4, 4, 0.1, 0.3)
-    for module, name in ((numba_project_forward, "_project_block"), (numba_project_backward, "_differentiate_block")):
+    for module, name in ((numba_project_forward, "_project_batch"), (numba_project_backward, "_differentiate_batch")):
         kernel = getattr(module, name)
         kernel(np.ones(module._STATE, np.float32), lens)
         (text,) = (t for s, t in kernel.inspect_asm().items() if s[0].dtype == numba.float32)

@@ -8,8 +8,8 @@ from kfgs.formats import SplatFile
 from kfgs.splat.rasterize import rasterize
 from kfgs.viz import palette
 from kfgs.viz.explorer import drawing, gaussian_at
-from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.meaning import SplatMeaning
+from kfgs.viz.explorer.state import Exploration
 
 pytestmark = pytest.mark.usefixtures("driver")
 

@@ -11,9 +11,9 @@ from cases_explorer import splat_file
 from kfgs.viz import available, headless
 from kfgs.viz.explorer import ExploreOptions, Explorer
 from kfgs.viz.explorer.desktop import Desktop, open_window
-from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.meaning import SplatMeaning
 from kfgs.viz.explorer.panel import WIDTH
+from kfgs.viz.explorer.state import Exploration
 
 pytestmark = pytest.mark.skipif(not available(), reason=headless.probe().reason)
 
@@ -149,20 +149,25 @@ semantic, color = clouds()
 explorer = Explorer(Exploration(SplatMeaning(splat_file(semantic)), color), ExploreOptions(height=420, width=600))
 interactor, seen = explorer.plotter.iren.interactor, []
 
+def press(*keys):
+    for key in keys:
+        code = {"slash": "/", "Return": chr(13)}.get(key, key)
+        interactor.SetKeyEventInformation(0, 0, code, 0, key)
+        interactor.InvokeEvent("KeyPressEvent")
+        interactor.InvokeEvent("CharEvent")
+
 def work(*_):
     if not seen:
         seen.append(explorer.screenshot())
-        for key in ("slash", *"chair", "Return", "q"):
-            code = {"slash": "/", "Return": chr(13)}.get(key, key)
-            interactor.SetKeyEventInformation(0, 0, code, 0, key)
-            interactor.InvokeEvent("KeyPressEvent")
-            interactor.InvokeEvent("CharEvent")
+        press("slash", *"chair", "Return")
         seen.append(explorer.screenshot())
+    press("q")  # again and again: it closes nothing before the window's loop runs
 
 interactor.AddObserver("TimerEvent", work)
 interactor.Initialize()
-interactor.CreateOneShotTimer(300)
+timer = interactor.CreateRepeatingTimer(300)
 open_window(explorer)
+interactor.DestroyTimer(timer)
 first, asked = seen
 assert explorer.state.asked.words == "chair"
 assert (first[:, :600] != asked[:, :600]).any() and (first[:, 600:] != asked[:, 600:]).any()
@@ -182,7 +187,7 @@ def test_a_real_window_opens_answers_and_closes():
             environment = {name: value for name, value in os.environ.items() if name not in headless.WITHOUT_DISPLAY}
             paths = os.pathsep.join(["tests", *filter(None, [os.environ.get("PYTHONPATH")])])
             done = subprocess.run(
-                [sys.executable, "-W", "error", "-c", WINDOW], capture_output=True, text=True, check=False, timeout=120,
+                [sys.executable, "-W", "error", "-c", WINDOW], capture_output=True, text=True, check=False, timeout=600,
                 env=environment | {"DISPLAY": f":{server.stdout.readline().strip()}", "PYTHONPATH": paths},
                 cwd=os.path.join(os.path.dirname(__file__), *[os.pardir] * 3),
             )  # fmt: skip

@@ -9,8 +9,8 @@ from cases_explorer import classes as some_classes
 
 from kfgs.cameras import Distortion
 from kfgs.labels import transfer_labels
-from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.meaning import FieldMeaning, SplatMeaning
+from kfgs.viz.explorer.state import Exploration
 
 
 @pytest.mark.parametrize("distance", [0.5, 1.0, 1.5, 2**0.5, 2.0, 3.3, 100.0])

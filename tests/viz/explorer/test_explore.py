@@ -3,7 +3,7 @@ import torch
 from cases_explorer import NAMES, cameras, classes, cloud, field, splat_file, stored
 
 from kfgs.viz.explorer import ExploreOptions, FieldMeaning, SplatMeaning, explore
-from kfgs.viz.explorer.explore import meaning_of
+from kfgs.viz.explorer.entry import meaning_of
 
 SMALL = ExploreOptions(height=120, width=320)
 

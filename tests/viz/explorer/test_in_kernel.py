@@ -82,22 +82,28 @@ pytestmark = [
 ]
 
 
-def run(folder, monkeypatch, *cells):
-    """What cells put out, and the notebook as it would be saved."""
+@pytest.fixture(scope="module")
+def notebook(tmp_path_factory):
+    """What each cell puts out, by its source (a list where one is run several times), and the notebook as it would be saved."""
     import nbclient
     import nbformat
 
+    cells = (MAKE, EXPLORE, EXPLORE, EXPLORE, AGAIN, COUNT, CLOSE, CLOSED, SHOW, LOOK, CHANGE)
+    book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source.strip()) for source in cells])
     folders = [str(Path(cases_page.__file__).parent), str(Path(__file__).parents[3])]
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(folders))
-    book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source) for source in cells])
-    nbclient.NotebookClient(
-        book, timeout=120, kernel_name="python3", resources={"metadata": {"path": folder}}
-    ).execute()
-    return [cell.outputs for cell in book.cells], nbformat.writes(book)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join(folders))
+        place = {"metadata": {"path": tmp_path_factory.mktemp("notebook")}}
+        nbclient.NotebookClient(book, timeout=600, kernel_name="python3", resources=place).execute()
+    outputs = {}
+    for cell in book.cells:
+        outputs.setdefault(cell.source, []).append(cell.outputs)
+    return outputs, sum(len(nbformat.writes(nbformat.v4.new_notebook(cells=[cell]))) for cell in book.cells[-3:])
 
 
-def test_a_cell_shows_the_page_and_keeps_a_picture(tmp_path, monkeypatch):
-    (shown, looked, changed), saved = run(tmp_path, monkeypatch, SHOW, LOOK, CHANGE)
+def test_a_cell_shows_the_page_and_keeps_a_picture(notebook):
+    outputs, saved = notebook
+    [shown], [looked], [changed] = (outputs[source.strip()] for source in (SHOW, LOOK, CHANGE))
     assert [output.output_type for output in shown] == ["display_data"] * 2
     for output in shown:
         assert "data:image/jpeg;base64," in output.data["text/html"]
@@ -106,16 +112,17 @@ def test_a_cell_shows_the_page_and_keeps_a_picture(tmp_path, monkeypatch):
     assert len(urls) == 1  # shown twice, served once
     assert [output.text for output in looked] == ["200 image/png 403 1\n"]  # and nothing on standard error
     assert [output.text for output in changed] == ["both ways\n"]
-    assert len(saved) < 150_000
+    assert saved < 150_000
 
 
-def test_explore_as_the_last_line_shows_once_and_run_again_leaves_one_open(tmp_path, monkeypatch):
-    cells = (MAKE, EXPLORE, EXPLORE, EXPLORE, AGAIN, COUNT, CLOSE, CLOSED)
-    (_, *shown, again, counted, closed, after), _ = run(tmp_path, monkeypatch, *cells)
-    for outputs in shown:  # the page, and no second picture below it
-        assert [output.output_type for output in outputs] == ["display_data"]
-        assert "<script>" in outputs[0].data["text/html"]
-    assert len({outputs[0].data["text/plain"] for outputs in shown}) == 3
+def test_explore_as_the_last_line_shows_once_and_run_again_leaves_one_open(notebook):
+    outputs, _ = notebook
+    shown = outputs[EXPLORE]
+    [again], [counted], [closed], [after] = (outputs[source.strip()] for source in (AGAIN, COUNT, CLOSE, CLOSED))
+    for given in shown:  # the page, and no second picture below it
+        assert [output.output_type for output in given] == ["display_data"]
+        assert "<script>" in given[0].data["text/html"]
+    assert len({given[0].data["text/plain"] for given in shown}) == 3
     assert [output.data["text/plain"] for output in again] == [shown[-1][0].data["text/plain"]]  # the page once more
     assert [output.text for output in counted] == ["1 1 1\n"]
     assert [output.text for output in closed] == ["nobody listens\n"]

@@ -19,8 +19,8 @@ from cases_explorer import (
 )
 
 from kfgs.fields import SemanticField, answers, semantic_field
-from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.meaning import FieldMeaning, SplatMeaning
+from kfgs.viz.explorer.state import Exploration
 
 HOWS = [*((mode, how) for mode in TRAINED for how in ("own", "views", "answered")), ("fused", "fused")]
 KINDS = pytest.mark.parametrize(("mode", "how"), HOWS, ids=[f"{mode}-{how}" for mode, how in HOWS])

@@ -8,7 +8,7 @@ from cases_viz import some_camera, some_gaussians
 
 from kfgs.cameras import Camera, Distortion
 from kfgs.splat import rasterize
-from kfgs.viz.explorer.pick import gaussian_at, neighbours_of, views_seeing
+from kfgs.viz.explorer.hit_test import gaussian_at, neighbours_of, views_seeing
 
 
 def straight(shift=0.0, name="front"):

@@ -7,10 +7,10 @@ from cases_explorer import NAMES, cameras, field, line
 from cases_explorer import classes as some_classes
 
 from kfgs.formats import read_splats
-from kfgs.labels import answers
+from kfgs.labels import connected_parts
 from kfgs.viz.explorer import saved
-from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.meaning import FieldMeaning
+from kfgs.viz.explorer.state import Exploration
 
 
 def test_a_selection_is_saved_and_read_again(tmp_path):
@@ -31,7 +31,7 @@ def test_a_selection_is_saved_and_read_again(tmp_path):
         np.testing.assert_allclose(read.extra["score"], made.scores(side)[mask], rtol=1e-6)
     facts = json.loads(paths[0].read_text())
     assert {key: value for key, value in facts.items() if key != "parts"} == made.facts()
-    expected = answers(made.cloud("color"), made.selection("color"), cameras())
+    expected = connected_parts(made.cloud("color"), made.selection("color"), cameras())
     assert facts["parts"]["color"] == [part.to_json() for part in expected]
     assert facts["parts"]["color"][0]["best_view"]["camera"].startswith("view_")
 

@@ -5,8 +5,8 @@ from cases_explorer import LINE, cloud, line, splat_file
 from matplotlib import colormaps
 
 from kfgs.viz import FeatureColors, palette
-from kfgs.viz.explorer.exploration import Exploration
 from kfgs.viz.explorer.meaning import SplatMeaning
+from kfgs.viz.explorer.state import Exploration
 
 GREY = [128, 128, 128]
 

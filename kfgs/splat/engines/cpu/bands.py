@@ -9,7 +9,7 @@ from numba import njit
 
 from . import narrow as narrow
 from . import wide as wide
-from .cache import compiled
+from .cache import cached_njit
 from .simd import (
     LANES,
     add_scaled,
@@ -24,11 +24,11 @@ from .simd import (
     transpose,
 )
 from .square import (
-    BLOCK,
+    BLOCK_SIDE,
     BLOCKS,
     CHUNK,
+    FINAL,
     INLINE,
-    LEFT,
     OPTIONS,
     PIXELS,
     STATE,
@@ -48,21 +48,21 @@ SIXTEEN = (0,) * LANES
 @njit(**INLINE)
 def whole_planes(passes: Any, channels: int) -> int:
     """Planes that hold the channels of all passes, and of whole vectors of channels."""
-    return max(passes[2], wide.padded(channels))
+    return max(passes[2], wide.padded_length(channels))
 
 
 @njit(**INLINE)
-def _write_alphas(state: Any, box: tuple[int, int, int, int], alphas: Any, lefts: Any, width: int) -> None:
+def _write_alphas(state: Any, box: tuple[int, int, int, int], alphas: Any, finals: Any, width: int) -> None:
     """Transmittance of a square's pixels, and 1 - transmittance."""
     left, top, right, bottom = box
     for y in range(bottom - top):
         for x in range(right - left):
-            p = (y // BLOCK * BLOCK + x // BLOCK) * LANES + y % BLOCK * BLOCK + x % BLOCK
-            put(lefts, (top + y) * width + left + x, state[LEFT + p])
-            put(alphas, (top + y) * width + left + x, 1 - state[LEFT + p])
+            p = (y // BLOCK_SIDE * BLOCK_SIDE + x // BLOCK_SIDE) * LANES + y % BLOCK_SIDE * BLOCK_SIDE + x % BLOCK_SIDE
+            put(finals, (top + y) * width + left + x, state[FINAL + p])
+            put(alphas, (top + y) * width + left + x, 1 - state[FINAL + p])
 
 
-@compiled(**OPTIONS)
+@cached_njit(**OPTIONS)
 def composite_narrow(
     band: int, view: View, rows: Any, length: int, passes: Any, background: Any, images: Any, trace: Any
 ) -> None:
@@ -78,7 +78,7 @@ def composite_narrow(
         images: maps [H * W * D], alphas [H * W] and transmittances [H * W], written.
         trace: written: per tile and square how many Gaussians were looked at, then the blocks that each was drawn in.
     """
-    maps, alphas, lefts = images
+    maps, alphas, finals = images
     channels = len(maps) // len(alphas)
     picture, planes = Picture(maps, view.width, channels), whole_planes(passes, channels)
     state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
@@ -100,18 +100,18 @@ def composite_narrow(
             scratch = corners, sums, weights, hits, counts
             done = narrow.composite_square((rows, length, view.order), span, state, dark, passes, scratch, drawn)
             trace[tile * squares + square] = done - start
-            _write_alphas(state, box, alphas, lefts, view.width)
+            _write_alphas(state, box, alphas, finals, view.width)
             for block in range(BLOCKS):
                 p = block * LANES
-                left = load(state, LEFT + p)
+                final = load(state, FINAL + p)
                 for channel in range(0, channels, LANES):
                     total = load_many(SIXTEEN, sums, channel * PIXELS + p, PIXELS)
-                    total = add_scaled(total, left, spread_many(SIXTEEN, background, channel, 1))
+                    total = add_scaled(total, final, spread_many(SIXTEEN, background, channel, 1))
                     store_many(block_sums, 0, LANES, transpose(total))
                     write_block(picture, box, block, channel, block_sums, 0, LANES)
 
 
-@compiled(**OPTIONS)
+@cached_njit(**OPTIONS)
 def composite_wide(
     band: int, view: View, rows: Any, length: int, features: Any, begins: Any, background: Any, images: Any, trace: Any
 ) -> None:
@@ -128,9 +128,9 @@ def composite_wide(
         images: maps [H * W * D], alphas [H * W] and transmittances [H * W], written.
         trace: see `composite_narrow`.
     """
-    maps, alphas, lefts = images
+    maps, alphas, finals = images
     channels = len(maps) // len(alphas)
-    stride = wide.padded(channels)
+    stride = wide.padded_length(channels)
     state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
     sums = aligned(PIXELS * stride, rows)
     kept = wide.make_kept(rows)
@@ -149,11 +149,11 @@ def composite_wide(
             packed, source = (rows, length, view.order), (features, begins, channels)
             done, filled = wide.composite_square(packed, span, state, dark, source, scratch, drawn)
             trace[tile * squares + square] = done - start
-            _write_alphas(state, box, alphas, lefts, view.width)
+            _write_alphas(state, box, alphas, finals, view.width)
             for y in range(box[3] - box[1]):
                 for x in range(box[2] - box[0]):
-                    block = y // BLOCK * BLOCK + x // BLOCK
-                    p = block * LANES + y % BLOCK * BLOCK + x % BLOCK
+                    block = y // BLOCK_SIDE * BLOCK_SIDE + x // BLOCK_SIDE
+                    p = block * LANES + y % BLOCK_SIDE * BLOCK_SIDE + x % BLOCK_SIDE
                     at = ((box[1] + y) * view.width + box[0] + x) * channels
                     _write_pixel(
                         maps,
@@ -163,30 +163,30 @@ def composite_wide(
                         p * stride,
                         (filled >> np.uint32(block)) & 1,
                         background,
-                        state[LEFT + p],
+                        state[FINAL + p],
                     )
 
 
 @njit(**INLINE)
 def _write_pixel(
-    maps: Any, at: int, channels: int, sums: Any, place: int, filled: int, background: Any, left: Any
+    maps: Any, at: int, channels: int, sums: Any, place: int, filled: int, background: Any, final: Any
 ) -> None:
     """A pixel's sums, if it has any, and what shows through."""
     whole = channels // LANES * LANES
     lanes = lanes_below(maps, channels - whole)
     for channel in range(0, whole, LANES):
-        value = load(background, channel) * left
+        value = load(background, channel) * final
         if filled:
             value = value + load(sums, place + channel)
         store(maps, at + channel, value)
     if whole < channels:
-        value = load(background, whole) * left
+        value = load(background, whole) * final
         if filled:
             value = value + load(sums, place + whole)
         store_part(maps, at + whole, lanes, value)
 
 
-@compiled(**OPTIONS)
+@cached_njit(**OPTIONS)
 def accumulate_band(
     band: int, view: View, rows: Any, length: int, pixels: Any, channels: int, slots: Any, firsts: Any, out: Any
 ) -> None:
@@ -201,9 +201,9 @@ def accumulate_band(
         channels: D.
         slots: [P] from `number_slots`.
         firsts: [B + 1], where the bands' rows begin.
-        out: [R * padded(D + 1)], written.
+        out: [R * padded_length(D + 1)], written.
     """
-    width = wide.padded(channels + 1)
+    width = wide.padded_length(channels + 1)
     picture = Picture(pixels, view.width, channels)
     state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
     planes, weights = aligned(width * PIXELS, rows), aligned(PIXELS, rows)

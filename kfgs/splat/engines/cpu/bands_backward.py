@@ -10,10 +10,10 @@ from numba import njit
 from . import narrow as narrow
 from . import wide as wide
 from .bands import whole_planes
-from .cache import compiled
+from .cache import cached_njit
 from .simd import LANES, add_dot, load, load_many, spread, spread_many, store, store_many, transpose
 from .square import (
-    BLOCK,
+    BLOCK_SIDE,
     BLOCKS,
     CHUNK,
     INLINE,
@@ -35,11 +35,11 @@ SIXTEEN = (0,) * LANES
 @njit(**INLINE)
 def _read_pixels(values: Any, width: int, box: Any, block: int, scratch: Any) -> Any:
     """A block's pixels of an image of one channel; 0 outside of the box."""
-    left, top = box[0] + block % BLOCK * BLOCK, box[1] + block // BLOCK * BLOCK
+    left, top = box[0] + block % BLOCK_SIDE * BLOCK_SIDE, box[1] + block // BLOCK_SIDE * BLOCK_SIDE
     store(scratch, 0, 0)
-    for y in range(min(box[3] - top, BLOCK)):
-        for x in range(min(box[2] - left, BLOCK)):
-            scratch[y * BLOCK + x] = values[(top + y) * width + left + x]
+    for y in range(min(box[3] - top, BLOCK_SIDE)):
+        for x in range(min(box[2] - left, BLOCK_SIDE)):
+            scratch[y * BLOCK_SIDE + x] = values[(top + y) * width + left + x]
     return load(scratch, 0)
 
 
@@ -53,7 +53,7 @@ def _start_backward(
     SHARE = grad_alpha - background . grad, and all weights times their slopes are
     maps . grad - T background . grad + alphas SHARE.
     """
-    maps, grad_maps, lefts, grad_alphas = pictures
+    maps, grad_maps, finals, grad_alphas = pictures
     p = block * LANES
     total, through = spread(planes, 0), spread(planes, 0)
     for channel in range(0, maps.channels, LANES):
@@ -64,13 +64,13 @@ def _start_backward(
         through = add_dot(through, grads, spread_many(SIXTEEN, background, channel, 1))
         if keep:
             store_many(planes, narrow.GRADS + channel * PIXELS + p, PIXELS, grads)
-    left = _read_pixels(lefts, maps.width, box, block, scratch)
+    final = _read_pixels(finals, maps.width, box, block, scratch)
     share = _read_pixels(grad_alphas, maps.width, box, block, scratch) - through
     store(planes, narrow.SHARE + p, share)
-    store(planes, narrow.BEHIND + p, total - left * through + (1 - left) * share)
+    store(planes, narrow.BEHIND + p, total - final * through + (1 - final) * share)
 
 
-@compiled(**OPTIONS)
+@cached_njit(**OPTIONS)
 def differentiate_narrow(
     band: int,
     view: View,
@@ -99,10 +99,10 @@ def differentiate_narrow(
         firsts: [B + 1], where the bands' rows begin.
         out: [R * length], written.
     """
-    maps, grad_maps, lefts, grad_alphas = images
-    channels, width = len(maps) // len(lefts), view.width
+    maps, grad_maps, finals, grad_alphas = images
+    channels, width = len(maps) // len(finals), view.width
     grads = Picture(grad_maps, width, channels)
-    pictures = Picture(maps, width, channels), grads, lefts, grad_alphas
+    pictures = Picture(maps, width, channels), grads, finals, grad_alphas
     state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
     planes = aligned((2 + whole_planes(passes, channels)) * PIXELS, rows)
     planes[:] = 0
@@ -126,7 +126,7 @@ def differentiate_narrow(
             narrow.differentiate_square(packed, span, state, passes, planes, weights, drawn, slots, own)
 
 
-@compiled(**OPTIONS)
+@cached_njit(**OPTIONS)
 def differentiate_wide(
     band: int,
     view: View,
@@ -157,11 +157,11 @@ def differentiate_wide(
         out: [R * (LANES + padded D)], written.
         geometry: whether the moments are wanted.
     """
-    maps, grad_maps, lefts, grad_alphas = images
+    maps, grad_maps, finals, grad_alphas = images
     channels, width = source[2], view.width
-    stride = wide.padded(channels)
+    stride = wide.padded_length(channels)
     grads = Picture(grad_maps, width, channels)
-    pictures = Picture(maps, width, channels), grads, lefts, grad_alphas
+    pictures = Picture(maps, width, channels), grads, finals, grad_alphas
     state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
     planes, square_grads = aligned(2 * PIXELS, rows), aligned(PIXELS * stride, rows)
     scratch, slopes = aligned(LANES * LANES, rows), aligned((CHUNK + 3) * LANES, rows)

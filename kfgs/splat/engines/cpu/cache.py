@@ -1,4 +1,4 @@
-"""Compiled kernels that are kept on disk, and compiled again when any of the engine's files has changed."""
+"""Compiled kernels that are kept on disk, and compiled again when any file of the engines has changed."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ _FILES = [file for folder in (_HERE, _HERE.parent) for file in sorted(folder.glo
 SOURCES = crc32(b"".join(file.read_bytes() for file in _FILES))
 
 
-def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """As `numba.njit(cache=True)`, for kernels that call into other files.
+def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """`numba.njit(cache=True)` for kernels that call functions of other files.
 
-    Numba's cache looks at the time of a kernel's own file alone, and would go on with what it inlined from another one.
-    It has no hook for this, hence the private attributes. An argument with the sources' number as its default would do,
-    too, but such calls of a kernel from the cache are resolved in Python, at a tenth of a millisecond each. Where no
-    place for the cache can be written to, the kernel is compiled once per process.
+    Numba's cache looks only at the date of the kernel's own file. If a file that it inlines changes, numba would go on
+    with the old code. It offers no way to add to its key, so this sets a private attribute. (A default argument that
+    holds the checksum would work too, but then Python resolves every call of a cached kernel, in 0.1 ms.) If no folder
+    for the cache can be written, each process compiles the kernel for itself.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
@@ -28,7 +28,7 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             kernel = njit(cache=True, **options)(function)
             index = kernel._cache._cache_file
             index._source_stamp = index._source_stamp, SOURCES
-        except (RuntimeError, AttributeError):  # no place to write to, or another numba
+        except (RuntimeError, AttributeError):  # no folder can be written, or another version of numba
             return njit(**options)(function)
         return kernel
 

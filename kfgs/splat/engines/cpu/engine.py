@@ -12,28 +12,30 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from . import square, wide
 from .bands import accumulate_band, composite_narrow, composite_wide
 from .bands_backward import differentiate_narrow, differentiate_wide
-from .memory import take
+from .memory import take_memory
 from .narrow import FIRST, MOMENTS, plan_passes
 from .project import project, project_backward
 from .simd import LANES
 from .slots import chain_slots, gather_gradients, gather_sums, number_slots
-from .square import SIDE, View, pack_rows
-from .square import row_length as _row_length
+from .square import SQUARE_SIDE, View, pack_rows
 from .threads import run_bands
 from .tiles import bin
-from .wide import padded as _whole
 
-row_length, padded = _row_length.py_func, _whole.py_func  # as Python: one call is not worth a compilation
+row_length, padded_length = (
+    square.row_length.py_func,
+    wide.padded_length.py_func,
+)  # in Python: one call is not worth compiling
 
 __all__ = ["accumulate", "backward", "bin", "devices", "forward", "project", "project_backward"]
 
-BANDS, BAND = 32, 2048
+MOST_BANDS, PAIRS_PER_BAND = 32, 2048
 """Shares of the work, and the fewest pairs that make one: more shares keep more threads busy, and let more gradient rows
 meet at their borders. How many there are depends on the data alone."""
 
-NARROW = len(FIRST) + LANES
+NARROW_CHANNELS = len(FIRST) + LANES
 """Up to so many channels stay in registers, a vector each; more are multiplied in blocks."""
 
 
@@ -62,14 +64,14 @@ def forward(
     channels = features.shape[1]
     view = _view(rows, offsets, width, height, tile_size)
     bands = len(view.bounds) - 1
-    maps, alphas = take(features, height, width, channels), features.new_empty(height, width)
-    trace, packed, lefts, ends = _make_trace(view, means2d, channels)
+    maps, alphas = take_memory(features, height, width, channels), features.new_empty(height, width)
+    trace, packed, finals, ends = _make_trace(view, means2d, channels)
     ends[: view.across**2 * (len(view.offsets) - 1)] = 0
     splats = _flat(means2d), _flat(conics), _flat(opacities)
     run_bands(pack_rows, bands, bands, splats, _flat(features), _packed(channels), _index(index), packed)
-    images, length = (_flat(maps), _flat(alphas), lefts), row_length(_packed(channels))
-    behind = _padded(background, padded(channels))
-    if channels <= NARROW:
+    images, length = (_flat(maps), _flat(alphas), finals), row_length(_packed(channels))
+    behind = _padded(background, padded_length(channels))
+    if channels <= NARROW_CHANNELS:
         passes = plan_passes(channels)
         run_bands(composite_narrow, bands, view, packed, length, passes, behind, images, ends)
     else:
@@ -102,12 +104,12 @@ def backward(
     view = _view(rows, offsets, width, height, tile_size)
     bands = len(view.bounds) - 1
     slots, firsts, total, chains = _number(view, len(means2d))
-    packed, lefts, ends = _read_trace(trace, view, means2d, channels)
-    images = _flat(maps), _flat(grad_maps), lefts, _flat(grad_alphas)
-    length, behind = row_length(_packed(channels)), _padded(background, padded(channels))
-    row, column = (length, MOMENTS) if channels <= NARROW else (LANES + padded(channels), LANES)
-    out = take(means2d, total * row).numpy()
-    if channels <= NARROW:
+    packed, finals, ends = _read_trace(trace, view, means2d, channels)
+    images = _flat(maps), _flat(grad_maps), finals, _flat(grad_alphas)
+    length, behind = row_length(_packed(channels)), _padded(background, padded_length(channels))
+    row, column = (length, MOMENTS) if channels <= NARROW_CHANNELS else (LANES + padded_length(channels), LANES)
+    out = take_memory(means2d, total * row).numpy()
+    if channels <= NARROW_CHANNELS:
         passes = plan_passes(channels)
         run_bands(differentiate_narrow, bands, view, packed, length, passes, behind, images, ends, slots, firsts, out)
     else:
@@ -125,7 +127,7 @@ def backward(
     splats, targets = (_flat(conics), _flat(opacities)), tuple(_flat(value) for value in grads)
     run_bands(gather_gradients, shares, shares, splats, chains, out, layout, which, targets)
     grads.append(
-        (grad_maps * torch.from_numpy(lefts).view_as(alphas)[..., None]).sum((0, 1)) if wanted[4] else background
+        (grad_maps * torch.from_numpy(finals).view_as(alphas)[..., None]).sum((0, 1)) if wanted[4] else background
     )
     return [value if want else value.new_empty(0) for value, want in zip(grads, wanted, strict=True)]
 
@@ -149,8 +151,8 @@ def accumulate(
     packed = torch.empty(len(means2d) * row_length(0), dtype=pixels.dtype).numpy()
     splats = _flat(means2d), _flat(conics), _flat(opacities)
     run_bands(pack_rows, bands, bands, splats, packed[:0], 0, _index(None), packed)
-    length = padded(channels + 1)
-    out = take(pixels, total * length).numpy()
+    length = padded_length(channels + 1)
+    out = take_memory(pixels, total * length).numpy()
     shared = (view, packed, row_length(0), _flat(pixels), channels, slots, firsts, out)
     run_bands(accumulate_band, bands, *shared)
     sums, weights = pixels.new_empty(len(means2d), channels), pixels.new_empty(len(means2d))
@@ -165,7 +167,7 @@ def _flat(tensor: Tensor) -> np.ndarray:
 
 def _packed(channels: int) -> int:
     """How many channels are packed with their Gaussian."""
-    return channels if channels <= NARROW else 0
+    return channels if channels <= NARROW_CHANNELS else 0
 
 
 def _make_trace(view: View, like: Tensor, channels: int) -> tuple[Tensor, np.ndarray, np.ndarray, np.ndarray]:
@@ -177,7 +179,7 @@ def _make_trace(view: View, like: Tensor, channels: int) -> tuple[Tensor, np.nda
     squares = view.across**2
     numbers = sum(_floats(view, like, channels)) * like.element_size() // 4
     length = numbers + squares * (len(view.offsets) - 1 + len(view.order))
-    trace = take(torch.empty(0, dtype=torch.int32), length)
+    trace = take_memory(torch.empty(0, dtype=torch.int32), length)
     return trace, *_read_trace(trace, view, like, channels)
 
 
@@ -217,10 +219,10 @@ def _view(rows: Tensor, offsets: Tensor, width: int, height: int, tile_size: int
     """The tiles, and bands of consecutive tiles with about as many pairs each (an empty tile costs something, too)."""
     ends = offsets.numpy().astype(np.int64, copy=False)
     cost = ends + 4 * np.arange(len(ends))
-    bands = min(BANDS, 1 + int(cost[-1]) // BAND)
+    bands = min(MOST_BANDS, 1 + int(cost[-1]) // PAIRS_PER_BAND)
     bounds = np.searchsorted(cost, np.linspace(0, cost[-1], bands + 1)).astype(np.int64)
     bounds[0], bounds[-1] = 0, len(ends) - 1
-    across = -(-min(tile_size, max(width, height)) // SIDE)
+    across = -(-min(tile_size, max(width, height)) // SQUARE_SIDE)
     return View(rows.numpy().astype(np.int32, copy=False), ends, bounds, width, height, tile_size, across)
 
 

@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-LINE = 64
+CACHE_LINE = 64
 """Bytes of a cache line: a vector that straddles two costs double."""
 
-SMALL = 1 << 20
+SMALLEST_KEPT = 1 << 20
 """Bytes below which memory comes from the C library, which keeps so much by itself."""
 
-KEPT = 1 << 30
+MOST_KEPT = 1 << 30
 """Bytes that are kept at most, by each thread."""
 
 
@@ -45,22 +45,24 @@ class _Kept(threading.local):
 _kept = _Kept()
 
 
-def take(like: Tensor, *shape: int) -> Tensor:
+def take_memory(like: Tensor, *shape: int) -> Tensor:
     """Memory of the tensor's dtype, not initialised, that begins on a cache line.
 
     It is the caller's until the last tensor on it is gone: whether that is so is told by Python's count of references.
     """
     size = math.prod(shape) * like.element_size()
-    if size < SMALL or not _COUNTS:
+    if size < SMALLEST_KEPT or not _COUNTS:
         return like.new_empty(shape)
     buffer = _find(size)
     if buffer is None:
-        buffer = np.empty(size + LINE, np.uint8)  # of so much, numpy asks Linux for large pages, and torch does not
-        if size <= KEPT:
+        buffer = np.empty(
+            size + CACHE_LINE, np.uint8
+        )  # of so much, numpy asks Linux for large pages, and torch does not
+        if size <= MOST_KEPT:
             _kept.buffers.append(buffer)
-            while sum(kept.nbytes for kept in _kept.buffers) > KEPT:
+            while sum(kept.nbytes for kept in _kept.buffers) > MOST_KEPT:
                 del _kept.buffers[0]
-    skip = -buffer.ctypes.data % LINE
+    skip = -buffer.ctypes.data % CACHE_LINE
     # Shaped by numpy: to autograd, a view of a tensor would be another thing than a tensor.
     dtype = like.new_empty(0).numpy().dtype
     return torch.from_numpy(buffer[skip : skip + size].view(dtype).reshape(shape))
@@ -76,7 +78,7 @@ def _find(size: int) -> np.ndarray | None:
     buffers = _kept.buffers
     for i in range(len(buffers)):
         # Referred to by the list and by the call: a tensor on it would be a third.
-        if size + LINE <= buffers[i].nbytes <= 2 * (size + LINE) and sys.getrefcount(buffers[i]) == 2:
+        if size + CACHE_LINE <= buffers[i].nbytes <= 2 * (size + CACHE_LINE) and sys.getrefcount(buffers[i]) == 2:
             buffers.append(buffers.pop(i))
             return buffers[-1]
     return None

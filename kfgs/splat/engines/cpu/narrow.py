@@ -34,15 +34,15 @@ from .simd import (
     zero_many,
 )
 from .square import (
-    AHEAD,
     ALL_BLOCKS,
     BLOCKS,
     CHUNK,
     FEATURES,
+    FINAL,
     INLINE,
-    LEFT,
     LIGHT,
     PIXELS,
+    PREFETCH_AHEAD,
     X,
     Y,
     list_hits,
@@ -107,7 +107,7 @@ def _composite_block(packed: Any, state: Any, block: int, passes: Any, scratch: 
     _, sums, weights, hits, counts = scratch
     p, listed, count = block * LANES, block * CHUNK, counts[block]
     bit = np.uint32(1) << np.uint32(block)
-    x, y, light, left = load(state, X + p), load(state, Y + p), load(state, LIGHT + p), load(state, LEFT + p)
+    x, y, light, final = load(state, X + p), load(state, Y + p), load(state, LIGHT + p), load(state, FINAL + p)
     total = load_many(first, sums, p, PIXELS)
     for k in range(count):
         j = np.int64(fetch(hits, listed + k))
@@ -118,14 +118,14 @@ def _composite_block(packed: Any, state: Any, block: int, passes: Any, scratch: 
         light = light * (1 - alpha)  # falls on after a pixel has stopped, so that it never starts again
         drawn = light >= TRANSMITTANCE_MIN
         weight = select(drawn, weight, 0)
-        left = select(drawn, light, left)
+        final = select(drawn, light, final)
         total = add_scaled(total, weight, spread_many(first, rows, at + FEATURES, 1))
         if len(more) > 0:
             store(weights, k * LANES, weight)
         if not any_of(changed):
             put(trace, into + j, np.uint32(fetch(trace, into + j)) & ~bit)
     store(state, LIGHT + p, light)
-    store(state, LEFT + p, left)
+    store(state, FINAL + p, final)
     store_many(sums, p, PIXELS, total)
     if len(more) > 0:
         for channel in range(len(first), channels, LANES):
@@ -180,7 +180,7 @@ def differentiate_square(
         touched = np.uint32(fetch(trace, into + j - start))
         if touched == 0:
             continue
-        prefetch(rows, np.int64(fetch(order, min(j + AHEAD, end - 1))) * length)
+        prefetch(rows, np.int64(fetch(order, min(j + PREFETCH_AHEAD, end - 1))) * length)
         at = np.int64(fetch(order, j)) * length
         zero = spread(rows, 0)
         v_1, v_x, v_y, v_xx, v_xy, v_yy = zero, zero, zero, zero, zero, zero
@@ -266,7 +266,7 @@ def accumulate_square(
     for j in range(span[0], span[1]):
         if dark == ALL_BLOCKS:
             break
-        prefetch(rows, np.int64(fetch(order, min(j + AHEAD, span[1] - 1))) * length)
+        prefetch(rows, np.int64(fetch(order, min(j + PREFETCH_AHEAD, span[1] - 1))) * length)
         at = np.int64(fetch(order, j)) * length
         touched = touched_blocks(rows, at, corners, epsilon) & ~dark
         remaining = touched
@@ -276,9 +276,9 @@ def accumulate_square(
             remaining &= remaining - np.uint32(1)
             _, _, _, alpha = weigh_pixels(rows, at, load(state, X + p), load(state, Y + p))
             light = load(state, LIGHT + p)
-            left = light * (1 - alpha)
-            drawn = left >= TRANSMITTANCE_MIN
-            store(state, LIGHT + p, left)
+            light_behind = light * (1 - alpha)
+            drawn = light_behind >= TRANSMITTANCE_MIN
+            store(state, LIGHT + p, light_behind)
             store(weights, p, select(drawn, alpha * light, 0))
             if not any_of(drawn):
                 dark |= np.uint32(1) << np.uint32(block)

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from .cache import compiled
+from .cache import cached_njit
 from .project_math import (
-    BLOCK,
+    BATCH,
     MEAN,
     OPTIONS,
     OTHER,
@@ -28,11 +28,11 @@ from .project_math import (
     turn_row,
 )
 
-_GRAD_MEAN2D, _GRAD_CONIC, _GRAD_DEPTH = (OTHER + k * BLOCK for k in (0, 2, 5))
-_STATE = OTHER + 6 * BLOCK
+_GRAD_MEAN2D, _GRAD_CONIC, _GRAD_DEPTH = (OTHER + k * BATCH for k in (0, 2, 5))
+_STATE = OTHER + 6 * BATCH
 
 
-@compiled(fastmath=PLAIN, **OPTIONS)
+@cached_njit(fastmath=PLAIN, **OPTIONS)
 def differentiate_band(
     band: int,
     bands: int,
@@ -61,16 +61,16 @@ def differentiate_band(
     end: Any = np.searchsorted(index, last)
     state = np.zeros(_STATE, means.dtype)
     while begin < end:
-        count = min(BLOCK, end - begin)
+        count = min(BATCH, end - begin)
         for k in range(count):
             m = max(begin, 0) + k
             gather(state, k, index[m], means, quats, scales)
             for j in range(2):
-                state[_GRAD_MEAN2D + j * BLOCK + k] = grad_means2d[2 * m + j]
+                state[_GRAD_MEAN2D + j * BATCH + k] = grad_means2d[2 * m + j]
             for j in range(3):
-                state[_GRAD_CONIC + j * BLOCK + k] = grad_conics[3 * m + j]
+                state[_GRAD_CONIC + j * BATCH + k] = grad_conics[3 * m + j]
             state[_GRAD_DEPTH + k] = grad_depths[m]
-        _differentiate_block(state, lens)
+        _differentiate_batch(state, lens)
         beyond = index[begin + count - 1] + 1
         _clear(out, row, beyond)
         for k in range(count):
@@ -96,10 +96,10 @@ def _scatter(state: Any, slot: int, row: int, means: Any, quats: Any, scales: An
     """Copy one Gaussian's gradients from the planes of its values, which they replaced."""
     slot, row = max(slot, 0), max(row, 0)
     for k in range(3):
-        means[3 * row + k] = state[MEAN + k * BLOCK + slot]
-        scales[3 * row + k] = state[SCALE + k * BLOCK + slot]
+        means[3 * row + k] = state[MEAN + k * BATCH + slot]
+        scales[3 * row + k] = state[SCALE + k * BATCH + slot]
     for k in range(4):
-        quats[4 * row + k] = state[QUAT + k * BLOCK + slot]
+        quats[4 * row + k] = state[QUAT + k * BATCH + slot]
 
 
 @njit(inline="always", fastmath=PLAIN, **OPTIONS)
@@ -145,17 +145,17 @@ def _rotation_to_quat(
 
 
 @njit(fastmath=PLAIN, **OPTIONS)
-def _differentiate_block(state: Any, lens: Lens) -> None:
+def _differentiate_batch(state: Any, lens: Lens) -> None:
     """Replace the planes of means, quaternions and scales by the loss's slopes in them."""
     one, none, floor = state.dtype.type(1), state.dtype.type(0), state.dtype.type(QUAT_FLOOR)
     r = lens.turn
-    for i in range(BLOCK):
+    for i in range(BATCH):
         x, y, z = to_camera(state, i, lens)
         w, qx, qy, qz, norm = normalize(state, i)
         R = rotation(w, qx, qy, qz, one)
-        sx, sy, sz = state[SCALE + i], state[SCALE + BLOCK + i], state[SCALE + 2 * BLOCK + i]
-        g_mean_x, g_mean_y = state[_GRAD_MEAN2D + i], state[_GRAD_MEAN2D + BLOCK + i]
-        g_conic = state[_GRAD_CONIC + i], state[_GRAD_CONIC + BLOCK + i], state[_GRAD_CONIC + 2 * BLOCK + i]
+        sx, sy, sz = state[SCALE + i], state[SCALE + BATCH + i], state[SCALE + 2 * BATCH + i]
+        g_mean_x, g_mean_y = state[_GRAD_MEAN2D + i], state[_GRAD_MEAN2D + BATCH + i]
+        g_conic = state[_GRAD_CONIC + i], state[_GRAD_CONIC + BATCH + i], state[_GRAD_CONIC + 2 * BATCH + i]
         per_z = one / z
         tan_x, tan_y = x * per_z, y * per_z
         t = linearize(lens, tan_x, tan_y, per_z)
@@ -184,12 +184,12 @@ def _differentiate_block(state: Any, lens: Lens) -> None:
         g_cam = _jacobian_to_point(lens, (tan_x, tan_y, per_z), g_tx, g_ty, (g_mean_x, g_mean_y))
         g_cam_z = g_cam[2] + state[_GRAD_DEPTH + i]
         state[MEAN + i] = r[0] * g_cam[0] + r[3] * g_cam[1] + r[6] * g_cam_z
-        state[MEAN + BLOCK + i] = r[1] * g_cam[0] + r[4] * g_cam[1] + r[7] * g_cam_z
-        state[MEAN + 2 * BLOCK + i] = r[2] * g_cam[0] + r[5] * g_cam[1] + r[8] * g_cam_z
-        state[QUAT + i], state[QUAT + BLOCK + i] = (g_w - radial * w) * per_norm, (g_x - radial * qx) * per_norm
-        state[QUAT + 2 * BLOCK + i] = (g_y - radial * qy) * per_norm
-        state[QUAT + 3 * BLOCK + i] = (g_z - radial * qz) * per_norm
-        state[SCALE + i], state[SCALE + BLOCK + i], state[SCALE + 2 * BLOCK + i] = g_sx, g_sy, g_sz
+        state[MEAN + BATCH + i] = r[1] * g_cam[0] + r[4] * g_cam[1] + r[7] * g_cam_z
+        state[MEAN + 2 * BATCH + i] = r[2] * g_cam[0] + r[5] * g_cam[1] + r[8] * g_cam_z
+        state[QUAT + i], state[QUAT + BATCH + i] = (g_w - radial * w) * per_norm, (g_x - radial * qx) * per_norm
+        state[QUAT + 2 * BATCH + i] = (g_y - radial * qy) * per_norm
+        state[QUAT + 3 * BATCH + i] = (g_z - radial * qz) * per_norm
+        state[SCALE + i], state[SCALE + BATCH + i], state[SCALE + 2 * BATCH + i] = g_sx, g_sy, g_sz
 
 
 @njit(fastmath=PLAIN, **OPTIONS)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from .cache import compiled
+from .cache import cached_njit
 from .project_math import (
-    BLOCK,
+    BATCH,
     MEAN,
     OPTIONS,
     OTHER,
@@ -27,11 +27,11 @@ from .project_math import (
     turn_row,
 )
 
-_REACH, _MEAN2D, _CONIC, _EXTENT, _KEPT = (OTHER + k * BLOCK for k in (0, 1, 3, 6, 8))
-_STATE = OTHER + 9 * BLOCK
+_REACH, _MEAN2D, _CONIC, _EXTENT, _KEPT = (OTHER + k * BATCH for k in (0, 1, 3, 6, 8))
+_STATE = OTHER + 9 * BATCH
 
 
-@compiled(fastmath=PLAIN, **OPTIONS)
+@cached_njit(fastmath=PLAIN, **OPTIONS)
 def project_band(
     band: int,
     bands: int,
@@ -53,16 +53,16 @@ def project_band(
         counts: [B] int64, written: how many are visible.
     """
     means, first, last = gaussians[0], len(reach) * band // bands, len(reach) * (band + 1) // bands
-    state, depths = np.zeros(_STATE, means.dtype), np.empty(BLOCK, means.dtype)
-    waiting = np.empty(2 * BLOCK, np.int64)
+    state, depths = np.zeros(_STATE, means.dtype), np.empty(BATCH, means.dtype)
+    waiting = np.empty(2 * BATCH, np.int64)
     count, end = 0, first
-    for begin in range(first, last, BLOCK):
-        count = _append_candidates(waiting, count, begin, min(begin + BLOCK, last), lens, means, reach, depths)
-        if count >= BLOCK:
-            end = _project_waiting(waiting, BLOCK, lens, gaussians, reach, state, out, end)
-            count -= BLOCK
+    for begin in range(first, last, BATCH):
+        count = _append_candidates(waiting, count, begin, min(begin + BATCH, last), lens, means, reach, depths)
+        if count >= BATCH:
+            end = _project_waiting(waiting, BATCH, lens, gaussians, reach, state, out, end)
+            count -= BATCH
             for k in range(count):
-                waiting[k] = waiting[BLOCK + k]
+                waiting[k] = waiting[BATCH + k]
     counts[band] = _project_waiting(waiting, count, lens, gaussians, reach, state, out, end) - first
 
 
@@ -93,15 +93,15 @@ def _project_waiting(
         row = max(waiting[k], 0)
         gather(state, k, row, means, quats, scales)
         state[_REACH + k] = reach[row]
-    _project_block(state, lens)
+    _project_batch(state, lens)
     for k in range(count):
         row, at = max(waiting[k], 0), max(end, 0)
         for j in range(2):
-            means2d[2 * at + j] = state[_MEAN2D + j * BLOCK + k]
-            extents[2 * at + j] = state[_EXTENT + j * BLOCK + k]
+            means2d[2 * at + j] = state[_MEAN2D + j * BATCH + k]
+            extents[2 * at + j] = state[_EXTENT + j * BATCH + k]
         for j in range(3):
-            conics[3 * at + j] = state[_CONIC + j * BLOCK + k]
-        depths[at] = state[MEAN + 2 * BLOCK + k]
+            conics[3 * at + j] = state[_CONIC + j * BATCH + k]
+        depths[at] = state[MEAN + 2 * BATCH + k]
         out_opacities[at] = opacities[row]
         index[at] = row
         end += state[_KEPT + k] > 0
@@ -109,15 +109,15 @@ def _project_waiting(
 
 
 @njit(fastmath=PLAIN, **OPTIONS)
-def _project_block(state: Any, lens: Lens) -> None:
+def _project_batch(state: Any, lens: Lens) -> None:
     """Fill the planes that follow _REACH; the third of the means becomes the depths."""
     one, none = state.dtype.type(1), state.dtype.type(0)
     half, most, low_pass = state.dtype.type(0.5), lens.largest, lens.low_pass
-    for i in range(BLOCK):
+    for i in range(BATCH):
         x, y, z = to_camera(state, i, lens)
         w, qx, qy, qz, norm = normalize(state, i)
         R = rotation(w, qx, qy, qz, one)
-        sx, sy, sz = state[SCALE + i], state[SCALE + BLOCK + i], state[SCALE + 2 * BLOCK + i]
+        sx, sy, sz = state[SCALE + i], state[SCALE + BATCH + i], state[SCALE + 2 * BATCH + i]
         reach = state[_REACH + i]
         per_z = one / z
         tan_x, tan_y = x * per_z, y * per_z
@@ -139,13 +139,13 @@ def _project_block(state: Any, lens: Lens) -> None:
         finite &= (reach * ball_x <= most) & (reach * ball_y <= most) & (ball_x * ball_y <= most)
         touches = _covers_center(mean_x, extent_x, lens.size[0], half, lens.rounding)
         touches &= _covers_center(mean_y, extent_y, lens.size[1], half, lens.rounding)
-        state[_MEAN2D + i], state[_MEAN2D + BLOCK + i] = mean_x, mean_y
+        state[_MEAN2D + i], state[_MEAN2D + BATCH + i] = mean_x, mean_y
         state[_CONIC + i] = var_y * per_det
-        state[_CONIC + BLOCK + i] = -dot(u, v) * per_det
-        state[_CONIC + 2 * BLOCK + i] = var_x * per_det
-        state[_EXTENT + i], state[_EXTENT + BLOCK + i] = extent_x, extent_y
+        state[_CONIC + BATCH + i] = -dot(u, v) * per_det
+        state[_CONIC + 2 * BATCH + i] = var_x * per_det
+        state[_EXTENT + i], state[_EXTENT + BATCH + i] = extent_x, extent_y
         state[_KEPT + i] = one if finite & touches else none
-        state[MEAN + 2 * BLOCK + i] = z
+        state[MEAN + 2 * BATCH + i] = z
 
 
 @njit(fastmath=PLAIN, **OPTIONS)

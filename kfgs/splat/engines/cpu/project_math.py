@@ -1,7 +1,7 @@
 """What the compiled projection and its gradient share: the lens as numbers, planes of scratch memory, the footprint.
 
-Gaussians are worked on in blocks of BLOCK, gathered into planes: entry i of plane p is `state[p + i]`. The inner loop
-over a block has no branches, always the same length, and planes at constant distances, so that LLVM computes 8 or 16
+Gaussians are worked on in batches of BATCH, gathered into planes: entry i of plane p is `state[p + i]`. The inner loop
+over a batch has no branches, always the same length, and planes at constant distances, so that LLVM computes 8 or 16
 Gaussians per instruction; and since it has no remainder, what comes out does not depend on a Gaussian's neighbours.
 
 Arrays with several numbers per Gaussian are passed flat, so that these numbers' distance is known to the compiler, too;
@@ -18,10 +18,10 @@ from numba import njit
 
 from ...project import FIELD_OF_VIEW_MARGIN
 
-BLOCK = 64
-MEAN, QUAT, SCALE = 0, 3 * BLOCK, 7 * BLOCK
+BATCH = 64
+MEAN, QUAT, SCALE = 0, 3 * BATCH, 7 * BATCH
 """First planes of the Gaussian's means [3], quaternions [4] and scales [3]."""
-OTHER = 10 * BLOCK
+OTHER = 10 * BATCH
 """First plane that a kernel uses as it likes."""
 
 QUAT_FLOOR = 1e-12
@@ -67,17 +67,17 @@ def gather(state: Any, slot: int, row: int, means: Any, quats: Any, scales: Any)
     """Copy one Gaussian into place `slot` of the planes; the arrays are flat."""
     slot, row = max(slot, 0), max(row, 0)
     for k in range(3):
-        state[MEAN + k * BLOCK + slot] = means[3 * row + k]
-        state[SCALE + k * BLOCK + slot] = scales[3 * row + k]
+        state[MEAN + k * BATCH + slot] = means[3 * row + k]
+        state[SCALE + k * BATCH + slot] = scales[3 * row + k]
     for k in range(4):
-        state[QUAT + k * BLOCK + slot] = quats[4 * row + k]
+        state[QUAT + k * BATCH + slot] = quats[4 * row + k]
 
 
 @njit(fastmath=PLAIN, **OPTIONS)
 def to_camera(state: Any, i: int, lens: Lens) -> tuple[Any, Any, Any]:
-    """R X + t of the block's Gaussian i."""
+    """R X + t of the batch's Gaussian i."""
     r, t = lens.turn, lens.shift
-    X, Y, Z = state[MEAN + i], state[MEAN + BLOCK + i], state[MEAN + 2 * BLOCK + i]
+    X, Y, Z = state[MEAN + i], state[MEAN + BATCH + i], state[MEAN + 2 * BATCH + i]
     x = r[0] * X + r[1] * Y + r[2] * Z + t[0]
     y = r[3] * X + r[4] * Y + r[5] * Z + t[1]
     z = r[6] * X + r[7] * Y + r[8] * Z + t[2]
@@ -86,12 +86,12 @@ def to_camera(state: Any, i: int, lens: Lens) -> tuple[Any, Any, Any]:
 
 @njit(fastmath=PLAIN, **OPTIONS)
 def normalize(state: Any, i: int) -> tuple[Any, Any, Any, Any, Any]:
-    """Quaternion (w, x, y, z) of the block's Gaussian i divided by its norm, and the norm."""
+    """Quaternion (w, x, y, z) of the batch's Gaussian i divided by its norm, and the norm."""
     w, x, y, z = (
         state[QUAT + i],
-        state[QUAT + BLOCK + i],
-        state[QUAT + 2 * BLOCK + i],
-        state[QUAT + 3 * BLOCK + i],
+        state[QUAT + BATCH + i],
+        state[QUAT + 2 * BATCH + i],
+        state[QUAT + 3 * BATCH + i],
     )
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     scale = state.dtype.type(1) / max(norm, state.dtype.type(QUAT_FLOOR))

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from .cache import compiled
+from .cache import cached_njit
 
 _DIGIT = 11
 """Bits sorted at once: 2048 counters stay in the first-level cache, and 32 bits take three passes."""
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 
-@compiled(**_OPTIONS)
+@cached_njit(**_OPTIONS)
 def sort_rows(bits: Any) -> Any:
     """Stable radix sort of floating point numbers, given as their bits [M]; returns the rows [M] int32."""
     count, passes = len(bits), (8 * bits.itemsize + _DIGIT - 1) // _DIGIT

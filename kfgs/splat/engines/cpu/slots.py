@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from .cache import compiled
+from .cache import cached_njit
 from .simd import LANES, fetch, lanes_below, load, load_part, prefetch, put, store, store_part
-from .square import AHEAD, INLINE, OPTIONS, View, aligned
+from .square import INLINE, OPTIONS, PREFETCH_AHEAD, View, aligned
 
 
-@compiled(**OPTIONS)
+@cached_njit(**OPTIONS)
 def number_slots(band: int, view: View, slots: Any, owners: Any, counts: Any, total: int) -> None:
     """Number the distinct Gaussians of one band, in order of appearance.
 
@@ -40,7 +40,7 @@ def number_slots(band: int, view: View, slots: Any, owners: Any, counts: Any, to
     counts[band] = count
 
 
-@compiled(**OPTIONS)
+@cached_njit(**OPTIONS)
 def chain_slots(view: View, owners: Any, counts: Any, heads: Any, following: Any) -> None:
     """Link the rows of each Gaussian over all bands: heads [M] and following [R], in order of the bands, -1 at the end."""
     heads[:] = -1
@@ -65,7 +65,7 @@ def _sum_chain(row: int, following: Any, out: Any, width: int, total: Any) -> No
         row = following[row]
 
 
-@compiled(**OPTIONS)
+@cached_njit(**OPTIONS)
 def gather_gradients(
     band: int, bands: int, splats: Any, chains: Any, out: Any, layout: tuple[int, int, int], index: Any, grads: Any
 ) -> None:
@@ -91,7 +91,7 @@ def gather_gradients(
     total = aligned(width, out)
     half = out.dtype.type(0.5)
     for m in range(count * band // bands, count * (band + 1) // bands):
-        prefetch(out, np.int64(heads[min(m + AHEAD, count - 1)]) * width)
+        prefetch(out, np.int64(heads[min(m + PREFETCH_AHEAD, count - 1)]) * width)
         _sum_chain(heads[m], following, out, width, total)
         a, b, c = fetch(conics, 3 * m), fetch(conics, 3 * m + 1), fetch(conics, 3 * m + 2)
         v, v_x, v_y = fetch(total, 0), fetch(total, 1), fetch(total, 2)
@@ -109,14 +109,14 @@ def gather_gradients(
             store_part(of_features, into + i, lanes, load_part(of_features, into + i, lanes) + value)
 
 
-@compiled(**OPTIONS)
+@cached_njit(**OPTIONS)
 def gather_sums(band: int, bands: int, chains: Any, out: Any, width: int, sums: Any, weights: Any) -> None:
     """Sum the rows of one share of the Gaussians over all bands: sums [M, D] and weights [M], written."""
     heads, following = chains
     count, channels = len(heads), sums.shape[1]
     total = aligned(width, out)
     for m in range(count * band // bands, count * (band + 1) // bands):
-        prefetch(out, np.int64(heads[min(m + AHEAD, count - 1)]) * width)
+        prefetch(out, np.int64(heads[min(m + PREFETCH_AHEAD, count - 1)]) * width)
         _sum_chain(heads[m], following, out, width, total)
         for i in range(channels):
             sums[m, i] = total[i]

@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 
 from ..contract import ALPHA_MAX, ALPHA_MIN
-from .cache import compiled
+from .cache import cached_njit
 from .simd import (
     LANES,
     bits,
@@ -38,11 +38,11 @@ from .simd import (
     trailing_zeros,
 )
 
-SIDE = 16
+SQUARE_SIDE = 16
 """Pixels along a square's side."""
 
-PIXELS = SIDE * SIDE
-BLOCK = 4
+PIXELS = SQUARE_SIDE * SQUARE_SIDE
+BLOCK_SIDE = 4
 """Pixels along a block's side."""
 
 BLOCKS = PIXELS // LANES
@@ -51,13 +51,13 @@ ALL_BLOCKS = np.uint32((1 << BLOCKS) - 1)
 CHUNK = 64
 """Gaussians of a square listed at once."""
 
-AHEAD = 8
+PREFETCH_AHEAD = 8
 """Gaussians between the one worked on and the one asked for from memory."""
 
 MEAN_X, MEAN_Y, SQUARE, LEAN, REST, LOG_OPACITY, FEATURES = range(7)
 """Columns of a packed row: with u = dx + LEAN dy, log2(opacity density) = LOG_OPACITY - SQUARE u^2 - REST dy^2."""
 
-X, Y, LIGHT, LEFT = 0, PIXELS, 2 * PIXELS, 3 * PIXELS
+X, Y, LIGHT, FINAL = 0, PIXELS, 2 * PIXELS, 3 * PIXELS
 """Planes of a square's state: pixel centres; the transmittance as it falls on, also after a pixel has stopped; and the
 transmittance that the pixel stopped with."""
 STATE = 4 * PIXELS
@@ -84,7 +84,7 @@ def row_length(channels: int) -> int:
     return (FEATURES + channels + LANES - 1) // LANES * LANES
 
 
-@compiled(**OPTIONS)
+@cached_njit(**OPTIONS)
 def pack_rows(band: int, bands: int, splats: Any, features: Any, channels: int, index: Any, rows: Any) -> None:
     """Pack one share of the Gaussians.
 
@@ -138,9 +138,9 @@ def square_box(view: View, tile: int, square: int) -> tuple[int, int, int, int]:
     """Left, top, right and bottom pixel of a square of a tile, cut off at the tile's and the image's border."""
     columns = (view.width + view.tile_size - 1) // view.tile_size
     tile_x, tile_y = tile % columns * view.tile_size, tile // columns * view.tile_size
-    left, top = tile_x + square % view.across * SIDE, tile_y + square // view.across * SIDE
-    right = min(left + SIDE, tile_x + view.tile_size, view.width)
-    bottom = min(top + SIDE, tile_y + view.tile_size, view.height)
+    left, top = tile_x + square % view.across * SQUARE_SIDE, tile_y + square // view.across * SQUARE_SIDE
+    right = min(left + SQUARE_SIDE, tile_x + view.tile_size, view.width)
+    bottom = min(top + SQUARE_SIDE, tile_y + view.tile_size, view.height)
     return left, top, right, bottom
 
 
@@ -150,15 +150,15 @@ def start_square(state: Any, corners: Any, box: tuple[int, int, int, int]) -> An
     left, top, right, bottom = box
     dark = np.uint32(0)
     for block in range(BLOCKS):
-        x0, y0 = left + block % BLOCK * BLOCK, top + block // BLOCK * BLOCK
+        x0, y0 = left + block % BLOCK_SIDE * BLOCK_SIDE, top + block // BLOCK_SIDE * BLOCK_SIDE
         corners[block], corners[BLOCKS + block] = x0 + 0.5, y0 + 0.5
         if x0 >= right or y0 >= bottom:
             dark |= np.uint32(1) << np.uint32(block)
         for lane in range(LANES):
             p = block * LANES + lane
-            x, y = x0 + lane % BLOCK, y0 + lane // BLOCK
+            x, y = x0 + lane % BLOCK_SIDE, y0 + lane // BLOCK_SIDE
             state[X + p], state[Y + p] = x + 0.5, y + 0.5
-            state[LIGHT + p] = state[LEFT + p] = 1 if x < right and y < bottom else 0
+            state[LIGHT + p] = state[FINAL + p] = 1 if x < right and y < bottom else 0
     return dark
 
 
@@ -179,7 +179,7 @@ def touched_blocks(rows: Any, at: int, corners: Any, epsilon: Any) -> Any:
     square, lean, rest = fetch(rows, at + SQUARE), fetch(rows, at + LEAN), fetch(rows, at + REST)
     left = load(corners, 0) - fetch(rows, at + MEAN_X)
     top = load(corners, BLOCKS) - fetch(rows, at + MEAN_Y)
-    right, bottom = left + (BLOCK - 1), top + (BLOCK - 1)
+    right, bottom = left + (BLOCK_SIDE - 1), top + (BLOCK_SIDE - 1)
     near_x = maximum(left, minimum(right, 0))
     near_y = maximum(top, minimum(bottom, 0))
     tilt = -(square * lean) / (square * lean * lean + rest)  # -b / c
@@ -245,7 +245,7 @@ def list_hits(
     epsilon = rows.dtype.type(np.finfo(rows.dtype).eps)
     counts[:] = 0
     for j in range(first, stop):
-        prefetch(rows, np.int64(fetch(order, min(j + AHEAD, stop - 1))) * length)
+        prefetch(rows, np.int64(fetch(order, min(j + PREFETCH_AHEAD, stop - 1))) * length)
         touched = touched_blocks(rows, np.int64(fetch(order, j)) * length, corners, epsilon) & ~dark
         put(trace, into + j - first, touched)
         list_bits(touched, j, hits, counts)
@@ -274,21 +274,21 @@ def read_block(picture: Picture, box: Any, block: int, channel: int, into: Any, 
     """
     values, width, channels = picture
     lanes = lanes_below(values, channels - channel)
-    left, top = box[0] + block % BLOCK * BLOCK, box[1] + block // BLOCK * BLOCK
-    columns, rows = min(box[2] - left, BLOCK), min(box[3] - top, BLOCK)
-    if columns == BLOCK and rows == BLOCK:
-        for y in range(BLOCK):
+    left, top = box[0] + block % BLOCK_SIDE * BLOCK_SIDE, box[1] + block // BLOCK_SIDE * BLOCK_SIDE
+    columns, rows = min(box[2] - left, BLOCK_SIDE), min(box[3] - top, BLOCK_SIDE)
+    if columns == BLOCK_SIDE and rows == BLOCK_SIDE:
+        for y in range(BLOCK_SIDE):
             at = ((top + y) * width + left) * channels + channel
-            for x in range(BLOCK):
-                store(into, place + (y * BLOCK + x) * stride, load_part(values, at + x * channels, lanes))
+            for x in range(BLOCK_SIDE):
+                store(into, place + (y * BLOCK_SIDE + x) * stride, load_part(values, at + x * channels, lanes))
         return
-    for y in range(BLOCK):
-        for x in range(BLOCK):
+    for y in range(BLOCK_SIDE):
+        for x in range(BLOCK_SIDE):
             if x < columns and y < rows:
                 at = ((top + y) * width + left + x) * channels + channel
-                store(into, place + (y * BLOCK + x) * stride, load_part(values, at, lanes))
+                store(into, place + (y * BLOCK_SIDE + x) * stride, load_part(values, at, lanes))
             else:
-                store(into, place + (y * BLOCK + x) * stride, 0)
+                store(into, place + (y * BLOCK_SIDE + x) * stride, 0)
 
 
 @njit(**INLINE)
@@ -296,9 +296,9 @@ def write_block(picture: Picture, box: Any, block: int, channel: int, source: An
     """The inverse of `read_block`: nothing is written outside of the box and beyond the last channel."""
     values, width, channels = picture
     lanes = lanes_below(values, channels - channel)
-    left, top = box[0] + block % BLOCK * BLOCK, box[1] + block // BLOCK * BLOCK
-    for y in range(min(box[3] - top, BLOCK)):
+    left, top = box[0] + block % BLOCK_SIDE * BLOCK_SIDE, box[1] + block // BLOCK_SIDE * BLOCK_SIDE
+    for y in range(min(box[3] - top, BLOCK_SIDE)):
         at = ((top + y) * width + left) * channels + channel
-        for x in range(min(box[2] - left, BLOCK)):
-            vector = load(source, place + (y * BLOCK + x) * stride)
+        for x in range(min(box[2] - left, BLOCK_SIDE)):
+            vector = load(source, place + (y * BLOCK_SIDE + x) * stride)
             store_part(values, at + x * channels, lanes, vector)

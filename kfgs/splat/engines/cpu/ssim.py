@@ -14,7 +14,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from .cache import compiled
+from .cache import cached_njit
 from .project_math import OPTIONS
 from .threads import run_bands
 
@@ -73,7 +73,7 @@ def _along(values: Any, j: Any, step: Any, w: Any) -> Any:
     )
 
 
-@compiled(fastmath=_FAST, **OPTIONS)
+@cached_njit(fastmath=_FAST, **OPTIONS)
 def compare_band(
     band: int,
     bands: int,
@@ -136,7 +136,7 @@ def compare_band(
     sums[band] = total
 
 
-@compiled(fastmath=_FAST, **OPTIONS)
+@cached_njit(fastmath=_FAST, **OPTIONS)
 def spread_band(
     band: int,
     bands: int,

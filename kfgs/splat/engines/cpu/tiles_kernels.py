@@ -1,6 +1,6 @@
 """The compiled tests of Gaussians against tiles.
 
-Most Gaussians lie in boxes of at most 2 x 2 tiles. These are tested together: blocks of BLOCK Gaussians are gathered into
+Most Gaussians lie in boxes of at most 2 x 2 tiles. These are tested together: batches of BATCH Gaussians are gathered into
 planes (entry i of plane p is `state[p + i]`), and one loop without branches tests four tiles for 8 or 16 Gaussians at a
 time. In a larger box each row of tiles is first cut to where the ellipse is, so that a long needle costs no more than the
 tiles it crosses.
@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from .cache import compiled
+from .cache import cached_njit
 
-BLOCK = 64
-_X, _Y, _A, _B, _C, _EXTENT_X, _EXTENT_Y, _REACH = (k * BLOCK for k in range(8))
-_LEFT, _RIGHT, _TOP, _BOTTOM, _HIT = (k * BLOCK for k in range(8, 13))  # the box, in tiles, and four answers
-_TILE_X, _TILE_Y, _TOUCHED = (k * BLOCK for k in range(16, 19))  # tiles of one Gaussian
-_STATE = 19 * BLOCK
+BATCH = 64
+_X, _Y, _A, _B, _C, _EXTENT_X, _EXTENT_Y, _REACH = (k * BATCH for k in range(8))
+_LEFT, _RIGHT, _TOP, _BOTTOM, _HIT = (k * BATCH for k in range(8, 13))  # the box, in tiles, and four answers
+_TILE_X, _TILE_Y, _TOUCHED = (k * BATCH for k in range(16, 19))  # tiles of one Gaussian
+_STATE = 19 * BATCH
 
 _WIDE = 8
 """A row of more tiles than this is cut to where the ellipse is; testing a shorter one costs less."""
@@ -33,7 +33,7 @@ _FLAT, _HUGE = 1e-9, 1e30
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}  # no fused multiply-add: torch rounds each product
 
 
-@compiled(**_OPTIONS)
+@cached_njit(**_OPTIONS)
 def find_pairs(
     band: int,
     bands: int,
@@ -62,19 +62,19 @@ def find_pairs(
     tiles = columns * ((height + side - 1) // side)
     state, end = np.zeros(_STATE, splats[0].dtype), 0
     first, last = len(order) * band // bands, len(order) * (band + 1) // bands
-    pairs = np.empty((2, 4 * (last - first) + 4 * BLOCK), np.int32)
-    for begin in range(first, last, BLOCK):
-        count = min(BLOCK, last - begin)
+    pairs = np.empty((2, 4 * (last - first) + 4 * BATCH), np.int32)
+    for begin in range(first, last, BATCH):
+        count = min(BATCH, last - begin)
         _gather(state, order, begin, count, splats)
-        _test_block(state, width, height, side, eps)
+        _test_batch(state, width, height, side, eps)
         if end + _count_boxes(state, count) > pairs.shape[1]:
-            pairs = _grow(pairs, end, BLOCK * tiles)
-        end = _append_block(state, order, begin, count, side, columns, eps, pairs[0], pairs[1], end)
+            pairs = _grow(pairs, end, BATCH * tiles)
+        end = _append_batch(state, order, begin, count, side, columns, eps, pairs[0], pairs[1], end)
     _count_tiles(pairs[0], end, counts)
     return pairs[0, :end], pairs[1, :end]
 
 
-@compiled(**_OPTIONS)
+@cached_njit(**_OPTIONS)
 def list_rows(tiles: Any, which: Any, starts: Any, rows: Any) -> None:
     """Write the rows of one share's pairs into the tiles' lists.
 
@@ -100,7 +100,7 @@ def _count_tiles(tiles: Any, end: int, counts: Any) -> None:
 
 @njit(**_OPTIONS)
 def _count_boxes(state: Any, count: int) -> int:
-    """How many pairs `_append_block` may look at."""
+    """How many pairs `_append_batch` may look at."""
     total = 0
     for k in range(count):
         total += max(4, int((state[_RIGHT + k] - state[_LEFT + k]) * (state[_BOTTOM + k] - state[_TOP + k])))
@@ -128,13 +128,13 @@ def _gather(state: Any, order: Any, begin: int, count: int, splats: tuple[Any, A
 
 
 @njit(**_OPTIONS)
-def _test_block(state: Any, width: int, height: int, side: int, eps: float) -> None:
+def _test_batch(state: Any, width: int, height: int, side: int, eps: float) -> None:
     """Find each Gaussian's box of tiles, and test the first 2 x 2 of them."""
     kind = state.dtype.type
     one, size, length = kind(1), kind(side), kind(side - 1)
     across, down = kind(width), kind(height)
     half, per_side, rounding, slack = kind(0.5), kind(1 / side), kind(4 * eps), kind(8 * eps)
-    for i in range(BLOCK):
+    for i in range(BATCH):
         x, y, reach = state[_X + i], state[_Y + i], state[_REACH + i]
         a, b, c = state[_A + i], state[_B + i], state[_C + i]
         form = a, b + b, c, -b / a, -b / c, reach, slack, one
@@ -146,9 +146,9 @@ def _test_block(state: Any, width: int, height: int, side: int, eps: float) -> N
         y_0, y_1 = top * size + half - y, (top + one) * size + half - y
         filled, wide, high = right > left, left + one < right, top + one < bottom
         state[_HIT + i] = one if filled & _touches(form, x_0, y_0, length) else one - one
-        state[_HIT + BLOCK + i] = one if wide & _touches(form, x_1, y_0, length) else one - one
-        state[_HIT + 2 * BLOCK + i] = one if high & _touches(form, x_0, y_1, length) else one - one
-        state[_HIT + 3 * BLOCK + i] = one if wide & high & _touches(form, x_1, y_1, length) else one - one
+        state[_HIT + BATCH + i] = one if wide & _touches(form, x_1, y_0, length) else one - one
+        state[_HIT + 2 * BATCH + i] = one if high & _touches(form, x_0, y_1, length) else one - one
+        state[_HIT + 3 * BATCH + i] = one if wide & high & _touches(form, x_1, y_1, length) else one - one
 
 
 @njit(inline="always", **_OPTIONS)
@@ -197,10 +197,10 @@ def _limit(a: Any, b2: Any, c: Any, reach: Any, slack: Any, one: Any, far_x: Any
 
 
 @njit(**_OPTIONS)
-def _append_block(
+def _append_batch(
     state: Any, order: Any, begin: int, count: int, side: int, columns: int, eps: float, tiles: Any, rows: Any, end: int
 ) -> int:
-    """Append the pairs of a block to `tiles` and `rows`; returns their new number."""
+    """Append the pairs of a batch to `tiles` and `rows`; returns their new number."""
     for k in range(count):
         row, end = order[begin + k], max(end, 0)
         left, right = int(state[_LEFT + k]), int(state[_RIGHT + k])
@@ -209,7 +209,7 @@ def _append_block(
             corner = top * columns + left
             for j in range(4):
                 tiles[end], rows[end] = corner + (j & 1) + (j >> 1) * columns, row
-                end += state[_HIT + j * BLOCK + k] > 0
+                end += state[_HIT + j * BATCH + k] > 0
         else:
             start, end = end, _test_box(state, k, (left, right, top, bottom), side, columns, eps, tiles, end)
             rows[start:end] = row
@@ -220,7 +220,7 @@ def _append_block(
 def _test_box(
     state: Any, k: int, box: tuple[int, int, int, int], side: int, columns: int, eps: float, tiles: Any, end: int
 ) -> int:
-    """Append the tiles of the block's Gaussian k, whose box may be of any size; returns their new number."""
+    """Append the tiles of the batch's Gaussian k, whose box may be of any size; returns their new number."""
     kind = state.dtype.type
     half, length, one, slack = kind(0.5), kind(side - 1), kind(1), kind(8 * eps)
     x, y, a, b, c = state[_X + k], state[_Y + k], state[_A + k], state[_B + k], state[_C + k]
@@ -238,7 +238,7 @@ def _test_box(
         for tile_x in range(start, stop):
             state[_TILE_X + max(count, 0)], state[_TILE_Y + max(count, 0)] = tile_x, tile_y
             count += 1
-            if count == BLOCK:
+            if count == BATCH:
                 end = _append_touched(state, count, form, x, y, columns, length, tiles, end)
                 count = 0
     return _append_touched(state, count, form, x, y, columns, length, tiles, end)

@@ -38,8 +38,8 @@ from .square import (
     ALL_BLOCKS,
     BLOCKS,
     CHUNK,
+    FINAL,
     INLINE,
-    LEFT,
     LIGHT,
     PIXELS,
     X,
@@ -56,7 +56,7 @@ STEP = 4 * LANES
 
 
 @njit(**INLINE)
-def padded(channels: int) -> int:
+def padded_length(channels: int) -> int:
     """Numbers in a row of whole vectors."""
     return -(-channels // LANES) * LANES
 
@@ -78,7 +78,7 @@ def weigh_block(
     Args:
         packed: rows, their length, and the list of the Gaussians' numbers.
         block: which.
-        state: the square's planes; LIGHT and LEFT move on.
+        state: the square's planes; LIGHT and FINAL move on.
         hits: see `list_hits`.
         count: Gaussians listed for the block.
         sources: where in the features each Gaussian's row begins: its number times D, by way of the index.
@@ -91,7 +91,7 @@ def weigh_block(
     rows, length, order = packed
     weights, ratios, places, begins = kept
     p, listed, drawn_count = block * LANES, block * CHUNK, 0
-    x, y, light, left = load(state, X + p), load(state, Y + p), load(state, LIGHT + p), load(state, LEFT + p)
+    x, y, light, final = load(state, X + p), load(state, Y + p), load(state, LIGHT + p), load(state, FINAL + p)
     for k in range(count):
         j = np.int64(fetch(hits, listed + k))
         number = np.int64(fetch(order, j))
@@ -101,7 +101,7 @@ def weigh_block(
         light = light * clear
         drawn = light >= TRANSMITTANCE_MIN
         weight = select(drawn, weight, 0)
-        left = select(drawn, light, left)
+        final = select(drawn, light, final)
         store(weights, drawn_count * LANES, weight)
         store(ratios, drawn_count * LANES, select(drawn & (full <= ALPHA_MAX), alpha * reciprocal(clear), 0))
         put(places, drawn_count, j)
@@ -109,7 +109,7 @@ def weigh_block(
         if any_of(weight > 0):
             drawn_count += 1
     store(state, LIGHT + p, light)
-    store(state, LEFT + p, left)
+    store(state, FINAL + p, final)
     return drawn_count, any_of(light >= TRANSMITTANCE_MIN)
 
 
@@ -188,7 +188,7 @@ def composite_square(
     features, sources, channels = wide
     start, end, into = span
     corners, sums, kept, hits, counts = scratch
-    stride = padded(channels)
+    stride = padded_length(channels)
     position, filled = start, np.uint32(0)
     while position < end and dark != ALL_BLOCKS:
         stop = min(position + CHUNK, end)
@@ -238,7 +238,7 @@ def differentiate_square(
     features, _, channels = wide
     kept, slopes, hits, counts = scratch
     start, end, into = span
-    stride = padded(channels)
+    stride = padded_length(channels)
     for position in range(start, end, CHUNK):
         stop = min(position + CHUNK, end)
         list_traced(position, stop, into - start, hits, counts, trace)

@@ -1,0 +1,80 @@
+"""How an object shows itself: one short line in Python, and a small table in a notebook."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from html import escape
+from typing import Any
+
+LONGEST = 100  # characters of one value in a line
+STYLE = "text-align:left;padding:1px 10px 1px 0"  # notebooks centre cells by default
+
+
+def html_card(title: str, facts: Mapping[str, object]) -> str:
+    """An HTML table for `_repr_html_`: a title and one row for each fact. Everything is escaped.
+
+    Args:
+        title: what the object is, such as "Codebook".
+        facts: the name and the value of each row, in order. A value of None leaves its row out; `short_value` shortens
+            the others.
+
+    Example:
+        >>> html_card("Codebook", {"codewords": 64, "fitted to": None}).count("<tr>")
+        1
+    """
+    rows = "".join(
+        f'<tr><th style="{STYLE}">{escape(name)}</th><td style="{STYLE}">{escape(_plain(value))}</td></tr>'
+        for name, value in facts.items()
+        if value is not None
+    )
+    return f'<table><caption style="{STYLE};font-weight:bold">{escape(title)}</caption><tbody>{rows}</tbody></table>'
+
+
+def short_repr(thing: Any) -> str:
+    """A line for `__repr__` of a dataclass or a named tuple: its fields, tensors by shape and type only.
+
+    Fields that are None, and fields declared with `repr=False`, are left out.
+
+    Example:
+        >>> import torch
+        >>> from typing import NamedTuple
+        >>> class Nearest(NamedTuple):
+        ...     codeword: torch.Tensor
+        ...     exact: bool
+        >>> short_repr(Nearest(torch.zeros(5, 3), True))
+        'Nearest(codeword=[5, 3] float32, exact=True)'
+    """
+    names = [field.name for field in fields(thing) if field.repr] if is_dataclass(thing) else thing._fields
+    values = {name: getattr(thing, name) for name in names}
+    inside = ", ".join(f"{name}={short_value(value)}" for name, value in values.items() if value is not None)
+    return f"{type(thing).__name__}({inside})"
+
+
+def short_value(value: object) -> str:
+    """One value in at most `LONGEST` characters: a tensor by its shape and type, a long list by its length.
+
+    Example:
+        >>> short_value(range(1000)), short_value([1.5, 2.0]), short_value(list("a long list"))
+        ('range(0, 1000)', '[1.5, 2.0]', '11 of str')
+    """
+    shape: Any = getattr(value, "shape", None)
+    if shape is not None and hasattr(value, "dtype"):
+        device = str(getattr(value, "device", "cpu"))
+        return f"{list(shape)} {value.dtype}".replace("torch.", "") + ("" if device == "cpu" else f" on {device}")
+    if isinstance(value, Mapping):
+        return f"{len(value)} entries" if len(value) > 3 else _cut(", ".join(f"{k}: {v!r}" for k, v in value.items()))
+    if isinstance(value, list | tuple) and not hasattr(value, "_fields"):
+        simple = len(value) <= 4 and all(isinstance(item, str | int | float) for item in value)
+        kinds = sorted({type(item).__name__ for item in value})
+        return repr(value) if simple else f"{len(value)} of {' or '.join(kinds)}"
+    return _cut(repr(value))
+
+
+def _plain(value: object) -> str:
+    return _cut(value) if isinstance(value, str) else f"{value:,}" if type(value) is int else short_value(value)
+
+
+def _cut(text: str) -> str:
+    line = " ".join(text.split())
+    return line if len(line) <= LONGEST else line[: LONGEST - 3] + "..."

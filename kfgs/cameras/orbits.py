@@ -1,0 +1,124 @@
+"""Cameras that go once around a scene, and the direction that is up in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import cos, hypot, pi, radians, sin, tan
+
+import torch
+from torch import Tensor
+
+from .._check import check_range, check_shapes, check_size, check_whole
+from .bounds import robust_bounds
+from .camera import UP, Camera, unit_vector
+
+LEVEL = 0.05  # of all: less spread of the pictures' x axes than this, in their second direction, leaves "up" open
+
+
+@dataclass(frozen=True)
+class Orbit:
+    """How cameras go around a scene."""
+
+    frames: int = 72
+    """Pictures of one round: every 5 degrees."""
+    size: tuple[int, int] = (360, 480)
+    """(height, width) in pixels."""
+    elevation_degrees: float = 25.0
+    """Above the horizon through the middle, in (-90, 90)."""
+    start_degrees: float = 0.0
+    """Where the first camera stands, counter-clockwise seen from above."""
+    fov_degrees: float = 40.0
+    """Vertical field of view."""
+    zoom: float = 1.0
+    """At 1 the sphere around the scene's robust box fits the picture; 2 halves the distance."""
+    cut: float = 0.0
+    """Share of the way from the sphere's front to its middle that is not drawn: opens a room whose walls hide it.
+    A lid is better left out of the cloud: `gaussians.select(gaussians.labels != ceiling)`."""
+
+    def __post_init__(self) -> None:
+        check_whole("frames", self.frames, 1)
+        check_size(self.size)
+        check_range("elevation_degrees", self.elevation_degrees, -90, 90, closed=(False, False))
+        check_range("start_degrees", self.start_degrees, float("-inf"))
+        check_range("fov_degrees", self.fov_degrees, 0, 180, closed=(False, False))
+        check_range("zoom", self.zoom, 0, closed=(False, False))
+        check_range("cut", self.cut, 0, 1)
+
+
+def estimate_up(cameras: Sequence[Camera]) -> Tensor:  # [3] float64, unit
+    """The direction that is up in the world, from the cameras that looked at it.
+
+    People hold cameras level: the pictures' x axes are horizontal, wherever they look and however far down, so up is the
+    direction least along any of them (least eigenvector of sum x x^T), on the side of the pictures' upper edges. Where
+    all look the same way, the x axes leave it open, and up is the mean of the pictures' own.
+
+    Raises:
+        ValueError: if there are no cameras, or their upper edges point everywhere and cancel.
+    """
+    if not cameras:
+        raise ValueError("cameras: expected at least one camera, got none; give up as a vector instead")
+    R = torch.stack([camera.viewmat[:3, :3].detach().double().cpu() for camera in cameras])
+    right, mean = R[:, 0], -R[:, 1].mean(0)
+    if float(mean.norm()) < LEVEL:
+        raise ValueError(
+            f"cameras: expected pictures that are held upright, got {len(cameras)} whose upper edges cancel; give up as a "
+            "vector instead"
+        )
+    values, vectors = torch.linalg.eigh(right.T @ right / len(right))
+    if float(values[1]) < LEVEL:
+        return mean / mean.norm()
+    up = vectors[:, 0]
+    return up * torch.sign(up @ mean)
+
+
+def orbit_cameras(
+    points: Tensor,  # [N, 3]
+    orbit: Orbit | None = None,
+    *,
+    up: Tensor | Sequence[float] = UP,  # [3]
+) -> list[Camera]:
+    """Cameras on a circle of constant elevation around a cloud, all looking at its middle.
+
+    The middle is that of the box of the central 96 % of the points (`robust_bounds`): a few points far outside do not
+    move it. Seen from above, the cameras go counter-clockwise.
+
+    Args:
+        points: the cloud, usually `gaussians.means`.
+        orbit: how they go round.
+        up: the world's up. COLMAP's worlds often have no axis that points up: pass `estimate_up(scene.cameras)`.
+
+    Raises:
+        ValueError: if there are no points, one is not finite, or `up` has no direction.
+    """
+    check_shapes(("points", points, "N 3"))
+    orbit = orbit or Orbit()
+    cloud = points.detach().double().cpu()
+    if not bool(cloud.isfinite().all()):
+        raise ValueError(
+            f"points: expected finite positions, got {int((~cloud.isfinite()).any(1).sum())} rows with NaN or infinity; "
+            "remove them first"
+        )
+    bounds = robust_bounds(cloud, coverage=0.96, margin=0.0)
+    center, radius = (bounds.low + bounds.high) / 2, float((bounds.high - bounds.low).norm()) / 2
+    radius = radius or 1.0  # all in one place
+    height, width = orbit.size
+    half = min(height, width) / height * tan(radians(orbit.fov_degrees) / 2)  # tangent of half the narrower angle
+    distance = radius * hypot(1, half) / half / orbit.zoom  # the sphere touches the nearer edges
+    near = max(distance - radius * (1 - orbit.cut), 1e-3 * distance)
+    zenith = unit_vector("up", up)
+    axis = torch.eye(3, dtype=torch.float64)[int(zenith[0].abs() > 0.9)]  # azimuth 0 is x, or y where x is nearly up
+    north = torch.linalg.cross(zenith, axis)
+    north /= north.norm()
+    east, e = torch.linalg.cross(north, zenith), radians(orbit.elevation_degrees)
+    cameras = []
+    for number in range(orbit.frames):
+        a = radians(orbit.start_degrees) + 2 * pi * number / orbit.frames
+        outward = cos(e) * (cos(a) * east + sin(a) * north) + sin(e) * zenith
+        cameras.append(
+            Camera.look_at(
+                center + distance * outward, center, up=zenith, fov_degrees=orbit.fov_degrees,
+                width=width, height=height, name=f"orbit_{number:04d}", near=near,
+            )
+        )  # fmt: skip
+    return cameras

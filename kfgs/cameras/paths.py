@@ -1,0 +1,115 @@
+"""Cameras along a smooth path through given cameras, at an even pace."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+from torch import Tensor
+
+from .._check import check_size, check_whole
+from .camera import Camera
+
+Array = np.ndarray[Any, Any]
+SAME = 1e-9  # of the walk: two views in a row that are closer than this, in place and direction, are one
+STANDING = 1e-6  # of the coordinates: cameras on one tripod differ by the rounding of float32
+AROUND = 3  # keys of the other end before the start and after the end of a closed walk: the splines feel no further
+
+
+def path_cameras(
+    cameras: Sequence[Camera],
+    frames: int = 150,
+    *,
+    every: int = 1,
+    size: tuple[int, int] | None = None,
+    closed: bool = False,
+) -> list[Camera]:
+    """Cameras along a smooth path through posed cameras, in the order given.
+
+    Centres lie on a cubic spline and rotations on a cubic rotation spline (scipy's `RotationSpline`: slerp between the
+    keys, which kornia's `Quaternion.slerp` would do, turns with a jerk at each of them). Both pass through every key.
+    The pace is even: time between two keys is hypot(distance / extent, angle / pi).
+
+    Args:
+        cameras: at least two different ones, in the order of the walk (pictures of a video by name).
+        frames: how many cameras to return; the first and last stand at the first and last key (a closed walk stops one
+            step before its start).
+        every: only each so many-th camera is a key, and the last: a hand-held walk of 200 pictures trembles less with 10.
+        size: (height, width) in pixels of the new cameras; None: the first camera's.
+        closed: come back to the first camera, for a film that repeats.
+
+    Returns:
+        Pinhole cameras, `path_0000` and so on. Focal lengths and principal points run linearly between the keys; lens
+        distortion is left out, and the smallest `near` holds for all.
+
+    Raises:
+        ValueError: if there are fewer than two different views, or a number is out of range.
+    """
+    check_whole("frames", frames, 2)
+    check_whole("every", every, 1)
+    if size is not None:
+        check_size(size)
+    keys = _keys(cameras, every, closed)
+    height, width = size or cameras[0].size
+    keys = [key.resized(height, width) for key in keys]
+    places, turns = _poses(keys)
+    times = np.concatenate([[0.0], np.cumsum(_steps(places, turns))])
+    start, end = (times[AROUND], times[-AROUND - 1]) if closed else (times[0], times[-1])
+    moments = np.linspace(start, end, frames, endpoint=not closed)
+    R = RotationSpline(times, turns)(moments).as_matrix()  # [frames, 3, 3] world to camera
+    t = -np.einsum("nij,nj->ni", R, CubicSpline(times, places)(moments))  # t = -R c
+    lenses = np.stack([_numpy(key.K) for key in keys])[:, [0, 1, 0, 1], [0, 1, 2, 2]]  # [k, 4] fx, fy, cx, cy
+    lenses = np.stack([np.interp(moments, times, column) for column in lenses.T], axis=1)
+    near = min(camera.near for camera in cameras)
+    path = []
+    for number in range(frames):
+        viewmat, K = np.eye(4), np.eye(3)
+        viewmat[:3, :3], viewmat[:3, 3] = R[number], t[number]
+        K[0, 0], K[1, 1], K[0, 2], K[1, 2] = lenses[number]
+        name = f"path_{number:04d}"
+        path.append(Camera(torch.from_numpy(viewmat), torch.from_numpy(K), width, height, name=name, near=near))
+    return path
+
+
+def _keys(cameras: Sequence[Camera], every: int, closed: bool) -> list[Camera]:
+    """The views to pass through, each different from the one before; a closed walk goes on past both of its ends."""
+    keys = [*cameras[::every]]
+    if not closed and (len(cameras) - 1) % every:
+        keys.append(cameras[-1])
+    if len(keys) > 1:
+        moved = _steps(*_poses(keys)) > SAME
+        keys = [keys[0], *(key for key, new in zip(keys[1:], moved, strict=True) if new)]
+    if closed and len(keys) > 1 and _steps(*_poses([keys[-1], keys[0]]))[0] <= SAME:
+        keys.pop()
+    if len(keys) < 2:
+        raise ValueError(
+            f"cameras: expected at least two different views, got {len(keys)} (of {len(cameras)}, every {every}); pass the "
+            "scene's cameras in the order of the walk"
+        )
+    if closed:
+        keys = [keys[i % len(keys)] for i in range(-AROUND, len(keys) + AROUND + 1)]
+    return keys
+
+
+def _poses(keys: Sequence[Camera]) -> tuple[Array, Rotation]:  # [k, 3], k rotations from world to camera
+    viewmats = np.stack([_numpy(key.viewmat) for key in keys])
+    R, t = viewmats[:, :3, :3], viewmats[:, :3, 3]
+    return -np.einsum("nji,nj->ni", R, t), Rotation.from_matrix(R)  # c = -R^T t
+
+
+def _steps(places: Array, turns: Rotation) -> Array:  # [k - 1]
+    """Time from each key to the next: hypot(distance / extent, angle / pi)."""
+    extent = float(np.linalg.norm(np.ptp(places, axis=0)))
+    if extent <= STANDING * np.abs(places).max():
+        extent = 1.0
+    angles = (turns[1:] * turns[:-1].inv()).magnitude()
+    return np.hypot(np.linalg.norm(np.diff(places, axis=0), axis=1) / extent, angles / np.pi)
+
+
+def _numpy(values: Tensor) -> Array:
+    array: Array = values.detach().double().cpu().numpy()
+    return array

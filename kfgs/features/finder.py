@@ -1,0 +1,147 @@
+"""Which file of a folder is the map of which view: by the name of its picture, and by the manifest that kfgs writes."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+from ..scenes.files import IMAGE_SUFFIXES, some
+from .layouts import FEATURE_3DGS, LAYOUTS, OWN, Reading, StoredMap, layout_of, open_map
+from .manifest import MANIFEST, MapRecord, read_manifest
+
+
+class MapFinder:
+    """The rules of a folder of maps.
+
+    Args:
+        path: the folder.
+
+    Raises:
+        NotADirectoryError: if `path` is no folder.
+        ValueError: if its manifest is damaged.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        if not self.path.is_dir():
+            raise NotADirectoryError(f"path: expected a folder of feature maps, got {self.path}; check its name")
+        self.manifest = read_manifest(self.path)
+        self.records: dict[str, MapRecord] = self.manifest.maps if self.manifest else {}
+        self.own = frozenset(self.path / record.file for record in self.records.values())
+        """The files of the maps that kfgs wrote, including discarded ones."""
+
+    def record(self, stem: str, file: Path) -> MapRecord | None:
+        """The record of this very file of a view, which may have been discarded since; None if the file may have changed."""
+        record = self.records.get(stem)
+        if record is None or file != self.path / record.file:
+            return None
+        return None if file.is_file() and record.doubt(file, read=False) else record
+
+    def open(self, stem: str, file: Path, reading: Reading) -> StoredMap:  # [h, w, D]
+        """Map a view's file into memory, see `layouts.open_map`; a record tells the order of the axes."""
+        record = self.record(stem, file)
+        return open_map(file, replace(reading, channels=record.shape[2]) if record else reading, self.own)
+
+    def discarded(self, stem: str) -> Path | None:
+        """Where a view's map was before it was discarded; None if it is there, or was never made or never discarded."""
+        if self.manifest is None or not self.manifest.discarded or stem not in self.records:
+            return None
+        file = self.path / self.records[stem].file
+        return None if file.is_file() else file
+
+    def listed(self, *, deep: bool = False) -> dict[str, list[Path]]:
+        """The maps in the folder by stem; of several files with one stem, the one to read comes first.
+
+        A file may also have the whole name of the picture (`rgb_1.png.npy`); the stem is `rgb_1` even then. Hidden files
+        are left out.
+
+        Args:
+            deep: look into subfolders too (not into hidden ones or links); the stem then starts with the subfolder.
+        """
+        found: dict[str, list[tuple[int, str, Path]]] = {}
+        for here, folders, names in os.walk(self.path):
+            folders[:] = sorted(name for name in folders if deep and not name.startswith("."))
+            for name in names:
+                file = Path(here) / name
+                layout = None if name.startswith(".") else layout_of(file, self.own)
+                if layout is None:
+                    continue
+                stem = file.relative_to(self.path).as_posix().removesuffix(layout.suffix)
+                ending = PurePosixPath(stem).suffix
+                if file not in self.own and ending.lower() in IMAGE_SUFFIXES and PurePosixPath(stem).stem:
+                    stem = stem.removesuffix(ending)
+                found.setdefault(stem, []).append((LAYOUTS.index(layout), name, file))
+        return {stem: [file for _, _, file in sorted(files)] for stem, files in found.items()}
+
+    def find(self, stems: Sequence[str]) -> dict[str, list[Path]]:
+        """Each view's map: an empty list if there is none, several files if it is not clear which one is meant.
+
+        A view's map is in the folder under the picture's stem; if the picture is in a subfolder, so is the map. If no view
+        has a map there, the last part of the stem is looked for in the folder and all its subfolders. A discarded map is
+        the file that it was.
+        """
+        gone = {stem: [file] for stem in stems if (file := self.discarded(stem)) is not None}
+        found = {stem: self.beside(stem) for stem in stems if stem not in gone}
+        if not all(found.values()):
+            present = self.listed(deep=True)
+            found = {stem: files or present.get(stem, [])[:1] for stem, files in found.items()}
+            if not any(found.values()):
+                bases = Counter(PurePosixPath(stem).name for stem in found)
+                by_base: dict[str, list[Path]] = {}
+                for stem, files in present.items():
+                    by_base.setdefault(PurePosixPath(stem).name, []).append(files[0])
+                found = {
+                    stem: by_base.get(base, []) if bases[base] == 1 else []
+                    for stem, base in ((stem, PurePosixPath(stem).name) for stem in found)
+                }
+        return {stem: gone[stem] if stem in gone else found[stem] for stem in stems}
+
+    def beside(self, stem: str) -> list[Path]:
+        """The file that is called `stem` and the suffix of a layout, in a list; an empty list if there is none."""
+        files = ((self.path / f"{stem}{layout.suffix}", layout) for layout in LAYOUTS)
+        return [file for file, layout in files if file.is_file() and layout_of(file, self.own) is layout][:1]
+
+    def faults(self, found: dict[str, list[Path]]) -> dict[str, str]:
+        """What is wrong with the files that `find` returned, by the name of the file (if there is none, of the one expected).
+
+        A map without a record in a folder that kfgs filled is a fault: its teacher need not have made it.
+        """
+        faults = {}
+        for stem, files in found.items():
+            names = [file.relative_to(self.path).as_posix() for file in files]
+            expected = stem + (OWN if self.manifest else FEATURE_3DGS).suffix
+            if len(files) > 1:
+                text = (
+                    f"expected one map for view {stem!r}, got {len(files)}: {some(names, 3)}; name the subfolder itself"
+                )
+                faults[expected] = text
+            elif not files and self.manifest:
+                faults[expected] = "missing; `kfgs features` with the --split of this view makes it"
+            elif not files:
+                faults[expected] = "missing, and no other layout of this view either; encode it"
+            elif self.manifest and files[0] not in self.own:
+                faults[names[0]] = (
+                    f"expected a map that {MANIFEST} lists, as kfgs filled this folder, got one without a record; move it "
+                    "away if another program made it, then run `kfgs features`, which makes (or overwrites) it"
+                )
+        return faults
+
+    def explain_missing(self, stems: Sequence[str], missing: Sequence[str]) -> str:
+        """The message for views without a map: which views, and what the maps that are there are called."""
+        suffix = OWN.suffix if self.manifest else FEATURE_3DGS.suffix
+        named = some([stem + suffix for stem in missing])
+        text = f"expected a feature map for each of {len(stems)} views, {len(missing)} missing: {named}"
+        others = sorted(set(self.listed(deep=True)) - set(stems))
+        if self.manifest:  # its maps have the names of the pictures, so views are missing, and no name is wrong
+            hint = f"make them with `kfgs features ... --split all --out {self.path}` (or the split of these views)"
+        elif len(missing) == len(stems) and others:
+            return (
+                f"{text} (or {missing[0]}{OWN.suffix}); the maps there ({len(others)}) are called {some(others, 3)}, but the "
+                f"pictures {some(list(stems), 3)}: rename the maps to the names of the pictures"
+            )
+        else:
+            text, hint = f"{text} (or {missing[0]}{OWN.suffix})", "encode these views"
+        return f"{text}; {hint}, or leave them out of `stems`"

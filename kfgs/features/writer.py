@@ -1,0 +1,192 @@
+"""Writing one teacher's maps to a folder, so that a killed process can go on where it stopped."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .._files import bytes_in_words, digest_file
+from ..teachers.protocol import Teacher, check_features
+from .finder import MapFinder
+from .layouts import LAYOUTS, OWN, layout_of, map_file
+from .manifest import MANIFEST, Manifest, MapRecord, differences, plain_identity
+from .pictures import Picture
+
+try:
+    import fcntl
+except ImportError:  # Windows: two processes that write to one folder are not noticed there
+    fcntl = None  # type: ignore[assignment]
+
+LOCK = ".features.lock"
+ROW_BLOCK = 8  # rows of a map rounded at a time: 4 MB at 480 x 512 channels
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keep other processes from writing to a folder of maps; the folder is made if it does not exist.
+
+    Raises:
+        ValueError: if another process is writing to it.
+        OSError: if it cannot be made or written to; the message says so.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / LOCK).open("a")
+    except OSError as error:
+        raise type(error)(
+            f"folder: expected a folder that can be written to, got {folder} ({error.strerror}); choose another"
+        ) from error
+    with file:
+        if fcntl is not None:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise ValueError(
+                    f"folder: expected one that no other process writes to, got {folder}, which is in use; wait until "
+                    "that process has ended"
+                ) from error
+        yield  # the empty file stays: if it were removed, two processes could hold locks of the same name
+
+
+class MapWriter:
+    """Adds one teacher's maps to a folder and records each in its manifest. Use it while the folder is `locked`.
+
+    Half-written files that a killed process left for these pictures are deleted.
+
+    Args:
+        folder: of the maps.
+        identity: of the teacher, see `identify`.
+        pictures: whose maps will be written, or are there already.
+        overwrite: give up maps in the folder that another teacher or another program made.
+
+    Raises:
+        TypeError: if JSON cannot hold `identity`.
+        ValueError: if the folder holds maps of another teacher (the message says what differs), or of other programs.
+    """
+
+    def __init__(
+        self, folder: Path, identity: Mapping[str, Any], pictures: Sequence[Picture], *, overwrite: bool = False
+    ) -> None:
+        wanted, finder = plain_identity(identity), MapFinder(folder)
+        files = {map_file(folder, picture.stem): picture.stem for picture in pictures}
+        finder.own |= set(files)
+        read_first = LAYOUTS[: LAYOUTS.index(OWN)]
+        for file in (file for stem in files.values() for file in finder.beside(stem)):
+            if layout_of(file, finder.own) in read_first:
+                raise ValueError(
+                    f"folder: expected one without maps of other programs, got {file}, which would be read instead of ours; "
+                    "use another folder"
+                )
+        found = finder.manifest
+        if found is None and not overwrite and (other := next((file for file in files if file.is_file()), None)):
+            raise ValueError(
+                f"folder: expected one without maps of other programs, got {other} and no {MANIFEST}; use another "
+                "folder, or pass overwrite=True (--overwrite)"
+            )
+        if found is not None and found.teacher != wanted:
+            if not overwrite:
+                raise ValueError(
+                    f"folder: expected maps of the same teacher as now, got others in {folder} "
+                    f"({differences(found.teacher, wanted)}); use another folder, or pass overwrite=True "
+                    f"(--overwrite) to give up its {len(found.maps)} maps"
+                )
+            for stem in found.maps:
+                if (file := map_file(folder, stem)) in finder.own:  # never a file outside of the folder
+                    file.unlink(missing_ok=True)
+            found = None
+        self.folder, self.manifest = folder, found or Manifest(wanted)
+        self._missing = {stem for stem, one in self.manifest.maps.items() if not (folder / one.file).is_file()}
+        if found is None:
+            self.manifest.save(folder)  # from now on, a map without a record is one that a killed process left
+        for file in [folder / MANIFEST, *files]:
+            if file.parent.is_dir():
+                literal = "".join(f"[{c}]" if c in "*?[" else c for c in file.name)
+                for left_over in file.parent.glob(f".{literal}.*"):
+                    left_over.unlink(missing_ok=True)
+
+    def doubt(self, stem: str, image_digest: str) -> str | None:
+        """Why a picture's map must be made (again), in words; None if the map that is there can be used."""
+        record = self.manifest.maps.get(stem)
+        if record is None:
+            return "new"
+        if record.image_digest != image_digest:
+            return "the picture has changed"
+        if stem in self._missing:
+            return "its map was discarded" if self.manifest.discarded else "its map is gone"
+        file = self.folder / record.file
+        if (doubt := record.doubt(file)) is not None:
+            return f"its map {doubt}"
+        if (mtime_ns := file.stat().st_mtime_ns) != record.mtime_ns:  # the same bytes: copied, or touched
+            self._keep(stem, replace(record, mtime_ns=mtime_ns))
+        return None
+
+    def add(
+        self, picture: Picture, image_digest: str, file: Path, shape: tuple[int, int, int], seconds: float
+    ) -> MapRecord:
+        """Record a map [h, w, D] that has been written to `file`, and save the manifest."""
+        info, name = file.stat(), file.relative_to(self.folder).as_posix()
+        what = {"image": picture.path.name, "image_digest": image_digest, "seconds": round(seconds, 3)}
+        record = MapRecord(name, shape, info.st_size, info.st_mtime_ns, digest_file(file), **what)  # type: ignore[arg-type]
+        self._keep(picture.stem, record)
+        return record
+
+    def _keep(self, stem: str, record: MapRecord) -> None:
+        self._missing.discard(stem)
+        maps = {**self.manifest.maps, stem: record}
+        # while one of the discarded maps is missing, its record still describes it
+        self.manifest = replace(self.manifest, maps=maps, discarded=self.manifest.discarded and bool(self._missing))
+        self.manifest.save(self.folder)
+
+    def check_space(self, maps: int, map_bytes: int) -> None:
+        """Raise an OSError unless the disk has space for so many maps of so many bytes."""
+        needed, free = maps * map_bytes, shutil.disk_usage(self.folder).free
+        if needed > free:
+            raise OSError(
+                f"folder: expected {bytes_in_words(needed)} free for {maps} maps, got {bytes_in_words(free)} where "
+                f"{self.folder} is; free some, take another disk, or store no maps (RecomputedMaps)"
+            )
+
+
+def encode_half(teacher: Teacher, picture: Tensor, path: Path) -> Tensor:  # [H, W, 3] -> [h, w, D] float16
+    """A teacher's map of one picture as it is stored: channels last, rounded to half precision, on the CPU.
+
+    Raises:
+        TypeError: if the teacher returns no tensor.
+        ValueError: if the map is not finite before or after rounding, or if a feature becomes all-zero by rounding, which
+            would mean "unknown"; the message names the picture.
+    """
+    with torch.inference_mode():
+        features = check_features(teacher.name, teacher.encode_image(picture.permute(2, 0, 1).contiguous()))
+        D, h, w = features.shape
+        half = torch.empty(h, w, D, dtype=torch.float16, device=features.device)
+        finite, lost = torch.ones((), dtype=torch.bool, device=features.device), 0
+        for start in range(0, h, ROW_BLOCK):  # one block stays in the processor's cache
+            block = features[:, start : start + ROW_BLOCK]
+            rows = half[start : start + ROW_BLOCK].copy_(block.permute(1, 2, 0))
+            sums = rows.sum(-1, dtype=torch.float32)  # finite only if all values are; isfinite takes six times as long
+            finite &= torch.isfinite(sums).all()
+            i, j = (sums == 0).nonzero(as_tuple=True)
+            lost += int((~rows[i, j].any(-1) & block[:, i, j].any(0)).sum()) if len(i) else 0
+        if not bool(finite):
+            bad = int((~torch.isfinite(features)).sum())
+            expected, got = (
+                "finite features",
+                f"{bad} NaN or infinite values; check its weights, or use single precision",
+            )
+            if not bad:
+                expected = "features below 65504 (they are stored as float16)"
+                got = f"values up to {float(features.abs().max()):g}; scale them, or bring the rows to unit length"
+            raise ValueError(f"teacher {teacher.name!r}: expected {expected} for {path}, got {got}")
+        if lost:
+            raise ValueError(
+                f"teacher {teacher.name!r}: expected features above 6e-8 (they are stored as float16) for {path}, got "
+                f"{lost} that become all-zero; scale them, or bring the rows to unit length"
+            )
+    return half.cpu()

@@ -1,0 +1,105 @@
+"""Films of a scene: once around it, or along the cameras that took its pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from torch import Tensor
+
+from ..cameras import Camera, Orbit, estimate_up, orbit_cameras, path_cameras
+from ..cameras.camera import UP
+from ..gaussians import Gaussians
+from .animation import Progress, save_animation
+from .shows import Show
+
+KEYS = 40  # cameras of a long walk that a flight passes through: enough to follow it, too few to tremble with the hand
+
+
+def save_turntable(
+    path: str | Path,
+    shows: Gaussians | Mapping[str, Gaussians | Show],
+    *,
+    orbit: Orbit | None = None,
+    up: Tensor | Sequence[float] | None = None,  # [3]
+    cameras: Sequence[Camera] | None = None,
+    fps: float = 15.0,
+    names: Sequence[str] | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Write one round about a scene as a GIF or MP4 that can be played for ever.
+
+    A GIF takes about 60 kB a frame of 360x480 of textured colours, and 40 kB of labels: `orbit` bounds both.
+
+    Args:
+        path: a name that ends in .gif or .mp4.
+        shows: Gaussians, or several things by title, side by side (`save_animation`). The cameras go round the first
+            Gaussians among them.
+        orbit: how they go round.
+        up: the world's up.
+        cameras: the scene's own cameras, which tell where up is when `up` is None.
+        fps: frames per second.
+        names: class names for a legend below.
+        progress: called after each frame with (done, all).
+
+    Returns:
+        `path`.
+
+    Raises:
+        ValueError: if nothing can be shown, or there are no Gaussians to go round (pass `orbit_cameras` to
+            `save_animation` then).
+        ImportError: for .mp4, where imageio-ffmpeg is not installed.
+    """
+    things = shows.values() if isinstance(shows, Mapping) else [shows]
+    cloud = next((thing for thing in things if isinstance(thing, Gaussians)), None)
+    if cloud is None:
+        raise ValueError(
+            "shows: expected Gaussians to go round, got only functions; pass orbit_cameras(points) to save_animation"
+        )
+    if up is None and cameras:
+        up = estimate_up(cameras)
+    return save_animation(
+        path,
+        shows,
+        orbit_cameras(cloud.means, orbit, up=UP if up is None else up),
+        fps=fps,
+        names=names,
+        progress=progress,
+    )
+
+
+def save_flythrough(
+    path: str | Path,
+    shows: Gaussians | Show | Mapping[str, Gaussians | Show],
+    cameras: Sequence[Camera],
+    *,
+    frames: int = 150,
+    size: tuple[int, int] | None = None,
+    fps: float = 15.0,
+    names: Sequence[str] | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Write a flight along posed cameras as a GIF or MP4: of labels, of edited colours, or of both side by side.
+
+    For other keys or a closed walk pass `path_cameras(...)` to `save_animation`.
+
+    Args:
+        path: a name that ends in .gif or .mp4.
+        shows: Gaussians, a function camera -> picture, or several by title, side by side (`save_animation`).
+        cameras: the scene's cameras in the order of the walk; at most about 40 of them become keys, evenly chosen.
+        frames: in all.
+        size: (height, width) in pixels of each picture; None: the first camera's.
+        fps: frames per second.
+        names: class names for a legend below.
+        progress: called after each frame with (done, all).
+
+    Returns:
+        `path`.
+
+    Raises:
+        ValueError: if nothing can be shown, or there are fewer than two different views.
+        ImportError: for .mp4, where imageio-ffmpeg is not installed.
+    """
+    every = max(1, round(len(cameras) / KEYS))
+    walk = path_cameras(cameras, frames, every=every, size=size)
+    return save_animation(path, shows, walk, fps=fps, names=names, progress=progress)

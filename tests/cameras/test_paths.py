@@ -1,0 +1,110 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from kfgs.cameras import Camera, Distortion, path_cameras
+
+
+def camera(center, yaw=0.0, *, focal=50.0, size=(40, 60), near=0.2, distortion=None):
+    """Looks along z, turned by yaw about y."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = torch.tensor([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ torch.tensor(center, dtype=torch.float64)
+    K = torch.tensor([[focal, 0, 31], [0, focal + 1, 19], [0, 0, 1]], dtype=torch.float64)
+    return Camera(viewmat, K, size[1], size[0], near=near, distortion=distortion)
+
+
+def yaw_of(view):
+    return math.atan2(float(view.viewmat[2, 0]), float(view.viewmat[2, 2]))
+
+
+def centers(path):
+    return torch.stack([view.center for view in path]).numpy()
+
+
+def test_between_two_views_the_path_is_straight_and_turns_evenly():
+    path = path_cameras([camera((0, 1, 2)), camera((4, 1, 0), math.pi / 2)], 5)
+    t = np.linspace(0, 1, 5)
+    np.testing.assert_allclose(centers(path), np.outer(1 - t, (0, 1, 2)) + np.outer(t, (4, 1, 0)), atol=1e-9)
+    np.testing.assert_allclose([yaw_of(view) for view in path], t * math.pi / 2, atol=1e-9)
+    assert [view.name for view in path] == [f"path_{i:04d}" for i in range(5)]
+
+
+def test_every_key_is_passed_and_a_steady_walk_stays_steady():
+    keys = [camera((2.0 * i, 0.5, 0), 0.3 * i) for i in range(5)]
+    path = path_cameras(keys, 9)
+    np.testing.assert_allclose(centers(path), [(i, 0.5, 0) for i in range(9)], atol=1e-9)
+    for key, view in zip(keys, path[::2], strict=True):
+        np.testing.assert_allclose(view.viewmat, key.viewmat, atol=1e-9)
+
+
+def test_places_with_different_gaps_are_passed_at_one_pace():
+    places = [0.0, 1.0, 4.0, 5.0, 9.0]
+    path = path_cameras([camera((x, 0, 0)) for x in places], 19)
+    np.testing.assert_allclose(np.diff(centers(path)[:, 0]), 0.5, atol=1e-9)
+
+
+def test_a_closed_walk_round_a_circle_ends_a_step_before_its_start():
+    keys = [camera((3 * math.sin(a), 0, -3 * math.cos(a)), -a) for a in np.arange(8) * math.pi / 4]
+    path = path_cameras(keys, 24, closed=True)
+    places = centers(path)
+    np.testing.assert_allclose(places[0], (0, 0, -3), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(places, axis=1), 3, rtol=3e-3)  # a cubic through every 45 degrees
+    steps = np.linalg.norm(np.diff(places, axis=0, append=places[:1]), axis=1)
+    assert steps.max() / steps.min() < 1.03
+    looks = np.stack([view.viewmat[2, :3].numpy() for view in path])
+    assert (np.sum(looks * -places / 3, axis=1) > 0.999).all()  # all the way round to the middle
+
+
+def test_a_closed_walk_may_name_its_start_twice_or_have_two_places_only():
+    keys = [camera((math.sin(a), 0, math.cos(a)), a) for a in np.arange(4) * math.pi / 2]
+    np.testing.assert_allclose(
+        centers(path_cameras([*keys, keys[0]], 12, closed=True)),
+        centers(path_cameras(keys, 12, closed=True)),
+    )
+    back = centers(path_cameras([camera((0, 0, 0)), camera((1, 0, 0))], 4, closed=True))
+    np.testing.assert_allclose(back[:, 0], [0, 0.5, 1, 0.5], atol=0.02)
+
+
+def test_views_that_stand_still_or_only_turn():
+    twice = path_cameras([camera((0, 0, 0)), camera((0, 0, 0)), camera((1, 0, 0))], 3)
+    np.testing.assert_allclose(centers(twice)[:, 0], [0, 0.5, 1], atol=1e-9)
+    turning = path_cameras([camera((1, 2, 3), yaw) for yaw in (0, 0.4, 1.2)], 4)
+    np.testing.assert_allclose(centers(turning), [(1, 2, 3)] * 4, atol=1e-9)
+    np.testing.assert_allclose([yaw_of(view) for view in turning], [0, 0.4, 0.8, 1.2], atol=1e-6)
+
+
+def test_every_tenth_view_is_a_key_and_the_last_is_too():
+    shaky = [camera((i, 0.3 * (-1) ** i, 0)) for i in range(18)]
+    path = centers(path_cameras(shaky, 50, every=2))
+    assert path[:40, 1].min() > 0.25  # the even ones are all above ...
+    np.testing.assert_allclose(path[-1], (17, -0.3, 0), atol=1e-9)  # ... and the last is below
+
+
+def test_lenses_run_linearly_and_sizes_are_the_askers():
+    bent = camera((2, 0, 0), focal=70, near=0.05, distortion=Distortion("brown_conrady", (0.1, 0, 0, 0)))
+    path = path_cameras([camera((0, 0, 0), focal=50), bent], 3, size=(20, 120))
+    for view, focal in zip(path, (50, 60, 70), strict=True):
+        assert view.size == (20, 120)
+        expected = [[2 * focal, 0, 62], [0, (focal + 1) / 2, 9.5], [0, 0, 1]]
+        np.testing.assert_allclose(view.K, expected, atol=1e-9)
+        assert view.near == 0.05
+        assert view.distortion is None
+
+
+@pytest.mark.parametrize(
+    ("keys", "options", "message"),
+    [
+        ([], {}, r"cameras: expected at least two different views, got 0"),
+        ([camera((0, 0, 0))] * 3, {}, r"cameras: expected at least two different views, got 1 \(of 3"),
+        ([camera((0, 0, 0)), camera((1, 0, 0))], {"frames": 1}, "frames: expected a number"),
+        ([camera((0, 0, 0)), camera((1, 0, 0))], {"every": 0}, "every: expected a number"),
+        ([camera((0, 0, 0)), camera((1, 0, 0))], {"size": (5, 2.5)}, r"size \(width\): expected a whole number"),
+    ],
+)
+def test_what_is_no_walk_is_refused(keys, options, message):
+    with pytest.raises(ValueError, match=message):
+        path_cameras(keys, **options)

@@ -1,0 +1,165 @@
+import numpy as np
+import pytest
+import torch
+
+from kfgs.formats import SplatFile
+from kfgs.gaussians import Gaussians
+from kfgs.labels import Everything, Extract, OfClass, OfIndex, Opacity, Recolor, Remove, recolor
+from kfgs.splat import rgb_to_sh0
+
+CLASSES = ("wall", "chair", "plant")
+
+
+def scene(positions=range(9), labels=(0, 0, 0, 1, 1, -1, -1, 0, -1)):
+    n = len(positions)
+    means = torch.zeros(n, 3)
+    means[:, 0] = torch.tensor(list(positions), dtype=torch.float32)
+    gaussians = Gaussians(
+        means=means,
+        quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        scales=torch.full((n, 3), 0.1),
+        opacities=torch.linspace(0.1, 0.9, n),
+        sh=rgb_to_sh0(torch.rand(n, 1, 3, generator=torch.Generator().manual_seed(0))),
+        labels=torch.tensor(labels),
+    )
+    return SplatFile(gaussians, {"score": np.arange(n, dtype=np.float32)}, CLASSES, {"format": "ply"})
+
+
+def places(splats):
+    assert splats.extra["score"].tolist() == splats.gaussians.means[:, 0].tolist()  # columns stay with their rows
+    return splats.gaussians.means[:, 0].tolist()
+
+
+def test_remove_and_extract_divide_the_cloud():
+    splats = scene()
+    assert places(Remove("chair").apply(splats)) == [0, 1, 2, 5, 6, 7, 8]
+    assert places(Extract("chair").apply(splats)) == [3, 4]
+    assert Remove("chair").apply(splats).classes == CLASSES  # names stay: labels mean what they meant
+    assert places(splats) == list(range(9))
+
+
+def test_grow_takes_unlabelled_neighbours_that_are_nearest_to_it():
+    splats = scene()  # the chair at 3 and 4, a wall at 0, 1, 2 and 7, orphans at 5, 6 and 8
+    assert places(Remove("chair", grow=1.0).apply(splats)) == [0, 1, 2, 5, 6, 7, 8]  # strictly closer
+    assert places(Remove("chair", grow=1.5).apply(splats)) == [0, 1, 2, 6, 7, 8]
+    assert places(Remove("chair", grow=100.0).apply(splats)) == [0, 1, 2, 6, 7, 8]  # 6 and 8 belong to the wall at 7
+    middle = scene((0, 1, 2, 3, 4, 5, 5.5, 7, 8))
+    assert places(Remove("chair", grow=100.0).apply(middle)) == [0, 1, 2, 7, 8]  # 5.5 lies half-way: taken
+
+
+def test_grow_against_loops():
+    rng = np.random.default_rng(0)
+    labels = rng.integers(-1, 2, 200)
+    splats = scene(range(200), labels)
+    points = rng.uniform(0, 1, (200, 3))
+    splats = splats.replace(gaussians=splats.gaussians.replace(means=torch.from_numpy(points)))
+    gone = []
+    for i in range(200):
+        to = {label: min(np.linalg.norm(points[i] - p) for p in points[labels == label]) for label in (0, 1)}
+        if labels[i] == 1 or (labels[i] == -1 and to[1] < 0.1 and to[1] <= to[0]):
+            gone.append(i)
+    assert (labels == 1).sum() < len(gone) < (labels != 0).sum()
+    left = Remove("chair", grow=0.1).apply(splats).extra["score"].astype(int).tolist()
+    assert left == sorted(set(range(200)) - set(gone))
+
+
+def test_grow_without_labels_takes_every_neighbour():
+    splats = scene()
+    splats = splats.replace(gaussians=splats.gaussians.replace(labels=None))
+    assert places(Remove(OfIndex([3, 4]), grow=1.5).apply(splats)) == [0, 1, 6, 7, 8]
+
+
+def test_opacity_multiplies_and_nought_hides():
+    splats = scene()
+    before = splats.gaussians.opacities.clone()
+    half, hidden = Opacity("chair", 0.5).apply(splats), Opacity("chair", 0).apply(splats)
+    expected = [0.5 if i in (3, 4) else 1.0 for i in range(9)]
+    torch.testing.assert_close(half.gaussians.opacities / before, torch.tensor(expected))
+    assert (hidden.gaussians.opacities[3:5] < 1 / 255).all()
+    assert (hidden.gaussians.opacities > 0).all()
+    assert len(hidden) == 9
+    faint = torch.tensor([0.5, 0.5, 0.5, 1e-9, 0.0, 0.5, 0.5, 0.5, 0.5])
+    faint = splats.replace(gaussians=splats.gaussians.replace(opacities=faint))
+    for factor in (1, 0.5, 0):  # what is fainter than hidden gets no stronger
+        assert Opacity("chair", factor).apply(faint).gaussians.opacities.equal(faint.gaussians.opacities)
+    assert Opacity("chair", 1).apply(splats).gaussians.opacities.equal(before)
+    assert splats.gaussians.opacities.equal(before)
+
+
+def test_recolor_is_the_function_on_the_class():
+    splats = scene()
+    mask = splats.gaussians.labels == 1
+    for mode in ("tint", "hue"):
+        painted = Recolor("chair", "#c04040", mode).apply(splats).gaussians
+        assert painted.sh.equal(recolor(splats.gaussians, mask, "#c04040", mode).sh)
+        assert painted.sh[~mask].equal(splats.gaussians.sh[~mask])
+        assert not painted.sh[mask].equal(splats.gaussians.sh[mask])
+
+
+@pytest.mark.parametrize(
+    "edit", [Remove, Extract, lambda w, **k: Recolor(w, "red", **k), lambda w, **k: Opacity(w, 0, **k)]
+)
+def test_nothing_selected_is_an_error_unless_allowed(edit):
+    splats = scene()
+    with pytest.raises(
+        ValueError,
+        match=r"where: expected a selection of some of 9 Gaussians, got none from OfClass\(name='plant'\); "
+        r"classes present are wall \(4\), chair \(2\): select one of them, or allow none",
+    ):
+        edit(OfClass("plant")).apply(splats)
+    result = edit(OfClass("plant"), allow_empty=True).apply(splats)
+    assert len(result) == (0 if edit is Extract else 9)
+
+
+def test_nothing_selected_in_a_cloud_without_labels():
+    splats = scene()
+    splats = splats.replace(gaussians=splats.gaussians.replace(labels=None))
+    with pytest.raises(ValueError, match="the cloud carries no labels: widen the box or sphere"):
+        Remove(OfIndex([])).apply(splats)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: Remove(3), TypeError, "where: expected a Where, such as OfClass"),
+        (lambda: Remove("chair", grow=-1), ValueError, "grow: expected a number in"),
+        (lambda: Remove("chair", grow="1"), TypeError, "grow: expected a number, got '1'"),
+        (lambda: Remove("chair", allow_empty=1), TypeError, "allow_empty: expected true or false, got 1"),
+        (lambda: Opacity("chair", 1.5), ValueError, r"factor: expected a number in \[0, 1\], got 1.5"),
+        (lambda: Recolor("chair", "reddish"), ValueError, "rgb: expected a colour such as '#c04040'"),
+        (lambda: Recolor("chair", "red", "paint"), ValueError, "mode: expected one of 'tint', 'hue', got 'paint'"),
+    ],
+)
+def test_wrong_input_is_named(make, error, message):
+    with pytest.raises(error, match=message):
+        make()
+
+
+def test_a_cloud_without_colours_cannot_be_painted():
+    splats = scene()
+    with pytest.raises(ValueError, match=r"gaussians.sh: expected spherical harmonics"):
+        Recolor(Everything(), "red").apply(splats.replace(gaussians=splats.gaussians.replace(sh=None)))
+
+
+def test_grow_names_a_position_that_is_none():
+    splats = scene()
+    means = splats.gaussians.means.clone()
+    means[5] = torch.nan
+    broken = splats.replace(gaussians=splats.gaussians.replace(means=means))
+    with pytest.raises(ValueError, match="gaussians.means: expected finite numbers, got NaN or infinity in row 5"):
+        Remove("chair", grow=0.5).apply(broken)
+    assert len(Remove("chair").apply(broken)) == 7
+
+
+def test_classes_of_one_name_are_counted_together():
+    splats = scene().replace(classes=("wall", "wall", "plant"))
+    assert len(Remove("wall").apply(splats)) == 3
+    with pytest.raises(ValueError, match=r"classes present are wall \(6\): select one of them"):
+        Remove("plant").apply(splats)
+
+
+def test_a_selection_can_be_edited_as_well():
+    splats = scene()
+    chairs = OfClass("chair").select(splats)
+    assert Remove(chairs) == Remove(OfIndex([3, 4]))
+    assert places(Remove(chairs).apply(splats)) == places(Remove("chair").apply(splats))

@@ -1,0 +1,315 @@
+import random
+import shutil
+import struct
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from colmap_models import (
+    CAMERAS,
+    FRAMES,
+    IMAGES,
+    POINTS,
+    RIGS,
+    pycolmap,
+    read_with_pycolmap,
+    write_model,
+    write_text_model,
+)
+from messages import tells
+
+from kfgs.scenes import ColmapModel, SceneError, read_model
+from kfgs.scenes.colmap_files import CAMERA_MODELS
+
+LAYOUTS = [(text, rigs) for text in (False, True) for rigs in (False, True)]
+
+
+def _read_alike(folder: Path) -> ColmapModel:
+    """Read a model with kfgs and with pycolmap; cameras, poses and points must be the same to the last bit."""
+    ours = read_model(folder)
+    theirs = read_with_pycolmap(folder)
+    assert set(ours.cameras) == set(theirs.cameras)
+    for i, camera in theirs.cameras.items():
+        expected = (camera.model_name, camera.width, camera.height, tuple(camera.params))
+        assert (
+            ours.cameras[i].model,
+            ours.cameras[i].width,
+            ours.cameras[i].height,
+            ours.cameras[i].params,
+        ) == expected
+    assert {i: (image.name, image.camera_id) for i, image in ours.images.items()} == {
+        i: (image.name, image.camera_id) for i, image in theirs.images.items()
+    }
+    for i, image in theirs.images.items():
+        pose = ours.images[i].pose
+        assert pose is not None
+        assert np.array_equal(pose[:3], image.cam_from_world().matrix())
+        assert pose[3].tolist() == [0, 0, 0, 1]
+        seen = [point.point3D_id if point.has_point3D() else -1 for point in image.points2D]
+        assert ours.images[i].observed.tolist() == seen
+    assert ours.point_ids.tolist() == sorted(theirs.points3D)
+    points = [theirs.points3D[i] for i in sorted(theirs.points3D)]
+    assert np.array_equal(ours.points, np.array([point.xyz for point in points]).reshape(-1, 3))
+    assert np.array_equal(ours.colors, np.array([point.color for point in points]).reshape(-1, 3))
+    return ours
+
+
+@pytest.mark.parametrize(("text", "rigs"), LAYOUTS)
+def test_models_are_read_as_pycolmap_reads_them(tmp_path: Path, text: bool, rigs: bool) -> None:
+    model = _read_alike(write_model(tmp_path / "m", ["a.png", "sub/b.png", "c.png"], text=text, rigs=rigs))
+    assert (model.layout, len(model.cameras), len(model.images), len(model.points), model.rigs) == (
+        "text" if text else "binary", 1, 3, 5, int(rigs),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("folder", ["room_0/sparse/0", "lund_door/colmap_ground_truth"])
+def test_real_models_are_read_as_pycolmap_reads_them(shared_data: Path, folder: str) -> None:
+    model = _read_alike(shared_data / folder)
+    facts = (model.layout, len(model.cameras), len(model.images), len(model.points), model.rigs)
+    assert facts == {"r": ("binary", 1, 180, 18543, 0), "l": ("text", 1, 12, 11384, 0)}[folder[0]]
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("name", [name for name, _ in CAMERA_MODELS.values()])
+def test_every_camera_model_is_read(tmp_path: Path, name: str, text: bool) -> None:
+    params = [50 + i / 7 for i in range(len(dict(CAMERA_MODELS.values())[name].split(",")))]
+    folder = write_model(tmp_path / "m", ["a.png"], text=text, model=name, params=params)
+    assert _read_alike(folder).cameras[1].model == name
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_rigs_place_their_cameras_as_in_pycolmap(tmp_path: Path, text: bool) -> None:
+    rng = np.random.default_rng(3)
+
+    def pose() -> object:
+        quaternion = rng.normal(size=4)
+        return pycolmap.Rigid3d(pycolmap.Rotation3d(quaternion / np.linalg.norm(quaternion)), rng.normal(size=3))
+
+    rec, rig = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=4)
+    for i in (1, 2, 3):
+        rec.add_camera(pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[50, 55, 31, 25], camera_id=i))
+    rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, 2))
+    for i in (1, 3):
+        rig.add_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, i), pose())
+    rec.add_rig(rig)
+    for f in range(4):
+        frame = pycolmap.Frame(frame_id=f + 1, rig_id=4, rig_from_world=pose())
+        images = [pycolmap.Image(name=f"{f}_{c}.png", camera_id=c, image_id=10 * f + c) for c in (1, 2, 3)]
+        for image in images:
+            frame.add_data_id(image.data_id)
+        rec.add_frame(frame)
+        for image in images:
+            image.frame_id = frame.frame_id
+            rec.add_image(image)
+        rec.register_frame(frame.frame_id)
+    (tmp_path / "m").mkdir()
+    rec.write_text(tmp_path / "m") if text else rec.write(tmp_path / "m")
+    model, theirs = read_model(tmp_path / "m"), read_with_pycolmap(tmp_path / "m")
+    assert (len(model.images), model.rigs) == (12, 1)
+    for i, image in model.images.items():
+        assert image.pose is not None
+        np.testing.assert_allclose(image.pose[:3], theirs.images[i].cam_from_world().matrix(), rtol=0, atol=1e-14)
+
+
+def test_camera_models_are_those_of_pycolmap() -> None:
+    theirs = {}
+    for name, member in pycolmap.CameraModelId.__members__.items():
+        if int(member) >= 0:
+            camera = pycolmap.Camera.create_from_model_id(1, member, 100.0, 64, 48)
+            theirs[int(member)] = (name, [word.strip() for word in camera.params_info.split(",")])
+    assert theirs == {i: (name, params.split(", ")) for i, (name, params) in CAMERA_MODELS.items()}
+
+
+@pytest.mark.parametrize("rigs", [False, True])
+def test_every_truncation_of_every_binary_file_is_refused(tmp_path: Path, rigs: bool) -> None:
+    folder = write_model(tmp_path / "m", ["a.png", "b.png"], rigs=rigs)
+    for file in sorted(folder.iterdir()):
+        whole = file.read_bytes()
+        for length in range(len(whole)):
+            file.write_bytes(whole[:length])
+            with pytest.raises(SceneError, match=file.name):
+                read_model(folder)
+        file.write_bytes(whole + b"\0")
+        with pytest.raises(SceneError, match="expected the end of the file"):
+            read_model(folder)
+        file.write_bytes(whole)
+    read_model(folder)
+
+
+def _shape(model: ColmapModel) -> tuple[int, ...]:
+    sizes = sorted(len(image.observed) for image in model.images.values())
+    return len(model.cameras), len(model.images), len(model.points), *sizes
+
+
+def _mutate(data: bytes, rng: random.Random) -> bytes:
+    changed, at = bytearray(data), rng.randrange(len(data))
+    kind = rng.choice(["flip", "bytes", "cut", "insert", "zero"])
+    if kind == "flip":
+        changed[at] ^= 1 << rng.randrange(8)
+    elif kind == "bytes":
+        for _ in range(8):
+            changed[rng.randrange(len(changed))] = rng.randrange(256)
+    elif kind == "cut":
+        del changed[at:]
+    elif kind == "insert":
+        changed[at:at] = rng.randbytes(rng.randrange(1, 20))
+    else:
+        changed[at : at + 16] = bytes(len(changed[at : at + 16]))
+    return bytes(changed)
+
+
+@pytest.mark.parametrize(("text", "rigs"), LAYOUTS)
+def test_corrupt_models_are_refused_or_load_with_equal_shapes(tmp_path: Path, text: bool, rigs: bool) -> None:
+    folder = write_model(tmp_path / "m", ["a.png", "b.png"], text=text, rigs=rigs)
+    expected = _shape(_read_alike(folder))
+    files = {file: file.read_bytes() for file in sorted(folder.iterdir())}
+    rng, outcome = random.Random(7), Counter[str]()
+    for trial in range(300):
+        file = rng.choice(list(files))
+        file.write_bytes(_mutate(files[file], rng))
+        try:
+            found = _shape(_read_alike(folder))  # undistort_scene hands it to pycolmap, which must not hang
+        except SceneError:
+            outcome["refused"] += 1
+        else:
+            # a digit or letter lost from a text file can leave a shorter, still consistent model
+            assert text or found == expected, f"trial {trial}, {file.name}: {found}"
+            outcome["loaded"] += 1
+        file.write_bytes(files[file])
+    assert outcome["refused"] > 100
+    assert outcome["loaded"] > 10  # numbers may change within their bounds: no check can know better
+
+
+def test_a_huge_count_is_refused_before_anything_is_allocated(tmp_path: Path) -> None:
+    folder = write_model(tmp_path / "m", ["a.png"])
+    for name in ("cameras", "images", "points3D", "rigs", "frames"):
+        file = folder / f"{name}.bin"
+        whole = file.read_bytes()
+        for count in (2**40, 2**64 - 1):
+            file.write_bytes(struct.pack("<Q", count) + whole[8:])
+            with pytest.raises(SceneError, match=rf"{name}.bin: expected at most \d+ .*, got {count}"):
+                read_model(folder)
+        file.write_bytes(whole)
+
+
+def test_the_message_names_file_place_and_cure(tmp_path: Path) -> None:
+    folder = write_model(tmp_path / "m", ["a.png"])
+    file = folder / "cameras.bin"
+    file.write_bytes(file.read_bytes()[:-5])
+    parts = ("cameras.bin, camera 0", "32 bytes (fx, fy, cx, cy) at byte 32", "after 27", "truncated", "copy the model")
+    with pytest.raises(SceneError, match=tells(*parts)):
+        read_model(folder)
+
+
+BAD_TABLES = [
+    ({"cameras": CAMERAS.replace("PINHOLE", "BANANA")}, ["cameras.txt, line 1", "MODEL", "RADIAL", "'BANANA'"]),
+    ({"cameras": CAMERAS.replace("31 25", "31")}, ["line 1", "cy", "end of the line"]),
+    ({"cameras": CAMERAS.replace("31 25", "31 25 9")}, ["line 1", "end of the line", "got 9"]),
+    ({"cameras": CAMERAS.replace("50 55", "-50 55")}, ["line 1", "focal length above 0", "-50"]),
+    ({"cameras": CAMERAS.replace("50 55", "nan 55")}, ["fx", "finite", "'nan'"]),
+    ({"cameras": CAMERAS.replace("50 55", "1e400 55")}, ["fx", "finite", "'1e400'"]),
+    ({"cameras": CAMERAS.replace("50 55", "5_0 55")}, ["fx", "finite", "'5_0'"]),
+    ({"cameras": CAMERAS.replace("64 48", "0 48")}, ["1 to 100000 pixels", "0 x 48"]),
+    ({"cameras": CAMERAS.replace("64 48", "64 4800000")}, ["1 to 100000 pixels", "64 x 4800000"]),
+    ({"cameras": CAMERAS.replace("64 48", "-64 48")}, ["WIDTH", "integer in [0, ", "'-64'"]),
+    ({"cameras": CAMERAS + CAMERAS}, ["line 2", "an id that no other has", "1 again"]),
+    ({"cameras": CAMERAS.replace("1 P", "2 P")}, ["image 1", "a camera of the model (2)", "got camera 1"]),
+    ({"cameras": ""}, ["image 1", "a camera of the model", "it has none"]),
+    ({"images": IMAGES.replace("0.6 0.8", "0 0")}, ["images.txt, line 3", "unit quaternion", "of length 0"]),
+    ({"images": IMAGES.replace("0.6 0.8", "6 8")}, ["unit quaternion", "of length 10"]),
+    ({"images": IMAGES.replace("1 2 3 1 b", "1 x 3 1 b")}, ["TY", "finite", "'x'"]),
+    ({"images": IMAGES.replace("b.png", "b c.png")}, ["without spaces", "'b c.png'", "write the model as binary"]),
+    ({"images": IMAGES.replace("b.png", "../b.png")}, ["inside the image folder", "'../b.png'", "rename"]),
+    ({"images": IMAGES.replace("b.png", "/etc/b.png")}, ["inside the image folder", "'/etc/b.png'", "rename"]),
+    ({"images": IMAGES.replace("b.png", "a.png")}, ["image 2", "name", "'a.png' again", "as image 1"]),
+    ({"images": IMAGES.replace("2 0.6", "1 0.6")}, ["line 3", "an id that no other has", "1 again"]),
+    ({"images": IMAGES.removesuffix("5 6 7\n")}, ["line 3", "a line of 2-D points", "the end of the file"]),
+    ({"images": IMAGES.replace("5 6 7", "5 6")}, ["line 4", "2-D points as X Y POINT3D_ID", "2 words"]),
+    ({"images": IMAGES.replace("5 6 7", "5 six 7")}, ["line 4", "2-D points as X Y POINT3D_ID", "'six'"]),
+    ({"images": IMAGES.replace("5 6 7", "5 6 7.5")}, ["line 4", "2-D points as X Y POINT3D_ID", "'7.5'"]),
+    ({"images": IMAGES.replace("5 6 7", "")}, ["point 7", "track", "2-D point 0 of image 2", "that has 0"]),
+    ({"images": IMAGES.replace("5 6 7", "5 6 8")}, ["2-D point 0 of image 2", "sees point 8"]),
+    ({"points3D": POINTS.replace("1 0 2 0", "9 0 2 0")}, ["2-D point 0 of image 9", "not in the model"]),
+    ({"points3D": POINTS.replace("1 0 2 0", "1 99 2 0")}, ["2-D point 99 of image 1", "has 2 2-D points"]),
+    ({"points3D": POINTS + POINTS}, ["points3D.txt", "each point id once", "7"]),
+    ({"points3D": POINTS.replace("10 20 30", "10 256 30")}, ["points3D.txt, line 1", "G", "[0, 255]", "'256'"]),
+    ({"points3D": POINTS.replace("1 2 3", "1 2 1e30")}, ["Z", "finite", "'1e30'"]),
+    ({"points3D": POINTS.replace("0.5", "half")}, ["ERROR", "finite", "'half'"]),
+    ({"points3D": POINTS.replace("1 0 2 0", "1 0 2")}, ["track as IMAGE_ID POINT2D_IDX", "3 words"]),
+    ({"points3D": POINTS.replace("1 0 2 0", "1 0 -2 0")}, ["track as IMAGE_ID POINT2D_IDX", "-2"]),
+    ({"rigs": RIGS}, ["rigs.txt and frames.txt together", "1 rigs", "frames of 0 images", "delete both"]),
+    ({"frames": FRAMES}, ["frames.txt, line 1", "a rig of the model", "rig 1"]),
+    ({"rigs": RIGS.replace("CAMERA 1", "CAMERA 5"), "frames": FRAMES}, ["rig 1", "a camera of the model", "camera 5"]),
+    ({"rigs": RIGS.replace("CAMERA", "SONAR"), "frames": FRAMES}, ["SENSOR_TYPE", "CAMERA, IMU", "'SONAR'"]),
+    ({"rigs": "1 9999999 CAMERA 1\n", "frames": FRAMES}, ["rigs.txt, line 1", "NUM_SENSORS", "9999999"]),
+    ({"rigs": "1 2 CAMERA 1 CAMERA 1 0\n", "frames": FRAMES}, ["rigs.txt, line 1", "each sensor once"]),
+    ({"rigs": RIGS, "frames": FRAMES.replace("2 1 0.6", "2 5 0.6")}, ["frame 2", "a rig of the model", "rig 5"]),
+    ({"rigs": RIGS, "frames": FRAMES.replace("A 1 2", "A 3 2")}, ["frame 2", "a sensor of rig 1", "sensor 3"]),
+    ({"rigs": RIGS, "frames": FRAMES.replace("A 1 2", "A 1 1")}, ["images of one frame only", "image 1"]),
+    ({"rigs": RIGS, "frames": FRAMES.splitlines()[0]}, ["every image in one frame", "1 images in none"]),
+]
+
+
+@pytest.mark.parametrize(("tables", "parts"), BAD_TABLES)
+def test_bad_tables_are_refused(tmp_path: Path, tables: dict[str, str], parts: list[str]) -> None:
+    with pytest.raises(SceneError, match=tells(*parts)):
+        read_model(write_text_model(tmp_path, **tables))
+
+
+def test_honest_variants_pass(tmp_path: Path) -> None:
+    variants: list[dict[str, str]] = [
+        {},
+        {"rigs": RIGS, "frames": FRAMES},
+        {"rigs": "# none\n", "frames": ""},
+        {"cameras": "# comment\n\n" + CAMERAS.replace("\n", "\r\n")},
+        {"images": "1 1 0 0 0 0 0 0 1 a.png\n\n", "points3D": ""},
+    ]
+    for i, tables in enumerate(variants):
+        folder = write_text_model(tmp_path / str(i), **tables)
+        assert len(_read_alike(folder).images) in (1, 2)
+
+
+def test_bad_binary_values_are_refused(tmp_path: Path) -> None:
+    def refused(name: str, offset: int, layout: str, value: object, *parts: str) -> None:
+        folder = write_model(tmp_path / "m", ["a.png", "b.png"])
+        data = bytearray((folder / name).read_bytes())
+        struct.pack_into(layout, data, offset, value)
+        (folder / name).write_bytes(data)
+        with pytest.raises(SceneError, match=tells(name, *parts)):
+            read_model(folder)
+
+    refused("cameras.bin", 12, "<i", 99, "camera 0", "a camera model in 0..17", "got 99")
+    refused("cameras.bin", 16, "<Q", 0, "an image of 1 to 100000", "0 x 48")
+    refused("cameras.bin", 32, "<d", float("inf"), "finite, plausible", "fx", "inf")
+    refused("images.bin", 12, "<d", float("nan"), "image 0", "finite", "QW", "nan")
+    refused("images.bin", 8 + 4 + 56, "<I", 77, "image 1", "a camera of the model (1)", "camera 77")
+    refused("images.bin", 8 + 64, "<B", 0xFF, "UTF-8")
+    refused("points3D.bin", 16, "<d", float("nan"), "point 0", "finite", "nan")
+    refused("rigs.bin", 16, "<i", 7, "type 0 (camera) or 1 (IMU)", "got 7")
+    refused("frames.bin", 12, "<I", 4, "a rig of the model", "rig 4")
+
+
+def test_nobody_needs_the_error_of_a_point(tmp_path: Path) -> None:
+    folder = write_model(tmp_path / "m", ["a.png"])
+    data = bytearray((folder / "points3D.bin").read_bytes())
+    struct.pack_into("<d", data, 8 + 8 + 24 + 3, float("nan"))  # some programs write no number here
+    (folder / "points3D.bin").write_bytes(data)
+    assert len(_read_alike(folder).points) == 5
+
+
+def test_missing_folder_and_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no such folder; expected a COLMAP model"):
+        read_model(tmp_path / "nothing")
+    with pytest.raises(SceneError, match="got none of these files"):
+        read_model(tmp_path)
+    folder = write_model(tmp_path / "m", ["a.png"])
+    shutil.move(folder / "points3D.bin", tmp_path / "elsewhere.bin")
+    with pytest.raises(SceneError, match=r"all as .bin or all as .txt.*got cameras.bin, images.bin; copy the missing"):
+        read_model(folder)
+
+
+def test_binary_is_read_where_both_are_present(tmp_path: Path) -> None:
+    folder = write_model(tmp_path / "m", ["a.png"])
+    write_text_model(folder, cameras="rubbish")
+    assert read_model(folder).layout == "binary"

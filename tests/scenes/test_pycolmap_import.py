@@ -1,0 +1,60 @@
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from kfgs.scenes import SceneError
+from kfgs.scenes.pycolmap_import import import_pycolmap, quiet_pycolmap, scene_errors
+
+ASKED_TO_END = """
+import os, signal
+from kfgs.scenes.pycolmap_import import import_pycolmap
+import_pycolmap()
+os.kill(os.getpid(), signal.SIGTERM)
+"""
+
+
+def test_a_process_that_is_asked_to_end_says_nothing():
+    ended = subprocess.run(
+        [sys.executable, "-c", ASKED_TO_END], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert ended.returncode == -signal.SIGTERM
+    assert ended.stderr == ""  # pycolmap's log library would print a stack
+
+
+def test_pycolmap_failures_become_scene_errors(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match=r"x: expected a model \(IndexError: unordered_map::at\); do this"):  # noqa: SIM117
+        with scene_errors("x: expected a model", "do this"):
+            raise IndexError("unordered_map::at")
+    with pytest.raises(SceneError, match="MemoryError: no text"), scene_errors("x", "y"):
+        raise MemoryError
+    with pytest.raises(KeyboardInterrupt), scene_errors("x", "y"):
+        raise KeyboardInterrupt
+
+
+def test_the_log_level_is_put_back() -> None:
+    pycolmap = import_pycolmap()
+    before = pycolmap.logging.minloglevel
+    with quiet_pycolmap():
+        assert pycolmap.logging.minloglevel == 3
+    assert pycolmap.logging.minloglevel == before
+
+
+def test_pillow_can_write_png_after_pycolmap(tmp_path: Path) -> None:
+    code = """
+import sys
+import kfgs.scenes
+assert "pycolmap" not in sys.modules, "kfgs.scenes must not load pycolmap before it is needed"
+import pycolmap
+import numpy as np
+from PIL import Image
+noise = np.random.default_rng(0).integers(0, 255, (700, 500, 3), dtype=np.uint8)
+noise[:, 100:300] = 7
+for i in range(3):
+    Image.fromarray(noise).save(f"{sys.argv[1]}/{i}.png")
+"""
+    pytest.importorskip("PIL")
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr[-500:]

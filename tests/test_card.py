@@ -1,0 +1,119 @@
+import importlib
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from kfgs import Autoencoder, Camera, Codebook, Gaussians, SemanticField, rasterize
+from kfgs._card import LONGEST, html_card, short_repr, short_value
+from kfgs.quant import CodebookFit, LinearLatents, Nearest
+
+
+def test_a_card_escapes_everything_and_leaves_out_what_is_none():
+    card = html_card("<b>Scene</b>", {"<i>name": "a & <script>", "points": 12345, "missing": None})
+    assert "<script>" not in card
+    assert "<i>" not in card
+    assert "<b>" not in card
+    assert "a &amp; &lt;script&gt;" in card
+    assert "12,345" in card
+    assert "missing" not in card
+    assert card.count("<tr>") == 2
+
+
+def test_a_card_cuts_long_values():
+    assert len(html_card("x", {"words": "word " * 10_000})) < 600
+
+
+def test_a_line_shows_tensors_by_shape_and_type():
+    @dataclass
+    class Thing:
+        rows: Tensor
+        names: tuple[str, ...]
+        hidden: int = field(default=3, repr=False)
+        nothing: float | None = None
+
+        __repr__ = short_repr
+
+    assert repr(Thing(torch.zeros(4, 2), ("a", "b"))) == "Thing(rows=[4, 2] float32, names=('a', 'b'))"
+    assert repr(Thing(torch.zeros(0, 2, dtype=torch.float64), ("a",) * 9)).endswith("[0, 2] float64, names=9 of str)")
+
+
+def test_a_line_of_a_named_tuple():
+    class Pair(NamedTuple):
+        left: np.ndarray
+        right: object
+
+        def __repr__(self) -> str:
+            return short_repr(self)
+
+    inner = Pair(np.zeros(2), 1)
+    assert repr(Pair(np.zeros((3, 1), dtype=np.int64), inner)) == (
+        "Pair(left=[3, 1] int64, right=Pair(left=[2] float64, right=1))"
+    )
+
+
+def test_no_value_is_long():
+    for value in ("x\n" * 1000, {str(i): i for i in range(9)}, [torch.zeros(3)] * 5, {"a": "b" * 500}, [], {}):
+        shown = short_value(value)
+        assert len(shown) <= LONGEST
+        assert "\n" not in shown
+
+
+PACKAGES = ["kfgs.quant", "kfgs.fields", "kfgs.splat", "kfgs.viz", "kfgs.gaussians", "kfgs.metrics"]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_public_class_with_tensors_has_a_line_of_its_own(package):
+    """The generated lines of dataclasses and named tuples print thousands of numbers."""
+    module = importlib.import_module(package)
+    for name in getattr(module, "__all__", vars(module)):
+        kind = getattr(module, name)
+        if isinstance(kind, type) and any(
+            "Tensor" in str(one) for one in vars(kind).get("__annotations__", {}).values()
+        ):
+            from_namedtuple = kind.__repr__.__module__ == "collections"
+            from_dataclass = hasattr(kind.__repr__, "__wrapped__")
+            assert not from_namedtuple, name
+            assert not from_dataclass, name
+
+
+def test_lines_stay_short_and_cards_are_tables():
+    book = Codebook(torch.rand(300, 512))
+    widths = [(512, 64), (64, 9), (9, 64), (64, 512)]
+    layers = [(torch.rand(out, width), torch.rand(out)) for width, out in widths]
+    autoencoder = Autoencoder(tuple(layers[:2]), tuple(layers[2:]), 0.0, 1.0)
+    cloud = Gaussians(torch.rand(50, 3), torch.rand(50, 4), torch.rand(50, 3), torch.rand(50), torch.rand(50, 9))
+    field = SemanticField(cloud, book, autoencoder, {"teacher": {"name": "<lseg>"}})
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 3.0
+    camera = Camera(viewmat, torch.tensor([[30.0, 0, 15], [0, 30, 10], [0, 0, 1]]), 30, 20)
+    rendering = rasterize(cloud, camera, engine="reference")
+    results = [
+        Nearest(torch.rand(900), torch.rand(900)),
+        CodebookFit(book, [{"a": 1.0}] * 99, torch.rand(9), 1, 1, 1, None),
+    ]
+    for thing in (
+        book,
+        autoencoder,
+        field,
+        rendering,
+        rendering.projected,
+        cloud,
+        LinearLatents(torch.eye(9)),
+        *results,
+    ):
+        assert len(repr(thing)) < 200
+        assert "tensor(" not in repr(thing)
+        assert "\n" not in repr(thing)
+    assert repr(autoencoder) == "Autoencoder(512 channels to 9 latents and back, widths [512, 64, 9, 64, 512])"
+    for card, facts in (
+        (field._repr_html_(), ("&lt;lseg&gt;", "decouple+ADC+SC", ">300<", "9 for 512")),
+        (book._repr_html_(), (">300<", "[300, 512] float32")),
+        (rendering._repr_html_(), ("30 x 20", "9")),
+    ):
+        assert card.startswith("<table>")
+        assert all(fact in card for fact in facts)
+        assert len(card) < 2_000
