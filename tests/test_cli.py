@@ -145,17 +145,20 @@ def test_a_single_query_reports_its_threshold(run, room, tmp_path, capsys):
         (["label", "{run}/field", "--out", "{tmp}/o", "--classes", "{room}/classes.json"], "pass --classes and --text"),
         (
             ["fit", "{room}", "--features", "{room}/features", "--out", "{tmp}/o", "--mode", "adc"],
-            "mode: expected none",
+            "--mode: expected none",
         ),
-        (["fit", "{room}", "--out", "{tmp}/o", "--method", "paper", "--splat", "a.ply"], "splat: expected none beside"),
+        (
+            ["fit", "{room}", "--out", "{tmp}/o", "--method", "paper", "--splat", "a.ply"],
+            "--splat: expected none beside",
+        ),
         (["label", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--query", "dragon"], "got 'dragon'"),
         (
             ["label", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--distance", "1"],
-            "expected --cloud beside it",
+            "--distance: expected --cloud beside it",
         ),
         (
             ["label", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--threshold", "1"],
-            "expected --query beside",
+            "--threshold: expected --query beside",
         ),
         (["label", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--cloud", "{room}/no.ply"], "no such file"),
         (["segment", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--labels", "{tmp}"], "found none"),
@@ -202,4 +205,4 @@ def test_a_scene_without_points_is_told_before_features_are_asked_for(room, tmp_
     assert main(["fit", str(tmp_path), "--out", str(tmp_path / "run")]) == 1
     said = capsys.readouterr()
     assert "note: no points: this transforms.json names no ply_file_path" in said.out
-    assert said.err.startswith("error: scene: expected sparse points to start from, got 0")
+    assert said.err.startswith("error: SCENE: expected sparse points to start from, got 0")

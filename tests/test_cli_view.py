@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from cases_color import surface
-from cases_words import TEACHER
+from cases_text import TEACHER
 from PIL import Image
 from small_room import make_room
 
@@ -18,7 +18,7 @@ from kfgs.splat import rgb_to_sh0
 from kfgs.teachers.prompts import make_label_set
 from kfgs.viz import available, headless, palette
 
-LETTERS = ["--teacher", "cases_words:TEACHER"]
+LETTERS = ["--teacher", "cases_text:TEACHER"]
 
 
 @pytest.fixture(scope="module")
@@ -121,19 +121,19 @@ def test_no_driver_is_told_before_anything_is_read(files, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["FIELD", "--where", "window"], "where: expected a display for 'window', got none"),
-        (["FIELD", "--where", "picture", "--host", "0.0.0.0"], "host: expected none without --where browser"),
-        (["FIELD", "--where", "picture", "--port", "80"], "port: expected none without --where browser"),
-        (["FIELD", "--port", "70000"], "port: expected a number in [0, 65535], got 70000"),
-        (["FIELD", "--where", "picture"], "classes, text: expected class names"),
-        (["FIELD", "--where", "picture", "--distance", "0"], "distance: expected"),
-        (["FIELD", "--where", "picture", "--images", "x"], "images: expected none without --scene"),
-        (["FIELD", "--text", "TABLE", "--where", "picture", "--weights", "x"], "weights: expected none without --teacher"),
+        (["FIELD", "--where", "window"], "--where: expected a display for 'window', got none"),
+        (["FIELD", "--where", "picture", "--host", "0.0.0.0"], "--host: expected none without --where browser"),
+        (["FIELD", "--where", "picture", "--port", "80"], "--port: expected none without --where browser"),
+        (["FIELD", "--port", "70000"], "--port: expected a number in [0, 65535], got 70000"),
+        (["FIELD", "--where", "picture"], "--classes, --text: expected class names"),
+        (["FIELD", "--where", "picture", "--distance", "0"], "--distance: expected"),
+        (["FIELD", "--where", "picture", "--images", "x"], "--images: expected none without --scene"),
+        (["FIELD", "--text", "TABLE", "--where", "picture", "--weights", "x"], "--weights: expected none without --teacher"),
         (["FIELD", "--text", "TABLE", "--where", "picture", "--ask", "wal"], "wal"),
-        (["SPLAT", "--text", "TABLE", "--where", "picture"], "text: expected none beside a splat"),
-        (["COLOR", "--where", "picture"], "source: expected a splat with classes"),
-        (["nowhere", "--where", "picture"], "field: expected the folder that `kfgs fit` wrote"),
-        (["FIELD", "--text", "TABLE", "--color", "FIELD", "--where", "picture"], "color: expected a splat file"),
+        (["SPLAT", "--text", "TABLE", "--where", "picture"], "--text: expected none beside a splat"),
+        (["COLOR", "--where", "picture"], "SOURCE: expected a splat with classes"),
+        (["nowhere", "--where", "picture"], "SOURCE: expected the folder that `kfgs fit` wrote"),
+        (["FIELD", "--text", "TABLE", "--color", "FIELD", "--where", "picture"], "--color: expected a splat file"),
     ],
 )  # fmt: skip
 def test_wrong_input_is_told(files, tmp_path, capsys, arguments, message):

@@ -1,49 +1,47 @@
-"""The command line: `kfgs demo | sfm | plan | features | text | fit | uplift | segment | label | info | color | attach |
-select | edit | convert | view`.
+"""The command line: `kfgs COMMAND ...`; `kfgs --help` lists the commands.
 
 Every command names the files it wrote, shows progress on long work, and ends with 0 (done), 1 (bad input, with one
-message that says what to do), 2 (wrong usage), 130 (interrupted; demo, features, fit and color go on where they stopped) or 141
-(nobody reads its lines any more).
+message that says what to do), 2 (wrong usage), 130 (interrupted; demo, features, fit and color continue where they stopped)
+or 141 (nobody reads its lines any more).
 """
 
 from __future__ import annotations
 
+import dataclasses
+import difflib
+import inspect
 import os
+import re
+import shutil
 import sys
-from typing import Any
+import textwrap
+from collections.abc import Callable
+from typing import Any, get_type_hints
 
 import tyro
 
-from .color import attach, color, convert, edit
-from .look import view
-from .query import select
-from .say import warnings_as_notes
-from .semantic import demo, fit, info, label, segment, sfm, uplift
+from .fit import color, demo, fit, sfm, uplift
+from .output import say, warnings_as_notes
+from .query import info, label, segment, select
+from .splats import attach, convert, edit
 from .teach import features, plan
-from .words import text
+from .text import text
+from .view import view
 
-COMMANDS: dict[str, Any] = {
-    command.__name__: command
-    for command in (
-        demo,
-        sfm,
-        plan,
-        features,
-        text,
-        fit,
-        uplift,
-        segment,
-        label,
-        info,
-        color,
-        attach,
-        select,
-        edit,
-        convert,
-        view,
-    )
+GROUPS: dict[str, tuple[Any, ...]] = {
+    "Start here": (demo, info),
+    "Make a semantic field": (sfm, plan, features, text, fit, uplift),
+    "Ask it": (select, segment, label, view),
+    "Colour splats": (color, attach, edit, convert),
 }
+COMMANDS = {command.__name__: command for group in GROUPS.values() for command in group}
 RESUMED = {"demo", "features", "fit", "color"}  # commands that find what they did before
+STYLE = (
+    tyro.conf.DisallowNone,
+    tyro.conf.FlagCreatePairsOff,
+    tyro.conf.OmitArgPrefixes,
+    tyro.conf.PositionalMetavarFromFieldName,
+)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -51,23 +49,109 @@ def main(arguments: list[str] | None = None) -> int:
     # Read when torch is first imported: waiting threads sleep instead of spinning, which beside other busy programs is
     # the difference between 25 training steps a second and one (measured on two cores).
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    name, *given = [_expand_home(word) for word in (sys.argv[1:] if arguments is None else arguments)] or [""]
+    if name in ("-h", "--help"):
+        say(_overview())
+        return 0
+    if name == "--version":
+        from .. import __version__
+
+        say(f"kfgs {__version__}")
+        return 0
+    if name not in COMMANDS:
+        _fail(_unknown(name))
+        raise SystemExit(2)
+    command = COMMANDS[name]
+    names = _shown_names(command)
+
+    def spoken(message: str) -> str:
+        return _in_options(message, names)
+
     try:
-        with warnings_as_notes():
-            tyro.extras.subcommand_cli_from_dict(
-                COMMANDS,
-                prog="kfgs",
-                description="Decoupled semantic fields of 3-D Gaussians: distil, compress, segment, label, edit.",
-                args=arguments,
-            )
+        with warnings_as_notes(spoken):
+            command.__doc__ = re.sub(
+                r"\n {8,}(?!kfgs)", " ", inspect.getdoc(command) or ""
+            )  # an option's text on one line
+            tyro.cli(command, prog=f"kfgs {name}", description=_description(command), args=given, config=STYLE)
     except KeyboardInterrupt:
-        given = sys.argv[1:] if arguments is None else arguments
-        goes_on = "; the same command goes on where it stopped" if RESUMED.intersection(given[:1]) else ""
-        print(f"interrupted{goes_on}", file=sys.stderr)  # noqa: T201
+        _fail("interrupted" + ("; the same command goes on where it stopped" if name in RESUMED else ""))
         return 130
     except BrokenPipeError:  # whoever read our lines has gone, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter complains when it ends
         return 141
     except (ValueError, TypeError, OSError, ImportError, ArithmeticError) as error:
-        print(f"error: {error}", file=sys.stderr)  # noqa: T201
+        _fail(f"error: {spoken(str(error))}")
         return 1
     return 0
+
+
+def _fail(text: str) -> None:
+    print(text, file=sys.stderr)  # noqa: T201
+
+
+def _expand_home(word: str) -> str:
+    """A word of the command line with `~` as the home folder: `~/scene`, `--out=~/run`."""
+    option, equals, value = word.partition("=")
+    if option.startswith("--") and equals:
+        return f"{option}={os.path.expanduser(value)}"
+    return os.path.expanduser(word)
+
+
+def _overview() -> str:
+    """What `kfgs --help` prints: a line for each command."""
+    lines = [
+        "usage: kfgs COMMAND ...",
+        "",
+        "Decoupled semantic fields of 3-D Gaussians: distil, compress, segment, label, edit.",
+    ]
+    for title, commands in GROUPS.items():
+        lines += ["", f"{title}:"]
+        for command in commands:
+            summary = (inspect.getdoc(command) or "").split("\n\n")[0]
+            lines.append(_wrap(f"  {command.__name__:<10s}{' '.join(summary.split())}", " " * 12))
+    return "\n".join(
+        [*lines, "", "`kfgs COMMAND --help` has the options and examples; `kfgs --version` says which kfgs this is."]
+    )
+
+
+def _unknown(name: str) -> str:
+    near = difflib.get_close_matches(name, COMMANDS, n=1)
+    hint = f"did you mean {near[0]!r}?" if near else "`kfgs --help` lists them"
+    return f"error: expected a command, got {repr(name) if name else 'none'}; {hint}"
+
+
+def _description(command: Callable[..., None]) -> str:
+    """A command's docstring without the options: what it does, and examples. The indent keeps tyro from joining lines."""
+    first, *more = (inspect.getdoc(command) or "").split("\n\nArgs:")[0].split("\n\n")
+    lines = [_wrap(first, "  ")]
+    for part in more:
+        lines.append("\n" + part if part.startswith("Examples:") else _wrap("  " + part, "  "))
+    return "\n".join(lines)
+
+
+def _wrap(text: str, indent: str = "") -> str:
+    return textwrap.fill(text, min(100, shutil.get_terminal_size().columns) - 2, subsequent_indent=indent)
+
+
+def _shown_names(kind: Any) -> dict[str, str]:
+    """How the command line writes the parameters of a command, or the fields of its options: SCENE, --splat-scene."""
+    found: dict[str, str] = {}
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        if dataclasses.is_dataclass(hint):
+            found |= _shown_names(hint)
+        elif name != "return":
+            positional = tyro.conf.Positional in getattr(hint, "__metadata__", ())
+            shown = name.upper() if positional else "--" + name.replace("_", "-")
+            found |= {name: shown, name.removeprefix("no_"): shown}
+    return found
+
+
+def _in_options(message: str, names: dict[str, str]) -> str:
+    """A message about arguments as one about options: "splat_scene: expected" becomes "--splat-scene: expected"."""
+    about, colon, rest = message.partition(": ")
+    arguments = about.replace("-", "_").split(", ")
+    if colon and all(argument in names for argument in arguments):
+        about = ", ".join(names[argument] for argument in arguments)
+    for name in (name for name in names if "_" in name):  # in the text only names that are no English words
+        rest = re.sub(rf"\b{name}(=\w+)?\b", names[name], rest)
+    return about + colon + rest

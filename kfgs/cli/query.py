@@ -1,65 +1,59 @@
-"""The command that asks: select."""
+"""Commands that ask a field or a labelled splat: select, segment, label, info."""
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-import tyro
-
-from .._check import check_range
-from .checks import check_alone, check_folder, open_splats
-from .say import open_answering, say, wrote
-from .words import ask
+from .files import check_alone, check_folder, is_field, open_field, open_splats
+from .options import Classes, Given, Positional, Teacher
+from .output import say, say_counts, wrote
+from .text import ask
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
+Rule = Literal["fused", "paper"]
 Negatives = Literal["auto", "classes", "canonical", "none"]
 Score = Literal["auto", "cosine", "softmax", "relevancy"]
 
 
 def select(
-    query: Annotated[str, tyro.conf.Positional],
-    source: Annotated[Path, tyro.conf.Positional],
-    out: Path | None = None,
-    scene: Path | None = None,
-    classes: Path | None = None,
-    text: Path | None = None,
-    threshold: float | None = None,
+    query: Positional[str],
+    source: Positional[Path],
+    *,
+    out: Given[Path] = None,
+    threshold: Given[float] = None,
     negatives: Negatives = "auto",
     score: Score = "auto",
-    teacher: str | None = None,
-    weights: str | None = None,
-    images: Path | None = None,
+    teacher: Teacher,
+    classes: Classes,
 ) -> None:
-    """Which Gaussians are the chair? How many there are, where, how large, and the view that shows each best.
+    """Find the Gaussians of a class or phrase: how many, where, how large, and the view that shows them best.
 
-    Connected parts are listed one by one, the largest first. Those of a labelled splat have names, chair/1, chair/2, by
-    which `kfgs edit` takes them.
+    Connected parts are listed one by one, the largest first. Those of a labelled splat have names, chair/1, chair/2, which
+    `kfgs edit` understands.
+
+    Examples:
+        kfgs select chair run/field
+        kfgs select chair labelled.ply --scene scene/ --out chairs/
+        kfgs select "the red chair by the window" run/field --teacher lseg --weights demo_e200.ckpt
 
     Args:
-        query: a class name, "chair"; of a field with --teacher any phrase, "the red chair by the window".
-        source: a field folder (`RUN/field`), asked by text; or a splat with classes, asked by label.
-        out: folder for selection.json (with the indices) and selection.ply (the Gaussians), if wanted.
-        scene: scene folder: classes.json and text.npy, or text.safetensors. A field remembers its own; for a splat, the
-            cameras that tell which view shows a part best.
-        classes: JSON list of class names; SCENE/classes.json when not given.
-        text: .npy of one embedding per class, or a table that `kfgs text` made (.safetensors), which needs no classes;
-            SCENE/text.npy or SCENE/text.safetensors when not given.
-        threshold: scores must be above it. Of a field the paper's gamma: when not given 0.5 for a relevancy, else read off
-            the scores' distribution. Of a splat all of the class are taken when not given.
-        negatives: what to tell the query from: all other classes, LERF's canonical words, or nothing; of a field.
-            `auto`: the classes for one of them, the canonical words for any other phrase.
-        score: relevancy (against the most similar negative), softmax (over query and negatives) or cosine; of a field.
-            `auto`: relevancy, or with --negatives none cosine.
-        teacher: embed the query with this teacher's text encoder: lseg, clip, siglip, ...; of a field.
-        weights: the teacher's checkpoint file (lseg), or folder or hub id (the others).
-        images: folder of the scene's pictures, if it is not SCENE/images.
+        query: A class name, "chair"; with --teacher any phrase.
+        source: A field folder (RUN/field), or a splat with classes.
+        out: Folder for selection.json (with the indices) and selection.ply (the Gaussians).
+        threshold: Scores must be above it. For a field it is the paper's gamma; when not given it is 0.5 for a relevancy,
+            else read off the scores. For a splat every Gaussian of the class is taken when not given.
+        negatives: What the query is compared with (field only): all other classes, LERF's canonical words (object, things,
+            stuff, texture), or nothing. auto: the other classes for a class, the canonical words for another phrase.
+        score: relevancy (against the most similar negative), softmax (over query and negatives) or cosine (field only).
+            auto: relevancy, or cosine with --negatives none.
     """
+    from .._check import check_range
     from ..formats import SplatFile
     from ..labels import connected_parts
     from ..pipeline.apply import select_labelled
-    from ..scenes import load_scene
 
     if not source.exists() and Path(query).exists():
         raise ValueError(f"query, source: expected a class, then a file, got {query!r}, {str(source)!r}; swap them")
@@ -67,24 +61,23 @@ def select(
         check_folder("out", out)
     if threshold is not None:
         check_range("threshold", threshold, 0, 1)
-    if scene is None:
-        check_alone("images", images, "without --scene, whose pictures they are")
-    is_field = (source / "field.json").is_file()
-    counted = not is_field and threshold is None  # parts are numbered as `kfgs edit` does
-    if is_field:
-        field = open_answering(source, scene, images)
-        label_set, target = ask(query, (scene, classes, text), teacher, weights, field)
+    classes.check_images()
+    asked_by_text = is_field(source)
+    counted = not asked_by_text and threshold is None  # parts are numbered as `kfgs edit` does
+    if asked_by_text:
+        field = classes.open_field("source", source)
+        label_set, target = ask(query, classes, teacher, field)
         query = target if isinstance(target, str) else query
         how = None if score == "auto" else score
         found = field.query(target, label_set, threshold, negatives=_negatives(negatives, score), score=how)
         cloud, cameras = SplatFile(field.gaussians, {"score": found.scores.numpy()}), field.cameras or None
     else:
-        given = {"classes": classes, "text": text, "negatives": negatives, "score": score, "teacher": teacher}
-        for name, value in (given | {"weights": weights}).items():
+        given = {"classes": classes.classes, "text": classes.text, "negatives": negatives, "score": score}
+        for name, value in (given | dataclasses.asdict(teacher)).items():
             check_alone(name, None if value == "auto" else value, "beside a splat, which has its own classes")
         cloud = open_splats("source", source, labelled=True)
         found = select_labelled(cloud, query, threshold)
-        cameras = None if scene is None else load_scene(scene, images=images).undistorted().cameras
+        cameras = None if classes.scene is None else classes.load_scene().undistorted().cameras
     say(f"{query}: {len(found)} of {len(cloud)} Gaussians, {found.words}")
     things = connected_parts(cloud.gaussians, found, cameras)
     for number, thing in enumerate(things, start=1):
@@ -95,6 +88,147 @@ def select(
                 f"query: expected Gaussians to save, got none of {query!r}; lower the threshold or drop --out"
             )
         wrote(_save(out, query, cloud, found, things))
+
+
+def segment(
+    field: Positional[Path],
+    out: Path,
+    *,
+    split: str = "test",
+    labels: Given[Path] = None,
+    rule: Rule = "fused",
+    pictures: int = 4,
+    classes: Classes,
+) -> None:
+    """Segment the views of a scene with a field; score them if there are label pictures.
+
+    Examples:
+        kfgs segment run/field --out segmented/
+        kfgs segment run/field --out segmented/ --scene scene/ --text words.safetensors --split train
+
+    Args:
+        field: The folder that `kfgs fit` wrote (RUN/field).
+        out: Folder for label maps, pictures and scores.json.
+        split: Which views: train, test, or another split that SCENE/split.json names.
+        labels: Folder of true label pictures; SCENE/labels_scored or SCENE/labels when not given.
+        rule: fused: the classes of the field's Gaussians; paper: decode every pixel (Sec. 3.4), seconds a view.
+        pictures: How many views get pictures.
+    """
+    from .._files import read_json
+    from ..fields import recall_scene
+    from ..pipeline import score_scene, segment_scene, true_labels, write_report
+    from ..viz import plot_confusion, plot_iou
+
+    loaded_field = open_field("field", field)
+    scene = recall_scene(loaded_field.info, loaded_field.folder) if classes.scene is None else classes.scene
+    classes = dataclasses.replace(classes, scene=scene)
+    loaded, label_set = classes.load_scene().undistorted(), classes.load_classes()
+    folder = labels or next((scene / name for name in ("labels_scored", "labels") if (scene / name).is_dir()), None)
+    listed = scene / "classes.json"
+    if labels is None and folder is not None and listed.is_file() and tuple(read_json(listed)) != label_set.names:
+        say(f"note: not scored: {folder} counts the classes of {listed}, which are others; pass --classes {listed}")
+        folder = None
+    truth = {} if folder is None else true_labels(loaded, folder, split)
+    if labels is not None and not truth:
+        raise ValueError(
+            f"labels: expected pictures <stem>.png of the views of split {split!r} in {labels}, found none; "
+            "name the folder that holds them"
+        )
+    seen = set(loaded_field.info.get("views", ())) & {loaded.cameras[i].name for i in loaded.views(split)}
+    if seen:
+        say(f"note: the field was trained on {len(seen)} of these views")
+    found = segment_scene(
+        loaded_field, loaded, label_set, out, split=split, rule=rule, pictures=pictures, progress=True
+    )
+    written = [out / name for name in ("predicted", "overlay", "features") if (out / name).is_dir()]
+    if truth:
+        scores = score_scene(found, truth, label_set)
+        say(str(scores))
+        write_report(out / "scores.json", segmentation=scores, truth=str(folder), field=str(field), rule=rule)
+        plot_confusion(scores.confusion, list(label_set.names), out / "confusion.png", misses=scores.misses)
+        plot_iou(scores.iou, list(label_set.names), out / "iou.png")
+        written += [out / name for name in ("scores.json", "confusion.png", "iou.png")]
+    else:
+        say(f"note: no label pictures of split {split!r} to score against")
+    wrote(written)
+
+
+def label(
+    field: Positional[Path],
+    out: Path,
+    *,
+    query: Given[str] = None,
+    threshold: Given[float] = None,
+    cloud: Given[Path] = None,
+    distance: Given[float] = None,
+    rule: Rule = "fused",
+    classes: Classes,
+) -> None:
+    """Label the Gaussians of a field, and carry the labels to a cloud of points by distance.
+
+    Examples:
+        kfgs label run/field --out labelled/
+        kfgs label run/field --out labelled/ --cloud points.ply --distance 0.05
+
+    Args:
+        field: The folder that `kfgs fit` wrote (RUN/field).
+        out: Folder for gaussians.ply, and cloud.ply if there is a --cloud.
+        query: Label only the Gaussians of this class, as `kfgs select` finds them.
+        threshold: The paper's gamma for --query: scores must be above it; see `kfgs select`.
+        cloud: PLY of points in the field's frame that receive the labels. For a splat `kfgs attach` does better.
+        distance: The paper's lambda: the distance within which a label is carried over, in world units; from the clouds'
+            spacing when not given.
+        rule: fused: what the training views show of a Gaussian decides; paper: its own latent (Sec. 3.4).
+    """
+    import torch
+
+    from ..pipeline import label_cloud, read_cloud, save_labelled
+
+    for name, value, other, needed in (
+        ("threshold", threshold, "query", query),
+        ("distance", distance, "cloud", cloud),
+    ):
+        if value is not None and needed is None:
+            raise ValueError(f"{name}: expected --{other} beside it, got none; it would have no effect")
+    loaded = classes.open_field("field", field)
+    label_set = classes.of_field(loaded)
+    carried = None if cloud is None else read_cloud(cloud)
+    targets = [out / "gaussians.ply"] + ([] if cloud is None else [out / "cloud.ply"])
+    if cloud is not None and cloud.resolve() in {target.resolve() for target in targets}:
+        raise ValueError(f"out: expected another folder than that of --cloud, got {out}; {cloud} would be overwritten")
+    if query is None:
+        labels, scores = loaded.classify(label_set, rule=rule)
+        who = "what the views show of each Gaussian" if rule == "fused" else "each Gaussian's own latent (Sec. 3.4)"
+        how = f"{who}; score = cosine"
+    else:
+        found = loaded.query(query, label_set, threshold, rule=rule)
+        labels, scores = torch.where(found.mask, label_set.index(query), -1), found.scores
+        how = f"{query}: {len(found)} Gaussians above gamma = {found.threshold:.4f} ({found.how})"
+    gaussians = loaded.gaussians.replace(labels=labels)
+    say(f"labelled by {how}")
+    written = save_labelled(targets[0], gaussians, scores, label_set, rule=how)
+    if query is None:
+        say_counts(labels, label_set.names)
+    if carried is not None:
+        moved, paths = label_cloud(gaussians, carried, targets[1], label_set, distance=distance)
+        say(str(moved))
+        written += paths
+    wrote(written)
+
+
+def info(path: Positional[Path]) -> None:
+    """Say what a field, a run, a scene, a folder of feature maps or a PLY file holds.
+
+    Examples:
+        kfgs info run/field
+        kfgs info scene/
+
+    Args:
+        path: A field folder, run folder, scene folder, folder of feature maps, or .ply file.
+    """
+    from ..pipeline import describe
+
+    say(describe(path))
 
 
 def _save(out: Path, query: str, cloud: Any, found: Any, things: list[Any]) -> list[Path]:
@@ -108,12 +242,8 @@ def _save(out: Path, query: str, cloud: Any, found: Any, things: list[Any]) -> l
     return [out / "selection.json", *write_splats(out / "selection.ply", cloud.select(found.mask)).paths]
 
 
-def _negatives(negatives: Negatives, score: Score) -> Any:
-    """As asked, if the score can use it.
-
-    Raises:
-        ValueError: if it cannot.
-    """
+def _negatives(negatives: Negatives, score: Score) -> Negatives:
+    """As asked; a ValueError if the score cannot use them."""
     if score == "cosine" and negatives not in ("auto", "none"):
         raise ValueError(f"negatives: expected none beside --score cosine, got {negatives}; leave one of both out")
     if score in ("softmax", "relevancy") and negatives == "none":

@@ -5,74 +5,61 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-import tyro
-
-from .._check import one_line
-from .checks import check_alone, check_file, check_folder
-from .say import Method, Mode, Preset, fit_config, say, wrote
+from .files import check_alone, check_file, check_folder
+from .options import Device, Flag, Given, Level, MapTeacher, Method, Mode, Preset, SceneFolder, Views, fit_config
+from .output import say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
-Level = Literal["default", "s", "m", "l"]  # of LangSplat: SAM's own choice of masks; subparts, parts, wholes
 MISFITS = 3  # maps named in notes
-SceneFolder = Annotated[Path, tyro.conf.Positional]
 
 
 def features(
     scene: SceneFolder,
-    teacher: str | None = None,
-    weights: str | None = None,
-    out: Path | None = None,
-    split: str = "train",
-    fast: bool = False,
-    size: tuple[int, ...] = (),
-    images: Path | None = None,
-    device: str = "auto",
-    overwrite: bool = False,
-    check: Path | None = None,
-    level: Level | None = None,
+    *,
+    out: Given[Path] = None,
+    overwrite: Flag = False,
+    check: Given[Path] = None,
+    level: Given[Level] = None,
+    device: Device = "auto",
+    teacher: MapTeacher,
+    views: Views,
 ) -> None:
-    """Run a teacher over a scene's pictures, one at a time, and keep its maps; or look over maps that exist.
+    """Run a teacher over a scene's pictures and keep its feature maps; or check maps that exist.
 
-    A killed run goes on with the same command: finished pictures are not done again.
+    Pictures are done one at a time. A killed run goes on with the same command: finished pictures are not done again.
+
+    Examples:
+        kfgs features scene/ --teacher lseg --weights demo_e200.ckpt
+        kfgs features scene/ --teacher dinov2 --weights facebook/dinov2-small --out maps/
+        kfgs features scene/ --check maps/    # by Feature 3DGS, LangSplat, or in .npy or .safetensors
 
     Args:
-        scene: folder with images and a COLMAP model or transforms.json.
-        teacher: lseg, clip, siglip, ... (a wrong name lists them), or package.module:name of your own.
-        weights: checkpoint file (lseg, sam), or folder or hub id (the others).
-        out: folder for the maps; SCENE/features when not given.
-        split: views to encode; `all` for every view.
-        fast: one pass over each picture instead of the teacher's exact multi-scale evaluation (lseg).
-        size: HEIGHT WIDTH of the maps (lseg), or the long side in pixels that pictures are brought to (the others).
-        images: folder of the pictures, if it is not SCENE/images.
-        device: where the teacher runs: `auto` (a GPU if there is one), `cpu` or `cuda`.
-        overwrite: give up maps of another teacher, weights or options that lie there; without it they are an error.
-        check: look over this folder of maps instead (Feature 3DGS, LangSplat, .npy, .safetensors), and report every file
-            that does not fit.
-        level: which masks of LangSplat's maps are looked at: `default`, `s`, `m` or `l`; beside --check.
+        out: Folder for the maps; SCENE/features when not given.
+        overwrite: Replace maps of another teacher, other weights or other options; without it they are an error.
+        check: Check this folder of maps instead, and report every file that does not fit.
+        level: For --check: which masks of LangSplat's maps, default, subparts (s), parts (m) or wholes (l).
+        device: Where the teacher runs: auto (a GPU if there is one), cpu or cuda.
     """
     from ..features import FeatureFolder, extract_features
-    from ..scenes import load_scene
 
     if check is not None:
-        for name, given in (("teacher", teacher), ("weights", weights), ("out", out)):
+        for name, given in (("teacher", teacher.teacher), ("weights", teacher.weights), ("out", out)):
             check_alone(name, given, "beside --check, which encodes nothing")
     else:
         check_alone("level", level, "without --check; it is of LangSplat's maps")
-    loaded = load_scene(scene, images=images)
-    for note in loaded.notes:
-        say(f"note: {note}")
+    loaded = views.load(scene)
     if check is not None:
-        found = FeatureFolder(check, level=level or "default").check(loaded, split)
+        found = FeatureFolder(check, level=level or "default").check(loaded, views.split)
         say(str(found))
         found.raise_if_bad()
         return
     target = out if out is not None else scene_folder(scene) / "features"
     check_folder("out", target)
-    chosen = choose_teacher(teacher, weights, fast, size, device)
-    made = extract_features(chosen, loaded, target, split, overwrite=overwrite, report=say, progress=True)
+    network = choose_teacher(teacher.teacher, teacher.weights, teacher.fast, teacher.size, device)
+    made = extract_features(network, loaded, target, views.split, overwrite=overwrite, report=say, progress=True)
     shapes = sorted({" x ".join(map(str, record.shape)) for record in made.maps.values()})
     say(f"{len(made.maps)} maps of {', '.join(shapes)} by {teacher_words(made.teacher)}")
     say(f"next: kfgs fit {scene} --out run" + ("" if out is None else f" --features {out}"))
@@ -81,46 +68,39 @@ def features(
 
 def plan(
     scene: SceneFolder,
-    teacher: str | None = None,
-    weights: str | None = None,
-    fast: bool = False,
-    size: tuple[int, ...] = (),
+    *,
     preset: Preset = "cpu",
     method: Method = "fuse",
-    mode: Mode | None = None,
-    steps: int | None = None,
-    split: str = "train",
+    mode: Given[Mode] = None,
+    steps: Given[int] = None,
     store: Literal["keep", "discard", "recompute"] = "keep",
-    images: Path | None = None,
-    device: str = "auto",
-    features: Path | None = None,
-    run: Path | None = None,
-    out: Path | None = None,
+    device: Device = "auto",
+    features: Given[Path] = None,
+    run: Given[Path] = None,
+    out: Given[Path] = None,
+    teacher: MapTeacher,
+    views: Views,
 ) -> None:
     """Predict disk, memory and minutes of `kfgs features` and `kfgs fit`, before either starts.
 
     Times are measured: the teacher sees one picture, and a few views and steps are tried. Maps that exist, and stages that
     are finished, are counted.
 
+    Examples:
+        kfgs plan scene/
+        kfgs plan scene/ --teacher clip --weights openai/clip-vit-base-patch16 --store discard
+
     Args:
-        scene: folder with images and a COLMAP model or transforms.json.
-        teacher: lseg, clip, siglip, ... as for `kfgs features`; it is run on one picture if maps are missing. lseg when not
-            given.
-        weights: as for `kfgs features`. Nothing is downloaded. lseg needs none here.
-        fast: as for `kfgs features`.
-        size: as for `kfgs features`.
-        preset: as for `kfgs fit`.
-        method: as for `kfgs fit`.
-        mode: as for `kfgs fit`.
-        steps: as for `kfgs fit`.
-        split: views to encode and to learn from.
-        store: what becomes of the dense maps: `keep` them; `discard` them when the field is made (fit
-            --discard-features); `recompute` instead of storing (fit --teacher).
-        images: folder of the pictures, if it is not SCENE/images.
-        device: as for `kfgs fit`.
-        features: folder of maps that exist, in any layout that `kfgs fit` reads; SCENE/features when not given.
-        run: run folder of `kfgs fit` (its --out), whose finished stages count as done.
-        out: also write the plan to this .json file.
+        preset: As for `kfgs fit`.
+        method: As for `kfgs fit`.
+        mode: As for `kfgs fit`.
+        steps: As for `kfgs fit`.
+        store: What becomes of the feature maps: keep them; discard them when the field is made (kfgs fit
+            --discard-features); recompute instead of storing (kfgs fit --teacher).
+        device: As for `kfgs fit`.
+        features: Folder of maps that exist, in any layout that `kfgs fit` reads; SCENE/features when not given.
+        run: Run folder of `kfgs fit` (its --out), whose finished stages count as done.
+        out: Also write the plan to this .json file.
     """
     from .._files import write_json
     from ..pipeline.plan import plan_scene
@@ -131,13 +111,12 @@ def plan(
         check_file("out", out)
     if features is not None and not features.is_dir():
         raise ValueError(f"features: expected a folder of maps, got {features}, which is none; leave --features out")
-    config = fit_config(preset, method, mode, 0, steps, None, split)
-    named = teacher_options(teacher or "lseg", fast, size)
+    config = fit_config(preset, method, mode, 0, steps, None, views.split)
+    named = teacher_options(teacher.teacher or "lseg", teacher.fast, teacher.size)
+    tried = teacher.teacher is not None or teacher.weights is not None or named
     found = plan_scene(
-        load_scene(scene, images=images),
-        teacher=None
-        if teacher is None and weights is None and not named
-        else NamedTeacher(teacher or "lseg", weights, named),
+        load_scene(scene, images=views.images),
+        teacher=NamedTeacher(teacher.teacher or "lseg", teacher.weights, named) if tried else None,
         config=dataclasses.replace(config, device=device),
         dense=store,
         features=scene_folder(scene) / "features" if features is None else features,
@@ -229,6 +208,8 @@ def scene_folder(scene: Path) -> Path:
 
 def teacher_words(identity: dict[str, Any]) -> str:
     """A teacher's identity in a few words: `lseg (weights 3f2a...)`."""
+    from .._check import one_line
+
     weights, options = identity.get("weights"), identity.get("options")
     words = [one_line(identity.get("name", "unknown"))]
     words += [f"weights {one_line(weights)[:12]}"] if weights else []

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from cases_words import DIM, MUTE, TEACHER, letters
+from cases_text import DIM, MUTE, TEACHER, letters
 from oracles_words import ensemble
 
 from kfgs.labels import CANONICAL, LabelSet, load_label_set

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from kfgs.cli.edit_words import edits_from_words, inserted_files
+from kfgs.cli.edit_syntax import Edits, inserted_files, parse_edits
 from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
 from kfgs.labels import connected_parts
@@ -12,7 +12,7 @@ from kfgs.labels.where import Component, Either, OfClass
 
 
 def read(**words):
-    return list(edits_from_words(**words))
+    return list(parse_edits(Edits(**words)))
 
 
 def test_each_option_is_the_edit_it_says():

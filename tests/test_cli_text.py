@@ -7,18 +7,23 @@ import numpy as np
 import pytest
 import torch
 from cases_color import surface
-from cases_words import DIM, TEACHER, letters
+from cases_text import DIM, TEACHER, letters
 from small_room import make_room
 
 from kfgs.cli import main
-from kfgs.cli.say import find_classes, load_classes
-from kfgs.cli.words import read_words, text
+from kfgs.cli.options import Classes, Teacher
+from kfgs.cli.text import read_words
+from kfgs.cli.text import text as text_command
 from kfgs.fields import SemanticField
 from kfgs.labels import load_label_set
 from kfgs.scenes import load_scene
 from kfgs.teachers.prompts import make_label_set
 
-LETTERS = ["--teacher", "cases_words:TEACHER"]
+LETTERS = ["--teacher", "cases_text:TEACHER"]
+
+
+def text(names, teacher, out, **options):
+    text_command(names, teacher=Teacher(teacher), out=out, **options)
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +75,7 @@ def test_words_are_words_whatever_lies_in_the_folder(tmp_path, monkeypatch):
 
 def test_text_writes_a_table_with_its_origin(tmp_path, capsys):
     out = tmp_path / "new" / "t.safetensors"
-    text("wall,chair;seat", "cases_words:TEACHER", out, templates="a {}")
+    text("wall,chair;seat", "cases_text:TEACHER", out, templates="a {}")
     said = capsys.readouterr().out
     assert f"2 classes, {DIM} channels each, by letters, as 'a {{}}'" in said
     assert "chair: also seat" in said
@@ -81,7 +86,7 @@ def test_text_writes_a_table_with_its_origin(tmp_path, capsys):
     expected = make_label_set(TEACHER, ["wall", "chair;seat"], templates="a {}")
     assert found.embeddings.equal(expected.embeddings)
     assert found.negatives.equal(expected.negatives)
-    text("wall", "cases_words:TEACHER", out, negatives=False)
+    text("wall", "cases_text:TEACHER", out, no_negatives=True)
     assert load_label_set(out).negatives is None
 
 
@@ -90,7 +95,7 @@ def test_text_writes_a_table_with_its_origin(tmp_path, capsys):
     [
         ("wall", {"out": "t.npy"}, "out: expected a file whose name ends in .safetensors"),
         ("wall", {"out": "."}, "out: expected a file whose name ends in .safetensors"),
-        ("wall", {"teacher": "cases_words:MUTE"}, "teacher 'mute': expected one with a text encoder"),
+        ("wall", {"teacher": "cases_text:MUTE"}, "teacher 'mute': expected one with a text encoder"),
         ("wall", {"teacher": "no_such_teacher"}, "teacher: expected one of lseg"),
         ("wall", {"templates": "clip8"}, "did you mean 'clip7'"),
         (" , ", {}, "names: expected at least one word, got none"),
@@ -106,7 +111,7 @@ def test_text_names_what_is_wrong_and_writes_nothing(tmp_path, names, options, m
     (tmp_path / "a.json").write_text('{"wall": 1}')
     (tmp_path / "a.txt").write_bytes(b"\xff\xfew\x00")
     (tmp_path / "a.yaml").write_text("- wall")
-    given = {"teacher": "cases_words:TEACHER", "out": "t.safetensors"} | options
+    given = {"teacher": "cases_text:TEACHER", "out": "t.safetensors"} | options
     given["out"] = tmp_path / given["out"]
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         text(names.format(tmp=tmp_path), **given)
@@ -115,7 +120,7 @@ def test_text_names_what_is_wrong_and_writes_nothing(tmp_path, names, options, m
 
 def test_a_table_alone_serves_select_label_and_segment(field, room, truth, names, tmp_path, capsys):
     table = tmp_path / "t.safetensors"
-    text(str(room / "classes.json"), "cases_words:TEACHER", table)
+    text(str(room / "classes.json"), "cases_text:TEACHER", table)
     assert main(["select", "lamp", str(field), "--text", str(table)]) == 0
     said = capsys.readouterr().out
     assert f"lamp: {count(truth, names, 'lamp')} of 4000 Gaussians" in said
@@ -131,35 +136,35 @@ def test_a_table_alone_serves_select_label_and_segment(field, room, truth, names
 def test_a_table_in_the_scene_is_found(field, room, truth, names, tmp_path, capsys):
     scene = tmp_path / "scene"
     shutil.copytree(room, scene, ignore=shutil.ignore_patterns("classes.json", "text.npy"))
-    text(",".join(reversed(names)), "cases_words:TEACHER", scene / "text.safetensors")
-    assert load_classes(scene, None, None).names == tuple(reversed(names))
+    text(",".join(reversed(names)), "cases_text:TEACHER", scene / "text.safetensors")
+    assert Classes(scene).load_classes().names == tuple(reversed(names))
     assert main(["select", "lamp", str(field), "--scene", str(scene)]) == 0
     assert "lamp: " in capsys.readouterr().out
     shutil.copy(room / "classes.json", scene)  # label pictures count as it does
-    assert load_classes(scene, None, None).names == tuple(names)
+    assert Classes(scene).load_classes().names == tuple(names)
     assert capsys.readouterr().out == ""
-    whole = load_classes(scene, None, scene / "text.safetensors")
+    whole = Classes(scene, text=scene / "text.safetensors").load_classes()
     assert whole.names == tuple(reversed(names))
     assert "note: labels count the classes of" in capsys.readouterr().out
     np.save(scene / "text.npy", np.ones((len(names), 3), np.float32))
-    assert load_classes(scene, None, None).embeddings.shape == (len(names), 3)  # the pair of old goes first
+    assert Classes(scene).load_classes().embeddings.shape == (len(names), 3)  # the pair of old goes first
 
 
 def test_where_classes_are_looked_for(tmp_path):
     scene, table, names, rows = (tmp_path / name for name in ("s", "t.safetensors", "c.json", "t.npy"))
-    assert find_classes(None, None, table) == (table,)
-    assert find_classes(None, table, None) == (table,)
-    assert find_classes(None, names, table) == (names, table)
-    assert find_classes(scene, None, None) == (scene / "classes.json", scene / "text.npy")
-    assert find_classes(scene, names, None) == (names, scene / "text.npy")
-    assert find_classes(scene, None, table) == (table,)
-    assert find_classes(None, None, rows) is None
+    assert Classes(text=table).files() == (table,)
+    assert Classes(classes=table).files() == (table,)
+    assert Classes(classes=names, text=table).files() == (names, table)
+    assert Classes(scene=scene).files() == (scene / "classes.json", scene / "text.npy")
+    assert Classes(scene=scene, classes=names).files() == (names, scene / "text.npy")
+    assert Classes(scene=scene, text=table).files() == (table,)
+    assert Classes(text=rows).files() is None
     with pytest.raises(ValueError, match="text: expected none beside the table"):
-        find_classes(None, table, rows)
+        Classes(classes=table, text=rows).files()
     with pytest.raises(
         ValueError, match="pass --classes and --text, or --scene, or --text alone with what `kfgs text`"
     ):
-        load_classes(None, names, None)
+        Classes(classes=names).load_classes()
 
 
 def test_any_phrase_with_a_teacher_and_no_table(field, truth, names, capsys):
@@ -179,7 +184,7 @@ def test_any_phrase_with_a_teacher_and_no_table(field, truth, names, capsys):
 
 def test_a_phrase_joins_the_classes_of_a_table(field, room, truth, names, tmp_path, capsys):
     table = tmp_path / "t.safetensors"
-    text(str(room / "classes.json"), "cases_words:TEACHER", table)
+    text(str(room / "classes.json"), "cases_text:TEACHER", table)
     arguments = [str(field), "--text", str(table), *LETTERS]
     lamps = count(truth, names, "lamp")
     assert main(["select", "palm", *arguments, "--negatives", "none", "--threshold", "0.999"]) == 0  # the same letters
@@ -198,14 +203,14 @@ def test_a_phrase_joins_the_classes_of_a_table(field, room, truth, names, tmp_pa
     assert f"{len(names) - 1} negatives" in said
     assert main(["select", "lamp", *arguments, "--negatives", "canonical"]) == 0
     assert "4 negatives" in capsys.readouterr().out
-    text("lamp", "cases_words:TEACHER", table)
+    text("lamp", "cases_text:TEACHER", table)
     assert main(["select", "lamp", str(field), "--text", str(table)]) == 0
     assert "4 negatives" in capsys.readouterr().out  # there are no other classes
 
 
 def test_a_phrase_takes_the_templates_of_the_table(field, truth, names, tmp_path, capsys):
     table = tmp_path / "t.safetensors"
-    text("lamp", "cases_words:TEACHER", table, templates="{} ll")
+    text("lamp", "cases_text:TEACHER", table, templates="{} ll")
     framed, lamp = torch.nn.functional.normalize(letters(["palm ll", "lamp"]).double(), dim=1)
     cosine = float(framed @ lamp)
     assert 0.5 < cosine < 0.98  # asked bare it would be 1
@@ -219,7 +224,7 @@ def test_a_phrase_takes_the_templates_of_the_table(field, truth, names, tmp_path
 
 def test_scores_by_name(field, room, truth, names, tmp_path, capsys):
     table = tmp_path / "t.safetensors"
-    text(str(room / "classes.json"), "cases_words:TEACHER", table)
+    text(str(room / "classes.json"), "cases_text:TEACHER", table)
     arguments = ["select", "lamp", str(field), "--text", str(table), "--score"]
     lamps = count(truth, names, "lamp")
     assert main([*arguments, "cosine", "--threshold", "0.999"]) == 0
@@ -238,11 +243,13 @@ def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
     made.save(table)
     assert main(["select", "lamp", str(field), "--text", str(table)]) == 0
     said = capsys.readouterr().out
-    assert "note: classes: expected text of the field's teacher (name 'letters'), got text of another ('clip')" in said
+    assert (
+        "note: --classes: expected text of the field's teacher (name 'letters'), got text of another ('clip')" in said
+    )
     assert main(["select", "palm", str(field), "--text", str(table), *LETTERS]) == 0
     said = capsys.readouterr().out
-    assert "note: text: expected a table by the query's teacher (name 'letters'" in said
-    assert "got one by another ('clip'); their spaces do not mix: take the table's teacher for the query" in said
+    assert "note: --text: expected a table by the query's teacher (name 'letters'" in said
+    assert "got one by another ('clip'); they cannot be compared: use the table's teacher for the query" in said
     assert "field's teacher" not in said  # the query is of the field's own
 
 
@@ -257,7 +264,7 @@ def test_words_of_another_teacher_are_noted(field, names, tmp_path, capsys):
         (["lamp", *LETTERS, "--negatives", "classes"], "negatives: expected other classes than 'lamp', got none"),
         (["lamp", "--text", "{table}", "--score", "cosine", "--negatives", "classes"], "none beside --score cosine"),
         (["lamp", "--text", "{table}", "--score", "softmax", "--negatives", "none"], "expected classes or canonical"),
-        (["lamp", "--teacher", "cases_words:MUTE"], "teacher 'mute': expected one with a text encoder"),
+        (["lamp", "--teacher", "cases_text:MUTE"], "teacher 'mute': expected one with a text encoder"),
         (["palm", "--text", "{other}", *LETTERS], "text of another teacher?"),
         (
             ["lamp", "--text", "{other}"],

@@ -4,53 +4,73 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from .options import Several
 
-def edits_from_words(
-    *,
-    recolor: Sequence[str] = (),
-    opacity: Sequence[str] = (),
-    scale: Sequence[str] = (),
-    rotate: Sequence[str] = (),
-    move: Sequence[str] = (),
-    duplicate: Sequence[str] = (),
-    remove: Sequence[str] = (),
-    extract: Sequence[str] = (),
-    insert: Sequence[str] = (),
-    mode: Literal["tint", "hue"] = "tint",
-) -> Iterator[Any]:
-    """The edits that some options ask for, in this order: what is removed later was still there to be recoloured.
 
-    A class may be followed by a part of it: `chair/1` is the largest connected part of all that is chair, `chair/2` the
-    next, as `connected_parts` lists them. Each edit counts them anew, in what the edits before left; all parts of one class that
-    are removed are counted together. A class whose own name ends so can be edited in Python alone.
+@dataclass(frozen=True)
+class Edits:
+    """Done in this order, whatever their order on the line; each may be given several times.
+
+    A class stands for everything that carries it, "chair/1" for the largest of its connected parts, "chair/2" for the next,
+    as `kfgs select chair SPLAT` lists them.
+    """
+
+    recolor: Several = ()
+    """A class and a colour, "plant:#c04040" or "plant:teal"."""
+    mode: Literal["tint", "hue"] = "tint"
+    """How to recolor: tint gives the colour itself and keeps the shading, hue keeps the lightness."""
+    opacity: Several = ()
+    """A class and a factor from 0 to 1, "lamp:0.3"."""
+    scale: Several = ()
+    """A class and a factor, "lamp:1.5"; about the centre of the class, or of its part."""
+    rotate: Several = ()
+    """A class, an axis of the world and degrees, "table:z,90"; by the right hand about the same centre."""
+    move: Several = ()
+    """A class and a translation in world units, "table:0.5,0,0"."""
+    duplicate: Several = ()
+    """A class and the translation of its copy, "chair:1,0,0"."""
+    remove: Several = ()
+    """A class, "chair", or a part of it, "chair/2"; copies of --duplicate are removed too."""
+    extract: Several = ()
+    """Keep only these classes, or parts of them."""
+    insert: Several = ()
+    """A splat file to add, "lamp.ply"; with a translation, "lamp.ply:1,0,0". No other edit touches it."""
+
+
+def parse_edits(asked: Edits) -> Iterator[Any]:
+    """The edits that the options ask for, in the order of `Edits`: what is removed last could be recoloured before.
+
+    Each edit counts the parts of a class (`chair/1`) in what the edits before left; all parts of one class that are
+    removed are counted together. A class whose own name ends in `/1` can only be edited in Python.
 
     Raises:
-        ValueError: if an option lacks its value, or the value is of another kind; the message quotes the words.
+        ValueError: if an option lacks its value, or the value is of another kind; the message quotes the option's text.
     """
     from ..labels.color import parse_color
     from ..labels.edits import Duplicate, Extract, Move, Opacity, Recolor, Remove, Turn
     from ..labels.edits.motion import AXES
     from ..labels.where import Either
 
-    for words in recolor:
+    for words in asked.recolor:
         name, value = _split("recolor", words, "plant:#c04040")
-        yield Recolor(_where("recolor", name), parse_color(value, "recolor"), mode)
-    for words in opacity:
+        yield Recolor(_where("recolor", name), parse_color(value, "recolor"), asked.mode)
+    for words in asked.opacity:
         name, value = _split("opacity", words, "lamp:0.3")
         (factor,) = _numbers("opacity", words, value, "a factor from 0 to 1", 1)
         if not 0 <= factor <= 1:
             raise ValueError(f"opacity: expected a factor from 0 to 1 after the colon, got {words!r}; 0 hides, 1 keeps")
         yield Opacity(_where("opacity", name), factor)
-    for words in scale:
+    for words in asked.scale:
         name, value = _split("scale", words, "lamp:1.5")
         (factor,) = _numbers("scale", words, value, "a factor above 0", 1)
         if factor <= 0:
             raise ValueError(f"scale: expected a factor above 0 after the colon, got {words!r}; 0.5 halves, 2 doubles")
         yield Move(_where("scale", name), scale=factor)
-    for words in rotate:
+    for words in asked.rotate:
         name, value = _split("rotate", words, "table:z,90")
         axis, _, degrees = value.partition(",")
         if axis not in AXES:
@@ -59,17 +79,17 @@ def edits_from_words(
             )
         (angle,) = _numbers("rotate", words, degrees, "an axis (x, y or z) and degrees", 1)
         yield Move(_where("rotate", name), rotation=Turn(AXES[axis], angle))
-    for words in move:
+    for words in asked.move:
         name, value = _split("move", words, "table:0.5,0,0")
         yield Move(_where("move", name), _numbers("move", words, value, "3 numbers between commas", 3))
-    for words in duplicate:
+    for words in asked.duplicate:
         name, value = _split("duplicate", words, "chair:1,0,0")
         yield Duplicate(_where("duplicate", name), _numbers("duplicate", words, value, "3 numbers between commas", 3))
-    for parts in _together(remove).values():
+    for parts in _together(asked.remove).values():
         yield Remove(parts[0] if len(parts) == 1 else Either(tuple(parts)))
-    if extract:
-        yield Extract(Either(tuple(_where("extract", words) for words in extract)))
-    for words in insert:
+    if asked.extract:
+        yield Extract(Either(tuple(_where("extract", words) for words in asked.extract)))
+    for words in asked.insert:
         yield _insertion(words)
 
 
@@ -78,6 +98,43 @@ def inserted_files(edits: Iterable[Any]) -> list[Path]:
     from ..labels.edits import Insert
 
     return [Path(edit.source) for edit in edits if isinstance(edit, Insert) and isinstance(edit.source, str | Path)]
+
+
+def check_parts(splats: Any, edits: Iterable[Any]) -> None:
+    """Raise a ValueError if an edit names a part of a class (`chair/6`) that `kfgs select` does not list.
+
+    Args:
+        splats: what the edits begin with.
+        edits: edits that `parse_edits` made.
+    """
+    import torch
+
+    from ..labels import component_numbers
+    from ..labels.parts import SPECK
+
+    for part in (part for edit in edits for part in _parts(getattr(edit, "where", None))):
+        name = part.where.name
+        mask = part.where.mask(splats)
+        numbers = component_numbers(splats.gaussians.means, mask, part.distance)
+        sizes = torch.bincount(numbers[mask])
+        count = int((sizes >= SPECK * sizes[0]).sum()) if len(sizes) else 0
+        if part.rank >= count:
+            raise ValueError(
+                f"{name}/{part.rank + 1}: expected a part from {name}/1 to {name}/{count}, got no part of that number; "
+                f"`kfgs select {name} SPLAT` lists them"
+                if count
+                else f"{name}/{part.rank + 1}: expected Gaussians of class {name!r}, got none in this splat; "
+                "`kfgs info SPLAT` lists what it holds"
+            )
+
+
+def _parts(where: Any) -> list[Any]:
+    """The parts of classes that a selection names."""
+    from ..labels.where import Component, Either
+
+    if isinstance(where, Either):
+        return [part for one in where.parts for part in _parts(one)]
+    return [where] if isinstance(where, Component) else []
 
 
 def _where(option: str, words: str) -> Any:
@@ -93,7 +150,7 @@ def _where(option: str, words: str) -> Any:
 
 
 def _together(remove: Sequence[str]) -> dict[str, list[Any]]:
-    """What is removed of each class, whatever the case of its name: removing one part would number the others anew."""
+    """What is removed of each class, whatever the case of its name: removing one part changes the numbers of the others."""
     found: dict[str, list[Any]] = {}
     for words in dict.fromkeys(remove):
         where = _where("remove", words)

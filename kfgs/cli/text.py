@@ -1,4 +1,4 @@
-"""Words and teachers: the command text, and any phrase as a query."""
+"""The command text: a table of classes from words or examples; and any phrase as a query."""
 
 from __future__ import annotations
 
@@ -6,41 +6,47 @@ import dataclasses
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
+from .files import check_alone, open_field
+from .options import Classes, Flag, Given, Name, Positional, Teacher
+from .output import say, wrote
 
-from .checks import check_alone, open_field
-from .say import field_classes, find_classes, load_classes, say, wrote
-
-# Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
+# Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
 
 
 def text(
-    names: Annotated[str | None, tyro.conf.Positional] = None,
-    teacher: str | None = None,
+    names: Positional[Given[str]] = None,
+    *,
     out: Path = Path("text.safetensors"),
-    weights: str | None = None,
-    templates: str | None = None,
-    negatives: bool = True,
-    examples: Path | None = None,
-    field: Path | None = None,
+    templates: Name = None,
+    no_negatives: Flag = False,
+    examples: Given[Path] = None,
+    field: Given[Path] = None,
+    teacher: Teacher,
 ) -> None:
-    """Make classes for all other commands (--text): embed words with a teacher's text encoder, or show examples.
+    """Make a table of classes: embed words with a teacher's text encoder, or learn classes from examples.
+
+    Other commands take the table as --text; SCENE/text.safetensors is found without it.
+
+    Examples:
+        kfgs text wall,floor,chair,plant --teacher lseg --weights demo_e200.ckpt --out scene/text.safetensors
+        kfgs text "chair;armchair;seat,plant" --teacher clip --weights openai/clip-vit-base-patch16
+        kfgs text --examples clicks.json --field run/field    # for a teacher without text
+
+    In clicks.json each class has its examples: {"chair": [{"view": "a.png", "points": [[x, y]]}, {"view": "b.png",
+    "box": [x0, y0, x1, y1]}, {"gaussians": [3, 14]}], ...}
 
     Args:
-        names: classes.json (a list), a .txt file (a class a line), or words between commas. A class may have synonyms:
+        names: Words between commas, a .txt file (a class a line), or a .json file (a list). Synonyms follow a semicolon:
             "chair;armchair;seat" is called chair.
-        teacher: lseg, clip, siglip, ... (a wrong name lists them), or package.module:name of your own.
-        examples: a .json file in place of words, for a teacher without text: {"chair": [{"view": "a.png", "points": [[x, y]]},
-            {"view": "b.png", "box": [x0, y0, x1, y1]}, {"gaussians": [3, 14]}], ...}; beside --field.
-        field: the field folder that the examples are shown in.
-        out: the table to write, .safetensors; as SCENE/text.safetensors it is found by itself.
-        weights: checkpoint file (lseg), or folder or hub id (the others).
-        templates: bare (as LSeg and the paper), clip7, tcl9, siglip, or one of your own with {} for the word; what suits
-            the teacher when not given.
-        negatives: embed LERF's canonical words (object, things, stuff, texture) as well, for `kfgs select --negatives
-            canonical`.
+        out: The table to write (.safetensors).
+        templates: Sentences around each word: bare (none, as LSeg and the paper), clip7, tcl9, siglip, or your own with {}
+            for the word; when not given, what suits the teacher.
+        no_negatives: Leave out LERF's canonical words (object, things, stuff, texture), which `kfgs select --negatives
+            canonical` needs.
+        examples: A .json file of examples instead of words.
+        field: The field folder in which the examples are shown.
     """
     from ..labels import CANONICAL
     from ..labels.label_set import SUFFIX
@@ -49,7 +55,7 @@ def text(
     if out.suffix != SUFFIX or out.is_dir():
         raise ValueError(f"out: expected a file whose name ends in {SUFFIX}, got {out}; give another name")
     if examples is not None:
-        for name, given in (("names", names), ("teacher", teacher), ("weights", weights), ("templates", templates)):
+        for name, given in ({"names": names, "templates": templates} | dataclasses.asdict(teacher)).items():
             check_alone(name, given, "beside --examples, which take the place of words")
         if field is None:
             raise ValueError(
@@ -57,18 +63,19 @@ def text(
             )
         from ..fields import label_set_from_examples, read_examples
 
-        shown = label_set_from_examples(open_field(field), read_examples(examples))
+        shown = label_set_from_examples(open_field("field", field), read_examples(examples))
         shown.save(out)
         say(f"{len(shown)} classes, {shown.dim} channels each, by examples: {', '.join(shown.names)}")
         wrote([out])
         return
     check_alone("field", field, "without --examples, which are shown in it")
-    if names is None or teacher is None:
+    if names is None or teacher.teacher is None:
         raise ValueError(
-            "names, teacher: expected words and --teacher, or --examples and --field, got neither whole pair"
+            "names, teacher: expected words and --teacher, or --examples and --field, got neither whole pair; "
+            "see `kfgs text --help`"
         )
     words, patterns = read_words(names), None if templates is None else template_set(templates)
-    made = embed(teacher, weights, words, templates=patterns, negatives=CANONICAL if negatives else None)
+    made = text_encoder(teacher)(words, templates=patterns, negatives=None if no_negatives else CANONICAL)
     made.save(out)
     templates_used = ", ".join(map(repr, made.info["templates"]))
     say(f"{len(made)} classes, {made.dim} channels each, by {made.info['teacher']['name']}, as {templates_used}")
@@ -78,9 +85,9 @@ def text(
 
 
 def read_words(names: str) -> list[str]:
-    """Class names out of a .json list, a .txt file with a class a line, or words between commas.
+    """Class names from a .json list, a .txt file with a class a line, or words between commas.
 
-    What ends in neither is words, even where a folder has the same name; a file without these endings is an error.
+    Text with neither ending is words, even if a folder has the same name; a file with another ending is an error.
 
     Raises:
         FileNotFoundError: if the file is not there.
@@ -125,12 +132,7 @@ def _words_of_file(name: str, kind: str) -> Any:
         ) from error
 
 
-def embed(teacher: str, weights: str | None, names: Sequence[str], **options: Any) -> Any:
-    """The label set that a teacher makes of words, once; `text_encoder` for more than once."""
-    return text_encoder(teacher, weights)(names, **options)
-
-
-def text_encoder(teacher: str, weights: str | None) -> Callable[..., Any]:
+def text_encoder(teacher: Teacher) -> Callable[..., Any]:
     """A function that makes label sets of words (`teachers.prompts.make_label_set`) with a teacher that is loaded now.
 
     The function raises a ValueError if the teacher has no text encoder.
@@ -138,7 +140,8 @@ def text_encoder(teacher: str, weights: str | None) -> Callable[..., Any]:
     from ..teachers.load import load_teacher
     from ..teachers.prompts import make_label_set
 
-    loaded = load_teacher(teacher, weights)
+    assert teacher.teacher is not None
+    loaded = load_teacher(teacher.teacher, teacher.weights)
 
     def encode(names: Sequence[str], **options: Any) -> Any:
         try:
@@ -149,38 +152,27 @@ def text_encoder(teacher: str, weights: str | None) -> Callable[..., Any]:
     return encode
 
 
-def ask(
-    query: str,
-    sources: tuple[Path | None, Path | None, Path | None],
-    teacher: str | None,
-    weights: str | None,
-    field: Any,
-) -> tuple[Any, Any]:
-    """The label set to look a query up in, and what to ask for: a class's name, or a phrase's embedding.
+def ask(query: str, classes: Classes, teacher: Teacher, field: Any) -> tuple[Any, Any]:
+    """The label set to look a query up in, and what to ask for: the name of a class, or the embedding of a phrase.
 
     Without a teacher the query is a class of the table. With one it may be any phrase, embedded in the table's templates;
-    canonical negatives come from the teacher.
-
-    Args:
-        query: class name or phrase.
-        sources: scene, classes and text, as `load_classes` takes them; without any the field's own.
-        teacher: name of a teacher with text.
-        weights: its weights.
-        field: whose own label set counts where no source is given.
+    canonical negatives then come from the teacher. If the options name no table, the field's own classes count.
     """
-    if teacher is None:
-        check_alone("weights", weights, "without --teacher, whose weights they are")
-        label_set = field_classes(field, *sources)
+    if teacher.teacher is None:
+        teacher.check_weights()
+        label_set = classes.of_field(field)
         try:
             return label_set, label_set.names[label_set.index(query)]
         except ValueError as error:
             raise ValueError(
                 f"{error}; for any other phrase pass --teacher and --weights, or add it to the table with `kfgs text`"
             ) from error
-    found = find_classes(*sources)
-    there = found is not None and (any(sources[1:]) or all(path.is_file() for path in found))
-    label_set = load_classes(*sources) if there else field.label_set() if "classes" in field.info else None
-    asked = embed(teacher, weights, [query], templates=None if label_set is None else label_set.info.get("templates"))
+    found = classes.files()
+    named = classes.classes is not None or classes.text is not None
+    there = found is not None and (named or all(path.is_file() for path in found))
+    label_set = classes.load_classes() if there else field.label_set() if "classes" in field.info else None
+    templates = None if label_set is None else label_set.info.get("templates")
+    asked = text_encoder(teacher)([query], templates=templates)
     if label_set is None:
         return asked, asked.names[0]
     note_other_teacher(asked, label_set)
@@ -194,9 +186,9 @@ def ask(
 
 
 def note_other_teacher(asked: Any, table: Any) -> None:
-    """Say where a query and the table whose classes it joins were embedded by different teachers.
+    """Say so if a query and the table that it is compared with were embedded by different teachers.
 
-    Whether the query fits the field is told apart from this, by `SemanticField.query`.
+    `SemanticField.query` says whether the query fits the field.
     """
     from ..labels.label_set import teacher_difference
 
@@ -204,7 +196,7 @@ def note_other_teacher(asked: Any, table: Any) -> None:
     if found is not None:
         key, query, classes = found
         say(
-            f"note: text: expected a table by the query's teacher ({key} {query!r:.40}, from --teacher and --weights), got one "
-            f"by another ({classes!r:.40}); their spaces do not mix: take the table's teacher for the query, or pass a table "
-            "of the query's teacher as --text"
+            f"note: --text: expected a table by the query's teacher ({key} {query!r:.40}, from --teacher and --weights), got "
+            f"one by another ({classes!r:.40}); they cannot be compared: use the table's teacher for the query, or pass a "
+            "table of the query's teacher as --text"
         )

@@ -1,0 +1,95 @@
+"""Files that commands read and write: checked before the work, so that nothing is found out after minutes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+# Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
+
+
+def check_file(name: str, target: Path) -> None:
+    """Raise a ValueError unless `target` is a file or can become one."""
+    _check_place(name, target, "a file")
+
+
+def check_folder(name: str, target: Path) -> None:
+    """Raise a ValueError unless `target` is a folder or can become one."""
+    _check_place(name, target, "a folder")
+
+
+def check_target(name: str, target: Path, *sources: Path) -> None:
+    """Raise a ValueError unless `target` can become a splat file that overwrites none of the sources."""
+    from ..formats import formats
+
+    endings = tuple(ending for one in formats().values() if hasattr(one, "write") for ending in one.SUFFIXES)
+    if not target.name.lower().endswith(endings):
+        raise ValueError(
+            f"{name}: expected a file whose name ends in one of {', '.join(endings)}, got {target}; "
+            "the ending chooses the format"
+        )
+    check_file(name, target)
+    for source in sources:
+        if target.resolve() == source.resolve():
+            raise ValueError(f"{name}: expected another file than {source}, got the same; give another name")
+
+
+def check_alone(name: str, given: object, why: str) -> None:
+    """Raise a ValueError if an option is given that would have no effect; None, or False for a flag: it is not given."""
+    if given is None or given is False:
+        return
+    shown = "--" + name.replace("_", "-") if given is True else given
+    raise ValueError(f"{name}: expected none {why}, got {shown}; leave it out")
+
+
+def is_field(path: Path) -> bool:
+    """Whether a path is a field folder, or a run folder with one in it (`open_field` then names that one)."""
+    return any((folder / "field.json").is_file() for folder in (path, path / "field"))
+
+
+def open_field(name: str, field: Path) -> Any:
+    """Load a semantic field.
+
+    Raises:
+        ValueError: if the path is something else; a run folder gets a hint of its own.
+    """
+    from ..fields import SemanticField
+
+    if not (field / "field.json").is_file():
+        inside = field / "field"
+        what = "a file" if field.is_file() else "a folder without one" if field.is_dir() else "no such folder"
+        hint = "make one with `kfgs fit`"
+        if is_field(inside):
+            what, hint = "a run folder", f"pass {inside}"
+        raise ValueError(
+            f"{name}: expected the folder that `kfgs fit` wrote (RUN/field, with field.json), got {field}, {what}; {hint}"
+        )
+    return SemanticField.load(field)
+
+
+def open_splats(name: str, path: Path, *, labelled: bool = False) -> Any:
+    """Read a splat file.
+
+    Raises:
+        ValueError: if the path is a semantic field, or the splat has no classes and `labelled` asks for them.
+    """
+    from ..formats import read_splats
+
+    if is_field(path):
+        raise ValueError(
+            f"{name}: expected a splat file, got {path}, a semantic field; pass a colour splat, for example what "
+            "`kfgs color` writes"
+        )
+    splats = read_splats(path)
+    if labelled and splats.gaussians.labels is None:
+        raise ValueError(f"{name}: expected a splat with classes, got {path} without; `kfgs attach` gives it some")
+    return splats
+
+
+def _check_place(name: str, target: Path, kind: str) -> None:
+    if target.exists() and target.is_dir() != (kind == "a folder"):
+        other = "a file" if kind == "a folder" else "a folder"
+        raise ValueError(f"{name}: expected {kind} or nothing at {target}, got {other}; give another name")
+    above = next(place for place in (*target.parents, Path("/")) if place.exists())
+    if not above.is_dir():
+        raise ValueError(f"{name}: expected a folder to write to, got {target} below the file {above}; give another")

@@ -1,0 +1,263 @@
+"""Commands that make fields and what they need: demo, sfm, fit, uplift, color."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any, Literal
+
+from .files import check_alone, check_folder, open_field, open_splats
+from .options import (
+    Flag,
+    Given,
+    Maps,
+    MapTeacher,
+    Method,
+    Mode,
+    Positional,
+    Preset,
+    SceneFolder,
+    Training,
+    Views,
+    fit_config,
+)
+from .output import say, wrote
+from .teach import check_discard, choose_teacher, stored_maps
+
+# Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
+
+
+def demo(out: Path = Path("kfgs_demo"), seed: int = 0) -> None:
+    """See all of kfgs at work on a toy room that it makes itself (about five minutes).
+
+    It fits a semantic field, segments unseen views, labels points, edits colours, and scores each against the exact truth.
+
+    Examples:
+        kfgs demo
+        kfgs demo --out somewhere/else
+
+    Args:
+        out: Folder for the scene, the run and its results; running again continues where it stopped.
+        seed: Every random choice follows from it.
+    """
+    from ..pipeline import demo as run_demo
+    from ..toy.room_folder import ToyConfig
+
+    wrote(run_demo.run(out, fit_config(seed=seed), room=ToyConfig(seed=seed), report=say, progress=True))
+    say(f"next: kfgs view {out / 'run' / 'field'} --scene {out / 'scene'} --color {out / 'color.ply'}")
+
+
+def sfm(
+    images: Positional[Path],
+    out: Path,
+    matching: Literal["exhaustive", "sequential"] = "exhaustive",
+    camera_model: str = "SIMPLE_RADIAL",
+    no_single_camera: Flag = False,
+    min_registered: float = 0.9,
+    seed: int = 0,
+) -> None:
+    """Find the cameras of a folder of photographs (structure from motion, pycolmap).
+
+    Examples:
+        kfgs sfm photos/ --out scene/
+        kfgs sfm frames/ --out scene/ --matching sequential    # frames of a video
+
+    Args:
+        images: Folder of photographs.
+        out: Scene folder to make; OUT/sparse/0 receives the COLMAP model.
+        matching: sequential for the frames of a video, exhaustive for everything else.
+        camera_model: COLMAP's name of the lens model.
+        no_single_camera: The photographs were taken with several cameras, or with changes of zoom.
+        min_registered: Share of the images that must be placed; fewer is an error.
+        seed: Every random choice follows from it.
+    """
+    from ..scenes import SfmConfig, run_sfm
+
+    config = SfmConfig(
+        matching=matching,
+        camera_model=camera_model,
+        single_camera=not no_single_camera,
+        min_registered=min_registered,
+        seed=seed,
+    )
+    say(str(run_sfm(images, out, config=config, progress=True)))
+    written = [out / "sparse" / "0"]
+    beside = out / "images"
+    if not os.path.lexists(beside):
+        beside.symlink_to(images.resolve(), target_is_directory=True)  # so that `kfgs fit OUT` finds the pictures
+        written.append(beside)
+    elif beside.resolve() != images.resolve():
+        say(f"note: {beside} is another folder; pass --images {images} to the other commands")
+    wrote(written)
+
+
+def fit(
+    scene: SceneFolder,
+    out: Path,
+    *,
+    splat: Given[Path] = None,
+    method: Method = "fuse",
+    preset: Preset = "cpu",
+    mode: Given[Mode] = None,
+    discard_features: Flag = False,
+    views: Views,
+    maps: Maps,
+    teacher: MapTeacher,
+    training: Training,
+) -> None:
+    """Make a semantic field of a scene and its teacher features.
+
+    The features are averaged onto Gaussians in 3-D and then compressed. The Gaussians are those of --splat. Without it
+    they are trained on the pictures first; `kfgs color` with the same --out makes better ones, which are then used.
+
+    Examples:
+        kfgs fit scene/ --out run/ --splat my.ply
+        kfgs fit scene/ --out run/ --features maps/
+        kfgs fit scene/ --out run/ --teacher lseg --weights demo_e200.ckpt    # stores no feature maps
+        kfgs fit scene/ --out run/ --method paper --preset paper
+
+    Args:
+        out: Run folder; OUT/field receives the field. Running again continues where it stopped.
+        splat: Any splat file of the scene, in its frame: the Gaussians to average onto.
+        method: fuse as described above; paper compresses maps per pixel and trains Gaussians on them (DF-3DGS).
+        preset: cpu (minutes on two cores) or paper (30,000 steps of training).
+        mode: For --method paper: adc+sc (codebook and autoencoder, 9 channels; the default), adc (codebook) or
+            decouple (raw features).
+        discard_features: Delete the feature maps when the stages made of them are done. Later runs with the same options
+            do not need them; runs with other options (another --splat, for example) do.
+    """
+    from .._files import bytes_in_words
+    from ..features import RecomputedMaps, discard_maps
+    from ..pipeline import fit_scene, write_training_pictures
+    from ..pipeline.train import check_scene
+
+    config = fit_config(preset, method, mode, training.seed, training.steps, training.max_gaussians, views.split)
+    config = dataclasses.replace(config, undistorted_features=maps.undistorted_features, device=training.device)
+    check_folder("out", out)
+    if method == "paper":
+        check_alone("splat", splat, "beside --method paper, which trains its own Gaussians")
+    elif splat is not None:
+        check_alone("steps", training.steps, "beside --splat, which needs no training")
+    as_taken = views.load(scene)
+    loaded = as_taken.undistorted()
+    check_scene(loaded)  # before hours of features
+    chosen = loaded.views(views.split)
+    if teacher.teacher is not None:
+        for name, given in (("features", maps.features), ("level", maps.level)):
+            check_alone(name, given, "beside --teacher, whose maps are not stored")
+        check_alone("discard_features", discard_features, "beside --teacher, which stores no dense maps")
+        check_alone(
+            "undistorted_features", maps.undistorted_features, "beside --teacher, which sees the pictures as taken"
+        )
+        network = choose_teacher(teacher.teacher, teacher.weights, teacher.fast, teacher.size, training.device)
+        found: Any = RecomputedMaps(network, as_taken, views.split, out / "teacher")
+    else:
+        teacher.check_weights()
+        check_alone("size", teacher.size or None, "without --teacher, whose option it is")
+        check_alone("fast", teacher.fast, "without --teacher, whose option it is")
+        found = stored_maps(as_taken, chosen, maps.folder(scene), maps.level)
+        if discard_features:
+            check_discard(found, config)
+    result = fit_scene(loaded, found, out, config, splat=splat, report=say, progress=True)
+    if teacher.teacher is not None:
+        found.clear()  # the samples; the stages made of them are found without
+    say(result.field.summary())
+    written = [result.field_path, *write_training_pictures(result)]
+    if discard_features:
+        freed = discard_maps(found.path, found.stems)
+        say(
+            f"{found.path}: {bytes_in_words(freed)} of {len(found)} dense maps deleted; what was made of them is in {out}"
+        )
+    wrote(written)
+
+
+def uplift(
+    scene: SceneFolder,
+    splat: Positional[Path],
+    out: Path,
+    *,
+    max_gaussians: Given[int] = None,
+    views: Views,
+    maps: Maps,
+) -> None:
+    """Give every Gaussian of a splat the teacher's features, without training: `kfgs fit` without merging.
+
+    Examples:
+        kfgs uplift scene/ my.ply --out field/
+        kfgs uplift scene/ my.ply --out field/ --features maps/ --max-gaussians 100000
+
+    Args:
+        splat: Any splat file of the scene, or a field folder, in the scene's frame.
+        out: The field folder to write.
+        max_gaussians: Prune and merge to at most this many; every Gaussian is kept when not given.
+    """
+    from ..fields import UpliftConfig
+    from ..pipeline import FitConfig
+    from ..pipeline.fuse import uplift as uplift_scene
+
+    check_folder("out", out)
+    as_taken = views.load(scene)
+    loaded = as_taken.undistorted()
+    found = stored_maps(as_taken, loaded.views(views.split), maps.folder(scene), maps.level)
+    cloud = (
+        open_field("splat", splat).gaussians
+        if (splat / "field.json").is_file()
+        else open_splats("splat", splat).gaussians
+    )
+    fused = UpliftConfig(max_gaussians=max_gaussians)
+    config = FitConfig(uplift=fused, split=views.split, undistorted_features=maps.undistorted_features)
+    field = uplift_scene(loaded, found, cloud, config, folder=out, progress=True, report=say)
+    field.save(out)
+    say(field.summary())
+    wrote([out])
+
+
+def color(
+    scene: SceneFolder,
+    out: Path,
+    *,
+    preset: Literal["quick", "cpu", "paper"] = "cpu",
+    pictures: int = 4,
+    views: Views,
+    training: Training,
+) -> None:
+    """Train a colour splat (3-D Gaussian Splatting) on a scene, and score it on the views held out.
+
+    Examples:
+        kfgs color scene/ --out run/
+        kfgs color scene/ --out run/ --preset paper --device cuda
+
+    Args:
+        out: Run folder; OUT/color.ply receives the splat. Running again continues where it stopped.
+        preset: quick (a minute, for small scenes), cpu (minutes on two cores) or paper (30,000 steps, full size, degree 3:
+            for a GPU).
+        pictures: How many of the views held out are drawn beside their photographs.
+    """
+    from .._check import check_whole
+    from ..evaluation.color import score_views
+    from ..pipeline import write_report
+    from ..pipeline.color import ColorConfig, fit_color
+    from ..pipeline.compare import PhotoPictures
+
+    check_whole("pictures", pictures, 0)
+    check_folder("out", out)
+    config = {"quick": ColorConfig.quick, "cpu": ColorConfig.cpu, "paper": ColorConfig.paper}[preset]()
+    fields = config.field if training.steps is None else config.field.with_steps(training.steps)
+    if training.max_gaussians is not None:
+        fields = dataclasses.replace(fields, max_gaussians=training.max_gaussians)
+    config = dataclasses.replace(config, seed=training.seed, split=views.split, field=fields)
+    loaded = views.load(scene).undistorted()
+    result = fit_color(loaded, out, config, report=say, progress=True, device=training.device)
+    took = f"{result.seconds / 60:.1f} min" if result.seconds >= 60 else f"{result.seconds:.0f} s"
+    say(f"{result.gaussians!r} in {took}")
+    written = [result.path]
+    if loaded.splits.get("test"):
+        beside = PhotoPictures(out / "views", [loaded.stem(i) for i in loaded.views("test")], pictures)
+        scores = score_views(result.gaussians, loaded, "test", show=beside)
+        say(str(scores))
+        write_report(out / "scores.json", color=scores)
+        written += [*beside.written, out / "scores.json"]
+    else:
+        say("note: no views are held out (split 'test'): nothing to score against")
+    wrote(written)

@@ -1,0 +1,242 @@
+"""Options that several commands share, each described once: scene, images, classes, text, teacher, weights, training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import tyro
+from tyro.conf import Positional as Positional
+
+from .files import check_alone, open_field
+from .output import say
+
+# Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
+
+T = TypeVar("T")
+_quiet = tyro.conf.arg(help_behavior_hint="")  # no "(default: None)" in the help
+Given = Annotated[T | None, _quiet]  # None when the option is not given
+Flag = Annotated[bool, _quiet]
+Name = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
+Device = Annotated[str, tyro.conf.arg(metavar="NAME")]
+Several = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="TEXT")]
+
+Preset = Literal["cpu", "paper"]
+Method = Literal["fuse", "paper"]
+Mode = Literal["decouple", "adc", "adc+sc"]
+Level = Literal["default", "s", "m", "l"]  # of LangSplat: SAM's own choice of masks; subparts, parts, wholes
+
+
+SceneFolder = Annotated[
+    Path, Positional, tyro.conf.arg(help="Folder with images and a COLMAP model or transforms.json.")
+]
+
+
+@dataclass(frozen=True)
+class Views:
+    """Which pictures of the scene are used."""
+
+    images: Given[Path] = None
+    """Folder of the pictures, if it is not SCENE/images."""
+    split: Annotated[str, tyro.conf.arg(metavar="NAME")] = "train"
+    """Which views: train, test, or another split that SCENE/split.json names; `kfgs features` also takes all."""
+
+    def load(self, scene: Path) -> Any:
+        """The scene as its pictures were taken; its notes are printed."""
+        from ..scenes import load_scene
+
+        loaded = load_scene(scene, images=self.images)
+        for note in loaded.notes:
+            say(f"note: {note}")
+        return loaded
+
+
+@dataclass(frozen=True)
+class Maps:
+    """Feature maps that exist already."""
+
+    features: Given[Path] = None
+    """Folder of maps by `kfgs features`, Feature 3DGS or LangSplat; SCENE/features when not given."""
+    level: Given[Level] = None
+    """Which masks of LangSplat's maps: default, subparts (s), parts (m) or wholes (l)."""
+    undistorted_features: Flag = False
+    """The teacher saw undistorted pictures, so no lens has to be removed from its maps."""
+
+    def folder(self, scene: Path) -> Path:
+        """The folder of maps of a scene (a folder, or a transforms.json); a ValueError if there is none."""
+        folder = self.features or (scene if scene.is_dir() else scene.parent) / "features"
+        if not folder.is_dir():
+            raise ValueError(
+                f"features: expected a folder of feature maps, got {folder}, which is none; name another, or make them with "
+                "`kfgs features`"
+            )
+        return folder
+
+
+@dataclass(frozen=True)
+class Teacher:
+    """The network whose features, or whose text encoder, is used."""
+
+    teacher: Name = None
+    """lseg, clip, siglip, ... (a wrong name lists all), or package.module:name of your own."""
+    weights: Name = None
+    """Its checkpoint file (lseg, sam), or a folder or hub id (the others)."""
+
+    def check_weights(self) -> None:
+        """Raise a ValueError if there are weights and no teacher."""
+        if self.teacher is None:
+            check_alone("weights", self.weights, "without --teacher, whose weights they are")
+
+
+@dataclass(frozen=True)
+class MapTeacher(Teacher):
+    """The network that makes the feature maps."""
+
+    fast: Flag = False
+    """One pass over each picture instead of the exact evaluation at several scales (lseg)."""
+    size: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N [N]", help_behavior_hint="")] = ()
+    """Height and width of the maps (lseg), or the longer side of the pictures in pixels (the others)."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """How long and where to train."""
+
+    steps: Given[int] = None
+    """Training steps; the preset's when not given."""
+    max_gaussians: Given[int] = None
+    """At most this many Gaussians; the preset's when not given."""
+    seed: int = 0
+    """Every random choice follows from it."""
+    device: Device = "auto"
+    """auto (a GPU if there is one), cpu or cuda."""
+
+
+@dataclass(frozen=True)
+class SceneOption:
+    """The scene, where its cameras and pictures are needed."""
+
+    scene: Given[Path] = None
+    """Scene folder in the same frame: cameras, pictures and classes."""
+    images: Given[Path] = None
+    """Folder of its pictures, if it is not SCENE/images."""
+
+    def check_images(self) -> None:
+        """Raise a ValueError if there are images and no scene."""
+        if self.scene is None:
+            check_alone("images", self.images, "without --scene, whose pictures they are")
+
+    def load_scene(self) -> Any:
+        """The scene as its pictures were taken."""
+        from ..scenes import load_scene
+
+        assert self.scene is not None
+        return load_scene(self.scene, images=self.images)
+
+
+@dataclass(frozen=True)
+class Classes(SceneOption):
+    """A field remembers its scene and classes. These options name others."""
+
+    classes: Given[Path] = None
+    """List of class names (.json); SCENE/classes.json when not given."""
+    text: Given[Path] = None
+    """Text embeddings: a table of `kfgs text` (.safetensors) or a row for each class (.npy); SCENE/text.* when not given."""
+
+    def files(self) -> tuple[Path, ...] | None:
+        """What `load_label_set` takes: a table alone, or names and rows; None if nothing says where they are."""
+        scene, classes, text = self.scene, self.classes, self.text
+        if classes is not None and classes.suffix == ".safetensors":
+            check_alone("text", text, f"beside the table {classes}")
+            return (classes,)
+        if text is not None and classes is None and text.suffix == ".safetensors":
+            return (text,)
+        if scene is not None:
+            if text is None:
+                rows, table = scene / "text.npy", scene / "text.safetensors"
+                text = table if table.is_file() and not rows.is_file() else rows
+            listed = scene / "classes.json"
+            if classes is None and text.suffix == ".safetensors" and not listed.is_file():
+                return (text,)
+            classes = listed if classes is None else classes
+        return None if classes is None or text is None else (classes, text)
+
+    def load_classes(self) -> Any:
+        """The label set of these files.
+
+        If the scene has a `classes.json`, it chooses and orders the classes of the scene's table, because label pictures
+        hold indices into it. A table given by name is taken whole unless --classes is given too.
+        """
+        from ..labels import load_label_set
+
+        found = self.files()
+        if found is None:
+            raise ValueError(
+                "classes, text: expected class names (.json) and embeddings (.npy), or a table (.safetensors), got none; "
+                "pass --classes and --text, or --scene, or --text alone with what `kfgs text` made"
+            )
+        label_set = load_label_set(*found)
+        listed = None if self.scene is None else self.scene / "classes.json"
+        if self.text is not None and len(found) == 1 and listed is not None and listed.is_file():
+            from .._files import read_json
+
+            if tuple(read_json(listed)) != label_set.names:
+                say(
+                    f"note: labels count the classes of {self.text}; those of {listed} differ. "
+                    f"Pass --classes {listed} to use them"
+                )
+        return label_set
+
+    def of_field(self, field: Any) -> Any:
+        """The label set that these options name; if they name none, the one that the field remembers."""
+        given = any(path is not None for path in (self.scene, self.classes, self.text))
+        return self.load_classes() if given or "classes" not in field.info else field.label_set()
+
+    def open_field(self, name: str, path: Path) -> Any:
+        """A field with what its views show of each Gaussian; an old field asks the views of --scene, if that is given."""
+        field = open_field(name, path)
+        if field.linear is not None and (field.cameras or self.scene is None):
+            return field
+        if self.scene is None:
+            say(
+                "note: this field was made before fields kept what the views show of each Gaussian; each one's own latent "
+                "answers, which is noisy. Pass --scene, or fit it again"
+            )
+            return field
+        loaded = self.load_scene().undistorted()
+        trained = set(field.info.get("views", ())) or {loaded.cameras[i].name for i in loaded.splits.get("train", ())}
+        voting = [camera for camera in loaded.cameras if camera.name in trained]
+        if not voting:
+            raise ValueError(
+                f"scene: expected the views that the field was trained on ({', '.join(sorted(trained)[:3])}, ...), got "
+                f"{len(loaded.cameras)} others in {self.scene}; pass the field's own scene, or --classes and --text instead"
+            )
+        return field.with_answers(voting)
+
+
+def fit_config(
+    preset: Preset = "cpu",
+    method: Method = "fuse",
+    mode: Mode | None = None,
+    seed: int = 0,
+    steps: int | None = None,
+    max_gaussians: int | None = None,
+    split: str = "train",
+) -> Any:
+    """The options of a fit, from a preset and what was given beside it."""
+    from ..pipeline import FitConfig
+    from ..pipeline.color import ColorConfig
+
+    if mode is not None and method != "paper":
+        raise ValueError(f"mode: expected none for method {method!r}, got {mode!r}; pass --method paper as well")
+    config = FitConfig.cpu() if preset == "cpu" else FitConfig.paper(method=method, color=ColorConfig.paper())
+    config = replace(config, method=method, mode=mode or config.mode, seed=seed, split=split)
+    if steps is not None:
+        color = replace(config.color, field=config.color.field.with_steps(steps))
+        config = replace(config, color=color, field=config.field.with_steps(steps))
+    if max_gaussians is not None:
+        fields = replace(config.field, max_gaussians=max_gaussians)
+        uplift = replace(config.uplift, max_gaussians=max_gaussians)
+        config = replace(config, field=fields, uplift=uplift)
+    return config

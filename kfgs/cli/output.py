@@ -1,0 +1,50 @@
+"""What commands print: lines, the files they wrote, counts of Gaussians, and warnings as notes."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+
+def say(text: str) -> None:
+    """Print a line at once."""
+    print(text, flush=True)  # noqa: T201 - the place that prints
+
+
+def wrote(paths: list[Path]) -> None:
+    """Name the files that a command wrote."""
+    say("wrote:")
+    for path in paths:
+        say(f"  {path}" + (f"  ({sum(1 for p in path.iterdir())} files)" if path.is_dir() else ""))
+
+
+def say_counts(labels: Any, names: Sequence[str]) -> None:
+    """Print how many Gaussians each class has, and how many have none if there are any."""
+    for i, name in enumerate(names):
+        say(f"  {name:<16s} {int((labels == i).sum()):8d} Gaussians")
+    if bool((labels < 0).any()):
+        say(f"  {'(none)':<16s} {int((labels < 0).sum()):8d} Gaussians")
+
+
+def say_lost(written: Any) -> None:
+    """Say what the format of a splat file (`Written`) could not hold, and whether it reordered the Gaussians."""
+    for words in written.lost:
+        say(f"note: {words}")
+    if written.order is not None:
+        say("note: neighbours now lie side by side (Morton order), so indices into the old file do not fit the new one")
+
+
+@contextmanager
+def warnings_as_notes(spoken: Callable[[str], str]) -> Iterator[None]:
+    """Print the warnings of kfgs about classes and teachers as notes of one line each, in the words of `spoken`."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("always", message="classes: ")
+
+        def note(message: Warning | str, *_: Any, **__: Any) -> None:
+            say(f"note: {spoken(str(message))}")
+
+        warnings.showwarning = note
+        yield

@@ -1,0 +1,218 @@
+"""Commands for colour splats: attach, edit, convert."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from itertools import accumulate
+from pathlib import Path
+from typing import Any, Literal
+
+from .edit_syntax import Edits, check_parts, inserted_files, parse_edits
+from .files import check_alone, check_file, check_target, open_splats
+from .options import Classes, Flag, Given, Positional, SceneOption, Several
+from .output import say, say_counts, say_lost, wrote
+
+# Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
+
+TITLES = ("before", "after")
+
+
+def attach(
+    field: Positional[Path],
+    splats: Positional[Path],
+    out: Path,
+    *,
+    by: Given[Literal["views", "distance"]] = None,
+    method: Literal["nearest", "vote", "mahalanobis"] = "nearest",
+    distance: Given[float] = None,
+    splat_scene: Given[Path] = None,
+    same_frame: Flag = False,
+    classes: Classes,
+) -> None:
+    """Give every Gaussian of a splat file the class that a semantic field has at its place.
+
+    The frames of field and splat are compared first, and aligned if they differ.
+
+    Examples:
+        kfgs attach run/field run/color.ply --out labelled.ply
+        kfgs attach run/field my.spz --out labelled.spz --splat-scene my_scene/
+        kfgs attach run/field my.ply --out labelled.ply --by distance --distance 0.05    # the paper's rule
+
+    Args:
+        field: The folder that `kfgs fit` wrote (RUN/field).
+        splats: A splat of the same scene in any format, by any program.
+        out: The labelled splat to write; its ending chooses the format.
+        by: views (the default): the field segments its training views, and each Gaussian takes the class of the pixels that
+            it fills. distance: labelled Gaussians of the field within lambda decide, as in the paper (Sec. 3.4).
+        method: For --by distance: the nearest labelled Gaussian (as in the paper), a vote of those around, or their overlap
+            (mahalanobis), which is the best of the three for a field with noisy labels.
+        distance: The paper's lambda: the distance within which a label is carried over, in the splat's world units; from
+            the clouds' spacing when not given.
+        splat_scene: Scene folder of the splat's own cameras, if its frame differs: cameras of the same names align the two.
+            Without it the shapes of the clouds do.
+        same_frame: Do not compare the frames; they are the same.
+    """
+    from ..cameras.similarity import Similarity
+    from ..formats import write_splats
+    from ..pipeline.attach import attach as attach_field
+    from ..scenes import SceneError, load_scene
+
+    check_target("out", out, splats)
+    classes.check_images()
+    if same_frame and splat_scene is not None:
+        raise ValueError("same_frame: expected it alone, got --splat-scene too, whose cameras find the frame; drop one")
+    loaded, cloud = classes.open_field("field", field), open_splats("splats", splats)
+    for name, asked in (("by", by == "views"), ("splat_scene", splat_scene is not None)):
+        if asked and not loaded.cameras:
+            raise ValueError(
+                f"{name}: expected --scene beside it for a field that remembers no cameras, got none; pass --scene"
+            )
+    label_set = classes.of_field(loaded)
+    same = Similarity.identity() if same_frame else None
+    frame = same if splat_scene is None else load_scene(splat_scene).undistorted().cameras
+    try:
+        found = attach_field(loaded, cloud, label_set, frame=frame, distance=distance, by=by, method=method)
+    except SceneError as error:
+        raise SceneError(
+            f"splats: no frame found in which field and splat agree: {error} (--splat-scene gives the splat's cameras, "
+            "--same-frame says that there is nothing to find)"
+        ) from error
+    for words in found.words:
+        say(words)
+    say_counts(found.labels, label_set.names)
+    written = write_splats(out, found.splats)
+    say_lost(written)
+    wrote(written.paths)
+
+
+def edit(
+    splats: Positional[Path],
+    out: Path,
+    *,
+    replay: Given[Path] = None,
+    views: Several = (),
+    pictures: int = 2,
+    edits: Edits,
+    scene: SceneOption,
+) -> None:
+    """Edit a labelled splat by class. The edits are saved beside the result and can be replayed.
+
+    The input stays as it is. For another order of edits run the command several times, or use --replay.
+
+    Examples:
+        kfgs edit labelled.ply --out edited.ply --remove chair --recolor "plant:#c04040" --scene scene/
+        kfgs edit labelled.ply --out edited.spz --move table:0.5,0,0 --opacity lamp:0.3
+        kfgs edit other.ply --out edited.ply --replay edited.edits.json
+
+    Args:
+        splats: A splat with classes, as `kfgs attach` writes it.
+        out: The edited splat; its ending chooses the format. The edits go to a file beside it (edited.edits.json for
+            edited.ply), and with --scene the views before and after to a picture (edited.png).
+        replay: Edits that were saved before; they come first.
+        views: Name of a view to show (with --scene). When none is given, one for each edit in turn, then those in which most
+            changes.
+        pictures: How many views to show if none is named.
+    """
+    from .._check import check_whole
+    from ..formats import write_splats
+    from ..labels.edits import EditList
+    from ..pipeline.compare import views_of_edits, write_comparison
+
+    check_target("out", out, splats)
+    saved = _edits_beside(out, replay)
+    check_whole("pictures", pictures, 0)
+    if scene.scene is None:
+        check_alone("views", ", ".join(views) or None, "without --scene, whose views they are")
+        scene.check_images()
+    replayed = EditList() if replay is None else EditList.load(replay, anywhere=True)  # the user's own file
+    asked, listed = tuple(parse_edits(edits)), replayed
+    for one in asked:
+        listed = listed.then(one)
+    if len(listed) == 0:
+        raise ValueError("edits: expected at least one, got none; give --remove, --recolor, --move or another")
+    check_target("out", out, *inserted_files(listed))
+    before = open_splats("splats", splats, labelled=any(edit.op != "insert" for edit in asked))
+    check_parts(replayed.apply(before), asked)
+    cameras = [] if scene.scene is None else _cameras_to_show(before, scene, views)
+    after = listed.apply(before)
+    say(f"{len(before)} Gaussians before, {len(after)} after {len(listed)} edit(s)")
+    if len(after) == 0:
+        say("note: nothing is left")
+    states = (cloud.gaussians for cloud in accumulate(listed, lambda cloud, one: one.apply(cloud), initial=before))
+    shown = cameras if views or not cameras else [cameras[i] for i in views_of_edits(states, cameras, pictures)]
+    written = write_splats(out, after)
+    say_lost(written)
+    paths = [*written.paths, listed.save(saved)]
+    if cameras and pictures and not shown:
+        say("note: no view of the scene shows a change")
+    if shown:
+        paths.append(write_comparison(out.with_suffix(".png"), before.gaussians, after.gaussians, shown, titles=TITLES))
+        say("before and after from " + ", ".join(camera.name for camera in shown))
+    wrote(paths)
+
+
+def convert(source: Positional[Path], target: Positional[Path]) -> None:
+    """Convert a splat file to another format. Classes are kept; whatever the new format cannot hold is named.
+
+    Examples:
+        kfgs convert edited.ply edited.spz
+        kfgs convert scene.ksplat scene.ply
+
+    Args:
+        source: A .ply (3DGS, or SuperSplat's compressed), .splat, .ksplat, .spz, .sog, .glb or .gltf file.
+        target: The file to write; its ending chooses the format (.ply, .compressed.ply, .splat, .spz, .sog, .glb, .gltf).
+    """
+    from ..formats import write_splats
+
+    check_target("target", target, source)
+    splats = open_splats("source", source)
+    say(repr(splats))
+    written = write_splats(target, splats)
+    say_lost(written)
+    say(f"{_bytes_of(source) / 2**10:,.1f} KiB -> {_bytes_of(target) / 2**10:,.1f} KiB")
+    wrote(written.paths)
+
+
+def _edits_beside(out: Path, replay: Path | None) -> Path:
+    """Where the edits behind a splat file are saved; a ValueError if that is the file to replay, or no file can be there."""
+    saved = out.with_suffix(".edits.json")
+    check_file("out", saved)
+    if replay is not None and replay.resolve() == saved.resolve():
+        raise ValueError(
+            f"replay: expected another file than {saved}, where the edits behind {out} are saved, got the same; give --out "
+            "another name"
+        )
+    return saved
+
+
+def _cameras_to_show(splats: Any, scene: SceneOption, views: Sequence[str]) -> list[Any]:
+    """The undistorted cameras of a scene, or of some of its views."""
+    if splats.gaussians.sh is None:
+        raise ValueError(f"scene: expected a splat with colours to show in it, got {splats!r}; leave --scene out")
+    loaded = scene.load_scene()
+    return list((_choose_views(loaded, views) if views else loaded).undistorted().cameras)
+
+
+def _choose_views(scene: Any, names: Sequence[str]) -> Any:
+    """The scene with the named views only; a ValueError if a name is unknown, or one view is named twice."""
+    seen = set[str]()
+    for name in names:
+        try:
+            (view,) = (camera.name for camera in scene.select([name]).cameras)
+        except ValueError as error:
+            near = difflib.get_close_matches(name, [camera.name for camera in scene.cameras], n=3, cutoff=0)
+            raise ValueError(
+                f"views: expected names of the scene's {len(scene)} views, got {name!r}; "
+                f"did you mean {' or '.join(map(repr, near))}?"
+            ) from error
+        if view in seen:
+            raise ValueError(f"views: expected each view once, got {view!r} twice; name it once")
+        seen.add(view)
+    return scene.select(names)
+
+
+def _bytes_of(path: Path) -> int:
+    """Bytes of a file, or of all files in a folder."""
+    files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+    return sum(file.stat().st_size for file in files)

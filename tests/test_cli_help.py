@@ -1,0 +1,122 @@
+"""The help of every command, and the command lines that docs and help show: true, and in the words of the command line."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+import kfgs
+from kfgs import cli
+
+REPOSITORY = Path(kfgs.__file__).parents[1]
+SHOWN = ["README.md", "docs/results.md", "docs/architecture.md", "notebooks/6_inspect_in_pyvista.py"]
+
+
+def help_of(command, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main([command, "--help"])
+    assert stop.value.code == 0
+    return capsys.readouterr().out
+
+
+def command_lines(text):
+    """The lines that run kfgs, without their comments."""
+    return [shlex.split(line, comments=True) for line in re.findall(r"^ *(kfgs [a-z].*)$", text, re.MULTILINE)]
+
+
+def run_nothing(monkeypatch):
+    """Commands that read their options and do no more; returns the names of those that were called."""
+    called = []
+
+    def stub(command):
+        def run(**options):
+            called.append(command.__name__)
+
+        run.__name__, run.__doc__, run.__annotations__ = command.__name__, command.__doc__, command.__annotations__
+        run.__wrapped__ = command
+        return run
+
+    monkeypatch.setattr(cli, "COMMANDS", {name: stub(command) for name, command in cli.COMMANDS.items()})
+    return called
+
+
+@pytest.mark.parametrize("command", sorted(cli.COMMANDS))
+def test_help_is_short_and_has_no_python_in_it(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    text = help_of(command, capsys)
+    assert "None" not in text
+    assert "(default: )" not in text
+    positionals = [name for name in cli._shown_names(cli.COMMANDS[command]).values() if name.isupper()]
+    assert re.sub(r"[\[\]]", "", text.splitlines()[0]).endswith(" ".join(positionals))
+    main_options = text.split("─ options ─")[1].split("╰")[0] if "─ options ─" in text else ""
+    assert len(re.findall(r"^│ --", main_options, re.MULTILINE)) <= 8
+    assert max(map(len, text.split("Examples:")[0].splitlines())) <= 80
+    assert f"kfgs {command} " in text.split("Examples:")[1] or command == "demo"
+
+
+@pytest.mark.parametrize("command", sorted(cli.COMMANDS))
+def test_examples_are_understood(command, capsys, monkeypatch):
+    lines = command_lines(help_of(command, capsys))
+    assert lines
+    called = run_nothing(monkeypatch)
+    for line in lines:
+        assert cli.main(line[1:]) == 0
+    assert called == [command] * len(lines)
+
+
+@pytest.mark.parametrize("name", SHOWN)
+def test_command_lines_in_the_docs_are_understood(name, monkeypatch):
+    if not (REPOSITORY / name).is_file():
+        pytest.skip("kfgs is installed without its repository")
+    called = run_nothing(monkeypatch)
+    text = (REPOSITORY / name).read_text(encoding="utf-8")
+    blocks = re.findall(r"```bash\n(.*?)```", text, re.DOTALL)
+    quoted = [one for one in re.findall(r"`(kfgs [a-z]+ [^`]*)`", text.replace("\n", " ")) if "..." not in one]
+    lines = [line for block in blocks for line in command_lines(block)]
+    complete = [shlex.split(one) for one in quoted if "--out" in one or "--color" in one]
+    for line in lines + complete:
+        assert cli.main(line[1:]) == 0, line
+    assert len(called) == len(lines) + len(complete)
+    for line in (line for line in map(str.split, quoted)):
+        known = cli._shown_names(cli.COMMANDS[line[1]]).values()
+        assert {word for word in line if word.startswith("--")} <= {*known, "--help"}, line
+
+
+def test_a_home_folder_is_understood_everywhere(monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "words.txt").write_text("wall\nfloor\n")
+    assert cli.main(["text", "~/words.txt", "--teacher", "cases_text:TEACHER", "--out=~/t.safetensors"]) == 0
+    assert (tmp_path / "t.safetensors").is_file()
+    assert cli.main(["info", "~/nothing"]) == 1
+    assert f"{tmp_path}/nothing" in capsys.readouterr().err
+
+
+def test_version_and_overview(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"kfgs {kfgs.__version__}\n"
+    assert cli.main(["--help"]) == 0
+    said = capsys.readouterr().out
+    for command in cli.COMMANDS:
+        assert f"\n  {command} " in said
+    for given, hint in ((["fitt"], "did you mean 'fit'?"), ([], "`kfgs --help` lists them")):
+        with pytest.raises(SystemExit) as stop:
+            cli.main(given)
+        assert stop.value.code == 2
+        assert hint in capsys.readouterr().err
+
+
+def test_messages_name_options_as_they_are_written():
+    names = cli._shown_names(cli.COMMANDS["attach"])
+    assert cli._in_options("splat_scene: expected", names) == "--splat-scene: expected"
+    assert cli._in_options("field, text: expected: one", names) == "FIELD, --text: expected: one"
+    message = (
+        "scene: expected 9 images (min_registered = 0.9), got 3; pass single_camera=False, or lower min_registered"
+    )
+    names = cli._shown_names(cli.COMMANDS["sfm"])
+    expected = message.replace("min_registered", "--min-registered").replace(
+        "single_camera=False", "--no-single-camera"
+    )
+    assert cli._in_options(message, names) == expected
+    for message in ("a.ply: no such file", "no colon", "splats, more: expected"):
+        assert cli._in_options(message, names) == message
