@@ -34,7 +34,7 @@ class TeacherCost:
     forwards: int = 1
     """How often the network runs for a picture."""
     assumed: str | None = None
-    """What was taken for granted about the network's size, in words; None where its config or name told it."""
+    """Which size was assumed, in words; None where the config or the name of the weights says the size."""
 
     @classmethod
     def unknown(cls, name: str) -> TeacherCost:
@@ -43,12 +43,12 @@ class TeacherCost:
 
     @classmethod
     def of_maps(cls, name: str, shape: tuple[int, int, int]) -> TeacherCost:
-        """Maps (h, w, D) that are there already: no work is left for a teacher."""
+        """Maps (h, w, D) that exist already: the teacher has nothing to do."""
         h, w, channels = shape
         return cls(name, channels, (h, w), 0.0, 0, 0, 0)
 
 
-# With the text's tower, taken to be as large, in memory too.
+# In memory with their text tower, assumed to be as large as the image tower.
 _TWO_TOWERS = ("clip", "openclip", "siglip", "siglip2", "tipsv2")
 
 
@@ -67,10 +67,10 @@ def teacher_cost(
     """What a picture of (height, width) pixels costs, from the sizes of the released networks; nothing is loaded.
 
     Args:
-        name: as `load_teacher` takes it; what stands behind `package.module:name` is not known.
+        name: as in `load_teacher`. The cost of `package.module:name` is unknown.
         image_size: (height, width) of the picture, pixels.
-        weights: tells which size: a folder with config.json is read, otherwise the last part of the name decides
-            ("...large-patch14"). Where it says nothing, a common size is taken, and `assumed` tells which (lseg has only
+        weights: decides the size, by config.json if it is a folder that has one, otherwise by the last part of its name
+            ("...large-patch14"). If the name has no size, a common one is used, and `assumed` says which (lseg has only
             one).
         options: those of the teacher that matter here: `size`; lseg: `scales`, `flip`, `fast`. Others are ignored.
 
@@ -95,13 +95,13 @@ def teacher_cost(
 
 
 def check_weights(name: str, weights: str | Path | None) -> None:
-    """Refuse weights that `load_teacher` would refuse at first sight; nothing of them is read but a config.json.
+    """Refuse weights that `load_teacher` would refuse at once. Only config.json is read.
 
-    Hub ids are taken on trust, and so is what belongs to a teacher of one's own.
+    Hub ids and the weights of your own teachers are not checked.
 
     Raises:
         FileNotFoundError: if the checkpoint (lseg, sam) is not there, or the folder lacks its config.json.
-        ValueError: if the config is another model's.
+        ValueError: if the config is of another model.
     """
     if weights is None:
         return

@@ -1,4 +1,4 @@
-"""Sizes of the released vision transformers, told by the config or the name of their weights."""
+"""Sizes of the released vision transformers, from the config or the name of their weights."""
 
 from __future__ import annotations
 
@@ -119,10 +119,10 @@ def vit_sizes(kind: str, weights: str | Path | None) -> tuple[VitSizes, bool]:
     Args:
         kind: a key of `RELEASED`.
         weights: a folder with config.json, which is read; otherwise the last part of the name decides ("...large-patch14"),
-            for `open_clip_*` that of the folder it lies in. Where it says nothing, or is None, a common size is assumed.
+            for `open_clip_*` the name of its folder. If the name has no size, or is None, a common size is assumed.
 
     Raises:
-        ValueError: if config.json is not a vision transformer's.
+        ValueError: if config.json is not of a vision transformer.
     """
     config = None if weights is None else Path(weights).expanduser() / "config.json"
     if config is not None and config.is_file():
