@@ -19,6 +19,25 @@ _CLIP_PATCH, _CLIP_TOKENS = 32, 50  # of the unused picture tower: 224 / 32 squa
 _HALF = (".attn.", ".mlp.", "visual.conv1.weight", "visual.proj", ".text_projection")  # what CLIP keeps in float16
 
 
+# A tiny LSeg: every part of the network, in milliseconds.
+TINY = LSegConfig(
+    width=32,
+    depth=4,
+    heads=4,
+    position_grid=3,
+    window=64,
+    hooks=(0, 1, 2, 3),
+    neck=(8, 12, 16, 20),
+    fusion=16,
+    dim=24,
+    text_width=32,
+    text_layers=2,
+    text_heads=4,
+    context=9,
+    vocabulary=60,
+)
+
+
 def layout(config: LSegConfig) -> dict[str, tuple[int, ...]]:
     """Name and shape of every tensor of a checkpoint whose network has these sizes: 730 with the default ones.
 

@@ -1,4 +1,4 @@
-"""What is known of a teacher of one's own, as JSON: its code, weights and options, so that a cache notices a change."""
+"""The identity of a user's own teacher as JSON (code, weights, options), so that a cache notices a change."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _NESTED = (tuple, list, slice, set, frozenset, dict, torch.dtype, torch.device)
 
 
 def code_identity(source: Any) -> dict[str, str]:
-    """Where a function (or a class, or an object's class) lies, and a digest of its code.
+    """Find where a function (or a class, or an object's class) is defined, and take a digest of its code.
 
     The digest is of the compiled code: instructions with their names and constants, and plain default arguments; of a
     class, of all methods and plain attributes (also in tuples, lists, dicts) that it and its bases in the same module
     have. Comments, line numbers and docstrings do not count. **Not noticed** are the values of globals and closures, the
-    attributes of an object, nested classes, and changes in the functions that are called: who relies on those gives an
-    `identity` of their own. Another minor version of Python compiles to other code, and counts as a change.
+    attributes of an object, nested classes, and changes in the functions that are called: a teacher that relies on those needs
+    an `identity`. Another minor version of Python compiles to other code, and counts as a change.
 
     Returns:
         `source`, "package.module:name", and `code`, hexadecimal digits.
@@ -44,7 +44,7 @@ def code_identity(source: Any) -> dict[str, str]:
 
 
 def weights_identity(weights: str | Path | None) -> str | None:
-    """What tells weights from others: SHA-256 of a file, or of a folder's files (hidden ones left out); else the text."""
+    """SHA-256 of a file, or of the files in a folder (without hidden ones); any other text as it is."""
     if weights is None or weights == "":
         return None
     path = Path(weights).expanduser()

@@ -1,4 +1,4 @@
-"""A teacher by its name: one row of a table per kind, and anything importable beside them."""
+"""Load a teacher by its name: one of the known kinds, or anything importable."""
 
 from __future__ import annotations
 
@@ -46,15 +46,15 @@ def load_teacher(name: str, weights: str | Path | None = None, **options: Any) -
 
     Args:
         name: one of `teacher_names()`, or `package.module:name` of your own: a teacher, a function from [3, H, W] to
-            [D, h, w], or a class, which is called with `weights` (if given) and the options. It is looked for in the
-            folder in which the command runs, too, while it is imported and made. One without an `identity` of its own
-            gets one of source, code, weights and options, so that a cache notices when they change; see
-            `identity.code_identity` for what is not noticed.
+            [D, h, w], or a class, which is called with `weights` (if given) and the options. The current folder is
+            searched for the module too. A teacher without `identity` gets one from source, code, weights and options, so
+            that a cache notices when they change; `identity.code_identity` says what is not noticed.
         weights: a checkpoint file (lseg, sam), or a folder as `save_pretrained` writes it or a hub id (all others).
         options: of the kind: see `load_lseg`, `load_sam`, `load_transformers_teacher`.
 
     Raises:
-        ValueError: if there is no such teacher or option, or the weights are another's; the message says whose.
+        ValueError: if there is no such teacher or option, or the weights are of another network; the message says
+            which.
         FileNotFoundError: if the weights are not there.
         ImportError: if a package is missing, or there but broken.
     """
@@ -150,13 +150,13 @@ def _working_folder() -> Iterator[None]:
 
 
 class OwnTeacher:
-    """A teacher of a user's own that brings no identity, with one of what can be known; made by `load_teacher`.
+    """A user's teacher that has no `identity`, with one made from what is known; made by `load_teacher`.
 
     Args:
-        teacher: does the work; its other attributes are seen through this one.
-        source: "package.module:name", as it was asked for.
+        teacher: does the work; its other attributes are attributes of this object too.
+        source: "package.module:name".
         code: digest of its code; see `code_identity` for what that does not notice.
-        weights: what it was made with; the digest of the file or folder is taken when the identity is first asked for.
+        weights: what it was made with; the digest of the file or folder is taken when `identity` is first read.
         options: what it was made with.
     """
 

@@ -8,9 +8,10 @@ a dry run: it follows the opcodes and counts, for each object, how many values a
 from __future__ import annotations
 
 import pickletools
-from _compat_pickle import IMPORT_MAPPING, NAME_MAPPING  # Python 2's names; pickle and torch translate them too
 from dataclasses import dataclass, field
 from typing import Any, Protocol
+
+from torch._utils import IMPORT_MAPPING, NAME_MAPPING  # Python 2's names, as torch.load translates them
 
 from .._check import one_line
 
@@ -38,9 +39,11 @@ _REBUILDS = _words(
     "torch._utils._rebuild_tensor torch._utils._rebuild_tensor_v2 torch._utils._rebuild_tensor_v3 "
     "torch._utils._rebuild_parameter torch._utils._rebuild_parameter_with_state torch.nn.parameter.Parameter"
 )
-_COPIES = _words("collections.OrderedDict builtins.set builtins.complex torch.Size torch.device _codecs.encode")
+_COPIES = _words(
+    "collections.OrderedDict collections.Counter builtins.set builtins.complex torch.Size torch.device _codecs.encode"
+)
 _UNSAFE_MODULES = _words(
-    "os posix nt sys subprocess shutil pty socket runpy importlib ctypes code pdb pickle marshal webbrowser pip"
+    "os posix nt sys subprocess shutil pty socket runpy importlib ctypes code pdb pickle cPickle marshal webbrowser pip commands"
 )
 _UNSAFE_BUILTINS = _words("eval exec compile open __import__ globals breakpoint input delattr setattr")
 

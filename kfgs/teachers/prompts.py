@@ -88,7 +88,7 @@ def make_label_set(
         names: as in `embed_labels`; each class is called by its first word.
         templates: as in `embed_labels`; negatives take the same ones.
         synonyms: as in `embed_labels`.
-        negatives: what a query is told from where no other class is known; LERF's canonical words, or None.
+        negatives: words that a query is compared with if there is no other class (LERF's canonical words), or None.
 
     Raises:
         ValueError: as `embed_labels`.
@@ -126,7 +126,7 @@ def template_set(templates: str | Sequence[str]) -> tuple[str, ...]:
 
 
 def _templates_of(teacher: Teacher, templates: str | Sequence[str] | None) -> tuple[str, ...]:
-    """The templates asked for, or those that suit the teacher."""
+    """The templates that are given, or those that suit the teacher."""
     return template_set(getattr(teacher, "templates", "bare") if templates is None else templates)
 
 

@@ -19,12 +19,12 @@ PROMPTS_AT_ONCE = 64  # 60 MB of activations in CLIP ViT-L's text tower
 
 @runtime_checkable
 class Teacher(Protocol):
-    """An image encoder, best with a text encoder into the same space, such as LSeg or a dense CLIP.
+    """An image encoder, usually with a text encoder into the same space: LSeg, or a dense CLIP.
 
     Any object with these three members is a teacher; nothing needs to be inherited. `isinstance` checks that the
-    members exist, not their signatures. Two more are used where they exist: `identity`, JSON that tells what decides its
-    features (see `identify`; without one, a cache cannot tell other weights of the same name, but for a teacher that
-    `load_teacher` made, which gets one), and `to(device)`.
+    members exist, not their signatures. Two more are used if they exist: `to(device)` and `identity`, JSON of everything
+    that the features depend on (see `identify`). Without it a cache does not notice other weights; a teacher that
+    `load_teacher` made always has one.
 
     **Convention**: pictures and features have the channels first here, as encoders have them; kfgs's own maps, and those
     on disk, have them last ([h, w, D]).
@@ -68,8 +68,8 @@ class CallableTeacher:
         images: [3, H, W] RGB in [0, 1] -> [D, h, w].
         text: n prompts -> [n, D]; rows are brought to unit length. None: the teacher knows no text.
         name: a short name; the function's own when not given.
-        identity: JSON that tells what decides the features beside the name, such as a digest of the weights: a cache is
-            made again when it changes. When not given, where `images` lies and a digest of its code, which notices
+        identity: JSON of what the features depend on besides the name, for example a digest of the weights: a cache is
+            made again when it changes. If None, where `images` lies and a digest of its code, which notices
             neither globals and closures nor a model's weights; see `identity.code_identity`.
 
     Example:
@@ -152,7 +152,7 @@ def as_teacher(source: Teacher | Callable[[Tensor], Tensor]) -> Teacher:
 
 
 def identify(teacher: Teacher) -> dict[str, Any]:
-    """JSON that tells what decides a teacher's features: its own `identity`, or else its name alone."""
+    """JSON of what a teacher's features depend on: its `identity`, or its name if it has none."""
     found = getattr(teacher, "identity", None)
     return dict(found) if isinstance(found, dict) else {"name": teacher.name}
 

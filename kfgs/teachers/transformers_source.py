@@ -161,7 +161,7 @@ def load_tokenizer_of(kind: str, source: Path | str, commit: str | None, *, loca
 
 
 def refuse_gaps(source: Path | str, name: str, info: dict[str, Any]) -> None:
-    """Raise a ValueError if weights were missing or of another shape: transformers would only have drawn them anew."""
+    """Raise a ValueError if weights were missing or of another shape: transformers would fill them with random values."""
     gaps = sorted(map(str, info.get("missing_keys") or ())) + sorted(
         str(entry[0] if isinstance(entry, (tuple, list)) else entry) for entry in info.get("mismatched_keys") or ()
     )
@@ -173,7 +173,7 @@ def refuse_gaps(source: Path | str, name: str, info: dict[str, Any]) -> None:
 
 
 def weights_of(source: Path | str, commit: str | None = None) -> str:
-    """What tells these weights from others: a digest of the folder's files (or of a file), or the hub's commit."""
+    """The identity of weights: a digest of the files of a folder (or of one file), or the hub's commit."""
     if isinstance(source, str):
         return f"commit {commit}"
     folder = source if source.is_dir() else source.parent

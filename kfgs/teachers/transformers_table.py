@@ -1,6 +1,6 @@
-"""The teachers over transformers, as one table: a new one is a row.
+"""The table of the teachers from transformers. To add one, add a row.
 
-Nothing here imports transformers: the table can be read on a machine without it.
+Nothing here imports transformers, so the table can be read without it.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class TeacherRow:
     normalisation: tuple[Triple, Triple]  # mean and standard deviation of RGB in [0, 1]
     text: TextRule | None = None  # None: no text tower in the space of the patches
     templates: str = "bare"  # the templates that suit it, by name in `prompts.TEMPLATES`
-    residual: bool = False  # can `residual=True` be asked of it?
-    activation: str | None = None  # of files in OpenCLIP's layout that do not say; None: the kind takes no such files
+    residual: bool = False  # whether it takes `residual=True`
+    activation: str | None = None  # of files in OpenCLIP's layout that name none; None: that layout is not read
 
 
 TRANSFORMERS: dict[str, TeacherRow] = {

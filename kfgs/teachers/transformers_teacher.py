@@ -20,7 +20,7 @@ from .transformers_table import TRANSFORMERS, TeacherRow, TextRule
 
 _Tokenize = Callable[[list[str]], tuple[Tensor, Tensor]]  # n prompts -> ids [n, T], mask [n, T] (0: padding)
 
-_CLIP_VOCABULARY = 49408  # entries of CLIP's own, which kfgs brings along
+_CLIP_VOCABULARY = 49408  # entries of the vocabulary of CLIP, which kfgs contains
 _TOKENIZER_FILES = ("tokenizer.json", "vocab.json", "tokenizer.model", "spiece.model")
 
 
@@ -42,7 +42,7 @@ def load_transformers_teacher(
             `openai/clip-vit-base-patch16` on the hub.
         size: longer side, in pixels, that pictures are resized to before they are cut into patches; None: their own. A
             map has one cell per patch, so that a larger picture gives a finer map.
-        residual: clip, openclip: keep the residual connection and the MLP of the last block beside its values (as in
+        residual: clip, openclip: keep the residual connection and the MLP of the last block in addition to its values (as in
             MaskCLIP's code). tipsv2: the values of the last block instead of its attention, residual and MLP kept.
         local_only: take a hub id from the local cache alone.
 
@@ -193,7 +193,7 @@ def resize_picture(image: Tensor, size: tuple[int, int]) -> Tensor:  # [3, H, W]
 
 
 def _has_tokenizer(folder: Path) -> bool:
-    """Does a folder hold the files of a tokenizer?"""
+    """Whether a folder holds the files of a tokenizer."""
     return any((folder / name).is_file() for name in _TOKENIZER_FILES)
 
 
@@ -235,7 +235,7 @@ def _hub_tokenize(kind: str, source: Path | str, rule: TextRule, longest: int, l
 
 
 def _bpe_tokenize() -> _Tokenize:
-    """CLIP's own vocabulary, for weights that come without a tokenizer."""
+    """CLIP's vocabulary, which kfgs contains, for weights without a tokenizer."""
     loaded: list[Any] = []
 
     def tokenize(prompts: list[str]) -> tuple[Tensor, Tensor]:

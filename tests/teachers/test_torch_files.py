@@ -11,6 +11,7 @@ import re
 import signal
 import sys
 import tracemalloc
+import urllib.parse
 import warnings
 import zipfile
 from pathlib import Path
@@ -219,6 +220,7 @@ class Items(list):
     pass
 
 
+OPTIMIZER = torch.optim.Adam([torch.nn.Parameter(torch.ones(2))])
 HONEST = {
     "nested class": Outer.Inner,
     "class in it": Outer.Inner.Deep,
@@ -244,6 +246,9 @@ HONEST = {
     "set of tuples": {(1, 2), (3, "a")},
     "many times the same": [[0.5] * 3] * 1000,
     "keywords": Keywords(),
+    "scheduler": torch.optim.lr_scheduler.MultiStepLR(OPTIMIZER, [3, 5]).state_dict(),
+    "Python 2's names": [KeyError("a"), urllib.parse.urlsplit("https://a/b")],
+    "optimizer": OPTIMIZER.state_dict(),
 }
 
 

@@ -138,7 +138,7 @@ def _shapes(module: nn.Module, names: Mapping[str, str]) -> dict[str, tuple[int,
 
 
 def _check(state: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]], source: str) -> None:
-    """Raise unless the state holds float tensors of these names and shapes, and beside them only what is known as unused."""
+    """Raise unless the state holds float tensors of these names and shapes. Tensors known to be unused may be there too."""
     missing = [f"{name} {shape}" for name, shape in shapes.items() if name not in state]
     unknown = [f"{one_line(name)} {tuple(value.shape)}" for name, value in state.items() if not _known(name, shapes)]
     other = [

@@ -32,8 +32,8 @@ class LSeg(nn.Module):
     Args:
         network: the image network, in evaluation mode.
         options: how pictures are evaluated.
-        load_text: gives the text tower and its tokenizer at the first prompt; None: the teacher knows no text.
-        digest: gives the SHA-256 of the weights when it is asked for.
+        load_text: loads the text tower and its tokenizer at the first prompt; None: the teacher has no text encoder.
+        digest: computes the SHA-256 of the weights; called when `identity` is first read.
     """
 
     name = "lseg"
@@ -80,9 +80,9 @@ class LSeg(nn.Module):
 
     @torch.no_grad()
     def encode_image(self, image: Tensor) -> Tensor:  # [3, H, W] RGB in [0, 1] -> [D, h, w] float32
-        """Features of one picture, at the size that `options.map_size` tells.
+        """Features of one picture, at the size `options.map_size`.
 
-        The picture is brought to that size (bilinear, corners aligned, no antialiasing, as in the paper's script), and
+        The picture is resized to it (bilinear, corners aligned, no antialiasing, as in the paper's script), and
         evaluated in windows; see `windows.multi_scale_features`.
 
         Raises:

@@ -1,7 +1,6 @@
 import pytest
 import torch
-from cases_lseg import TINY
-from lseg_layout import random_state
+from lseg_layout import TINY, random_state
 from torch.nn import functional
 
 from kfgs.teachers.lseg.keys import network_from_state, text_from_state

@@ -1,15 +1,15 @@
 from dataclasses import replace
 
-import cases_lseg
 import oracles_lseg
 import pytest
 import torch
+from lseg_layout import TINY as TINY_LSEG
 from lseg_layout import random_state
 from torch.nn import functional
 
 from kfgs.teachers.lseg.keys import text_from_state
 
-TINY = replace(cases_lseg.TINY, text_layers=3)
+TINY = replace(TINY_LSEG, text_layers=3)
 IDS = torch.tensor(
     [[58, 3, 59, 0, 0, 0, 0, 0, 0], [58, 7, 41, 5, 20, 33, 2, 59, 0], [58, 59, 59, 59, 59, 59, 59, 59, 59]]
 )
