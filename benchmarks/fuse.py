@@ -129,7 +129,7 @@ def main() -> None:
         splat = read_splats(args.splat).gaussians
         for corrections in (0, 1):
             start = time.perf_counter()
-            field = uplift(room.scene, room.maps, splat, UpliftConfig(corrections=corrections))
+            field = uplift(room.scene, room.maps, splat, FitConfig(uplift=UpliftConfig(corrections=corrections)))
             seconds = time.perf_counter() - start
             miou, accuracy = room.score(field)
             print(

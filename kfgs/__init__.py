@@ -45,6 +45,7 @@ _WHERE = {
     "fit_color": ".pipeline",
     "score_views": ".evaluation",
     "transfer_labels": ".labels",
+    "label_splats": ".labels",
     "FeatureFolder": ".features",
     "load_teacher": ".teachers",
     "extract_features": ".features",
@@ -100,6 +101,7 @@ if TYPE_CHECKING:
     from .labels import Remove as Remove
     from .labels import Selection as Selection
     from .labels import connected_parts as connected_parts
+    from .labels import label_splats as label_splats
     from .labels import load_label_set as load_label_set
     from .labels import transfer_labels as transfer_labels
     from .pipeline import ColorConfig as ColorConfig

@@ -144,7 +144,7 @@ def check_size(size: tuple[int, int]) -> None:
 
 
 def one_line(text: object, length: int = 60) -> str:
-    """A name out of an untrusted file for a message: one line, no control characters, not long."""
+    """Shorten a name from an untrusted file for a message: one line, no control characters."""
     shown = ascii(str(text))[1:-1]
     return shown if len(shown) <= length else shown[:length] + "..."
 

@@ -1,4 +1,4 @@
-"""Scores, each with one definition that is said out loud: mIoU, accuracy, cosine, PSNR, SSIM, and bytes.
+"""Scores with their definitions: mIoU, accuracy, cosine, PSNR, SSIM, and bytes.
 
 `kornia.metrics` counts and compares. What it leaves open is settled here: labels to ignore, pooling over views, classes
 that do not occur, and which SSIM.
@@ -68,8 +68,8 @@ def confusion_matrix(
 
     Raises:
         TypeError: if labels are not integers.
-        ValueError: if shapes differ, or a scored label lies outside [0, classes). A prediction of -1 ("none") is such
-            a label: `ConfusionMatrix` counts it as a miss.
+        ValueError: if shapes differ, or a scored label lies outside [0, classes). That includes a
+            prediction of -1 ("none"), which `ConfusionMatrix` counts as a miss.
 
     Note:
         kornia counts. It has no ignored label, needs two classes, and returns float32, which is exact up to 2^24
@@ -81,7 +81,7 @@ def confusion_matrix(
                 [0, 1]])
     """
     pred, target = _scored_labels(pred, target, classes, ignore)
-    _check_labels("pred", pred, classes, "pass such predictions to ConfusionMatrix, which counts -1 as a miss")
+    _check_labels("pred", pred, classes, "use ConfusionMatrix, which counts a prediction of -1 as a miss")
     return _count(pred, target, classes)
 
 

@@ -65,7 +65,7 @@ from kfgs import (
 )
 from kfgs.cameras import Orbit, estimate_up, orbit_cameras
 from kfgs.scenes import list_images, read_image
-from kfgs.teachers import CallableTeacher, TeacherCost
+from kfgs.teachers import CallableTeacher
 
 # %% [markdown]
 # ## Pictures
@@ -166,15 +166,15 @@ Image.fromarray(viz.picture_grid([pictures], ["photo", "features", question], wi
 # %% [markdown]
 # ## What it will cost
 #
-# Before anything long starts: minutes, memory and disk of each stage, on this machine at this moment. Ask with
-# `teacher="lseg"` to see what the paper's would take. The field is fused onto Gaussians that are trained on the photographs
-# first (`color`, a short schedule here); if you have a splat in this frame, `fit_scene` takes it instead (`splat=`).
+# Before anything long starts: minutes, memory and disk of each stage. The planner lets the teacher see one picture and tries a
+# few views and steps on this machine. Ask with `teacher="lseg"` to see what the paper's would take. The field is fused onto
+# Gaussians that are trained on the photographs first (`color`, a short schedule here); if you have a splat in this frame,
+# `fit_scene` takes it instead (`splat=`).
 
 # %%
 quick = ColorConfig.quick()
 config = FitConfig.cpu(color=replace(quick, field=replace(quick.field.with_steps(800), max_gaussians=60_000)))
-map_size = tuple(teacher.encode_image(photo.movedim(-1, 0)).movedim(0, -1).shape)
-print(plan_scene(scene, teacher=TeacherCost.of_maps("colour words", map_size), config=config, folder=out))
+print(plan_scene(scene, teacher=teacher, config=config, features=out / "features", run=out))
 
 # %% [markdown]
 # ## Features, then the field

@@ -19,10 +19,10 @@ import pytest
 from PIL import Image
 
 from kfgs.viz import available, palette
-from kfgs.viz.through import camera_of
+from kfgs.viz.camera_view import camera_of
 
 CHROMIUM = next((path for path in ("/usr/bin/chromium", "/usr/bin/chromium-browser") if Path(path).exists()), None)
-SECONDS = 60  # of patience with a slow machine, for each thing that is waited for
+SECONDS = 300  # of patience with a busy machine, for each thing that is waited for
 SIZE = {"width": 900, "height": 420}
 
 

@@ -130,9 +130,9 @@ def test_smallest_run_measures_every_engine(smallest_run):
     assert list(case["seconds"]) == list(case["difference"]) == list(step["step"]) == ["kfgs numba", "kfgs reference"]
     for parts in case["seconds"].values():
         assert list(parts) == ["forward", "backward", "frame"]
-        assert all(0 < times["least"] <= times["median"] < 20 for times in parts.values())
+        assert all(0 < times["least"] <= times["median"] for times in parts.values())
     assert max(case["difference"].values()) < 1e-2
-    assert all(0 < times["least"] <= times["median"] < 20 for times in step["step"].values())
+    assert all(0 < times["least"] <= times["median"] for times in step["step"].values())
     assert len(step["stages"]["kfgs numba"]) == 7
     assert all(times["least"] > 0 for times in step["stages"]["kfgs numba"].values())
     pairs = case["pairs"]

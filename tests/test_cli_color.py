@@ -18,8 +18,8 @@ from kfgs.fields import SemanticField
 from kfgs.formats import read_splats, write_splats
 from kfgs.formats.sidecar import names_path
 from kfgs.labels.edits import EditList
+from kfgs.pipeline.color import Photos
 from kfgs.pipeline.compare import views_of_edits
-from kfgs.pipeline.photos import Photos
 from kfgs.scenes import load_scene
 from kfgs.splat import rasterize
 

@@ -1,13 +1,12 @@
 """The command plan: what it refuses before it plans, and what it counts."""
 
 import json
+import shutil
 
 import pytest
 from small_room import make_room
 
 from kfgs.cli import main
-from kfgs.pipeline import plan_stages
-from kfgs.pipeline.machine import Speed
 
 
 @pytest.fixture(scope="module")
@@ -16,8 +15,9 @@ def room(tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def a_known_speed(monkeypatch):
-    monkeypatch.setattr(plan_stages, "measure_speed", lambda device="cpu": Speed(4e11, 2))
+def untimed(monkeypatch):
+    for name in ("time_color", "time_fit"):
+        monkeypatch.setattr(f"kfgs.pipeline.plan.{name}", lambda *_: {})
 
 
 def test_a_plan_is_said_and_written(room, tmp_path, capsys):
@@ -27,7 +27,18 @@ def test_a_plan_is_said_and_written(room, tmp_path, capsys):
     assert f"wrote:\n  {out}" in said
     found = json.loads(out.read_text())
     assert found["title"] in said
-    assert found["stages"][0]["name"] == "features"
+    assert "6 of 6 maps exist" in said
+    assert [stage["name"] for stage in found["stages"]] == ["color", "uplift"]
+
+
+def test_maps_may_lie_in_another_folder(room, tmp_path, capsys):
+    moved = tmp_path / "scene"
+    shutil.copytree(room, moved)
+    (moved / "features").rename(tmp_path / "maps")
+    assert main(["plan", str(moved), "--features", str(tmp_path / "maps"), "--run", str(tmp_path / "run")]) == 0
+    assert "6 of 6 maps exist" in capsys.readouterr().out
+    assert main(["plan", str(moved), "--teacher", "clip"]) == 0
+    assert "clip was not run" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -38,20 +49,17 @@ def test_a_plan_is_said_and_written(room, tmp_path, capsys):
             ["--out", "{tmp}/file/plan.json"],
             "out: expected a folder to write to, got {tmp}/file/plan.json below the file",
         ),
-        (
-            ["--weights", "{tmp}/no.ckpt"],
-            "{tmp}/no.ckpt: expected a checkpoint file of teacher 'lseg', got no such file;",
-        ),
-        (
-            ["--teacher", "clip", "--weights", "{tmp}"],
-            "got a folder without config.json; download the whole repository",
-        ),
+        (["--features", "{tmp}/maps"], "features: expected a folder of maps, got {tmp}/maps"),
+        (["--weights", "{tmp}/no.ckpt"], "{tmp}/no.ckpt: "),
+        (["--teacher", "clip", "--weights", "{tmp}"], "{tmp}: "),
     ],
 )
 def test_what_cannot_end_well_is_refused_before_planning(room, given, message, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("kfgs.pipeline.plan.Plan.__init__", lambda *_, **__: pytest.fail("it planned"))
+    bare = tmp_path.with_name(tmp_path.name + "-scene")
+    shutil.copytree(room, bare, ignore=shutil.ignore_patterns("features"))
     (tmp_path / "file").write_text("")
-    assert main(["plan", str(room), *(word.format(tmp=tmp_path) for word in given)]) == 1
+    assert main(["plan", str(bare), *(word.format(tmp=tmp_path) for word in given)]) == 1
     error = capsys.readouterr().err
     assert message.format(tmp=tmp_path) in error
     assert error.count("\n") == 1

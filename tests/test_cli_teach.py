@@ -353,7 +353,7 @@ def wrong_files(folder: Path, weights: Path) -> dict[str, tuple[Path, str]]:
         "noise": "got",
         "short": "cut short",
         "half": "cut short",
-        "pickle": "asks to run",
+        "pickle": "a plain pickle",
         "zip": "asks to run",
         "rn101": "clip_resnet101",
         "clip": "CLIP alone, without LSeg's decoder",

@@ -47,7 +47,7 @@ class Orbit:
 
 
 def estimate_up(cameras: Sequence[Camera]) -> Tensor:  # [3] float64, unit
-    """The direction that is up in the world, from the cameras that looked at it.
+    """Estimate the up direction of the world from the cameras.
 
     People hold cameras level: the pictures' x axes are horizontal, wherever they look and however far down, so up is the
     direction least along any of them (least eigenvector of sum x x^T), on the side of the pictures' upper edges. Where

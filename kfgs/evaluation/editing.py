@@ -34,15 +34,18 @@ RECOLOR = (
     "kfgs-recolor/1: test views of a scene with exact labels. Outside = PSNR of after against before over all pixels of "
     "other classes and channels; inside = share of the class's coloured pixels whose hue is within 20 degrees of the target"
 )
-GONE, UNTOUCHED, OUTSIDE = 0.95, 0.98, 35.0  # shares and decibels that `passed` asks for
+# What `passed` asks for: shares, and decibels.
+GONE, UNTOUCHED, OUTSIDE = 0.95, 0.98, 35.0
 CHANGED = (
-    0.8  # likewise: what looks as before is not gone, wherever its Gaussians went; some things match their background
+    0.8  # a class that looks as before is not gone, wherever its Gaussians went; but some things match their background
 )
-HUE_INSIDE, MEASURED = 0.8, 0.5  # likewise, so that neither an edit that does nothing nor a void measurement passes
+HUE_INSIDE = 0.8
+MEASURED = 0.5  # so that an edit that does nothing does not pass, nor a report that could measure nothing
+
 STEP = 8 / 255  # a channel that moves less is untouched: twice what 8-bit rounding and a JPEG would do
 HUE = 20.0  # degrees
-LEAST_LIGHT = 0.25  # of a pixel that has to come from the object before the edit, else nothing can be said of it
-LEAST_DENSITY = 0.05  # at a surface point before the edit, likewise
+LEAST_LIGHT = 0.25  # share of a pixel's light that the object gave before the edit; of other pixels nothing can be said
+LEAST_DENSITY = 0.05  # at a surface point before the edit, for the same reason
 LEAST_CHROMA = 0.04  # ten 8-bit steps between the largest and the smallest channel: below, a hue is noise
 
 

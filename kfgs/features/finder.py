@@ -84,7 +84,7 @@ class MapFinder:
         the file that it was.
         """
         gone = {stem: [file] for stem in stems if (file := self.discarded(stem)) is not None}
-        found = {stem: self.beside(stem) for stem in stems if stem not in gone}
+        found = {stem: self.named(stem) for stem in stems if stem not in gone}
         if not all(found.values()):
             present = self.listed(deep=True)
             found = {stem: files or present.get(stem, [])[:1] for stem, files in found.items()}
@@ -99,7 +99,7 @@ class MapFinder:
                 }
         return {stem: gone[stem] if stem in gone else found[stem] for stem in stems}
 
-    def beside(self, stem: str) -> list[Path]:
+    def named(self, stem: str) -> list[Path]:
         """The file that is called `stem` and the suffix of a layout, in a list; an empty list if there is none."""
         files = ((self.path / f"{stem}{layout.suffix}", layout) for layout in LAYOUTS)
         return [file for file, layout in files if file.is_file() and layout_of(file, self.own) is layout][:1]
@@ -144,4 +144,4 @@ class MapFinder:
             )
         else:
             text, hint = f"{text} (or {missing[0]}{OWN.suffix})", "encode these views"
-        return f"{text}; {hint}, or leave them out of `stems`"
+        return f"{text}; {hint}, or leave these views out"

@@ -83,7 +83,7 @@ class FeatureFolder(Sequence[Tensor]):
         """What decides the maps (`identify`) if kfgs made them, else None."""
         self.channels, self.sizes = channels, None if sizes is None else list(sizes)
         self.reading = Reading(channels=channels, level=parse_level(level), stride=stride)
-        self._chosen = stems
+        self._chosen = stems if stems is None or isinstance(stems, str) else list(stems)
         if self.sizes is not None and len(self.sizes) != len(self.stems):
             raise ValueError(
                 f"sizes: expected {len(self.stems)} (one per view), got {len(self.sizes)}; give one for each"
@@ -143,9 +143,9 @@ class FeatureFolder(Sequence[Tensor]):
     @cached_property
     def stems(self) -> list[str]:
         """The names of the views."""
-        listed = sorted({*self._finder.listed(), *self._finder.records}) if self._chosen is None else self._chosen
-        check_stems("stems" if self._chosen else f"stems (of {self.path})", listed)
-        return list(listed)
+        all_maps = sorted({*self._finder.listed(), *self._finder.records}) if self._chosen is None else []
+        check_stems(f"stems (in {self.path})", self._chosen or all_maps)
+        return list(self._chosen or all_maps)
 
     @cached_property
     def files(self) -> list[Path]:

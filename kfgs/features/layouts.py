@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-import pickle
-import warnings
-import zipfile
 from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +16,7 @@ from torch import Tensor
 
 from .._check import check_shapes
 from .._files import atomic_path
+from ..teachers.torch_files import Placeholder, check_plain, load_torch_file
 from .langsplat import INDEX, ROWS, MaskFeatures
 
 StoredMap = Tensor | NDArray[Any] | MaskFeatures
@@ -55,21 +53,12 @@ class Layout(NamedTuple):
 
 
 def _open_torch(file: Path, _: Reading) -> Any:
-    mapped = zipfile.is_zipfile(file)  # files of torch < 1.6 are not zip archives and cannot be mapped
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about the pickle's protocol; what matters is raised
-        try:
-            found = torch.load(file, map_location="cpu", mmap=mapped, weights_only=True)
-        except pickle.UnpicklingError as error:  # its own text is a page about torch 2.6
-            code = "global" in str(error).lower() or "class" in str(error).lower()
-            words = "it holds objects beside tensors, which are not run" if code else "not a tensor that torch saved"
-            raise ValueError(words) from error
-    if isinstance(found, Tensor) and (found.is_nested or found.is_meta):
-        raise ValueError("it is nested, or has no values; save one dense tensor")
-    if not isinstance(found, Tensor) or found.layout != torch.strided:
+    found = load_torch_file(file)
+    if isinstance(found, Placeholder):
+        raise ValueError("it holds objects beside tensors, which are not run")
+    if not isinstance(found, Tensor):
         return found
-    if found.numel() * found.element_size() > found.untyped_storage().nbytes():  # a few bytes could fill the memory
-        raise ValueError("its values are repeated by strides; save the tensor contiguous")
+    check_plain(found)
     return found.detach()  # saved by a training run, it may ask for gradients
 
 

@@ -74,33 +74,8 @@ class MapWriter:
     def __init__(
         self, folder: Path, identity: Mapping[str, Any], pictures: Sequence[Picture], *, overwrite: bool = False
     ) -> None:
-        wanted, finder = plain_identity(identity), MapFinder(folder)
-        files = {map_file(folder, picture.stem): picture.stem for picture in pictures}
-        finder.own |= set(files)
-        read_first = LAYOUTS[: LAYOUTS.index(OWN)]
-        for file in (file for stem in files.values() for file in finder.beside(stem)):
-            if layout_of(file, finder.own) in read_first:
-                raise ValueError(
-                    f"folder: expected one without maps of other programs, got {file}, which would be read instead of ours; "
-                    "use another folder"
-                )
-        found = finder.manifest
-        if found is None and not overwrite and (other := next((file for file in files if file.is_file()), None)):
-            raise ValueError(
-                f"folder: expected one without maps of other programs, got {other} and no {MANIFEST}; use another "
-                "folder, or pass overwrite=True (--overwrite)"
-            )
-        if found is not None and found.teacher != wanted:
-            if not overwrite:
-                raise ValueError(
-                    f"folder: expected maps of the same teacher as now, got others in {folder} "
-                    f"({differences(found.teacher, wanted)}); use another folder, or pass overwrite=True "
-                    f"(--overwrite) to give up its {len(found.maps)} maps"
-                )
-            for stem in found.maps:
-                if (file := map_file(folder, stem)) in finder.own:  # never a file outside of the folder
-                    file.unlink(missing_ok=True)
-            found = None
+        wanted, files = plain_identity(identity), [map_file(folder, picture.stem) for picture in pictures]
+        found = _make_room(MapFinder(folder), [picture.stem for picture in pictures], wanted, overwrite=overwrite)
         self.folder, self.manifest = folder, found or Manifest(wanted)
         self._missing = {stem for stem, one in self.manifest.maps.items() if not (folder / one.file).is_file()}
         if found is None:
@@ -154,6 +129,30 @@ class MapWriter:
             )
 
 
+def _make_room(finder: MapFinder, stems: list[str], identity: dict[str, Any], *, overwrite: bool) -> Manifest | None:
+    """The manifest, if this teacher made the maps in the folder. Other maps are an error, or given up with `overwrite`."""
+    folder, found, hint = finder.path, finder.manifest, "use another folder, or pass overwrite=True (--overwrite)"
+    expected = "folder: expected one without maps of other programs, got"
+    files = [map_file(folder, stem) for stem in stems]
+    finder.own |= set(files)
+    for file in (file for stem in stems for file in finder.named(stem)):
+        if layout_of(file, finder.own) in LAYOUTS[: LAYOUTS.index(OWN)]:
+            raise ValueError(f"{expected} {file}, which would be read instead of ours; use another folder")
+        if found is None and not overwrite and file in files:
+            raise ValueError(f"{expected} {file} and no {MANIFEST}; {hint}")
+    if found is None or found.teacher == identity:
+        return found
+    if not overwrite:
+        raise ValueError(
+            f"folder: expected maps of the same teacher as now, got others in {folder} "
+            f"({differences(found.teacher, identity)}); {hint} to give up its {len(found.maps)} maps"
+        )
+    for stem in found.maps:
+        if (file := map_file(folder, stem)) in finder.own:  # never a file outside of the folder
+            file.unlink(missing_ok=True)
+    return None
+
+
 def encode_half(teacher: Teacher, picture: Tensor, path: Path) -> Tensor:  # [H, W, 3] -> [h, w, D] float16
     """A teacher's map of one picture as it is stored: channels last, rounded to half precision, on the CPU.
 
@@ -170,7 +169,7 @@ def encode_half(teacher: Teacher, picture: Tensor, path: Path) -> Tensor:  # [H,
         for start in range(0, h, ROW_BLOCK):  # one block stays in the processor's cache
             block = features[:, start : start + ROW_BLOCK]
             rows = half[start : start + ROW_BLOCK].copy_(block.permute(1, 2, 0))
-            sums = rows.sum(-1, dtype=torch.float32)  # finite only if all values are; isfinite takes six times as long
+            sums = rows.float().sum(-1)  # finite only if all values are; isfinite takes six times as long
             finite &= torch.isfinite(sums).all()
             i, j = (sums == 0).nonzero(as_tuple=True)
             lost += int((~rows[i, j].any(-1) & block[:, i, j].any(0)).sum()) if len(i) else 0

@@ -1,7 +1,7 @@
-"""What each Gaussian answers when it is asked alone: the mean of what the training views show where it is seen.
+"""The fused feature of each Gaussian: the mean of what the training views show at the pixels where it is seen.
 
-Training constrains only blends of Gaussians, so a trained Gaussian's own latent may say something that no view shows. The mean
-over its pixels, weighted by w = T alpha, does not. It is found once, when a field is finished, and needs no camera afterwards.
+Training constrains only blends of Gaussians, so the latent of a single Gaussian may mean something that no view shows. The
+mean over its pixels, weighted by w = T alpha, cannot. It is computed once, when a field is finished, and needs no camera later.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from ..labels import average_views, nearest_codeword
 from ..quant import Autoencoder, Codebook, LinearLatents, fit_linear_latents
 from ..splat import rasterize
 
-KEEP, MOST = 0.999, 64  # of the variation between codewords, and at most so many latents for it
+KEEP, MOST = 0.999, 64  # share of the variation between codewords that is kept, and the most latents for it
 CHUNK = 8192  # pixels quantised at once
-PIXELS = 80_000  # most of a view that is rendered for it
+PIXELS = 80_000  # most pixels of a view that are rendered
 
 
 class Seen(NamedTuple):

@@ -40,7 +40,7 @@ def identify_fit(
     generator: torch.Generator,
     others: dict[str, Any],
 ) -> dict[str, str]:
-    """A digest of each thing a fit depends on. Of the targets their number and the first one are looked at.
+    """A digest of each thing a fit depends on. For the targets these are their number and the first map.
 
     Near planes count where one is not at 0.2: checkpoints from before cameras had one stay valid.
     """

@@ -1,4 +1,4 @@
-"""How a field of Gaussians is trained: one frozen dataclass whose defaults are the published values."""
+"""The options for training a field of Gaussians; the defaults are the published values."""
 
 from __future__ import annotations
 

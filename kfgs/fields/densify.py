@@ -49,7 +49,7 @@ class GradientStatistics(NamedTuple):
 
 
 class Densified(NamedTuple):
-    """The new cloud, and where each of its rows comes from."""
+    """The new cloud, and the source of each of its rows."""
 
     params: GaussianParams
     source: Tensor  # [N'] int64: row of the old cloud

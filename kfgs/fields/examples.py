@@ -1,4 +1,4 @@
-"""Classes without text: what a class looks like is shown by examples in views, or by Gaussians of the field."""
+"""Classes without text: examples in views, or Gaussians of the field, show what a class looks like."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ def _known(target: Tensor) -> Tensor:  # [H, W, D] -> [H, W] bool
 
 
 class _CompiledSimilarity(torch.autograd.Function):
-    """The gradient comes along with the value."""
+    """Returns the gradient together with the value."""
 
     @staticmethod
     def forward(ctx: Any, picture: Tensor, target: Tensor, counted: Tensor | None) -> Tensor:

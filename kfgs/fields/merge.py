@@ -26,7 +26,7 @@ OPACITY = 0.05, 0.99  # of merged Gaussians: fainter ones would be pruned by the
 
 
 class Merged(NamedTuple):
-    """A smaller cloud, and where its Gaussians come from."""
+    """A smaller cloud, and the source of its Gaussians."""
 
     gaussians: Gaussians  # M, with features
     weights: Tensor  # [M] sums of their members' weights
@@ -45,7 +45,7 @@ def merge_gaussians(
     clusters: int = CLUSTERS,
     generator: torch.Generator | None = None,
 ) -> Merged:
-    """Prune and merge Gaussians with features until at most `maximum` are left; no class is looked at.
+    """Prune and merge Gaussians with features until at most `maximum` are left. It uses no classes.
 
     If there are more, the faintest are dropped, those that together hold the share `faint` of all weight: many, since a splat
     has many Gaussians that hardly show, and their features are noise. The others merge where they lie in one cube of a grid

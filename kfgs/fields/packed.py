@@ -85,7 +85,7 @@ def unpack_field(data: bytes) -> SemanticField:
 
 
 def rounded(field: SemanticField) -> SemanticField:
-    """A fused field as it comes back from being packed, with everything else that it had."""
+    """A fused field with the values that packing and unpacking give; its other parts stay."""
     back = unpack_field(pack_field(field))
     return replace(field, gaussians=back.gaussians, linear=back.linear)
 

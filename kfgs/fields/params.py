@@ -23,7 +23,7 @@ LARGEST_SPACING_QUANTILE = 0.99
 
 @dataclass(frozen=True, eq=False)
 class GaussianParams:
-    """N Gaussians as the optimiser sees them: unbounded numbers. `activated()` gives what everyone else uses.
+    """N Gaussians as the optimiser sees them: unbounded numbers. `activated()` returns the `Gaussians` they stand for.
 
     **Convention**: scales are logarithms of world units, opacities are logits, quaternions are (w, x, y, z) of any
     length; features and spherical harmonics are linear, without activation. A semantic field carries `features`, a colour
@@ -75,7 +75,7 @@ class GaussianParams:
         return 0 if self.sh_rest is None else isqrt(self.sh_rest.shape[1] + 1) - 1
 
     def used_sh_degree(self) -> int:
-        """Highest degree with a coefficient other than 0; 0 where only `sh0` says something."""
+        """Highest degree with a coefficient other than 0; 0 where only `sh0` is used."""
         if self.sh_rest is None:
             return 0
         filled = self.sh_rest.detach().ne(0).any(dim=2).any(dim=0)  # [K - 1]

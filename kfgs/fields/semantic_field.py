@@ -1,4 +1,4 @@
-"""The finished semantic field: Gaussians with latents, what turns latents into features, and the one rule of what is what."""
+"""The finished semantic field: Gaussians with latents, the decoder of latents, and the rule that gives each its class."""
 
 from __future__ import annotations
 
@@ -6,51 +6,41 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as default
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from .._card import html_card
-from .._check import as_tensor, check_choice, check_shapes
+from .._check import as_tensor, check_choice
 from .._rows import unit_embeddings, unit_rows
 from ..cameras import Camera
 from ..gaussians import Gaussians
-from ..labels import (
-    LOGIT_SCALES,
-    Classification,
-    CodewordLabels,
-    LabelSet,
-    Score,
-    Selection,
-    label_codewords,
-    label_pixels,
-    select_by_similarity,
-)
+from ..labels import Classification, CodewordLabels, LabelSet, Score, Selection, label_codewords, select_by_similarity
 from ..labels.questions import Classes, Negatives, check_rows, class_rows, make_question
 from ..metrics import MIB, semantic_storage_bytes
 from ..quant import Autoencoder, Codebook, LinearLatents
 from ..splat import Rendering, rasterize
+from . import parts
 from .answers import Answers, Seen, fused_answers
+from .remembered import recall_classes
 from .store import load_field, save_field
 
-CHUNK = 8192  # latents decoded at once: the decoder's widest layer then holds 32 MB
 Rule = Literal["fused", "paper"]
-RULES: tuple[Rule, ...] = ("fused", "paper")
 
 
 @dataclass(frozen=True, eq=False)
 class SemanticField:
-    """A scene's semantics in 3-D, and everything that is needed to ask it.
+    """A scene's semantics in 3-D, with all that is needed to classify, query and segment.
 
-    Latents are linear in the teacher's features (`linear`, what `uplift` makes), or one of the three rows of Table 1: with
+    Latents are linear in the teacher's features (`linear`, made by `uplift`), or one of the three rows of Table 1: with
     codebook and autoencoder d latents ("decouple+ADC+SC"), with the codebook alone features near codewords
     ("decouple+ADC"), with neither the teacher's features as they are ("just decouple").
 
     **The rule.** Each Gaussian has a class, or a score, of its own: that of its *fused* feature, the mean of what the
     training views show where it is seen. Selections, labels of other clouds, and the views of a fused field follow from it.
     `rule="paper"` is Sec. 3.4 as printed: a Gaussian's own latent, or a pixel's rendered one, is decoded and quantised.
+    `field.gaussians[field.query("chair")]` are the Gaussians of the chair.
     """
 
     gaussians: Gaussians
@@ -70,34 +60,7 @@ class SemanticField:
     """Where it was loaded from."""
 
     def __post_init__(self) -> None:
-        if self.gaussians.features is None:
-            raise ValueError("gaussians: expected features [N, d], got None; fit them with fit_field")
-        if self.autoencoder is not None and self.codebook is None:
-            raise ValueError("codebook: expected the one that the autoencoder was fitted to, got None; pass it as well")
-        if self.linear is None and self.answers is not None:
-            raise ValueError("linear: expected what the answers stand for, got None; pass it as well")
-        if self.linear is not None:
-            check_shapes(
-                ("gaussians.means", self.gaussians.means, "N 3"),
-                ("gaussians.features" if self.answers is None else "answers", self._own, ("N", self.linear.latent)),
-            )
-            if self.answers is None and self.codebook is not None:
-                raise ValueError(
-                    "codebook: expected none for linear latents, got one; pass answers, or leave linear out"
-                )
-        if self.codebook is None:
-            return
-        expected = self.codebook.dim if self.autoencoder is None else self.autoencoder.latent
-        if self.autoencoder is not None and self.autoencoder.dim != self.codebook.dim:
-            raise ValueError(
-                f"autoencoder: expected {self.codebook.dim} decoded channels (from codebook), got {self.autoencoder.dim}; "
-                "pass the autoencoder that was fitted to this codebook"
-            )
-        if expected != self.channels:
-            raise ValueError(
-                f"gaussians: expected {expected} features each (from the codebook's latents), got {self.channels}; "
-                "pass the codebook and autoencoder that this field was fitted with"
-            )
+        parts.check_parts(self.gaussians, self.codebook, self.autoencoder, self.linear, self.answers)
 
     @property
     def features(self) -> Tensor:  # [N, d]
@@ -113,8 +76,7 @@ class SemanticField:
     @property
     def dim(self) -> int:
         """D, the channels of the teacher's features."""
-        if self._is_linear:
-            assert self.linear is not None
+        if self.linear is not None and self._is_linear:
             return self.linear.dim
         return self.channels if self.codebook is None else self.codebook.dim
 
@@ -123,8 +85,7 @@ class SemanticField:
         """Either "fused", or the row of Table 1."""
         if self._is_linear:
             return "fused"
-        row = "just decouple" if self.codebook is None else "decouple+ADC"
-        return row + ("+SC" if self.autoencoder is not None else "")
+        return "just decouple" if self.codebook is None else "decouple+ADC" + ("+SC" if self.autoencoder else "")
 
     @property
     def known(self) -> Tensor:  # [N] bool
@@ -138,17 +99,13 @@ class SemanticField:
         return f"SemanticField({self.method}: {len(self)} Gaussians, {self.channels} channels for {self.dim})"
 
     def _repr_html_(self) -> str:
-        teacher = self.info.get("teacher")
-        facts = {
-            "method": self.method,
-            "Gaussians": len(self),
-            "channels": f"{self.channels} for {self.dim} of the teacher",
+        facts: dict[str, object] = {"method": self.method, "Gaussians": len(self), "channels": self.channels}
+        facts |= {
+            "channels of the teacher": self.dim,
             "codewords": None if self.codebook is None else self.codebook.size,
-            "training views": len(self.cameras) or None,
-            "size (as Table 1 counts it)": f"{self.storage() / MIB:.2f} MiB",
-            "teacher": teacher.get("name") if isinstance(teacher, dict) else None,
-            "folder": None if self.folder is None else str(self.folder),
         }
+        facts |= {"training views": len(self.cameras), "size as Table 1 counts it": f"{self.storage() / MIB:.2f} MiB"}
+        facts |= {"teacher": parts.teacher_name(self.info), "folder": None if self.folder is None else str(self.folder)}
         return html_card("SemanticField", facts)
 
     # Maps
@@ -158,10 +115,7 @@ class SemanticField:
         with torch.no_grad():
             return rasterize(self.gaussians, camera, engine=engine)
 
-    def decode(
-        self,
-        latents: Tensor,  # [..., d]
-    ) -> Tensor:  # [..., D]
+    def decode(self, latents: Tensor) -> Tensor:  # [..., d] -> [..., D]
         """Bring latents back to the teacher's space (Psi of Sec. 3.3.2, or B z); features are returned as they are."""
         latents = as_tensor("latents", latents, floating=True)
         if latents.shape[-1] != self.channels:
@@ -170,10 +124,9 @@ class SemanticField:
                 "pass maps or features of this field"
             )
         with torch.no_grad():
-            if self._is_linear:
-                assert self.linear is not None
+            if self.linear is not None and self._is_linear:
                 return self.linear.decode(latents)
-            return latents if self.autoencoder is None else self.autoencoder.decode(latents, chunk=CHUNK)
+            return latents if self.autoencoder is None else self.autoencoder.decode(latents, chunk=parts.CHUNK)
 
     def feature_map(self, camera: Camera) -> Tensor:  # [H, W, D]
         """The teacher's features as seen from a viewpoint. 512 channels at 640x480 take 630 MB."""
@@ -181,12 +134,7 @@ class SemanticField:
 
     # The rule
 
-    def cosines(
-        self,
-        rows: Tensor,  # [M, D]
-        *,
-        rule: Rule = "fused",
-    ) -> Tensor:  # [N, M]
+    def cosines(self, rows: Tensor, *, rule: Rule = "fused") -> Tensor:  # [M, D] -> [N, M]
         """The cosine of each Gaussian's feature with some rows; 0 where nothing is known of the Gaussian.
 
         Args:
@@ -197,7 +145,7 @@ class SemanticField:
         Raises:
             ValueError: if there is no row, shapes disagree, or a row is all-zero.
         """
-        check_choice("rule", rule, RULES)
+        check_choice("rule", rule, get_args(Rule))
         rows = as_tensor("rows", rows, floating=True)
         check_rows("rows", rows, ("M",), self.dim)
         unit = unit_embeddings(rows, "rows").to(self.features)
@@ -205,15 +153,12 @@ class SemanticField:
             if self.linear is not None and (rule == "fused" or self._is_linear):
                 return self.linear.cosines(self._own, unit)
             if self.codebook is None:
-                return torch.cat([unit_rows(part) @ unit.T for part in self.features.split(CHUNK)])
+                return torch.cat([unit_rows(part) @ unit.T for part in self.features.split(parts.CHUNK)])
             per_codeword = self.codebook.unit.to(unit) @ unit.T  # [K, M]
-            index = [self.codebook.quantize(self.decode(part)) for part in self.features.split(CHUNK)]
+            index = [self.codebook.quantize(self.decode(part)) for part in self.features.split(parts.CHUNK)]
             return per_codeword[torch.cat(index)] * self.features.any(dim=1)[:, None]
 
-    def own_features(
-        self,
-        rows: Tensor,  # [n] int64
-    ) -> Tensor:  # [n, D]
+    def own_features(self, rows: Tensor) -> Tensor:  # [n] int64 -> [n, D]
         """The features that some Gaussians answer with, in the teacher's space; all-zero where nothing is known."""
         if self.linear is not None:
             return self.linear.decode(self._own[rows])
@@ -229,8 +174,7 @@ class SemanticField:
         Returns:
             Labels [N], -1 where nothing is known of the Gaussian, and scores [N]. A tie goes to the lowest class.
         """
-        cosines = self.cosines(self._rows(classes), rule=rule)
-        scores, labels = cosines.max(dim=1)
+        scores, labels = self.cosines(self._rows(classes), rule=rule).max(dim=1)
         nothing = ~(self.known if rule == "fused" else self.features.any(dim=1))
         return Classification(labels.masked_fill(nothing, -1), scores.masked_fill(nothing, 0))
 
@@ -260,8 +204,7 @@ class SemanticField:
             threshold: gamma. None: 0.5 for a relevancy, else read off the scores; the result says how.
             negatives: what the target is compared with: "classes", "canonical" (words of the classes' table), "none", rows
                 [M, D], or "auto" as above.
-            score: "relevancy", "softmax" over target and negatives, or "cosine"; None: relevancy with negatives, else
-                cosine.
+            score: "relevancy", "softmax" over target and negatives, or "cosine". None: relevancy if there are negatives.
             logit_scale: of the softmax: "raw", "lseg", "clip", or a number that multiplies the cosines.
             rule: see `cosines`.
 
@@ -280,9 +223,8 @@ class SemanticField:
                 if isinstance(target, str) or negatives != "auto":  # an embedding needs no classes
                     raise
         asked = make_question(target, classes, negatives, self.dim, self.info)
-        rows = (
-            asked.row[None] if asked.negatives is None else torch.cat([asked.row[None], asked.negatives.to(asked.row)])
-        )
+        others = [] if asked.negatives is None else [asked.negatives.to(asked.row)]
+        rows = torch.cat([asked.row[None], *others])
         cosines = self.cosines(rows, rule=rule)
         known = self.known if rule == "fused" else self.features.any(dim=1)
         against = None if asked.negatives is None else cosines[:, 1:]
@@ -297,44 +239,26 @@ class SemanticField:
             camera: any viewpoint.
             classes: a label set, or embeddings [C, D]; None: the field's own (`label_set`).
             rule: `fused`: each Gaussian of a fused field shares one vote among the classes (the softmax of 100 cosines,
-                CLIP's scale), and a pixel takes the class with most votes, as blended; a trained field, which learnt
-                blends of latents, takes the codeword whose latent is nearest to the rendered one. `paper`: render the
-                latent map, decode every pixel, quantise, look up (Sec. 3.4). Features without an autoencoder need no codeword:
-                the class most similar to the rendered feature wins, quantised first only by the paper's rule.
+                CLIP's scale), and a pixel takes the class with most blended votes. A trained field learnt blends of latents,
+                so it takes the codeword whose latent is nearest to the rendered one. `paper`: render the latent map, decode
+                every pixel, quantise, look up (Sec. 3.4). Without an autoencoder, the class most similar to the rendered
+                feature wins; only `paper` quantises it first.
 
         Raises:
             ValueError: if shapes disagree or `rule` is unknown.
         """
-        check_choice("rule", rule, RULES)
+        check_choice("rule", rule, get_args(Rule))
         rows = self._rows(classes)
         if rule == "fused" and self._is_linear:
-            return self._blend_votes(camera, rows)
+            return parts.blend_votes(self.gaussians, camera, self.cosines(rows), self.known)
         rendering = self.render(camera)
         if self.codebook is None or (rule == "fused" and self.autoencoder is None):
-            pixels = [self.decode(part) for part in rendering.map.flatten(0, 1).split(CHUNK)]
-            unit = unit_embeddings(rows).to(self.features)
-            found = torch.cat([(part @ unit.T).max(dim=1).indices.masked_fill(~part.any(dim=1), -1) for part in pixels])
-            return found.view(camera.size).masked_fill(rendering.alpha <= 0, -1)
-        labels = self.codeword_labels(rows)
-        decode: Literal["exact", "latent"] = "exact" if rule == "paper" else "latent"
-        covered = rendering.alpha > 0
-        return label_pixels(rendering.map, self.codebook, labels, self.autoencoder, decode=decode, covered=covered)
+            return parts.label_rendered(rendering, self.decode, unit_embeddings(rows).to(self.features))
+        return parts.label_latents(
+            rendering, self.codebook, self.codeword_labels(rows), self.autoencoder, exact=rule == "paper"
+        )
 
-    def _blend_votes(self, camera: Camera, rows: Tensor) -> Tensor:  # [C, D] -> [H, W] int64
-        with torch.no_grad():
-            cosines = self.cosines(rows)
-            winners = cosines.argmax(dim=1)[self.known].unique()  # a class that no Gaussian prefers wins no pixel
-            if len(winners) == 0:
-                return torch.full(camera.size, -1, dtype=torch.int64, device=self.features.device)
-            votes = torch.softmax(LOGIT_SCALES["clip"] * cosines[:, winners], dim=1) * self.known[:, None]
-            blended = rasterize(self.gaussians.replace(features=votes.contiguous(), sh=None), camera).map
-            most, index = blended.max(dim=-1)
-            return winners[index].masked_fill(most <= 0, -1)
-
-    def codeword_labels(
-        self,
-        embeddings: Tensor,  # [C, D]
-    ) -> CodewordLabels:
+    def codeword_labels(self, embeddings: Tensor) -> CodewordLabels:  # [C, D]
         """The class of each codeword (Sec. 3.4).
 
         Raises:
@@ -347,11 +271,11 @@ class SemanticField:
         return label_codewords(self.codebook.codewords, embeddings)
 
     def with_answers(self, cameras: Sequence[Camera], found: Answers | None = None) -> SemanticField:
-        """This field with fused features found from some views, which it remembers. A fused field has its own.
+        """This field with the fused features that some views show, and with these views. A fused field keeps its own features.
 
         Args:
-            cameras: those that the field was trained with.
-            found: what `fused_answers` gave; None asks it.
+            cameras: the views that the field was trained with.
+            found: what `fused_answers` returned; None calls it.
 
         Raises:
             ValueError: if there is no camera.
@@ -370,8 +294,6 @@ class SemanticField:
             ValueError: if it remembers none, or they have changed.
             FileNotFoundError: if they are no longer where they were.
         """
-        from .remembered import recall_classes
-
         return recall_classes(self.info, self.folder)
 
     # Size and files
@@ -379,8 +301,7 @@ class SemanticField:
     def storage(self) -> int:
         """Bytes as Table 1 counts them: every attribute of the Gaussians, and what decodes them, in float32.
 
-        With no autoencoder the table's sizes hold no codebook or decoder; ours counts the codebook, which labelling needs.
-        Fused answers of a trained field are not counted.
+        Without an autoencoder, the table counts no codebook; we do: labelling needs it. Fused answers are not counted.
         """
         decoder = 0 if self.autoencoder is None else self.autoencoder.decoder_parameters
         codebook = 0 if self.codebook is None else self.codebook.codewords.numel()
@@ -390,12 +311,10 @@ class SemanticField:
     def summary(self) -> str:
         """A few lines for a person: counts, channels, codewords, size."""
         codewords = "no codebook" if self.codebook is None else f"{self.codebook.size} codewords"
-        teacher = self.info.get("teacher")
         lines = [
             f"semantic field ({self.method}): {len(self)} Gaussians, {self.channels} channels for {self.dim}, {codewords}",
             f"  size as Table 1 counts it: {self.storage() / MIB:.2f} MiB",
-            *([f"  teacher: {teacher.get('name')}"] if isinstance(teacher, dict) else []),
-            *(f"  {name}: {value}" for name, value in self.info.items() if not isinstance(value, list | dict)),
+            *parts.info_lines(self.info),
         ]
         return "\n".join(lines)
 
@@ -406,7 +325,7 @@ class SemanticField:
             FileExistsError: if something else than a field lies at `path`.
             ValueError: if `info` is not JSON.
         """
-        save_field(path, self)
+        save_field(path, vars(self))
 
     @classmethod
     def load(cls, path: str | Path) -> SemanticField:
@@ -427,11 +346,4 @@ class SemanticField:
         return self.features if self.answers is None else self.answers
 
     def _rows(self, classes: Classes | None) -> Tensor:  # [C, D]
-        if isinstance(classes, str):
-            raise TypeError(
-                f"classes: expected a LabelSet or embeddings [C, {self.dim}], got the name {classes!r}; "
-                f"query({classes!r}) finds the Gaussians of one class"
-            )
-        if isinstance(classes, np.ndarray):
-            classes = as_tensor("classes", classes, floating=True)
-        return class_rows(self.label_set() if classes is None else classes, self.dim, self.info)
+        return class_rows(self.label_set() if classes is None else parts.checked_classes(classes), self.dim, self.info)

@@ -1,10 +1,11 @@
-"""A semantic field on disk: one folder with `field.safetensors` (numbers) and `field.json` (what they are)."""
+"""A semantic field on disk: one folder with `field.safetensors` (numbers) and `field.json` (their description)."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from safetensors import SafetensorError
@@ -18,40 +19,35 @@ from ..quant import Autoencoder, Codebook, LinearLatents
 from .answers import Seen
 from .remembered import rebased
 
-if TYPE_CHECKING:
-    from .semantic_field import SemanticField
-
 FORMAT, VERSIONS = "kfgs.semantic_field", (1, 2)
 """Version 2 may hold linear latents, fused answers and cameras."""
 TENSORS, DESCRIPTION = "field.safetensors", "field.json"
 
 
-def save_field(path: str | Path, field: SemanticField) -> None:
-    """Write the folder, replacing a field that lies there and nothing else; see `SemanticField.save`."""
+def save_field(path: str | Path, parts: Mapping[str, Any]) -> None:
+    """Write the parts of a field, as `load_field` gives them, into a folder; see `SemanticField.save`."""
     path = Path(path)
     if path.exists() and not (path / DESCRIPTION).is_file() and not (path.is_dir() and not any(path.iterdir())):
         raise FileExistsError(
             f"path: expected a new folder or an older field at {path}, got something else; give another"
         )
-    info = rebased(field.info, field.folder, path)
+    gaussians, cameras = parts["gaussians"], parts["cameras"]
+    info = rebased(parts["info"], parts["folder"], path)
     try:
         json.dumps(info, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ValueError(f"info: expected what JSON can hold, got {error}; use strings and finite numbers") from error
-    tensors = {f"gaussians.{name}": value for name, value in vars(field.gaussians).items() if value is not None}
-    if field.codebook is not None:
-        tensors["codebook.codewords"] = field.codebook.codewords
-    if field.autoencoder is not None:
-        tensors |= {f"autoencoder.{name}": value for name, value in field.autoencoder.to_tensors().items()}
-    if field.linear is not None:
-        tensors |= {f"linear.{name}": value for name, value in field.linear.to_tensors().items()}
-    if field.answers is not None:
-        tensors["answers.latents"] = field.answers
-    if field.seen is not None:
-        tensors |= {f"seen.{name}": value for name, value in field.seen._asdict().items()}
-    if field.cameras:
-        tensors["cameras.viewmats"] = torch.stack([camera.viewmat for camera in field.cameras])
-        tensors["cameras.Ks"] = torch.stack([camera.K for camera in field.cameras])
+    tensors = {f"gaussians.{name}": value for name, value in vars(gaussians).items() if value is not None}
+    for part in ("codebook", "autoencoder", "linear"):
+        if parts[part] is not None:
+            tensors |= {f"{part}.{name}": value for name, value in parts[part].to_tensors().items()}
+    if parts["answers"] is not None:
+        tensors["answers.latents"] = parts["answers"]
+    if parts["seen"] is not None:
+        tensors |= {f"seen.{name}": value for name, value in parts["seen"]._asdict().items()}
+    if cameras:
+        tensors["cameras.viewmats"] = torch.stack([camera.viewmat for camera in cameras])
+        tensors["cameras.Ks"] = torch.stack([camera.K for camera in cameras])
     with atomic_folder(path) as folder:
         whole = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
         save_file(whole, folder / TENSORS)
@@ -59,8 +55,8 @@ def save_field(path: str | Path, field: SemanticField) -> None:
             "format": FORMAT,
             "version": VERSIONS[-1],
             "sha256": digest_file(folder / TENSORS),
-            "gaussians": len(field),
-            "cameras": [[camera.name, camera.width, camera.height, camera.near] for camera in field.cameras],
+            "gaussians": len(gaussians),
+            "cameras": [[camera.name, camera.width, camera.height, camera.near] for camera in cameras],
             "info": info,
         }
         write_json(folder / DESCRIPTION, description)

@@ -13,12 +13,12 @@ from torch import Tensor
 from ..cameras import Camera
 from ..splat import rasterize
 from .checkpoint import Checkpoint
-from .coarse import shrink_camera, shrink_map
 from .config import FieldConfig
 from .densify import GradientStatistics, densify, lowered_opacities
 from .loss import Loss
 from .optimizer import FieldOptimizer
 from .params import GaussianParams
+from .working_maps import shrink_camera, shrink_map
 
 
 class Trainer:

@@ -7,9 +7,8 @@ iterative reconstruction technique (SIRT, Gilbert 1972) take that out: render, c
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,25 +19,19 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._card import short_repr
-from .._check import check_range, check_shapes, check_whole
-from .._files import atomic_path
-from .._rows import EPS, row_norms, unit_rows
+from .._check import check_range, check_whole
+from .._rows import row_norms, unit_rows
 from ..cameras import Camera, resize_map
 from ..gaussians import Gaussians
 from ..labels.views import sum_pixels
 from ..quant import FeatureMaps
-from ..quant.linear import LinearLatents, fit_linear_latents, principal_directions
-from ..quant.sampling import sample_grid
+from ..quant.linear import LinearLatents, fit_linear_latents
 from ..splat import rasterize
-from .coarse import shrink_map
 from .merge import FAINT, Merged, merge_gaussians
+from .working_maps import WorkingMaps, shrink_map, working_directions
 
-WORKING = 64
-"""Directions in which maps are averaged at first. Those of room_0's maps hold 98.8 % of their energy, and what they leave out is
-noise of single pixels: the latents found among them keep a cosine above 0.99 with the average of all 512 channels."""
 NEIGHBOURS = 17  # a Gaussian and 16 around it, whose corrections are judged together
 SPARSE = 0.3  # of the views: a splat of the scene fills nearly all of them
-LOOKED_AT = 32, 2_000  # views, and features of each, that the working directions are found in
 
 
 @dataclass(frozen=True)
@@ -138,8 +131,8 @@ def uplift_maps(
     cloud = cloud.to(torch.promote_types(cloud.means.dtype, torch.float32))
     steps = len(cameras) * (1 + config.corrections + (config.max_gaussians is not None and config.corrections > 0))
     with torch.no_grad(), tqdm(total=steps, desc="uplift", unit="view", disable=not progress) as bar:
-        directions = _working_directions(maps).to(cloud.means)
-        with _Views(cameras, maps, directions, config.pixels, scratch) as views:
+        directions = working_directions(maps).to(cloud.means)
+        with WorkingMaps(cameras, maps, directions, config.pixels, scratch) as views:
             sums, shown = _average(cloud, views, bar)
             if not bool((shown > 0).any()):
                 raise ValueError(
@@ -175,108 +168,6 @@ def uplift_maps(
     return Uplifted(cloud.replace(features=_mean(sums)), latents, shown, agreement)
 
 
-class _Views:
-    """The maps at their working size, in few directions, each kept in a file."""
-
-    def __init__(
-        self, cameras: Sequence[Camera], maps: FeatureMaps, directions: Tensor, pixels: int, scratch: Path | None
-    ) -> None:
-        self._cameras, self._maps, self._directions, self._pixels = cameras, maps, directions, pixels
-        self._temporary = tempfile.TemporaryDirectory(prefix="kfgs_") if scratch is None else None
-        self._folder = Path(self._temporary.name) if self._temporary is not None else Path(scratch or "")
-        self._basis: Tensor | None = None
-
-    def __enter__(self) -> _Views:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._temporary is not None:
-            self._temporary.cleanup()
-
-    def __len__(self) -> int:
-        return len(self._cameras)
-
-    @property
-    def channels(self) -> int:
-        """Of the maps as they are given now."""
-        return int((self._directions if self._basis is None else self._basis).shape[1])
-
-    def project(self, basis: Tensor) -> None:  # [d', d]
-        """From now on give maps in these directions of the working ones."""
-        self._basis = basis
-
-    def __getitem__(self, i: int) -> tuple[Camera, Tensor, int, float]:
-        """The working camera, the map [h, w, d] (NaN where nothing is known), by what to shrink, and pixels per pixel."""
-        kept, shape = self._keep(i)
-        h, w, _ = kept.shape
-        camera = self._cameras[i]
-        largest = min(camera.height // h, camera.width // w)
-        factor = max(1, min(largest, int((self._pixels / (h * w)) ** 0.5)))
-        features = kept if self._basis is None else kept @ self._basis
-        # (width, height) of the whole picture in working pixels: not whole if some at the right or bottom were left over
-        span = shape.flip(0) / (int(shape[0]) // h) * factor / torch.tensor([camera.width, camera.height])
-        K = camera.K.to(features) * torch.cat([span, torch.ones(1)]).to(features)[:, None]
-        working = replace(camera.to(features), K=K, width=w * factor, height=h * factor)
-        return working, features, factor, 1 / float(span.prod())
-
-    def _keep(self, i: int) -> tuple[Tensor, Tensor]:  # [h, w, d'], [2]
-        """The map in the working directions, and the (height, width) that it had; made once, then read."""
-        file = self._folder / f"{i}.npz"
-        if not file.is_file():
-            rows, shape = self._make(i)
-            with atomic_path(file) as path, path.open("wb") as opened:
-                np.savez(opened, rows=rows.to(torch.float16).cpu().numpy(), shape=np.asarray(shape))
-            return rows, torch.tensor(shape, dtype=torch.float64)
-        with np.load(file, allow_pickle=False) as found:
-            rows = torch.from_numpy(found["rows"].astype(np.float32)).to(self._directions)
-            return rows, torch.from_numpy(found["shape"]).double()
-
-    def _make(self, i: int) -> tuple[Tensor, tuple[int, int]]:  # [h, w, d']
-        """Read a map, take unit features in the working directions, and shrink it to its working size."""
-        features = self._maps[i]
-        check_shapes((f"maps[{i}]", features, ("h", "w", len(self._directions))))
-        features = features.to(self._directions)
-        lengths = row_norms(features)
-        if not bool(torch.isfinite(lengths).all()):
-            raise ValueError(f"maps[{i}]: expected finite features, got NaN or infinity; encode that image again")
-        known = (lengths > EPS)[..., None]
-        rows = (features @ self._directions) / lengths.clamp_min(EPS)[..., None] * known
-        height, width = rows.shape[:2]
-        shrink = 1
-        while (height // shrink) * (width // shrink) > self._pixels and shrink < min(height, width):
-            shrink += 1
-        if shrink > 1:
-            rows, share = shrink_map(rows, shrink), shrink_map(known.to(rows), shrink)
-            rows, known = rows / share.clamp_min(EPS), share > 0.5
-        return torch.where(known, rows, torch.nan).contiguous(), (height, width)
-
-
-def _working_directions(maps: FeatureMaps) -> Tensor:  # [D, d']
-    """The main directions of unit features, found in samples of some evenly spread maps."""
-    most, samples = LOOKED_AT
-    views = sorted({round(i) for i in np.linspace(0, len(maps) - 1, min(most, len(maps)))})
-    moment: Tensor | float = 0.0
-    for i in views:
-        grid: Callable[..., Tensor] | None = getattr(maps, "grid", None)
-        channels = "D" if isinstance(moment, float) else len(moment)
-        if grid is None:
-            whole = maps[i]
-            check_shapes((f"maps[{i}]", whole, ("h", "w", channels)))
-            rows = sample_grid(whole, samples=samples)
-        else:
-            rows = grid(i, None, samples)
-            check_shapes((f"maps[{i}]", rows, ("n", channels)))
-        rows = unit_rows(rows.float())
-        if not bool(torch.isfinite(rows).all()):
-            raise ValueError(f"maps[{i}]: expected finite features, got NaN or infinity; encode that image again")
-        moment = moment + rows.T @ rows
-    assert isinstance(moment, Tensor)
-    values, directions = principal_directions(moment)
-    if not float(values[0]) > 0:
-        raise ValueError(f"maps: expected nonzero features, got {len(maps)} all-zero maps; check the teacher")
-    return directions[:, :WORKING].float()
-
-
 def _add(cloud: Gaussians, camera: Camera, signal: Tensor, sums: Tensor) -> None:  # [h, w, c], [N, c + 1]
     """Add the signal of one view to the sums by rendering weight, and in the last column the weight of its known pixels."""
     known = ~signal[..., :1].isnan()
@@ -286,7 +177,7 @@ def _add(cloud: Gaussians, camera: Camera, signal: Tensor, sums: Tensor) -> None
     sums.index_add_(0, index, total)
 
 
-def _average(cloud: Gaussians, views: _Views, bar: Any) -> tuple[Tensor, Tensor]:  # [2, N, d' + 1], [N]
+def _average(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, Tensor]:  # [2, N, d' + 1], [N]
     """Sums of features and of weights over the even and over the odd views, and the pixels that each Gaussian fills."""
     sums, shown = cloud.means.new_zeros(2, len(cloud), views.channels + 1), torch.zeros_like(cloud.opacities)
     for i in range(len(views)):
@@ -298,8 +189,8 @@ def _average(cloud: Gaussians, views: _Views, bar: Any) -> tuple[Tensor, Tensor]
     return sums, shown
 
 
-def _correct(cloud: Gaussians, sums: Tensor, views: _Views, bar: Any) -> Tensor:  # [2, N, d + 1]
-    """One pass of SIRT: add to each Gaussian's feature the mean, by weight, of what its pixels lack, without the noise.
+def _correct(cloud: Gaussians, sums: Tensor, views: WorkingMaps, bar: Any) -> Tensor:  # [2, N, d + 1]
+    """One pass of SIRT: add to each Gaussian's feature the mean, by weight, of the difference at its pixels, without the noise.
 
     The even and the odd views make a reconstruction each, from their own maps alone. How well the two corrections agree
     among neighbours tells signal from noise (`_reliability`), and both take the reliable share.

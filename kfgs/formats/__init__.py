@@ -1,9 +1,9 @@
-"""Splat files of other programs: 3DGS PLY, compressed PLY, .splat, SPZ, SOG, .ksplat, glTF; read, written, labels kept."""
+"""Read and write the splat files of other programs, with labels: 3DGS PLY, compressed PLY, .splat, SPZ, SOG, .ksplat, glTF."""
 
 from .order import morton_order
-from .splat_file import Precision, SplatFile
+from .splat_file import Precision, SplatFile, Written
 from .spz import write_spz
-from .table import Written, find_format, formats, read_splats, write_splats
+from .table import find_format, formats, read_splats, write_splats
 
 __all__ = [
     "Precision",

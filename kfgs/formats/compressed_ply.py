@@ -28,7 +28,7 @@ from .ply import Columns, read_comments, read_ply_elements, write_ply_elements
 from .render_mode import comments_of_mode, mode_from_comments
 from .smallest_three import pack_smallest_three, rotation_error, unpack_smallest_three
 from .splat_file import Precision, SplatFile
-from .values import SH_C0, check_finite, colours_to_write, positive_scales, words_of_loss
+from .values import SH_C0, check_finite, colours_to_write, describe_loss, positive_scales
 
 NAME = "compressed_ply"
 SUFFIXES = (".compressed.ply",)
@@ -63,7 +63,7 @@ def matches(head: bytes) -> bool:
 
 
 def read(path: Path) -> SplatFile:
-    """Read a compressed PLY file with harmonics of degree 0 to 3; opacities of 0 and 1 are read as such.
+    """Read a compressed PLY file with harmonics of degree 0 to 3; opacities of 0 and 1 stay 0 and 1.
 
     Raises:
         ValueError: if it is truncated, elements or columns are missing or disagree, or bounds are not finite.
@@ -131,7 +131,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
         steps_of_rest = np.clip(np.floor((rest / (2 * SH_LIMIT) + 0.5) * 256), 0, 255).astype(np.uint8)
         elements["sh"] = {f"f_rest_{i}": np.ascontiguousarray(column) for i, column in enumerate(steps_of_rest.T)}
     write_ply_elements(path, elements, comments=("written by kfgs", *comments_of_mode(splats.info)))
-    return words_of_loss(splats, ".compressed.ply", 3) + _words_of_clipping(g)
+    return describe_loss(splats, ".compressed.ply", 3) + _words_of_clipping(g)
 
 
 def precision(gaussians: Gaussians) -> Precision:
@@ -236,7 +236,7 @@ def _read_rest(path: Path, columns: Columns | None, n: int) -> NDArray[np.float3
 
 
 def _read_bounds(path: Path, chunk: Columns, axes: tuple[tuple[str, ...], tuple[str, ...]]) -> _Bounds | None:
-    """The bounds of one kind, or None where the file has none of them (colours in older files)."""
+    """The bounds of one kind, or None if the file has none (colours in older files)."""
     names = [name for side in axes for name in side]
     if not any(name in chunk for name in names) and names[0] == "min_r":
         return None

@@ -30,15 +30,23 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..gaussians import Gaussians
-from .axes import UP_AND_BACK, flip_axes
 from .gltf_accessors import AccessorWriter, read_accessor
 from .gltf_container import MAGIC as GLB
 from .gltf_container import Document, open_document, write_document
 from .gltf_nodes import place, placed_meshes
 from .ply import Columns
-from .render_mode import words_of_lost_mode
+from .render_mode import describe_lost_mode
 from .splat_file import SCORE, Precision, SplatFile
-from .values import SH_C0, check_finite, colours_to_write, positive_scales, unit_quats, words_of_loss
+from .values import (
+    SH_C0,
+    UP_AND_BACK,
+    check_finite,
+    colours_to_write,
+    describe_loss,
+    flip_axes,
+    positive_scales,
+    unit_quats,
+)
 
 NAME = "gltf"
 SUFFIXES = (".glb", ".gltf")
@@ -150,7 +158,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     }
     write_document(path, root, writer.binary())
     left = {name: values for name, values in splats.extra.items() if name not in kept}
-    return words_of_loss(splats.replace(extra=left), path.suffix, 3) + words_of_lost_mode(splats.info, path.suffix)
+    return describe_loss(splats.replace(extra=left), path.suffix, 3) + describe_lost_mode(splats.info, path.suffix)
 
 
 def precision(gaussians: Gaussians) -> Precision:

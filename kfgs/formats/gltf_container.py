@@ -1,6 +1,6 @@
 """glTF 2.0 files as a JSON document and its buffers: `.glb`, and `.gltf` with buffers inside or beside it.
 
-Nothing is believed: every index, offset and length is checked against what is there before anything is read.
+Every index, offset and length is checked against the file before anything is read.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ class Document:
         return ValueError(f"{self.path}: {where}: expected {expected}, got {got!r:.80}; the file is damaged")
 
     def all(self, kind: str) -> list[Any]:
-        """A list at the top of the document, such as "nodes"; absent is empty."""
+        """A list at the top of the document, for example "nodes"; empty if it is absent."""
         return self.list_of(self.root, kind, kind)
 
     def item(self, kind: str, index: object) -> dict[str, Any]:
-        """One entry of such a list."""
+        """One entry of a list at the top of the document."""
         items = self.all(kind)
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(items):
             raise self.wrong(kind, f"an index below {len(items)}", index)

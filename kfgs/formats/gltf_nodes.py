@@ -22,7 +22,7 @@ _DEEPEST = 256  # nodes below nodes
 def placed_meshes(document: Document) -> Iterator[tuple[str, int, Tensor]]:  # name of the node, mesh, [4, 4] float64
     """Every mesh that the default scene shows, with the matrix from its own space to the scene's.
 
-    A document without scenes shows all nodes that are no child of another; without nodes, all meshes as they are.
+    A document without scenes shows all nodes without a parent; one without nodes shows all meshes unmoved.
 
     Raises:
         ValueError: if nodes form a loop, or a transform is no list of finite numbers.
@@ -53,7 +53,7 @@ def placed_meshes(document: Document) -> Iterator[tuple[str, int, Tensor]]:  # n
 
 
 def place(document: Document, where: str, gaussians: Gaussians, matrix: Tensor) -> Gaussians:  # matrix: [4, 4]
-    """The Gaussians of a mesh moved to where its node puts them, their colours turned along.
+    """Move the Gaussians of a mesh to where its node puts them, and turn their colours.
 
     Raises:
         ValueError: if the node mirrors, shears or scales the axes differently, or moves Gaussians out of the range of

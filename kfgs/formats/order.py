@@ -1,4 +1,4 @@
-"""The order in which formats that compress neighbours together store Gaussians: along a Morton curve."""
+"""Morton order: formats that compress neighbours together store their Gaussians along this curve."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SPREAD = (  # (shift, mask): bit i of a 21-bit number goes to bit 3 i, in halve
 def morton_order(
     means: Tensor,  # [N, 3]
 ) -> Tensor:  # [N] int64
-    """The indices that put positions in the order of their Morton codes, so that neighbours come close together.
+    """The indices that sort positions by their Morton codes, so that neighbours in space are neighbours in the file.
 
     A code interleaves 21 bits of x, y and z between the cloud's least and largest coordinates (Morton 1966), x in the
     lowest bit. Equal codes keep their order, so an ordered cloud stays as it is.

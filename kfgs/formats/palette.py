@@ -1,4 +1,4 @@
-"""Few values that stand for many: codebooks of 256 numbers and palettes of rows, by k-means without chance."""
+"""Few values that stand for many: codebooks of 256 numbers and palettes of rows, by k-means without random numbers."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def fit_palette(
 
 
 def _share(counts: Tensor, size: int) -> list[int]:
-    """Whole parts of `size` in proportion to the counts, at least 1 where there is something, never more than it."""
+    """Whole parts of `size` in proportion to the counts: at least 1 for each count above 0, and never more than the count."""
     filled = int((counts > 0).sum())
     parts = (counts * (size - filled) // int(counts.sum())) + (counts > 0).long()
     return torch.minimum(parts, counts).tolist()

@@ -1,4 +1,4 @@
-"""PLY files: tables of named columns of numbers, whatever they mean; most often one, of vertices."""
+"""PLY files: tables with named columns of numbers. Most files have one table, of vertices."""
 
 from __future__ import annotations
 

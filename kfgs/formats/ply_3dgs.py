@@ -37,7 +37,7 @@ def read(path: Path) -> SplatFile:
 
     Raises:
         ValueError: if it is damaged, no 3DGS file, or a value is not a finite number; opacities of 0 and 1, whose logits
-            are infinite, are read as such.
+            are infinite, stay 0 and 1.
     """
     columns = read_ply(path)
     try:

@@ -1,8 +1,8 @@
-"""How a cloud was trained to be drawn, which no value of a Gaussian says: antialiased, or as flat surfels.
+"""For which kind of drawing a cloud was trained: antialiased, or as flat surfels. No value of a Gaussian shows it.
 
-`info["antialiased"]` (true or false): trained with the filter of Mip-Splatting, so whoever widens a Gaussian on the screen
-has to lower its opacity by as much; drawn without, small Gaussians are too opaque. `info["surfels"]` (true): trained as
-2D Gaussians. Neither is there where a file does not say.
+`info["antialiased"]` (true or false): trained with the filter of Mip-Splatting, so a renderer that widens a Gaussian on the
+screen has to lower its opacity by as much. Drawn without, small Gaussians are too opaque. `info["surfels"]` (true): trained
+as 2D Gaussians. A file that does not say has neither.
 
 - PLY and compressed PLY, in comments: `SplatRenderMode: default`, `mip` or `2dgs` (Brush), `antialiased 1` or `0` and
   `postshot.anti_aliasing=1` or `0` (Postshot);
@@ -29,7 +29,7 @@ _WORDS = {ANTIALIASED: "antialiased rendering", SURFELS: "rendering as surfels (
 
 
 def mode_from_comments(comments: Iterable[str]) -> dict[str, bool]:
-    """What a PLY header's comments say, for `info`; of several that do, the last counts, as in Brush."""
+    """Read the mode from the comments of a PLY header, for `info`. The last one counts, as in Brush."""
     said: dict[str, bool] = {}
     for comment in comments:
         words = comment.lower().replace("=", " ").split()
@@ -45,7 +45,7 @@ def mode_from_comments(comments: Iterable[str]) -> dict[str, bool]:
 
 
 def comments_of_mode(info: Mapping[str, Any]) -> tuple[str, ...]:
-    """Comments for a PLY header, in the words of Brush and of Postshot; none where `info` does not say."""
+    """Comments for a PLY header, in the words of Brush and of Postshot; none if `info` does not say."""
     if info.get(SURFELS):
         return ("SplatRenderMode: 2dgs",)
     if info.get(ANTIALIASED) is None:
@@ -67,7 +67,7 @@ def mode_from_meta(meta: Mapping[str, Any]) -> dict[str, bool]:
 
 
 def meta_of_mode(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Keys for the `meta.json` of a SOG scene; none where `info` does not say."""
+    """Keys for the `meta.json` of a SOG scene; none if `info` does not say."""
     if info.get(SURFELS):
         return {"model": "2dgs"}
     if info.get(ANTIALIASED) is None:
@@ -75,8 +75,8 @@ def meta_of_mode(info: Mapping[str, Any]) -> dict[str, Any]:
     return {"antialias": True, "model": "antialiased"} if info[ANTIALIASED] else {"antialias": False}
 
 
-def words_of_lost_mode(info: Mapping[str, Any], name: str, holds: tuple[str, ...] = ()) -> tuple[str, ...]:
-    """What a format that can say only what it `holds` leaves out, in words."""
+def describe_lost_mode(info: Mapping[str, Any], name: str, holds: tuple[str, ...] = ()) -> tuple[str, ...]:
+    """Say what a format leaves out of the mode if it can only store what it `holds`."""
     return tuple(
         f"{words}: {name} has no place for it" for key, words in _WORDS.items() if info.get(key) and key not in holds
     )

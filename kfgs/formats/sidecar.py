@@ -1,4 +1,4 @@
-"""What travels beside a splat file: the names of its classes, and the labels where the format has no place for them."""
+"""Files beside a splat file: the names of its classes, and the labels if the format has no place for them."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ _NPZ_HEADERS = 1 << 16  # bytes: what an .npz file of three arrays has beside th
 
 
 def names_path(path: str | Path) -> Path:
-    """`scene.ply` -> `scene.ply.classes.json`: the names of the classes in a splat file, and in that one alone."""
+    """`scene.ply` -> `scene.ply.classes.json`: the names of the classes of this one splat file."""
     path = Path(path)
     return path.with_name(path.name + ".classes.json")
 
 
 def shared_names_path(path: str | Path) -> Path:
-    """`scene.ply` -> `scene.classes.json`: where names lay once; read where a file has none of its own.
+    """`scene.ply` -> `scene.classes.json`: read if the file has no names of its own (older versions of kfgs wrote this name).
 
-    It may belong to `scene.spz` as well, so it is never written or deleted.
+    It may also belong to `scene.spz`, so it is never written or deleted.
     """
     return Path(path).with_suffix(".classes.json")
 
@@ -45,10 +45,10 @@ def write_names(path: str | Path, classes: tuple[str, ...], **facts: Any) -> Pat
 
 
 def write_sidecar(path: Path, splats: SplatFile, *, holds_labels: bool) -> list[Path]:
-    """Write what the format itself could not hold, and take away labels and names that belonged to an older `path`.
+    """Write what the format itself could not hold, and delete the labels and names of an older `path`.
 
-    Names always lie beside a labelled file, whether or not the format holds them: people read them there, with the facts
-    of how the labels came about.
+    The names are always written beside a labelled file, even if the format holds them: people read them there, together
+    with how the labels were made.
     """
     labels, written = splats.gaussians.labels, []
     beside = labels_path(path)
@@ -61,7 +61,7 @@ def write_sidecar(path: Path, splats: SplatFile, *, holds_labels: bool) -> list[
         written.append(beside)
     else:
         beside.unlink(missing_ok=True)
-    # Where another file's names would be read as this one's, that it has none is written too.
+    # An empty file of names keeps the shared one from being read for this file.
     if labels is not None and (splats.classes or shared_names_path(path).is_file()):
         facts = splats.info.get("labels", {})
         written.append(write_names(path, splats.classes, **facts))
@@ -71,7 +71,7 @@ def write_sidecar(path: Path, splats: SplatFile, *, holds_labels: bool) -> list[
 
 
 def read_sidecar(path: Path, splats: SplatFile) -> SplatFile:
-    """Add what lies beside a splat file; what the file itself says comes first.
+    """Add the labels and names from the files beside a splat file. What the file itself says has priority.
 
     Raises:
         ValueError: if a file beside it is damaged, or its labels belong to another version of the splat file.
@@ -86,7 +86,7 @@ def read_sidecar(path: Path, splats: SplatFile) -> SplatFile:
 
 
 def find_names(path: str | Path) -> Path | None:
-    """The file with the names of a splat file's classes: its own, or the one that it may share; None where there is none."""
+    """The file with the names of a splat file's classes: its own, or the shared one; None if there is neither."""
     return next((found for found in (names_path(path), shared_names_path(path)) if found.is_file()), None)
 
 
@@ -110,7 +110,7 @@ def _with_labels(beside: Path, path: Path, splats: SplatFile) -> SplatFile:
     labels, score, of = _load_labels(beside, path, len(splats))
     if of != _digest(path) or labels.shape != (len(splats),):
         raise ValueError(
-            f"{beside}: expected the labels of {path.name} as it is, got those of another version; delete it, or write "
+            f"{beside}: expected the labels of {path.name} as it is now, got those of another version; delete it, or write "
             "both again"
         )
     if (labels < -1).any() or (score is not None and (score.shape != labels.shape or not np.isfinite(score).all())):

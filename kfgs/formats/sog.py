@@ -7,7 +7,7 @@ as alpha. `shN_labels`: which row of `shN_centroids`, 64 to a line, holds the hi
 codebook. Version 1 has even steps between bounds instead of codebooks, and opacity as a logit; it is read, not written.
 Axes are those of the 3DGS PLY. There is no place for labels, which go to a file beside it.
 
-**Why not a library**: gsply 0.4.6 reads SOG but does not write it, and unpacks whatever a zip entry promises; the tests
+**Why not a library**: gsply 0.4.6 reads SOG but does not write it, and unpacks a zip entry to any size it claims; the tests
 have it as an independent reader.
 """
 
@@ -33,7 +33,7 @@ from .smallest_three import pack_smallest_three, rotation_error, unpack_smallest
 from .sog_images import META, SogFiles, encode_image, write_zip
 from .sog_meta import SogMeta, parse_meta
 from .splat_file import Precision, SplatFile
-from .values import check_finite, colours_to_write, positive_scales, words_of_loss
+from .values import check_finite, colours_to_write, describe_loss, positive_scales
 
 NAME = "sog"
 SUFFIXES = (".sog",)
@@ -59,7 +59,7 @@ def matches(head: bytes) -> bool:
 
 
 def read(path: Path) -> SplatFile:
-    """Read a .sog file, a folder with `meta.json`, or that `meta.json`; opacities of 0 and 1 are read as such.
+    """Read a .sog file, a folder with `meta.json`, or that `meta.json`; opacities of 0 and 1 stay 0 and 1.
 
     `info` has `version`, and, where the scene says so, `generator`, and `antialiased` or `surfels` (`render_mode`).
 
@@ -95,7 +95,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     """Write version 2 in the order given: a zip file where the name ends in .sog, else a folder.
 
     Raises:
-        ValueError: if the cloud has no colours, or a folder of that name holds files that are not of such a scene.
+        ValueError: if the cloud has no colours, or there is a folder of that name with files that do not belong to a SOG scene.
     """
     files = _encode(colours_to_write(splats.gaussians, ".sog"), meta_of_mode(splats.info))
     if path.name.lower().endswith(SUFFIXES):
@@ -106,7 +106,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
         with atomic_folder(path) as folder:
             for name, data in files.items():
                 (folder / name).write_bytes(data)
-    return words_of_loss(splats, ".sog", 3)
+    return describe_loss(splats, ".sog", 3)
 
 
 def precision(gaussians: Gaussians) -> Precision:

@@ -15,9 +15,9 @@ import torch
 
 from .._files import atomic_path
 from ..gaussians import Gaussians
-from .render_mode import words_of_lost_mode
+from .render_mode import describe_lost_mode
 from .splat_file import Precision, SplatFile
-from .values import SH_C0, byte_error, check_finite, colours_to_write, positive_scales, unit_quats, words_of_loss
+from .values import SH_C0, byte_error, check_finite, colours_to_write, describe_loss, positive_scales, unit_quats
 
 NAME = "splat"
 SUFFIXES = (".splat",)
@@ -75,7 +75,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
     rows["quats"] = (quats * 128 + 128).round().clamp(0, 255).numpy()
     with atomic_path(path) as temporary:
         rows.tofile(temporary)
-    return words_of_loss(splats, ".splat", 0) + words_of_lost_mode(splats.info, ".splat")
+    return describe_loss(splats, ".splat", 0) + describe_lost_mode(splats.info, ".splat")
 
 
 def precision(gaussians: Gaussians) -> Precision:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from torch import Tensor
 
+from .._card import html_card, short_value
 from ..gaussians import Gaussians
 from .ply import Columns
 
@@ -25,12 +28,12 @@ class SplatFile:
     gaussians: Gaussians
     """N Gaussians with activated values; colour in `sh`, classes in `labels`."""
     extra: Columns = field(default_factory=dict)
-    """Whatever else the file says of each Gaussian: N values a column, by name (`score` belongs to the label)."""
+    """Other columns of the file, by name: one value per Gaussian (`score` belongs to the label)."""
     classes: tuple[str, ...] = ()
-    """The name of each class index in `labels`; empty where the file has no names."""
+    """The name of each class index in `labels`; empty if the file has no names."""
     info: dict[str, Any] = field(default_factory=dict)
-    """Facts about the file: `format`, and what its header says; anything that JSON can hold. `antialiased` and `surfels` say
-    how the cloud was trained to be drawn (`render_mode`): they travel to other formats, or are named among what is lost."""
+    """Facts about the file that JSON can hold: `format`, and what the header says. `antialiased` and `surfels` say for which
+    kind of drawing the cloud was trained (`render_mode`). A format that has no place for them reports them as lost."""
 
     def __post_init__(self) -> None:
         for name, values in self.extra.items():
@@ -45,12 +48,24 @@ class SplatFile:
 
     def __repr__(self) -> str:
         classes = f", {len(self.classes)} classes" if self.classes else ""
-        extra = f", extra {', '.join(self.extra)}" if self.extra else ""
+        extra = f", extra {short_value(list(self.extra))}" if self.extra else ""
         return f"SplatFile({self.info.get('format', 'new')}: {self.gaussians!r}{classes}{extra})"
+
+    def _repr_html_(self) -> str:
+        facts: dict[str, object] = {"format": self.info.get("format", "new"), "gaussians": repr(self.gaussians)}
+        if self.classes:
+            facts["classes"] = f"{len(self.classes)}: {', '.join(self.classes)}"
+        return html_card("SplatFile", facts | {"other columns": ", ".join(self.extra) or None})
 
     def replace(self, **changes: Any) -> SplatFile:
         """A copy with some parts exchanged."""
         return replace(self, **changes)
+
+    def save(self, path: str | Path, *, format: str | None = None) -> Written:
+        """Write the cloud in the format that the ending of `path` names; see `write_splats`, which this calls."""
+        table = import_module(".table", __package__)  # it imports this file
+        written: Written = table.write_splats(path, self, format=format)
+        return written
 
     def select(self, which: Tensor) -> SplatFile:  # which: [N] bool or [n] int64
         """The Gaussians under a mask or an index, with their extra columns."""
@@ -59,8 +74,16 @@ class SplatFile:
         return replace(self, gaussians=self.gaussians.select(which), extra=extra)
 
 
+class Written(NamedTuple):
+    """What `write_splats` left behind."""
+
+    paths: list[Path]  # the file, and those beside it
+    lost: tuple[str, ...]  # what the format could not hold, in words
+    order: Tensor | None  # [N] int64: row i of the file is Gaussian order[i] of the cloud; None: the cloud's own order
+
+
 class Precision(NamedTuple):
-    """How far a value may be off after it was written and read again; what a format states and its tests ask."""
+    """How far a value may be off after it was written and read again. Each format states it, and the tests hold it to that."""
 
     means: float | Tensor  # world units, per axis: one number, or [N, 3]
     scales: float  # relative, of each standard deviation

@@ -1,27 +1,39 @@
-"""SPZ, Niantic's compressed splat file: versions 1 to 4 read, 2 to 4 written; labels travel in an extension record.
+"""SPZ, Niantic's compressed splat file: versions 1 to 4 are read, 2 to 4 written. Labels lie in an extension record.
 
 **Why not a library**: Niantic's own binding is not in the Python package index (in 2026 the `spz` there, 0.0.1, is another
 author's, with a wheel for Python 3.13 alone). gsply 0.4.6 leaves the axes as the file has them, keeps neither flags nor
-extension records, where the labels are, and unpacks a gzip stream to whatever size it has; the tests have it as an
-independent reader and writer.
+extension records, where the labels are, and unpacks a gzip stream to any size. The tests use it as an independent reader and
+writer.
+
+**Labels** lie in kfgs's extension record, type 0x4B460001; other readers skip it. Its payload, little-endian:
+
+| bytes | what |
+|---|---|
+| u16 | layout version, 1; a reader refuses others |
+| u16 | flags: 1 = scores follow |
+| u32 | N, the number of Gaussians, as in the file's header |
+| u32 | J, bytes of JSON: at most 1 MiB |
+| rest | one Zstandard frame of N int32 class_id (-1 = none), N float32 score if flagged, J bytes of a JSON list of names |
 """
 
 from __future__ import annotations
 
+import json
 import struct
 import zlib
 from math import exp
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+import zstandard
+from numpy.typing import NDArray
 
 from .._check import check_choice, check_whole
 from ..gaussians import Gaussians
-from .axes import UP_AND_BACK
 from .render_mode import ANTIALIASED as ANTIALIASED_MODE
-from .render_mode import words_of_lost_mode
+from .render_mode import describe_lost_mode
 from .splat_file import SCORE, Precision, SplatFile
 from .spz_codec import (
     LOG_SCALES,
@@ -31,15 +43,17 @@ from .spz_codec import (
     precision_of,
     unpack,
 )
-from .spz_labels import TYPE as LABELS
-from .spz_labels import LabelRecord, pack_labels, unpack_labels
 from .spz_streams import ANTIALIASED, GZIP, MAGIC, MAX_FRACTIONAL_BITS, Container, read_container, write_container
-from .values import check_splats, colours_to_write, words_of_loss
+from .values import UP_AND_BACK, check_splats, colours_to_write, describe_loss
 
 NAME = "spz"
 SUFFIXES = (".spz",)
 HOLDS_LABELS = True
 _COORDINATES = 0xADBE0003  # Adobe's record: u32, which axes the file has
+LABELS = 0x4B460001  # vendor 0x4B46 (KF), extension 1
+_LABELS_VERSION, _HAS_SCORE = 1, 0x1
+_LABELS_HEAD = struct.Struct("<HHII")
+_MAX_NAMES = 1 << 20
 _SPARSE_BITS = 8  # fewer bits after the point than this are worth a word: steps of 1/256 unit
 
 
@@ -73,7 +87,7 @@ def read(path: Path) -> SplatFile:
     splats = SplatFile(unpack(path, c, axes), info=info)
     if label_record is None:
         return splats
-    labels = unpack_labels(path, label_record, c.count)
+    labels = _unpack_labels(path, label_record, c.count)
     gaussians = splats.gaussians.replace(labels=torch.from_numpy(labels.class_id.astype(np.int64)))
     extra = {} if labels.score is None else {SCORE: labels.score}
     return splats.replace(gaussians=gaussians, extra=extra, classes=labels.classes)
@@ -128,7 +142,7 @@ def write_spz(
     assert g.sh is not None
     degree = int(g.sh.shape[1] ** 0.5) - 1
     flags = ANTIALIASED if splats.info.get(ANTIALIASED_MODE) else 0
-    records = [] if g.labels is None else [(LABELS, pack_labels(_record(splats)))]
+    records = [] if g.labels is None else [(LABELS, _pack_labels(_record(splats)))]
     streams = pack(g, version, fractional_bits, sh_bits)
     write_container(Path(path), Container(version, len(g), degree, fractional_bits, flags, streams, records))
     return _lost(splats, g, fractional_bits)
@@ -139,12 +153,76 @@ def precision(gaussians: Gaussians) -> Precision:
     return precision_of(gaussians, choose_fractional_bits(gaussians.means))
 
 
-def _record(splats: SplatFile) -> LabelRecord:
+class _LabelRecord(NamedTuple):
+    """What kfgs's extension record holds."""
+
+    class_id: NDArray[np.int32]  # [N], -1 = none
+    score: NDArray[np.float32] | None  # [N]
+    classes: tuple[str, ...]
+
+
+def _pack_labels(record: _LabelRecord) -> bytes:
+    """The payload of a record.
+
+    Raises:
+        ValueError: if the names take more than 1 MiB.
+    """
+    names = json.dumps(list(record.classes), ensure_ascii=False).encode() if record.classes else b""
+    if len(names) > _MAX_NAMES:
+        raise ValueError(f"classes: expected names of at most {_MAX_NAMES} bytes, got {len(names)}; shorten them")
+    parts = [record.class_id.astype("<i4").tobytes(), names]
+    if record.score is not None:
+        parts.insert(1, record.score.astype("<f4").tobytes())
+    head = _LABELS_HEAD.pack(
+        _LABELS_VERSION, 0 if record.score is None else _HAS_SCORE, len(record.class_id), len(names)
+    )
+    return head + zstandard.compress(b"".join(parts), 12)
+
+
+def _unpack_labels(path: Path, payload: bytes, count: int) -> _LabelRecord:
+    """Read a record of a file of `count` Gaussians.
+
+    Raises:
+        ValueError: if it is damaged, of another version, or of another number of Gaussians.
+    """
+    version, flags, n, names_size = (
+        _LABELS_HEAD.unpack_from(payload) if len(payload) >= _LABELS_HEAD.size else (0, 0, 0, 0)
+    )
+    if version != _LABELS_VERSION:
+        raise ValueError(
+            f"{path}: expected labels of layout {_LABELS_VERSION}, got {version}; update kfgs, or write them again"
+        )
+    if n != count or names_size > _MAX_NAMES:
+        raise ValueError(
+            f"{path}: expected labels of {count} Gaussians and at most {_MAX_NAMES} bytes of names, got {n} and {names_size}; "
+            "the record is damaged"
+        )
+    scores = flags & _HAS_SCORE
+    size = n * (8 if scores else 4) + names_size
+    try:
+        if zstandard.get_frame_parameters(payload[_LABELS_HEAD.size :]).content_size != size:
+            raise zstandard.ZstdError("of another size")
+        plain = (
+            zstandard.ZstdDecompressor().decompress(payload[_LABELS_HEAD.size :], allow_extra_data=False)
+            if size
+            else b""
+        )
+        classes = json.loads(plain[size - names_size :]) if names_size else []
+    except (zstandard.ZstdError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: expected {size} bytes of labels, but they cannot be read ({error})") from error
+    class_id = np.frombuffer(plain, "<i4", n).astype(np.int32)
+    score = np.frombuffer(plain, "<f4", n, 4 * n).astype(np.float32) if scores else None
+    if (class_id < -1).any() or not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
+        raise ValueError(f"{path}: expected class_id of -1 or more and a list of names; the labels are damaged")
+    return _LabelRecord(class_id, score, tuple(classes))
+
+
+def _record(splats: SplatFile) -> _LabelRecord:
     labels = splats.gaussians.labels
     assert labels is not None
     class_id = labels.detach().cpu().numpy()
     score = splats.extra.get(SCORE)
-    return LabelRecord(class_id.astype(np.int32), None if score is None else score.astype(np.float32), splats.classes)
+    return _LabelRecord(class_id.astype(np.int32), None if score is None else score.astype(np.float32), splats.classes)
 
 
 def _axes(path: Path, record: bytes | None) -> tuple[int, int, int]:
@@ -164,7 +242,7 @@ def _axes(path: Path, record: bytes | None) -> tuple[int, int, int]:
 
 
 def _lost(splats: SplatFile, g: Gaussians, fractional_bits: int) -> tuple[str, ...]:
-    lost = list(words_of_loss(splats, ".spz", 3) + words_of_lost_mode(splats.info, ".spz", (ANTIALIASED_MODE,)))
+    lost = list(describe_loss(splats, ".spz", 3) + describe_lost_mode(splats.info, ".spz", (ANTIALIASED_MODE,)))
     if fractional_bits < _SPARSE_BITS:
         lost.append(
             f"positions finer than {2.0**-fractional_bits:g} units: the cloud reaches {g.means.abs().max().item():g} units "

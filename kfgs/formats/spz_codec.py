@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..gaussians import Gaussians
-from .axes import UP_AND_BACK, flip_axes
 from .smallest_three import join_largest, split_largest
 from .splat_file import Precision
 from .spz_streams import MAX_FRACTIONAL_BITS, Container
-from .values import byte_error, check_finite, unit_quats
+from .values import UP_AND_BACK, byte_error, check_finite, flip_axes, unit_quats
 
 Bytes = NDArray[np.uint8]
 _DC = 0.5 / 0.15  # the degree-0 coefficient of byte 255

@@ -8,8 +8,8 @@ A format is one module of this package with
 - `write(path, splats) -> tuple[str, ...]`: write the file, whole or not at all, and say in words what it could not hold
   (formats that are only read have no `write`);
 - `precision(gaussians) -> Precision`: how exactly a written cloud comes back;
-- `HOLDS_LABELS`: whether `class_id` and `score` travel inside; else they go to a file beside it (`sidecar`, which writes
-  the names of classes beside every labelled file);
+- `HOLDS_LABELS`: whether `class_id` and `score` are stored inside. If not, they go to a file beside it (see `sidecar`, which
+  writes the names of the classes beside every labelled file);
 - `SORTS = True`, where the format packs neighbours together: `write` keeps the order that it is given, and `write_splats`
   gives it Morton order;
 
@@ -22,14 +22,11 @@ import os
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
-
-from torch import Tensor
 
 from ..gaussians import Gaussians
 from .order import morton_order
 from .sidecar import find_names, names_path, read_sidecar, write_sidecar
-from .splat_file import SplatFile
+from .splat_file import SplatFile, Written
 from .values import check_splats
 
 MODULES = (  # asked in this order: compressed PLY before PLY, whose ending it shares
@@ -44,22 +41,14 @@ MODULES = (  # asked in this order: compressed PLY before PLY, whose ending it s
 _HEAD_BYTES = 1 << 16
 
 
-class Written(NamedTuple):
-    """What `write_splats` left behind."""
-
-    paths: list[Path]  # the file, and those beside it
-    lost: tuple[str, ...]  # what the format could not hold, in words
-    order: Tensor | None  # [N] int64: row i of the file is Gaussian order[i] of the cloud; None: the cloud's own order
-
-
 def formats() -> dict[str, ModuleType]:
-    """Every format by name, in the order in which they are asked whether a file is theirs."""
+    """Every format by name, in the order in which they are tried on a file."""
     modules = [import_module(f".{name}", __package__) for name in MODULES]
     return {module.NAME: module for module in modules}
 
 
 def find_format(path: str | Path) -> ModuleType:
-    """The format of a file, by its content first, and by its name where the content has no mark (`.splat`).
+    """The format of a file: by its content, or by its name if the content has no mark (`.splat`).
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -83,12 +72,12 @@ def find_format(path: str | Path) -> ModuleType:
 
 
 def read_splats(path: str | Path) -> SplatFile:
-    """Read a splat file of any known format; labels and names come along, from the file or from those beside it.
+    """Read a splat file of any known format, with labels and class names from the file itself or from files beside it.
 
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is of no known format, or damaged: truncated, with counts that disagree, numbers that are not
-            finite, or labels that are none of the named classes.
+            finite, or labels without a name in its classes.
     """
     path = Path(path)
     module = find_format(path)
@@ -107,22 +96,22 @@ def read_splats(path: str | Path) -> SplatFile:
 def write_splats(path: str | Path, splats: SplatFile | Gaussians, *, format: str | None = None) -> Written:
     """Write a cloud in the format that the file's name asks for.
 
-    **Convention**: formats that pack neighbours together (compressed PLY, SOG) get the Gaussians in Morton order, labels
-    and scores along; `Written.order` says which went where. Whoever keeps indices (an edit of `OfIndex`) applies it to
-    them, or works on the cloud as read back. All other formats keep the order.
+    **Convention**: formats that pack neighbours together (compressed PLY, SOG) store the Gaussians in Morton order, with
+    their labels and scores. `Written.order` is that order: apply it to indices that you keep (an edit of `OfIndex`), or
+    work on the cloud as read back. All other formats keep the order.
 
     Args:
         path: the file; it is whole or absent. Its ending chooses the format.
-        splats: a cloud with colours; `labels`, `score` and class names travel with it.
-        format: a format's name, where the ending does not say it.
+        splats: a cloud with colours; its `labels`, `score` and class names are written too.
+        format: a format's name, if the ending does not say it.
 
     Returns:
         The files written, what the format could not hold, and the order.
 
     Raises:
         ValueError: if no format has such an ending, or the format cannot be written or cannot hold such a cloud, or a value
-            is NaN or infinite, a scale not positive, an opacity outside [0, 1] (its ends are fine), or a label none of the
-            named classes. Nothing is written then.
+            is NaN or infinite, a scale not positive, an opacity outside [0, 1] (both ends are allowed), or a label that has no
+            name in `classes`. Nothing is written then.
     """
     path = Path(path)
     if isinstance(splats, Gaussians):

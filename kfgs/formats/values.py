@@ -1,4 +1,4 @@
-"""Values that quantised formats share: what they refuse, and what they say about a cloud that they hold only in part."""
+"""What the formats share: checks of values, axes that point the other way, and what a format cannot hold."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from ..gaussians import Gaussians
 from .splat_file import SCORE, SplatFile
 
 SH_C0 = 0.28209479177387814  # the constant harmonic: rgb = 0.5 + SH_C0 * coefficient
+UP_AND_BACK = (1, -1, -1)  # x right, y up, z back (RUB) against x right, y down, z forward (RDF) of the 3DGS PLY
+# Signs of the coefficients under a flip of axes: which of x, y, z each harmonic is odd in, degrees 1 to 3.
+_ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 _TINY_SCALE = 1e-10  # world units, of a Gaussian that a file gives no extent at all
 _LABELS = 2**31 - 1  # the largest int32
 _EXPECTED = {
@@ -47,6 +50,23 @@ def positive_scales(path: Path, scales: NDArray[np.float32]) -> Tensor:  # [N, 3
     return torch.from_numpy(np.maximum(scales, np.float32(_TINY_SCALE)))
 
 
+def flip_axes(g: Gaussians, axes: tuple[int, int, int]) -> Gaussians:
+    """Turn some axes of a cloud around: means change sign, rotations become S R S, harmonics follow their parity.
+
+    Args:
+        g: the cloud.
+        axes: 1 or -1 for x, y and z.
+    """
+    sign = dict(zip("xyz", axes, strict=True))
+    x, y, z = axes
+    means, quats = g.means.new_tensor([x, y, z]), g.quats.new_tensor([1, y * z, x * z, x * y])
+    sh = None
+    if g.sh is not None:
+        parity = [float(np.prod([sign[axis] for axis in odd])) for odd in ("", *_ODD)]
+        sh = g.sh * g.sh.new_tensor(parity[: g.sh.shape[1]])[:, None]
+    return g.replace(means=g.means * means + 0.0, quats=g.quats * quats + 0.0, sh=sh)  # + 0: no negative zeros
+
+
 def unit_quats(quats: Tensor) -> Tensor:  # [N, 4] wxyz -> [N, 4] of length 1
     """Quaternions of length 1; those of length 0 become the identity."""
     length = quats.norm(dim=1, keepdim=True)
@@ -55,9 +75,9 @@ def unit_quats(quats: Tensor) -> Tensor:  # [N, 4] wxyz -> [N, 4] of length 1
 
 
 def check_splats(splats: SplatFile) -> None:
-    """Refuse what readers of any format refuse, before anything is written; values count as float32, which files hold.
+    """Refuse what readers of any format refuse, before anything is written. Values are checked as float32, as files store them.
 
-    Opacities of exactly 0 and 1 are fine: the PLY, which stores logits, keeps them within 1e-7 of these ends.
+    Opacities of exactly 0 and 1 are allowed: the PLY, which stores logits, keeps them within 1e-7.
 
     Raises:
         ValueError: if a value is NaN or infinite, a scale is not positive, an opacity lies outside [0, 1], a label is below
@@ -97,7 +117,7 @@ def _check_rows(name: str, expected: str, values: Tensor, good: Tensor) -> None:
 
 
 def colours_to_write(gaussians: Gaussians, name: str) -> Gaussians:
-    """The cloud in float64 on the CPU without its history.
+    """The cloud in float64 on the CPU, without its autograd history.
 
     Raises:
         ValueError: if it has no spherical harmonics.
@@ -110,8 +130,8 @@ def colours_to_write(gaussians: Gaussians, name: str) -> Gaussians:
     return gaussians.detach().to("cpu", torch.float64)
 
 
-def words_of_loss(splats: SplatFile, name: str, degree: int) -> tuple[str, ...]:
-    """What a format without room for features, extra columns and high degrees of harmonics leaves out, in words."""
+def describe_loss(splats: SplatFile, name: str, degree: int) -> tuple[str, ...]:
+    """Say what a format leaves out that has no room for features, other columns and high degrees of harmonics."""
     g, lost = splats.gaussians, []
     if g.sh is not None and (have := int(g.sh.shape[1] ** 0.5) - 1) > degree:
         kept = "the base colour only" if degree == 0 else f"degree {degree}"
@@ -125,7 +145,7 @@ def words_of_loss(splats: SplatFile, name: str, degree: int) -> tuple[str, ...]:
 
 
 def byte_error(values: Tensor, low: float, high: float) -> float:
-    """Largest error of values kept in 256 even steps from `low` to `high`: half a step, or what is cut off beyond.
+    """Largest error of values kept in 256 even steps from `low` to `high`: half a step, or the most that is cut off.
 
     `values` may be empty. The ends belong to the range.
     """

@@ -16,12 +16,12 @@ from .components import component_distance, component_numbers
 from .edits import Duplicate, Edit, EditList, Extract, Insert, Move, Opacity, Recolor, Remove, Turn, join
 from .label_set import LabelSet, load_label_set, teacher_mismatch
 from .names import class_index, class_indices
+from .nearest import default_distance
 from .parts import BestView, Part, connected_parts, describe_selection, view_shares
 from .scores import CANONICAL, LOGIT_SCALES, Score, relevancy, select_by_similarity, similarity_threshold, text_scores
 from .segment import label_pixels, nearest_codeword
 from .selection import Selection
-from .transfer import Transfer, transfer_labels
-from .transfer_distance import default_distance
+from .transfer import Transfer, label_splats, transfer_labels
 from .views import ViewAverage, Votes, average_views, vote_labels
 from .where import AboveScore, Both, Component, Either, Everything, InBox, InSphere, Not, OfClass, OfIndex, Where
 
@@ -72,6 +72,7 @@ __all__ = [
     "join",
     "label_codewords",
     "label_pixels",
+    "label_splats",
     "load_label_set",
     "nearest_codeword",
     "parse_color",

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import MISSING, fields
 from typing import Any, TypeVar
 
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 T = TypeVar("T")
@@ -99,25 +98,3 @@ def set_fields(frozen: Any, **values: Any) -> None:
     """Replace fields of a frozen dataclass by their checked form, from its own `__post_init__`."""
     for name, value in values.items():
         object.__setattr__(frozen, name, value)
-
-
-def quaternion_of(name: str, values: Any) -> tuple[float, ...]:
-    """Four numbers (w, x, y, z) that are not all zero."""
-    quaternion = numbers_of(name, values, 4)
-    if not any(quaternion):
-        raise ValueError(f"{name}: expected a quaternion (w, x, y, z), got zeros; (1, 0, 0, 0) is no rotation")
-    return quaternion
-
-
-def rotation_matrix(quaternion: Sequence[float]) -> Any:  # (w, x, y, z) -> [3, 3]
-    """The rotation of a quaternion of any length; scipy wants (x, y, z, w)."""
-    w, x, y, z = unit(quaternion)
-    return Rotation.from_quat([x, y, z, w]).as_matrix()
-
-
-def unit(values: Sequence[float]) -> list[float]:
-    """Divide a vector by its length, also where a square of its numbers would overflow or vanish. It must not be zero."""
-    largest = max(abs(value) for value in values)
-    scaled = [value / largest for value in values]
-    length = math.hypot(*scaled)
-    return [value / length for value in scaled]

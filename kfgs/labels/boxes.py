@@ -1,7 +1,8 @@
-"""An oriented box: a place to select in, and the shape of what was found."""
+"""An oriented box, the size and place of what was selected; and rotations by quaternions."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,10 +10,12 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from .._check import check_shapes
+from .._check import as_tensor, check_shapes
 from .._rows import check_finite
+from ._json import numbers_of
 
 ROUNDS = 3  # over the three faces; room_0's objects no longer change after two
 
@@ -23,7 +26,8 @@ Array = np.ndarray[Any, Any]
 class OrientedBox:
     """A box with any orientation, in world units: the points `center + sum_i t_i axes[i]` with |t_i| <= half[i].
 
-    **Convention**: the axes are the *rows* of a rotation (right-handed); `half` are half the edges.
+    **Convention**: the axes are the *rows* of a rotation (right-handed); `half` are half the edges. In Open3D the box is
+    `OrientedBoundingBox(box.center.numpy(), box.axes.numpy().T, 2 * box.half.numpy())`.
     """
 
     center: Tensor  # [3]
@@ -35,7 +39,7 @@ class OrientedBox:
         for name, value in (("center", self.center), ("axes", self.axes), ("half", self.half)):
             check_finite(name, value)
         if bool((self.half < 0).any()):
-            raise ValueError(f"half: expected half edges >= 0, got {self.half.tolist()}; exchange minimum and maximum")
+            raise ValueError(f"half: expected half edges >= 0, got {self.half.tolist()}; swap minimum and maximum")
         axes = self.axes.double()
         if float((axes @ axes.T - torch.eye(3).to(axes)).abs().max()) > 1e-3 or float(torch.linalg.det(axes)) < 0:
             raise ValueError(f"axes: expected a rotation, got {self.axes.tolist()}; normalise it, right-handed")
@@ -53,16 +57,16 @@ class OrientedBox:
 
     @classmethod
     def around(cls, points: Tensor) -> OrientedBox:  # points: [N, 3]
-        """A small box around points: the smaller of two, started at the principal axes and at the world's.
+        """A small box around points: the smaller of two, one started at the principal axes, one at the world's.
 
-        Each start is turned about one of its axes after another to the rectangle of least area around the points'
-        shadow along that axis (an edge of the hull lies on it), until it turns no more. This finds no guaranteed least
-        volume, but never more than that of the start. The longest edge comes first. `contains` is true of every one of
-        the points.
+        Each start is rotated about one of its axes after another, to the rectangle of least area around the projection of
+        the points along that axis (an edge of the hull lies on it). The volume is never more than that of the start, but
+        not always the least possible. The longest edge comes first. `contains` is true of all the points.
 
         Raises:
             ValueError: if there is no point, or one is not finite.
         """
+        points = as_tensor("points", points)
         check_shapes(("points", points, "N 3"))
         if len(points) == 0:
             raise ValueError("points: expected at least one, got none; select something first")
@@ -93,6 +97,7 @@ class OrientedBox:
 
     def contains(self, points: Tensor) -> Tensor:  # [N, 3] -> [N] bool
         """Which points lie inside or on the faces, in float64."""
+        points = as_tensor("points", points)
         check_shapes(("points", points, "N 3"))
         center, axes, half = (part.to(points.device, torch.float64) for part in (self.center, self.axes, self.half))
         return (_local(points.double(), center, axes).abs() <= half).all(dim=1)
@@ -102,14 +107,36 @@ class OrientedBox:
         return {name: getattr(self, name).tolist() for name in ("center", "axes", "half")}
 
 
+def quaternion_of(name: str, values: Any) -> tuple[float, ...]:
+    """Four numbers (w, x, y, z) that are not all zero."""
+    quaternion = numbers_of(name, values, 4)
+    if not any(quaternion):
+        raise ValueError(f"{name}: expected a quaternion (w, x, y, z), got zeros; (1, 0, 0, 0) is no rotation")
+    return quaternion
+
+
+def rotation_matrix(quaternion: Sequence[float]) -> Any:  # (w, x, y, z) -> [3, 3]
+    """The rotation of a quaternion of any length; scipy wants (x, y, z, w)."""
+    w, x, y, z = unit(quaternion)
+    return Rotation.from_quat([x, y, z, w]).as_matrix()
+
+
+def unit(values: Sequence[float]) -> list[float]:
+    """Divide a vector by its length, without overflow for huge or tiny numbers. It must not be all zeros."""
+    largest = max(abs(value) for value in values)
+    scaled = [value / largest for value in values]
+    length = math.hypot(*scaled)
+    return [value / length for value in scaled]
+
+
 def _local(points: Tensor, center: Tensor, axes: Tensor) -> Tensor:  # [N, 3], [3], [3, 3] -> [N, 3]
-    """Coordinates along the axes, from the centre; a matrix product would round by the number of points and the device."""
+    """Coordinates along the axes, from the centre. A matrix product would round differently for other counts and devices."""
     x, y, z = (points - center).unbind(dim=1)
     return torch.stack([x * axis[0] + y * axis[1] + z * axis[2] for axis in axes], dim=1)
 
 
 def _shell(cloud: Array) -> Array:
-    """The corners of the convex hull; the points themselves where they have no volume."""
+    """The corners of the convex hull; the points themselves if they have no volume."""
     try:
         shell: Array = cloud[ConvexHull(cloud).vertices]
         return shell
@@ -118,7 +145,7 @@ def _shell(cloud: Array) -> Array:
 
 
 def _turned(shell: Array, axes: Array) -> Array:
-    """Turn a frame about its own axes, one after another, to the rectangle of least area seen along each."""
+    """Rotate a frame about its axes, one after another, to the rectangle of least area seen along each."""
     for turn in range(3 * ROUNDS):
         a, b = (turn + 1) % 3, (turn + 2) % 3
         angle = _least_rectangle(shell @ axes[[a, b]].T)
@@ -136,7 +163,7 @@ def _least_rectangle(flat: Array) -> float:  # flat: [n, 2]
         return 0.0
     edges = np.roll(corners, -1, axis=0) - corners
     angles = np.mod(np.arctan2(edges[:, 1], edges[:, 0]), np.pi / 2)
-    angles = np.concatenate([[0.0], angles])  # as it is, where nothing is smaller
+    angles = np.concatenate([[0.0], angles])  # 0 keeps the frame if no other area is smaller
     along = np.stack([np.cos(angles), np.sin(angles)])  # [2, E]
     across = np.stack([-np.sin(angles), np.cos(angles)])
     areas = np.ptp(corners @ along, axis=0) * np.ptp(corners @ across, axis=0)

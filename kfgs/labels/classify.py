@@ -1,4 +1,4 @@
-"""Which class does a feature belong to: max-similarity among several classes, a threshold for one (Sec. 3.4)."""
+"""Which class does a feature belong to: the most similar of several classes, or a threshold for one (Sec. 3.4)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_shapes, check_whole
-from .._rows import EPS, check_finite, row_norms, unit_embeddings, unit_rows
+from .._rows import EPS, as_tensor, check_finite, row_norms, unit_embeddings, unit_rows
 from .components import component_numbers
 from .scores import Score, select_by_similarity
 from .selection import Selection
@@ -28,7 +28,7 @@ class Classification(NamedTuple):
     """The class of each feature and its cosine with that class."""
 
     labels: Tensor  # [N] int64, -1 = none
-    scores: Tensor  # [N] cosine with the winning class; 0 where there is none
+    scores: Tensor  # [N] cosine with the winning class; 0 if there is none
 
 
 def label_codewords(
@@ -48,6 +48,7 @@ def label_codewords(
     Raises:
         ValueError: if shapes disagree, there is no class, an embedding is all-zero, or a number is not finite.
     """
+    codewords, embeddings = as_tensor("codewords", codewords), as_tensor("embeddings", embeddings)
     check_shapes(("codewords", codewords, "K D"), ("embeddings", embeddings, "C D"))
     classes = unit_embeddings(embeddings)
     check_finite("codewords", codewords)
@@ -62,7 +63,7 @@ def classify(
 ) -> Classification:
     """Give each feature the class of the most similar embedding, by cosine (Sec. 3.4, max-similarity).
 
-    Runs in chunks, so the [N, C] table is never held. A tie goes to the lowest class; an all-zero feature has label -1.
+    Runs in chunks, without a table [N, C]. A tie goes to the lowest class; an all-zero feature has label -1.
 
     Args:
         features: decoded features, of Gaussians or of pixels; any scale.
@@ -79,6 +80,7 @@ def classify(
         >>> classify(torch.tensor([[2.0, 0.0], [0.1, 0.3], [0.0, 0.0]]), torch.eye(2)).labels.tolist()
         [0, 1, -1]
     """
+    features, embeddings = as_tensor("features", features), as_tensor("embeddings", embeddings)
     check_shapes(("features", features, "N D"), ("embeddings", embeddings, "C D"))
     classes = unit_embeddings(embeddings).T.to(features)
     check_finite("features", features)
@@ -96,25 +98,27 @@ def select_by_query(
     score: Score | None = None,
     logit_scale: float | str = "clip",
 ) -> Selection:
-    """Select the features whose cosine with one query is **above** a threshold (Sec. 3.4, single target).
+    """Select the features whose cosine with one query is **above** a threshold, the paper's gamma (Sec. 3.4, single target).
 
-    The paper publishes no value for its threshold gamma. Without one, it is taken from the scores: the gap below their
-    highest mode (see `similarity_threshold`), and `how` says what was found. A scene that does not contain the target
-    has a highest mode as well, so look at `how` and at the scores before trusting an automatic gamma. With negatives
-    (what the query is *not*: the other classes of the scene) none is needed: scores are relevancies, and gamma is 0.5.
+    The paper gives no value for gamma. If none is given, it is found from the scores: in the gap below their highest mode
+    (see `similarity_threshold`), and `how` says what was found. The scores of a scene without the target have a highest
+    mode too, so look at `how` and at the scores before you trust an automatic gamma. With negatives (what the query is
+    *not*, such as the other classes of the scene) it is not needed: scores are relevancies, and gamma is 0.5.
 
     Args:
         features: decoded features; any scale. All-zero features score 0 and are never selected.
         query: the target's embedding, or a prototype.
-        threshold: gamma, a cosine in [-1, 1], or with negatives a relevancy in [0, 1]; None as above.
-        negatives: one row per thing to tell the target from.
-        score: "cosine", "softmax" or "relevancy" (`text_scores`); when not given as above.
+        threshold: gamma, a cosine in [-1, 1], or with negatives a relevancy in [0, 1]; None finds it as above.
+        negatives: one row per thing that is not meant.
+        score: "cosine", "softmax" or "relevancy" (`text_scores`); None: the relevancy with negatives, else the cosine.
         logit_scale: of the softmax, as in `text_scores`.
 
     Raises:
         ValueError: if shapes disagree, the query or a negative is all-zero, the threshold is out of range, or a number
             is not finite.
     """
+    features, query = as_tensor("features", features), as_tensor("query", query)
+    negatives = None if negatives is None else as_tensor("negatives", negatives)
     check_shapes(("features", features, "N D"), ("query", query, "D"), ("negatives", negatives, "M D"))
     rows = unit_embeddings(query[None], "query").to(features)
     if negatives is not None:
@@ -140,10 +144,10 @@ def select_by_category(
         category: which class.
 
     Returns:
-        The Gaussians that `classify` gives this class; scores are the winner's cosine where it won and 0 elsewhere.
+        The Gaussians that `classify` gives this class; scores are its cosine for these and 0 for the others.
 
     Raises:
-        ValueError: as `classify`, or if there is no such class.
+        ValueError: as `classify`, or if `category` is not a class index.
     """
     found = classify(features, embeddings)
     check_whole("category", category, 0, len(embeddings) - 1)
@@ -168,8 +172,9 @@ def select_like(
     Raises:
         ValueError: as `select_by_query`, or if there are no examples or an index is out of range.
     """
+    features = as_tensor("features", features)
     check_shapes(("features", features, "N D"))
-    rows = torch.atleast_1d(torch.as_tensor(like, device=features.device))
+    rows = torch.atleast_1d(as_tensor("like", like)).to(features.device)
     rows = rows.nonzero()[:, 0] if rows.dtype == torch.bool and len(rows) == len(features) else rows
     if rows.dtype.is_floating_point or rows.dtype == torch.bool or rows.ndim != 1 or len(rows) == 0:
         raise ValueError(f"like: expected at least one index below {len(features)}, got {like!r}; name some examples")
@@ -209,6 +214,11 @@ def select_near(
         ValueError: if neither or both of labels and features are given, the nearest Gaussian has no label or an all-zero
             feature, there is no Gaussian, shapes disagree, or a number is not finite.
     """
+    means = as_tensor("means", means)
+    labels, features = (
+        None if values is None else as_tensor(name, values)
+        for name, values in (("labels", labels), ("features", features))
+    )
     check_shapes(("means", means, "N 3"), ("labels", labels, "N"), ("features", features, "N D"))
     if (labels is None) == (features is None):
         raise ValueError(
@@ -226,7 +236,7 @@ def select_near(
     else:
         assert features is not None
         alike = select_like(features, nearest, threshold)
-        if not bool(alike.mask[nearest]):  # a threshold of 1 refuses even itself, as scores are compared strictly
+        if not bool(alike.mask[nearest]):  # at a threshold of 1 nothing is above it, not even itself
             alike = Selection(alike.mask | (alike.scores >= alike.scores[nearest]), alike.scores, None, alike.words)
     numbers = component_numbers(means, alike.mask, distance)
     return alike.within(numbers == numbers[nearest], f"connected with Gaussian {nearest}, the nearest to the point")

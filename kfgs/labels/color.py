@@ -127,16 +127,16 @@ def _middle(luminance: Tensor, opacities: Tensor, scales: Tensor) -> Tensor:  # 
 class Shades(NamedTuple):
     """Which colour replaces each luminance: a curve from black to white through the shades and tints of one hue.
 
-    A tone t(L) comes first: `gain L` up to the bend, then straight on to white at L = 1. The colour of a tone is the one
-    of that luminance and hue, as saturated as the display shows it: `peak t / knee` up to the knee, then straight on to
-    white. Both rise, so what was darker stays darker, and from [0, 1] neither leaves the display's range; only a tone that
-    reaches white at its bend (`tint` to white) is flat from there on.
+    The old luminance L first becomes a tone t(L): `gain L` up to the bend, then linear to white at L = 1. The colour of a
+    tone has its luminance and the hue, as saturated as the display can show it: `peak t / knee` up to the knee, then linear
+    to white. Both functions rise, so darker stays darker, and luminance in [0, 1] stays in the display's range. Only a tone
+    that reaches white at its bend (`tint` to white) is flat from there on.
     """
 
     peak: Tensor  # [3] the brightest colour of the hue and saturation: its largest channel is 1
     knee: Tensor  # [] its luminance
     gain: Tensor  # [] ratio of new to old luminance
-    bend: Tensor  # [] old luminance up to which the ratio holds; infinite where it holds throughout
+    bend: Tensor  # [] old luminance up to which the ratio holds; infinite if it holds throughout
 
     def __call__(self, luminance: Tensor) -> tuple[Tensor, Tensor]:  # [n] -> [n, 3], [n, 3]
         """The colour of each luminance, and by how much it changes per unit of luminance."""
@@ -146,7 +146,7 @@ class Shades(NamedTuple):
         rate = torch.where(bent, straight, self.gain)
         above = (tone > self.knee)[:, None]
         rest = 1 - self.knee
-        to_white = (1 - self.peak) / rest if float(rest) > 1e-6 else torch.ones_like(self.peak)  # greys go on as greys
+        to_white = (1 - self.peak) / rest if float(rest) > 1e-6 else torch.ones_like(self.peak)  # greys stay grey
         slopes = torch.where(above, to_white, self.peak / self.knee)
         colors = torch.where(above, self.peak + to_white * (tone - self.knee)[:, None], slopes * tone[:, None])
         return colors, slopes * rate[:, None]
@@ -163,9 +163,9 @@ def same_luminance(rgb: Tensor) -> Shades:  # rgb: [3]
 def tint(rgb: Tensor, middle: Tensor) -> Shades:  # [3], []
     """Shades that turn the luminance `middle` (> 0) into `rgb` and keep ratios, as a change of albedo does.
 
-    A darker colour than before keeps all ratios. A brighter one could leave the display's range: there they hold until
-    `rgb` is at its most brilliant, or half-way to white, and what is brighter still goes straight on to white. To white
-    itself they hold up to `middle`, and all above it is white.
+    A darker colour than before keeps all ratios. A brighter one could leave the display's range: then ratios hold until
+    the hue is at its brightest, or half-way to white, and brighter values go linearly to white. If `rgb` is white, ratios
+    hold up to `middle`, and all above it is white.
     """
     shades = same_luminance(rgb)
     target = rgb @ rgb.new_tensor(LUMINANCE)

@@ -18,7 +18,7 @@ def class_index(name: str, names: Sequence[str]) -> int:
     """The label of a class: its place in `names`, found as `class_indices` does.
 
     Raises:
-        ValueError: if there is no such class (the message offers the nearest names), or several labels have that name.
+        ValueError: if the name is unknown (the message offers the nearest names), or several labels have it.
 
     Example:
         >>> class_index("chair", ["wall", "chair"])
@@ -39,7 +39,7 @@ def class_indices(name: str, names: Sequence[str]) -> tuple[int, ...]:
     A name is looked up exactly, then without regard to case, if only one spelling fits.
 
     Raises:
-        ValueError: if there is no such class; the message offers the nearest names.
+        ValueError: if the name is unknown; the message offers the nearest names.
 
     Example:
         >>> class_indices("chair", ["chair", "wall", "chair"]), class_indices("Wall", ["chair", "wall"])

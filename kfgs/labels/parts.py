@@ -28,7 +28,7 @@ class BestView:
     """The camera that shows a selection largest."""
 
     camera: str  # its name
-    index: int  # its place among the cameras asked
+    index: int  # its index in the list of cameras
     share: float  # of the picture that the selection fills, in [0, 1); what lies in front of it is not counted
 
 
@@ -37,11 +37,11 @@ class Part:
     """A part of a selection in numbers, or the whole of it. Positions are the Gaussians' centres, in world units."""
 
     indices: Tensor  # [n] int64, ascending
-    score: float  # mean score of the selected
+    score: float  # mean score of its Gaussians
     centroid: Tensor  # [3] mean position
     box: OrientedBox  # a small box around the centres
     extent: tuple[Tensor, Tensor]  # lowest and highest corner [3] along the world's axes
-    best_view: BestView | None  # None without cameras, or where no camera shows any of it
+    best_view: BestView | None  # None without cameras, or if no camera shows any of it
     how: str  # how it was selected
 
     @property
@@ -80,7 +80,7 @@ class Part:
         return f"Part({self.count} Gaussians at ({place}), {size}, score {self.score:.3f}{view})"
 
     def to_json(self, indices: bool = True) -> dict[str, Any]:
-        """Plain numbers, lists and strings; the list of Gaussians can be left out, as it may be long."""
+        """Plain numbers, lists and strings; `indices=False` leaves out the list of Gaussians, which may be long."""
         view = self.best_view
         return {
             "count": self.count,
@@ -170,7 +170,7 @@ def view_shares(
 ) -> Tensor:  # [C, P]
     """The share of each camera's picture that each part fills: the mean over pixels of its rendering weights w = T alpha.
 
-    What lies in front hides a part, and a transparent part counts by its opacity. Pictures are drawn with at most 160
+    What lies in front hides a part, and a transparent part counts by its opacity. Pictures are rendered with at most 160
     pixels a side, 16 parts at a time.
 
     Args:

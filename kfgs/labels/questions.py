@@ -1,4 +1,4 @@
-"""What a field is asked: class names, label sets and rows of numbers, brought to rows in the teacher's space."""
+"""Queries of a field: class names, label sets or embeddings become rows in the teacher's space."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_choice, check_shapes
-from .._rows import unit_rows
+from .._rows import as_tensor, unit_rows
 from .label_set import LabelSet, teacher_difference, teacher_mismatch
 
 SAME = 1 - 1e-4  # cosine of one text embedded twice: half precision stays well above, other words below
@@ -20,7 +20,7 @@ Classes = LabelSet | Tensor
 
 
 class Question(NamedTuple):
-    """One thing asked for."""
+    """A target and what it is compared with."""
 
     row: Tensor  # [D]
     negatives: Tensor | None  # [M, D]
@@ -28,10 +28,10 @@ class Question(NamedTuple):
 
 
 def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [C, D]
-    """The embeddings of some classes, checked against a field's features; warns where another teacher embedded them.
+    """The embeddings of some classes, checked against a field's features. Warns if another teacher embedded them.
 
     Args:
-        classes: a label set or embeddings.
+        classes: a label set, or embeddings as a tensor or an array.
         dim: D of the field.
         info: the field's, which may name its teacher.
 
@@ -42,13 +42,13 @@ def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [
     if isinstance(classes, LabelSet):
         _check_words(classes, dim, info)
         return classes.embeddings
-    if not isinstance(classes, Tensor):
+    if not hasattr(classes, "shape"):
         raise TypeError(
             f"classes: expected a LabelSet or embeddings [C, {dim}], got {type(classes).__name__}; load_label_set reads one, "
             "make_label_set makes one"
         )
     check_rows("embeddings", classes, ("C",), dim)
-    return classes
+    return as_tensor("embeddings", classes)
 
 
 def make_question(
@@ -61,8 +61,8 @@ def make_question(
     """The row of a target and of what it is compared with; see `SemanticField.query`.
 
     With negatives "auto" a class, given by its name or by its own embedding, is compared with the other classes, or with the
-    canonical words where it is the only class. Anything else is compared with the canonical words, and with nothing where there
-    are none: a class such as "chair" would take away what "office chair" asks for.
+    canonical words if it is the only class. Anything else is compared with the canonical words, or with nothing if there are
+    none. It is not compared with the classes, because "chair" would exclude much of "office chair".
     """
     if isinstance(negatives, str):
         check_choice("negatives", negatives, ("auto", "classes", "canonical", "none"))
@@ -78,11 +78,12 @@ def make_question(
         others = classes.embeddings[_unlike(classes.embeddings, row)]
     else:
         check_rows("embedding", target, (), dim)
+        target = as_tensor("embedding", target)
         row, words = target if rows is None else target.to(rows), "embedding"
         others = row.new_zeros(0, dim) if rows is None else rows[_unlike(rows, row)]
-    if isinstance(negatives, Tensor):
+    if not isinstance(negatives, str):
         check_rows("negatives", negatives, ("M",), dim)
-        return Question(row, negatives, words)
+        return Question(row, as_tensor("negatives", negatives), words)
     table = classes if isinstance(classes, LabelSet) else None
     canonical = _canonical(table, words, row)
     if negatives == "auto":
@@ -100,19 +101,19 @@ def make_question(
 
 
 def check_rows(name: str, rows: Tensor | None, axes: Sequence[str], dim: int) -> None:
-    """Refuse rows of another shape; where only D differs, they are mostly text of another teacher."""
+    """Refuse rows of another shape. If only D differs, the error asks for the other teacher's text."""
     shape = tuple(getattr(rows, "shape", ()))
     if len(shape) == len(axes) + 1 and shape[-1] != dim:
         expected = ", ".join((*axes, str(dim)))
         raise ValueError(
-            f"{name}: expected [{expected}], got {shape}: text of another teacher? Embed the words with the one whose "
-            "features this field was fitted to"
+            f"{name}: expected [{expected}], got {shape}: text of another teacher? Embed the words with the teacher "
+            "whose features this field was fitted to"
         )
     check_shapes((name, rows, (*axes, dim)))
 
 
 def _canonical(classes: LabelSet | None, words: str, row: Tensor) -> Tensor | None:  # [M, D]
-    """The canonical negatives, without the target itself: neither its words nor its embedding."""
+    """The canonical negatives without the target, by its words or by its embedding."""
     if classes is None or classes.negatives is None:
         return None
     other_words = torch.tensor([word.casefold() != words.casefold() for word in classes.negative_names])
@@ -128,10 +129,10 @@ def _unlike(rows: Tensor, row: Tensor) -> Tensor:  # [M, D], [D] -> [M] bool
 def _check_words(classes: LabelSet, dim: int, info: dict[str, Any]) -> None:
     if classes.dim != dim:
         words = teacher_difference(info, classes.info)
-        told = "" if words is None else f" ({words[0]} {words[2]!r:.40} in place of {words[1]!r:.40})"
+        difference = "" if words is None else f" ({words[0]} {words[2]!r:.40} in place of {words[1]!r:.40})"
         raise ValueError(
             f"classes: expected embeddings [C, {dim}] (from the field), got {tuple(classes.embeddings.shape)}: text of "
-            f"another teacher?{told} Embed the words with the one whose features this field was fitted to"
+            f"another teacher?{difference} Embed the words with the teacher whose features this field was fitted to"
         )
     mismatch = teacher_mismatch(info, classes.info)
     if mismatch is not None:

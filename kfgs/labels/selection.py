@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from .._card import html_card
 from .._check import check_shapes
 from .._rows import as_tensor, check_finite
-from ..formats.splat_file import SplatFile
-from ..gaussians import Gaussians
 from .boxes import OrientedBox
-
-Array = np.ndarray[Any, Any]
+from .nearest import Array, Cloud, means_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +31,11 @@ class Selection:
     """
 
     mask: Tensor  # [N] bool
-    scores: Tensor  # [N] how well each fits: a cosine or a relevancy; 1 and 0 where a place or a label decides
+    scores: Tensor  # [N] how well each fits: a cosine or a relevancy; 1 and 0 if a place or a label decides
     threshold: float | None = None
     """Gamma of Sec. 3.4, the score that a selected Gaussian exceeds; None if there was no threshold, or several."""
     how: str = ""
-    """Where the threshold comes from, or what was combined."""
+    """How the threshold was found, or what was combined."""
 
     @classmethod
     def of(cls, mask: Tensor | Array, how: str = "given") -> Selection:  # mask: [N] bool
@@ -80,10 +75,10 @@ class Selection:
 
     @property
     def words(self) -> str:
-        """How it was made, with its threshold, for a person."""
+        """How it was made and its threshold, in words."""
         return self.how if self.threshold is None else f"score > {self.threshold:.4g} ({self.how})"
 
-    def points(self, cloud: SplatFile | Gaussians | Tensor | Array) -> Array:  # [n, 3] float64
+    def points(self, cloud: Cloud) -> Array:  # [n, 3] float64
         """The centres of the selected Gaussians as a numpy array, in world units.
 
         Args:
@@ -92,13 +87,12 @@ class Selection:
         Raises:
             ValueError: if the cloud has another number of Gaussians.
         """
-        gaussians = cloud.gaussians if isinstance(cloud, SplatFile) else cloud
-        means = as_tensor("cloud", gaussians.means if isinstance(gaussians, Gaussians) else gaussians)
+        means = means_of("cloud", cloud)
         check_shapes(("selection.mask", self.mask, "N"), ("cloud", means, "N 3"))
         points: Array = means[self.mask].detach().cpu().double().numpy()
         return points
 
-    def box(self, cloud: SplatFile | Gaussians | Tensor | Array) -> OrientedBox:
+    def box(self, cloud: Cloud) -> OrientedBox:
         """A small box around the centres of the selected Gaussians; `cloud` as in `points`.
 
         Raises:
@@ -107,7 +101,7 @@ class Selection:
         return OrientedBox.around(torch.from_numpy(self.points(cloud)))
 
     def within(self, mask: Tensor, how: str) -> Selection:  # mask: [N] bool
-        """The part of this selection under a mask: the same scores and threshold, one more reason."""
+        """The part of this selection under a mask, with the same scores and threshold; `how` is added to the words."""
         check_shapes(("selection.mask", self.mask, "N"), ("mask", mask, "N"))
         return Selection(self.mask & mask, self.scores, self.threshold, f"{self.how}; {how}" if self.how else how)
 

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from .._check import check_choice, check_range, check_shapes, check_whole
+from .._rows import as_tensor
+from ..formats.splat_file import SCORE, SplatFile
 from ..gaussians import Gaussians
-from ..splat.covariance import covariance_3d
-from .transfer_distance import explained_distance, positions
-from .transfer_rules import Density, Nearest, Rule, Verdict, Vote, upper_triangle
-from .transfer_sources import Array, Near, Sources, neighbours_together
-
-Method = Literal["nearest", "vote", "mahalanobis"]
+from .label_set import LabelSet
+from .nearest import Array, Cloud, Sources, explained_distance, means_of, neighbours_together, positions
+from .transfer_methods import Method, make_rule
 
 NEIGHBOURS = 4  # looked at by "nearest", for ambiguity alone; 8 cost half as much again
 CHUNK = 16_384  # destinations at a time: with 16 neighbours and their covariances, 25 MB
-THIN = 1e-3  # of a Gaussian's length is the least thickness that "mahalanobis" sees
-TINY = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +27,11 @@ class Transfer:
     """Labels carried from S source Gaussians to N destination Gaussians, and what became of the rest."""
 
     labels: Tensor  # [N] int64, -1 = none
-    distances: Tensor  # [N] world units, to the source that gave the label; infinite where there is none
-    sources: Tensor  # [N] int64, index of that source; -1 where there is none
-    distance: float  # lambda, world units
-    how: str  # where lambda comes from
-    shares: Tensor  # [N] of the label in the weight of the sources looked at, in (0, 1]; 0 where there is none
+    distances: Tensor  # [N] world units, to the source that gave the label; infinite if there is none
+    sources: Tensor  # [N] int64, index of that source; -1 if there is none
+    distance: float  # lambda, the distance within which a label is carried over, world units
+    how: str  # how lambda was found
+    shares: Tensor  # [N] the label's share of the weight of the sources looked at, in (0, 1]; 0 if there is none
     disagree: Tensor  # [N] bool, labelled, but with another label among the sources looked at
     method: Method = "nearest"
 
@@ -52,14 +50,26 @@ class Transfer:
         """Labelled destinations with another label among the sources looked at."""
         return int(self.disagree.sum())
 
+    @property
+    def scores(self) -> Tensor:  # [N] in [0, 1]
+        """How sure each label is: 1 - distance / lambda for "nearest", else the label's share; 0 without a label."""
+        if self.method != "nearest":
+            return self.shares
+        reach = max(self.distance, torch.finfo(self.distances.dtype).tiny)
+        return (1 - self.distances / reach).clamp_min(0.0)
+
+    @property
+    def score_meaning(self) -> str:
+        """What `scores` are, in words."""
+        return "1 - distance / lambda" if self.method == "nearest" else "the label's share of the weights in range"
+
     def select(self, which: Tensor) -> Transfer:  # which: [N] bool or [n] int64
         """The transfer of the destinations under a mask or an index alone, to go with `Gaussians.select` of them.
 
-        Sources stay numbered as they were. Counts are those of the selected: over the parts of a partition they add up
-        to the counts of the whole.
+        `sources` keep their indices. Counts are those of the selected destinations.
 
         Raises:
-            ValueError: if a mask is not of these destinations.
+            ValueError: if a mask has another length.
         """
         if which.dtype == torch.bool and which.shape != self.labels.shape:
             raise ValueError(
@@ -71,15 +81,15 @@ class Transfer:
 
     def __repr__(self) -> str:
         return (
-            f"Transfer({self.labelled} labelled, {self.orphaned} orphaned, {self.ambiguous} ambiguous, "
-            f"{self.method} within {self.distance:.4g}: {self.how})"
+            f"Transfer({self.labelled:,} of {len(self.labels):,} labelled ({self.method} within {self.distance:.4g}), "
+            f"{self.orphaned:,} orphaned, {self.ambiguous:,} ambiguous; lambda: {self.how})"
         )
 
 
 def transfer_labels(
-    src: Tensor | Gaussians,  # [S, 3] means, or the Gaussians
-    src_labels: Tensor,  # [S] int64, -1 = none
-    dst: Tensor | Gaussians,  # [N, 3] means, or the Gaussians
+    src: Cloud,  # [S, 3] means, Gaussians or a splat
+    src_labels: Tensor | Array,  # [S] int64, -1 = none
+    dst: Cloud,  # [N, 3] means, Gaussians or a splat
     distance: float | None = None,
     *,
     method: Method = "nearest",
@@ -88,32 +98,32 @@ def transfer_labels(
 ) -> Transfer:
     """Give each destination a label from the labelled sources **strictly** closer than `distance`.
 
-    The rule of Sec. 3.4, where `distance` is lambda. The paper does not say which label wins when several lie in range.
-    Three answers; sources with label -1 take no part and do not hide a labelled one behind them:
+    The rule of Sec. 3.4; `distance` is its lambda, the distance within which a label is carried over. The paper does not
+    say which label wins if several are in range. There are three methods; sources with label -1 take no part in any:
 
-    - "nearest": the nearest source decides. Its share is that of its label among the 4 nearest in range, each counting 1.
+    - "nearest": the nearest source decides. The share is that of its label among the 4 nearest in range.
     - "vote": the `neighbours` nearest in range vote with weight o / d, opacity (1 for positions) over distance. Among
-      tied labels, the one with the nearest voter.
+      tied labels, the one with the nearest voter wins.
     - "mahalanobis": shapes decide. Of the `neighbours` nearest in range, those less than `deviations` standard deviations
-      away vote with weight o exp(-m^2 / 2), m^2 = d^T (Sigma_src + Sigma_dst)^-1 d: how much source and destination
-      overlap. Among tied labels, the one with the source of least m. `src` must be Gaussians; a `dst` of positions has
-      Sigma_dst = 0.
+      away vote with weight o exp(-m^2 / 2), m^2 = d^T (Sigma_src + Sigma_dst)^-1 d, which says how much source and
+      destination overlap. Among tied labels, the one with the source of least m wins. `src` must be Gaussians; if `dst`
+      is positions, Sigma_dst = 0.
 
     Of equally near sources (as float64 distances) the lowest indices come first; of several at one position only the
-    lowest index speaks. A Gaussian thinner than a thousandth of its length counts as that thick.
+    lowest index gives a label. A Gaussian thinner than a thousandth of its length counts as that thick.
 
     Args:
-        src: the semantic field, as positions or as Gaussians.
+        src: the semantic field, as positions (a tensor or an array), Gaussians or a splat.
         src_labels: their labels.
-        dst: what to label (the colour field), as positions or as Gaussians.
+        dst: what to label (the colour field), as positions, Gaussians or a splat. `label_splats` labels a splat in one call.
         distance: lambda in world units; None takes `default_distance`.
         method: which label wins.
         neighbours: how many sources "vote" and "mahalanobis" look at, at most.
         deviations: the reach of "mahalanobis", besides `distance`.
 
     Returns:
-        Labels, shares, distances and sources on the destinations' device, with counts. Without any labelled source
-        everything is orphaned.
+        Labels, shares, distances and sources on the destinations' device, with counts. Without any labelled source no
+        destination has a label.
 
     Raises:
         ValueError: if shapes disagree, a position, shape or opacity is not finite, a label is below -1, a number is out of
@@ -122,15 +132,16 @@ def transfer_labels(
 
     Note:
         Measured on the colour Gaussians of the toy room (true classes of its surface) and of Replica's room_0 (classes of
-        the labelled pixels that they fill), mIoU in per cent over nearest / vote / mahalanobis of Gaussians: 88.6 / 89.6 /
-        90.9 and 74.7 / 75.4 / 78.7 from votes of segmented views; 50.1 / 70.1 / 74.4 and 30.7 / 51.1 / 48.9 from
+        the labelled pixels that they fill), mIoU in per cent for nearest / vote / mahalanobis of Gaussians: 88.6 / 89.6 /
+        90.9 and 74.7 / 75.4 / 78.7 with votes of segmented views; 50.1 / 70.1 / 74.4 and 30.7 / 51.1 / 48.9 with
         `SemanticField.classify`, whose labels are noisy. Times: benchmarks/transfer.py.
     """
     check_choice("method", method, get_args(Method))
     check_whole("neighbours", neighbours, 1)
     check_range("deviations", deviations, 0, closed=(False, False))
-    src_means = src.means if isinstance(src, Gaussians) else src
-    dst_means = dst.means if isinstance(dst, Gaussians) else dst
+    src, dst = (one.gaussians if isinstance(one, SplatFile) else one for one in (src, dst))
+    src_means, dst_means = means_of("src", src), means_of("dst", dst)
+    src_labels = as_tensor("src_labels", src_labels)
     check_shapes(("src_means", src_means, "S 3"), ("src_labels", src_labels, "S"), ("dst_means", dst_means, "N 3"))
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
@@ -138,90 +149,87 @@ def transfer_labels(
         raise ValueError(
             "src: expected Gaussians for method 'mahalanobis', got positions; pass the Gaussians themselves"
         )
-    labels = _labels(src_labels)
+    given = _labels(src_labels)
     points, targets = positions("src_means", src_means), positions("dst_means", dst_means)
-    kept = np.flatnonzero(labels >= 0)
-    found = _Found(len(targets))
-    if kept.size == 0:
-        chosen, how = (0.0, "no labelled source") if distance is None else (float(distance), "given")
-        return found.report(dst_means, chosen, how, method)
-    sources = Sources(points[kept], labels[kept])
-    kept = kept[sources.first]
-    chosen, how = explained_distance(sources.tree, targets) if distance is None else (float(distance), "given")
-    k = NEIGHBOURS if method == "nearest" else neighbours
-    rule: Rule = Nearest(sources)
-    if method == "vote":
-        rule = Vote(sources, _opacities(src)[kept], 1e-9 * chosen)
-    elif method == "mahalanobis":
-        shapes = _covariances("src", src)[:, kept], targets, _covariances("dst", dst)
-        rule = Density(sources, _opacities(src)[kept], *shapes, deviations)
-    order = neighbours_together(targets)
-    for start in range(0, len(targets), CHUNK):
-        rows = order[start : start + CHUNK]
-        near = sources.near(targets[rows], k, chosen)
-        found.fill(rows, sources, kept, near, rule(rows, near))
-    return found.report(dst_means, chosen, how, method)
+    n, kept = len(targets), np.flatnonzero(given >= 0)
+    labels, winners, distances = np.full(n, -1), np.full(n, -1), np.full(n, np.inf)
+    shares, disagree = np.zeros(n), np.zeros(n, dtype=np.bool_)
+    chosen, how = (0.0, "no labelled source") if distance is None else (float(distance), "given")
+    if kept.size:
+        sources = Sources(points[kept], given[kept])
+        if distance is None:
+            chosen, how = explained_distance(sources.tree, targets)
+        kept = kept[sources.first]
+        reach = deviations if method == "mahalanobis" else chosen
+        rule = make_rule(method, sources, kept, src, dst, reach)
+        order = neighbours_together(targets)
+        for rows in (order[start : start + CHUNK] for start in range(0, n, CHUNK)):
+            near = sources.near(targets[rows], NEIGHBOURS if method == "nearest" else neighbours, chosen)
+            found = rule(rows, near)
+            some = np.flatnonzero(found.column >= 0)
+            column, rows = found.column[some], rows[some]
+            source = near.source[some, column]
+            labels[rows], winners[rows] = sources.labels[source], kept[source]
+            distances[rows], shares[rows] = near.distance[some, column], found.share[some]
+            disagree[rows] = found.ambiguous[some]
+    return Transfer(
+        labels=torch.from_numpy(labels).to(dst_means.device),
+        distances=torch.from_numpy(distances).to(dst_means),
+        sources=torch.from_numpy(winners).to(dst_means.device),
+        distance=chosen,
+        how=how,
+        shares=torch.from_numpy(shares).to(dst_means),
+        disagree=torch.from_numpy(disagree).to(dst_means.device),
+        method=method,
+    )
 
 
-class _Found:
-    """What is known about N destinations, filled in piece by piece."""
+def label_splats(
+    splats: SplatFile | Gaussians,
+    labelled: SplatFile | Gaussians,
+    classes: LabelSet | Sequence[str] = (),
+    distance: float | None = None,
+    *,
+    method: Method = "nearest",
+) -> SplatFile:
+    """Label a splat by distance, in one call: `label_splats(read_splats("mine.ply"), field.label(classes), classes)`.
 
-    def __init__(self, n: int) -> None:
-        self.labels = np.full(n, -1, dtype=np.int64)
-        self.sources = np.full(n, -1, dtype=np.int64)
-        self.distances = np.full(n, np.inf)
-        self.shares = np.zeros(n)
-        self.disagree = np.zeros(n, dtype=np.bool_)
+    Both must share one frame; `kfgs.attach` finds the common frame, and can let the views decide instead of the distance.
 
-    def fill(self, rows: Array, sources: Sources, kept: Array, near: Near, verdict: Verdict) -> None:
-        """Note a verdict on some rows; `kept` says which of the caller's sources each source is."""
-        some = np.flatnonzero(verdict.column >= 0)
-        column = verdict.column[some]
-        source, rows = near.source[some, column], rows[some]
-        self.labels[rows], self.sources[rows] = sources.labels[source], kept[source]
-        self.distances[rows], self.shares[rows] = near.distance[some, column], verdict.share[some]
-        self.disagree[rows] = verdict.ambiguous[some]
+    Args:
+        splats: what to label; labels that it has are replaced.
+        labelled: Gaussians with labels, such as `SemanticField.label` gives, or a labelled splat.
+        classes: the names of the classes; of a labelled splat its own by default.
+        distance: lambda, the distance within which a label is carried over, in world units; None takes `default_distance`.
+        method: which label wins, see `transfer_labels`.
 
-    def report(self, dst_means: Tensor, distance: float, how: str, method: Method) -> Transfer:
-        device = dst_means.device
-        return Transfer(
-            labels=torch.from_numpy(self.labels).to(device),
-            distances=torch.from_numpy(self.distances).to(device, dst_means.dtype),
-            sources=torch.from_numpy(self.sources).to(device),
-            distance=distance,
-            how=how,
-            shares=torch.from_numpy(self.shares).to(device, dst_means.dtype),
-            disagree=torch.from_numpy(self.disagree).to(device),
-            method=method,
-        )
+    Returns:
+        The splat with `labels`, the extra column `score` (`Transfer.scores`), class names, and facts in `info["labels"]`.
 
-
-def _opacities(cloud: Tensor | Gaussians) -> Array:  # [N] float64, > 0
-    """What each source has to say: its opacity, or 1 where there are only positions."""
-    if not isinstance(cloud, Gaussians):
-        return np.ones(len(cloud))
-    values = cloud.opacities.detach().cpu().double()
-    _check_finite("src.opacities", values[:, None])
-    return values.clamp_min(TINY).numpy()
-
-
-def _covariances(name: str, cloud: Tensor | Gaussians) -> Array:  # [6, N]
-    """Covariances in float64, none so thin that its inverse is lost in rounding; zeros for positions."""
-    if not isinstance(cloud, Gaussians):
-        return np.zeros((6, len(cloud)))
-    scales, quats = cloud.scales.detach().cpu().double(), cloud.quats.detach().cpu().double()
-    _check_finite(f"{name}.scales, {name}.quats", torch.cat([scales, quats], dim=1))
-    scales = torch.maximum(scales, (THIN * scales.amax(dim=1, keepdim=True)).clamp_min(1e-30))
-    return upper_triangle(covariance_3d(quats, scales).numpy())
-
-
-def _check_finite(name: str, values: Tensor) -> None:  # [N, n]
-    finite = torch.isfinite(values).all(dim=1)
-    if not finite.all():
-        row = int((~finite).nonzero()[0])
+    Raises:
+        ValueError: if `labelled` carries no labels, or as `transfer_labels`.
+    """
+    splats, source = (SplatFile(one) if isinstance(one, Gaussians) else one for one in (splats, labelled))
+    if source.gaussians.labels is None:
         raise ValueError(
-            f"{name}: expected finite numbers, got NaN or infinity in row {row}; remove such Gaussians first"
+            "labelled: expected Gaussians with labels, got none; label them first, with SemanticField.label"
         )
+    names = classes.names if isinstance(classes, LabelSet) else tuple(classes) or source.classes
+    found = transfer_labels(source.gaussians, source.gaussians.labels, splats.gaussians, distance, method=method)
+    facts = {
+        "labelled by": "distance",
+        "method": method,
+        "lambda": found.distance,
+        "lambda from": found.how,
+        "score": found.score_meaning,
+        "ambiguous": found.ambiguous,
+    }
+    return splats.replace(
+        gaussians=splats.gaussians.replace(labels=found.labels),
+        extra=splats.extra | {SCORE: found.scores.to(torch.float32).cpu().numpy()},
+        classes=names,
+        info=splats.info | {"labels": facts},
+    )
 
 
 def _labels(labels: Tensor) -> Array:  # [S] int64

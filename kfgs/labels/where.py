@@ -19,17 +19,8 @@ from .._check import check_range, check_whole
 from .._rows import check_finite
 from ..formats.splat_file import SplatFile
 from ..gaussians import Gaussians
-from ._json import (
-    NESTED,
-    build,
-    checked_object,
-    members_of,
-    number_of,
-    numbers_of,
-    quaternion_of,
-    rotation_matrix,
-    set_fields,
-)
+from ._json import NESTED, build, checked_object, members_of, number_of, numbers_of, set_fields
+from .boxes import quaternion_of, rotation_matrix
 from .components import component_numbers
 from .label_set import LabelSet
 from .names import class_of, labelled

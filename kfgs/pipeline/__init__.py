@@ -11,15 +11,17 @@ from .apply import (
     select_labelled,
     true_labels,
     write_report,
+    write_training_pictures,
 )
 from .attach import Attached, attach
 from .color import ColorConfig, ColorResult, fit_color
 from .compare import render_color, views_of_change, write_comparison
+from .config import FitConfig
 from .describe import describe
-from .fit import FitConfig, FitResult, fit_scene, load_history
+from .fit import FitResult, fit_scene, load_history
 from .fuse import uplift
-from .pictures import write_training_pictures
 from .plan import Plan, plan_scene
+from .plan_maps import NamedTeacher
 from .stages import Run, Stage
 
 __all__ = [
@@ -28,6 +30,7 @@ __all__ = [
     "ColorResult",
     "FitConfig",
     "FitResult",
+    "NamedTeacher",
     "Plan",
     "Run",
     "Stage",

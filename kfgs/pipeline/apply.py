@@ -1,4 +1,4 @@
-"""What a finished field is used for: segmented views with scores and pictures, labelled Gaussians, labelled clouds."""
+"""Use a finished field: segment views, score them, label Gaussians and clouds, draw pictures of how the run went."""
 
 from __future__ import annotations
 
@@ -26,8 +26,9 @@ from ..gaussians import Gaussians
 from ..labels import LabelSet, OfClass, Selection, Transfer, classify, transfer_labels
 from ..labels.questions import class_rows
 from ..scenes import Scene
-from ..viz import overlay_labels, palette, save_picture
+from ..viz import overlay_labels, palette, plot_codebook_history, plot_training, save_picture
 from ..viz.field_colors import feature_colors
+from .fit import FitResult, load_history
 
 
 def save_label_map(path: Path, labels: Tensor) -> None:  # [H, W] int64
@@ -231,3 +232,14 @@ def label_cloud(
 def write_report(path: Path, **parts: Any) -> None:
     """Write scores and facts of a run as one JSON file; reports are turned into plain numbers."""
     write_json(path, {name: part.to_json() if hasattr(part, "to_json") else part for name, part in parts.items()})
+
+
+def write_training_pictures(result: FitResult) -> list[Path]:
+    """Draw the histories of a run's codebook and field into its folder; return the pictures written."""
+    draw = {"codebook": plot_codebook_history, "field": plot_training}
+    written = []
+    for stage in result.stages:
+        if stage.name in draw:  # `decouple` has no codebook
+            written.append(result.folder / f"{stage.name}.png")
+            draw[stage.name](load_history(stage), written[-1])
+    return written

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import check_choice, check_range
 from ..align.by_cameras import Alignment, align_by_cameras
 from ..align.by_shape import align_clouds
@@ -18,6 +20,7 @@ from ..cameras import Camera
 from ..cameras.similarity import Similarity
 from ..evaluation import LabelSet
 from ..fields import SemanticField
+from ..formats import read_splats
 from ..formats.splat_file import SCORE, SplatFile
 from ..gaussians import Gaussians
 from ..labels import Transfer, transfer_labels, vote_labels
@@ -46,6 +49,8 @@ class Attached:
     words: tuple[str, ...]
     """What was done and found, a sentence each."""
 
+    __repr__ = short_repr
+
     @property
     def labels(self) -> Tensor:  # [N] int64
         """The class of each Gaussian, -1 = none."""
@@ -55,7 +60,7 @@ class Attached:
 
 def attach(
     field: SemanticField,
-    splats: SplatFile,
+    splats: SplatFile | Gaussians | str | Path,
     classes: LabelSet | None = None,
     *,
     cameras: Sequence[Camera] | None = None,
@@ -77,7 +82,7 @@ def attach(
 
     Args:
         field: a finished field.
-        splats: any splat of the same scene; labels that it has are replaced.
+        splats: any splat of the same scene, its Gaussians alone, or the path of a splat file; labels that it has are replaced.
         classes: names and embeddings in the teacher's space.
         cameras: undistorted views in the field's frame, usually those it was trained on.
         frame: what tells the splat's frame: the similarity from the field's to it (`Similarity.identity()` says that they
@@ -98,6 +103,10 @@ def attach(
         0.969 are gone and 0.976 untouched. A vote of neighbours for such Gaussians, or the class of the nearest
         rendered surface, made it worse.
     """
+    if isinstance(splats, str | Path):
+        splats = read_splats(splats)
+    elif isinstance(splats, Gaussians):
+        splats = SplatFile(splats)
     classes = field.label_set() if classes is None else classes
     cameras = cameras or field.cameras or None
     if field.linear is None and cameras:
@@ -207,10 +216,10 @@ def _by_distance(
     facts = {
         "labelled by": "distance to the field's Gaussians",
         "method": transfer.method,
-        "score": _meaning(transfer),
+        "score": transfer.score_meaning,
         "ambiguous": transfer.ambiguous,
     }
-    return transfer.labels, _sureness(transfer), transfer, facts
+    return transfer.labels, transfer.scores, transfer, facts
 
 
 def _by_views(
@@ -232,23 +241,15 @@ def _by_views(
     open_ = votes.labels < 0
     carried = carry(colour, votes.labels, colour.select(open_))
     labels, scores = votes.labels.clone(), votes.shares.clone()
-    labels[open_], scores[open_] = carried.labels, _sureness(carried).to(scores)
+    labels[open_], scores[open_] = carried.labels, carried.scores.to(scores)
     facts = {
         "labelled by": f"votes of {len(cameras)} segmented views",
         "method": carried.method,
-        "score": f"share of the votes; where no view shows a Gaussian, {_meaning(carried)}, to those that have a class",
+        "score": f"share of the votes; where no view shows a Gaussian, {carried.score_meaning}, to those that have a class",
         "shown": int((~open_).sum()),
         "not shown": int(open_.sum()),
     }
     return labels, scores, carried, facts
-
-
-def _sureness(transfer: Transfer) -> Tensor:  # [N] in [0, 1]
-    """The score of labels that distance carried; 0 where there is none."""
-    if transfer.method != "nearest":
-        return transfer.shares
-    reach = max(transfer.distance, torch.finfo(transfer.distances.dtype).tiny)
-    return (1 - transfer.distances / reach).clamp_min(0.0)
 
 
 def _about(transfer: Transfer, by: By) -> str:
@@ -257,8 +258,3 @@ def _about(transfer: Transfer, by: By) -> str:
         return repr(transfer)
     count = len(transfer.labels)
     return f"of {count} that no view shows: {transfer!r}" if count else "there is none that no view shows"
-
-
-def _meaning(transfer: Transfer) -> str:
-    """What `_sureness` gives, in words."""
-    return "1 - distance / lambda" if transfer.method == "nearest" else "the label's share of the weights in range"

@@ -20,7 +20,7 @@ PREVIEW = 96  # pixels: width of the renderings that choose the viewpoints
 VISIBLE = 8 / 255  # a pixel has changed when some channel did by more than this
 MOST = 0.5  # a picture of which more has changed is taken from inside the change: it comes after all others
 SHOWN = 0.5  # an edit is shown where a view shows this share of what its best view shows
-APART = 30.0  # degrees between the viewing directions of chosen viewpoints, where there are such
+APART = 30.0  # degrees between the viewing directions of chosen viewpoints, if enough viewpoints are that far apart
 
 
 def render_color(gaussians: Gaussians, camera: Camera) -> Tensor:  # [H, W, 3] in [0, 1]
@@ -35,7 +35,7 @@ def changed_share(before: Gaussians, after: Gaussians, camera: Camera) -> float:
 
 
 def views_of_change(before: Gaussians, after: Gaussians, cameras: Sequence[Camera], count: int = 2) -> list[int]:
-    """The viewpoints that show an edit best, each looking another way than those before it where possible.
+    """The viewpoints that show an edit best. Each looks in a different direction than those before it, if possible.
 
     Args:
         before: the scene.
@@ -50,7 +50,7 @@ def views_of_change(before: Gaussians, after: Gaussians, cameras: Sequence[Camer
 def views_of_edits(states: Iterable[Gaussians], cameras: Sequence[Camera], count: int = 2) -> list[int]:
     """The viewpoints that show several edits: for each in turn its best, then those that show most of all together.
 
-    An edit that a view chosen before shows half as well as its own best gets no other, nor does one that is undone later.
+    An edit gets no view of its own if a chosen view shows it half as well as its best view does, or if it is undone later.
 
     Args:
         states: the scene before the first edit, and after each of them.

@@ -1,4 +1,4 @@
-"""The whole job on a room that the package makes itself, colours and edits too, with exact truth to score against."""
+"""Every step on a room that the package makes itself, with colours and edits, scored against exact ground truth."""
 
 from __future__ import annotations
 
@@ -26,12 +26,13 @@ from .apply import (
     segment_scene,
     true_labels,
     write_report,
+    write_training_pictures,
 )
 from .attach import attach
 from .color import ColorConfig, fit_color
 from .compare import views_of_change, write_comparison
-from .fit import FitConfig, FitResult, fit_scene
-from .pictures import write_training_pictures
+from .config import FitConfig
+from .fit import FitResult, fit_scene
 
 REMOVED, PAINTED, PAINT = "chair", "plant", "#c04040"  # the edits of the paper's Figures 5 and 4
 TITLES = ("before", "after")

@@ -1,4 +1,4 @@
-"""What lies at a path, in words: a field, a run, a scene, feature maps, a splat file, a point cloud."""
+"""Describe what is at a path: a field, a run, a scene, feature maps, a splat file or a point cloud."""
 
 from __future__ import annotations
 

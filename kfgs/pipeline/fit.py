@@ -1,7 +1,7 @@
-"""Teacher maps and posed images in, a saved semantic field out: fused in 3-D and then compressed, or as the paper's Figure 2.
+"""From teacher maps and posed images to a saved semantic field: fused in 3-D and then compressed, or as the paper's Figure 2.
 
-Each call is a stage of a run folder: finished stages are found again by the hash of their inputs, and the long one
-(the field) also resumes from its last checkpoint.
+Each step is a stage in the run folder. A finished stage is found again by the hash of its inputs; the long one (the field) also
+resumes from its last checkpoint.
 """
 
 from __future__ import annotations
@@ -11,23 +11,19 @@ import shutil
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from dataclasses import field as default
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from .._check import check_choice
 from .._files import digest_value, read_json, write_json
 from ..cameras import Camera
 from ..fields import (
-    FieldConfig,
     FieldFit,
     GaussianParams,
     SemanticField,
-    UpliftConfig,
     fit_field,
     remember,
 )
@@ -35,9 +31,7 @@ from ..formats import SplatFile
 from ..gaussians import Gaussians
 from ..quant import (
     Autoencoder,
-    AutoencoderConfig,
     Codebook,
-    CodebookConfig,
     IndexMaps,
     LatentMaps,
     fit_autoencoder,
@@ -46,62 +40,11 @@ from ..quant import (
 )
 from ..scenes import Scene
 from .color import ColorConfig, find_color
-from .device import training_device
-from .digests import describe_lens, digest_scene, stage_generator
-from .fuse import answers_stage, find_geometry, uplift_stage
+from .config import FitConfig
+from .fuse import answers_stage, find_geometry, uplift_stage, without_lens
 from .maps import KnownFeatures, Maps, UndistortedMaps, check_readable, map_digests, map_shape
-from .stages import Run, Stage, UnfinishedError
-from .train import check_scene, field_stage
-
-Method = Literal["fuse", "paper"]
-METHODS: tuple[Method, ...] = ("fuse", "paper")
-Mode = Literal["decouple", "adc", "adc+sc"]
-MODES: tuple[Mode, ...] = ("decouple", "adc", "adc+sc")
-
-
-@dataclass(frozen=True)
-class FitConfig:
-    """What a run does."""
-
-    method: Method = "fuse"
-    """`fuse`: features are averaged onto sharp Gaussians in 3-D, merged and compressed after (`fields.uplift_maps`).
-    `paper`: maps are compressed per pixel, and Gaussians are trained on them (Sec. 3)."""
-    mode: Mode = "adc+sc"
-    """Of method `paper`, rows of Table 1: `decouple` (raw features), `adc` (+ codebook), `adc+sc` (+ codebook + autoencoder)."""
-    seed: int = 0
-    """Every random choice of the run follows from it."""
-    split: str = "train"
-    """Which views of the scene are learnt from."""
-    undistorted_features: bool = False
-    """Whether the teacher saw undistorted pictures; otherwise the lens is removed from its maps as from the pictures."""
-    uplift: UpliftConfig = default(default_factory=UpliftConfig.field)
-    """Of method `fuse`."""
-    color: ColorConfig = default(default_factory=ColorConfig.geometry)
-    """Of method `fuse`: how Gaussians are trained to fuse onto, where there is no splat."""
-    codebook: CodebookConfig = default(default_factory=CodebookConfig)
-    """This and the rest: of method `paper`."""
-    autoencoder: AutoencoderConfig = default(default_factory=AutoencoderConfig)
-    field: FieldConfig = default(default_factory=FieldConfig)
-
-    def __post_init__(self) -> None:
-        check_choice("method", self.method, METHODS)
-        check_choice("mode", self.mode, MODES)
-
-    @property
-    def needs_maps(self) -> bool:
-        """Whether the field learns from the dense maps themselves, so that they must be stored and stay."""
-        return self.method == "paper" and self.mode == "decouple"
-
-    @staticmethod
-    def paper(**changes: Any) -> FitConfig:
-        """The paper's method and schedule: 28 epochs, 5,000 autoencoder steps, 30,000 field steps. For a workstation."""
-        options: dict[str, Any] = {"codebook": CodebookConfig.paper(), "autoencoder": AutoencoderConfig.paper()}
-        return FitConfig(**{"method": "paper", **options, **changes})
-
-    @staticmethod
-    def cpu(**changes: Any) -> FitConfig:
-        """For two CPU cores: the same as `FitConfig()`, and 2,000 field steps where the method is the paper's."""
-        return FitConfig(**{"field": FieldConfig.cpu(), **changes})
+from .stages import Run, Stage, UnfinishedError, describe_lens, digest_scene, stage_generator
+from .train import check_scene, field_stage, training_device
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +190,6 @@ def fit_scene(
     report: Callable[[str], None] | None = None,
     progress: bool = False,
     callback: Callable[[dict[str, Any]], None] | None = None,
-    device: str | torch.device = "auto",
 ) -> FitResult:
     """Make a semantic field of a scene, resuming whatever a run folder already holds.
 
@@ -262,7 +204,6 @@ def fit_scene(
         report: receives one line per stage.
         progress: show progress bars.
         callback: receives the history rows of every trained stage as they appear.
-        device: where a field is trained, see `training_device`; the other stages and the result stay on the CPU.
 
     Raises:
         ValueError: if the counts of views and maps differ, a camera has distortion, there is no such device, a splat is given
@@ -270,7 +211,7 @@ def fit_scene(
         FileNotFoundError: if a stage is to be made of maps that were discarded, or a picture is missing.
     """
     config = config or FitConfig()
-    target_device = training_device(device)
+    target_device = training_device(config.device)
     _check_inputs(scene, scene.views(config.split), maps, config)
     if splat is not None and config.method == "paper":
         raise ValueError("splat: expected none for method 'paper', which trains its own Gaussians; leave it out")
@@ -328,9 +269,9 @@ def _paper_stages(job: _Job) -> SemanticField:
 
 def _job(run: Run, scene: Scene, maps: Maps, config: FitConfig, device: torch.device, options: dict[str, Any]) -> _Job:
     views = scene.views(config.split)
-    lenses = [] if scene.lenses is None else [scene.lenses[i] for i in views]
-    straight = UndistortedMaps(maps, lenses) if lenses and not config.undistorted_features else maps
-    removed = None if straight is maps else digest_value([describe_lens(lens) for lens in lenses])
+    straight = without_lens(scene, maps, config)
+    lenses = straight.lenses if isinstance(straight, UndistortedMaps) else None
+    removed = None if lenses is None else digest_value([describe_lens(lens) for lens in lenses])
     features = {"files": map_digests(run, straight), "lenses": removed}
     return _Job(run, scene, views, straight, features, config, device, options)
 

@@ -19,9 +19,9 @@ from ..gaussians import Gaussians
 from ..quant import LinearLatents
 from ..scenes import Scene
 from .color import ColorConfig, find_color, make_color
-from .digests import digest_tensors, stage_generator
+from .config import FitConfig
 from .maps import Maps, UndistortedMaps, check_readable
-from .stages import Run
+from .stages import Run, digest_tensors, stage_generator
 
 SHAPE = ("means", "quats", "scales", "opacities")
 
@@ -36,8 +36,8 @@ def find_geometry(
 ) -> tuple[Gaussians, str]:
     """The Gaussians to fuse onto, and where they come from.
 
-    Without a splat they are the colour field of the run, whose stage is found again; one that was trained by `fit_color` with
-    other options of the same scene, as `kfgs color` does, is taken as it is.
+    Without a splat they are the colour field of the run. Its stage is found again if it is there. A longer colour field of the
+    same scene, as `kfgs color` makes it in the same run folder, is taken instead.
     """
     if isinstance(splat, Gaussians):
         return splat, "given"
@@ -94,15 +94,19 @@ def uplift_stage(
     )
 
 
+def without_lens(scene: Scene, maps: Maps, config: FitConfig) -> Maps:
+    """The maps of a run's views as its undistorted cameras see them."""
+    if scene.lenses is None or config.undistorted_features:
+        return maps
+    return UndistortedMaps(maps, [scene.lenses[i] for i in scene.views(config.split)])
+
+
 def uplift(
     scene: Scene,
-    maps: Maps,  # teacher maps of the views of `split`, in their order
+    maps: Maps,  # teacher maps of the views of `config.split`, in their order
     splat: Gaussians | SplatFile | SemanticField | str | Path,
-    config: UpliftConfig | None = None,
+    config: FitConfig | None = None,
     *,
-    split: str = "train",
-    undistorted_features: bool = False,
-    seed: int = 0,
     folder: str | Path | None = None,
     progress: bool = False,
     report: Callable[[str], None] | None = None,
@@ -111,12 +115,10 @@ def uplift(
 
     Args:
         scene: posed, undistorted views in the splat's frame.
-        maps: one teacher map per view of `split`, of the pictures as they were taken; read one at a time.
+        maps: one teacher map per view, of the pictures as they were taken; read one at a time.
         splat: the Gaussians, a splat file or its content, or a field.
-        config: see `UpliftConfig`; by default every Gaussian is kept as it is.
-        split: which views.
-        undistorted_features: whether the teacher saw undistorted pictures; otherwise the lens is removed from its maps.
-        seed: of merging, if Gaussians are merged.
+        config: its `uplift`, `split`, `undistorted_features` and `seed` count. None takes the training views and keeps every
+            Gaussian as it is.
         folder: where the field will be saved: what it remembers of the scene is relative to it.
         progress: show a bar.
         report: receives a line per step.
@@ -124,19 +126,16 @@ def uplift(
     Raises:
         ValueError: if counts disagree, a camera has distortion, or no view shows any Gaussian.
     """
-    views = scene.views(split)
+    config = config or FitConfig(uplift=UpliftConfig())
+    cameras = tuple(scene.cameras[i] for i in scene.views(config.split))
     if scene.distorted:
         raise ValueError("scene: expected cameras without distortion, got a lens; pass scene.undistorted()")
     if isinstance(splat, str | Path):
         splat = read_splats(splat)
     cloud = splat if isinstance(splat, Gaussians) else splat.gaussians
-    lenses = [] if scene.lenses is None else [scene.lenses[i] for i in views]
-    straight = UndistortedMaps(maps, lenses) if lenses and not undistorted_features else maps
-    cameras = tuple(scene.cameras[i] for i in views)
-    generator = stage_generator(seed, "uplift")
-    found = uplift_maps(
-        cloud.to("cpu"), cameras, straight, config, generator=generator, progress=progress, report=report
-    )
+    options: dict[str, Any] = {"generator": stage_generator(config.seed, "uplift"), "progress": progress}
+    straight = without_lens(scene, maps, config)
+    found = uplift_maps(cloud.to("cpu"), cameras, straight, config.uplift, report=report, **options)
     teacher = getattr(maps, "identity", None)
     info = {
         "method": "uplift",

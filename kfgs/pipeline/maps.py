@@ -13,8 +13,7 @@ from torch import Tensor
 from .._rows import EPS, row_norms
 from ..cameras import Camera, undistort
 from ..quant.sampling import SAMPLES, sample_grid
-from .digests import describe_lens
-from .stages import Run
+from .stages import Run, describe_lens
 
 
 class Maps(Protocol):

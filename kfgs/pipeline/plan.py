@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from .._check import check_choice
 from .._files import bytes_in_words, seconds_in_words
+from ..features import FeatureFolder
 from ..scenes import Scene
-from ..teachers.costs import TeacherCost
-from .device import training_device
-from .fit import FitConfig
-from .machine import Speed, disk_free, memory_free
-from .plan_stages import DENSE, Dense, Sizes, StagePlan, add
+from ..teachers import Teacher
+from .config import FitConfig
+from .estimate import DENSE, Dense, Sizes, StagePlan, add, gaussian_counts, notes_on, plan_stages, training_bytes
+from .fit import finished_stages
+from .plan_maps import NamedTeacher, find_stored, run_teacher
+from .train import training_device
+from .trial import Timing, disk_free, memory_free, memory_now, time_color, time_fit
 
-FEATURES = "features"  # the folder of maps, as `kfgs features` and `kfgs fit` take it
+FEATURES = "features"  # the folder of maps in a scene's, where `kfgs features` writes and `kfgs fit` reads
 
 
 @dataclass(frozen=True)
@@ -28,14 +34,11 @@ class Plan:
     stages: tuple[StagePlan, ...]
     notes: tuple[str, ...]
     dense: Dense
-    speed: Speed
     disk_free: int
     memory_free: int | None
     """Bytes that processes can still have; None where the system does not say."""
     disk_recomputed: int | None = None
-    """Disk that the same run needs if maps are made anew instead of stored."""
-    forwards: int = 1
-    """How often the teacher's network runs for a picture."""
+    """Disk that the same run needs if maps are made again instead of stored."""
 
     @property
     def seconds(self) -> float | None:
@@ -60,36 +63,38 @@ class Plan:
 
     @property
     def fits(self) -> bool | None:
-        """Whether the machine has the disk and the memory; None if either need is not known."""
-        if self.disk_bytes is None or self.peak_bytes is None:
-            return None
-        return self.disk_bytes <= self.disk_free and (self.memory_free is None or self.peak_bytes <= self.memory_free)
+        """Whether the machine has the disk and the memory; None if that is not known."""
+        return None if self._lacks is None else not self._lacks
 
     @property
     def verdict(self) -> str:
         """Whether it fits, in a sentence, and what to do if not."""
-        if self.disk_bytes is None or self.peak_bytes is None:
+        if self._lacks is None:
             return (
-                "unknown whether it fits: nothing is known about this teacher; encode one picture and look at its map"
+                "unknown whether it fits: the maps' size is not known; name a teacher that can be loaded, or --features"
             )
-        wants = []
-        if self.disk_bytes > self.disk_free:
-            text = f"needs {bytes_in_words(self.disk_bytes)} on disk, {bytes_in_words(self.disk_free)} free"
-            wants.append(f"{text}; {self._less_disk()}")
-        if self.memory_free is not None and self.peak_bytes > self.memory_free:
-            stage = max(self.stages, key=lambda one: one.peak_bytes or 0).name
-            text = (
-                f"needs {bytes_in_words(self.peak_bytes)} of memory ({stage}), {bytes_in_words(self.memory_free)} free"
-            )
-            wants.append(f"{text}; ask for smaller maps (--size), or end other programs")
-        return "does not fit: " + "; ".join(wants) if wants else "fits"
+        return "does not fit: " + "; ".join(self._lacks) if self._lacks else "fits"
+
+    @property
+    def _lacks(self) -> list[str] | None:
+        """What the machine has too little of; None if it lacks nothing that is known, and something is not known."""
+        found = []
+        disk = sum(stage.disk_bytes or 0 for stage in self.stages)
+        if disk > self.disk_free:
+            less = f"needs {bytes_in_words(disk)} on disk, {bytes_in_words(self.disk_free)} free; {self._less_disk()}"
+            found.append(less)
+        largest = max(self.stages, key=lambda one: one.peak_bytes or 0)
+        if self.memory_free is not None and (largest.peak_bytes or 0) > self.memory_free:
+            have = f"{bytes_in_words(largest.peak_bytes)} of memory ({largest.name}), {bytes_in_words(self.memory_free)} free"
+            found.append(f"needs {have}; ask for smaller maps (--size), or end other programs")
+        unknown = self.disk_bytes is None or (self.peak_bytes is None and self.memory_free is not None)
+        return None if unknown and not found else found
 
     def _less_disk(self) -> str:
         less = self.disk_recomputed
         if self.dense != "recompute" and less is not None and less <= self.disk_free:
-            fast = "--fast does not change that; " if self.forwards > 1 else ""
             return (
-                f"{fast}recompute instead of storing: {bytes_in_words(less)} on disk, twice the teacher's time "
+                f"recompute instead of storing: {bytes_in_words(less)} on disk, twice the teacher's time "
                 "(kfgs fit SCENE --teacher ...)"
             )
         return "ask for smaller maps (--size), or use a larger disk"
@@ -122,56 +127,104 @@ class Plan:
 def plan_scene(
     scene: Scene,
     *,
-    teacher: str | TeacherCost = "lseg",
-    weights: str | Path | None = None,
-    options: dict[str, Any] | None = None,
+    teacher: Teacher | Callable[[Tensor], Tensor] | NamedTeacher | str | None = None,
     config: FitConfig | None = None,
     dense: Dense = "keep",
-    device: str | torch.device = "auto",
-    folder: str | Path = ".",
+    features: str | Path | None = None,
+    run: str | Path | None = None,
 ) -> Plan:
-    """Predict disk, memory and minutes of `extract_features` and `fit_scene`, from sizes, measured constants (`work`) and a
-    third of a second of matrix products that tell how fast this machine is now.
+    """Predict disk, memory and minutes of `extract_features` and `fit_scene` on this machine.
 
-    Times are orders of magnitude: within about a factor of two where the constants were measured, further off elsewhere.
+    Disk and memory follow from shapes. Times are measured: the teacher sees one picture, and each stage is run with a few
+    views and twenty steps, with as many Gaussians and as large maps as planned; then counts scale them up. That takes
+    seconds, or a minute where a teacher is slow. Times are orders of magnitude, within about a factor of two.
 
     Args:
-        scene: its views of `config.split`, their sizes and the number of points count; no picture is read.
-        teacher: a name as `load_teacher` takes it, or what is known about one (`TeacherCost.of_maps` for maps on disk).
-        weights: tells the teacher's size, see `teacher_cost`; not loaded, but refused where `load_teacher` would at first
-            sight (`check_weights`).
-        options: the teacher's.
-        config: the method and its options; those of `fit_scene` when not given.
-        dense: what becomes of the dense maps: `keep`, `discard` once index maps are made of them, or `recompute` them
+        scene: whose views of `config.split` are learnt from.
+        teacher: makes the maps that are missing: a teacher, a function from [3, H, W] to [D, h, w], or a name, see
+            `NamedTeacher`. None: whose maps exist, or else `lseg`.
+        config: the method and its options, and where teacher and field run; those of `fit_scene` when not given.
+        dense: what becomes of the dense maps: `keep`, `discard` once the field is made of them, or `recompute` them
             instead of storing any.
-        device: where teacher and field run, see `training_device`.
-        folder: where the run and the maps will be written; need not be there yet. Maps of this teacher that lie in its
-            `features` already are not made again, unless `dense` is `recompute`.
+        features: the folder of maps, in any layout that `FeatureFolder` reads; need not exist. Maps that are there are not
+            made again, unless `dense` is `recompute`. None: `features` in the scene's folder.
+        run: the folder of `fit_scene`; stages that are finished there count as done.
 
     Raises:
-        ValueError: if there is no such teacher, split or device, or `dense` is not `keep` although the field learns from the
-            dense maps themselves (mode `decouple`), or the weights are another model's.
-        FileNotFoundError: if the weights are not there.
+        ValueError: if there is no such teacher, split or device; if `dense` is not `keep` although the field learns from the
+            dense maps themselves (mode `decouple`); or if the weights are of another model.
+        FileNotFoundError: if the weights or a picture are not there.
     """
     check_choice("dense", dense, DENSE)
     config = config or FitConfig()
+    target = training_device(config.device)
     if config.needs_maps and dense != "keep":
         raise ValueError(
             f"dense: expected 'keep' with mode 'decouple', whose field learns from the dense maps, got {dense!r}; keep them"
         )
-    target = training_device(device)
-    sizes = Sizes.of(scene, teacher, weights, options or {}, config, dense, Path(folder) / FEATURES)
-    plan = Plan(
-        title=sizes.title(target),
-        stages=tuple(sizes.stages(target)),
-        notes=tuple(sizes.notes(target)),
+    folder = Path(features) if features is not None else (scene.folder or Path()) / FEATURES
+    teacher = NamedTeacher(teacher) if isinstance(teacher, str) else teacher
+    stored = find_stored(scene, config.split, folder, teacher)
+    views, straight = scene.views(config.split), scene.undistorted()
+    done = set() if run is None else finished_stages(straight, stored.maps, run, config)
+    sizes = Sizes(
+        config=config,
         dense=dense,
-        speed=sizes.speed,
-        disk_free=disk_free(folder),
-        memory_free=memory_free(),
-        forwards=sizes.cost.forwards,
+        points=len(scene.points),
+        pictures=tuple(scene.cameras[i].size for i in views),
+        shapes=tuple(stored.shape for _ in views),
+        made=stored.there,
+        done=frozenset(done),
     )
-    if config.needs_maps or dense == "recompute" or sizes.existing:
+    notes = [] if stored.note is None else [stored.note]
+    if isinstance(teacher, NamedTeacher) and teacher.weights is not None and not sizes.missing:
+        notes.append(f"no map is missing, so {teacher.name} and its weights were not looked at")
+    with TemporaryDirectory(prefix="kfgs-plan-") as place:
+        maps, name = stored.sample, stored.teacher
+        if sizes.missing and not {"uplift", "index_maps"} & done:
+            sizes, made, name, said = run_teacher(scene, sizes, teacher, target, Path(place))
+            notes += said
+            maps = maps if made is None else made
+        sizes = _run_stages(straight, sizes, maps)
+    plan = Plan(
+        title=_title(sizes, name, target),
+        stages=tuple(plan_stages(sizes)),
+        notes=(*notes, *notes_on(sizes)),
+        dense=dense,
+        disk_free=disk_free(run if run is not None else folder),
+        memory_free=memory_free(),
+    )
+    if config.needs_maps or dense == "recompute" or not sizes.missing:
         return plan
-    anew = replace(sizes, dense="recompute", made=(0,) * len(sizes.made))
-    return replace(plan, disk_recomputed=add([one.disk_bytes for one in anew.stages(target)]))
+    again = plan_stages(replace(sizes, dense="recompute"))
+    return replace(plan, disk_recomputed=add([stage.disk_bytes for stage in again]))
+
+
+def _run_stages(scene: Scene, sizes: Sizes, maps: FeatureFolder | None) -> Sizes:
+    """Try the stages that are not done and fit into memory; sizes with what they took."""
+    config, free, now = sizes.config, memory_free(), memory_now() or 0
+    sizes = replace(sizes, base=now)
+    if sizes.points < 2 or (free is not None and training_bytes(sizes) > free):
+        return sizes
+    timings: dict[str, Timing] = {}
+    fuse = config.method == "fuse"
+    mean, last = gaussian_counts(config.color.field if fuse else config.field, sizes.points, full=fuse)
+    if fuse and "color" not in sizes.done:
+        timings |= time_color(scene, config, round(mean))
+    if maps is not None and "uplift" not in sizes.done and "answers" not in sizes.done:
+        timings |= time_fit(scene, maps, config, last if fuse else round(mean))
+    return replace(sizes, timings=timings)
+
+
+def _title(sizes: Sizes, teacher: str, device: torch.device) -> str:
+    (height, width), config = sizes.pictures[0], sizes.config
+    fuse = config.method == "fuse"
+    steps, method = (config.color.field.steps, "fuse") if fuse else (config.field.steps, config.mode)
+    maps = "maps of unknown size"
+    if sizes.shape is not None:
+        maps = f"{sizes.shape[2]} channels at {sizes.shape[0]}x{sizes.shape[1]}"
+    stored = {"keep": "kept", "discard": "discarded", "recompute": "made again instead of stored"}[sizes.dense]
+    return (
+        f"{sizes.count} views of {width}x{height}, {teacher} ({maps}, {stored}), {method}, {steps} steps, on {device} "
+        f"({torch.get_num_threads()} threads)"
+    )

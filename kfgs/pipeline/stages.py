@@ -2,20 +2,27 @@
 
 A stage is a function that fills a folder. Its name and the JSON description of its inputs give a key; a folder with
 that key that is complete is used as it is, otherwise the stage is made in a temporary folder and moved into place in
-one step. So a killed run leaves only finished stages, and the same command starts where it stopped.
+one step. So a killed run leaves only finished stages, and the same command continues where it stopped.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from .._files import atomic_folder, digest_file, digest_value, read_json, write_json
+from ..cameras import Camera
+from ..cameras.camera import NEAR
+from ..scenes import Scene
 
 STAGE_FILE = "stage.json"
 STAGE_VERSION = 2
@@ -139,3 +146,36 @@ def _key(name: str, inputs: dict[str, Any]) -> str:
 
 def _sizes(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_size for path in sorted(folder.iterdir()) if path.name != STAGE_FILE}
+
+
+def stage_generator(seed: int, purpose: str) -> torch.Generator:
+    """A generator of its own for each stage, so that skipping a finished stage changes nothing downstream."""
+    digest = hashlib.sha256(f"{purpose}:{seed}".encode()).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest[:7], "little"))
+
+
+def digest_tensors(*tensors: Tensor) -> str:
+    """SHA-256 over shapes, dtypes and values, in hexadecimal."""
+    digest = hashlib.sha256()
+    for tensor in tensors:
+        digest.update(f"{tuple(tensor.shape)}{tensor.dtype}".encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def digest_scene(scene: Scene, views: Sequence[int]) -> str:
+    """SHA-256 of some views' poses, intrinsics, sizes and near planes, and of the sparse points.
+
+    Where all near planes are at 0.2 they are left out: runs from before cameras had one stay valid.
+    """
+    cameras = [scene.cameras[i] for i in views]
+    poses = torch.stack([camera.viewmat for camera in cameras])
+    intrinsics = torch.stack([camera.K for camera in cameras])
+    sizes = torch.tensor([camera.size for camera in cameras])
+    near = torch.tensor([camera.near for camera in cameras], dtype=torch.float64)
+    return digest_tensors(poses, intrinsics, sizes, scene.points, *([near] if (near != NEAR).any() else []))
+
+
+def describe_lens(lens: Camera) -> list[Any]:
+    """What decides how a lens is removed, as plain values."""
+    return [lens.K.tolist(), lens.size, asdict(lens.distortion) if lens.distortion else None]

@@ -1,4 +1,4 @@
-"""What the semantic and the colour field's long stage share: what a scene must bring, and a fit that can be killed."""
+"""What the semantic and the colour field share: where they are trained, on what scene, and a fit that can be resumed."""
 
 from __future__ import annotations
 
@@ -7,12 +7,39 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors.torch import load_file, save_file
 
 from .._files import write_json
 from ..fields import FieldFit, GaussianParams
 from ..scenes import Scene
+from ..splat import available_engines
 from .stages import Run, Stage
+
+
+def training_device(device: str | torch.device = "auto") -> torch.device:
+    """The device that a name stands for.
+
+    Args:
+        device: `auto` takes CUDA if torch sees it and an engine runs on it, else the CPU; `cpu`, `cuda`, `cuda:1`.
+
+    Raises:
+        ValueError: if it is no device, or a GPU that is not there.
+    """
+    if device == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() and available_engines("cuda") else "cpu")
+    try:
+        chosen = torch.device(device)
+    except RuntimeError as error:
+        raise ValueError(f"device: expected auto, cpu or cuda, got {device!r}; name one of them") from error
+    if chosen.type not in ("cpu", "cuda"):
+        raise ValueError(f"device: expected auto, cpu or cuda, got {device!r}; engines run on these only")
+    if chosen.type == "cuda" and (chosen.index or 0) >= torch.cuda.device_count():
+        raise ValueError(
+            f"device: expected a GPU that torch sees ({torch.cuda.device_count()} are there), got {device!r}; "
+            "use cpu, or install a torch for CUDA"
+        )
+    return chosen
 
 
 def check_scene(scene: Scene) -> None:

@@ -1,4 +1,4 @@
-"""Named tensors in one .safetensors file that says what it is: no pickle, whole or absent."""
+"""Named tensors in one .safetensors file with its kind in the header. Files are written whole or not at all; no pickle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ KIND, VERSION = "kfgs", "1"  # the metadata's key for the kind of file, and the 
 
 
 def write_tensors(path: str | Path, tensors: Mapping[str, Tensor], *, kind: str) -> None:
-    """Write tensors (copied to the CPU) and the kind of thing they are."""
+    """Write tensors (copied to the CPU) and their kind."""
     with atomic_path(path) as temporary:
         whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
         save_file(whole, temporary, metadata={KIND: kind, "version": VERSION})
@@ -26,7 +26,7 @@ def read_tensors(path: str | Path, *, kind: str) -> dict[str, Tensor]:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is no .safetensors file, or holds something else than `kind`.
+        ValueError: if it is no .safetensors file, or is of another kind.
     """
     path = Path(path)
     if not path.is_file():

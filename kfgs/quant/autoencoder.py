@@ -62,7 +62,7 @@ class Autoencoder:
 
     @property
     def decoder_parameters(self) -> int:
-        """Weights and biases of the decoder: what Table 1 counts as stored (831,744 for D = 512, d = 9)."""
+        """Weights and biases of the decoder: counted as storage in Table 1 (831,744 for D = 512, d = 9)."""
         return sum(weight.numel() + bias.numel() for weight, bias in self.decoder)
 
     def encode(
@@ -95,7 +95,7 @@ class Autoencoder:
         return Autoencoder(encoder, decoder, self.low, self.high)
 
     def to_tensors(self) -> dict[str, Tensor]:
-        """What `from_tensors` needs to make this autoencoder again: `<network>.<layer>.weight|bias` and `range` [2]."""
+        """The tensors that `from_tensors` reads: `<network>.<layer>.weight|bias` and `range` [2]."""
         tensors = {"range": torch.tensor([self.low, self.high], dtype=torch.float64)}
         for name, layers in (("encoder", self.encoder), ("decoder", self.decoder)):
             for i, (weight, bias) in enumerate(layers):
@@ -104,7 +104,7 @@ class Autoencoder:
 
     @staticmethod
     def from_tensors(tensors: Mapping[str, Tensor]) -> Autoencoder:
-        """The autoencoder that `to_tensors` took apart; its widths are those of the weights. Other names are ignored.
+        """An autoencoder from the tensors of `to_tensors`, with the widths of the weights. Other names are ignored.
 
         Raises:
             ValueError: if a tensor is missing, or layers do not fit together.

@@ -32,14 +32,14 @@ def spherical_kmeans(
     rounds: int = ROUNDS,
     generator: torch.Generator | None = None,
 ) -> Clusters:
-    """Group features by direction (Dhillon & Modha 2001): each goes to the centre of largest cosine, a centre is the mean
-    direction of its features.
+    """Group features by direction (Dhillon & Modha 2001): each feature joins the centre of largest cosine, and a
+    centre is the mean direction of its features.
 
     Args:
         features: of any length; an all-zero one goes to group 0 and moves no centre.
-        weights: how much each counts. The first centres are drawn with these chances, held to the 0.99 quantile, so that
-            one huge weight does not draw all of them.
-        clusters: most groups, K; fewer where there are not so many features. A centre that loses all features stays.
+        weights: how much each counts. The first centres are drawn in proportion to them, capped at their 0.99 quantile, so
+            that one huge weight does not draw all of them.
+        clusters: most groups, K; fewer if there are fewer features. A centre that loses all features stays.
         rounds: of assignment and averaging.
         generator: draws the first centres; None stands for seed 0.
 

@@ -8,11 +8,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from .._card import html_card, short_repr, short_value
-from .._check import as_tensor, check_range, check_shapes
+from .._check import as_array, as_tensor, check_range, check_shapes
 from .._rows import EPS, row_norms, unit_rows
 from ._store import read_tensors, write_tensors
 
@@ -30,7 +31,7 @@ class Nearest(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """What one look at each feature tells."""
+    """The best codeword of each feature, before the division by the feature's length."""
 
     codeword: Tensor  # [...] int64, of the largest product
     product: Tensor  # [...] of the feature with that unit row, in the rows' precision
@@ -106,10 +107,13 @@ class Codebook:
         facts = {"codewords": self.size, "channels": self.dim, "numbers": short_value(self.codewords)}
         return html_card("Codebook", facts)
 
+    def __len__(self) -> int:
+        return int(self.codewords.shape[0])
+
     @property
     def size(self) -> int:
-        """Number of codewords, K."""
-        return int(self.codewords.shape[0])
+        """Number of codewords, K; `len` is the same."""
+        return len(self)
 
     @property
     def dim(self) -> int:
@@ -138,7 +142,7 @@ class Codebook:
 
         Note:
             Ties go to the lowest index. An all-zero feature is equally (0) similar to all, and so gets index 0 with
-            similarity 0, by which it can be told.
+            similarity 0; the similarity shows which features were zero.
         """
         index, best, length = compare(self._checked(features), self.unit, chunk=chunk)
         shortest = max(EPS, torch.finfo(best.dtype).tiny)  # as in unit_rows
@@ -153,17 +157,21 @@ class Codebook:
         """The index map M of Eq. 5: for each feature, t = argmax_e cos(f, f_e). Ties as in `nearest`."""
         return compare(self._checked(features), self.unit, chunk=chunk).codeword
 
+    def to_numpy(self) -> np.ndarray[Any, Any]:  # [K, D]
+        """The codewords as a NumPy array."""
+        return as_array(self.codewords)
+
     def to(self, *args: Any, **kwargs: Any) -> Codebook:
         """Move or convert the codewords as `Tensor.to` does."""
         return Codebook(self.codewords.to(*args, **kwargs))
 
     def to_tensors(self) -> dict[str, Tensor]:
-        """What `from_tensors` needs to make this codebook again."""
+        """The tensors that `from_tensors` reads."""
         return {"codewords": self.codewords}
 
     @staticmethod
     def from_tensors(tensors: Mapping[str, Tensor]) -> Codebook:
-        """The codebook that `to_tensors` took apart; other names are ignored.
+        """A codebook from the tensors of `to_tensors`; other names are ignored.
 
         Raises:
             ValueError: if "codewords" is missing.

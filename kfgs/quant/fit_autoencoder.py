@@ -69,7 +69,7 @@ class AutoencoderConfig:
 
 @dataclass(frozen=True, eq=False)
 class AutoencoderFit:
-    """A fitted autoencoder and what it does to the codebook it was fitted to."""
+    """A fitted autoencoder, and how well it keeps the codebook apart."""
 
     autoencoder: Autoencoder
     history: list[dict[str, Any]] = field(repr=False)

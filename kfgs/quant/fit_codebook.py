@@ -14,11 +14,9 @@ from .._card import short_repr
 from .._check import as_tensor, check_range, check_shapes, check_whole
 from .._rows import EPS, row_norms, unit_rows
 from .codebook import Codebook
-from .evolve import admit, prune
+from .evolve import EvolvingCodebook, Tally, prune
 from .grow import ROUNDS, grow, kmeans
-from .loss import class_balanced_loss
 from .maps import FeatureMaps
-from .row_adam import RowAdam
 from .sampling import SAMPLES, farthest_points, sample_grid
 
 POOL = 32_768  # features that codewords grow on: 67 MB of 512 channels in float32, 365 of each of 90 maps
@@ -86,11 +84,11 @@ class CodebookConfig:
 
     @property
     def passes(self) -> int:
-        """How often each map is looked at."""
+        """How often each map is read."""
         return 1 if self.adaptive else self.epochs + 1
 
     def samples_of(self, maps: int) -> int:
-        """Most features that are looked at in each of so many maps when `grid_step` is None."""
+        """Most features taken from each of `maps` maps when `grid_step` is None."""
         return min(self.samples, -(-POOL // maps)) if self.adaptive else self.samples
 
     @staticmethod
@@ -106,7 +104,7 @@ class CodebookConfig:
 
 @dataclass(frozen=True, eq=False)
 class CodebookFit:
-    """A fitted codebook and how it came about."""
+    """A fitted codebook and its history."""
 
     codebook: Codebook
     history: list[dict[str, Any]] = field(repr=False)
@@ -221,7 +219,7 @@ def _pool(maps: FeatureMaps, config: CodebookConfig, progress: bool) -> Tensor: 
 
 
 def _note(config: CodebookConfig, size: int, full: bool, coverage: float, alpha: float) -> str | None:
-    """What a user should know and do, in one line."""
+    """One line for the user: what is wrong and what to do."""
     reached = f"{100 * coverage:.0f} % of the features are {alpha:.2f} similar to their codeword"
     if full:
         otherwise = "" if config.expand_below is None else ", or lower expand_below"
@@ -241,15 +239,23 @@ def _fit_paper(
     """Eq. 5-9 as the paper has them, pass after pass."""
     alpha = config.expand_below
     assert alpha is not None  # checked by the config
-    book = _EvolvingCodebook(_first_codewords(maps, config), config, images=len(maps))
+    book = EvolvingCodebook(
+        _first_codewords(maps, config),
+        learning_rate=config.learning_rate,
+        eps=config.eps,
+        expand_below=alpha,
+        prune_above=config.prune_above,
+        maximum=config.maximum,
+        joins=config.joins_per_image or -(-(config.maximum - config.initial) // len(maps)) or 1,
+    )
     history: list[dict[str, Any]] = []
     with tqdm(total=(config.epochs + 1) * len(maps), desc="codebook", disable=not progress) as bar:
         for epoch in range(config.epochs):
             order = torch.randperm(len(maps), generator=generator, device=generator.device).tolist()
-            tally = _Tally(alpha)
+            tally = Tally(alpha)
             period = 1 if epoch < config.eager_epochs else config.step_every
             for seen, i in enumerate(order, start=1):
-                book.look_at(_samples(maps, i, config, dim=book.dim), tally)
+                book.learn_from(_samples(maps, i, config, dim=book.dim), tally)
                 if seen % period == 0 or seen == len(order):
                     book.step(tally)
                 bar.update()
@@ -257,7 +263,7 @@ def _fit_paper(
             bar.set_postfix(K=book.size, coverage=f"{tally.coverage:.3f}")
             callback(dict(history[-1]))
         codebook = Codebook(book.adam.rows)
-        usage, tally = torch.zeros(codebook.size, dtype=torch.int64), _Tally(alpha)
+        usage, tally = torch.zeros(codebook.size, dtype=torch.int64), Tally(alpha)
         for i in range(len(maps)):
             index, similarity = codebook.nearest(_samples(maps, i, config, dim=book.dim))
             usage += torch.bincount(index, minlength=codebook.size).cpu()
@@ -266,88 +272,6 @@ def _fit_paper(
     full = codebook.size >= config.maximum and tally.coverage < config.coverage
     note = _note(config, codebook.size, full, tally.coverage, alpha)
     return CodebookFit(codebook, history, usage, tally.coverage, tally.mean_similarity, alpha, note)
-
-
-class _EvolvingCodebook:
-    """Codewords, their optimiser, and the gradients gathered since the last step, which grow and shrink together."""
-
-    def __init__(self, codewords: Tensor, config: CodebookConfig, *, images: int) -> None:
-        self.config = config
-        assert config.expand_below is not None  # checked by the config
-        self.alpha = config.expand_below
-        self.joins = config.joins_per_image or -(-(config.maximum - config.initial) // images) or 1
-        self.adam = RowAdam(codewords, learning_rate=config.learning_rate, eps=config.eps)
-        self.gradient, self.gathered = torch.zeros_like(codewords), 0
-
-    @property
-    def size(self) -> int:
-        return int(self.adam.rows.shape[0])
-
-    @property
-    def dim(self) -> int:
-        return int(self.adam.rows.shape[1])
-
-    def look_at(self, features: Tensor, tally: _Tally) -> None:  # [n, D] of one image
-        """Quantise, expand, and gather the gradient."""
-        if features.shape[0] == 0:
-            return
-        index, similarity = Codebook(self.adam.rows).nearest(features)
-        tally.see(similarity)
-        room = min(self.joins, self.config.maximum - self.size)
-        joining = features[admit(features, similarity, threshold=self.alpha, room=room)]
-        if joining.shape[0] > 0:
-            newest = Codebook(joining).nearest(features)
-            index = torch.where(newest.similarity > similarity, newest.codeword + self.size, index)
-            self.adam.append(joining)
-            self.gradient = torch.cat([self.gradient, torch.zeros_like(joining)])
-            tally.added += joining.shape[0]
-        balanced = class_balanced_loss(features, self.adam.rows, index)
-        self.gradient, self.gathered = self.gradient + balanced.gradient, self.gathered + 1
-        tally.loss += float(balanced.loss)
-
-    def step(self, tally: _Tally) -> None:
-        """Optimise with the mean of the gathered gradients, then prune."""
-        if self.gathered == 0:  # nothing but zeros seen
-            return
-        self.adam.step(self.gradient / self.gathered)
-        self.gradient, self.gathered = torch.zeros_like(self.gradient), 0
-        stays = prune(self.adam.rows, threshold=self.config.prune_above)
-        if stays.numel() < self.size:
-            tally.pruned += self.size - stays.numel()
-            self.adam.keep(stays)
-            self.gradient = self.gradient[stays]
-
-
-class _Tally:
-    """What one epoch saw."""
-
-    def __init__(self, alpha: float) -> None:
-        self.alpha = alpha
-        self.added = self.pruned = self.features = self.covered = self.images = 0
-        self.similarity = self.loss = 0.0
-
-    def see(self, similarity: Tensor) -> None:  # [n] of one image
-        self.features += similarity.numel()
-        self.covered += int((similarity >= self.alpha).sum())
-        self.similarity += float(similarity.sum(dtype=torch.float64))
-        self.images += 1
-
-    @property
-    def coverage(self) -> float:
-        return self.covered / max(self.features, 1)
-
-    @property
-    def mean_similarity(self) -> float:
-        return self.similarity / max(self.features, 1)
-
-    def record(self) -> dict[str, Any]:
-        return {
-            "added": self.added,
-            "pruned": self.pruned,
-            "loss": self.loss / max(self.images, 1),
-            "coverage": self.coverage,
-            "mean_similarity": self.mean_similarity,
-        }
 
 
 def _first_codewords(maps: FeatureMaps, config: CodebookConfig) -> Tensor:  # [K, D]

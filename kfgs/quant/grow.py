@@ -1,4 +1,4 @@
-"""Growing codewords by splitting the cell whose features are worst represented, with k-means on the sphere between."""
+"""Grow codewords: split the cell whose features are represented worst, and run k-means on the sphere after each split."""
 
 from __future__ import annotations
 

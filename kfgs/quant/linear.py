@@ -78,12 +78,12 @@ class LinearLatents:
         return LinearLatents(self.basis.to(*args, **kwargs))
 
     def to_tensors(self) -> dict[str, Tensor]:
-        """What `from_tensors` needs."""
+        """The tensors that `from_tensors` reads."""
         return {"basis": self.basis}
 
     @staticmethod
     def from_tensors(tensors: Mapping[str, Tensor]) -> LinearLatents:
-        """The latents that `to_tensors` took apart; other names are ignored."""
+        """Latents from the tensors of `to_tensors`; other names are ignored."""
         return LinearLatents(tensors["basis"])
 
 

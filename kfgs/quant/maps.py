@@ -1,4 +1,4 @@
-"""What is left of a scene's feature maps after quantisation: an index per pixel, and what the indices stand for."""
+"""A scene's feature maps after quantisation: one index per pixel, and the latents of the indices."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .codebook import Codebook, compare
 
 
 class FeatureMaps(Protocol):
-    """Feature maps of many images, read when asked for: all that fitting and quantising need of a sequence."""
+    """Feature maps of many images, read one at a time: the part of a sequence that fitting and quantising use."""
 
     def __len__(self) -> int: ...
 
@@ -100,7 +100,7 @@ class IndexMaps(Sequence[NDArray[Any]]):
 
 
 class LatentMaps(Sequence[Tensor]):
-    """The maps F_l = S'[M] that the field learns (Sec. 3.3.2), each looked up when asked for; holes are NaN.
+    """The maps F_l = S'[M] that the field learns (Sec. 3.3.2), each made when it is read; holes are NaN.
 
     Args:
         index_maps: M, per image.
@@ -154,8 +154,8 @@ def quantize_maps(
         maps: see `fit_codebook`.
         codebook: what the maps are quantised with.
         progress: show a progress bar.
-        scratch: a folder of these maps and this codebook alone, where each index map is kept at once; those that a
-            killed process left there are not made again. The caller deletes it.
+        scratch: a folder for these maps and this codebook only. Each index map is written there at once, so a run that was
+            killed goes on where it stopped. The caller deletes the folder.
 
     Raises:
         ValueError: if a map is not [h, w, D] with the codebook's D, or holds NaN or infinity.

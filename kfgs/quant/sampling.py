@@ -1,4 +1,4 @@
-"""Which features of a map are looked at: a regular grid of pixels, and farthest-point sampling by cosine."""
+"""Choose features of a map: a regular grid of pixels, and farthest-point sampling by cosine."""
 
 from __future__ import annotations
 

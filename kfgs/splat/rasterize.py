@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 from torch import Tensor
 
 from .._card import html_card, short_value
+from .._check import as_array
 from ..cameras.camera import Camera
 from ..gaussians import Gaussians, check_gaussians
 from .engines import composite
@@ -21,6 +23,10 @@ class Rendering(NamedTuple):
     map: Tensor  # [H, W, D] features, or red, green, blue
     alpha: Tensor  # [H, W] opacity in [0, 1): 1 - transmittance
     projected: Projected  # the visible Gaussians on the image plane
+
+    def to_numpy(self) -> np.ndarray[Any, Any]:  # [H, W, D]
+        """The map as a NumPy array, from any device and without its gradient."""
+        return as_array(self.map)
 
     def __repr__(self) -> str:
         return f"Rendering(map {short_value(self.map)}, {len(self.projected.index)} Gaussians in sight)"
@@ -55,7 +61,7 @@ def rasterize(
         camera: a pinhole; undistort a picture from a distorting lens first.
         background: what shows through, zeros if None; one value per channel.
         engine: see `composite`.
-        near: smallest depth that is drawn, world units; None: the camera's.
+        near: smallest depth that is drawn, world units; None takes the camera's.
 
     Returns:
         The map, its opacity, and the projected Gaussians; differentiable in all tensors of `gaussians` and in

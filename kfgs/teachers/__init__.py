@@ -2,7 +2,6 @@
 
 from .bpe import Tokenizer, load_tokenizer
 from .checkpoint import read_checkpoint, weights_digest
-from .costs import TeacherCost, teacher_cost
 from .load import load_teacher, teacher_names
 from .lseg import LSeg, LSegConfig, LSegOptions, load_lseg
 from .prompts import TEMPLATES, embed_labels, make_label_set
@@ -20,7 +19,6 @@ __all__ = [
     "LSegOptions",
     "SamTeacher",
     "Teacher",
-    "TeacherCost",
     "Tokenizer",
     "TransformersTeacher",
     "as_teacher",
@@ -33,7 +31,6 @@ __all__ = [
     "load_transformers_teacher",
     "make_label_set",
     "read_checkpoint",
-    "teacher_cost",
     "teacher_names",
     "weights_digest",
 ]

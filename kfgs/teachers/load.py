@@ -167,6 +167,9 @@ class OwnTeacher:
         self._known = {"source": source, "code": code, "options": plain_options(options)}
         self._digest: str | None = None
 
+    def __repr__(self) -> str:
+        return f"OwnTeacher({self._known['source']!r}, name={str(self.name)!r})"
+
     @property
     def name(self) -> str:
         """The teacher's own name."""

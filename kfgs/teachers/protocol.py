@@ -95,6 +95,9 @@ class CallableTeacher:
         self.name = name or getattr(images, "__name__", type(images).__name__).strip("<>")
         self._identity = code_identity(images) if identity is None else dict(identity)
 
+    def __repr__(self) -> str:
+        return f"CallableTeacher({self.name!r}, text={self._text is not None})"
+
     @property
     def identity(self) -> dict[str, Any]:
         """What decides the features, as far as it is known."""

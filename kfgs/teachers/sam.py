@@ -73,6 +73,9 @@ class SamTeacher:
     def __init__(self, encoder: nn.Module, identity: dict[str, Any]) -> None:
         self.encoder, self.identity = encoder, identity
 
+    def __repr__(self) -> str:
+        return f"SamTeacher(device={next(self.encoder.parameters()).device})"
+
     def to(self, device: torch.device | str) -> SamTeacher:
         """Move the encoder to a device; features are computed and returned there."""
         self.encoder.to(device)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,12 @@ from .protocol import PROMPTS_AT_ONCE, check_picture, check_prompts
 from .transformers_openclip import find_openclip, load_openclip
 from .transformers_patches import Patches, patch_size
 from .transformers_source import find_source, load_model, load_tokenizer_of, read_config, weights_of
-from .transformers_table import TRANSFORMERS, TeacherRow
-from .transformers_text import CLIP_VOCABULARY, Tokenize, bpe_tokenize, has_tokenizer, hub_tokenize
+from .transformers_table import TRANSFORMERS, TeacherRow, TextRule
+
+_Tokenize = Callable[[list[str]], tuple[Tensor, Tensor]]  # n prompts -> ids [n, T], mask [n, T] (0: padding)
+
+_CLIP_VOCABULARY = 49408  # entries of CLIP's own, which kfgs brings along
+_TOKENIZER_FILES = ("tokenizer.json", "vocab.json", "tokenizer.model", "spiece.model")
 
 
 def load_transformers_teacher(
@@ -73,17 +77,17 @@ def load_transformers_teacher(
     return TransformersTeacher(model, row, row.models[model_type][1], identity, tokenize)
 
 
-def _tokenize_of(kind: str, source: Path | str, commit: str | None, model: Any, *, local_only: bool) -> Tokenize:
+def _tokenize_of(kind: str, source: Path | str, commit: str | None, model: Any, *, local_only: bool) -> _Tokenize:
     """The tokenizer beside the weights; CLIP's own vocabulary where none lies there and the kind has that one."""
     row = TRANSFORMERS[kind]
     folder = source.parent if isinstance(source, Path) and source.is_file() else source
     words = model.config.text_config
-    bare = isinstance(folder, Path) and not has_tokenizer(folder)
-    if bare and row.activation is not None and words.vocab_size == CLIP_VOCABULARY:
-        return bpe_tokenize()
+    bare = isinstance(folder, Path) and not _has_tokenizer(folder)
+    if bare and row.activation is not None and words.vocab_size == _CLIP_VOCABULARY:
+        return _bpe_tokenize()
     assert row.text is not None
     longest = int(words.max_position_embeddings)
-    return hub_tokenize(
+    return _hub_tokenize(
         kind, folder, row.text, longest, lambda: load_tokenizer_of(kind, folder, commit, local_only=local_only)
     )
 
@@ -102,12 +106,16 @@ class TransformersTeacher:
     """
 
     def __init__(
-        self, model: Any, row: TeacherRow, patches: Patches, identity: dict[str, Any], tokenize: Tokenize | None
+        self, model: Any, row: TeacherRow, patches: Patches, identity: dict[str, Any], tokenize: _Tokenize | None
     ) -> None:
         self.model, self.row, self.identity = model, row, identity
         self.name: str = identity["name"]
         self.templates = row.templates
         self._patches, self._tokenize = patches, tokenize
+
+    def __repr__(self) -> str:
+        options = ", ".join(f"{name}={value}" for name, value in self.identity["options"].items())
+        return f"TransformersTeacher({self.name!r}, {options}, device={next(self.model.parameters()).device})"
 
     def to(self, device: torch.device | str) -> TransformersTeacher:
         """Move the model to a device; features are computed and returned there."""
@@ -182,3 +190,60 @@ def resize_picture(image: Tensor, size: tuple[int, int]) -> Tensor:  # [3, H, W]
     if tuple(image.shape[1:]) == size:
         return image
     return interpolate(image[None], size, mode="bilinear", align_corners=False, antialias=True)[0]
+
+
+def _has_tokenizer(folder: Path) -> bool:
+    """Does a folder hold the files of a tokenizer?"""
+    return any((folder / name).is_file() for name in _TOKENIZER_FILES)
+
+
+def _hub_tokenize(kind: str, source: Path | str, rule: TextRule, longest: int, load: Callable[[], Any]) -> _Tokenize:
+    """A tokenizer of transformers that `load` reads at the first prompt, so that pictures alone need none.
+
+    Args:
+        kind: the teacher's name, for messages.
+        source: the folder or hub id that `load` reads from.
+        rule: what the text tower was trained with.
+        longest: tokens that the text tower takes; a longer prompt is refused, not cut.
+        load: reads the tokenizer.
+    """
+    loaded: list[Any] = []
+
+    def tokenize(prompts: list[str]) -> tuple[Tensor, Tensor]:
+        if isinstance(source, Path) and not _has_tokenizer(source):
+            raise ValueError(
+                f"{source}: expected a tokenizer beside the weights of teacher {kind!r} ({', '.join(_TOKENIZER_FILES[:2])}, "
+                "...), got none; download those files too, or use a text table made elsewhere"
+            )
+        if not loaded:
+            loaded.append(load())
+        found = loaded[0](
+            [prompt.lower() for prompt in prompts] if rule.lower else prompts,
+            **({"padding": "max_length", "max_length": longest} if rule.pad else {"padding": True}),
+            padding_side="right",  # siglip pools at the last position, and the tokenizer of siglip2 would pad in front
+            return_attention_mask=True,
+        )
+        for prompt, mask in zip(prompts, found["attention_mask"], strict=True):
+            if sum(mask) > longest:
+                raise ValueError(
+                    f"prompts: expected at most {longest} tokens for teacher {kind!r}, got {sum(mask)} in "
+                    f"{prompt[:40]!r}; shorten it"
+                )
+        return torch.tensor(found["input_ids"]), torch.tensor(found["attention_mask"])
+
+    return tokenize
+
+
+def _bpe_tokenize() -> _Tokenize:
+    """CLIP's own vocabulary, for weights that come without a tokenizer."""
+    loaded: list[Any] = []
+
+    def tokenize(prompts: list[str]) -> tuple[Tensor, Tensor]:
+        from .bpe import load_tokenizer
+
+        if not loaded:
+            loaded.append(load_tokenizer())
+        ids = loaded[0](prompts)
+        return ids, torch.ones_like(ids)  # never used: CLIP is causal and pools at the end of the text
+
+    return tokenize

@@ -2,9 +2,11 @@
 
 from .animation import save_animation, save_frames
 from .boxes import add_boxes, add_names, add_selections
+from .camera_view import look_through
 from .clouds import CloudOptions, add_cloud, recolor_cloud, to_pyvista
 from .explorer import ExploreOptions, Explorer, explore
 from .field_colors import FeatureColors, feature_colors
+from .film_frames import show_cloud
 from .films import save_flythrough, save_turntable
 from .frusta import add_camera_images, add_cameras
 from .headless import available, make_plotter
@@ -17,8 +19,6 @@ from .palette import PALETTE, palette
 from .pictures import legend_column, legend_strip, overlay_labels, picture_grid, save_picture
 from .plots import plot_codebook_history, plot_confusion, plot_iou, plot_quality_storage, plot_training
 from .reports import CodebookRows, codebook_rows, plot_codebook_growth, plot_codebook_report
-from .shows import show_cloud
-from .through import look_through
 
 __all__ = [
     "PALETTE",

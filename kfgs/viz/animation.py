@@ -16,8 +16,8 @@ from .._check import check_range
 from .._files import atomic_path
 from ..cameras import Camera
 from ..gaussians import Gaussians
+from .film_frames import Show, as_shows, draw_frame, legend_under
 from .pictures import as_bytes
-from .shows import Show, as_shows, draw_frame, legend_under
 
 Array = np.ndarray[Any, Any]
 Progress = Callable[[int, int], object]
@@ -46,8 +46,8 @@ def save_animation(
             `show_cloud` makes), or several of them by title, which are shown side by side.
         cameras: one per frame, all of one size (`kfgs.cameras.orbit_cameras`, `path_cameras`).
         fps: frames per second, at most 50 in a GIF, which counts hundredths of a second.
-        names: class names; when given, the classes of the labelled Gaussians are listed below every frame. Labelled
-            Gaussians are those passed as such, not inside functions.
+        names: class names; when given, the classes of the labelled Gaussians are listed below every frame. Gaussians
+            inside functions are not listed.
         progress: called after each frame with (done, all).
 
     Returns:
@@ -97,7 +97,7 @@ def save_frames(
 
 
 def _write(path: str | Path, frames: Iterable[Tensor | Array], fps: float, strip: Array | None) -> Path:
-    """`strip` is what all frames end with, the legend, whose colours have to stay what they are."""
+    """`strip` is the legend below every frame; a GIF keeps its colours exactly."""
     target = _check_target(path, fps)
     with atomic_path(target) as temporary:
         if target.suffix.lower() == ".gif":
@@ -108,7 +108,7 @@ def _write(path: str | Path, frames: Iterable[Tensor | Array], fps: float, strip
 
 
 def _check_target(path: str | Path, fps: float) -> Path:
-    """Everything that can be refused before the first frame is drawn."""
+    """Check the target before the first frame is drawn."""
     target = Path(path)
     suffix = target.suffix.lower()
     if suffix not in SUFFIXES:

@@ -162,7 +162,7 @@ def add_selections(
 
 
 def _colors(gaussians: Gaussians) -> Array:  # [N, 3] uint8
-    """The palette's colours; what has no label keeps the brightness of its own colour, if it has one."""
+    """The palette's colours; Gaussians without a label keep the brightness of their colour."""
     assert gaussians.labels is not None
     colors = palette(gaussians.labels)
     if gaussians.sh is None:

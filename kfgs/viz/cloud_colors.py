@@ -43,9 +43,7 @@ def cloud_colors(
     """
     check_gaussians(gaussians)
     if color_by is None:
-        color_by = _what_there_is(gaussians)
-        if color_by == "feature" and feature_colors is None and gaussians.features is not None:
-            feature_colors = colors_of_features(gaussians.features)
+        color_by, feature_colors = color_by_default(gaussians, feature_colors)
     if isinstance(color_by, str):
         check_choice("color_by", color_by, get_args(ColorBy))
         return _named(gaussians, color_by, feature_colors, clim)
@@ -63,13 +61,17 @@ def cloud_colors(
     return CloudColors(palette(values), "label", values.astype(np.int64), None)
 
 
-def _what_there_is(gaussians: Gaussians) -> ColorBy:
-    """What to colour by if the caller does not say: classes, else colours, else features."""
+def color_by_default(
+    gaussians: Gaussians, feature_colors: FeatureColors | None
+) -> tuple[Literal["label", "rgb", "feature", "opacity"], FeatureColors | None]:
+    """What to colour by if the caller does not say: classes, else colours, else features, else opacity."""
     if gaussians.labels is not None:
-        return "label"
+        return "label", feature_colors
     if gaussians.sh is not None:
-        return "rgb"
-    return "opacity" if gaussians.features is None else "feature"
+        return "rgb", feature_colors
+    if gaussians.features is not None:
+        return "feature", feature_colors or colors_of_features(gaussians.features)
+    return "opacity", None
 
 
 def seen_from(gaussians: Gaussians, center: Array) -> Array:  # center: [3] -> [N, 3] uint8
@@ -104,7 +106,7 @@ def _named(
 
 
 def _scale(name: str, values: Array, clim: tuple[float, float] | None) -> CloudColors:
-    """Colours of a scale; what is not finite is grey."""
+    """Colours of a scale; values that are not finite are grey."""
     from matplotlib import colormaps
 
     finite = np.isfinite(values)

@@ -1,4 +1,4 @@
-"""What pyvista draws of a scene: clouds of Gaussians, as points, as Gaussians or as ellipsoids.
+"""Draw clouds with pyvista: as points, as Gaussians or as ellipsoids.
 
 Every `add_*` puts one actor into the plotter's active subplot and returns it; the caller shows the plotter. Data travel
 as named arrays on the actor's mesh (`actor.mapper.dataset["label"]`). pyvista is imported when something is drawn.
@@ -17,10 +17,10 @@ from .._check import as_array, check_choice, check_range, check_shapes
 from ..cameras.camera import NEAR
 from ..gaussians import Gaussians
 from .cloud_colors import CloudColors, ColorBy, cloud_colors, seen_from
-from .ellipsoids import ellipsoids
 from .field_colors import FeatureColors
 from .gaussian_actor import Moving, as_gaussians
 from .meshes import draw_mesh
+from .points_and_ellipsoids import ellipsoids
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -31,7 +31,7 @@ Style = Literal["points", "gaussians", "ellipsoids"]
 
 @dataclass(frozen=True)
 class CloudOptions:
-    """How a cloud is drawn, beside its style."""
+    """Options for drawing a cloud."""
 
     opacity: float = 1.0
     """Of everything drawn, in (0, 1]; it multiplies the opacities of Gaussians."""
@@ -44,7 +44,7 @@ class CloudOptions:
     near: float = NEAR
     """Gaussians up to this depth, in world units, are not drawn, as `Camera.near`; a haze before the view otherwise."""
     sort: bool = True
-    """Draw Gaussians back to front (exact). Without it their order is averaged: five times faster, less right."""
+    """Draw Gaussians back to front (exact). Without it their order is averaged: five times faster, less accurate."""
     moving: Moving = "auto"
     """What stands for Gaussians while the mouse moves the camera: "points" (at most 50,000, evenly chosen; faint ones pale),
     "gaussians", or "auto": points where a frame of Gaussians takes longer than 0.1 s, as in software from some 20,000 on."""
@@ -128,7 +128,7 @@ def to_pyvista(
     *,
     feature_colors: FeatureColors | None = None,
 ) -> pv.PolyData:
-    """A cloud as a point cloud of pyvista: one point for each Gaussian, whatever it holds as named arrays.
+    """A cloud as a point cloud of pyvista: one point for each Gaussian, its values as named arrays.
 
     The arrays are `index`, `rgb` (uint8), `opacity`, `scale` (standard deviations), `quat` (w, x, y, z), and, where there are
     any, `label` and what `color_by` shows (`score`). `to_pyvista(cloud).plot(scalars="rgb", rgb=True)` shows it;

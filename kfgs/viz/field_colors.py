@@ -115,7 +115,7 @@ def feature_colors(field: SemanticField) -> FeatureColors:
 def colors_of_features(
     features: Tensor,  # [N, D]
 ) -> FeatureColors:
-    """The projection of Gaussians of which nothing else is known, fitted to all features that are not 0.
+    """The projection for Gaussians without a codebook, fitted to all features that are not all-zero.
 
     Raises:
         ValueError: if one is not finite, or there are none.

@@ -24,7 +24,7 @@ DPI = 110
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure; sizes in inches. matplotlib comes with pyvista."""
+    """An empty figure; sizes in inches. Needs matplotlib, which pyvista installs."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure

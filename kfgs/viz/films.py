@@ -11,7 +11,7 @@ from ..cameras import Camera, Orbit, estimate_up, orbit_cameras, path_cameras
 from ..cameras.camera import UP
 from ..gaussians import Gaussians
 from .animation import Progress, save_animation
-from .shows import Show
+from .film_frames import Show
 
 KEYS = 40  # cameras of a long walk that a flight passes through: enough to follow it, too few to tremble with the hand
 

@@ -13,7 +13,7 @@ from ..splat.engines import ALPHA_MAX, ALPHA_MIN
 from ..splat.project import FIELD_OF_VIEW_MARGIN
 from .frusta import evenly
 from .meshes import draw_mesh
-from .stand_ins import FAINT
+from .points_and_ellipsoids import FAINT
 
 if TYPE_CHECKING:
     import pyvista as pv

@@ -31,7 +31,7 @@ _ours: set[str] = set()  # variables set here, not by the user
 
 
 class Probe(NamedTuple):
-    """Whether an 8 x 8 picture could be drawn, and what happened if not."""
+    """Whether an 8 x 8 picture could be drawn, and the error if not."""
 
     works: bool
     reason: str

@@ -1,9 +1,9 @@
-"""What the colours of a 3-D picture mean: classes by name, scores along a bar."""
+"""Legends of a 3-D picture: classes by name, scores along a bar."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -12,12 +12,12 @@ from torch import Tensor
 from .._check import check_range
 from .cloud_colors import COLORMAP
 from .pictures import LEGEND_INK, LEGEND_PAPER, check_names, legend_column
-from .pinned import MARGIN, pin_picture
 
 if TYPE_CHECKING:
     import pyvista as pv
 
 Array = np.ndarray[Any, Any]
+MARGIN = 10  # pixels from a corner
 DARK = 0.5  # of a background on which letters are white
 LETTERS = 14  # pixels, in windows up to 770 pixels high; larger ones have larger letters, to be read from as far
 SMALLEST = 9  # pixels: the least that can be read
@@ -41,7 +41,7 @@ def add_legend(
     present = np.unique(labels.cpu().numpy() if isinstance(labels, Tensor) else np.asarray(labels))
     if present.size == 0:
         raise ValueError("labels: expected at least one to list, got none; leave the legend out")
-    check_names(present.tolist(), names)  # at once, and not in the midst of a frame
+    check_names(present.tolist(), names)  # now, not while a frame is drawn
 
     def draw(height: int, width: int) -> Array:
         room = height - 2 * MARGIN
@@ -55,7 +55,7 @@ def add_legend(
 
 
 def add_scalar_bar(plotter: pv.Plotter, cloud: pv.Actor | tuple[float, float], title: str = "score") -> Any:
-    """Say which colour stands for which number, in a bar in the lower right corner of the active subplot.
+    """Show which colour stands for which number, in a bar in the lower right corner of the active subplot.
 
     Args:
         plotter: where the cloud is.
@@ -144,3 +144,75 @@ def _broken(text: str, font: Any, width: float) -> list[str]:
         else:
             lines.append(word)
     return lines
+
+
+def pin_picture(
+    plotter: pv.Plotter,
+    draw: Callable[[int, int], Array],  # (height, width) of the subplot, pixels -> [h, w, 3] uint8
+    corner: Literal["left", "right"] = "left",
+) -> Any:
+    """Put a picture into the lower left or the lower right corner of the active subplot.
+
+    It is drawn pixel by pixel, and again when the subplot's size changes. It appears in the next frame: drawing one here could
+    take long.
+
+    Args:
+        plotter: where to draw.
+        draw: makes the picture, best no larger than the subplot without a margin of 10 pixels on each side.
+        corner: which.
+
+    Returns:
+        The actor; `plotter.remove_actor` takes it away.
+    """
+    from vtkmodules.vtkRenderingCore import vtkActor2D, vtkImageMapper
+
+    mapper = vtkImageMapper()
+    mapper.SetColorWindow(255)  # bytes as they are
+    mapper.SetColorLevel(127.5)
+    actor = vtkActor2D()
+    actor.SetMapper(mapper)
+    pinned = _Pinned(plotter.renderer, actor, draw, corner)
+    pinned.draw(*_size_of(plotter))
+    plotter.add_actor(actor, reset_camera=False, pickable=False, render=False)
+    pinned.tag = plotter.renderer.AddObserver("StartEvent", pinned.before_frame)
+    return actor
+
+
+class _Pinned:
+    """Follows the size of its subplot as long as its actor is there."""
+
+    def __init__(self, renderer: Any, actor: Any, make: Callable[[int, int], Array], corner: str) -> None:
+        self.renderer, self.actor, self.make, self.corner = renderer, actor, make, corner
+        self.size: tuple[int, int] | None = None
+        self.tag = 0
+
+    def before_frame(self, *_: Any) -> None:
+        """The renderer is about to draw."""
+        if not self.renderer.HasViewProp(self.actor):
+            self.renderer.RemoveObserver(self.tag)
+            return
+        width, height = self.renderer.GetSize()
+        self.draw(height, width)
+
+    def draw(self, height: int, width: int) -> None:
+        """Make the picture for a subplot of this size, unless it is there already."""
+        if self.size == (height, width):
+            return
+        self.size = (height, width)
+        picture = self.make(height, width)
+        import pyvista as pv
+
+        rows, columns, _ = picture.shape
+        image = pv.ImageData(dimensions=(columns, rows, 1))
+        image.point_data["rgb"] = picture[::-1].reshape(-1, 3)  # VTK counts rows from below
+        image.set_active_scalars("rgb")
+        self.actor.GetMapper().SetInputData(image)
+        left = MARGIN if self.corner == "left" else max(width - columns - MARGIN, 0)
+        self.actor.SetPosition(left, MARGIN)
+
+
+def _size_of(plotter: pv.Plotter) -> tuple[int, int]:
+    """(height, width) that the active subplot will have, also before the first frame."""
+    width, height = plotter.window_size
+    x0, y0, x1, y1 = plotter.renderer.GetViewport()
+    return max(round((y1 - y0) * height), 1), max(round((x1 - x0) * width), 1)

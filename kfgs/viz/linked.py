@@ -1,4 +1,4 @@
-"""The semantic and the colour cloud side by side under one camera: what one says, the other shows."""
+"""The semantic and the colour cloud side by side under one camera."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 from .._check import check_whole
 from ..cameras import Camera, estimate_up
 from ..gaussians import Gaussians
+from .camera_view import look_through
 from .cloud_colors import ColorBy
 from .clouds import Style, add_cloud
 from .headless import make_plotter
 from .legends import add_legend, letters
-from .through import look_through
 
 if TYPE_CHECKING:
     import pyvista as pv

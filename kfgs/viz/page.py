@@ -24,7 +24,7 @@ from .._check import check_choice, check_whole
 from .._files import atomic_path
 from .palette import palette
 from .pictures import check_names
-from .stand_ins import MOST, Instead, without_gaussians
+from .points_and_ellipsoids import MOST_EXPORTED, Instead, without_gaussians
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -82,8 +82,8 @@ def save_page(
     target = Path(path)
     if target.suffix.lower() != ".html":
         raise ValueError(f"path: expected a name that ends in .html, got {target.name!r}; rename it")
-    check_choice("instead", instead, MOST)
-    most = MOST[instead] if limit is None else limit
+    check_choice("instead", instead, MOST_EXPORTED)
+    most = MOST_EXPORTED[instead] if limit is None else limit
     check_whole("limit", most, 1)
     legend = _legend(labels, names)
     if not any(renderer.actors for renderer in plotter.renderers):
@@ -125,7 +125,7 @@ def _scene(plotter: pv.Plotter, serializers: Any) -> bytes:
     window = plotter.render_window
     state = serializers.serialize(None, window, serializers.reference_id(window), context, 1)
     for renderer in plotter.renderers:
-        _turn_about_midst(state, serializers.reference_id(renderer.GetActiveCamera()), renderer)
+        _turn_about_middle(state, serializers.reference_id(renderer.GetActiveCamera()), renderer)
     arrays = {
         entry["hash"]: {**entry, "content": context.get_cached_data_array(entry["hash"], False)}
         for entry in serializers.extract_array_hash(state)
@@ -136,8 +136,8 @@ def _scene(plotter: pv.Plotter, serializers: Any) -> bytes:
     return packed.getvalue()
 
 
-def _turn_about_midst(state: dict[str, Any], camera_id: str, renderer: Any) -> None:
-    """Give a serialised camera its view angle, which is not serialised, and a focal point in the midst of what it sees.
+def _turn_about_middle(state: dict[str, Any], camera_id: str, renderer: Any) -> None:
+    """Give a serialised camera its view angle, which is not serialised, and a focal point in the middle of what it shows.
 
     Dragging turns about the focal point; `look_through` leaves it one unit before the camera. Here it lies straight
     ahead, at the median depth of the points in front: a few far ones do not move it.

@@ -1,4 +1,4 @@
-"""The codebook looked at: who is like whom, who is used, what each codeword means, and how the book grew (Figure 6)."""
+"""Pictures of a codebook: similarity, usage, the nearest words of each codeword, and its growth (Figure 6)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ROW = 0.145
 
 
 class CodebookRows(NamedTuple):
-    """What a codebook report shows, row by row."""
+    """The rows of a codebook report."""
 
     codewords: Tensor  # [R] int64, indices into the codebook in the order of the rows
     labels: Tensor  # [R] int64, class of each

@@ -1,6 +1,7 @@
 import fcntl
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -491,10 +492,10 @@ def test_an_identity_of_tuples_is_the_same_after_a_round_trip(pictures, tmp_path
     assert len(teacher.calls) == 3
 
 
-def test_a_bar_shows_each_picture(pictures, tmp_path, capsys):
+def test_a_bar_shows_each_picture_and_the_time_left(pictures, tmp_path, capsys):
     extract_features(Counting(), pictures, tmp_path / "maps", progress=True)
     shown = capsys.readouterr().err
-    assert "3/3" in shown
+    assert re.search(r"3/3 \[\d+:\d+<\d+:\d+", shown)  # time taken < time left
     assert "sub/c" in shown
 
 

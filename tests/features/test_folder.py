@@ -132,9 +132,7 @@ def test_a_file_that_is_no_tensor_is_refused(tmp_path):
     with pytest.raises(TypeError, match="expected one dense tensor .*, got a dict"):
         FeatureFolder(tmp_path, ["a"])[0]
     save_pt(tmp_path, "s", features(0).to_sparse())
-    with pytest.raises(
-        TypeError, match=r"s_fmap_CxHxW\.pt: expected one dense tensor .*, got a torch\.sparse_coo tensor"
-    ):
+    with pytest.raises(ValueError, match=tells("s_fmap_CxHxW.pt", "something else than dense tensors", "sparse")):
         FeatureFolder(tmp_path, ["s"])[0]
     save_pt(tmp_path, "b", features(0).long())
     with pytest.raises(ValueError, match=r"floating-point features, got torch\.int64"):
@@ -465,6 +463,13 @@ def test_a_map_saved_by_a_training_run_needs_no_gradient(tmp_path):
 def test_a_map_that_repeats_a_few_bytes_is_refused(tmp_path):
     save_pt(tmp_path, "a", torch.ones(1, 1, 1).expand(100_000, 100_000, 10_000))  # 4 bytes on disk, 400 TB read
     assert (tmp_path / "a_fmap_CxHxW.pt").stat().st_size < 4000
-    said = r"a_fmap_CxHxW\.pt: expected a feature map, .*its values are repeated by strides; save the tensor contiguous"
-    with pytest.raises(ValueError, match=said):
+    said = ("a_fmap_CxHxW.pt: expected a feature map", "its values are repeated by strides", "save it contiguous")
+    with pytest.raises(ValueError, match=tells(*said)):
         FeatureFolder(tmp_path, ["a"])[0]
+
+
+def test_stems_may_come_from_any_iterable(tmp_path):
+    for i, stem in enumerate("ab"):
+        np.save(tmp_path / f"{stem}.npy", features(i).numpy())
+    for stems in (("b", "a"), {"b": 1, "a": 2}, (stem for stem in "ba")):
+        assert FeatureFolder(tmp_path, stems).stems == ["b", "a"]

@@ -1,8 +1,10 @@
+import argparse
 import os
 
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from safetensors.torch import save_file
 
 from kfgs.features.layouts import (
@@ -154,16 +156,21 @@ class Harmful:
 def test_a_file_with_code_in_it_is_named_and_runs_nothing(tmp_path, zipped):
     made, file = tmp_path / "made", tmp_path / "a_fmap_CxHxW.pt"
     torch.save({"features": Harmful(made)}, file, _use_new_zipfile_serialization=zipped)
-    with pytest.raises(
-        ValueError, match=r"a_fmap.*cannot be read \(it holds objects beside tensors, which are not run\)"
-    ):
+    with pytest.raises(ValueError, match=tells(file, "cannot be read", "posix.mkdir", "nothing was run")):
         open_map(file)
     assert not made.exists()
 
 
+def test_objects_of_classes_are_not_made(tmp_path):
+    file = tmp_path / "a_fmap_CxHxW.pt"
+    torch.save(argparse.Namespace(a=1), file)
+    with pytest.raises(ValueError, match=tells(file, "cannot be read", "objects beside tensors, which are not run")):
+        open_map(file)
+
+
 @pytest.mark.parametrize(
     ("start", "words"),
-    [(b"\x89PNG\r\n\x1a\n" + bytes(100), "not a tensor that torch saved"), (b"", "EOFError"), (b"junk", "error: ")],
+    [(b"\x89PNG\r\n\x1a\n" + bytes(100), "a PNG picture"), (b"", "an empty file"), (b"junk", "a text file")],
 )
 def test_what_torch_did_not_save_is_named_in_a_few_words(tmp_path, start, words):
     file = tmp_path / "a_fmap_CxHxW.pt"

@@ -297,7 +297,7 @@ def test_decoding_in_chunks_changes_nothing(monkeypatch, mode, rule):
         return made.cosines(embeddings(), rule=rule), made.segment(camera(), embeddings(), rule=rule)
 
     whole = ask()
-    monkeypatch.setattr("kfgs.fields.semantic_field.CHUNK", 2)
+    monkeypatch.setattr("kfgs.fields.parts.CHUNK", 2)
     for one, other in zip(ask(), whole, strict=True):
         torch.testing.assert_close(one, other)
 

@@ -12,8 +12,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from kfgs import Camera, Gaussians
 from kfgs._rows import unit_rows
 from kfgs.cameras import resize_map
-from kfgs.fields import FieldConfig, GaussianParams, UpliftConfig, fit_field, uplift, uplift_maps
-from kfgs.fields.coarse import shrink_map
+from kfgs.fields import FieldConfig, GaussianParams, UpliftConfig, fit_field, uplift, uplift_maps, working_maps
+from kfgs.fields.working_maps import shrink_map
 from kfgs.labels import average_views
 from kfgs.splat import rasterize
 
@@ -428,7 +428,7 @@ def test_the_temporary_folder_is_gone_afterwards(folders):
 
 
 def test_the_temporary_folder_is_gone_after_an_error(folders, monkeypatch):
-    monkeypatch.setattr(uplift, "LOOKED_AT", (1, 2_000))  # so that the bad map is met in the second reading
+    monkeypatch.setattr(working_maps, "LOOKED_AT", (1, 2_000))  # so that the bad map is met in the second reading
     maps = random_maps(cameras())
     maps[2][4, 5, 1] = torch.nan
     with pytest.raises(
@@ -439,7 +439,7 @@ def test_the_temporary_folder_is_gone_after_an_error(folders, monkeypatch):
 
 
 def test_a_killed_uplift_reads_no_map_twice(tmp_path, monkeypatch):
-    monkeypatch.setattr(uplift, "LOOKED_AT", (1, 2_000))
+    monkeypatch.setattr(working_maps, "LOOKED_AT", (1, 2_000))
     maps, reads, dies = random_maps(cameras()), [], [True]
 
     class Maps:

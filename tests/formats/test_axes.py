@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from kfgs.cameras import Similarity
-from kfgs.formats.axes import flip_axes
+from kfgs.formats.values import flip_axes
 from kfgs.gaussians import Gaussians
 from kfgs.splat import evaluate_sh, transform_gaussians
 

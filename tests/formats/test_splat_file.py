@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from kfgs.formats import SplatFile
+from kfgs.formats import SplatFile, read_splats
 from kfgs.gaussians import Gaussians
 
 
@@ -42,9 +42,26 @@ def test_a_copy_leaves_the_original():
     assert other.gaussians is splats.gaussians
 
 
+def test_it_saves_itself(tmp_path):
+    sh = torch.zeros(4, 1, 3)
+    splats = SplatFile(_cloud().replace(sh=sh), {}, ("a", "b", "c"))
+    written = splats.save(tmp_path / "a.ply")
+    assert [path.name for path in written.paths] == ["a.ply", "a.ply.classes.json"]
+    back = read_splats(tmp_path / "a.ply")
+    assert (back.classes, back.gaussians.labels.tolist()) == (splats.classes, [-1, 0, 1, 2])
+    splats.save(tmp_path / "a.bin", format="spz")
+    assert read_splats(tmp_path / "a.bin").info["format"] == "spz"
+    with pytest.raises(ValueError, match="path: expected a name that ends in one of"):
+        splats.save(tmp_path / "a.bin")
+
+
 def test_it_says_what_it_holds():
     splats = SplatFile(_cloud(), {"score": np.zeros(4)}, ("a", "b"), {"format": "spz"})
     assert len(splats) == 4
     assert repr(splats).startswith("SplatFile(spz: Gaussians(4 Gaussians, labelled")
-    assert repr(splats).endswith(", 2 classes, extra score)")
+    assert repr(splats).endswith(", 2 classes, extra ['score'])")
+    many = splats.replace(extra={f"column_{i}": np.zeros(4) for i in range(50)})
+    assert repr(many).endswith(", extra 50 of str)")
+    card = splats.replace(classes=("<b>", "c"))._repr_html_()
+    assert all(part in card for part in ("SplatFile", "spz", "4 Gaussians", "2: &lt;b&gt;, c", "score"))
     assert repr(SplatFile(_cloud())).startswith("SplatFile(new: ")

@@ -11,10 +11,10 @@ from oracles_spz import legacy_payload, smallest_three
 from kfgs.cameras import Camera
 from kfgs.formats import SplatFile, read_splats, write_splats
 from kfgs.formats import spz as module
-from kfgs.formats.axes import flip_axes
 from kfgs.formats.spz import precision, read, write, write_spz
 from kfgs.formats.spz_codec import choose_fractional_bits
 from kfgs.formats.spz_streams import read_container
+from kfgs.formats.values import flip_axes
 from kfgs.gaussians import Gaussians
 from kfgs.splat import rasterize
 

@@ -12,8 +12,7 @@ from oracles_spz import legacy_payload
 
 from kfgs.formats import SplatFile, read_splats, write_spz
 from kfgs.formats import spz as module
-from kfgs.formats.spz import read
-from kfgs.formats.spz_labels import TYPE as LABELS
+from kfgs.formats.spz import LABELS, read
 from kfgs.gaussians import Gaussians
 
 ROW = {"position": (256, -512, 768), "alpha": 51, "color": (0, 128, 255), "scale": (160, 128, 96)}

@@ -3,9 +3,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from oracles_labels import cosine, most_similar
 
-from kfgs.labels import classify, label_codewords, select_by_query
+from kfgs.labels import classify, label_codewords, select_by_query, select_like
 from kfgs.labels import classify as classify_function
 
 
@@ -117,3 +118,15 @@ def test_threshold_that_is_no_cosine_is_refused(value, message):
 def test_query_without_a_direction_is_refused():
     with pytest.raises(ValueError, match="query: expected rows with a direction"):
         select_by_query(torch.eye(2), torch.zeros(2))
+
+
+def test_arrays_are_taken_and_a_name_gets_advice():
+    rows, classes = torch.tensor([[2.0, 0.1], [0.1, 0.3]]), torch.eye(2)
+    assert classify(rows.numpy(), classes.numpy()).labels.equal(classify(rows, classes).labels)
+    assert classify(rows, classes.double()).labels.tolist() == [0, 1]
+    expected = select_by_query(rows, classes[0], 0.5)
+    assert select_by_query(rows.numpy(), classes[0].double().numpy(), 0.5).mask.equal(expected.mask)
+    assert select_like(rows, np.array([0]), 0.5).mask.equal(select_like(rows, 0, 0.5).mask)
+    for call in (lambda: select_by_query(rows, "chair"), lambda: classify(rows, "chair")):
+        with pytest.raises(TypeError, match=tells("'chair'", "field.query", "OfClass")):
+            call()

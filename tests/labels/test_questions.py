@@ -2,6 +2,7 @@ import dataclasses
 
 import pytest
 import torch
+from messages import tells
 
 from kfgs import Camera, Gaussians
 from kfgs.fields import SemanticField
@@ -168,3 +169,15 @@ def test_words_of_other_channels_are_refused_before_any_view_is_drawn(monkeypatc
             r"\(name 'clip' in place of 'lseg'\) Embed the words",
         ):
             ask()
+
+
+def test_arrays_are_taken_as_tensors_are():
+    for target, negatives in ((ROWS[0], "auto"), (PHRASE, ROWS[1:])):
+        expected = make_question(target, FULL, negatives, 6, {})
+        array = negatives if isinstance(negatives, str) else negatives.numpy()
+        found = make_question(target.double().numpy(), FULL, array, 6, {})
+        assert found.row.equal(expected.row)
+        assert found.negatives.equal(expected.negatives)
+    assert class_rows(ROWS.numpy(), 6, {}).equal(ROWS)
+    with pytest.raises(TypeError, match=tells("classes", "LabelSet", "list")):
+        class_rows(["chair"], 6, {})

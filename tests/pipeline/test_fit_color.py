@@ -10,8 +10,7 @@ from kfgs.cameras import Distortion, Similarity
 from kfgs.evaluation.color import score_views
 from kfgs.fields import FieldConfig
 from kfgs.formats import read_splats, write_splats
-from kfgs.pipeline.color import ColorConfig, fit_color
-from kfgs.pipeline.photos import Photos
+from kfgs.pipeline.color import ColorConfig, Photos, fit_color
 from kfgs.scenes import load_scene
 
 FIELD = dataclasses.replace(

@@ -1,4 +1,4 @@
-"""Fits whose maps were discarded, or are made anew each time, against the fit of the same maps on disk."""
+"""Fits of maps that were discarded, or are computed again each time, against the fit of the same maps on disk."""
 
 import dataclasses
 
@@ -133,9 +133,9 @@ def test_through_a_lens_samples_are_kept_and_the_field_is_that_of_stored_maps(sc
     views = bent.views("train")
     stored = fit_scene(bent, read(maps_folder, bent), tmp_path / "stored", QUICK)
     teacher = Mixer()
-    anew = fit_scene(bent, RecomputedMaps(teacher, bent, views, tmp_path / "store"), tmp_path / "anew", QUICK)
+    again = fit_scene(bent, RecomputedMaps(teacher, bent, views, tmp_path / "store"), tmp_path / "again", QUICK)
     assert teacher.calls == 12
-    assert same(stored.field, anew.field)
+    assert same(stored.field, again.field)
 
 
 class _Plain(list):

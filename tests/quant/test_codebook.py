@@ -159,6 +159,8 @@ def test_every_feature_gets_the_first_largest_product_whatever_the_size(size):
 def test_arrays_are_accepted_and_names_refused():
     rows = random_rows(6, 4)
     book, same = Codebook(rows[:3]), Codebook(rows[:3].numpy())
+    assert len(book) == book.size == 3
+    assert torch.equal(torch.from_numpy(book.to_numpy()), rows[:3])
     assert torch.equal(same.quantize(rows.numpy()), book.quantize(rows))
     assert torch.equal(same.similarity(rows.numpy()), book.similarity(rows))
     with pytest.raises(TypeError, match=tells("features", "'chair'", "embedding")):

@@ -218,6 +218,8 @@ def test_arguments_of_another_kind_and_mixed_types_are_named():
         rasterize(SimpleNamespace(gaussians=gaussians), camera)
     with pytest.raises(TypeError, match=tells("camera", "str", "scene.cameras")):
         rasterize(gaussians, "view_0")
+    rendering = rasterize(gaussians.replace(features=gaussians.features.requires_grad_()), camera)
+    assert torch.equal(torch.from_numpy(rendering.to_numpy()), rendering.map.detach())
     for name in ("quats", "scales", "opacities", "features"):
         mixed = gaussians.replace(**{name: getattr(gaussians, name).float()})
         with pytest.raises(

@@ -42,6 +42,10 @@ def test_a_function_becomes_a_teacher_of_its_name():
         teacher.encode_text(["chair"])
 
 
+def test_repr_is_short():
+    assert repr(as_teacher(halve)) == "CallableTeacher('halve', text=False)"
+
+
 def test_text_of_a_function_comes_as_unit_rows():
     teacher = CallableTeacher(halve, lambda prompts: torch.tensor([[3.0, 0, 4]] * len(prompts)))
     assert torch.allclose(teacher.encode_text(["a", "b"]), torch.tensor([[0.6, 0, 0.8]] * 2))

@@ -42,6 +42,10 @@ def test_sizes_of_the_encoder_follow_from_its_weights(teacher):
     assert not any(tensor.is_meta for tensor in teacher.encoder.state_dict().values())
 
 
+def test_repr_is_short(teacher):
+    assert repr(teacher) == "SamTeacher(device=cpu)"
+
+
 def test_map_of_a_wide_picture_loses_the_rows_of_the_padding(teacher, sam):
     image = torch.rand(3, 600, 1024)  # as wide as SAM wants it: no resampling
     mean = torch.tensor([123.675, 116.28, 103.53])[:, None, None]

@@ -247,6 +247,10 @@ def test_features_come_from_the_device_of_the_model(load, name):
         assert teacher.encode_text(["wall", "a red chair"]).device.type == "meta"
 
 
+def test_repr_is_short(load):
+    assert repr(load("clip")) == "TransformersTeacher('clip', size=None, residual=False, device=cpu)"
+
+
 def test_hook_is_taken_away_again(load):
     teacher = load("clip")
     teacher.encode_image(picture())

@@ -139,7 +139,7 @@ def test_ellipsoids_are_the_gaussians_surfaces(plotter):
 def test_too_many_or_too_faint_ellipsoids_are_refused(plotter, monkeypatch):
     with pytest.raises(ValueError, match="expected at least one of opacity above 0.95, got none; lower options.faint"):
         add_cloud(plotter, some_gaussians(), style="ellipsoids", options=CloudOptions(faint=0.95))
-    monkeypatch.setattr("kfgs.viz.ellipsoids.MOST", 10)
+    monkeypatch.setattr("kfgs.viz.points_and_ellipsoids.MOST", 10)
     with pytest.raises(ValueError, match="gaussians: expected at most 10 to draw as ellipsoids, got"):
         add_cloud(plotter, some_gaussians(), style="ellipsoids")
 

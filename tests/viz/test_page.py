@@ -16,7 +16,7 @@ from PIL import Image
 from kfgs.gaussians import Gaussians
 from kfgs.viz import add_cloud, available, headless, make_plotter, palette
 from kfgs.viz.page import _furnish, _legend, save_page
-from kfgs.viz.stand_ins import half_surfaces, strongest, without_gaussians
+from kfgs.viz.points_and_ellipsoids import half_surfaces, strongest, without_gaussians
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 EMPTY = "<html><head><title>viewer\nof others</title></head><body>\n<script>'</body>'</script>\n</body></html>"

@@ -1,4 +1,4 @@
-"""The edit that brings in Gaussians from another file or scene."""
+"""The edit that adds the Gaussians of another splat file."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from .merge import join
 class Insert(Edit):
     """Add the Gaussians of another splat file after those of the scene; `join` says what happens to labels and columns.
 
-    The file is read when the edit is applied. Two inserts are equal when they name the same file, relative to the working
-    folder or in full, and the same place.
+    The file is read when the edit is applied. Two inserts are equal if they have the same similarity and name the same file,
+    relative to the working folder or in full.
     """
 
     op: ClassVar[str] = "insert"
     source: str | Path | SplatFile
     """A splat file of any known format, or a cloud in memory (which JSON cannot hold)."""
     similarity: Similarity | None = None
-    """From the axes of the source to those of the scene; None leaves it where it is."""
+    """From the axes of the source to those of the scene; None: both have the same axes."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.source, str | Path | SplatFile) or self.source == "":
@@ -107,7 +107,7 @@ def read_similarity(value: Any, name: str) -> Similarity | None:
 
 
 def read_source(value: Any, name: str, folder: Path, anywhere: bool) -> Path:
-    """The file that a saved edit names, which by default must lie in the folder of the edits or below it.
+    """The file that a saved edit names. Unless `anywhere`, it must lie in the folder of the edits or below.
 
     Raises:
         ValueError: if it is not a path, leads out of the folder (an absolute path, `..`, a link), or is a folder without a

@@ -1,4 +1,4 @@
-"""Two clouds become one: colours of different degree, labels of different classes, columns that one of them lacks."""
+"""Join two clouds, which may differ in colour degree, classes and columns."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _ALWAYS = ("means", "quats", "scales", "opacities")
 
 
 def join(first: SplatFile, second: SplatFile) -> SplatFile:
-    """The Gaussians of two clouds, those of the first in front; the first gives dtype, device and `info`.
+    """The Gaussians of two clouds, the first before the second; dtype, device and `info` are those of the first.
 
-    - Spherical harmonics: the lower degree is filled up with zeros, which changes no colour.
+    - Spherical harmonics: the lower degree is padded with zeros, which changes no colour.
     - Labels: classes with the same name are the same class. If the first cloud has the name twice, the lowest label is
       used. New names that occur are added after those of the first. A class without a name is called `class 7` if the
       other cloud has names; if neither has names, indices are kept.

@@ -1,4 +1,4 @@
-"""Edits of where it stands: move, turn and resize Gaussians about a pivot, or a copy of them."""
+"""Edits of place: move, rotate and resize Gaussians about a pivot, or a copy of them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from ...cameras.similarity import Similarity
 from ...formats.splat_file import SplatFile
 from ...gaussians import Gaussians
 from ...splat.transform import transform_gaussians
-from .._json import number_of, numbers_of, quaternion_of, rotation_matrix, set_fields, unit
+from .._json import number_of, numbers_of, set_fields
+from ..boxes import quaternion_of, rotation_matrix, unit
 from .edit import OnSelection
 from .merge import join
 
@@ -25,7 +26,7 @@ AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 @dataclass(frozen=True)
 class Turn:
-    """A rotation by an angle about an axis, by the right hand: a positive turn about z takes x to y."""
+    """A right-handed rotation by an angle about an axis: 90 degrees about z take x to y."""
 
     axis: tuple[float, ...]
     """A direction (x, y, z) of any length, or `"x"`, `"y"`, `"z"`."""
@@ -58,7 +59,7 @@ class _Motion(OnSelection):
     scale: float = 1.0
     """> 0"""
     pivot: str | tuple[float, ...] = "centroid"
-    """The point that turning and resizing leave in place: `"centroid"` (the mean of the selected positions, weighted by
+    """The point that rotation and scale leave in place: `"centroid"` (the mean of the selected positions, weighted by
     opacity; the plain mean if every opacity is 0) or (x, y, z)."""
 
     def __post_init__(self) -> None:
@@ -106,7 +107,7 @@ class Move(_Motion):
 
 @dataclass(frozen=True)
 class Duplicate(_Motion):
-    """Add a copy of Gaussians, moved as `Move` does; labels and other columns are copied. Copies follow the originals."""
+    """Add a copy of Gaussians, moved as `Move` does, with labels and other columns. Copies come after the originals."""
 
     op: ClassVar[str] = "duplicate"
 

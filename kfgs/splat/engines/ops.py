@@ -3,7 +3,7 @@
 An engine works on plain tensors and knows nothing of gradients. Here its functions become opaque operators,
 `kfgs::composite`, `kfgs::project`, `kfgs::bin_tiles` and `kfgs::accumulate`, with backward passes and with fake kernels
 that tell the shapes without computing anything. How many Gaussians can be seen, how many pairs there are, and how long an
-engine's trace is (one axis, int32), is known after the fact. Whoever loads an exported program imports `kfgs.splat`
+engine's trace is (one axis, int32), is known after the fact. To load an exported program, import `kfgs.splat`
 first, which registers them.
 """
 

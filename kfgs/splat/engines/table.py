@@ -35,10 +35,10 @@ _ENGINES = {
 
 
 def available_engines(device: str | None = None) -> list[str]:
-    """Names of the engines whose packages are installed, fastest first.
+    """Names of the engines whose packages are installed, the fastest first.
 
     Args:
-        device: "cpu" or "cuda": only those for use there, which are imported to find out; None: all, wherever they run,
+        device: "cpu" or "cuda": only the engines for that device, which are imported to find out. None: all engines,
             and nothing is imported.
     """
     names = [name for name, entry in _ENGINES.items() if find_spec(entry.needs) and find_spec(entry.module)]
@@ -75,7 +75,7 @@ def _own_symbols() -> Iterator[None]:
     module does not see an allocator that was loaded before all others (LD_PRELOAD), either. It changes nothing for numba,
     whose LLVM is loaded by ctypes, past this flag, and keeps to itself.
 
-    The flag is the process's: one import at a time, and what other threads import meanwhile by themselves has it too.
+    The flag holds for the whole process. So only one import at a time sets it, and imports of other threads get it too.
     """
     flag = getattr(os, "RTLD_DEEPBIND", 0)  # glibc's
     maps = Path("/proc/self/maps")
@@ -123,7 +123,7 @@ def _choose(engine: str, device: str, dtype: torch.dtype) -> str:
 
 
 def choose_compiled(engine: str, function: str, name: str, *tensors: Tensor) -> str | None:
-    """The engine whose own projection or binning is to work on these tensors; None: kornia's and torch's functions do.
+    """The engine that projects or bins these tensors itself. None: kornia's and torch's functions do it.
 
     Args:
         engine: a name, or "auto".
@@ -136,7 +136,7 @@ def choose_compiled(engine: str, function: str, name: str, *tensors: Tensor) -> 
             all of one dtype it knows.
         ImportError: if the named engine's package is missing.
     """
-    dtype = tensors[0].dtype if engine == "auto" else torch.float32  # of a named engine, what is wrong is said below
+    dtype = tensors[0].dtype if engine == "auto" else torch.float32  # a named engine's errors are raised below
     chosen = choose(engine, tensors[0].device.type, dtype)
     if not offers(chosen, function):
         return None
@@ -151,7 +151,7 @@ def choose_compiled(engine: str, function: str, name: str, *tensors: Tensor) -> 
 
 
 def offers(name: str, function: str) -> bool:
-    """Whether an engine has a function that not all have."""
+    """Whether an engine has a function that is optional."""
     return hasattr(load(name), function)
 
 
@@ -161,7 +161,7 @@ offers._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 def _serves(name: str, device: str) -> bool:
-    """Whether an engine is for use on a device; one that runs there for proofs only has to be named."""
+    """Whether an engine is meant for a device. An engine that runs there only for tests must be named."""
     try:
         engine = load(name)
         return device in engine.devices() and device not in getattr(engine, "PROOFS", ())

@@ -11,7 +11,6 @@ from torch.nn import functional
 
 from ..._check import one_line
 from .network import LSegConfig, LSegNetwork
-from .recognise import recognise
 from .text import ClipText
 
 _EXPECTED = "the LSeg checkpoint of backbone clip_vitl16_384 (demo_e200.ckpt)"
@@ -54,6 +53,16 @@ _TEXT_NAMES = (
 _UNUSED = re.compile(
     r"clip_pretrained\.(visual\.|logit_scale$)|pretrained\.model\.(norm|head)\.|scratch\.refinenet4\.resConfUnit1\."
     r"|scratch\.head_block\.|logit_scale$|.*\.num_batches_tracked$"
+)
+
+# Other networks by how the names of their tensors begin. The first rule that fits counts; LSeg's prefixes are asked before.
+_BY_PREFIX = (
+    (("student.", "teacher."), "a self-supervised training checkpoint (DINO, iBOT)"),
+    (("image_encoder.", "mask_decoder.", "prompt_encoder.", "vision_encoder."), "a SAM checkpoint"),
+    (("visual.", "transformer.resblocks.", "token_embedding."), "CLIP alone, without LSeg's decoder"),
+    (("vision_model.", "text_model."), "CLIP or SigLIP of transformers, without LSeg's decoder"),
+    (("conv1.", "layer1."), "a ResNet"),
+    (("blocks.", "patch_embed.", "encoder.layer.", "embeddings."), "a ViT alone (DINO, timm), without LSeg's decoder"),
 )
 
 
@@ -144,7 +153,7 @@ def _check(state: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]], s
     ]
     if not (missing or unknown or other):
         return
-    what = recognise(state)
+    what = _recognise(state)
     hint = "pass that file"
     if what is None:
         lists = ((missing, "missing"), (unknown, "unknown"), (other, "of another shape or type"))
@@ -181,3 +190,33 @@ def _fill(module: nn.Module, tensors: dict[str, Tensor]) -> None:
     counters = {name: torch.tensor(0) for name in module.state_dict() if name.endswith(_COUNTER)}
     module.requires_grad_(False).load_state_dict({**tensors, **counters}, assign=True)
     module.eval()
+
+
+def _recognise(state: Mapping[str, Tensor]) -> str | None:  # names without "net."
+    """What another network a state is of, as far as names tell; None if it looks like LSeg's expected backbone, or unknown."""
+    names = list(state)
+    if not names:
+        return "no tensors of its image network"
+    if any(name.startswith("pretrained.layer1") for name in names):
+        return "LSeg of backbone clip_resnet101, or another without a ViT"
+    if any(name.startswith(("pretrained.", "scratch.")) for name in names):
+        return _other_lseg(state)
+    return next((what for prefixes, what in _BY_PREFIX if any(name.startswith(prefixes) for name in names)), None)
+
+
+def _size(value: Tensor | None, axis: int) -> int | None:
+    """A tensor's size along an axis, if it has that axis."""
+    return value.shape[axis] if value is not None and -value.ndim <= axis < value.ndim else None
+
+
+def _other_lseg(state: Mapping[str, Tensor]) -> str | None:
+    patches, head = state.get("pretrained.model.patch_embed.proj.weight"), state.get("scratch.head1.weight")
+    positions = state.get("pretrained.model.pos_embed")
+    if _size(positions, -1) == 768:
+        size = 16 if _size(patches, -1) == 16 else 32
+        return f"LSeg of backbone clip_vitb{size}_384 (768 channels)"
+    if _size(head, 0) == 768:
+        return "LSeg of backbone clipRN50x16_vitl16_384 (features of 768 channels)"
+    if head is None and any(name.startswith("scratch.output_conv.") for name in state):
+        return "a DPT for depth or closed classes, without LSeg's head"
+    return None

@@ -56,6 +56,9 @@ class LSeg(nn.Module):
         self._weights: str | None = None
         self.eval()
 
+    def __repr__(self) -> str:
+        return f"LSeg({self.options}, device={self.device})"
+
     def train(self, mode: bool = True) -> LSeg:
         """Stay in evaluation mode: a teacher is not trained, and its normalisation must not follow the pictures."""
         return super().train(False)

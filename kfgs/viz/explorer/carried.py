@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from ...gaussians import Gaussians
-from ...labels.transfer_distance import explained_distance, positions
-from ...labels.transfer_sources import Sources, neighbours_together
+from ...labels.nearest import Sources, explained_distance, neighbours_together, positions
 
 Array = np.ndarray[Any, Any]
 SPAN = 30.0  # the lambda slider reaches from a 30th of the suggestion to 30 times it

@@ -19,7 +19,7 @@ from ..gaussian_actor import MOVING_POINTS, STILL
 from ..legends import add_legend, add_scalar_bar
 from ..linked import add_title
 from ..meshes import draw_mesh
-from ..stand_ins import FAINT
+from ..points_and_ellipsoids import FAINT
 from .hit_test import gaussian_at
 from .ring import Ring
 from .state import check_number

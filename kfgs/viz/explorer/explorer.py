@@ -14,10 +14,10 @@ from PIL import Image
 from ..._check import check_choice
 from ...cameras import Camera
 from ...cameras.camera import NEAR
+from ..camera_view import camera_of, letterboxed, look_through
 from ..headless import make_plotter
 from ..linked import look_over, upwards
 from ..pictures import save_picture
-from ..through import camera_of, fitted, look_through
 from .drawing import Drawn, Pane
 from .first_frame import FirstFrame
 from .meaning import Asked
@@ -190,7 +190,7 @@ class Explorer:
         """
         width, height = self.panes[0].renderer.GetSize()
         self.plotter.subplot(0, 0)
-        look_through(self.plotter, fitted(camera, height, width))
+        look_through(self.plotter, letterboxed(camera, height, width))
         if np.isclose(float(camera.K[0, 0]), float(camera.K[1, 1]), rtol=1e-6):
             self.plotter.camera.SetUseExplicitAspectRatio(False)  # the window may be resized
         self._moved()

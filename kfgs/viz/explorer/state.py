@@ -14,7 +14,7 @@ from ..._check import as_array, check_choice, check_range, check_whole
 from ...cameras import Camera
 from ...gaussians import Gaussians
 from ...labels import Selection, class_indices
-from ...labels.transfer_distance import positions
+from ...labels.nearest import positions
 from ..palette import palette
 from .carried import SPAN, Array, Carried
 from .meaning import Asked, Meaning

@@ -545,7 +545,7 @@ def test_error_of_a_band_reaches_the_caller(where, two_threads):
 # processes ------------------------------------------------------------------------------------------------------------
 
 
-def _in_fork(work, seconds=20):
+def _in_fork(work, seconds=300):
     """What `work` returns in a forked child, as JSON; the child is ended if it hangs."""
     read, write = os.pipe()
     with warnings.catch_warnings():
@@ -619,7 +619,7 @@ def test_workers_of_a_data_loader_composite_too(two_threads):
     expected = [_frame(i) for i in range(4)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
-        loader = DataLoader(_Frames(), batch_size=None, num_workers=2, multiprocessing_context="fork", timeout=60)
+        loader = DataLoader(_Frames(), batch_size=None, num_workers=2, multiprocessing_context="fork", timeout=300)
         frames = list(loader)
     for frame, truth in zip(frames, expected, strict=True):
         assert torch.equal(frame, truth)

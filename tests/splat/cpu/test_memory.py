@@ -98,11 +98,11 @@ def test_memory_in_use_is_not_handed_out(held):
     place = tensor.data_ptr()
     holder = HOLDERS[held](tensor)
     del tensor
-    gc.collect()
+    gc.collect(1)  # what the test made is young
     others = [take_memory(LIKE, SIZE).fill_(7) for _ in range(3)]
     assert place not in [other.data_ptr() for other in others]
     del holder
-    gc.collect()
+    gc.collect(1)  # what the test made is young
     assert take_memory(LIKE, SIZE).data_ptr() == place
 
 
@@ -207,7 +207,7 @@ def test_memory_outlives_the_thread_that_took_it():
     thread = threading.Thread(target=lambda: found.append(take_memory(LIKE, SIZE).fill_(5)))
     thread.start()
     thread.join()
-    gc.collect()
+    gc.collect(1)  # what the test made is young
     others = [take_memory(LIKE, SIZE).fill_(7) for _ in range(3)]
     assert (found[0] == 5).all()
     assert found[0].data_ptr() not in [other.data_ptr() for other in others]

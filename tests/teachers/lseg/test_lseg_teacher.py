@@ -129,6 +129,10 @@ def test_text_tower_comes_at_the_first_prompt_and_stays() -> None:
     assert not any(parameter.requires_grad for parameter in teacher.parameters())
 
 
+def test_repr_is_short_and_tells_the_options() -> None:
+    assert repr(tiny()) == f"LSeg({LSegOptions()}, device=cpu)"
+
+
 def test_features_can_enter_a_gradient() -> None:
     """encode_* take no gradient, but what they return is no inference tensor that autograd refuses."""
     teacher = with_text()

@@ -161,10 +161,10 @@ def test_clouds_that_cannot_be_explored():
     ):
         line(cameras=[bent])
     hole = cloud(LINE).replace(means=torch.full((4, 3), torch.nan))
-    with pytest.raises(ValueError, match="color.means: expected finite positions, got NaN or infinity in row 0"):
+    with pytest.raises(ValueError, match="color.means: expected finite numbers, got NaN or infinity in row 0"):
         Exploration(SplatMeaning(splat_file(cloud(LINE, [0] * 4))), hole)
     labelled = hole.replace(labels=torch.zeros(4, dtype=torch.int64))
-    with pytest.raises(ValueError, match="meaning.gaussians.means: expected finite positions, got NaN or infinity in"):
+    with pytest.raises(ValueError, match="meaning.gaussians.means: expected finite numbers, got NaN or infinity in"):
         Exploration(SplatMeaning(splat_file(labelled)))
     unlabelled = SplatMeaning(splat_file(cloud(LINE, [0] * 4)))
     unlabelled.gaussians = cloud(LINE)

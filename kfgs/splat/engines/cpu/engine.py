@@ -1,7 +1,7 @@
 """The CPU engine: compositing compiled by numba, with its own backward pass.
 
-Work is cut into bands of tiles by the data alone; each band writes its own pixels and its own gradient rows, and the
-rows are summed in the order of the bands. Reruns are therefore equal to the bit, whatever the number of threads.
+The data alone decide how the tiles are cut into bands. Each band writes its own pixels and its own gradient rows, and the
+rows are summed in the order of the bands. So reruns are equal to the bit, on any number of threads.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ row_length, padded_length = (
 __all__ = ["accumulate", "backward", "bin", "devices", "forward", "project", "project_backward"]
 
 MOST_BANDS, PAIRS_PER_BAND = 32, 2048
-"""Shares of the work, and the fewest pairs that make one: more shares keep more threads busy, and let more gradient rows
-meet at their borders. How many there are depends on the data alone."""
+"""The most bands, and the fewest pairs of a band. More bands keep more threads busy, but more Gaussians then have a gradient
+row in several bands. The number of bands depends on the data alone."""
 
 NARROW_CHANNELS = len(FIRST) + LANES
-"""Up to so many channels stay in registers, a vector each; more are multiplied in blocks."""
+"""The most channels that are summed in registers, one vector each; more are multiplied as small matrices."""
 
 
 DTYPES = torch.float32, torch.float64
@@ -171,10 +171,10 @@ def _packed(channels: int) -> int:
 
 
 def _make_trace(view: View, like: Tensor, channels: int) -> tuple[Tensor, np.ndarray, np.ndarray, np.ndarray]:
-    """What backward wants to know of forward, in one int32 tensor, and its parts.
+    """One int32 tensor with what the backward pass needs from the forward pass, and its parts.
 
-    The packed Gaussians come first, on whole cache lines; then each pixel's transmittance, of which 1 - alpha keeps few
-    digits; then, per tile and square, how many Gaussians were looked at, and the blocks that each was drawn in.
+    First the packed Gaussians, on whole cache lines. Then the transmittance of each pixel (1 - alpha would keep few digits of
+    it). Then, for each tile and square, how many Gaussians were looked at, and in which blocks each was drawn.
     """
     squares = view.across**2
     numbers = sum(_floats(view, like, channels)) * like.element_size() // 4
@@ -216,7 +216,7 @@ def _padded(background: Tensor, channels: int) -> np.ndarray:
 
 
 def _view(rows: Tensor, offsets: Tensor, width: int, height: int, tile_size: int) -> View:
-    """The tiles, and bands of consecutive tiles with about as many pairs each (an empty tile costs something, too)."""
+    """The tiles, and bands of consecutive tiles with about equally many pairs (an empty tile has a cost too)."""
     ends = offsets.numpy().astype(np.int64, copy=False)
     cost = ends + 4 * np.arange(len(ends))
     bands = min(MOST_BANDS, 1 + int(cost[-1]) // PAIRS_PER_BAND)
@@ -227,7 +227,7 @@ def _view(rows: Tensor, offsets: Tensor, width: int, height: int, tile_size: int
 
 
 def _number(view: View, count: int) -> tuple[np.ndarray, np.ndarray, int, Any]:
-    """Gradient rows: of each pair within its band, where each band's begin, how many, and which belong together."""
+    """Number the slots: of each pair in its band, the first of each band, how many, and each Gaussian's chain of slots."""
     slots, owners = np.empty(len(view.order), np.int32), np.empty(len(view.order), np.int32)
     counts = np.empty(len(view.bounds) - 1, np.int64)
     run_bands(number_slots, len(counts), view, slots, owners, counts, count)

@@ -58,7 +58,7 @@ FEW, FIRST, GROUP = (0,) * 4, (0,) * (LANES - MOMENTS), (0,) * LANES
 """Channels per pass: the compiler knows a tuple's length. FIRST fills a row with the moments; FEW is enough for colours."""
 
 BEHIND, SHARE, GRADS = 0, PIXELS, 2 * PIXELS
-"""Planes of the backward pass: the loss that comes from what is still behind; the slope of the loss in a weight apart
+"""Planes of the backward pass: the part of the loss that comes from Gaussians behind; the slope of the loss in a weight apart
 from its features; and the loss's gradient in each channel."""
 
 
@@ -160,7 +160,7 @@ def differentiate_square(
 ) -> None:
     """Add the gradients of one square's pixels to the rows of its Gaussians.
 
-    Front to back, as forward: what is still behind is the whole less what was in front, so no alpha is stored.
+    Front to back, like the forward pass. What lies behind is the whole minus what was in front, so alphas need not be stored.
 
     Args:
         packed: rows, their length, and the list of the Gaussians' numbers.

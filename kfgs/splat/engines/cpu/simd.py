@@ -7,7 +7,7 @@ maps each operation to what the processor has: one register of AVX-512, two of A
     fma(x, 2.0, y) * x - 1.0                numbers are broadcast
     select(x >= y, x, 0.0)                  comparisons give a Mask
 
-Indices are not checked and do not wrap around: whoever calls sees to it that they lie inside of the array. Arrays are
+Indices are not checked and do not wrap around: the caller must keep them inside the array. Arrays are
 contiguous and one-dimensional, of float32 or float64, and the vector's element type is that of the array. No operation
 is reordered or contracted, so the same expression gives the same bits wherever it stands.
 

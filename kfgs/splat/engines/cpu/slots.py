@@ -1,7 +1,7 @@
-"""Rows for what the bands find: each band sums into its own, one per Gaussian that it meets, and then they are summed.
+"""Slots: each band sums gradients into rows of its own, one for each Gaussian that it meets. Later each Gaussian's are summed.
 
-So no two threads write the same row, the order of the sums is that of the bands, and there are not many more rows than
-Gaussians that can be seen.
+So no two threads write the same row, and the sums always run in the order of the bands. There are few more rows than
+visible Gaussians, because a band is a strip of neighbouring tiles.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def _sum_chain(row: int, following: Any, out: Any, width: int, total: Any) -> No
 def gather_gradients(
     band: int, bands: int, splats: Any, chains: Any, out: Any, layout: tuple[int, int, int], index: Any, grads: Any
 ) -> None:
-    """Sum the rows of one share of the Gaussians over all bands, and turn moments into gradients.
+    """Sum all rows of each Gaussian of one share, and turn moments into gradients.
 
     The power of the density is -0.5 (a dx^2 + 2 b dx dy + c dy^2) with d = pixel - mean, and v its slope.
 
@@ -95,7 +95,7 @@ def gather_gradients(
         _sum_chain(heads[m], following, out, width, total)
         a, b, c = fetch(conics, 3 * m), fetch(conics, 3 * m + 1), fetch(conics, 3 * m + 2)
         v, v_x, v_y = fetch(total, 0), fetch(total, 1), fetch(total, 2)
-        drawn = v_x != 0 or v_y != 0  # a conic that is not finite draws nothing, and has the gradient 0
+        drawn = v_x != 0 or v_y != 0  # a conic that is not finite draws nothing; its gradient is 0
         put(of_means, 2 * m, a * v_x + b * v_y if drawn else v_x)
         put(of_means, 2 * m + 1, b * v_x + c * v_y if drawn else v_y)
         put(of_conics, 3 * m, -half * fetch(total, 3))
@@ -111,7 +111,7 @@ def gather_gradients(
 
 @cached_njit(**OPTIONS)
 def gather_sums(band: int, bands: int, chains: Any, out: Any, width: int, sums: Any, weights: Any) -> None:
-    """Sum the rows of one share of the Gaussians over all bands: sums [M, D] and weights [M], written."""
+    """Sum all rows of each Gaussian of one share: sums [M, D] and weights [M], written."""
     heads, following = chains
     count, channels = len(heads), sums.shape[1]
     total = aligned(width, out)

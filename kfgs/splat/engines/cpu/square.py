@@ -1,8 +1,8 @@
 """What the compiled kernels share: packed Gaussians, and squares of pixels cut into blocks of one vector each.
 
-A tile is worked on in squares of 16 x 16 pixels: 16 blocks of 4 x 4 pixels, and a block's pixels are the lanes of one
-vector. Block b of a square is in row b // 4 and column b % 4; pixel p of a square is lane p % 16 of block p // 16. What a
-square knows about its pixels is a *plane* of 256 numbers in that order.
+The kernels work on a tile in squares of 16 x 16 pixels. A square is 16 blocks of 4 x 4 pixels, and a block's pixels are the
+lanes of one vector. Block b of a square is in row b // 4 and column b % 4; pixel p of a square is lane p % 16 of block
+p // 16. A *plane* is 256 numbers, one for each pixel of a square, in that order.
 
 A Gaussian is packed into one row, so that it arrives in one cache line: its mean, the three numbers of its quadratic
 form, the logarithm of its opacity, then its features. The form a dx^2 + 2 b dx dy + c dy^2 is kept as
@@ -49,17 +49,17 @@ BLOCKS = PIXELS // LANES
 ALL_BLOCKS = np.uint32((1 << BLOCKS) - 1)
 
 CHUNK = 64
-"""Gaussians of a square listed at once."""
+"""Gaussians that a square lists at once."""
 
 PREFETCH_AHEAD = 8
-"""Gaussians between the one worked on and the one asked for from memory."""
+"""How many Gaussians ahead memory is prefetched."""
 
 MEAN_X, MEAN_Y, SQUARE, LEAN, REST, LOG_OPACITY, FEATURES = range(7)
 """Columns of a packed row: with u = dx + LEAN dy, log2(opacity density) = LOG_OPACITY - SQUARE u^2 - REST dy^2."""
 
 X, Y, LIGHT, FINAL = 0, PIXELS, 2 * PIXELS, 3 * PIXELS
-"""Planes of a square's state: pixel centres; the transmittance as it falls on, also after a pixel has stopped; and the
-transmittance that the pixel stopped with."""
+"""Planes of a square's state: pixel centres; the transmittance, which goes on falling after a pixel has stopped; and the
+transmittance with which the pixel stopped."""
 STATE = 4 * PIXELS
 
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
@@ -71,7 +71,7 @@ _LOG2_E = math.log2(math.e)
 
 @njit(**INLINE)
 def aligned(count: int, like: Any) -> Any:
-    """Room for `count` numbers of the array's type that begins on a cache line: vectors that straddle two cost double."""
+    """Memory for `count` numbers of the array's type that begins on a cache line; a vector in two cache lines costs double."""
     size = like.itemsize
     room = np.empty(count + 64 // size, like.dtype)
     skip = -(room.ctypes.data // size) % (64 // size)
@@ -95,7 +95,7 @@ def pack_rows(band: int, bands: int, splats: Any, features: Any, channels: int, 
         features: [N * D].
         channels: D; 0 if the features stay where they are.
         index: [M], the features' row of each Gaussian; empty if row m belongs to Gaussian m.
-        rows: [M * row_length(D)], written; what is beyond the features is 0.
+        rows: [M * row_length(D)], written; 0 beyond the features.
     """
     means2d, conics, opacities = splats
     count, length = len(opacities), row_length(channels)
@@ -167,8 +167,8 @@ def touched_blocks(rows: Any, at: int, corners: Any, epsilon: Any) -> Any:
     """Bits of the blocks where alpha may reach ALPHA_MIN, of one packed Gaussian.
 
     The smallest value of the form over the rectangle of a block's pixel centres is compared with that of ALPHA_MIN, all
-    blocks at once. The form is convex and 0 at the mean; beside the mean, its minimum lies on one of the (at most two)
-    sides that face it, where it is that of a parabola clamped to the side.
+    blocks at once. The form is convex and 0 at the mean. If the mean lies outside, the minimum is on one of the (at most
+    two) sides that face it: on each, the minimum of a parabola, clamped to the side.
 
     Args:
         rows: packed Gaussians.
@@ -207,7 +207,7 @@ def weigh_pixels(rows: Any, at: int, x: Any, y: Any) -> tuple[Any, Any, Any, Any
 
 @njit(**INLINE)
 def list_bits(touched: Any, j: int, hits: Any, counts: Any) -> None:
-    """Append place j to the list of every block whose bit is set."""
+    """Append place j to the lists of the blocks whose bits are set."""
     while touched:
         block = trailing_zeros(touched)
         touched &= touched - np.uint32(1)

@@ -1,8 +1,8 @@
 """Run a compiled kernel over numbered bands of work on a few threads.
 
 Numba's own parallel loops are not used: its default back end aborts when two Python threads enter it, another one does
-not survive a fork, and both decide the split from the number of threads. Here the bands are fixed by the data, and each
-owns what it writes, so results do not depend on how many threads there are or on which thread runs what.
+not survive a fork, and both split the work by the number of threads. Here the data fix the bands, and no two bands write
+the same memory. So results depend neither on the number of threads nor on which thread runs which band.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def run_bands(kernel: Callable[..., None], bands: int, *arguments: Any) -> None:
 
     Args:
         kernel: releases the GIL, and writes nothing that another band reads or writes.
-        bands: how many; each thread takes the next one that is left.
+        bands: their number; each thread takes the next one.
         arguments: passed on as they are.
     """
     remaining = iter(range(bands))

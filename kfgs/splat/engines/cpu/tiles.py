@@ -1,4 +1,4 @@
-"""Which Gaussians touch which tile, compiled by numba: one sort of the Gaussians by depth, none of the pairs.
+"""Find which Gaussians touch which tile, compiled by numba. It sorts the Gaussians by depth, and never the pairs.
 
 Gaussians are taken front to back in bands. A band lists the (tile, Gaussian) pairs that touch, and counts them by tile;
 then every band knows where its part of each tile's list begins, and copies its pairs there. The work is proportional to
@@ -20,7 +20,7 @@ from .tiles_kernels import find_pairs, list_rows
 __all__ = ["bin", "depth_order"]
 
 _SHARE = 8192
-"""Gaussians of a band: few enough that threads end together, and many against the counters of every tile."""
+"""Gaussians of a band: few enough that all threads end at about the same time, and many compared with the tiles' counters."""
 
 
 @torch.no_grad()

@@ -265,7 +265,7 @@ def _enlarge(a: float, b: float, c: float, limit: float, reach: float) -> tuple[
     """The ellipse a x^2 + 2 b x y + c y^2 = level that holds every tile that is touched, given the largest limit of any.
 
     Returns:
-        a, b, the determinant, the level, and y of the rightmost point; all 0 where there is no telling.
+        a, b, the determinant, the level, and y of the rightmost point; all 0 if rounding leaves them unknown.
     """
     det = a * c - b * b
     # Beyond this level rounding, at most half of what the limit allows for it, cannot bring a tile below the limit.

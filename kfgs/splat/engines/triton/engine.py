@@ -22,7 +22,7 @@ from .kernels_backward import differentiate_kernel
 __all__ = ["accumulate", "backward", "devices", "forward"]
 
 INTERPRETED = not isinstance(composite_kernel, triton.JITFunction)
-"""Whether triton was told to interpret: the kernels then run in numpy, on the CPU."""
+"""Whether triton interprets the kernels. They then run in numpy, on the CPU."""
 
 PRECISION = "tf32x3"
 """How matrix products round: tensor cores multiply numbers of 11 bits (tf32), which alone would be wrong by 5e-4. Three
@@ -48,7 +48,7 @@ LAUNCHES = {
     "differentiate": Launch(pixels=256, chunk=16, block=32, warps=8),
 }
 """A warp has 32 threads: warps * 32 = pixels, so each thread holds a chunk of one pixel, and no running product or sum
-crosses threads. A chunk of 16 is the shortest axis that tensor-core products take. Chosen such that, compiled for sm_80,
+crosses threads. A chunk of 16 is the shortest axis that tensor-core products take. Chosen so that, compiled for sm_80,
 sm_90 and sm_100, registers (at most 255 a thread) hardly spill, and shared memory stays below the 99 KB of the smaller
 GPUs (see tests/splat/test_triton_gpu.py). Not tuned by timing: none of this has been timed on a GPU."""
 

@@ -21,7 +21,7 @@ LEAST = tl.constexpr(ALPHA_MIN)
 END = tl.constexpr(TRANSMITTANCE_MIN)
 
 SIZES = ["width", "height", "columns"]
-"""Arguments of every kernel that it is not compiled anew for: another image size costs no compilation."""
+"""Arguments of every kernel whose change needs no new compilation: for example the size of the image."""
 
 
 @triton.jit
@@ -75,7 +75,7 @@ def weigh(alpha, position, light, stop, count):
     """Weights [CHUNK, PIXELS] of a chunk, and the pixels' transmittance and stop [PIXELS] after it.
 
     A pixel stops at the first position whose Gaussian would leave less than END; what is drawn lies before it. A tree
-    of products may round such that a later one is not smaller, hence the position is kept and not a comparison.
+    of products may round a later one up, so the position is kept and not a comparison.
     """
     passed = 1.0 - alpha
     left = light[None, :] * tl.cumprod(passed, 0)

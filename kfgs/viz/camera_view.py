@@ -1,4 +1,4 @@
-"""Look at a plotter's scene through a posed camera, as the camera saw it, and the way back."""
+"""Set a plotter's view to a posed camera, and read a posed camera from a view."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def look_through(plotter: pv.Plotter, camera: Camera) -> None:
 
 
 def camera_of(plotter: pv.Plotter, subplot: tuple[int, int] = (0, 0), *, near: float = NEAR) -> Camera:
-    """The posed camera through which a subplot is looked at: `look_through` backwards, for the picture as it is now.
+    """The posed camera of a subplot's current view: the inverse of `look_through`.
 
     Args:
         plotter: its window may have any size.
@@ -74,8 +74,8 @@ def camera_of(plotter: pv.Plotter, subplot: tuple[int, int] = (0, 0), *, near: f
     return Camera(torch.from_numpy(E), torch.tensor(K, dtype=torch.float64), width, height, near=near)
 
 
-def fitted(camera: Camera, height: int, width: int) -> Camera:
-    """A camera in whose picture lies all of another's, in the middle and undistorted."""
+def letterboxed(camera: Camera, height: int, width: int) -> Camera:
+    """Resize a camera. The old view stays complete and centred, at its aspect ratio."""
     scale = min(height / camera.height, width / camera.width)
     K = camera.K.detach().double().cpu().clone()
     K[:2] *= scale

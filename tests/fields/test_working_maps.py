@@ -3,7 +3,7 @@ import torch
 from oracles_color import block_means
 
 from kfgs import Camera, Gaussians, rasterize
-from kfgs.fields.coarse import shrink_camera, shrink_map
+from kfgs.fields.working_maps import shrink_camera, shrink_map
 
 
 def test_blocks_are_averaged_and_the_rest_dropped():

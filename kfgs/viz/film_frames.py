@@ -1,4 +1,4 @@
-"""What an animation shows: pictures of clouds from any camera, drawn by kfgs's own rasteriser.
+"""The frames of an animation: pictures of clouds from any camera, drawn by kfgs's own rasteriser.
 
 Not by pyvista: the rasteriser needs neither a display nor OpenGL, and its pictures are those that scores are taken from.
 """
@@ -6,25 +6,25 @@ Not by pyvista: the rasteriser needs neither a display nor OpenGL, and its pictu
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 
 from .._check import check_choice
 from ..cameras import Camera
-from ..gaussians import Gaussians
+from ..gaussians import Gaussians, check_gaussians
 from ..labels.color import parse_color
 from ..splat import rasterize
+from .cloud_colors import cloud_colors, color_by_default
 from .field_colors import FeatureColors
-from .palette import palette
 from .pictures import as_bytes, legend_strip, picture_grid
 
 Array = np.ndarray[Any, Any]
 Show = Callable[[Camera], Any]
 """Anything that makes a picture [H, W, 3] (uint8, or floats in [0, 1]) of the size of the camera it is given."""
 
-ColorBy = Literal["label", "rgb", "feature"]
+ColorBy = Literal["label", "rgb", "feature", "opacity"]
 
 
 def show_cloud(
@@ -41,8 +41,7 @@ def show_cloud(
 
     Args:
         gaussians: what to draw; on any device.
-        color_by: `label` (the palette), `rgb` or `feature` (through `feature_colors`); None: labels if there are any,
-            else rgb.
+        color_by: `label` (the palette), `rgb`, `feature` (through `feature_colors`) or `opacity`; None: as `add_cloud`.
         feature_colors: the scene's projection of features to colours.
         background: a colour by name or three numbers in [0, 1].
 
@@ -52,9 +51,10 @@ def show_cloud(
     Raises:
         ValueError: if there is nothing to draw, or what to colour by is missing.
     """
+    check_gaussians(gaussians)
     if color_by is None:
-        color_by = "label" if gaussians.labels is not None else "rgb"
-    check_choice("color_by", color_by, ("label", "rgb", "feature"))
+        color_by, feature_colors = color_by_default(gaussians, feature_colors)
+    check_choice("color_by", color_by, get_args(ColorBy))
     if len(gaussians) == 0:
         raise ValueError("gaussians: expected at least one Gaussian to draw, got none; widen the selection")
     painted = _paint(gaussians.detach(), color_by, feature_colors)
@@ -70,25 +70,9 @@ def show_cloud(
 
 def _paint(gaussians: Gaussians, color_by: ColorBy, feature_colors: FeatureColors | None) -> Gaussians:
     """The cloud with colours as its features, or with nothing but its harmonics."""
+    colors = cloud_colors(gaussians, color_by, feature_colors).rgb
     if color_by == "rgb":
-        if gaussians.sh is None:
-            raise ValueError(
-                "gaussians.sh: expected harmonics to colour by, got None; colour by labels, or pass a colour field"
-            )
         return gaussians.replace(features=None)
-    if color_by == "label":
-        if gaussians.labels is None:
-            raise ValueError(
-                "gaussians.labels: expected labels to colour by, got None; label them or choose another color_by"
-            )
-        colors = palette(gaussians.labels)
-    else:
-        if gaussians.features is None or feature_colors is None:
-            missing = "gaussians.features" if gaussians.features is None else "feature_colors"
-            raise ValueError(
-                f"{missing}: expected it to colour by features, got None; fit FeatureColors once per scene"
-            )
-        colors = feature_colors(gaussians.features)
     return gaussians.replace(features=torch.from_numpy(colors).to(gaussians.means) / 255, sh=None)
 
 
@@ -112,7 +96,7 @@ def draw_frame(
 
 
 def as_shows(shows: Gaussians | Show | Mapping[str, Gaussians | Show]) -> dict[str, Show]:
-    """Titles and what draws under them; one thing alone has the title ""."""
+    """A drawing function for each title; a single one has the title ""."""
     named = shows if isinstance(shows, Mapping) else {"": shows}
     if not named:
         raise ValueError("shows: expected at least one thing to show, got none; pass Gaussians or a function")

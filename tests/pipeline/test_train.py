@@ -1,7 +1,9 @@
+"""Where a field is trained."""
+
 import pytest
 import torch
 
-from kfgs.pipeline.device import training_device
+from kfgs.pipeline.train import training_device
 
 
 def test_auto_is_the_gpu_if_there_is_one():

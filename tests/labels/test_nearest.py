@@ -38,7 +38,7 @@ def test_default_distance_is_used_and_explained():
 @pytest.mark.parametrize(
     ("height", "words"),
     [
-        (4.0, "99.5 % of the destinations have a source so near (source spacings: 1 median, 1 wide)"),
+        (4.0, "99.5 % of the destinations have a source within it (source spacings: 1 median, 1 wide)"),
         (0.5, "2 median source spacings of 1 (99.5 % of the destinations need only 0.5)"),
         (100.0, "10 wide source spacings of 1 (99.5 % of the destinations would need 100)"),
     ],

@@ -1,4 +1,4 @@
-"""Points or ellipsoids in the place of Gaussians, where what draws or reads the scene knows none."""
+"""Points or ellipsoids in place of Gaussians, for viewers and files that cannot draw Gaussians."""
 
 from __future__ import annotations
 
@@ -8,26 +8,63 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
 from ..gaussians import Gaussians
-from .ellipsoids import ellipsoids
 
 if TYPE_CHECKING:
     import pyvista as pv
 
 Array = np.ndarray[Any, Any]
 Instead = Literal["points", "ellipsoids"]
-MOST = {"points": 400_000, "ellipsoids": 10_000}
-"""Of a cloud, which then take 8 and 20 MB of a page."""
+FACES = ((5_000, 2), (20_000, 1))  # up to so many have 320 faces each, or 80; more have 20
+MOST = 100_000  # 2 million faces: 1.2 s a frame in software
+MOST_EXPORTED = {"points": 400_000, "ellipsoids": 10_000}
+"""Most Gaussians of a cloud in a page: 8 and 20 MB."""
 FAINT = {"points": 0.1, "ellipsoids": 0.5}
-"""Opacity up to which a Gaussian is left out: points and ellipsoids are opaque, and would stand before what can be seen.
-An ellipsoid is the surface on which alpha is 1/2, so it vanishes with its Gaussian's opacity at 1/2."""
+"""Gaussians up to this opacity are left out: points and ellipsoids are opaque, and would hide what is behind. An ellipsoid is
+the surface on which alpha is 1/2, so it vanishes when its Gaussian's opacity is 1/2."""
 POINT_SIZE = 4.0  # pixels
+
+
+def ellipsoids(gaussians: Gaussians, deviations: float) -> pv.PolyData:
+    """A mesh of N ellipsoids with a point array `index`: the Gaussian of each vertex.
+
+    Args:
+        gaussians: N of them.
+        deviations: half axes, in standard deviations.
+
+    Raises:
+        ValueError: if there are more than 100,000.
+    """
+    count = len(gaussians)
+    if count > MOST:
+        raise ValueError(
+            f"gaussians: expected at most {MOST:,} to draw as ellipsoids, got {count:,}; select fewer, or draw points"
+        )
+    import pyvista as pv
+
+    ball = pv.Icosphere(nsub=next((times for most, times in FACES if count <= most), 0))
+    corners, faces = np.array(ball.points, dtype=np.float32), np.array(ball.regular_faces)
+    corners /= np.linalg.norm(corners, axis=1, keepdims=True)
+    with torch.no_grad():
+        turn = quaternion_to_rotation_matrix(gaussians.quats.double()).cpu().numpy().astype(np.float32)  # [N, 3, 3]
+    scales = gaussians.scales.detach().cpu().numpy().astype(np.float32)
+    means = gaussians.means.detach().cpu().numpy().astype(np.float32)
+    half = deviations * scales[:, None, :]
+    points = np.einsum("nij,nvj->nvi", turn, corners * half) + means[:, None]
+    normals = np.einsum("nij,nvj->nvi", turn, corners / np.maximum(half, 1e-12 * half.max()))  # the gradient's
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    shift = len(corners) * np.arange(count)[:, None, None]
+    mesh = pv.PolyData.from_regular_faces(points.reshape(-1, 3), (faces + shift).reshape(-1, 3))
+    mesh["index"] = np.repeat(np.arange(count), len(corners))
+    mesh.point_data.active_normals = normals.reshape(-1, 3)
+    return mesh
 
 
 @contextmanager
 def without_gaussians(plotter: pv.Plotter, instead: Instead, limit: int) -> Iterator[list[int]]:
-    """Hide a plotter's clouds of Gaussians behind stand-ins for a while; yields [drawn, left out]."""
+    """Replace a plotter's clouds of Gaussians by points or ellipsoids for a while; yields [drawn, left out]."""
     counts, hidden, added = [0, 0], [], []
     try:
         for renderer in plotter.renderers:
@@ -42,15 +79,15 @@ def without_gaussians(plotter: pv.Plotter, instead: Instead, limit: int) -> Iter
                 actor.SetVisibility(False)
                 hidden.append(actor)
                 if len(rows):
-                    stand_in = _as_actor(cloud, rows, instead)
-                    renderer.AddActor(stand_in)
-                    added.append((renderer, stand_in))
+                    substitute = _as_actor(cloud, rows, instead)
+                    renderer.AddActor(substitute)
+                    added.append((renderer, substitute))
         yield counts
     finally:
         for actor in hidden:
             actor.SetVisibility(True)
-        for renderer, stand_in in added:
-            renderer.RemoveActor(stand_in)
+        for renderer, substitute in added:
+            renderer.RemoveActor(substitute)
 
 
 def strongest(cloud: pv.PolyData, limit: int, faint: float) -> Array:  # [n] int64, ascending

@@ -4,7 +4,7 @@ import torch
 from cases_viz import some_camera, some_plotter
 
 from kfgs.viz import look_through, make_plotter
-from kfgs.viz.through import camera_of
+from kfgs.viz.camera_view import camera_of
 
 
 def test_camera_of_is_look_through_backwards():

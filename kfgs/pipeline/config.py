@@ -1,0 +1,64 @@
+"""What a run of `fit_scene` does: its method, and the options of every stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from dataclasses import field as default
+from typing import Any, Literal
+
+from .._check import check_choice
+from ..fields import FieldConfig, UpliftConfig
+from ..quant import AutoencoderConfig, CodebookConfig
+from .color import ColorConfig
+
+Method = Literal["fuse", "paper"]
+METHODS: tuple[Method, ...] = ("fuse", "paper")
+Mode = Literal["decouple", "adc", "adc+sc"]
+MODES: tuple[Mode, ...] = ("decouple", "adc", "adc+sc")
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """What a run does."""
+
+    method: Method = "fuse"
+    """`fuse`: features are averaged onto sharp Gaussians in 3-D, merged and compressed after (`fields.uplift_maps`).
+    `paper`: maps are compressed per pixel, and Gaussians are trained on them (Sec. 3)."""
+    mode: Mode = "adc+sc"
+    """Of method `paper`, rows of Table 1: `decouple` (raw features), `adc` (+ codebook), `adc+sc` (+ codebook + autoencoder)."""
+    seed: int = 0
+    """Every random choice of the run follows from it."""
+    split: str = "train"
+    """Which views of the scene are learnt from."""
+    device: str = "auto"
+    """Where a field is trained, see `training_device`; the other stages and the result stay on the CPU."""
+    undistorted_features: bool = False
+    """Whether the teacher saw undistorted pictures; otherwise the lens is removed from its maps as from the pictures."""
+    uplift: UpliftConfig = default(default_factory=UpliftConfig.field)
+    """Of method `fuse`."""
+    color: ColorConfig = default(default_factory=ColorConfig.geometry)
+    """Of method `fuse`: how Gaussians are trained to fuse onto, where there is no splat."""
+    codebook: CodebookConfig = default(default_factory=CodebookConfig)
+    """This and the rest: of method `paper`."""
+    autoencoder: AutoencoderConfig = default(default_factory=AutoencoderConfig)
+    field: FieldConfig = default(default_factory=FieldConfig)
+
+    def __post_init__(self) -> None:
+        check_choice("method", self.method, METHODS)
+        check_choice("mode", self.mode, MODES)
+
+    @property
+    def needs_maps(self) -> bool:
+        """Whether the field learns from the dense maps themselves, so that they must be stored and stay."""
+        return self.method == "paper" and self.mode == "decouple"
+
+    @staticmethod
+    def paper(**changes: Any) -> FitConfig:
+        """The paper's method and schedule: 28 epochs, 5,000 autoencoder steps, 30,000 field steps. For a workstation."""
+        options: dict[str, Any] = {"codebook": CodebookConfig.paper(), "autoencoder": AutoencoderConfig.paper()}
+        return FitConfig(**{"method": "paper", **options, **changes})
+
+    @staticmethod
+    def cpu(**changes: Any) -> FitConfig:
+        """For two CPU cores: the same as `FitConfig()`, and 2,000 field steps where the method is the paper's."""
+        return FitConfig(**{"field": FieldConfig.cpu(), **changes})

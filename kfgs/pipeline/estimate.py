@@ -1,0 +1,341 @@
+"""Disk, memory and time of each stage of a run: bytes from shapes, seconds from small runs (`trial`) times counts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any, Literal
+
+from .._files import bytes_in_words, seconds_in_words
+from ..fields import FieldConfig
+from ..fields.answers import MOST
+from ..fields.working_maps import WORKING
+from ..quant.sampling import choose_grid_step
+from .config import FitConfig
+from .trial import Timing
+
+Dense = Literal["keep", "discard", "recompute"]
+DENSE: tuple[Dense, ...] = ("keep", "discard", "recompute")
+HALF, FLOAT = 2, 4  # bytes
+GROWTH = {"low": 6.0, "high": 1.15}
+"""How many times more Gaussians than points training is taken to end with, by the gradient from which it densifies: below 4e-4
+as in the paper (110.5k in Table 2, of the 18.5k points of room_0), above it as room_0 and the toy room with the CPU preset. How
+many there will be depends on the scene; `max_gaussians` is never exceeded."""
+MARGIN = 1.25
+"""By how much more memory is planned than a small run took: a long one fragments it (toy room, 100,000 Gaussians: 1.11 GB, small
+runs 1.00)."""
+TRAINING = 8
+"""Copies of the Gaussians that are in memory while they are trained: values, gradients, Adam's two moments, and what a step makes
+of them."""
+
+
+@dataclass(frozen=True)
+class StagePlan:
+    """One stage. None: not known."""
+
+    name: str
+    what: str
+    """What it does, in words with its sizes."""
+    seconds: float | None
+    peak_bytes: int | None
+    """Memory of the whole process while it runs."""
+    disk_bytes: int | None
+    """What it writes. It lies on the disk together with what the other stages write."""
+    kept_bytes: int | None
+    """What of it is left in the end."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Everything that the stages' disk and memory follow from."""
+
+    config: FitConfig
+    dense: Dense
+    """What becomes of the maps."""
+    points: int
+    pictures: tuple[tuple[int, int], ...]
+    """(height, width) of each view."""
+    shapes: tuple[tuple[int, int, int] | None, ...]
+    """(h, w, D) of each view's map; None where it is not known."""
+    made: tuple[bool, ...]
+    """For each view, whether its map exists."""
+    done: frozenset[str] = frozenset()
+    """Stages that the run folder holds already."""
+    picture_seconds: float | None = None
+    """The teacher's, of all pictures; None if it was not run."""
+    teacher_peak: int | None = None
+    """Memory of a process that runs the teacher."""
+    teacher_bytes: int = 0
+    """Memory that the teacher takes."""
+    timings: dict[str, Timing] = field(default_factory=dict)
+    """What the small runs took, by stage."""
+    base: int = 0
+    """Memory of this process before any stage."""
+
+    @property
+    def count(self) -> int:
+        """Views."""
+        return len(self.pictures)
+
+    @property
+    def shape(self) -> tuple[int, int, int] | None:
+        """(h, w, D) of a map, None if some map's is not known."""
+        return None if None in self.shapes else self.shapes[0]
+
+    @property
+    def pixels(self) -> int:
+        """Of all maps."""
+        return sum(shape[0] * shape[1] for shape in self.shapes if shape)
+
+    @property
+    def render(self) -> int:
+        """Pixels of the largest picture."""
+        return max(height * width for height, width in self.pictures)
+
+    @property
+    def samples(self) -> int:
+        """Features of one map that the codebook looks at."""
+        if self.shape is None:
+            return 0
+        (h, w, _), options = self.shape, self.config.codebook
+        most = options.samples_of(self.count)
+        rows, columns = options.grid_step or choose_grid_step(h, w, most)
+        found = max(1, -(-(h - rows // 2) // rows)) * max(1, -(-(w - columns // 2) // columns))
+        return min(found, most) if options.adaptive else found
+
+    def map_bytes(self, views: Iterable[int]) -> int | None:
+        """Of some views' maps on disk, in half precision; None if the shape of one is not known."""
+        shapes = [self.shapes[i] for i in views]
+        return None if None in shapes else sum(HALF * h * w * D for h, w, D in filter(None, shapes))
+
+    @property
+    def missing(self) -> list[int]:
+        """Views whose maps the teacher has to make."""
+        return [i for i, made in enumerate(self.made) if self.dense == "recompute" or not made]
+
+
+def plan_stages(sizes: Sizes) -> list[StagePlan]:
+    """All stages of a run in their order."""
+    found = [_features(sizes)] if sizes.missing and not {"uplift", "index_maps"} & sizes.done else []
+    if sizes.config.method == "fuse":
+        return [*found, _color(sizes), _uplift(sizes)]
+    if sizes.config.mode != "decouple":
+        found += [_codebook(sizes), _index_maps(sizes)]
+    if sizes.config.mode == "adc+sc":
+        found.append(_autoencoder(sizes))
+    return [*found, _field(sizes), _answers(sizes)]
+
+
+def _stage(sizes: Sizes, name: str, what: str, count: int, disk: tuple[int, int] | None, *, more: int = 0) -> StagePlan:
+    """A stage by its name in the run folder.
+
+    Args:
+        sizes: of the run.
+        name: of the stage.
+        what: it does.
+        count: views or steps.
+        disk: bytes that it writes, and what of them it keeps; None if the shape of the maps is not known.
+        more: bytes of memory that a small run does not show, because it has fewer views or Gaussians.
+    """
+    title = name.replace("_", " ")
+    if name in sizes.done:
+        return StagePlan(title, "done already", 0.0, 0, 0, 0)
+    if disk is None:
+        return StagePlan(title, what, None, None, None, None)
+    timing = sizes.timings.get(name)
+    if timing is None:  # too large to try
+        return StagePlan(title, what, None, sizes.base + more, *disk)
+    peak = None if timing.peak is None else round(MARGIN * timing.peak) + more
+    return StagePlan(title, what, timing.seconds(count), peak, *disk)
+
+
+def _features(sizes: Sizes) -> StagePlan:
+    """The teacher over all pictures without a map; its maps (or the samples that the codebook looks at) on disk."""
+    missing, seconds = sizes.missing, sizes.picture_seconds
+    peak = None if sizes.teacher_peak is None else round(MARGIN * sizes.teacher_peak)
+    what = f"{len(missing)} pictures"
+    if seconds is not None:
+        what += f", {seconds_in_words(seconds / max(1, len(missing)))} each"
+    if sizes.dense == "recompute":
+        disk = None if sizes.shape is None else HALF * sizes.count * sizes.samples * sizes.shape[2]
+        return StagePlan("features", f"{what}, samples stored", seconds, peak, disk, disk and 0)
+    disk = sizes.map_bytes(missing)
+    kept = 0 if disk is not None and sizes.dense == "discard" else disk
+    return StagePlan("features", what, seconds, peak, disk, kept)
+
+
+def _again(sizes: Sizes, stage: StagePlan) -> StagePlan:
+    """A stage that looks at every map once: the teacher runs meanwhile where maps are not stored."""
+    if sizes.dense != "recompute" or stage.what == "done already":
+        return stage
+    peak = None if stage.peak_bytes is None else stage.peak_bytes + sizes.teacher_bytes
+    seconds = add([stage.seconds, sizes.picture_seconds])
+    return replace(stage, what=f"{stage.what}, each made again", seconds=seconds, peak_bytes=peak)
+
+
+def _codebook(sizes: Sizes) -> StagePlan:
+    """Adaptive Data Compression, Sec. 3.3.1."""
+    options = sizes.config.codebook
+    passes = f"{options.passes} pass{'es' if options.passes > 1 else ''}"
+    if sizes.shape is None:
+        return _stage(sizes, "codebook", f"{passes} over unknown maps", sizes.count, None)
+    size, D = FLOAT * options.maximum * sizes.shape[2], sizes.shape[2]
+    # The adaptive one holds the samples of all maps: four arrays of them, and three of their similarities.
+    pool = FLOAT * sizes.count * sizes.samples * (4 * D + 3 * options.maximum) if options.adaptive else 0
+    what = f"{passes} over {sizes.samples:,} features a map"
+    return _stage(sizes, "codebook", what, sizes.count, (size, size), more=pool)
+
+
+def _index_maps(sizes: Sizes) -> StagePlan:
+    """Quantisation of every pixel, Eq. 5."""
+    size = sizes.pixels * (1 if sizes.config.codebook.maximum <= 255 else 2)
+    disk = None if sizes.shape is None else (size, size)
+    return _again(
+        sizes, _stage(sizes, "index_maps", f"{sizes.count} maps of {_say(sizes)}", sizes.count, disk, more=size)
+    )
+
+
+def _autoencoder(sizes: Sizes) -> StagePlan:
+    """Semantic Compression, Sec. 3.3.2."""
+    options, K = sizes.config.autoencoder, sizes.config.codebook.maximum
+    size = _autoencoder_bytes(sizes)
+    disk = None if sizes.shape is None else (size, size)
+    return _stage(sizes, "autoencoder", f"{options.steps:,} steps on {K} codewords", options.steps, disk)
+
+
+def _autoencoder_bytes(sizes: Sizes) -> int:
+    """Weights and biases of encoder and decoder; none where there is no autoencoder."""
+    if sizes.shape is None or sizes.config.method != "paper" or sizes.config.mode != "adc+sc":
+        return 0
+    options, D = sizes.config.autoencoder, sizes.shape[2]
+    widths = ((D, *options.encoder, options.latent), (options.latent, *options.decoder, D))
+    return FLOAT * sum((a + 1) * b for row in widths for a, b in pairwise(row))
+
+
+def _channels(sizes: Sizes) -> int:
+    """That the paper's field is trained with."""
+    compressed = sizes.config.mode == "adc+sc"
+    return sizes.config.autoencoder.latent if compressed else sizes.shape[2] if sizes.shape else 0
+
+
+def _field(sizes: Sizes) -> StagePlan:
+    """Training; parameters of the stage and of the finished field are kept, a checkpoint goes."""
+    options, channels = sizes.config.field, _channels(sizes)
+    mean, last = gaussian_counts(options, sizes.points)
+    what = f"{options.steps:,} steps, {sizes.points / 1e3:.1f}k points, perhaps {last / 1e3:.1f}k Gaussians"
+    if sizes.shape is None:
+        return _stage(sizes, "field", what, options.steps, None)
+    book = 0 if sizes.config.mode == "decouple" else FLOAT * sizes.config.codebook.maximum * sizes.shape[2]
+    kept = 2 * gaussian_bytes(last, channels) + book + _autoencoder_bytes(sizes)
+    more = sizes.pixels + TRAINING * gaussian_bytes(last - round(mean), channels)
+    if "field" not in sizes.timings:
+        more = sizes.pixels + training_bytes(sizes)
+    disk = (kept + 3 * gaussian_bytes(last, channels), kept)
+    return _stage(sizes, "field", what, options.steps, disk, more=more)
+
+
+def _color(sizes: Sizes) -> StagePlan:
+    """Gaussians trained on the pictures, to fuse onto; a splat of the user's takes their place."""
+    options, colors = sizes.config.color.field, color_channels(sizes.config)
+    mean, last = gaussian_counts(options, sizes.points, full=True)
+    what = f"{options.steps:,} steps on the pictures, at most {last / 1e3:.1f}k Gaussians; none with --splat"
+    size, table = gaussian_bytes(last, colors), FLOAT * last * (14 + colors)  # color.ply has normals, too
+    photos = round(sum(4 * height * width for height, width in sizes.pictures) * sizes.config.color.picture_scale**2)
+    more = photos + TRAINING * gaussian_bytes(last - round(mean), colors)
+    if "color" not in sizes.timings:
+        more = photos + training_bytes(sizes)
+    return _stage(sizes, "color", what, options.steps, (size + table + 3 * size, size + table), more=more)
+
+
+def _uplift(sizes: Sizes) -> StagePlan:
+    """Maps averaged onto the Gaussians and corrected."""
+    options = sizes.config.uplift
+    what = f"{sizes.count} maps onto the Gaussians, at most {options.max_gaussians or 'all'} left"
+    if sizes.shape is None:
+        return _stage(sizes, "uplift", what, sizes.count, None)
+    h, w, D = sizes.shape
+    _, last = gaussian_counts(sizes.config.color.field, sizes.points, full=True)
+    left, latents = min(last, options.max_gaussians or last), min(options.max_latents, D)
+    size = 2 * FLOAT * (left * (13 + latents) + latents * D)  # in the stage and in the finished field
+    working = HALF * sizes.count * min(WORKING, D) * min(options.pixels, h * w)  # files of the working maps
+    more = 0
+    if "uplift" not in sizes.timings:
+        more = 2 * FLOAT * h * w * D + 4 * FLOAT * last * (min(WORKING, D) + 1)
+    return _again(sizes, _stage(sizes, "uplift", what, sizes.count, (size + working, size), more=more))
+
+
+def _answers(sizes: Sizes) -> StagePlan:
+    """What each Gaussian of the trained field answers with: every view rendered once and averaged onto the Gaussians."""
+    what = f"{sizes.count} views averaged onto the Gaussians"
+    if sizes.shape is None:
+        return _stage(sizes, "answers", what, sizes.count, None)
+    D, (mean, last) = sizes.shape[2], gaussian_counts(sizes.config.field, sizes.points)
+    latents = min(MOST, D if sizes.config.mode == "decouple" else min(D, sizes.config.codebook.maximum))
+    size = 2 * FLOAT * (last * (latents + 2) + latents * D)  # in the stage and in the finished field
+    more = TRAINING * gaussian_bytes(last - round(mean), max(latents, _channels(sizes)))
+    return _stage(sizes, "answers", what, sizes.count, (size, size), more=more)
+
+
+def color_channels(config: FitConfig) -> int:
+    """Numbers of a Gaussian's colour."""
+    return 3 * (config.color.sh_degree + 1) ** 2
+
+
+def gaussian_counts(config: FieldConfig, points: int, *, full: bool = False) -> tuple[float, int]:
+    """Mean number of Gaussians over the steps, and the last one: a guess (`GROWTH`), growing evenly while it densifies.
+
+    With `full`, as many as `config.max_gaussians` allows, if it has a limit.
+    """
+    until = min(config.densify_until, config.steps)
+    if until <= config.densify_from:
+        return float(points), points
+    last = round(points * GROWTH["low" if config.densify_gradient < 4e-4 else "high"])
+    if config.max_gaussians is not None:
+        last = max(points, config.max_gaussians if full else min(last, config.max_gaussians))
+    after, during = config.steps - until, until - config.densify_from
+    return (config.densify_from * points + during * (points + last) / 2 + after * last) / config.steps, last
+
+
+def gaussian_bytes(gaussians: int, channels: int) -> int:
+    """Mean, rotation, scale, opacity and features of so many Gaussians, in float32."""
+    return FLOAT * gaussians * (11 + channels)
+
+
+def training_bytes(sizes: Sizes) -> int:
+    """The least memory that training takes beside the process itself: Gaussians, and three maps of the rendered size."""
+    fuse = sizes.config.method == "fuse"
+    config, channels = sizes.config, color_channels(sizes.config) if fuse else _channels(sizes)
+    _, last = gaussian_counts(config.color.field if fuse else config.field, sizes.points, full=fuse)
+    return TRAINING * gaussian_bytes(last, channels) + 3 * FLOAT * sizes.render * ((3 if fuse else channels) + 2)
+
+
+def notes_on(sizes: Sizes) -> list[str]:
+    """What a reader should know besides the numbers."""
+    found = [
+        "times are those of small runs on this machine as busy as it is now, scaled up: within a factor of two or so"
+    ]
+    if any(sizes.made) and sizes.dense != "recompute":
+        found.append(f"{sum(sizes.made)} of {sizes.count} maps exist and are not made again")
+    if sizes.points < 2:
+        found.append(f"the scene has {sizes.points} points; training needs some: estimate them with `kfgs sfm`")
+    if not sizes.missing or sizes.shape is None:
+        return found
+    whole = sizes.samples * sizes.count == sizes.pixels
+    if sizes.dense == "recompute" and whole and sizes.config.method == "paper":
+        found.append(
+            "the codebook looks at every feature of these maps: keeping them takes no more disk, and half the time"
+        )
+    if sizes.dense == "keep" and not sizes.config.needs_maps:
+        size = bytes_in_words(sizes.map_bytes(range(sizes.count)))
+        found.append(f"the {size} of maps can be deleted once the field is made (kfgs fit --discard-features)")
+    return found
+
+
+def _say(sizes: Sizes) -> str:
+    return "unknown size" if sizes.shape is None else f"{sizes.shape[0]}x{sizes.shape[1]}"
+
+
+def add(values: list[Any]) -> Any:
+    """Their sum, or None if one is not known."""
+    return None if any(value is None for value in values) else sum(values)

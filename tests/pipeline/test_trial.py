@@ -1,0 +1,74 @@
+"""Small runs: a line through two of them, the teacher's one picture, and what this machine has."""
+
+import pytest
+import torch
+from small_room import make_room
+
+from kfgs.features import FeatureFolder, pictures_of
+from kfgs.pipeline.stages import Stage
+from kfgs.pipeline.trial import PeakMemory, Timing, _time_twice, disk_free, few_views, memory_free, time_picture
+from kfgs.scenes import load_scene
+from kfgs.teachers import LSeg, LSegConfig, LSegOptions
+from kfgs.teachers.lseg.network import LSegNetwork
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return load_scene(make_room(tmp_path_factory.mktemp("trial") / "scene"))
+
+
+def test_two_runs_give_a_line():
+    calls = []
+
+    def make(views, steps, folder, report):
+        calls.append((views, steps))
+        folder.mkdir()
+        seconds = {"index_maps": 3 + 0.5 * views, "field": 0.1 + 0.25 * steps, "noise": 1.0}
+        return [Stage(name, "", folder, time, False) for name, time in seconds.items()]
+
+    found = _time_twice(make, 90, {"field"})
+    assert calls == [(2, 2), (2, 2), (4, 16)]  # 16 steps of 0.3 s: five seconds
+    assert found["index_maps"].seconds(90) == pytest.approx(3 + 45)
+    assert found["field"].seconds(1_000) == pytest.approx(0.1 + 250)
+    assert found["noise"].seconds(90) > 2  # a view never costs nothing
+    only = _time_twice(make, 1, {"field"})
+    assert only["index_maps"].seconds(1) == pytest.approx(3.5)
+    assert Timing(1, 2).seconds(3) == 7
+
+
+def test_few_views_have_as_many_points_as_asked_for(scene):
+    few = few_views(scene, "train", 2, 4_000)
+    assert len(few) == len(few.views("train")) == 2
+    assert few.points.shape == few.colors.shape == (4_000, 3)
+    assert torch.allclose(few.points[:1_500].median(0).values, scene.points.median(0).values, atol=0.1)
+
+
+def test_one_picture_gives_a_map_as_the_cache_would_write_it(scene, tmp_path):
+    picture = pictures_of(scene, scene.views("train"))[0]
+    found = time_picture(lambda image: image[:, ::4, ::4] + 0.1, picture, tmp_path / "maps")
+    assert found.shape == FeatureFolder(tmp_path / "maps").shape == (15, 20, 3)
+    assert found.seconds > 0
+    assert found.peak is None or found.peak > 10**7
+
+
+def test_lseg_looks_once_and_is_multiplied(scene, tmp_path):
+    torch.manual_seed(0)
+    network = LSegNetwork(LSegConfig(width=32, depth=5, heads=4, window=96, hooks=(0, 1, 2, 4)))
+    runs = []
+    network.register_forward_hook(lambda *_: runs.append(1))
+    teacher = LSeg(network, LSegOptions(scales=(1.0, 2.0)))
+    picture = pictures_of(scene, scene.views("train"))[0]
+    found = time_picture(teacher, picture, tmp_path / "maps")
+    assert len(runs) <= 2
+    assert found.shape[:2] == teacher.options.map_size(60, 80, window=96)
+    assert found.seconds > 0
+
+
+def test_the_machine_is_looked_at(tmp_path):
+    assert disk_free(tmp_path / "not" / "there") > 0
+    assert memory_free() is None or memory_free() > 10**7
+    with PeakMemory() as nothing:
+        pass
+    with PeakMemory() as much:
+        torch.ones(25_000_000)  # 100 MB, gone at the end
+    assert nothing.bytes is None or much.bytes > nothing.bytes
