@@ -135,12 +135,12 @@ def check_whole(name: str, value: float, low: int, high: float = float("inf")) -
     check_range(name, int(value), low, high)
 
 
-def check_size(size: tuple[int, int]) -> None:
-    """Raise a ValueError unless `size` is (height, width) in whole pixels."""
+def check_size(size: tuple[int, int], name: str = "size", low: int = 1) -> None:
+    """Raise a ValueError unless `size` is (height, width) in whole pixels, each at least `low`."""
     if not isinstance(size, Sequence) or len(size) != 2:
-        raise ValueError(f"size: expected (height, width), got {size!r}; pass two whole numbers of pixels")
+        raise ValueError(f"{name}: expected (height, width), got {size!r}; pass two whole numbers of pixels")
     for axis, pixels in zip(("height", "width"), size, strict=True):
-        check_whole(f"size ({axis})", pixels, 1)
+        check_whole(f"{name} ({axis})", pixels, low)
 
 
 def one_line(text: object, length: int = 60) -> str:

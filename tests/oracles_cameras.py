@@ -1,4 +1,4 @@
-"""Cameras from COLMAP's own library, and projection in loops: neither calls the code under test."""
+"""Cameras from COLMAP's library, projection in loops, and the alignment of point sets. None of it calls the code under test."""
 
 from __future__ import annotations
 
@@ -50,3 +50,14 @@ def project_pinhole(K: np.ndarray, viewmat: np.ndarray, points: np.ndarray) -> t
         pixels.append((K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]))
         depths.append(z)
     return np.array(pixels), np.array(depths)
+
+
+def align_similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale, rotation [3, 3], translation [3] from source [N, 3] to target [N, 3], by least squares (Umeyama 1991)."""
+    source_mean, target_mean = source.mean(0), target.mean(0)
+    a, b = source - source_mean, target - target_mean
+    U, S, Vt = np.linalg.svd(b.T @ a / len(a))
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
+    rotation = U @ sign @ Vt
+    scale = float(np.trace(np.diag(S) @ sign) / (a**2).sum(1).mean())
+    return scale, rotation, target_mean - scale * rotation @ source_mean

@@ -1,4 +1,4 @@
-"""Where a point cloud really is: statistics that a few far outliers cannot move."""
+"""The box of a point cloud, from statistics that a few far outliers do not change."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import check_range, check_shapes
 
 
 class Bounds(NamedTuple):
-    """The box that holds the bulk of a cloud, in world units."""
+    """The box of most points of a cloud, in world units."""
 
     center: Tensor
     """[3] median."""
@@ -21,6 +22,9 @@ class Bounds(NamedTuple):
     inside: Tensor
     """[P] bool, which points lie in the box."""
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 def robust_bounds(
     points: Tensor,  # [P, 3]
@@ -30,8 +34,8 @@ def robust_bounds(
 ) -> Bounds:
     """The axis-aligned box of the central `coverage` of the points along each axis, widened by `margin` of its size.
 
-    SfM clouds have points far behind every wall (one of Replica's room_0 reached 139 m out of a room of about 8), so
-    the plain minimum and maximum say nothing.
+    SfM clouds have points far behind every wall (in Replica's room_0, a room of about 8 m, one is 139 m away), so the
+    minimum and maximum are useless.
 
     Args:
         points: the cloud, P >= 1, finite.

@@ -1,4 +1,4 @@
-"""One posed camera: where it stands, how it projects, how large its picture is."""
+"""One posed camera: its place, its projection, the size of its picture."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NEAR = 0.2
 """World units: the smallest depth that 3DGS draws, meant for scenes of metres."""
 
 UP = (0.0, 0.0, 1.0)
-"""What is up in a world unless the caller says otherwise."""
+"""The direction that is up in the world, by default."""
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,13 @@ class Distortion:
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera, perhaps behind a distorting lens.
+    """A pinhole camera, with or without lens distortion.
 
     **Convention** (COLMAP's): `viewmat` maps world to camera, x right, y down, z forward; the centre of the first pixel
     is (0.5, 0.5), so a centred principal point is (width / 2, height / 2). K is in pixels, without skew.
     A camera with distortion must be undistorted (`undistort`) before anything is rasterised through it.
-    What is not deeper than `near` is not drawn. It is a length of the scene, so it scales with it
-    (`Similarity.apply_to_camera`, `load_scene`); 0.2 of a unit is most of a room whose frame is small.
+    Only what is deeper than `near` is drawn. It is a length in world units and must suit the size of the scene: `load_scene`
+    chooses it, `Similarity.apply_to_camera` scales it.
     """
 
     viewmat: Tensor  # [4, 4] world to camera
@@ -66,7 +66,7 @@ class Camera:
     def __post_init__(self) -> None:
         check_shapes(("viewmat", self.viewmat, "4 4"), ("K", self.K, "3 3"))
         for name, matrix in (("viewmat", self.viewmat), ("K", self.K)):
-            if not matrix.is_floating_point():  # a matrix of integers would truncate the points
+            if not matrix.is_floating_point():  # integers would truncate the points
                 raise TypeError(f"{name}: expected floating point, got {matrix.dtype}; convert it with .float()")
         for name, size in (("width", self.width), ("height", self.height)):
             if not (isinstance(size, numbers.Real) and math.isfinite(size) and size >= 1 and int(size) == size):
@@ -192,7 +192,7 @@ class Camera:
 
 
 def unit_vector(name: str, vector: Tensor | Sequence[float]) -> Tensor:  # [3] float64
-    """The direction of a vector; `name` is the argument an error speaks of."""
+    """The direction of a vector; errors name the argument `name`."""
     values = torch.as_tensor(vector).detach().double().cpu()
     check_shapes((name, values, "3"))
     length = float(values.norm())

@@ -1,4 +1,4 @@
-"""Between kfgs's cameras, one view each, and kornia's `PinholeCamera`, a batch of them."""
+"""Convert between cameras of kfgs, one view each, and kornia's `PinholeCamera`, a batch of views."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ def to_kornia(cameras: Sequence[Camera], *, integer_centers: bool = False) -> Pi
     """Stack cameras into one kornia `PinholeCamera` of batch B = len(cameras).
 
     **Convention**: both libraries map world to camera with x right, y down, z forward, and both project by K (R X + t):
-    pixels are counted as K counts them. As it stands, kfgs's K puts the centre of the first pixel at (0.5, 0.5), so
-    `project` gives the pixels of `project_points`, and `unproject` takes them. What in kornia enumerates pixels itself
-    (`create_meshgrid`, `DepthWarper`, `remap`) puts that centre at (0, 0): for those, `integer_centers=True` takes 0.5 off
-    cx and cy, and `project` then gives pixels smaller by 0.5. kornia's `scale` is right for the first form, not the second.
+    K decides where pixel centres are. kfgs's K puts the centre of the first pixel at (0.5, 0.5), so `project` gives the
+    pixels of `project_points`, and `unproject` takes them. Functions of kornia that make their own pixel grid
+    (`create_meshgrid`, `DepthWarper`, `remap`) put that centre at (0, 0). For them, `integer_centers=True` subtracts 0.5 from
+    cx and cy, and `project` then gives pixels smaller by 0.5. kornia's `scale` is only right without it.
 
     Args:
-        cameras: without distortion; on one device. Sizes may differ. A batch has one dtype: the widest of all matrices.
-        integer_centers: count pixel centres from 0, as kornia's grids do.
+        cameras: without distortion, on one device; sizes may differ. The batch gets the widest dtype of all matrices.
+        integer_centers: put pixel centres on integers, as kornia's grids do.
 
     Returns:
-        `intrinsics` and `extrinsics` [B, 4, 4], `height` and `width` [B] int64. Names and `near` have no place there.
+        `intrinsics` and `extrinsics` [B, 4, 4], `height` and `width` [B] int64. Names and `near` are lost.
 
     Raises:
         ValueError: if there is no camera, one has distortion, or they are on several devices.
 
     Note:
-        `project` knows no front and no border: a point behind a camera gets a plausible pixel (`project_points` masks it).
+        `project` does not test for front and border: a point behind a camera gets a plausible pixel (`project_points` masks it).
 
     Example:
         >>> camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48)
@@ -69,22 +69,22 @@ def from_kornia(
     near: float = NEAR,
     integer_centers: bool = False,
 ) -> list[Camera]:
-    """The cameras of a kornia batch, one by one: the way back from `to_kornia`.
+    """The cameras of a kornia batch, one by one: the inverse of `to_kornia`.
 
     Args:
         pinhole: B cameras; of `intrinsics` only the upper left 3 x 3 is read, as kornia does.
         names: B names, or none.
         near: of every camera, world units; kornia's cameras have none.
-        integer_centers: whether its K counts pixel centres from 0, as kornia's documentation says of its cameras;
-            0.5 is then added to cx and cy. A K from COLMAP counts from 0.5 also where kornia holds it.
+        integer_centers: whether its K puts pixel centres on integers, as kornia's documentation says of its cameras; 0.5 is
+            then added to cx and cy. A K from COLMAP has them on halves, inside kornia's cameras too.
 
     Returns:
-        B cameras with matrices of their own, in the batch's dtype and on its device.
+        B cameras with copies of the matrices, in the dtype and on the device of the batch.
 
     Raises:
         TypeError: if `pinhole` is not kornia's.
-        ValueError: if it is not [B, 4, 4], names differ in number, or a camera is none of kfgs's (skew, a pose with scale,
-            a size that is not a whole number of pixels).
+        ValueError: if it is not [B, 4, 4], the number of names is wrong, or kfgs cannot hold a camera (skew, a pose with
+            scale, a size that is not a whole number of pixels).
 
     Example:
         >>> camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]]), 64, 48)
@@ -102,7 +102,7 @@ def from_kornia(
     )
     if names and len(names) != pinhole.batch_size:
         raise ValueError(f"names: expected {pinhole.batch_size} (one per camera), got {len(names)}; give one for each")
-    viewmats, Ks = pinhole.extrinsics.clone(), pinhole.camera_matrix.clone()  # kornia's scale_ changes its own in place
+    viewmats, Ks = pinhole.extrinsics.clone(), pinhole.camera_matrix.clone()  # kornia's scale_ changes them in place
     if integer_centers:
         Ks[:, :2, 2] += 0.5
     return [

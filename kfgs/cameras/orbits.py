@@ -13,7 +13,7 @@ from .._check import check_range, check_shapes, check_size, check_whole
 from .bounds import robust_bounds
 from .camera import UP, Camera, unit_vector
 
-LEVEL = 0.05  # of all: less spread of the pictures' x axes than this, in their second direction, leaves "up" open
+LEVEL = 0.05  # if the pictures' x axes spread less than this in their second direction, they do not determine "up"
 
 
 @dataclass(frozen=True)
@@ -21,20 +21,20 @@ class Orbit:
     """How cameras go around a scene."""
 
     frames: int = 72
-    """Pictures of one round: every 5 degrees."""
+    """Number of cameras; 72 are 5 degrees apart."""
     size: tuple[int, int] = (360, 480)
     """(height, width) in pixels."""
     elevation_degrees: float = 25.0
-    """Above the horizon through the middle, in (-90, 90)."""
+    """Angle above the horizon, seen from the middle, in (-90, 90)."""
     start_degrees: float = 0.0
-    """Where the first camera stands, counter-clockwise seen from above."""
+    """Direction of the first camera from the middle, counter-clockwise seen from above."""
     fov_degrees: float = 40.0
     """Vertical field of view."""
     zoom: float = 1.0
-    """At 1 the sphere around the scene's robust box fits the picture; 2 halves the distance."""
+    """With 1 the sphere around the robust box of the scene fits the picture; 2 halves the distance."""
     cut: float = 0.0
-    """Share of the way from the sphere's front to its middle that is not drawn: opens a room whose walls hide it.
-    A lid is better left out of the cloud: `gaussians.select(gaussians.labels != ceiling)`."""
+    """Share of the way from the front of the sphere to its middle that is not drawn, so that walls do not hide a room.
+    To look in from above, leave the ceiling out of the cloud: `gaussians.select(gaussians.labels != ceiling)`."""
 
     def __post_init__(self) -> None:
         check_whole("frames", self.frames, 1)
@@ -49,12 +49,12 @@ class Orbit:
 def estimate_up(cameras: Sequence[Camera]) -> Tensor:  # [3] float64, unit
     """Estimate the up direction of the world from the cameras.
 
-    People hold cameras level: the pictures' x axes are horizontal, wherever they look and however far down, so up is the
-    direction least along any of them (least eigenvector of sum x x^T), on the side of the pictures' upper edges. Where
-    all look the same way, the x axes leave it open, and up is the mean of the pictures' own.
+    People hold cameras level: the x axes of the pictures are horizontal in whatever direction they look. So up is the
+    direction that is most nearly perpendicular to all of them (least eigenvector of sum x x^T), on the side of the upper
+    edges. If all cameras look in one direction, the x axes do not determine it, and up is the mean of the pictures' y axes.
 
     Raises:
-        ValueError: if there are no cameras, or their upper edges point everywhere and cancel.
+        ValueError: if there are no cameras, or their upper edges point in all directions and cancel.
     """
     if not cameras:
         raise ValueError("cameras: expected at least one camera, got none; give up as a vector instead")
@@ -80,12 +80,12 @@ def orbit_cameras(
 ) -> list[Camera]:
     """Cameras on a circle of constant elevation around a cloud, all looking at its middle.
 
-    The middle is that of the box of the central 96 % of the points (`robust_bounds`): a few points far outside do not
-    move it. Seen from above, the cameras go counter-clockwise.
+    The middle is that of the box of the central 96 % of the points (`robust_bounds`), which a few points far outside do
+    not change. Seen from above, the cameras go counter-clockwise.
 
     Args:
         points: the cloud, usually `gaussians.means`.
-        orbit: how they go round.
+        orbit: number of cameras, size, elevation, ...; None: the defaults of `Orbit`.
         up: the world's up. COLMAP's worlds often have no axis that points up: pass `estimate_up(scene.cameras)`.
 
     Raises:

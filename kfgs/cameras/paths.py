@@ -15,9 +15,9 @@ from .._check import check_size, check_whole
 from .camera import Camera
 
 Array = np.ndarray[Any, Any]
-SAME = 1e-9  # of the walk: two views in a row that are closer than this, in place and direction, are one
+SAME = 1e-9  # two successive views that are closer than this, in place and direction, count as one
 STANDING = 1e-6  # of the coordinates: cameras on one tripod differ by the rounding of float32
-AROUND = 3  # keys of the other end before the start and after the end of a closed walk: the splines feel no further
+AROUND = 3  # a closed path is continued by this many keys at both ends: keys farther away hardly change a spline
 
 
 def path_cameras(
@@ -28,23 +28,23 @@ def path_cameras(
     size: tuple[int, int] | None = None,
     closed: bool = False,
 ) -> list[Camera]:
-    """Cameras along a smooth path through posed cameras, in the order given.
+    """Cameras along a smooth path through given cameras (the keys), in the order given.
 
-    Centres lie on a cubic spline and rotations on a cubic rotation spline (scipy's `RotationSpline`: slerp between the
-    keys, which kornia's `Quaternion.slerp` would do, turns with a jerk at each of them). Both pass through every key.
-    The pace is even: time between two keys is hypot(distance / extent, angle / pi).
+    Centres lie on a cubic spline and rotations on a cubic rotation spline (scipy's `RotationSpline`; kornia's
+    `Quaternion.slerp` would jerk at every key). Both pass through every key. The pace is even: the time between two keys is
+    hypot(distance / extent, angle / pi).
 
     Args:
-        cameras: at least two different ones, in the order of the walk (pictures of a video by name).
-        frames: how many cameras to return; the first and last stand at the first and last key (a closed walk stops one
-            step before its start).
-        every: only each so many-th camera is a key, and the last: a hand-held walk of 200 pictures trembles less with 10.
-        size: (height, width) in pixels of the new cameras; None: the first camera's.
+        cameras: at least two different ones, in the order of the path (pictures of a video by name).
+        frames: how many cameras to return. The first and last stand at the first and last key; a closed path ends one step
+            before its start.
+        every: take only every N-th camera as a key, and the last one. A hand-held video of 200 pictures trembles less with 10.
+        size: (height, width) in pixels of the new cameras; None: that of the first camera.
         closed: come back to the first camera, for a film that repeats.
 
     Returns:
-        Pinhole cameras, `path_0000` and so on. Focal lengths and principal points run linearly between the keys; lens
-        distortion is left out, and the smallest `near` holds for all.
+        Pinhole cameras, `path_0000` and so on. Focal lengths and principal points change linearly between the keys.
+        They have no lens distortion, and the smallest `near` of all.
 
     Raises:
         ValueError: if there are fewer than two different views, or a number is out of range.
@@ -76,7 +76,7 @@ def path_cameras(
 
 
 def _keys(cameras: Sequence[Camera], every: int, closed: bool) -> list[Camera]:
-    """The views to pass through, each different from the one before; a closed walk goes on past both of its ends."""
+    """The keys, each different from the one before; those of a closed path are continued past both ends."""
     keys = [*cameras[::every]]
     if not closed and (len(cameras) - 1) % every:
         keys.append(cameras[-1])
@@ -88,7 +88,7 @@ def _keys(cameras: Sequence[Camera], every: int, closed: bool) -> list[Camera]:
     if len(keys) < 2:
         raise ValueError(
             f"cameras: expected at least two different views, got {len(keys)} (of {len(cameras)}, every {every}); pass the "
-            "scene's cameras in the order of the walk"
+            "cameras of the scene in the order of the path"
         )
     if closed:
         keys = [keys[i % len(keys)] for i in range(-AROUND, len(keys) + AROUND + 1)]

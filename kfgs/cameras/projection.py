@@ -1,4 +1,4 @@
-"""Between the world, the camera's frame and its pixels, in both directions."""
+"""Convert points between the world, the frame of the camera and its pixels."""
 
 from __future__ import annotations
 
@@ -80,13 +80,13 @@ def project_points(
     *,
     near: float = 1e-6,
 ) -> tuple[Tensor, Tensor, Tensor]:  # [N, 2], [N], [N] bool
-    """Project world points to pixels and say which of them the camera sees.
+    """Project world points to pixels and decide which of them the camera sees.
 
-    Depth is tested before projecting, so a point behind the camera can never be mistaken for a visible one. With a
+    Depth is tested before projecting, so a point behind the camera never counts as visible. With a
     lens, a point so far off-axis that the lens model folds it back into the picture (`fold_radius`) is not visible.
 
     Args:
-        camera: where from; its distortion is applied.
+        camera: the camera; its distortion is applied.
         points: world coordinates; NaN and infinity count as not visible.
         near: depth that a point must exceed, in world units.
 
@@ -123,7 +123,7 @@ def unproject_depth(camera: Camera, depth: Tensor) -> Tensor:  # depth: [H, W] -
     """Lift a depth map to one world point per pixel centre.
 
     **Convention**: depth is the distance along the optical axis (z), not along the ray, in world units. A pixel of
-    depth 0 (often "unknown") lands on the camera's centre: mask it.
+    depth 0 (often "unknown") gives the centre of the camera: mask it.
 
     Raises:
         TypeError: if `depth` is not floating point.

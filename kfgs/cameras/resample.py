@@ -1,4 +1,4 @@
-"""Maps of another size; the only file that turns [H, W, D] into kornia's [B, D, H, W] and back."""
+"""Resize maps and label maps; the only file that turns [H, W, D] into kornia's [B, D, H, W] and back."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .._check import check_shapes
 
 
 def to_bchw(map: Tensor) -> Tensor:  # [H, W, D] -> [1, D, H, W]
-    """A map as kornia wants it: a view, without copying.
+    """A map in kornia's layout: a view, without copying.
 
     The batch axis is added *before* permuting, so that torch sees its channels-last memory order and resizes about 8 times
     faster (64 channels, 640x480 to 480x360: 32 against 160 ms on one thread).
@@ -65,7 +65,7 @@ def resize_labels(
     labels: Tensor,  # [H, W] integer
     size: tuple[int, int],  # (h, w)
 ) -> Tensor:  # [h, w], dtype of labels
-    """Resize a label map to the label under each new pixel's centre; no label is invented, -1 stays -1.
+    """Resize a label map: each new pixel takes the label at its centre; -1 stays -1.
 
     Row i of the result reads row floor((i + 0.5) H / h), in whole numbers.
 

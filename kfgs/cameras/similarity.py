@@ -1,7 +1,8 @@
-"""Similarities of space, x' = s R x + t: how a scene is moved, turned, resized, or carried into another frame."""
+"""Similarities of space, x' = s R x + t: move, turn and scale a scene, or convert it to another frame."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor
 from .._check import check_range, check_shapes
 from .camera import Camera
 
-ROTATION_TOLERANCE = 1e-3  # as Camera asks of its viewmat: matrices from text files carry few digits
+ROTATION_TOLERANCE = 1e-3  # as for Camera.viewmat: matrices from text files have few digits
 LAST_ROW_TOLERANCE = 1e-5  # a float32 matrix inverse leaves 1e-7 there
 STRAIGHT = 1e-6  # points whose second spread is below this share of the first lie on a line
 
@@ -19,8 +20,8 @@ STRAIGHT = 1e-6  # points whose second spread is below this share of the first l
 class Similarity:
     """x' = scale * R x + t: a rotation, one factor for all axes, and a shift.
 
-    **Convention**: points are columns; values are float64 on the CPU, whatever the points are. The rotation is stored as
-    the exact rotation nearest to the matrix given. Both tensors are copies: changing what was passed changes nothing here.
+    **Convention**: points are columns; rotation and translation are copied to float64 on the CPU. The rotation is the exact
+    rotation nearest to the given matrix.
 
     Raises:
         ValueError: if the scale is not positive, a number is not finite, or the matrix is not a rotation.
@@ -43,6 +44,12 @@ class Similarity:
         object.__setattr__(self, "scale", float(self.scale))
         object.__setattr__(self, "rotation", exact_rotation("rotation", self.rotation))
         object.__setattr__(self, "translation", self.translation.detach().double().cpu().clone())
+
+    def __repr__(self) -> str:
+        cosine = (float(self.rotation.trace()) - 1) / 2
+        degrees = math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+        x, y, z = self.translation.tolist()
+        return f"Similarity(scale {self.scale:.6g}, rotation by {degrees:.4g} degrees, translation ({x:.4g}, {y:.4g}, {z:.4g}))"
 
     @staticmethod
     def identity() -> Similarity:
@@ -77,13 +84,13 @@ class Similarity:
         return matrix
 
     def apply(self, points: Tensor) -> Tensor:  # [N, 3] -> [N, 3]
-        """Move points; computed in float64, returned in their own dtype and on their device."""
+        """Move points; computed in float64, returned in their dtype and on their device."""
         check_shapes(("points", points, "N 3"))
         R, t = self.rotation.to(points.device), self.translation.to(points.device)
         return (self.scale * (points.double() @ R.T) + t).to(points.dtype)
 
     def inverse(self) -> Similarity:
-        """The way back: x = R^T (x' - t) / s."""
+        """The inverse: x = R^T (x' - t) / s."""
         return Similarity(1 / self.scale, self.rotation.T, -(self.rotation.T @ self.translation) / self.scale)
 
     def compose(self, first: Similarity) -> Similarity:
@@ -100,8 +107,8 @@ class Similarity:
     def apply_to_camera(self, camera: Camera) -> Camera:
         """The camera that takes the same picture of the moved scene.
 
-        Its viewmat stays a rigid motion, [R_c R^T, s t_c - R_c R^T t], so depths come out `scale` times as large, and
-        `near` with them; K, the size and the lens stay.
+        Its viewmat stays a rigid motion, [R_c R^T, s t_c - R_c R^T t], so depths and `near` become `scale` times as large; K,
+        the size and the lens stay.
         """
         view = camera.viewmat.detach().double().cpu()
         moved = torch.eye(4, dtype=torch.float64)
@@ -118,8 +125,8 @@ def fit_similarity(
 ) -> Similarity:
     """The similarity with the least sum of w |s R src + t - dst|^2, in closed form (Umeyama 1991).
 
-    Flat clouds are fine (of the two mirror images the rotation is taken); points on a line leave the turn around it open
-    and are refused. Outliers count in full: who expects them gives weights, or fits to samples.
+    Flat clouds are accepted (the result is the rotation, not the mirror image). Points on a line are refused, because the
+    rotation about the line is unknown. Outliers count fully: give weights, or fit to samples.
 
     Args:
         src: points in the frame to move.
@@ -167,7 +174,7 @@ def fit_similarity(
 
 
 def exact_rotation(name: str, matrix: Tensor) -> Tensor:  # [3, 3] -> [3, 3] float64
-    """The rotation nearest to a matrix that is one up to rounding; `name` is the argument an error speaks of.
+    """The exact rotation nearest to a rounded one; errors name the argument `name`.
 
     Raises:
         ValueError: if the matrix is not finite, not orthonormal to 1e-3, or a reflection.

@@ -1,4 +1,4 @@
-"""Pictures and label maps as a pinhole camera of the same K would have taken them."""
+"""Remove lens distortion from pictures and label maps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def undistort(
 
     Args:
         image: any number of channels, as large as the camera says (a smaller feature map: `camera.resized(h, w)`).
-        camera: the camera that took it. Without distortion the picture returns as it came.
+        camera: the camera that took it. Without distortion the picture is returned unchanged.
 
     Returns:
         The picture, 0 where nothing was recorded; the camera without distortion; and the mask of recorded pixels.
@@ -35,9 +35,9 @@ def undistort(
         ValueError: if `image` is not of the camera's size.
 
     Note:
-        kornia's `undistort_image` is the same two steps (distort the grid, remap) without a fisheye and without a mask.
-        Beyond the picture's border, and beyond the lens model's `fold_radius`, nothing counts as recorded; within
-        half a pixel of the border the outermost pixel is repeated.
+        kornia's `undistort_image` does the same two steps (distort the grid, remap), but knows no fisheye and gives no mask.
+        Pixels beyond the border of the picture, or beyond the `fold_radius` of the lens model, do not count as recorded.
+        Within half a pixel of the border the outermost pixel is repeated.
     """
     check_shapes(("image", image, f"{camera.height} {camera.width} C"))
     if not image.is_floating_point():
@@ -46,7 +46,7 @@ def undistort(
         return image, camera, torch.ones(camera.size, dtype=torch.bool, device=image.device)
     dtype = torch.promote_types(image.dtype, torch.float32)  # half precision cannot tell the pixels of a row apart
     x, y, recorded = _source_positions(camera, dtype, image.device)
-    # align_corners must be said: with remap's default even an identity map changes the picture (kornia#4504)
+    # with remap's default align_corners even an identity map changes the picture (kornia#4504)
     result = remap(to_bchw(image.to(dtype)), x[None], y[None], padding_mode="border", align_corners=True)
     result = from_bchw(result).where(recorded[..., None], 0).to(image.dtype)
     return result, replace(camera, distortion=None), recorded
@@ -61,7 +61,7 @@ def undistort_labels(
 
     Args:
         labels: as large as the camera says.
-        camera: the camera that took it; see `undistort` for the one without distortion.
+        camera: the camera that took it; without distortion the labels are returned unchanged.
         fill: what to write where nothing was recorded.
 
     Raises:

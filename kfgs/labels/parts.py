@@ -202,32 +202,22 @@ def _described(
     cameras: Sequence[Camera] | None,
     engine: str,
 ) -> list[Part]:
-    views = [None] * len(parts) if not cameras else _best_views(gaussians, parts, cameras, engine)
-    return [
-        _part(gaussians.means[part], selection.scores[part], part, view, why)
-        for part, view, why in zip(parts, views, how, strict=True)
-    ]
-
-
-def _best_views(
-    gaussians: Gaussians, parts: list[Tensor], cameras: Sequence[Camera], engine: str
-) -> list[BestView | None]:
-    shares = view_shares(gaussians, parts, cameras, engine=engine)
-    return [
-        BestView(cameras[c].name, c, share) if share > 0 else None
-        for share, c in ((float(column.max()), int(column.argmax())) for column in shares.T)
-    ]
-
-
-def _part(means: Tensor, scores: Tensor, indices: Tensor, view: BestView | None, how: str) -> Part:
-    check_finite("gaussians.means", means)
-    points = means.detach().double()
-    return Part(
-        indices=indices,
-        score=float(scores.double().mean()),
-        centroid=points.mean(dim=0),
-        box=OrientedBox.around(points),
-        extent=(points.amin(dim=0), points.amax(dim=0)),
-        best_view=view,
-        how=how,
-    )
+    shares = view_shares(gaussians, parts, cameras or [], engine=engine)  # [C, P]
+    found = []
+    for i, (indices, why) in enumerate(zip(parts, how, strict=True)):
+        check_finite("gaussians.means", gaussians.means[indices])
+        points = gaussians.means[indices].detach().double()
+        best = int(shares[:, i].argmax()) if cameras else 0
+        view = BestView(cameras[best].name, best, float(shares[best, i])) if cameras and shares[best, i] > 0 else None
+        found.append(
+            Part(
+                indices=indices,
+                score=float(selection.scores[indices].double().mean()),
+                centroid=points.mean(dim=0),
+                box=OrientedBox.around(points),
+                extent=(points.amin(dim=0), points.amax(dim=0)),
+                best_view=view,
+                how=why,
+            )
+        )
+    return found

@@ -1,4 +1,4 @@
-"""Scenes: posed images and points, read from what COLMAP, nerfstudio, instant-ngp and Blender write, or estimated."""
+"""Scenes: posed images and points, read from files of COLMAP, nerfstudio, instant-ngp and Blender, or estimated."""
 
 from ..cameras.bounds import Bounds, robust_bounds
 from .colmap import load_colmap

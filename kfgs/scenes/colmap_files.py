@@ -1,4 +1,4 @@
-"""The files of a COLMAP model, binary and text. Both hold the same fields in the same order, so one set of readers serves both.
+"""The files of a COLMAP model, binary and text. Both hold the same fields in the same order, so one reader serves both.
 
 A `Table` hands out the fields of one record after the other. It compares every count with what is left of the file before it
 is used, so memory is bounded by the size of the file.
@@ -21,7 +21,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .files import SceneError
+from .files import MAX_NUMBER, SceneError
 
 # COLMAP's id of a camera model: its name and its parameters. Those that begin with f are focal lengths.
 CAMERA_MODELS: dict[int, tuple[str, str]] = {
@@ -49,7 +49,6 @@ OBSERVATIONS = np.dtype([("X", "<f8"), ("Y", "<f8"), ("POINT3D_ID", "<i8")])
 TRACK = np.dtype([("IMAGE_ID", "<u4"), ("POINT2D_IDX", "<u4")])
 """The 2-D points that see one 3-D point."""
 
-MAX_NUMBER = 1e15  # of lengths and intrinsics: still far inside float32
 ADVICE = "copy the model again from its source, or write it again with COLMAP"
 _LARGEST = {"B": 2**8 - 1, "I": 2**32 - 1, "Q": 2**64 - 1}
 _WORDS = {"m": {name: i for i, (name, _) in CAMERA_MODELS.items()}, "s": {"CAMERA": 0, "IMU": 1}}

@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .colmap_files import CAMERA_MODELS, OBSERVATIONS, TRACK, Table, open_table, require
-from .files import SceneError
+from .files import MAX_SIDE, SceneError
 
 FILES = ("cameras", "images", "points3D")
-MAX_SIDE = 100_000  # pixels: beyond any sensor, so a larger number is a wrong byte
 QUATERNION_SLACK = 0.1  # text files are rounded; a norm further from 1 is no rotation but a wrong byte
 _POSE = "QW, QX, QY, QZ, TX, TY, TZ"
 _CAMERA_SENSOR = 0
@@ -68,6 +67,9 @@ class ColmapModel:
     """[P, 3]."""
     rigs: int
     """0 in the older layout of three files."""
+
+    def __repr__(self) -> str:
+        return f"ColmapModel({self.layout}, {len(self.cameras)} cameras, {len(self.images)} images, {len(self.points)} points)"
 
 
 def has_model(path: str | Path) -> bool:

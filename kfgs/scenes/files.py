@@ -5,11 +5,16 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from kornia.io import ImageLoadType, load_image
 from torch import Tensor
 
+from .._files import read_json
+
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")  # what kornia decodes
+MAX_SIDE = 100_000  # pixels: beyond any sensor, so a larger number is a wrong byte
+MAX_NUMBER = 1e15  # of lengths and intrinsics: still far inside float32
 
 
 class SceneError(ValueError):
@@ -87,3 +92,18 @@ def read_image(path: str | Path) -> Tensor:  # [H, W, 3] float32 in [0, 1]
             "replace the file or take it out of the scene"
         ) from error
     return image.permute(1, 2, 0).contiguous()
+
+
+def read_scene_json(path: str | Path, advice: str) -> Any:
+    """Read a JSON file.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        SceneError: if it is no JSON; the message ends with `advice`.
+    """
+    try:
+        return read_json(path)
+    except ValueError as error:
+        raise SceneError(f"{error}; {advice}") from error
+    except RecursionError as error:
+        raise SceneError(f"{path}: expected a JSON file, got brackets nested too deep; {advice}") from error

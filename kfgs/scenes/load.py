@@ -1,4 +1,4 @@
-"""Open a scene folder, whoever wrote it."""
+"""Open a scene folder, whichever program wrote it."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ SplitChoice = Literal["auto", "file", "df3dgs", "holdout8", "all"]
 def load_scene(path: str | Path, *, images: str | Path | None = None, split: SplitChoice = "auto") -> Scene:
     """Open a folder with images and a COLMAP model, or with a transforms.json.
 
-    Looked for, in this order: a COLMAP model in `sparse/0`, `sparse`, `colmap/sparse/0`, `colmap_ground_truth` or the
+    The first of these is read: a COLMAP model in `sparse/0`, `sparse`, `colmap/sparse/0`, `colmap_ground_truth` or the
     folder itself (binary before text); `transforms.json`; Blender's `transforms_train.json`.
 
     Args:
         path: the scene folder, a model folder, or a .json file.
         images: the image folder; None: `images/` beside the model or up to two folders above it, else the scene folder.
-        split: `"auto"`: split.json if there is one, else the split that a transforms.json makes itself, else by number
-            of images: the paper's from 200 (which trains on every 10th image only), `"holdout8"` from 8, all below;
+        split: `"auto"`: split.json if there is one, else the split of the transforms.json if it has one, else by number
+            of images: from 200 the paper's (which trains on every 10th image only), from 8 `"holdout8"`, below 8 all;
             `"file"`: split.json; or a rule of `make_split`.
 
     Returns:
-        The scene, views in natural order of names, cameras with `near` in proportion to a small frame (`Scene.with_near`);
-        read its `notes`.
+        The scene, views in natural order of names, cameras with a `near` that suits the size of the scene
+        (`Scene.with_near`). Its `notes` say what is missing and what was assumed.
 
     Raises:
         FileNotFoundError: if there is no such folder, no image folder, or (`split="file"`) no split.json.
@@ -90,7 +90,7 @@ def _with_split(scene: Scene, root: Path, split: SplitChoice) -> Scene:
     splits = make_split(len(scene), rule)
     note = f"split {rule}: {len(splits['train'])} of {len(scene)} views train, {len(splits['test'])} test"
     if split == "auto" and rule == "df3dgs":
-        note += ' (the paper\'s, made for 900 frames of video); split="holdout8" trains on the other seven eighths'
+        note += ' (the paper\'s, for 900 frames of video); split="holdout8" trains on 7 of 8 views'
     if not splits["train"]:
         raise SceneError(
             f'{root}: expected at least 6 views for the split {rule!r}, got {len(scene)}; use split="all" or "holdout8"'

@@ -16,7 +16,9 @@ from ..cameras.camera import NEAR, Camera
 from ..cameras.undistort import undistort
 from .files import SceneError, file_stem, read_image
 
-NEAR_SHARE = 0.1  # of the extent: 3DGS's 0.2 is that of cameras 2 m about; in smaller frames the near plane follows
+NEAR_SHARE = (
+    0.1  # of the extent: 3DGS's near plane of 0.2 suits cameras 2 m apart; in smaller scenes it must be smaller
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +27,8 @@ class Scene:
 
     `scene.select("train").cameras` and `.image_paths` are those of one split; `scene.image(i)` is a picture.
 
-    **Convention**: world to camera, pixel centres on halves (`Camera`); world units are the file's. Views are in
-    natural order of their names where a loader made the scene.
+    **Convention**: world to camera, pixel centres on halves (`Camera`), world units of the file. Loaders put the views in
+    natural order of their names.
     """
 
     cameras: list[Camera]
@@ -34,17 +36,17 @@ class Scene:
     image_paths: list[Path]
     """V files."""
     points: Tensor  # [P, 3] float32
-    """The sparse cloud, possibly empty (P = 0), with outliers as it came: see `robust_bounds`."""
+    """The sparse cloud with its outliers (see `robust_bounds`); it may be empty (P = 0)."""
     colors: Tensor  # [P, 3] uint8
-    """The cloud's colours."""
+    """The colours of the cloud."""
     splits: dict[str, list[int]] = field(default_factory=dict)
     """Named lists of views; loaders give at least `train` and `test`."""
     notes: tuple[str, ...] = ()
-    """What a user should know about how the scene was read: what is missing, what was assumed."""
+    """What is missing and what was assumed when the scene was read."""
     lenses: list[Camera] | None = None
-    """Of an undistorted scene: the cameras with the distortion that the files on disk still have."""
+    """Only in an undistorted scene: the cameras with the distortion that the files on disk still have."""
     folder: Path | None = None
-    """Where it was loaded from."""
+    """Where the scene was loaded from."""
 
     def __post_init__(self) -> None:
         check_shapes(("points", self.points, "P 3"), ("colors", self.colors, "P 3"))
@@ -86,7 +88,7 @@ class Scene:
         return html_card("Scene", facts)
 
     def stem(self, i: int) -> str:
-        """The name of view `i` without its suffix: what feature and label files are called."""
+        """The name of view `i` without its suffix, which its feature and label files have too."""
         return file_stem(self.cameras[i].name)
 
     def views(self, split: str) -> list[int]:
@@ -104,7 +106,7 @@ class Scene:
         """Read the picture of view `i`; in an undistorted scene the lens is removed on the way.
 
         Raises:
-            FileNotFoundError: if the file has gone.
+            FileNotFoundError: if the file is no longer there.
             SceneError: if it cannot be decoded, or is not of the camera's size.
         """
         lens = self.cameras[i] if self.lenses is None else self.lenses[i]
@@ -117,7 +119,7 @@ class Scene:
         return image if self.lenses is None else undistort(image, lens)[0]
 
     def mask(self, i: int) -> Tensor:  # [H, W] bool
-        """Which pixels of view `i` were recorded: all, except at the border of an undistorted picture."""
+        """Which pixels of view `i` were recorded: all of them, or fewer at the border of an undistorted picture."""
         if self.lenses is None:
             return torch.ones(self.cameras[i].size, dtype=torch.bool)
         return undistort(torch.zeros(*self.lenses[i].size, 1), self.lenses[i])[2]
@@ -130,7 +132,7 @@ class Scene:
     def undistorted(self) -> Scene:
         """The same scene without lens distortion: pinhole cameras of the same K and size, pictures undistorted lazily.
 
-        Where the lens saw less than the pinhole does, pictures are black and `mask` is False.
+        Pixels that the lens did not record are black, and `mask` is False there.
         """
         if not self.distorted:
             return self
@@ -140,8 +142,8 @@ class Scene:
     def extent(self) -> float:
         """1.1 times the largest distance of a training camera from the training cameras' mean, in world units.
 
-        The length that 3DGS scales position steps with. All views count where the `train` split is empty. Cameras that
-        all stand in one place give no length: then the median distance to the points is taken, or 1 without points.
+        3DGS scales the steps of positions with this length. If the `train` split is empty, all views count. If all cameras
+        stand in one place, it is the median distance to the points, or 1 without points.
         """
         chosen = self.splits.get("train") or range(len(self))
         if len(chosen) == 0:
@@ -156,12 +158,12 @@ class Scene:
     def with_near(self) -> Scene:
         """The same scene with every camera's `near` at 0.2 world units or, if that is less, a tenth of the extent.
 
-        The extent of all views is taken, so that the split does not matter. Loaders do this; who makes a scene by hand in
-        a small frame (or one of kilometres, where another near plane may be wanted) chooses.
+        The extent is that of all views, so that the split does not matter. Loaders call this. A scene made by hand keeps the
+        `near` of its cameras until this is called.
         """
         if len(self) == 0:
             return self
-        near = min(NEAR, NEAR_SHARE * replace(self, splits={}).extent) or NEAR  # 0: all in one point, no length
+        near = min(NEAR, NEAR_SHARE * replace(self, splits={}).extent) or NEAR  # 0: everything is in one point
         return replace(self, cameras=[replace(camera, near=near) for camera in self.cameras])
 
     def select(self, which: str | Iterable[str] | Iterable[int]) -> Scene:

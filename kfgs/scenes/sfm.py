@@ -1,4 +1,4 @@
-"""Cameras for a folder of bare images: structure from motion through pycolmap, on the CPU."""
+"""Estimate cameras for a folder of images: structure from motion with pycolmap, on the CPU."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from .files import SceneError, list_images, some
 from .pycolmap_import import quiet_pycolmap, scene_errors
 
 OVERLAP = 10
-"""Following images that each image of a video is compared with, and how many powers of two beyond (COLMAP's default)."""
+"""An image of a video is compared with this many next images, and with this many at distances 1, 2, 4, ... (COLMAP's default)."""
 
 
 @dataclass(frozen=True)
 class SfmConfig:
-    """How cameras are estimated."""
+    """Options of the estimation."""
 
     matching: Literal["exhaustive", "sequential"] = "exhaustive"
-    """Which pairs of images are compared: all (90 images: minutes), or neighbours in natural order of names (video)."""
+    """Which pairs of images are compared: all (90 images take minutes), or neighbours in natural order of names (video)."""
     camera_model: str = "SIMPLE_RADIAL"
-    """COLMAP's name of the lens model that is fitted."""
+    """COLMAP's name of the lens model to fit."""
     single_camera: bool = True
-    """One camera took all images, at one zoom and size; False fits intrinsics to each image."""
+    """True: one camera took all images, at one zoom and size. False: fit intrinsics to each image."""
     min_registered: float = 0.9
-    """Least share of the images that one model must place, in (0, 1]."""
+    """The share of the images that one model must place at least, in (0, 1]."""
     max_features: int = 8192
-    """Most SIFT features per image."""
+    """SIFT features per image, at most."""
     seed: int = 0
-    """Of every random choice; with `num_threads=1` a rerun is bit-equal."""
+    """Seed of every random choice; with `num_threads=1` a rerun is bit-equal."""
     num_threads: int = -1
     """CPU threads; -1 takes all."""
 
@@ -51,7 +51,7 @@ class SfmConfig:
 
 @dataclass(frozen=True)
 class SfmReport:
-    """What structure from motion found."""
+    """The result of structure from motion."""
 
     registered: int
     """Images with a pose."""
@@ -60,13 +60,13 @@ class SfmReport:
     points: int
     """3-D points."""
     mean_reprojection_error: float
-    """Of the points, in pixels."""
+    """Mean over the points, in pixels."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall-clock time of features, matching, mapping."""
     missing: tuple[str, ...] = ()
     """Images without a pose."""
     model_sizes: tuple[int, ...] = ()
-    """Images of each model found, largest first; the first was written."""
+    """Number of images of each model that was found, largest first. Only the first model is written."""
 
     def __str__(self) -> str:
         lost = f"; without a pose: {some(list(self.missing))}" if self.missing else ""
@@ -83,9 +83,9 @@ def run_sfm(
     """Estimate cameras and a sparse cloud, and write them to `out/sparse/0`.
 
     Args:
-        images: folder of images (subfolders too); other files are passed over.
-        out: scene folder; `out/sparse/0` appears whole or not at all, and replaces an older one.
-        config: what to do; the default suits up to a few hundred photos of one camera.
+        images: folder of images (with subfolders); other files are ignored.
+        out: scene folder; `out/sparse/0` appears complete or not at all, and replaces an older one.
+        config: options; the default suits up to a few hundred photos of one camera.
         progress: show a bar: images described, pairs compared, images placed.
 
     Returns:
@@ -162,7 +162,7 @@ class _Run:
         self.bar.set_description(name)
 
     def extract(self) -> None:
-        """Describe the images a few at a time, which lets the bar move and Ctrl-C in."""
+        """Compute features of a few images at a time, so that the bar moves and Ctrl-C works."""
         colmap, config = self.pycolmap, self.config
         colmap.set_random_seed(config.seed)
         self._stage("features", len(self.names), "image")
@@ -180,13 +180,13 @@ class _Run:
             self.bar.update(len(some_names))
 
     def _first_camera(self) -> dict[str, Any]:
-        """What makes the next images share the camera of the first; nothing while no image could be read."""
+        """The option that makes the next images share the camera of the first; empty while no image could be read."""
         with self.pycolmap.Database.open(self.database) as database:
             cameras = database.read_all_cameras()
         return {"existing_camera_id": int(cameras[0].camera_id)} if cameras else {}
 
     def match(self) -> None:
-        """Compare pairs; pycolmap says nothing until it is done."""
+        """Compare pairs; pycolmap reports no progress meanwhile."""
         colmap, config, count = self.pycolmap, self.config, len(self.names)
         exhaustive = config.matching == "exhaustive"
         self._stage("matching", count * (count - 1) // 2 if exhaustive else count, "pair" if exhaustive else "image")
@@ -198,8 +198,10 @@ class _Run:
         self.bar.update(self.bar.total)
 
     def _sequential(self, colmap: Any) -> tuple[Callable[..., None], dict[str, Any]]:
-        """What matches a video. COLMAP orders names letter by letter (10.png before 9.png), so it gets a list of pairs;
-        its lists are cut at blanks, so names with blanks go without, which is right where both orders are the same.
+        """The function that matches a video, and its options.
+
+        COLMAP orders names letter by letter (10.png before 9.png), so it gets a list of pairs. In a list it cuts names at
+        blanks; names with blanks are only possible without a list, if both orders are the same.
         """
         if any(character.isspace() for name in self.names for character in name):
             if sorted(self.names) == self.names:
@@ -213,7 +215,7 @@ class _Run:
         return colmap.match_image_pairs, {"pairing_options": colmap.ImportedPairingOptions(match_list_path=str(listed))}
 
     def map(self) -> None:
-        """Place the images one after the other."""
+        """Estimate the pose of one image after the other."""
         colmap, seed = self.pycolmap, self.config.seed
         self._stage("mapping", len(self.names), "image")
         options = colmap.IncrementalPipelineOptions(random_seed=seed, num_threads=self.config.num_threads)
@@ -229,13 +231,13 @@ class _Run:
 def sequential_pairs(
     names: list[str],  # in the order of the video
 ) -> list[tuple[str, str]]:
-    """Pairs of each image with the next 10, and with those 2^k further on up to 512, as COLMAP's own matcher takes."""
+    """Pairs of each image with the next 10, and with those 1, 2, 4, ..., 512 further on, as COLMAP's matcher takes them."""
     steps = sorted({*range(1, OVERLAP + 1), *(2**k for k in range(OVERLAP))})
     return [(name, names[i + step]) for i, name in enumerate(names) for step in steps if i + step < len(names)]
 
 
 def _require_one_model(images: Path, sizes: tuple[int, ...], names: list[str], config: SfmConfig) -> None:
-    """Refuse a model that leaves too many images out: a scene quietly missing a room is worse than none."""
+    """Refuse a model that leaves out too many images: a scene that silently lacks a room is worse than none."""
     needed = config.min_registered * len(names)
     if sizes and sizes[0] >= needed:
         return

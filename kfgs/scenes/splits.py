@@ -1,4 +1,4 @@
-"""Which views are trained on and which are held out."""
+"""Which views are for training and which are for testing."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._check import check_choice
-from .._files import read_json
-from .files import SceneError, file_stem
+from .files import SceneError, file_stem, read_scene_json
 
 SplitRule = Literal["df3dgs", "holdout8", "all"]
 
-DF3DGS_FEWEST = 200  # a video: the paper leaves out 4 views of 5, which a few dozen photos cannot spare
+DF3DGS_FEWEST = 200  # the paper's rule leaves out 4 of 5 views: fine for a video, too many of a few dozen photos
 
 
 def split_every(count: int, *, step: int, test_start: int = 0, train_start: int | None = None) -> dict[str, list[int]]:
@@ -68,34 +67,27 @@ def make_split(count: int, rule: SplitRule) -> dict[str, list[int]]:
 
 
 def choose_split(count: int) -> SplitRule:
-    """The rule for a scene that brings no split: the paper's from 200 images, `"holdout8"` from 8, else `"all"`."""
+    """The rule for a scene without a split: the paper's from 200 images, `"holdout8"` from 8, else `"all"`."""
     if count >= DF3DGS_FEWEST:
         return "df3dgs"
     return "holdout8" if count >= 8 else "all"
 
 
 def read_split(path: str | Path, stems: Sequence[str]) -> tuple[dict[str, list[int]], list[str]]:
-    """Read a split.json: `{"train": [stems], "test": [stems]}`; more names of splits are welcome.
+    """Read a split.json: `{"train": [stems], "test": [stems]}`; more splits are allowed.
 
     Args:
         path: the file.
-        stems: the scene's views in order; a listed name may carry its suffix.
+        stems: the views of the scene in order; the names in the file may have a suffix.
 
     Returns:
-        The indices of each split in the scene's order, and the listed names that the scene does not have.
+        The indices of each split in the order of the scene, and the names that the scene does not have.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        SceneError: if it is not such a file, no training view is in the scene, or a view is in both train and test.
+        SceneError: if the file is something else, no training view is in the scene, or a view is in both train and test.
     """
-    try:
-        value = read_json(path)
-    except ValueError as error:
-        raise SceneError(f"{error}; repair the file or remove it") from error
-    except RecursionError as error:
-        raise SceneError(
-            f"{path}: expected a JSON file, got brackets nested too deep; repair the file or remove it"
-        ) from error
+    value = read_scene_json(path, "repair the file or remove it")
     if not _is_split(value):
         raise SceneError(
             f'{path}: expected {{"train": [names], "test": [names]}}, got {str(value)[:80]}; '
@@ -117,7 +109,7 @@ def read_split(path: str | Path, stems: Sequence[str]) -> tuple[dict[str, list[i
     if both:
         raise SceneError(
             f"{path}: expected train and test without a common view, {stems[both[0]]} and {len(both) - 1} more are in "
-            "both; a score on trained views means nothing: remove them from one"
+            "both; scores on training views mean nothing: remove them from one"
         )
     return splits, unknown
 

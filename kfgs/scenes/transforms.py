@@ -1,10 +1,10 @@
-"""transforms.json (nerfstudio, instant-ngp, Blender) to scenes.
+"""Read scenes from transforms.json (nerfstudio, instant-ngp, Blender).
 
-**Convention**: `transform_matrix` is camera to world with OpenGL axes (x right, y up, z backward); kfgs wants world to
-camera with y down and z forward, so the y and z columns change sign and the pose is inverted. The world stays the
-file's: `applied_transform` says what was done to poses and points alike, and is not undone.
-`cx, cy` are read as COLMAP's (the centre of the first pixel is (0.5, 0.5)), because nerfstudio's and instant-ngp's
-converters copy COLMAP's numbers and both programs sample pixels at +0.5.
+**Convention**: `transform_matrix` is camera to world with OpenGL axes (x right, y up, z backward). kfgs wants world to
+camera with y down and z forward, so the y and z columns change sign and the pose is inverted. World coordinates are those of
+the file: `applied_transform` says what was done to poses and points alike, and is not undone.
+`cx, cy` are read as in COLMAP (the centre of the first pixel is (0.5, 0.5)), because the converters of nerfstudio and
+instant-ngp copy COLMAP's numbers and both programs sample pixels at +0.5.
 """
 
 from __future__ import annotations
@@ -18,22 +18,30 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._files import read_json
 from ..cameras.camera import Camera, Distortion
 from ..formats.ply import points_from_columns, read_ply
-from .files import IMAGE_SUFFIXES, SceneError, is_file, natural_key, read_image, some
+from .files import (
+    IMAGE_SUFFIXES,
+    MAX_NUMBER,
+    MAX_SIDE,
+    SceneError,
+    is_file,
+    natural_key,
+    read_image,
+    read_scene_json,
+    some,
+)
 from .scene import Scene
 
 _PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 _COEFFICIENTS = {"PINHOLE": (), "SIMPLE_PINHOLE": (), **dict.fromkeys(_FISHEYE, ("k1", "k2", "k3", "k4"))}
 _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # OpenGL axes to COLMAP's
-_MAX_SIDE = 100_000
 
 
 @dataclass
 class _Reader:
-    """What one file says about frames, and what went wrong with some of them."""
+    """One file: the views that were read from it, and what was missing."""
 
     path: Path
     root: Path
@@ -43,28 +51,25 @@ class _Reader:
     outside: list[str] = field(default_factory=list)
     masked: int = 0
 
-    def fail(self, where: str, expected: str, got: object, advice: str) -> SceneError:
-        return SceneError(f"{self.path}, {where}: expected {expected}, got {got!r:.200}; {advice}")
-
 
 def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene:
     """Read a transforms.json, or the transforms_train.json and transforms_test.json of a Blender scene.
 
-    Intrinsics may stand at the top or in each frame (the frame's count): `w, h, fl_x, fl_y, cx, cy`, `camera_angle_x`
-    and `camera_angle_y` (radians) where focal lengths are missing, `k1 k2 p1 p2 [k3]` or, with a fisheye, `k1 k2 k3 k4`.
-    Without `w, h` the picture's own size is taken, without `cx, cy` its centre.
+    Intrinsics may be at the top or in each frame (the frame wins): `w, h, fl_x, fl_y, cx, cy`, `camera_angle_x`
+    and `camera_angle_y` (radians) if focal lengths are missing, `k1 k2 p1 p2 [k3]` or, with a fisheye, `k1 k2 k3 k4`.
+    Without `w, h` the size of the picture is taken, without `cx, cy` its centre.
 
-    A frame whose file is missing is left out and named in `notes`. Frames that reach outside the scene folder (an absolute
-    path, or `..`) are read if they are image files, and counted in `notes`. `ply_file_path` gives the points, if it is inside the
-    folder; else the scene has none (P = 0, noted). `mask_path` and `depth_file_path` are not read.
+    A frame whose file is missing is left out and named in `notes`. Frames outside the scene folder (an absolute path, or
+    `..`) are read if they are image files, and counted in `notes`. `ply_file_path` gives the points if it is inside the
+    folder; else the scene has no points (P = 0), and a note says so. `mask_path` and `depth_file_path` are not read.
 
     Args:
         path: the file, or a folder with `transforms.json` or `transforms_train.json`.
-        images: look image files up here before the scene folder.
+        images: where to look for image files before the scene folder.
 
     Returns:
-        The scene in natural order of names. Splits are the file's (`train_filenames`, `test_filenames`, Blender's files), or
-        all views in `train`.
+        The scene in natural order of names. Splits come from the file (`train_filenames`, `test_filenames`) or from Blender's
+        two files; else all views are in `train`.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -98,7 +103,7 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
 
 
 def _files(path: Path) -> dict[str, Path]:
-    """The files to read, by split; `all` where the file does not say."""
+    """The files to read, by split; `all` if the file itself has splits or none."""
     if path.is_dir():
         if (path / "transforms.json").is_file():
             return {"all": path / "transforms.json"}
@@ -111,34 +116,30 @@ def _files(path: Path) -> dict[str, Path]:
 
 
 def _read_frames(reader: _Reader) -> dict[str, Any]:
-    """Fill `reader.views`; return the file's top level."""
-    try:
-        top = read_json(reader.path)
-    except ValueError as error:
-        raise SceneError(f"{error}; write the file again") from error
-    except RecursionError as error:
-        raise SceneError(
-            f"{reader.path}: expected a JSON file, got brackets nested too deep; write the file again"
-        ) from error
+    """Fill `reader.views`; return the top level of the file."""
+    top = read_scene_json(reader.path, "write the file again")
     if not isinstance(top, dict) or not isinstance(top.get("frames"), list) or not top["frames"]:
-        raise reader.fail("top level", "an object with a list of 'frames'", top, "is this a transforms.json?")
+        place = _Frame(reader.path, "top level", {})
+        raise place.fail("", "an object with a list of 'frames'", top, "is this a transforms.json?")
     sizes: dict[str, tuple[int, int]] = {}
-    for i, frame in enumerate(top["frames"]):
-        where = f"frame {i}"
-        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
-            raise reader.fail(where, "an object with a 'file_path'", frame, "write the file again")
-        file = _find_image(reader, frame["file_path"])
+    for i, values in enumerate(top["frames"]):
+        merged = {**top, **values} if isinstance(values, dict) else {}
+        frame, listed = _Frame(reader.path, f"frame {i}", merged), merged.get("file_path")
+        if not isinstance(listed, str) or not listed:
+            raise frame.fail("", "an object with a 'file_path'", values, "write the file again")
+        file = _find_image(reader, listed)
         if file is None:
-            reader.missing.append(frame["file_path"])
+            reader.missing.append(listed)
             continue
-        merged = {**top, **frame}
-        reader.masked += "mask_path" in frame
+        reader.masked += "mask_path" in values
         if "w" not in merged or "h" not in merged:
-            if "all" not in sizes:  # pictures of one size, as Blender writes them; another size fails in Scene.image
+            if (
+                "all" not in sizes
+            ):  # Blender writes no size, and pictures of one size; another size fails in Scene.image
                 height, width = read_image(file).shape[:2]
                 sizes["all"] = width, height
             merged["w"], merged["h"] = sizes["all"]
-        reader.views.append((_camera(reader, where, merged, _name(reader, file)), file))
+        reader.views.append((frame.camera(_name(reader, file)), file))
     return top
 
 
@@ -165,7 +166,7 @@ def _find_image(reader: _Reader, listed: str) -> Path | None:
 
 
 def _name(reader: _Reader, file: Path) -> str:
-    """File name relative to the image folder: `images/` of the scene, else the scene's folder; elsewhere the bare name."""
+    """File name relative to `images/` of the scene, else to the scene folder; of a file elsewhere, the bare name."""
     plain = _normal(file)
     for folder in (reader.images, reader.root / "images", reader.root):
         if folder is not None and plain.is_relative_to(_normal(folder)):
@@ -185,117 +186,110 @@ def _normal(path: Path) -> Path:
     return Path(*parts)
 
 
-def _number(reader: _Reader, where: str, values: dict[str, Any], name: str, default: float | None = None) -> float:
-    value = values.get(name, default)
-    good = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e15
-    if not good:
-        raise reader.fail(f"{where}, {name}", "a finite number", value, "add it at the top or in each frame")
-    assert value is not None
-    return float(value)
+@dataclass(frozen=True)
+class _Frame:
+    """The values of one frame; those at the top of the file count where the frame has none."""
 
+    path: Path
+    where: str
+    values: dict[str, Any]
 
-def _camera(reader: _Reader, where: str, values: dict[str, Any], name: str) -> Camera:
-    width, height = (_number(reader, where, values, side) for side in ("w", "h"))
-    if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE and width % 1 == 0 and height % 1 == 0):
-        raise reader.fail(where, f"w and h of 1 to {_MAX_SIDE} whole pixels", (width, height), "correct the size")
-    fx, fy = _focal_lengths(reader, where, values, width, height)
-    cx = _number(reader, where, values, "cx", width / 2)
-    cy = _number(reader, where, values, "cy", height / 2)
-    viewmat = _viewmat(reader, where, values.get("transform_matrix"))
-    K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float32)
-    lens = _distortion(reader, where, values)
-    try:
-        return Camera(viewmat.float(), K, int(width), int(height), name, lens)
-    except ValueError as error:
-        raise SceneError(f"{reader.path}, {where} ({name}): {error}") from error
+    def fail(self, where: str, expected: str, got: object, advice: str) -> SceneError:
+        place = f"{self.where}, {where}" if where else self.where
+        return SceneError(f"{self.path}, {place}: expected {expected}, got {got!r:.200}; {advice}")
 
+    def number(self, name: str, default: float | None = None) -> float:
+        value = self.values.get(name, default)
+        if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) < MAX_NUMBER:
+            raise self.fail(name, "a finite number", value, "add it at the top or in each frame")
+        return float(value)
 
-def _focal_lengths(
-    reader: _Reader, where: str, values: dict[str, Any], width: float, height: float
-) -> tuple[float, float]:
-    def from_angle(name: str, side: float) -> float | None:
-        if name not in values:
+    def camera(self, name: str) -> Camera:
+        width, height = self.number("w"), self.number("h")
+        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE and width % 1 == 0 and height % 1 == 0):
+            raise self.fail("", f"w and h of 1 to {MAX_SIDE} whole pixels", (width, height), "correct the size")
+        fx = self.focal_length("x", width)
+        fy = self.focal_length("y", height)
+        if fx is None:
+            expected = "'fl_x' or 'camera_angle_x'"
+            raise self.fail("", expected, sorted(self.values), "add one at the top or in each frame")
+        cx, cy = self.number("cx", width / 2), self.number("cy", height / 2)
+        K = torch.tensor([[fx, 0, cx], [0, fx if fy is None else fy, cy], [0, 0, 1]], dtype=torch.float32)
+        viewmat, lens = self.viewmat(), self.distortion()
+        try:
+            return Camera(viewmat.float(), K, int(width), int(height), name, lens)
+        except ValueError as error:
+            raise SceneError(f"{self.path}, {self.where} ({name}): {error}") from error
+
+    def focal_length(self, axis: str, side: float) -> float | None:
+        if f"fl_{axis}" in self.values:
+            return self.number(f"fl_{axis}")
+        name = f"camera_angle_{axis}"
+        if name not in self.values:
             return None
-        angle = _number(reader, where, values, name)
+        angle = self.number(name)
         if not 0 < angle < math.pi:
-            raise reader.fail(f"{where}, {name}", "an angle in (0, pi) radians", angle, "correct it")
+            raise self.fail(name, "an angle in (0, pi) radians", angle, "correct it")
         return side / 2 / math.tan(angle / 2)
 
-    fx = _number(reader, where, values, "fl_x") if "fl_x" in values else from_angle("camera_angle_x", width)
-    if fx is None:
-        raise reader.fail(where, "'fl_x' or 'camera_angle_x'", sorted(values), "add one at the top or in each frame")
-    fy = _number(reader, where, values, "fl_y") if "fl_y" in values else from_angle("camera_angle_y", height)
-    return fx, fx if fy is None else fy
+    def distortion(self) -> Distortion | None:
+        """The lens; a perspective lens whose coefficients are all zero is None.
 
-
-def _distortion(reader: _Reader, where: str, values: dict[str, Any]) -> Distortion | None:
-    """The lens; a perspective one whose coefficients are all zero is none.
-
-    nerfstudio's k4 of a perspective camera is the fourth radial term, OpenCV's is the first of the denominator, so a k4
-    is taken only with FULL_OPENCV, which can only mean OpenCV's.
-    """
-    model = values.get("camera_model", "OPENCV")
-    if values.get("is_fisheye") is True:
-        model = "OPENCV_FISHEYE"
-    if model not in _PERSPECTIVE + _FISHEYE:
-        raise reader.fail(
-            f"{where}, camera_model",
-            f"one of {', '.join(_PERSPECTIVE + _FISHEYE)}",
-            model,
-            "undistort the images first",
-        )
-    k = [_number(reader, where, values, f"k{i}", 0.0) for i in range(1, 7)]
-    p = [_number(reader, where, values, f"p{i}", 0.0) for i in (1, 2)]
-    coefficients = {**{f"k{i + 1}": value for i, value in enumerate(k)}, "p1": p[0], "p2": p[1]}
-    known = _COEFFICIENTS.get(model, tuple(coefficients))
-    dropped = {name: value for name, value in coefficients.items() if value and name not in known}
-    if dropped:
-        raise reader.fail(
-            where, f"only {' '.join(known) or 'zeros'} with camera_model {model}", dropped,
-            "correct camera_model or remove them",
-        )  # fmt: skip
-    if model in _FISHEYE:
-        return Distortion("kannala_brandt", tuple(k[:4]))
-    if not any(k + p):
-        return None
-    if any(k[3:]) and model != "FULL_OPENCV":
-        raise reader.fail(
-            where, "at most k1 k2 k3 p1 p2", {"k4": k[3], "k5": k[4], "k6": k[5]},
-            'undistort the images first, or say "camera_model": "FULL_OPENCV" if these are OpenCV\'s k4 k5 k6',
-        )  # fmt: skip
-    if any(k[3:]):
+        The k4 of nerfstudio's perspective camera is the fourth radial term; OpenCV's k4 is the first of the denominator. So
+        k4 is accepted only with FULL_OPENCV, where it can only mean OpenCV's.
+        """
+        model = "OPENCV_FISHEYE" if self.values.get("is_fisheye") is True else self.values.get("camera_model", "OPENCV")
+        if model not in _PERSPECTIVE + _FISHEYE:
+            expected = f"one of {', '.join(_PERSPECTIVE + _FISHEYE)}"
+            raise self.fail("camera_model", expected, model, "undistort the images first")
+        k = [self.number(f"k{i}", 0.0) for i in range(1, 7)]
+        p = [self.number(f"p{i}", 0.0) for i in (1, 2)]
+        coefficients = {**{f"k{i}": value for i, value in enumerate(k, 1)}, "p1": p[0], "p2": p[1]}
+        known = _COEFFICIENTS.get(model, tuple(coefficients))
+        dropped = {name: value for name, value in coefficients.items() if value and name not in known}
+        if dropped:
+            expected = f"only {' '.join(known) or 'zeros'} with camera_model {model}"
+            raise self.fail("", expected, dropped, "correct camera_model or remove them")
+        if model in _FISHEYE:
+            return Distortion("kannala_brandt", tuple(k[:4]))
+        if not any(k + p):
+            return None
+        if not any(k[3:]):
+            return Distortion("brown_conrady", (k[0], k[1], *p, k[2]) if k[2] else (k[0], k[1], *p))
+        if model != "FULL_OPENCV":
+            raise self.fail(
+                "", "at most k1 k2 k3 p1 p2", {"k4": k[3], "k5": k[4], "k6": k[5]},
+                'undistort the images first, or say "camera_model": "FULL_OPENCV" if these are OpenCV\'s k4 k5 k6',
+            )  # fmt: skip
         return Distortion("brown_conrady", (k[0], k[1], *p, *k[2:]))
-    return Distortion("brown_conrady", (k[0], k[1], *p, k[2]) if k[2] else (k[0], k[1], *p))
 
-
-def _viewmat(reader: _Reader, where: str, rows: Any) -> Tensor:  # [4, 4] float64
-    """World to camera from a camera-to-world matrix with OpenGL axes."""
-    try:
-        pose = torch.tensor(rows, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise reader.fail(f"{where}, transform_matrix", "4 rows of 4 numbers", rows, "write the file again") from error
-    if pose.shape == (3, 4):
-        pose = torch.cat([pose, pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
-    if pose.shape != (4, 4) or not torch.isfinite(pose).all() or float(pose.abs().max()) > 1e15:
-        raise reader.fail(f"{where}, transform_matrix", "4 rows of 4 finite numbers", rows, "write the file again")
-    if pose[3].tolist() != [0, 0, 0, 1]:
-        raise reader.fail(
-            f"{where}, transform_matrix", "0 0 0 1 as the last row", pose[3].tolist(), "is it transposed?"
-        )
-    pose = pose @ _FLIP
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = pose[:3, :3].T  # Camera refuses what is not a rotation
-    viewmat[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return viewmat
+    def viewmat(self) -> Tensor:  # [4, 4] float64
+        """World to camera from a camera-to-world matrix with OpenGL axes."""
+        name, rows = "transform_matrix", self.values.get("transform_matrix")
+        try:
+            pose = torch.tensor(rows, dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            raise self.fail(name, "4 rows of 4 numbers", rows, "write the file again") from error
+        if pose.shape == (3, 4):
+            pose = torch.cat([pose, pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
+        if pose.shape != (4, 4) or not torch.isfinite(pose).all() or float(pose.abs().max()) > MAX_NUMBER:
+            raise self.fail(name, "4 rows of 4 finite numbers", rows, "write the file again")
+        if pose[3].tolist() != [0, 0, 0, 1]:
+            raise self.fail(name, "0 0 0 1 as the last row", pose[3].tolist(), "is it transposed?")
+        pose = pose @ _FLIP
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[:3, :3] = pose[:3, :3].T  # Camera refuses what is not a rotation
+        viewmat[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+        return viewmat
 
 
 def _points(reader: _Reader, top: dict[str, Any]) -> tuple[Tensor, Tensor, list[str]]:
-    """The cloud that `ply_file_path` names, in the frame of the poses."""
+    """The points of `ply_file_path`, in the frame of the poses."""
     nothing = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)
     listed = top.get("ply_file_path")
     if listed is None:
         return *nothing, [
-            "no points: this transforms.json names no ply_file_path; a field needs some to start from (`kfgs sfm` finds them)"
+            "no points: this transforms.json has no ply_file_path; a field needs points to start from (`kfgs sfm` finds them)"
         ]
     file = reader.root / listed if isinstance(listed, str) and "\0" not in listed else None
     if file is None or not _normal(file).is_relative_to(_normal(reader.root)) or not is_file(file):
@@ -305,7 +299,7 @@ def _points(reader: _Reader, top: dict[str, Any]) -> tuple[Tensor, Tensor, list[
         points = points_from_columns(columns)
     except ValueError as error:
         raise SceneError(
-            f"{error} (named by ply_file_path in {reader.path}; remove the entry to go without)"
+            f"{error} (named by ply_file_path in {reader.path}; remove the entry to load without points)"
         ) from error
     if not torch.isfinite(points).all():
         raise SceneError(f"{file}: expected finite coordinates, got NaN or infinity; write the point cloud again")
@@ -317,7 +311,7 @@ def _points(reader: _Reader, top: dict[str, Any]) -> tuple[Tensor, Tensor, list[
 
 
 def _splits(views: list[tuple[Camera, Path, str]], root: Path, top: dict[str, Any]) -> dict[str, list[int]]:
-    """The splits that the files themselves make, else all views in train."""
+    """The splits that the files give; if there are none, all views in train."""
     origin = [split for _, _, split in views]
     if "all" not in origin:
         return {name: [i for i, split in enumerate(origin) if split == name] for name in ("train", "test")}

@@ -1,4 +1,4 @@
-"""Remove lenses that kfgs has no exact form of, with COLMAP's own undistorter."""
+"""Remove lens distortion that kfgs cannot represent exactly, with COLMAP's undistorter."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from .pycolmap_import import quiet_pycolmap, scene_errors
 def undistort_scene(images: str | Path, model: str | Path, out: str | Path) -> Path:
     """Write a scene with pinhole cameras: `out/images` and `out/sparse/0`, undistorted by pycolmap.
 
-    For lenses that `load_scene` refuses (FOV, THIN_PRISM_FISHEYE, EUCM, ...); all others are undistorted lazily by
-    `Scene.undistorted`.
+    For lenses that `load_scene` refuses (FOV, THIN_PRISM_FISHEYE, EUCM, ...). `Scene.undistorted` handles all others without
+    new files.
 
     Args:
         images: the distorted images.
         model: their COLMAP model.
-        out: the scene folder to make, new or empty.
+        out: the scene folder to write, new or empty.
 
     Returns:
         `out`.

@@ -1,4 +1,4 @@
-"""A COLMAP model of known cameras and points, with tracks, as SfM would have written it."""
+"""Write a COLMAP model of known cameras and points, with tracks, as SfM would."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Boxes and ellipsoids, met by rays in closed form: exact depth, exact labels, exact visibility.
+"""Boxes and ellipsoids, intersected with rays in closed form: exact depth, labels and visibility.
 
-Everything here is numpy float64 in world units (metres); the solids are the furniture of `toy_room`.
+Everything is numpy float64 in world units (metres). The solids are the furniture of the toy room.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ NEAR = 0.02  # metres: hits closer than this to a ray's origin are ignored
 
 @dataclass(frozen=True)
 class Solid:
-    """One box or ellipsoid: `half` are half edges or radii along its own axes, which are turned by `yaw` about z."""
+    """A box or ellipsoid: `half` are half edges or radii along its axes, which are turned by `yaw` about z."""
 
     shape: Literal["box", "ellipsoid"]
     center: tuple[float, float, float]
@@ -36,7 +36,7 @@ class Solid:
         return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
     def to_local(self, points: Array) -> Array:  # [..., 3] -> [..., 3]
-        """World points in the solid's own axes, around its centre."""
+        """World points in the axes of the solid, around its centre."""
         return (points - np.array(self.center)) @ self.rotation()
 
     def area(self) -> float:
@@ -70,7 +70,7 @@ def intersect(solid: Solid, origin: Array, directions: Array) -> Array:  # [3], 
 
 
 def normals(solid: Solid, points: Array) -> Array:  # [N, 3] -> [N, 3]
-    """Outward unit normals at points on the surface; on an edge of a box, those of one of its faces."""
+    """Outward unit normals at points on the surface; on an edge of a box, the normal of one face."""
     local = solid.to_local(points)
     half = np.array(solid.half)
     if solid.shape == "ellipsoid":

@@ -1,4 +1,4 @@
-"""Cameras that walk around the toy room, and pictures of it: colour, exact z-depth and exact labels."""
+"""Cameras that walk around the toy room, and its pictures: colour, exact z-depth and exact labels."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class View(NamedTuple):
     solids: NDArray[np.int64]  # [H, W] index of the solid
 
 
-def look_at(position: Array, target: Array, roll: float) -> Array:  # [4, 4] world to camera
+def _look_at(position: Array, target: Array, roll: float) -> Array:  # [4, 4] world to camera
     """The pose (x right, y down, z forward) at `position` looking at `target`; z is up in the world, roll in radians."""
     forward = (target - position) / np.linalg.norm(target - position)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -44,18 +44,18 @@ def look_at(position: Array, target: Array, roll: float) -> Array:  # [4, 4] wor
 def intrinsics(height: int, width: int) -> Array:  # [3, 3]
     """The toy camera's K: 71 degrees wide, fx != fy, principal point off the centre by (+3.5, -2.5) / 256 widths.
 
-    Both are deliberate: code that assumes a centred or square-pixel camera fails visibly on this scene.
+    This is deliberate: code that assumes a centred principal point or square pixels fails visibly on this scene.
     """
     unit = width / 256.0
     fx = 180.0 * unit
     return np.array([[fx, 0, width / 2 + 3.5 * unit], [0, 1.02 * fx, height / 2 - 2.5 * unit], [0, 0, 1.0]])
 
 
-def orbit(train_views: int, test_views: int, size: tuple[int, int]) -> tuple[list[Camera], list[bool]]:
+def walk_cameras(train_views: int, test_views: int, size: tuple[int, int]) -> tuple[list[Camera], list[bool]]:
     """Cameras in the order of the walk, named `view_000.png` and so on, and which of them are for testing.
 
-    Training cameras divide the walk evenly; each test camera stands half-way between two of them. The walk goes round
-    the room twice, once higher and looking up, once lower and looking down, so that most surfaces are seen often.
+    Training cameras divide the walk evenly; each test camera stands half-way between two of them. The walk goes around
+    the room twice, first high and looking up, then low and looking down, so that most surfaces are seen often.
     """
     steps = [(i / train_views, False) for i in range(train_views)]
     steps += [((j * train_views // test_views + 0.5) / train_views, True) for j in range(test_views)]
@@ -66,7 +66,7 @@ def orbit(train_views: int, test_views: int, size: tuple[int, int]) -> tuple[lis
         position = np.array([2.15 * np.cos(a), 1.75 * np.sin(a), 1.5 + 0.2 * np.sin(3 * a + 0.5) + 0.25 * lift])
         height = 1.0 + 0.3 * np.sin(2 * a + 0.4) + 0.95 * lift
         target = np.array([0.55 * np.cos(2 * a + 1.0), 0.45 * np.sin(3 * a), height])
-        viewmat = look_at(position, target - 0.35 * position * [1, 1, 0], 0.05 * float(np.sin(5 * a)))
+        viewmat = _look_at(position, target - 0.35 * position * [1, 1, 0], 0.05 * float(np.sin(5 * a)))
         name = f"view_{number:03d}.png"
         K = torch.from_numpy(intrinsics(*size))
         cameras.append(Camera(torch.from_numpy(viewmat), K, width=size[1], height=size[0], name=name))
@@ -81,7 +81,7 @@ def surface_color(
     footprint: Array,  # [N] metres a pixel covers
     lit: Array,  # [N, L] 1 where a light reaches, 0 in its shadow
 ) -> Array:  # [N, 3] in [0, 1]
-    """Texture times a matte shading by the room's lights; it does not depend on who looks."""
+    """Texture times a matte shading by the lights of the room; it does not depend on the camera."""
     color = np.zeros((len(points), 3))
     for i in np.unique(which):
         rows = np.flatnonzero(which == i)
@@ -100,7 +100,7 @@ def surface_color(
 
 
 def light_reaches(solids: Sequence[Solid], points: Array) -> Array:  # [N, 3] -> [N, L]
-    """1 where nothing stands between a point and each light, else 0; the room's own shell casts no shadow."""
+    """1 where nothing stands between a point and each light, else 0; walls, floor and ceiling cast no shadow."""
     casters = [s for s in solids if s.label not in ("wall", "floor", "ceiling", "rug", "picture")]
     return np.stack([~occluded(casters, np.array(p), points) for p, _ in _LIGHTS], axis=-1).astype(float)
 
@@ -109,7 +109,9 @@ def render(solids: Sequence[Solid], noise: Noise, camera: Camera) -> View:
     """Render one view: depth and labels at pixel centres, colour averaged over 2 x 2 samples per pixel."""
     depth, index = cast(solids, camera)
     if not np.isfinite(depth).all():
-        raise AssertionError(f"{camera.name}: a ray leaves the room {ROOM}")  # the room is closed: our own bug
+        raise AssertionError(
+            f"{camera.name}: a ray leaves the room {ROOM}"
+        )  # the room is closed, so this is a bug of kfgs
     origin, rays = pixel_rays(camera)
     lit = light_reaches(solids, (origin + rays * depth[..., None]).reshape(-1, 3)).reshape(*camera.size, -1)
     lit = lit.repeat(_SPLIT, axis=0).repeat(_SPLIT, axis=1)

@@ -43,7 +43,7 @@ def _jitter(colors: Sequence[Color], rng: np.random.Generator, amount: float = 0
 
 
 class _Builder:
-    """Collects solids; each placed piece gets its own colours' shift and texture seed from `rng`."""
+    """Collects solids; `rng` gives each placed piece a shift of its colours and a texture seed."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng

@@ -1,7 +1,7 @@
-"""A furnished room that the package makes itself: a small scene with exact ground truth and a noisy teacher.
+"""Write the toy room: a small scene with exact ground truth and the features of a noisy teacher.
 
 The folder has the layout of a real scene (`images`, `sparse/0`, `labels`, `classes.json`, `text.npy`, `split.json`,
-`features`) and, beside it, what no real scene has: `depth` and `surface.npz`.
+`features`), and also `depth` and `surface.npz`, which no real scene has.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from .._check import check_range
+from .._check import check_size, check_whole
 from .._files import atomic_folder, read_json, write_json
 from ..cameras.camera import Camera
 from .colmap import write_model
 from .geometry import Array, Solid, normals, sample_surface, visible
-from .render import View, light_reaches, orbit, render, surface_color
+from .render import View, light_reaches, render, surface_color, walk_cameras
 from .room import CLASSES, build_room
 from .teacher import class_embeddings, teacher_features
 from .texture import Noise
@@ -35,10 +35,10 @@ PIXEL_NOISE = 0.4  # pixels, standard deviation of their observations
 
 @dataclass(frozen=True)
 class ToyConfig:
-    """What the toy room is made with; equal configurations give bit-identical folders on one machine."""
+    """Options of the toy room. Equal options give bit-identical folders on one machine."""
 
     seed: int = 0
-    """Textures, hues, how the chairs stand, embeddings, and every error of the teacher."""
+    """Decides textures, hues, the places of the chairs, embeddings, and every error of the teacher."""
     train_views: int = 48
     """Training cameras, evenly spaced on two rounds through the room."""
     test_views: int = 12
@@ -50,24 +50,24 @@ class ToyConfig:
     feature_dim: int = 512
     """D, channels of features and embeddings."""
     surface_points: int = 60_000
-    """Ground-truth points, uniform by area over all that some training camera sees."""
+    """Ground-truth points, uniform by area over the surface that the training cameras see."""
     sparse_points: int = 20_000
     """Points of the COLMAP model, outliers included."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "size", tuple(self.size))
-        object.__setattr__(self, "feature_size", tuple(self.feature_size))
-        counts = {"seed": (self.seed, 0), "train_views": (self.train_views, 2), "test_views": (self.test_views, 1)}
-        counts |= {"feature_dim": (self.feature_dim, 16), "surface_points": (self.surface_points, 100)}
-        counts |= {"sparse_points": (self.sparse_points, 10)}
-        for name, size in (("size", self.size), ("feature_size", self.feature_size)):
-            if len(size) != 2:
-                raise ValueError(f"{name}: expected (height, width), got {size!r}; give two whole numbers")
-            counts |= {f"{name}[{i}]": (n, 8) for i, n in enumerate(size)}
-        for name, (value, low) in counts.items():
-            if not isinstance(value, int):
-                raise TypeError(f"{name}: expected a whole number, got {value!r}; give an int")
-            check_range(name, value, low)
+        least = {
+            "seed": 0,
+            "train_views": 2,
+            "test_views": 1,
+            "feature_dim": 16,
+            "surface_points": 100,
+            "sparse_points": 10,
+        }
+        for name, low in least.items():
+            check_whole(name, getattr(self, name), low)
+        for name in ("size", "feature_size"):
+            check_size(tuple(getattr(self, name)), name, 8)
+            object.__setattr__(self, name, tuple(getattr(self, name)))
         if self.test_views > self.train_views:
             raise ValueError(
                 f"test_views: expected at most train_views = {self.train_views} (each test camera stands between two "
@@ -98,16 +98,16 @@ def make_toy_room(path: str | Path, config: ToyConfig | None = None, *, progress
     `toy.json` (configuration and version).
 
     Args:
-        path: the folder to make. It appears whole or not at all. If it holds a toy room of the same configuration, that
-            one is returned untouched.
-        config: what to make; the default takes about half a minute on two CPU cores and 120 MB of disk.
+        path: the folder to make. It appears complete or not at all. If it holds a toy room with the same options,
+            nothing is written.
+        config: options; the default takes about half a minute on two CPU cores and 120 MB of disk.
         progress: show a bar over the views.
 
     Returns:
         `path`.
 
     Raises:
-        FileExistsError: if `path` exists and holds anything else.
+        FileExistsError: if `path` holds anything else.
     """
     path, config = Path(path), config or ToyConfig()
     about = {"version": VERSION, "config": json.loads(json.dumps(asdict(config)))}
@@ -116,7 +116,7 @@ def make_toy_room(path: str | Path, config: ToyConfig | None = None, *, progress
         return path
     solids = build_room(config.seed)
     noise = Noise(np.random.default_rng([config.seed, 3]))
-    cameras, testing = orbit(config.train_views, config.test_views, config.size)
+    cameras, testing = walk_cameras(config.train_views, config.test_views, config.size)
     with atomic_folder(path) as folder:
         for name in ("images", "labels", "depth", "features"):
             (folder / name).mkdir()
@@ -151,7 +151,7 @@ def _check_same(path: Path, about: dict[str, Any]) -> None:
 
 
 def _write_view(folder: Path, stem: str, view: View, embeddings: NDArray[np.float32], config: ToyConfig) -> None:
-    """Image, labels, depth and features of one view; a view's errors depend on the seed and its stem alone."""
+    """Image, labels, depth and features of one view; their errors depend only on the seed and the name."""
     from skimage.io import imsave
 
     imsave(folder / "images" / f"{stem}.png", view.image, check_contrast=False)
@@ -165,7 +165,7 @@ def _write_view(folder: Path, stem: str, view: View, embeddings: NDArray[np.floa
 def _visible_surface(
     solids: Sequence[Solid], cameras: Sequence[Camera], count: int, rng: np.random.Generator
 ) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.bool_]]:
-    """`count` points uniform by area over what some camera sees: points, normals, solid [P], seen by camera [P, C]."""
+    """Draw `count` points uniformly by area where a camera sees them: points, normals, solid [P], seen by camera [P, C]."""
     areas = np.array([solid.area() for solid in solids])
     found: list[tuple[Array, Array, NDArray[np.int64], NDArray[np.bool_]]] = []
     have, batch = 0, count
@@ -191,7 +191,7 @@ def _write_geometry(
     testing: NDArray[np.bool_],  # [C]
     config: ToyConfig,
 ) -> None:
-    """`surface.npz`, and the sparse model: some of its points, noisy and observed, with a few far outliers."""
+    """Write `surface.npz` and the sparse model: some of these points with noise, observations, and a few far outliers."""
     rng = np.random.default_rng([config.seed, 6])
     training = [camera for camera, test in zip(cameras, testing, strict=True) if not test]
     points, outward, which, seen = _visible_surface(solids, training, config.surface_points, rng)

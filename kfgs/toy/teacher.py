@@ -1,9 +1,9 @@
-"""Dense, teacher-like features for views whose labels are known, and the class embeddings they are made of.
+"""A simulated teacher: dense features for views whose labels are known, and the class embeddings they are made of.
 
-What a real open-vocabulary encoder gets wrong is imitated, independently in each view: whole regions drift towards a
-related class, borders are soft, confusion comes in smooth patches, the features follow colour and texture, and there is
-white noise and a norm that varies by pixel. Views disagree about all of it, which is what distillation into one 3-D field
-and clustering repair. It is a simulation: scores say how well a pipeline denoises, and nothing about a real encoder.
+It imitates the errors of a real open-vocabulary encoder, independently in each view: whole regions drift towards a related
+class, borders are soft, confusion comes in smooth patches, the features follow colour and texture, there is white noise, and
+the norm varies by pixel. Views disagree about all of this. Distillation into one 3-D field and clustering repair it. Scores on
+this simulation say how well a pipeline removes noise, and nothing about a real encoder.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def _unit(rows: NDArray[np.floating]) -> Floats:
 
 
 def class_embeddings(feature_dim: int, seed: int) -> Floats:  # [C, D] unit rows
-    """One embedding per class: a shared mean, directions shared within groups of classes, and a direction of its own."""
+    """One embedding per class: a direction shared by all, directions shared within groups, and a direction of the class alone."""
     rng = np.random.default_rng([seed, 2])
     shared = _unit(rng.standard_normal(feature_dim))
     groups = _unit(rng.standard_normal((len(GROUPS), feature_dim)))
@@ -64,7 +64,7 @@ def _evidence(
     rng: np.random.Generator,
     pixel: float,
 ) -> Floats:  # [C, h, w]
-    """How much speaks for each class: its share, plus regions that drift to a related class, plus smooth confusion."""
+    """Evidence for each class: its share, plus regions that drift to a related class, plus smooth confusion."""
     h, w, C = shares.shape
     evidence = np.ascontiguousarray(shares.transpose(2, 0, 1))
     similarity = embeddings @ embeddings.T - 2 * np.eye(C)
@@ -87,7 +87,7 @@ def teacher_features(
     size: tuple[int, int],  # (h, w)
     rng: np.random.Generator,
 ) -> NDArray[np.float16]:  # [D, h, w]
-    """The feature map of one view, in the axis order of Feature-3DGS; `rng` decides all of the view's errors."""
+    """The feature map of one view, in the axis order of Feature-3DGS; `rng` decides all errors of the view."""
     (h, w), (C, D) = size, embeddings.shape
     pixel = w / 64.0  # lengths are given for a map 64 wide
     evidence = _evidence(_resize(np.eye(C, dtype=np.float32)[labels], size), embeddings, rng, pixel)

@@ -1,7 +1,7 @@
 """Procedural surface colour: patterns over multi-octave noise, rich enough for SIFT on every surface.
 
-A colour is a function of the place on the object alone, so all views agree on it; detail finer than a pixel fades out
-instead of aliasing.
+A colour depends only on the place on the object, so all views agree on it. Detail finer than a pixel fades out instead
+of aliasing.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ LATTICE = 48  # random values along each edge of the noise volume, mirrored beyo
 
 @dataclass(frozen=True)
 class Texture:
-    """A pattern of one object: its kind, two or more colours (RGB in [0, 1]), its size in metres and its own seed."""
+    """The pattern of one object: its kind, two or more colours (RGB in [0, 1]), its size in metres, its seed."""
 
     kind: Literal["plaster", "blobs", "wood", "planks", "checks", "stripes", "painting"]
     colors: tuple[Color, ...]

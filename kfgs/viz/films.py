@@ -27,7 +27,7 @@ def save_turntable(
     names: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> Path:
-    """Write one round about a scene as a GIF or MP4 that can be played for ever.
+    """Write one round about a scene as a GIF or MP4 that can repeat for ever.
 
     A GIF takes about 60 kB a frame of 360x480 of textured colours, and 40 kB of labels: `orbit` bounds both.
 
@@ -35,9 +35,9 @@ def save_turntable(
         path: a name that ends in .gif or .mp4.
         shows: Gaussians, or several things by title, side by side (`save_animation`). The cameras go round the first
             Gaussians among them.
-        orbit: how they go round.
-        up: the world's up.
-        cameras: the scene's own cameras, which tell where up is when `up` is None.
+        orbit: number of cameras, size, elevation, ...; None: the defaults of `kfgs.cameras.Orbit`.
+        up: the world's up; None: from `cameras`, else +z.
+        cameras: the cameras of the scene, from which `up` is estimated.
         fps: frames per second.
         names: class names for a legend below.
         progress: called after each frame with (done, all).

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from oracles_alignment import align_similarity
+from oracles_cameras import align_similarity
 from scipy.spatial.transform import Rotation
 
 from kfgs.align import align_by_cameras

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from oracles_alignment import align_similarity
+from oracles_cameras import align_similarity
 from scipy.spatial.transform import Rotation
 
 from kfgs.align.starts import Moves, _fit, improve_on_grid, principal_axes, spread_rotations, thin

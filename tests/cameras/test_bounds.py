@@ -24,6 +24,7 @@ def test_full_coverage_is_the_plain_box() -> None:
     assert bounds.high.tolist() == [4, 1, 5]
     assert bounds.center.tolist() == [1, 0, 2]
     assert bounds.inside.all()
+    assert repr(bounds).endswith("inside=[3] bool)")
 
 
 def test_one_point_is_its_own_box() -> None:

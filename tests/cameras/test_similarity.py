@@ -167,3 +167,10 @@ def test_a_matrix_inverted_in_float32_is_read():
         rounded[3] = torch.tensor(row)
         with pytest.raises(ValueError, match="matrix: expected the last row 0 0 0 1"):
             Similarity.from_matrix(rounded)
+
+
+def test_a_similarity_shows_itself_in_one_line():
+    quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    shown = repr(Similarity(2.0, quarter, torch.tensor([0.5, 0.0, -1.0])))
+    assert shown == "Similarity(scale 2, rotation by 90 degrees, translation (0.5, 0, -1))"
+    assert "by 0 degrees" in repr(Similarity.identity())

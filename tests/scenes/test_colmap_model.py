@@ -66,6 +66,7 @@ def test_models_are_read_as_pycolmap_reads_them(tmp_path: Path, text: bool, rigs
 @pytest.mark.parametrize("folder", ["room_0/sparse/0", "lund_door/colmap_ground_truth"])
 def test_real_models_are_read_as_pycolmap_reads_them(shared_data: Path, folder: str) -> None:
     model = _read_alike(shared_data / folder)
+    assert len(repr(model)) < 100
     facts = (model.layout, len(model.cameras), len(model.images), len(model.points), model.rigs)
     assert facts == {"r": ("binary", 1, 180, 18543, 0), "l": ("text", 1, 12, 11384, 0)}[folder[0]]
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from kornia.geometry import resize
 from kornia.io import write_image
-from oracles_alignment import align_similarity
+from oracles_cameras import align_similarity
 from tqdm import tqdm
 
 from kfgs.scenes import SceneError, SfmConfig, load_scene, read_image, run_sfm

@@ -12,7 +12,7 @@ from skimage.io import imread
 from kfgs.cameras.camera import Camera
 from kfgs.cameras.projection import project_points, unproject_depth
 from kfgs.toy import room_folder as toy
-from kfgs.toy.render import orbit
+from kfgs.toy.render import walk_cameras
 from kfgs.toy.room import CLASSES, ROOM
 from kfgs.toy.room_folder import ToyConfig, make_toy_room
 
@@ -86,7 +86,7 @@ def test_layout_is_that_of_a_real_scene(room):
 
 
 def test_test_cameras_stand_between_training_cameras():
-    cameras, testing = orbit(24, 12, (192, 256))
+    cameras, testing = walk_cameras(24, 12, (192, 256))
     assert sum(testing) == 12
     assert not testing[0]
     centers = torch.stack([camera.center for camera in cameras])
@@ -200,22 +200,22 @@ def test_a_failed_run_leaves_nothing(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("change", "error", "message"),
+    ("change", "message"),
     [
-        ({"train_views": 1}, ValueError, r"train_views: expected a number in \[2"),
-        ({"test_views": 0}, ValueError, r"test_views: expected a number in \[1"),
-        ({"test_views": 5}, ValueError, "test_views: expected at most train_views = 4"),
-        ({"size": (72,)}, ValueError, r"size: expected \(height, width\)"),
-        ({"size": (72, 4)}, ValueError, r"size\[1\]: expected a number in \[8"),
-        ({"size": (72.0, 96)}, TypeError, r"size\[0\]: expected a whole number, got 72.0"),
-        ({"feature_size": (80, 24)}, ValueError, r"feature_size: expected at most size = \(72, 96\)"),
-        ({"feature_dim": 8}, ValueError, r"feature_dim: expected a number in \[16"),
-        ({"sparse_points": 1501}, ValueError, "sparse_points: expected at most surface_points = 1500"),
-        ({"seed": -1}, ValueError, r"seed: expected a number in \[0"),
+        ({"train_views": 1}, r"train_views: expected a number in \[2"),
+        ({"test_views": 0}, r"test_views: expected a number in \[1"),
+        ({"test_views": 5}, "test_views: expected at most train_views = 4"),
+        ({"size": (72,)}, r"size: expected \(height, width\)"),
+        ({"size": (72, 4)}, r"size \(width\): expected a number in \[8"),
+        ({"size": (72.0, 96)}, r"size \(height\): expected a whole number, got 72.0"),
+        ({"feature_size": (80, 24)}, r"feature_size: expected at most size = \(72, 96\)"),
+        ({"feature_dim": 8}, r"feature_dim: expected a number in \[16"),
+        ({"sparse_points": 1501}, "sparse_points: expected at most surface_points = 1500"),
+        ({"seed": -1}, r"seed: expected a number in \[0"),
     ],
 )
-def test_a_bad_configuration_is_refused(change, error, message):
-    with pytest.raises(error, match=message):
+def test_a_bad_configuration_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
         replace(SMALL, **change)
 
 
@@ -229,7 +229,7 @@ def test_pictures_are_rich_enough_for_structure_from_motion(tmp_path):
 
     (tmp_path / "images").mkdir()
     (tmp_path / "sparse").mkdir()
-    cameras, _ = orbit(24, 12, (192, 256))
+    cameras, _ = walk_cameras(24, 12, (192, 256))
     noise, solids = Noise(np.random.default_rng([0, 3])), build_room(0)
     for camera in cameras[12:18]:
         imsave(tmp_path / "images" / camera.name, render(solids, noise, camera).image)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from kfgs.toy.render import orbit, render
+from kfgs.toy.render import render, walk_cameras
 from kfgs.toy.room import CLASSES, GROUPS, build_room
 from kfgs.toy.teacher import class_embeddings, teacher_features
 from kfgs.toy.texture import Noise
@@ -27,7 +27,7 @@ def test_embeddings_are_unit_and_related_classes_are_closer():
 @pytest.fixture(scope="module")
 def views():
     noise = Noise(np.random.default_rng([0, 3]))
-    cameras, testing = orbit(24, 12, (192, 256))
+    cameras, testing = walk_cameras(24, 12, (192, 256))
     solids = build_room(0)
     return [render(solids, noise, c) for c, test in zip(cameras, testing, strict=True) if test][::3]
 
