@@ -204,5 +204,5 @@ def test_a_scene_without_points_is_told_before_features_are_asked_for(room, tmp_
     (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
     assert main(["fit", str(tmp_path), "--out", str(tmp_path / "run")]) == 1
     said = capsys.readouterr()
-    assert "note: no points: this transforms.json names no ply_file_path" in said.out
+    assert "note: no points: this transforms.json has no ply_file_path" in said.out
     assert said.err.startswith("error: SCENE: expected sparse points to start from, got 0")

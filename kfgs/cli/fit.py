@@ -8,20 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .files import check_alone, check_folder, open_field, open_splats
-from .options import (
-    Flag,
-    Given,
-    Maps,
-    MapTeacher,
-    Method,
-    Mode,
-    Positional,
-    Preset,
-    SceneFolder,
-    Training,
-    Views,
-    fit_config,
-)
+from .options import FieldMethod, Flag, Given, Maps, MapTeacher, Positional, SceneFolder, Training, Views, fit_config
 from .output import say, wrote
 from .teach import check_discard, choose_teacher, stored_maps
 
@@ -44,7 +31,7 @@ def demo(out: Path = Path("kfgs_demo"), seed: int = 0) -> None:
     from ..pipeline import demo as run_demo
     from ..toy.room_folder import ToyConfig
 
-    wrote(run_demo.run(out, fit_config(seed=seed), room=ToyConfig(seed=seed), report=say, progress=True))
+    wrote(run_demo.run(out, fit_config(FieldMethod(), seed=seed), room=ToyConfig(seed=seed), report=say, progress=True))
     say(f"next: kfgs view {out / 'run' / 'field'} --scene {out / 'scene'} --color {out / 'color.ply'}")
 
 
@@ -97,10 +84,8 @@ def fit(
     out: Path,
     *,
     splat: Given[Path] = None,
-    method: Method = "fuse",
-    preset: Preset = "cpu",
-    mode: Given[Mode] = None,
     discard_features: Flag = False,
+    method: FieldMethod,
     views: Views,
     maps: Maps,
     teacher: MapTeacher,
@@ -120,10 +105,6 @@ def fit(
     Args:
         out: Run folder; OUT/field receives the field. Running again continues where it stopped.
         splat: Any splat file of the scene, in its frame: the Gaussians to average onto.
-        method: fuse as described above; paper compresses maps per pixel and trains Gaussians on them (DF-3DGS).
-        preset: cpu (minutes on two cores) or paper (30,000 steps of training).
-        mode: For --method paper: adc+sc (codebook and autoencoder, 9 channels; the default), adc (codebook) or
-            decouple (raw features).
         discard_features: Delete the feature maps when the stages made of them are done. Later runs with the same options
             do not need them; runs with other options (another --splat, for example) do.
     """
@@ -132,10 +113,12 @@ def fit(
     from ..pipeline import fit_scene, write_training_pictures
     from ..pipeline.train import check_scene
 
-    config = fit_config(preset, method, mode, training.seed, training.steps, training.max_gaussians, views.split)
+    config = fit_config(
+        method, seed=training.seed, steps=training.steps, max_gaussians=training.max_gaussians, split=views.split
+    )
     config = dataclasses.replace(config, undistorted_features=maps.undistorted_features, device=training.device)
     check_folder("out", out)
-    if method == "paper":
+    if method.method == "paper":
         check_alone("splat", splat, "beside --method paper, which trains its own Gaussians")
     elif splat is not None:
         check_alone("steps", training.steps, "beside --splat, which needs no training")

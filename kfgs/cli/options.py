@@ -22,9 +22,6 @@ Name = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint=""
 Device = Annotated[str, tyro.conf.arg(metavar="NAME")]
 Several = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="TEXT")]
 
-Preset = Literal["cpu", "paper"]
-Method = Literal["fuse", "paper"]
-Mode = Literal["decouple", "adc", "adc+sc"]
 Level = Literal["default", "s", "m", "l"]  # of LangSplat: SAM's own choice of masks; subparts, parts, wholes
 
 
@@ -97,6 +94,18 @@ class MapTeacher(Teacher):
     """One pass over each picture instead of the exact evaluation at several scales (lseg)."""
     size: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N [N]", help_behavior_hint="")] = ()
     """Height and width of the maps (lseg), or the longer side of the pictures in pixels (the others)."""
+
+
+@dataclass(frozen=True)
+class FieldMethod:
+    """How a field is made."""
+
+    method: Literal["fuse", "paper"] = "fuse"
+    """fuse: average the features in 3-D, then compress; paper: compress each map, then train Gaussians on it (DF-3DGS)."""
+    preset: Literal["cpu", "paper"] = "cpu"
+    """cpu (minutes on two cores) or paper (30,000 steps of training)."""
+    mode: Given[Literal["decouple", "adc", "adc+sc"]] = None
+    """For --method paper: adc+sc (the default: codebook and autoencoder), adc (codebook) or decouple (raw features)."""
 
 
 @dataclass(frozen=True)
@@ -216,9 +225,8 @@ class Classes(SceneOption):
 
 
 def fit_config(
-    preset: Preset = "cpu",
-    method: Method = "fuse",
-    mode: Mode | None = None,
+    given: FieldMethod,
+    *,
     seed: int = 0,
     steps: int | None = None,
     max_gaussians: int | None = None,
@@ -228,9 +236,10 @@ def fit_config(
     from ..pipeline import FitConfig
     from ..pipeline.color import ColorConfig
 
+    method, mode = given.method, given.mode
     if mode is not None and method != "paper":
         raise ValueError(f"mode: expected none for method {method!r}, got {mode!r}; pass --method paper as well")
-    config = FitConfig.cpu() if preset == "cpu" else FitConfig.paper(method=method, color=ColorConfig.paper())
+    config = FitConfig.cpu() if given.preset == "cpu" else FitConfig.paper(method=method, color=ColorConfig.paper())
     config = replace(config, method=method, mode=mode or config.mode, seed=seed, split=split)
     if steps is not None:
         color = replace(config.color, field=config.color.field.with_steps(steps))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .files import check_alone, check_file, check_folder
-from .options import Device, Flag, Given, Level, MapTeacher, Method, Mode, Preset, SceneFolder, Views, fit_config
+from .options import Device, FieldMethod, Flag, Given, Level, MapTeacher, SceneFolder, Views, fit_config
 from .output import say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -69,37 +69,32 @@ def features(
 def plan(
     scene: SceneFolder,
     *,
-    preset: Preset = "cpu",
-    method: Method = "fuse",
-    mode: Given[Mode] = None,
-    steps: Given[int] = None,
-    store: Literal["keep", "discard", "recompute"] = "keep",
-    device: Device = "auto",
     features: Given[Path] = None,
     run: Given[Path] = None,
+    store: Literal["keep", "discard", "recompute"] = "keep",
+    steps: Given[int] = None,
+    device: Device = "auto",
     out: Given[Path] = None,
+    method: FieldMethod,
     teacher: MapTeacher,
     views: Views,
 ) -> None:
     """Predict disk, memory and minutes of `kfgs features` and `kfgs fit`, before either starts.
 
     Times are measured: the teacher sees one picture, and a few views and steps are tried. Maps that exist, and stages that
-    are finished, are counted.
+    are finished, are counted. Nothing is downloaded. Without --teacher it is lseg, which needs no weights here.
 
     Examples:
         kfgs plan scene/
         kfgs plan scene/ --teacher clip --weights openai/clip-vit-base-patch16 --store discard
 
     Args:
-        preset: As for `kfgs fit`.
-        method: As for `kfgs fit`.
-        mode: As for `kfgs fit`.
-        steps: As for `kfgs fit`.
-        store: What becomes of the feature maps: keep them; discard them when the field is made (kfgs fit
-            --discard-features); recompute instead of storing (kfgs fit --teacher).
-        device: As for `kfgs fit`.
         features: Folder of maps that exist, in any layout that `kfgs fit` reads; SCENE/features when not given.
         run: Run folder of `kfgs fit` (its --out), whose finished stages count as done.
+        store: What becomes of the feature maps: keep them; discard them when the field is made (kfgs fit
+            --discard-features); recompute instead of storing (kfgs fit --teacher).
+        steps: Training steps; the preset's when not given.
+        device: auto (a GPU if there is one), cpu or cuda.
         out: Also write the plan to this .json file.
     """
     from .._files import write_json
@@ -111,12 +106,13 @@ def plan(
         check_file("out", out)
     if features is not None and not features.is_dir():
         raise ValueError(f"features: expected a folder of maps, got {features}, which is none; leave --features out")
-    config = fit_config(preset, method, mode, 0, steps, None, views.split)
-    named = teacher_options(teacher.teacher or "lseg", teacher.fast, teacher.size)
-    tried = teacher.teacher is not None or teacher.weights is not None or named
+    config = fit_config(method, steps=steps, split=views.split)
+    name, weights = teacher.teacher, teacher.weights
+    named = teacher_options(name or "lseg", teacher.fast, teacher.size)
+    asked = name is not None or weights is not None or bool(named)
     found = plan_scene(
         load_scene(scene, images=views.images),
-        teacher=NamedTeacher(teacher.teacher or "lseg", teacher.weights, named) if tried else None,
+        teacher=NamedTeacher(name or "lseg", weights, named) if asked else None,
         config=dataclasses.replace(config, device=device),
         dense=store,
         features=scene_folder(scene) / "features" if features is None else features,
