@@ -20,11 +20,11 @@ from typing import Any, get_type_hints
 
 import tyro
 
+from .features import features, plan
 from .fit import color, demo, fit, sfm, uplift
 from .output import say, warnings_as_notes
 from .query import info, label, segment, select
 from .splats import attach, convert, edit
-from .teach import features, plan
 from .text import text
 from .view import view
 

@@ -7,10 +7,10 @@ import os
 from pathlib import Path
 from typing import Any, Literal
 
+from .features import check_discard, choose_teacher, stored_maps
 from .files import check_alone, check_folder, open_field, open_splats
 from .options import FieldMethod, Flag, Given, Maps, MapTeacher, Positional, SceneFolder, Training, Views, fit_config
 from .output import say, wrote
-from .teach import check_discard, choose_teacher, stored_maps
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
