@@ -214,7 +214,7 @@ pictures = [shot(camera, draw_scores, 2), shot(camera, draw_parts, 2)]
 Image.fromarray(viz.picture_grid([pictures], ["scores", "parts"]))
 
 # %% [markdown]
-# ## Recolour without drawing anew
+# ## Recolour without drawing again
 #
 # The actor stays; its colours are exchanged in the order of the Gaussians. That is how the explorer's sliders are quick.
 

@@ -75,7 +75,7 @@ def matches(head: bytes) -> bool:
 def read(path: Path) -> SplatFile:
     """Read all splat primitives of the default scene, each where its node puts it, into the axes of the 3DGS PLY.
 
-    Drafts are read too: scales as logarithms (told by negative ones, which the ratified text forbids), `_ROTATION` and
+    Drafts are read too: scales as logarithms (recognised by negative values, which the ratified text forbids), `_ROTATION` and
     `_SCALE`, and colour and opacity from COLOR_0 where their attributes are missing.
 
     `info` has `color_space`, `primitives`, and `ignored`, the number of primitives that hold no splats.

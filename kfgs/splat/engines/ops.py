@@ -1,10 +1,8 @@
 """The engines as operators of torch: what autograd, `torch.compile` and `torch.export` see of them.
 
-An engine works on plain tensors and knows nothing of gradients. Here its functions become opaque operators,
-`kfgs::composite`, `kfgs::project`, `kfgs::bin_tiles` and `kfgs::accumulate`, with backward passes and with fake kernels
-that tell the shapes without computing anything. How many Gaussians can be seen, how many pairs there are, and how long an
-engine's trace is (one axis, int32), is known after the fact. To load an exported program, import `kfgs.splat`
-first, which registers them.
+An engine works on plain tensors and has no gradients. Here its functions become opaque operators, `kfgs::composite`,
+`kfgs::project`, `kfgs::bin_tiles` and `kfgs::accumulate`, with backward passes and with fake kernels that give the shapes.
+Importing `kfgs.splat` registers them, which an exported program needs.
 """
 
 from __future__ import annotations
@@ -21,10 +19,7 @@ from .table import load
 
 
 def _operator(function: Callable[..., Any]) -> Any:
-    """The function as `torch.ops.kfgs.<its name>`, on every device.
-
-    What torch.library.custom_op does, which costs a second more: at an operator's first call it imports the compiler.
-    """
+    """The function as `torch.ops.kfgs.<its name>`. torch.library.custom_op would import the compiler, for a second."""
     name = function.__name__
     torch.library.define(f"kfgs::{name}", infer_schema(function, mutates_args=()))
     torch.library.impl(f"kfgs::{name}", "default", function)
@@ -32,11 +27,7 @@ def _operator(function: Callable[..., Any]) -> Any:
 
 
 def _refuse(ctx: Any, *grads: Tensor) -> None:
-    """The gradient of a backward pass.
-
-    Raises:
-        NotImplementedError: always.
-    """
+    """The gradient of a backward pass: an error."""
     raise NotImplementedError(
         "backward: expected one of first order, got the gradient of a gradient, which compiled engines do not have; "
         "leave out create_graph=True (project(..., engine='reference') has second derivatives, composite has not)"

@@ -22,7 +22,7 @@ class PanelPane:
 
     Args:
         plotter: its window is made wider by the panel.
-        view: asked for what the panel says whenever that is drawn anew.
+        view: asked for what the panel says each time it is drawn.
     """
 
     def __init__(self, plotter: pv.Plotter, view: Callable[[], PanelView]) -> None:
