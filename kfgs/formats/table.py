@@ -3,6 +3,7 @@
 A format is one module of this package with
 
 - `NAME`, `SUFFIXES`: what it is called, and the endings of its files;
+- `MAGIC`, if all files begin with the same bytes: then the ending of a name alone never chooses this format;
 - `matches(head)`: whether a file that begins with these bytes (up to 64 KiB) is one;
 - `read(path) -> SplatFile`;
 - `write(path, splats) -> tuple[str, ...]`: write the file, whole or not at all, and say in words what it could not hold

@@ -13,7 +13,7 @@ from cases_splat import TOLERANCE, assert_close_but_for_thresholds, random_splat
 from kfgs.splat import Tiles, accumulate_pixels, available_engines, bin_tiles, composite
 from kfgs.splat.engines import table
 
-ENGINES = available_engines("cpu")  # what runs on a GPU is asked the same in test_triton_gpu.py
+ENGINES = available_engines("cpu")  # what runs on a GPU is asked the same in test_triton.py
 OTHERS = [name for name in ENGINES if name != "reference"]
 
 every_engine = pytest.mark.parametrize("engine", ENGINES)

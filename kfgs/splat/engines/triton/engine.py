@@ -30,7 +30,7 @@ products of high and low parts have float32's accuracy, still on the tensor core
 
 
 class Launch(NamedTuple):
-    """How a kernel is cut into programs; see `triton_kernels`."""
+    """How a kernel is cut into programs; see `kernels`."""
 
     pixels: int  # most pixels of a program
     chunk: int  # Gaussians at a time
@@ -50,7 +50,7 @@ LAUNCHES = {
 """A warp has 32 threads: warps * 32 = pixels, so each thread holds a chunk of one pixel, and no running product or sum
 crosses threads. A chunk of 16 is the shortest axis that tensor-core products take. Chosen so that, compiled for sm_80,
 sm_90 and sm_100, registers (at most 255 a thread) hardly spill, and shared memory stays below the 99 KB of the smaller
-GPUs (see tests/splat/test_triton_gpu.py). Not tuned by timing: none of this has been timed on a GPU."""
+GPUs (see tests/splat/test_triton.py). Not tuned by timing: none of this has been timed on a GPU."""
 
 SMALLEST = 16
 """Least size of an axis of a tensor-core product: less is padded."""

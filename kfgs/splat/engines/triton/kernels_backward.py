@@ -1,4 +1,4 @@
-"""The Triton kernel of the backward pass: the layout of `triton_kernels`, front to back again.
+"""The Triton kernel of the backward pass: the layout of `kernels`, front to back again.
 
 With G the gradient of a pixel's maps and g that of its alpha, the loss's slope in the weight of Gaussian k is
 D_k = f_k · G + g, and all that is composited adds up to R = maps · G + alpha g. So walking front to back, what lies
