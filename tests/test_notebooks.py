@@ -4,7 +4,9 @@ import ast
 import importlib
 import importlib.util
 import json
+import re
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -170,3 +172,13 @@ def test_unknown_numbers_are_refused(runner, tmp_path, capsys):
     with pytest.raises(SystemExit):
         runner.main(["4", "--sources", str(tmp_path)])
     assert "expected one of [1]" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "path", [*SOURCES, NOTEBOOKS / "README.md", NOTEBOOKS.parent / "README.md"], ids=lambda p: p.name
+)
+def test_every_extra_that_is_named_exists(path):
+    text = path.read_text(encoding="utf-8")
+    declared = tomllib.loads((NOTEBOOKS.parent / "pyproject.toml").read_text(encoding="utf-8"))
+    extras = {extra for found in re.findall(r'"\.\[([^]]*)\]"', text) for extra in found.split(",")}
+    assert extras <= declared["project"]["optional-dependencies"].keys()

@@ -152,7 +152,8 @@ def _load(path: Path, data: bytes, names: PickleNames, *, mapped: bool) -> Any:
             if names.called - unknown:  # torch would make sparse and nested tensors, or a bytearray of any size
                 odd = ", ".join(sorted(names.called - unknown))
                 raise TorchFileError(
-                    f"one with something else than dense tensors ({one_line(odd, 120)})", "save them dense"
+                    f"one with something else than dense tensors ({one_line(odd, 120)})",
+                    "save the state_dict alone, dense",
                 )
             classes: list[Any] = [(_placeholder(name, names.filled.get(name)), name) for name in unknown]
             with safe_globals([*classes, Placeholder]):
@@ -205,11 +206,27 @@ def _pickle_in_zip(file: BinaryIO) -> tuple[bytes, set[int]]:
                 )
             if any(info.compress_type or info.flag_bits & 1 for info in records.values()):
                 raise TorchFileError("an archive that is compressed or encrypted, which torch.save never does")
-            return archive.read(pickles[0]), {info.file_size for info in records.values()}
+            data = archive.read(pickles[0])
+            if _reads_otherwise(file, archive, data):
+                raise TorchFileError("a zip archive that two readers read differently, which torch.save never writes")
+            return data, {info.file_size for info in records.values()}
     except TorchFileError:
         raise
     except Exception as error:  # zipfile on hostile bytes raises struct.error, ValueError, NotImplementedError, ...
         raise TorchFileError("a zip archive that is damaged, or without its end: the download was cut short") from error
+
+
+def _reads_otherwise(file: BinaryIO, archive: zipfile.ZipFile, data: bytes) -> bool:
+    """Whether torch finds another pickle in the archive than zipfile, so that the wrong one would be checked.
+
+    torch's reader ignores the case of names, and takes the place of the directory literally, where zipfile allows for
+    bytes before the archive.
+    """
+    names = [name.lower() for name in archive.namelist()]
+    end = zipfile._EndRecData(file)  # type: ignore[attr-defined]
+    if len(set(names)) != len(names) or end is None or end[zipfile._ECD_OFFSET] != archive.start_dir:  # type: ignore[attr-defined]
+        return True
+    return bool(torch._C.PyTorchFileReader(str(file.name)).get_record("data.pkl") != data)
 
 
 def _pickle_in_legacy(file: BinaryIO, head: bytes) -> tuple[bytes, PickleNames]:

@@ -9,6 +9,7 @@ import os
 import pickle
 import re
 import signal
+import struct
 import sys
 import tracemalloc
 import urllib.parse
@@ -433,3 +434,42 @@ def test_a_zip_archive_of_torch_must_not_be_named_safetensors(tmp_path: Path) ->
     torch.save({"a": torch.ones(2)}, tmp_path / "a.safetensors")
     with pytest.raises(TorchFileError, match=tells("rename")):
         load_torch_file(tmp_path / "a.safetensors")
+
+
+def _in_other_case(good: dict[str, bytes], evil: bytes) -> bytes:
+    """torch's reader takes x/DATA.PKL for x/data.pkl."""
+    return zip_of(good | {"x/DATA.PKL": evil})
+
+
+def _with_two_directories(good: dict[str, bytes], evil: bytes) -> bytes:
+    """An archive whose end points to the directory of another one before it, which zipfile takes for other bytes."""
+
+    def parts(records: dict[str, bytes]) -> tuple[bytes, bytes, bytes]:
+        data = zip_of(records)
+        end = data.rindex(b"PK\5\6")
+        start = struct.unpack_from("<L", data, end + 16)[0]
+        return data[:start], data[start:end], data[end:]
+
+    evil_body, evil_directory, end = parts(good | {"x/data.pkl": evil})
+    body, directory, _ = parts(good)
+    assert len(directory) == len(evil_directory)
+    moved, place = bytearray(directory), 0
+    while place < len(moved):
+        lengths = struct.unpack_from("<3H", moved, place + 28)
+        (offset,) = struct.unpack_from("<L", moved, place + 42)
+        struct.pack_into("<L", moved, place + 42, offset - len(body) + len(evil_body))
+        place += 46 + sum(lengths)
+    return evil_body + evil_directory + body + bytes(moved) + end
+
+
+@pytest.mark.parametrize("container", [_in_other_case, _with_two_directories])
+def test_torch_reads_the_pickle_that_was_checked(tmp_path: Path, container) -> None:
+    """Python's zipfile and torch's reader must not find different pickles in one archive."""
+    good, evil = pickled({"weights": 1}), pickled({"a longer name": 2})
+    data = container({"x/data.pkl": good, "x/version": b"3\n"}, evil)
+    (tmp_path / "a.pt").write_bytes(data)
+    with zipfile.ZipFile(tmp_path / "a.pt") as seen:
+        assert seen.read("x/data.pkl") == good
+    assert torch._C.PyTorchFileReader(str(tmp_path / "a.pt")).get_record("data.pkl") == evil
+    with pytest.raises(TorchFileError, match=tells("two readers read differently")):
+        load_torch_file(tmp_path / "a.pt")
