@@ -30,6 +30,7 @@ def main() -> None:
     start = GaussianParams.from_points(scene.points, 3, generator=torch.Generator().manual_seed(0))
     config = FieldConfig(
         steps=args.steps,
+        extent=scene.extent,
         render_scale=1.0,
         densify_from=200,
         densify_until=2500,
@@ -39,7 +40,7 @@ def main() -> None:
         features_lr=0.01,
     )
     cameras = [scene.cameras[i] for i in views]
-    fit_field(start, cameras, pictures, config, extent=scene.extent, callback=lambda row: print(row, flush=True))
+    fit_field(start, cameras, pictures, config, progress=lambda row: print(row, flush=True))
 
 
 if __name__ == "__main__":

@@ -44,7 +44,7 @@ def main() -> None:
         if row["step"] % 250 == 0:
             print(f"{row}, load {loads[-1]:.1f}", flush=True)
 
-    result = fit_color(scene, args.out, config, report=print, callback=tell)
+    result = fit_color(scene, args.out, config, report=print, progress=tell)
     chosen = [scene.stem(i) for i in scene.views("test")]
     chosen = chosen[:: max(1, len(chosen) // max(1, args.pictures))][: args.pictures]
 

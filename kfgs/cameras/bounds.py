@@ -1,13 +1,16 @@
-"""The box of a point cloud, from statistics that a few far outliers do not change."""
+"""How large a scene is: the box of its points without far outliers, and the reach of its cameras."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from .._card import short_repr
 from .._check import check_range, check_shapes
+from .camera import Camera
 
 
 class Bounds(NamedTuple):
@@ -64,3 +67,24 @@ def robust_bounds(
     low, high = low - pad, high + pad
     inside = ((points.detach() >= low) & (points.detach() <= high)).all(-1)
     return Bounds(ordered[last // 2], low, high, inside)
+
+
+def camera_extent(
+    cameras: Sequence[Camera],
+    points: Tensor,  # [P, 3]
+) -> float:
+    """1.1 times the largest distance of a camera from the cameras' mean, in world units: the size of a scene in 3DGS.
+
+    If all cameras stand in one place, it is the median distance to the points, or 1 without points.
+
+    Raises:
+        ValueError: if there are no cameras.
+    """
+    if len(cameras) == 0:
+        raise ValueError("cameras: expected at least one view, got none; the extent of an empty scene is unknown")
+    centers = torch.stack([camera.center.detach().double().cpu() for camera in cameras])
+    mean = centers.mean(0)
+    radius = 1.1 * float((centers - mean).norm(dim=-1).max())
+    if radius > 1e-6 * (1 + float(mean.norm())):
+        return radius
+    return float((points.detach().double().cpu() - mean).norm(dim=-1).median()) if len(points) else 1.0

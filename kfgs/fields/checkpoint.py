@@ -42,9 +42,10 @@ def identify_fit(
 ) -> dict[str, str]:
     """A digest of each thing a fit depends on. For the targets these are their number and the first map.
 
-    Near planes count where one is not at 0.2: checkpoints from before cameras had one stay valid.
+    The extent of the config may be None, so the caller puts the one in use into `others`. Near planes count where one is not
+    at 0.2: checkpoints from before cameras had one stay valid.
     """
-    options = {name: value for name, value in asdict(config).items() if name != "checkpoint_every"}
+    options = {name: value for name, value in asdict(config).items() if name not in ("checkpoint_every", "extent")}
     views = [tensor for camera in cameras for tensor in (camera.viewmat, camera.K, torch.tensor(camera.size))]
     near = torch.tensor([camera.near for camera in cameras], dtype=torch.float64)
     views += [near] if (near != NEAR).any() else []

@@ -20,6 +20,9 @@ class FieldConfig:
 
     steps: int = 30_000
     """Optimisation steps, one view each."""
+    extent: float | None = None
+    """Size of the scene in world units; it scales the means' learning rate and what counts as a large Gaussian. None computes
+    it: `fit_scene` and `fit_color` take `Scene.extent`, `fit_field` the same formula for its own cameras."""
     means_lr: float = 1.6e-4
     """Learning rate of the means at step 0, in units of the scene extent."""
     means_lr_final: float = 1.6e-6
@@ -69,7 +72,7 @@ class FieldConfig:
     engine: str = "auto"
     """Compositing engine, as `kfgs.splat.rasterize` takes it."""
     report_every: int = 50
-    """Steps between entries of the history (and calls of the callback)."""
+    """Steps between entries of the history (and calls of a `progress` function)."""
     checkpoint_every: int = 1_000
     """Steps between checkpoints, when `fit_field` is given a file for them."""
 
@@ -80,6 +83,8 @@ class FieldConfig:
             _check_count(name, getattr(self, name), 0)
         if self.max_gaussians is not None:
             _check_count("max_gaussians", self.max_gaussians, 1)
+        if self.extent is not None:
+            check_range("extent", self.extent, 0, closed=_POSITIVE)
         for name in ("means_lr", "means_lr_final", "adam_eps"):
             check_range(name, getattr(self, name), 0, closed=_POSITIVE)
         rates = ("quats_lr", "scales_lr", "opacities_lr", "features_lr", "sh0_lr", "sh_rest_lr")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,15 +12,14 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from .._card import short_repr
-from .._check import check_range
+from .._progress import Progress
 from ..cameras import Camera
+from ..cameras.bounds import camera_extent
 from .checkpoint import identify_fit, read_checkpoint, write_checkpoint
 from .config import FieldConfig
 from .loss import Loss, l1_loss
 from .params import GaussianParams
 from .trainer import Trainer
-
-Callback = Callable[[dict[str, Any]], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +42,9 @@ def fit_field(
     targets: Sequence[Tensor],  # C maps [h, w, D]
     config: FieldConfig | None = None,
     *,
-    extent: float,
     loss: Loss = l1_loss,
     generator: torch.Generator | None = None,
-    progress: bool = False,
-    callback: Callback | None = None,
+    progress: Progress = False,
     checkpoint: str | Path | None = None,
 ) -> FieldFit:
     """Train Gaussians until their renderings match the targets (Eq. 4), growing and pruning them on the way.
@@ -59,13 +56,12 @@ def fit_field(
         cameras: C posed cameras without distortion.
         targets: one map per camera, of any size, NaN where nothing is known (`l1_loss`); read one at a time
             and only by `len` and index, so they may live on disk.
-        config: the paper's values when not given.
-        extent: size of the scene in world units (`Scene.extent`); scales the means' learning rate and what counts as a
-            large Gaussian.
+        config: the paper's values when not given. If its `extent` is None, the extent of `cameras` takes its place, which is
+            1.1 times their largest distance from their mean.
         loss: compares a rendered map, its alpha and the target. For colours, `ColorLoss`.
         generator: draws the views' order and the places of split Gaussians; None stands for seed 0.
-        progress: show a bar with loss, number of Gaussians and time left.
-        callback: called with each new row of the history. To stop early, raise from it; a checkpoint stays behind.
+        progress: True shows a bar with loss, number of Gaussians and time left. A function is called with each new row of
+            the history. To stop early, raise from it; a checkpoint stays behind.
         checkpoint: a file that is written every `checkpoint_every` steps and at the end. If it exists, the fit
             continues from it, and its result is bit for bit that of an undisturbed run (on one machine's CPU; a GPU adds
             gradients up in no fixed order).
@@ -81,8 +77,8 @@ def fit_field(
     """
     config = config or FieldConfig()
     generator = generator or torch.Generator().manual_seed(0)
-    check_range("extent", extent, 0, closed=(False, False))
     _check_views(params, cameras, targets)
+    extent = camera_extent(cameras, params.means) if config.extent is None else config.extent
     trainer = Trainer(params, cameras, targets, config, extent, loss, generator)
     path, identity = (Path(checkpoint) if checkpoint is not None else None), {}
     if path is not None:
@@ -91,14 +87,14 @@ def fit_field(
         saved = read_checkpoint(path, identity)
         if saved is not None:
             trainer.restore_(saved)
-    with tqdm(total=config.steps, initial=trainer.step, disable=not progress, desc="field", unit="step") as bar:
+    with tqdm(total=config.steps, initial=trainer.step, disable=progress is not True, desc="field", unit="step") as bar:
         while trainer.step < config.steps:
             row = trainer.advance_()
             bar.update()
             if row is not None:
                 bar.set_postfix(loss=f"{row['loss']:.4f}", Gaussians=row["count"], refresh=False)
-                if callback is not None:
-                    callback(dict(row))
+                if callable(progress):
+                    progress(dict(row))
             if path is not None and (trainer.step % config.checkpoint_every == 0 or trainer.step == config.steps):
                 write_checkpoint(path, trainer.snapshot(), identity)
     return FieldFit(trainer.optimizer.params.map(torch.Tensor.detach), trainer.history)

@@ -15,13 +15,14 @@ from torch import Tensor
 
 from .._check import check_range, check_whole
 from .._files import read_json
+from .._progress import Progress
 from ..cameras import Camera, resize_map
 from ..fields import ColorLoss, FieldConfig, FieldFit, GaussianParams, fit_field
 from ..formats import read_splats, write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene
 from .stages import Run, Stage, describe_lens, digest_scene, digest_tensors, stage_generator
-from .train import check_scene, field_stage, training_device
+from .train import check_scene, field_stage, training_device, with_extent
 
 
 @dataclass(frozen=True)
@@ -177,8 +178,7 @@ def fit_color(
     config: ColorConfig | None = None,
     *,
     report: Callable[[str], None] | None = None,
-    progress: bool = False,
-    callback: Callable[[dict[str, Any]], None] | None = None,
+    progress: Progress = False,
     device: str | torch.device = "auto",
 ) -> ColorResult:
     """Fit an ordinary 3DGS colour field to a scene's pictures, resuming what a run folder already holds.
@@ -190,8 +190,7 @@ def fit_color(
         folder: the run folder; `folder/color.ply` receives the Gaussians.
         config: the schedule; that of 3DGS when not given.
         report: receives one line per stage.
-        progress: show a bar.
-        callback: receives the rows of the history as they appear.
+        progress: True shows a bar; a function receives the rows of the history as they appear.
         device: where to train, see `training_device`; the result lies on the CPU.
 
     Raises:
@@ -201,15 +200,12 @@ def fit_color(
     config = config or ColorConfig.paper()
     scene.views(config.split)  # refuses a split without views
     check_scene(scene)
-    options = {"progress": progress, "callback": callback}
-    return make_color(Run(Path(folder), report), scene, config, training_device(device), options)
+    return make_color(Run(Path(folder), report), scene, config, training_device(device), progress)
 
 
-def make_color(
-    run: Run, scene: Scene, config: ColorConfig, device: torch.device, options: dict[str, Any]
-) -> ColorResult:
-    """The colour stage of a run, and the PLY file of its Gaussians. `options` are `progress` and `callback` of `fit_field`."""
-    params = _color_stage(run, scene, scene.views(config.split), config, device, options)
+def make_color(run: Run, scene: Scene, config: ColorConfig, device: torch.device, progress: Progress) -> ColorResult:
+    """The colour stage of a run, and the PLY file of its Gaussians."""
+    params = _color_stage(run, scene, scene.views(config.split), config, device, progress)
     result = ColorResult(params.activated().detach(), run.folder / "color.ply", run.stages)
     if not run.look_only and not _is_saved(result):
         write_splats(result.path, result.gaussians)
@@ -240,13 +236,15 @@ def find_color(run: Run, scene: Scene, config: ColorConfig) -> Gaussians | None:
 
 def _inputs(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig) -> dict[str, Any]:
     """What decides the colour stage."""
+    options = asdict(replace(config, field=with_extent(config.field, scene)))
+    extent = options["field"].pop("extent")
     return {
         "pictures": run.digests([scene.image_paths[i] for i in views]),
         "lenses": None if scene.lenses is None else [describe_lens(scene.lenses[i]) for i in views],
         "scene": digest_scene(scene, views),
         "colors": digest_tensors(scene.colors),
-        "extent": float(scene.extent),
-        "config": asdict(config),
+        "extent": extent,
+        "config": options,
     }
 
 
@@ -256,7 +254,7 @@ def _color_stage(
     views: Sequence[int],
     config: ColorConfig,
     device: torch.device,
-    options: dict[str, Any],
+    progress: Progress,
 ) -> GaussianParams:
     inputs = _inputs(run, scene, views, config)
 
@@ -274,12 +272,11 @@ def _color_stage(
             start.map(lambda value: value.to(device)),
             cameras,
             Photos(scene, views, cameras),
-            config.field,
-            extent=scene.extent,
+            with_extent(config.field, scene),
             loss=ColorLoss(config.ssim_weight),
             generator=generator,
+            progress=progress,
             checkpoint=checkpoint,
-            **options,
         )
 
     return field_stage(run, "color", inputs, train)[0]

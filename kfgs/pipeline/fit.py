@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from .._files import digest_value, read_json, write_json
+from .._progress import Progress
 from ..cameras import Camera
 from ..fields import (
     FieldFit,
@@ -44,7 +45,7 @@ from .config import FitConfig
 from .fuse import answers_stage, find_geometry, uplift_stage, without_lens
 from .maps import KnownFeatures, Maps, UndistortedMaps, check_readable, map_digests, map_shape
 from .stages import Run, Stage, UnfinishedError, describe_lens, digest_scene, stage_generator
-from .train import check_scene, field_stage, training_device
+from .train import check_scene, field_stage, training_device, with_extent
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +79,7 @@ class _Job:
     """What decides the maps, as JSON."""
     config: FitConfig
     device: torch.device
-    options: dict[str, Any]
-    """`progress` and `callback` of what is trained."""
+    progress: Progress
 
     @property
     def cameras(self) -> list[Camera]:
@@ -97,7 +97,7 @@ def _codebook_stage(job: _Job) -> tuple[Codebook, Stage]:
 
     def make(folder: Path) -> None:
         check_readable(job.maps, "the codebook")
-        fit = fit_codebook(job.maps, config.codebook, generator=job.generator("codebook"), **job.options)
+        fit = fit_codebook(job.maps, config.codebook, generator=job.generator("codebook"), progress=job.progress)
         fit.codebook.save(folder / "codebook.safetensors")
         if fit.note is not None and run.report is not None:
             run.report(f"note: {fit.note}")
@@ -111,7 +111,7 @@ def _codebook_stage(job: _Job) -> tuple[Codebook, Stage]:
 def _index_stage(job: _Job, codebook: Codebook, upstream: Stage) -> tuple[IndexMaps, Stage]:
     """Quantisation, Eq. 5: the index map M of every view; a killed one goes on with the view it was at."""
     inputs = {"features": job.features, "codebook": upstream.key}
-    scratch, progress = job.run.scratch("index_maps", inputs), bool(job.options["progress"])
+    scratch, progress = job.run.scratch("index_maps", inputs), job.progress is True
 
     def make(folder: Path) -> None:
         check_readable(job.maps, "quantisation")
@@ -127,7 +127,9 @@ def _autoencoder_stage(job: _Job, codebook: Codebook, upstream: Stage) -> tuple[
     config = job.config
 
     def make(folder: Path) -> None:
-        fit = fit_autoencoder(codebook, config.autoencoder, generator=job.generator("autoencoder"), **job.options)
+        fit = fit_autoencoder(
+            codebook, config.autoencoder, generator=job.generator("autoencoder"), progress=job.progress
+        )
         fit.autoencoder.save(folder / "autoencoder.safetensors")
         write_json(folder / "history.json", fit.history)
 
@@ -139,10 +141,13 @@ def _autoencoder_stage(job: _Job, codebook: Codebook, upstream: Stage) -> tuple[
 def _field_stage(job: _Job, targets: Sequence[Tensor], inputs: dict[str, Any]) -> GaussianParams:
     """The decoupled field, Sec. 3.2: Gaussians whose rendered latents follow the targets (Eq. 4)."""
     scene, config = job.scene, job.config
+    field = with_extent(config.field, scene)
+    options = asdict(field)
+    extent = options.pop("extent")
     inputs = inputs | {
         "scene": digest_scene(scene, job.views),
-        "extent": float(scene.extent),
-        "config": asdict(config.field),
+        "extent": extent,
+        "config": options,
         "seed": config.seed,
     }
 
@@ -150,8 +155,9 @@ def _field_stage(job: _Job, targets: Sequence[Tensor], inputs: dict[str, Any]) -
         generator = job.generator("field")
         start = GaussianParams.from_points(scene.points, int(targets[0].shape[-1]), generator=generator)
         start = start.map(lambda value: value.to(job.device))
-        options: dict[str, Any] = {"generator": generator, "checkpoint": checkpoint, **job.options}
-        return fit_field(start, job.cameras, targets, config.field, extent=scene.extent, **options)
+        return fit_field(
+            start, job.cameras, targets, field, generator=generator, progress=job.progress, checkpoint=checkpoint
+        )
 
     return field_stage(job.run, "field", inputs, train)[0]
 
@@ -188,8 +194,7 @@ def fit_scene(
     *,
     splat: Gaussians | SplatFile | str | Path | None = None,
     report: Callable[[str], None] | None = None,
-    progress: bool = False,
-    callback: Callable[[dict[str, Any]], None] | None = None,
+    progress: Progress = False,
 ) -> FitResult:
     """Make a semantic field of a scene, resuming whatever a run folder already holds.
 
@@ -202,8 +207,7 @@ def fit_scene(
         splat: of method `fuse`, the Gaussians to fuse onto, in the scene's frame: a splat file or its content. None trains them
             on the pictures with `config.color` (`folder/color.ply`), or takes those of a longer `fit_color` in the same folder.
         report: receives one line per stage.
-        progress: show progress bars.
-        callback: receives the history rows of every trained stage as they appear.
+        progress: True shows bars; a function receives the history rows of every trained stage as they appear.
 
     Raises:
         ValueError: if the counts of views and maps differ, a camera has distortion, there is no such device, a splat is given
@@ -216,7 +220,7 @@ def fit_scene(
     if splat is not None and config.method == "paper":
         raise ValueError("splat: expected none for method 'paper', which trains its own Gaussians; leave it out")
     run, teacher = Run(Path(folder), report), getattr(maps, "identity", None)
-    job = _job(run, scene, maps, config, target_device, {"progress": progress, "callback": callback})
+    job = _job(run, scene, maps, config, target_device, progress)
     found, about = _make_field(job, splat)
     done = FitResult(found, Path(folder), run.stages)
     info = {
@@ -241,10 +245,9 @@ def _make_field(job: _Job, splat: Gaussians | SplatFile | str | Path | None) -> 
     config = job.config
     if config.method == "paper":
         return answers_stage(job.run, _paper_stages(job), job.cameras), {"mode": config.mode}
-    geometry, where = find_geometry(job.run, job.scene, splat, _color_config(config), job.device, job.options)
-    progress = bool(job.options["progress"])
+    geometry, where = find_geometry(job.run, job.scene, splat, _color_config(config), job.device, job.progress)
     inputs = {"features": job.features, "config": asdict(config.uplift), "seed": config.seed}
-    found = uplift_stage(job.run, geometry, job.cameras, job.maps, config.uplift, inputs, progress)
+    found = uplift_stage(job.run, geometry, job.cameras, job.maps, config.uplift, inputs, job.progress is True)
     return found, {"geometry": where}
 
 
@@ -267,13 +270,13 @@ def _paper_stages(job: _Job) -> SemanticField:
     return SemanticField(_field_stage(job, targets, inputs).activated().detach(), codebook, autoencoder)
 
 
-def _job(run: Run, scene: Scene, maps: Maps, config: FitConfig, device: torch.device, options: dict[str, Any]) -> _Job:
+def _job(run: Run, scene: Scene, maps: Maps, config: FitConfig, device: torch.device, progress: Progress) -> _Job:
     views = scene.views(config.split)
     straight = without_lens(scene, maps, config)
     lenses = straight.lenses if isinstance(straight, UndistortedMaps) else None
     removed = None if lenses is None else digest_value([describe_lens(lens) for lens in lenses])
     features = {"files": map_digests(run, straight), "lenses": removed}
-    return _Job(run, scene, views, straight, features, config, device, options)
+    return _Job(run, scene, views, straight, features, config, device, progress)
 
 
 def finished_stages(scene: Scene, maps: Maps | None, folder: str | Path, config: FitConfig) -> set[str]:
@@ -286,12 +289,11 @@ def finished_stages(scene: Scene, maps: Maps | None, folder: str | Path, config:
         config: as for `fit_scene`.
     """
     run, device = Run(Path(folder), look_only=True), torch.device("cpu")
-    options = {"progress": False, "callback": None}
     with suppress(UnfinishedError):
         if maps is not None:
-            _make_field(_job(run, scene, maps, config, device, options), None)
+            _make_field(_job(run, scene, maps, config, device, False), None)
         elif config.method == "fuse":
-            find_geometry(run, scene, None, _color_config(config), device, options)
+            find_geometry(run, scene, None, _color_config(config), device, False)
     names = {stage.name for stage in run.stages}
     longer = config.method == "fuse" and find_color(run, scene, _color_config(config)) is not None
     return names | {"color"} if longer else names

@@ -12,6 +12,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from .._files import write_json
+from .._progress import Progress
 from ..cameras import Camera
 from ..fields import Answers, Seen, SemanticField, UpliftConfig, fused_answers, remember, uplift_maps
 from ..formats import SplatFile, read_splats
@@ -32,7 +33,7 @@ def find_geometry(
     splat: Gaussians | SplatFile | str | Path | None,
     config: ColorConfig,
     device: torch.device,
-    options: dict[str, Any],
+    progress: Progress,
 ) -> tuple[Gaussians, str]:
     """The Gaussians to fuse onto, and where they come from.
 
@@ -47,7 +48,7 @@ def find_geometry(
         return read_splats(splat).gaussians, str(splat)
     found = find_color(run, scene, config)
     if found is None:
-        found = make_color(run, scene, config, device, options).gaussians
+        found = make_color(run, scene, config, device, progress).gaussians
     return found, "trained on the pictures"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from .._files import write_json
-from ..fields import FieldFit, GaussianParams
+from ..fields import FieldConfig, FieldFit, GaussianParams
 from ..scenes import Scene
 from ..splat import available_engines
 from .stages import Run, Stage
@@ -51,6 +52,11 @@ def check_scene(scene: Scene) -> None:
             f"scene: expected sparse points to start from, got {len(scene.points)}; a transforms.json needs a "
             "ply_file_path, or estimate the scene with `kfgs sfm`"
         )
+
+
+def with_extent(config: FieldConfig, scene: Scene) -> FieldConfig:
+    """The options with the scene's extent, unless they have one of their own."""
+    return replace(config, extent=float(scene.extent if config.extent is None else config.extent))
 
 
 def field_stage(

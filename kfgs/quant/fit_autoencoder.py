@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from .._card import short_repr
 from .._check import check_range, check_whole
+from .._progress import Progress
 from .._rows import row_norms, unit_rows
 from .autoencoder import Autoencoder, Layer, mlp, unit_latents
 from .codebook import Codebook
@@ -92,8 +93,7 @@ def fit_autoencoder(
     config: AutoencoderConfig = AutoencoderConfig(),
     *,
     generator: torch.Generator | None = None,
-    progress: bool = False,
-    callback: Callable[[dict[str, Any]], None] | None = None,
+    progress: Progress = False,
 ) -> AutoencoderFit:
     """Fit the scene's autoencoder to its codewords (Eq. 10): the mean over codewords of |Psi(E(f)) - f|_2.
 
@@ -107,8 +107,7 @@ def fit_autoencoder(
         codebook: its K codewords, K >= 1; targets are their unit directions.
         config: see `AutoencoderConfig`.
         generator: draws the initial weights and the blends; None stands for a fresh one with seed 0.
-        progress: show a progress bar.
-        callback: called with each record as it is written to the history.
+        progress: True shows a bar; a function is called with each record as it is written to the history.
 
     Returns:
         The autoencoder, the history, the latents, and how many codewords are recovered.
@@ -133,7 +132,7 @@ def fit_autoencoder(
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate, weight_decay=config.weight_decay, fused=True)
     history: list[dict[str, Any]] = []
     with _quick_on_a_cpu():
-        for step in tqdm(range(1, config.steps + 1), desc="autoencoder", disable=not progress):
+        for step in tqdm(range(1, config.steps + 1), desc="autoencoder", disable=progress is not True):
             latents = unit_latents(_normalised_mlp(encoder, norms, target))
             low, high = latents.detach().amin(), latents.detach().amax()
             rows, wanted = (latents - low) / (high - low).clamp_min(_SMALLEST), target
@@ -148,8 +147,8 @@ def fit_autoencoder(
             optimizer.step()
             if step % config.record_every == 0 or step == config.steps:
                 history.append({"step": step, "loss": float(loss.detach())})
-                if callback is not None:
-                    callback(dict(history[-1]))
+                if callable(progress):
+                    progress(dict(history[-1]))
     with torch.no_grad():
         autoencoder = _freeze(encoder, norms, decoder, target)
         return _report(codebook, autoencoder, history)

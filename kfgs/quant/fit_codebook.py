@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from .._card import short_repr
 from .._check import as_tensor, check_range, check_shapes, check_whole
+from .._progress import Progress
 from .._rows import EPS, row_norms, unit_rows
 from .codebook import Codebook
 from .evolve import EvolvingCodebook, Tally, prune
@@ -129,8 +130,7 @@ def fit_codebook(
     config: CodebookConfig = CodebookConfig(),
     *,
     generator: torch.Generator | None = None,
-    progress: bool = False,
-    callback: Callable[[dict[str, Any]], None] | None = None,
+    progress: Progress = False,
 ) -> CodebookFit:
     """Fit a codebook to the feature maps of a scene (Sec. 3.3.1).
 
@@ -151,8 +151,7 @@ def fit_codebook(
         config: see `CodebookConfig`.
         generator: draws the first directions of splits (paper: the order of the images); None stands for a fresh one
             with seed 0. On a CPU the same generator state gives the same bits.
-        progress: show a progress bar.
-        callback: called with each record as it is written to the history.
+        progress: True shows a bar; a function is called with each record as it is written to the history.
 
     Returns:
         The codebook, the history, and how well the final codebook represents the sampled features.
@@ -164,15 +163,14 @@ def fit_codebook(
         raise ValueError("maps: expected at least one feature map, got none; encode the training images first")
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     fit = _fit_adaptive if config.adaptive else _fit_paper
-    return fit(maps, config, generator, progress, callback or (lambda record: None))
+    return fit(maps, config, generator, progress)
 
 
 def _fit_adaptive(
     maps: FeatureMaps,
     config: CodebookConfig,
     generator: torch.Generator,
-    progress: bool,
-    callback: Callable[[dict[str, Any]], None],
+    progress: Progress,
 ) -> CodebookFit:
     """One pass over the maps that gathers the pool; everything else is done on the pool."""
     pool = _pool(maps, config, progress)
@@ -190,8 +188,9 @@ def _fit_adaptive(
         for i, (record, similarity) in enumerate(zip(grown.history, grown.similarity, strict=True))
     ]
     history[-1] |= {"size": len(cells.centres), "pruned": pruned}
-    for record in history:
-        callback(dict(record))
+    if callable(progress):
+        for record in history:
+            progress(dict(record))
     codebook = Codebook(cells.centres * (CODEWORD_RMS * cells.centres.shape[1] ** 0.5))
     usage = torch.bincount(cells.index, minlength=codebook.size).cpu()
     coverage, mean = _share(cells.similarity, alpha), float(cells.similarity.mean(dtype=torch.float64))
@@ -204,10 +203,10 @@ def _share(similarity: Tensor, alpha: float) -> float:
     return float((similarity >= alpha).double().mean())
 
 
-def _pool(maps: FeatureMaps, config: CodebookConfig, progress: bool) -> Tensor:  # [n, D] unit
+def _pool(maps: FeatureMaps, config: CodebookConfig, progress: Progress) -> Tensor:  # [n, D] unit
     """Unit features from the grid of every map, in order."""
     parts, most = list[Tensor](), config.samples_of(len(maps))
-    for i in tqdm(range(len(maps)), desc="codebook", disable=not progress):
+    for i in tqdm(range(len(maps)), desc="codebook", disable=progress is not True):
         features = _samples(maps, i, config, dim=parts[0].shape[1] if parts else None)
         if len(features) > most:  # on a grid that the caller chose
             features = features[torch.arange(most, device=features.device) * len(features) // most]
@@ -233,8 +232,7 @@ def _fit_paper(
     maps: FeatureMaps,
     config: CodebookConfig,
     generator: torch.Generator,
-    progress: bool,
-    callback: Callable[[dict[str, Any]], None],
+    progress: Progress,
 ) -> CodebookFit:
     """Eq. 5-9 as the paper has them, pass after pass."""
     alpha = config.expand_below
@@ -249,7 +247,7 @@ def _fit_paper(
         joins=config.joins_per_image or -(-(config.maximum - config.initial) // len(maps)) or 1,
     )
     history: list[dict[str, Any]] = []
-    with tqdm(total=(config.epochs + 1) * len(maps), desc="codebook", disable=not progress) as bar:
+    with tqdm(total=(config.epochs + 1) * len(maps), desc="codebook", disable=progress is not True) as bar:
         for epoch in range(config.epochs):
             order = torch.randperm(len(maps), generator=generator, device=generator.device).tolist()
             tally = Tally(alpha)
@@ -261,7 +259,8 @@ def _fit_paper(
                 bar.update()
             history.append({"epoch": epoch, "size": book.size, **tally.record()})
             bar.set_postfix(K=book.size, coverage=f"{tally.coverage:.3f}")
-            callback(dict(history[-1]))
+            if callable(progress):
+                progress(dict(history[-1]))
         codebook = Codebook(book.adam.rows)
         usage, tally = torch.zeros(codebook.size, dtype=torch.int64), Tally(alpha)
         for i in range(len(maps)):

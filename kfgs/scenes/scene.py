@@ -12,6 +12,7 @@ from torch import Tensor
 
 from .._card import html_card
 from .._check import check_shapes
+from ..cameras.bounds import camera_extent
 from ..cameras.camera import NEAR, Camera
 from ..cameras.undistort import undistort
 from .files import SceneError, file_stem, read_image
@@ -146,14 +147,7 @@ class Scene:
         stand in one place, it is the median distance to the points, or 1 without points.
         """
         chosen = self.splits.get("train") or range(len(self))
-        if len(chosen) == 0:
-            raise ValueError("cameras: expected at least one view, got none; the extent of an empty scene is unknown")
-        centers = torch.stack([self.cameras[i].center.detach().double().cpu() for i in chosen])
-        mean = centers.mean(0)
-        radius = 1.1 * float((centers - mean).norm(dim=-1).max())
-        if radius > 1e-6 * (1 + float(mean.norm())):
-            return radius
-        return float((self.points.double() - mean).norm(dim=-1).median()) if len(self.points) else 1.0
+        return camera_extent([self.cameras[i] for i in chosen], self.points)
 
     def with_near(self) -> Scene:
         """The same scene with every camera's `near` at 0.2 world units or, if that is less, a tenth of the extent.

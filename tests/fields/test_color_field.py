@@ -10,6 +10,7 @@ from kfgs.fields import ColorLoss, FieldConfig, GaussianParams, fit_field
 
 SHORT = FieldConfig(
     steps=60,
+    extent=2.0,
     sh0_lr=0.05,
     sh_rest_lr=0.01,
     sh_degree_every=20,
@@ -88,10 +89,7 @@ def test_colours_that_change_with_the_view_are_recovered():
         gaussians, camera = params.activated(), look_at_origin(0.75)
         return float((rasterize(gaussians, camera).map - rasterize(blobs(), camera).map.clamp(0, 1)).abs().mean())
 
-    fits = [
-        fit_field(start(sh_degree=degree), cameras, targets, config, extent=2.0, loss=ColorLoss()).params
-        for degree in (0, 2)
-    ]
+    fits = [fit_field(start(sh_degree=degree), cameras, targets, config, loss=ColorLoss()).params for degree in (0, 2)]
     level = sum(float(target.mean()) for target in targets) / len(targets)
     assert error(fits[1]) < 0.15 * level
     assert error(fits[1]) < 0.9 * error(fits[0])  # one colour per Gaussian is not enough
@@ -103,7 +101,7 @@ def test_degrees_come_on_schedule():
     moved = []
     for steps in (19, 20, 39, 40):
         config = replace(SHORT, steps=steps, densify_from=100, coarse=())
-        rest = fit_field(start(), cameras, targets, config, extent=2.0).params.sh_rest
+        rest = fit_field(start(), cameras, targets, config).params.sh_rest
         moved.append((bool(rest[:, :3].any()), bool(rest[:, 3:].any())))
     assert moved == [(False, False), (True, False), (True, False), (True, True)]
 
@@ -117,7 +115,7 @@ def test_pictures_are_small_at_first():
         return ColorLoss()(rendered, alpha, target)
 
     config = replace(SHORT, steps=4, coarse=((1, 4), (3, 2)))
-    fit_field(start(), cameras, targets, config, extent=2.0, loss=recorded)
+    fit_field(start(), cameras, targets, config, loss=recorded)
     expected = [(6, 8, 3), (12, 16, 3), (12, 16, 3), (24, 32, 3)]
     assert sizes == [(size, size) for size in expected]
 
@@ -130,7 +128,7 @@ class StopHereError(Exception):
 def test_a_resumed_colour_fit_equals_an_undisturbed_one_bit_for_bit(tmp_path, stop_at):
     cameras, targets = scene(3)
     arguments = (cameras, targets, SHORT)
-    options = {"extent": 2.0, "loss": ColorLoss()}
+    options = {"loss": ColorLoss()}
     whole = fit_field(start(), *arguments, **options)
     path = tmp_path / "fit.safetensors"
 
@@ -139,7 +137,7 @@ def test_a_resumed_colour_fit_equals_an_undisturbed_one_bit_for_bit(tmp_path, st
             raise StopHereError
 
     with pytest.raises(StopHereError):
-        fit_field(start(), *arguments, **options, callback=interrupt, checkpoint=path)
+        fit_field(start(), *arguments, **options, progress=interrupt, checkpoint=path)
     resumed = fit_field(start(), *arguments, **options, checkpoint=path)
     assert same(resumed.params, whole.params)
     assert resumed.params.sh_rest.any()
@@ -149,18 +147,18 @@ def test_a_checkpoint_knows_the_loss(tmp_path):
     cameras, targets = scene(2)
     path = tmp_path / "fit.safetensors"
     config = replace(SHORT, steps=2)
-    fit_field(start(), cameras, targets, config, extent=2.0, loss=ColorLoss(0.2), checkpoint=path)
-    fit_field(start(), cameras, targets, config, extent=2.0, loss=ColorLoss(0.2), checkpoint=path)
+    fit_field(start(), cameras, targets, config, loss=ColorLoss(0.2), checkpoint=path)
+    fit_field(start(), cameras, targets, config, loss=ColorLoss(0.2), checkpoint=path)
     with pytest.raises(ValueError, match="got one with other loss; delete it"):
-        fit_field(start(), cameras, targets, config, extent=2.0, loss=ColorLoss(0.5), checkpoint=path)
+        fit_field(start(), cameras, targets, config, loss=ColorLoss(0.5), checkpoint=path)
 
 
 def test_an_existing_splat_can_be_trained_on():
     cameras, targets = scene(3)
     begin = GaussianParams.from_gaussians(blobs())
     config = replace(SHORT, steps=2, sh_degree_every=0)
-    fit = fit_field(begin, cameras, targets, config, extent=2.0)
-    scratch = fit_field(start(), cameras, targets, config, extent=2.0)
+    fit = fit_field(begin, cameras, targets, config)
+    scratch = fit_field(start(), cameras, targets, config)
     assert fit.history[0]["loss"] < 0.1 * scratch.history[0]["loss"]  # it was right already
     assert fit.params.sh_degree == 1
 
@@ -177,7 +175,7 @@ def test_a_perfect_splat_stays_perfect():
     begin, cameras = shiny(), [look_at_origin(0.5 * i) for i in range(3)]
     targets = [rasterize(begin.activated(), camera).map for camera in cameras]
     config = replace(SHORT, steps=30, sh_degree_every=1_000, coarse=(), densify_from=100, reset_every=0)
-    fit = fit_field(begin, cameras, targets, config, extent=2.0, loss=ColorLoss(0.0))
+    fit = fit_field(begin, cameras, targets, config, loss=ColorLoss(0.0))
     assert [row["loss"] for row in fit.history] == [0.0, 0.0, 0.0]
     assert same(fit.params, begin)
     without = [rasterize(begin.activated(0), camera).map for camera in cameras]
@@ -189,7 +187,7 @@ def test_degrees_start_where_the_splat_is_and_go_on():
     begin, moved = shiny(filled=1), []
     for steps in (19, 20, 39, 40):
         config = replace(SHORT, steps=steps, densify_from=100, coarse=())
-        rest = fit_field(begin, cameras, targets, config, extent=2.0).params.sh_rest
+        rest = fit_field(begin, cameras, targets, config).params.sh_rest
         moved.append([not torch.equal(rest[:, part], begin.sh_rest[:, part]) for part in DEGREES])
     assert moved == [[True, False, False], [True, True, False], [True, True, False], [True, True, True]]
 
@@ -200,15 +198,15 @@ def test_a_resumed_fit_of_a_splat_uses_the_same_degrees(tmp_path, stop_at):
     cameras, targets = scene(3)
     begin, path = shiny(filled=1), tmp_path / "fit.safetensors"
     config = replace(SHORT, steps=40, checkpoint_every=5)
-    whole = fit_field(begin, cameras, targets, config, extent=2.0)
+    whole = fit_field(begin, cameras, targets, config)
 
     def interrupt(row):
         if row["step"] == stop_at:
             raise StopHereError
 
     with pytest.raises(StopHereError):
-        fit_field(begin, cameras, targets, config, extent=2.0, callback=interrupt, checkpoint=path)
-    assert same(fit_field(begin, cameras, targets, config, extent=2.0, checkpoint=path).params, whole.params)
+        fit_field(begin, cameras, targets, config, progress=interrupt, checkpoint=path)
+    assert same(fit_field(begin, cameras, targets, config, checkpoint=path).params, whole.params)
 
 
 def test_a_divisor_larger_than_the_picture_leaves_one_row():
@@ -220,7 +218,7 @@ def test_a_divisor_larger_than_the_picture_leaves_one_row():
         return ColorLoss()(rendered, alpha, target)
 
     config = replace(SHORT, steps=2, coarse=((1, 100),))
-    fit_field(start(), cameras, targets, config, extent=2.0, loss=recorded)
+    fit_field(start(), cameras, targets, config, loss=recorded)
     assert sizes == [((1, 1, 3), (1, 1, 3)), ((24, 32, 3), (24, 32, 3))]
 
 
@@ -237,7 +235,7 @@ def test_unknown_pixels_teach_nothing():
     target = torch.ones(24, 32, 3)
     target[:, 16:] = torch.nan
     config = replace(SHORT, steps=5, densify_from=100, coarse=())
-    fit = fit_field(GaussianParams.from_gaussians(right), [camera], [target], config, extent=2.0, loss=ColorLoss())
+    fit = fit_field(GaussianParams.from_gaussians(right), [camera], [target], config, loss=ColorLoss())
     before = GaussianParams.from_gaussians(right)
     assert torch.equal(fit.params.sh0[0], before.sh0[0])
     assert (fit.params.sh0[1] > before.sh0[1]).all()
@@ -248,4 +246,4 @@ def test_coarse_pictures_must_have_the_cameras_size():
     with pytest.raises(
         ValueError, match=r"targets\[\d\]: expected \(24, 32\) pixels as the camera has .*got \(12, 16\)"
     ):
-        fit_field(start(), cameras, [target[::2, ::2] for target in targets], SHORT, extent=2.0)
+        fit_field(start(), cameras, [target[::2, ::2] for target in targets], SHORT)

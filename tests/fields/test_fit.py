@@ -11,6 +11,7 @@ HEIGHT, WIDTH, CHANNELS = 24, 32, 3
 K = torch.tensor([[30.0, 0, 16.3], [0, 31.0, 11.6], [0, 0, 1]])
 SHORT = FieldConfig(
     steps=60,
+    extent=2.0,
     features_lr=0.05,
     scales_lr=0.01,
     means_lr=1e-3,
@@ -82,7 +83,7 @@ def test_targets_are_recovered_from_a_poor_start():
         densify_gradient=2e-3,
         reset_every=0,
     )
-    fit = fit_field(start(), cameras, targets, config, extent=2.0)
+    fit = fit_field(start(), cameras, targets, config)
     level = sum(float(target.abs().mean()) for target in targets) / len(targets)
     assert mean_loss(fit.params, cameras, targets) < 0.05 * level
     held_out = look_at_origin(0.75)
@@ -95,12 +96,23 @@ def test_targets_are_recovered_from_a_poor_start():
 def test_history_and_callback_rows():
     cameras, targets = scene(3)
     rows = []
-    fit = fit_field(start(), cameras, targets, replace(SHORT, steps=25), extent=2.0, callback=rows.append)
+    fit = fit_field(start(), cameras, targets, replace(SHORT, steps=25), progress=rows.append)
     assert [row["step"] for row in fit.history] == [10, 20, 25]
     assert rows == fit.history
     assert set(rows[0]) == {"step", "loss", "count", "seconds"}
     assert rows[-1]["count"] == len(fit.params)
     assert rows[0]["seconds"] <= rows[1]["seconds"]
+
+
+def test_without_an_extent_that_of_the_cameras_is_used():
+    """Three cameras on a circle of radius 4: their mean, and from it the farthest one, by hand."""
+    cameras, targets = scene(3)
+    centers = torch.stack([camera.center for camera in cameras]).double()
+    extent = 1.1 * float((centers - centers.mean(0)).square().sum(1).sqrt().max())
+    assert 1 < extent < 4
+    fits = [fit_field(start(), cameras, targets, replace(SHORT, extent=size)).params for size in (None, extent, 9.0)]
+    assert same(fits[0], fits[1])
+    assert not same(fits[0], fits[2])
 
 
 def test_reported_loss_is_the_mean_since_the_last_row():
@@ -112,7 +124,7 @@ def test_reported_loss_is_the_mean_since_the_last_row():
         seen.append(float(value.detach()))
         return value
 
-    fit = fit_field(start(), cameras, targets, replace(SHORT, steps=25), extent=2.0, loss=recorded)
+    fit = fit_field(start(), cameras, targets, replace(SHORT, steps=25), loss=recorded)
     assert fit.history[0]["loss"] == pytest.approx(sum(seen[:10]) / 10)
     assert fit.history[2]["loss"] == pytest.approx(sum(seen[20:]) / 5)
 
@@ -132,7 +144,7 @@ def test_every_view_comes_once_per_epoch_in_seeded_random_order():
     def order(seed):
         maps = Recorded(targets)
         config = replace(SHORT, steps=12)
-        fit_field(start(), cameras, maps, config, extent=2.0, generator=torch.Generator().manual_seed(seed))
+        fit_field(start(), cameras, maps, config, generator=torch.Generator().manual_seed(seed))
         return maps.order
 
     views = order(1)
@@ -146,7 +158,7 @@ def test_equal_seeds_give_equal_bits_and_the_start_stays():
     cameras, targets = scene(3)
     first = start()
     before = first.map(torch.Tensor.clone)
-    fits = [fit_field(first, cameras, targets, SHORT, extent=2.0) for _ in range(2)]
+    fits = [fit_field(first, cameras, targets, SHORT) for _ in range(2)]
     assert same(fits[0].params, fits[1].params)
     assert same(first, before)
     assert not fits[0].params.means.requires_grad
@@ -159,7 +171,7 @@ class StopHereError(Exception):
 @pytest.mark.parametrize("stop_at", [30, 50])  # between checkpoints: resumes from step 20 and step 40
 def test_a_resumed_fit_equals_an_undisturbed_one_bit_for_bit(tmp_path, stop_at):
     cameras, targets = scene(3)
-    whole = fit_field(start(), cameras, targets, SHORT, extent=2.0, generator=torch.Generator().manual_seed(3))
+    whole = fit_field(start(), cameras, targets, SHORT, generator=torch.Generator().manual_seed(3))
     path = tmp_path / "fit.safetensors"
 
     def interrupt(row):
@@ -172,9 +184,8 @@ def test_a_resumed_fit_equals_an_undisturbed_one_bit_for_bit(tmp_path, stop_at):
             cameras,
             targets,
             SHORT,
-            extent=2.0,
             generator=torch.Generator().manual_seed(3),
-            callback=interrupt,
+            progress=interrupt,
             checkpoint=path,
         )
     steps, generator = [], torch.Generator().manual_seed(3)
@@ -183,9 +194,8 @@ def test_a_resumed_fit_equals_an_undisturbed_one_bit_for_bit(tmp_path, stop_at):
         cameras,
         targets,
         SHORT,
-        extent=2.0,
         generator=generator,
-        callback=lambda row: steps.append(row["step"]),
+        progress=lambda row: steps.append(row["step"]),
         checkpoint=path,
     )
     assert steps[0] == stop_at  # it did not start again
@@ -198,8 +208,8 @@ def test_a_resumed_fit_equals_an_undisturbed_one_bit_for_bit(tmp_path, stop_at):
 def test_a_finished_checkpoint_returns_at_once(tmp_path):
     cameras, targets = scene(3)
     path = tmp_path / "fit.safetensors"
-    done = fit_field(start(), cameras, targets, SHORT, extent=2.0, checkpoint=path)
-    again = fit_field(start(), cameras, targets, SHORT, extent=2.0, checkpoint=path, callback=lambda row: 1 / 0)
+    done = fit_field(start(), cameras, targets, SHORT, checkpoint=path)
+    again = fit_field(start(), cameras, targets, SHORT, checkpoint=path, progress=lambda row: 1 / 0)
     assert same(done.params, again.params)
 
 
@@ -207,20 +217,25 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
     cameras, targets = scene(3)
     path = tmp_path / "fit.safetensors"
     short = replace(SHORT, steps=5)
-    fit_field(start(), cameras, targets, short, extent=2.0, checkpoint=path)
+    fit_field(start(), cameras, targets, short, checkpoint=path)
     with pytest.raises(ValueError, match="got one with other config; delete it"):
-        fit_field(start(), cameras, targets, replace(short, features_lr=0.1), extent=2.0, checkpoint=path)
+        fit_field(start(), cameras, targets, replace(short, features_lr=0.1), checkpoint=path)
     with pytest.raises(ValueError, match="other cameras, targets;"):
-        fit_field(start(), cameras[:2], targets[:2], short, extent=2.0, checkpoint=path)
+        fit_field(start(), cameras[:2], targets[:2], short, checkpoint=path)
     nearer = [replace(camera, near=0.1) for camera in cameras]
     with pytest.raises(ValueError, match="other cameras;"):
-        fit_field(start(), nearer, targets, short, extent=2.0, checkpoint=path)
+        fit_field(start(), nearer, targets, short, checkpoint=path)
     with pytest.raises(ValueError, match="other extent, generator, params"):
         fit_field(
-            start(61), cameras, targets, short, extent=3.0, checkpoint=path, generator=torch.Generator().manual_seed(9)
+            start(61),
+            cameras,
+            targets,
+            replace(short, extent=3.0),
+            checkpoint=path,
+            generator=torch.Generator().manual_seed(9),
         )
     how_often = replace(short, checkpoint_every=2)  # changes no result
-    assert len(fit_field(start(), cameras, targets, how_often, extent=2.0, checkpoint=path).history) == 1
+    assert len(fit_field(start(), cameras, targets, how_often, checkpoint=path).history) == 1
 
 
 def test_a_damaged_or_foreign_checkpoint_is_refused(tmp_path):
@@ -231,9 +246,9 @@ def test_a_damaged_or_foreign_checkpoint_is_refused(tmp_path):
     damaged.write_bytes(b"nothing of the kind")
     save_file({"x": torch.zeros(2)}, foreign)
     with pytest.raises(ValueError, match="checkpoint: expected a kfgs field checkpoint at .*damaged, but it cannot"):
-        fit_field(start(), cameras, targets, SHORT, extent=2.0, checkpoint=damaged)
+        fit_field(start(), cameras, targets, SHORT, checkpoint=damaged)
     with pytest.raises(ValueError, match="got other tensors"):
-        fit_field(start(), cameras, targets, SHORT, extent=2.0, checkpoint=foreign)
+        fit_field(start(), cameras, targets, SHORT, checkpoint=foreign)
 
 
 def test_render_scale_sets_the_rendered_size_and_never_exceeds_the_camera():
@@ -247,7 +262,7 @@ def test_render_scale_sets_the_rendered_size_and_never_exceeds_the_camera():
 
     for scale in (None, 2.0, 100.0):
         config = replace(SHORT, steps=2, render_scale=scale)
-        fit_field(start(), cameras, small, config, extent=2.0, loss=recorded)
+        fit_field(start(), cameras, small, config, loss=recorded)
     assert sizes == {((24, 32, 3), (24, 32), (6, 8, 3)), ((12, 16, 3), (12, 16), (6, 8, 3))}
 
 
@@ -256,7 +271,7 @@ def test_target_gradient_size_densifies_less():
     small = [resize_map(target, (6, 8)) for target in targets]
     config = replace(SHORT, steps=16, densify_gradient=2e-3, densify_from=5, densify_every=15)
     counts = [
-        len(fit_field(start(), cameras, small, replace(config, densify_gradient_size=size), extent=2.0).params)
+        len(fit_field(start(), cameras, small, replace(config, densify_gradient_size=size)).params)
         for size in ("render", "target")
     ]
     assert counts[0] > counts[1]
@@ -265,12 +280,9 @@ def test_target_gradient_size_densifies_less():
 def test_opacities_are_reset_on_schedule():
     cameras, targets = scene(2)
     config = replace(SHORT, steps=10, reset_every=10, densify_from=20)
-    fit = fit_field(start(), cameras, targets, config, extent=2.0)
+    fit = fit_field(start(), cameras, targets, config)
     assert fit.params.activated().opacities.max() <= 0.01 + 1e-6
-    assert (
-        fit_field(start(), cameras, targets, replace(config, reset_every=0), extent=2.0).params.logit_opacities.max()
-        > -3
-    )
+    assert fit_field(start(), cameras, targets, replace(config, reset_every=0)).params.logit_opacities.max() > -3
 
 
 def test_a_view_without_gaussians_teaches_nothing_and_breaks_nothing():
@@ -278,7 +290,7 @@ def test_a_view_without_gaussians_teaches_nothing_and_breaks_nothing():
     away.viewmat[2, 3] = -40.0  # everything lies behind it
     target = torch.ones(HEIGHT, WIDTH, CHANNELS)
     config = replace(SHORT, steps=3, densify_from=50)
-    fit = fit_field(start(), [away], [target], config, extent=2.0)
+    fit = fit_field(start(), [away], [target], config)
     assert same(fit.params, start())
     assert fit.history[-1]["loss"] == pytest.approx(1.0)
 
@@ -292,18 +304,18 @@ def test_l1_loss_is_the_mean_over_pixels_and_channels_after_the_resize():
 def test_wrong_arguments():
     cameras, targets = scene(2)
     with pytest.raises(ValueError, match=r"targets: expected one map per camera \(2, at least one\), got 1"):
-        fit_field(start(), cameras, targets[:1], SHORT, extent=2.0)
+        fit_field(start(), cameras, targets[:1], SHORT)
     with pytest.raises(
         ValueError, match=r"targets\[\d\]: expected \[h, w, D\] with D = 5 \(from params\), got \(24, 32, 3\)"
     ):
-        fit_field(start(channels=5), cameras, targets, SHORT, extent=2.0)
+        fit_field(start(channels=5), cameras, targets, SHORT)
     with pytest.raises(ValueError, match="extent: expected a number in"):
-        fit_field(start(), cameras, targets, SHORT, extent=0.0)
+        replace(SHORT, extent=0.0)
     with pytest.raises(ValueError, match="params: expected at least one Gaussian"):
-        fit_field(start().map(lambda value: value[:0]), cameras, targets, SHORT, extent=2.0)
+        fit_field(start().map(lambda value: value[:0]), cameras, targets, SHORT)
     bent = replace(cameras[0], distortion=Distortion("brown_conrady", (0.1, 0.0, 0.0, 0.0)))
     with pytest.raises(ValueError, match="cameras: expected cameras without distortion, got brown_conrady"):
-        fit_field(start(), [bent], targets[:1], SHORT, extent=2.0)
+        fit_field(start(), [bent], targets[:1], SHORT)
 
 
 def test_unknown_pixels_count_nowhere():
@@ -322,11 +334,11 @@ def test_unknown_pixels_count_nowhere():
 def test_an_infinite_target_stops_the_fit():
     cameras, targets = scene(1)
     with pytest.raises(FloatingPointError, match=r"loss: expected a finite number at step 1, got inf"):
-        fit_field(start(), cameras, [targets[0] + torch.inf], SHORT, extent=2.0)
+        fit_field(start(), cameras, [targets[0] + torch.inf], SHORT)
 
 
 def test_losing_every_gaussian_says_so():
     cameras, targets = scene(1)
     config = replace(SHORT, prune_opacity=0.9)
     with pytest.raises(ValueError, match="config: expected some Gaussian to outlast pruning, got none at step 10"):
-        fit_field(start(), cameras, targets, config, extent=2.0)
+        fit_field(start(), cameras, targets, config)

@@ -470,8 +470,8 @@ def test_an_uplifted_cloud_is_a_start_for_training():
     maps = [torch.nn.functional.normalize(one, dim=-1) for one in random_maps(views)]
     found = uplift_maps(cloud(), views, maps)
     targets = [found.latents.encode(one) for one in maps]
-    config = FieldConfig(steps=30, densify_until=0, reset_every=0, features_lr=0.02, report_every=10)
-    trained = fit_field(GaussianParams.from_gaussians(found.gaussians), views, targets, config, extent=1.0)
+    config = FieldConfig(steps=30, extent=1.0, densify_until=0, reset_every=0, features_lr=0.02, report_every=10)
+    trained = fit_field(GaussianParams.from_gaussians(found.gaussians), views, targets, config)
     assert trained.history[-1]["loss"] < trained.history[0]["loss"]
     assert trained.params.channels == found.latents.latent
 

@@ -74,7 +74,7 @@ def test_killed_in_the_middle_of_the_field_it_goes_on_and_ends_the_same(when, fi
 
     settings = config(field=dataclasses.replace(CONFIG.field, report_every=12))
     with pytest.raises(KeyboardInterrupt):
-        fit_scene(scene, maps, tmp_path, settings, callback=kill)
+        fit_scene(scene, maps, tmp_path, settings, progress=kill)
     assert not (tmp_path / "field").exists()
     resumed = fit_scene(scene, maps, tmp_path, settings)
     assert [stage.reused for stage in resumed.stages] == [True, True, True, False, False]
@@ -88,7 +88,7 @@ def test_killed_in_the_codebook_it_starts_that_stage_again(fitted, scene, maps, 
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fit_scene(scene, maps, tmp_path, CONFIG, callback=kill)
+        fit_scene(scene, maps, tmp_path, CONFIG, progress=kill)
     assert list((tmp_path / "stages").iterdir()) == []
     assert _same(fit_scene(scene, maps, tmp_path, CONFIG).field, fitted.field)
 
@@ -119,6 +119,15 @@ def test_another_extent_is_another_field(fitted, scene, maps):
     assert fewer.extent != scene.extent
     again = fit_scene(fewer, maps, fitted.folder, config(split="all"))
     assert not again.stages[-1].reused
+
+
+def test_an_extent_of_the_config_decides_the_field_as_the_scenes_does(fitted, scene, maps):
+    stated = dataclasses.replace(CONFIG.field, extent=scene.extent)
+    assert fit_scene(scene, maps, fitted.folder, config(field=stated)).stages[-1].reused
+    larger = dataclasses.replace(CONFIG.field, extent=2 * scene.extent)
+    again = fit_scene(scene, maps, fitted.folder, config(field=larger))
+    assert not again.stages[-1].reused
+    assert not _same(again.field, fitted.field)
 
 
 def test_other_options_make_other_stages(fitted, scene, maps):

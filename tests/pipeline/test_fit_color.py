@@ -86,10 +86,10 @@ def test_killed_in_the_middle_it_goes_on_and_ends_the_same(fitted, scene, tmp_pa
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fit_color(scene, tmp_path, CONFIG, callback=kill)
+        fit_color(scene, tmp_path, CONFIG, progress=kill)
     assert not (tmp_path / "color.ply").exists()
     steps = []
-    resumed = fit_color(scene, tmp_path, CONFIG, callback=lambda row: steps.append(row["step"]))
+    resumed = fit_color(scene, tmp_path, CONFIG, progress=lambda row: steps.append(row["step"]))
     assert steps[0] == 60  # from the checkpoint at 50
     assert same(resumed.gaussians, fitted.gaussians)
 

@@ -128,7 +128,7 @@ def test_same_generator_state_same_bits_and_the_global_one_is_left_alone():
     torch.manual_seed(0)
     records = []
     fits = [
-        fit_autoencoder(book, config, generator=torch.Generator().manual_seed(seed), callback=records.append)
+        fit_autoencoder(book, config, generator=torch.Generator().manual_seed(seed), progress=records.append)
         for seed in (1, 1, 2)
     ]
     assert torch.equal(torch.rand(1), expected)

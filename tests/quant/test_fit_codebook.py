@@ -138,7 +138,7 @@ def test_never_more_than_the_maximum(step_every):
     maps, *_ = scene(classes=12, noise=1.0)
     sizes = []
     config = CodebookConfig.paper(initial=4, maximum=9, epochs=3, eager_epochs=1, step_every=step_every)
-    fit = fit_codebook(maps, config, callback=lambda record: sizes.append(record["size"]))
+    fit = fit_codebook(maps, config, progress=lambda record: sizes.append(record["size"]))
     assert sizes == [record["size"] for record in fit.history]
     assert max(sizes) == 9
     assert fit.coverage < 1
@@ -274,7 +274,7 @@ def test_no_image_fills_the_codebook_alone():
     maps = [torch.randn(8, 8, 32, generator=generator) for _ in range(4)]  # nothing is similar to anything
     seen: list[int] = []
     fit = fit_codebook(
-        maps, CodebookConfig.paper(initial=2, maximum=10, epochs=1), callback=lambda row: seen.append(row["added"])
+        maps, CodebookConfig.paper(initial=2, maximum=10, epochs=1), progress=lambda row: seen.append(row["added"])
     )
     assert seen == [8]  # two of each image
     index = [int((fit.codebook.unit @ m.reshape(-1, 32).T / m.reshape(-1, 32).norm(dim=1)).amax() > 0.99) for m in maps]
@@ -338,7 +338,7 @@ def test_paper_gives_the_codebook_it_always_gave():
 def test_default_finds_the_classes_and_says_what_it_reached():
     maps, labels, centres = scene(size=(48, 60))
     records = []
-    fit = fit_codebook(maps, callback=records.append)
+    fit = fit_codebook(maps, progress=records.append)
     assert (fit.codebook.size, fit.note) == (6, None)
     assert records == fit.history
     name = fit.codebook.quantize(centres)
