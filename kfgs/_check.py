@@ -6,6 +6,7 @@ tensor values unless its name says so, so they cost no device synchronisation.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import numbers
 from collections.abc import Iterable, Sequence
@@ -68,7 +69,9 @@ def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> di
 
 
 def as_tensor(name: str, value: Any, *, floating: bool = False) -> Tensor:
-    """A tensor as it is, a NumPy array as the tensor that shares its memory; anything else is an error.
+    """A tensor as it is; a NumPy array or a list of numbers as a tensor.
+
+    The tensor shares the memory of a NumPy array that may be written to. The floats of a list get torch's default type.
 
     Args:
         name: the argument, for the message.
@@ -76,15 +79,28 @@ def as_tensor(name: str, value: Any, *, floating: bool = False) -> Tensor:
         floating: also require floating-point numbers.
 
     Raises:
-        TypeError: if it is neither, or not of floating point; the message says what to pass instead.
+        TypeError: if it is something else, or not of floating point; the message says what to pass instead.
     """
-    if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
-        value = torch.as_tensor(value)
     if not isinstance(value, Tensor):
-        raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}; {_instead(value)}")
+        value = _from_numbers(name, value)
     if floating and not value.is_floating_point():
         raise TypeError(f"{name}: expected floating-point numbers, got {value.dtype}; convert them with .float()")
     return value
+
+
+def _from_numbers(name: str, value: Any) -> Tensor:
+    """Lists and whatever NumPy calls an array. Our own sequences, which may read a file for each item, are not looked into."""
+    is_list = isinstance(value, list | tuple | range | numbers.Real)
+    array = np.empty(0, dtype=object)
+    if is_list or hasattr(value, "__array__"):
+        with contextlib.suppress(ValueError):  # rows of different lengths
+            array = np.asarray(value)
+    if array.dtype.kind not in "fiub":
+        raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}; {_instead(value)}")
+    if not array.flags.writeable or min(array.strides, default=0) < 0:  # torch warns of the one and refuses the other
+        array = array.copy()
+    tensor = torch.as_tensor(array)
+    return tensor.to(torch.get_default_dtype()) if is_list and tensor.is_floating_point() else tensor
 
 
 def as_array(values: Any, name: str = "values") -> np.ndarray[Any, Any]:
@@ -104,7 +120,10 @@ def as_array(values: Any, name: str = "values") -> np.ndarray[Any, Any]:
 def _instead(value: object) -> str:
     """What to pass in place of a value that is no tensor."""
     if isinstance(value, str):
-        return f"pass the numbers, not the name {one_line(value)!r}: of a class its embedding, as in classes.embeddings"
+        lookups = "field.query(name, classes) and OfClass(name).select(splats) look a class up"
+        return (
+            f"pass the numbers, not the name {one_line(value)!r}: the embedding, a row of classes.embeddings; {lookups}"
+        )
     part = next((part for part in PARTS if hasattr(value, part)), None)
     return f"pass its .{part}" if part else "convert it with torch.as_tensor"
 

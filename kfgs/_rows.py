@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -50,22 +47,3 @@ def check_finite(name: str, values: Tensor) -> None:
         raise ValueError(
             f"{name}: expected finite numbers, got NaN or infinity in row {row}; remove or repair such rows"
         )
-
-
-def as_tensor(name: str, values: Any) -> Tensor:
-    """A tensor as it is; a numpy array or a list of numbers becomes one.
-
-    Raises:
-        TypeError: if it is text or something else without numbers.
-    """
-    if isinstance(values, Tensor):
-        return values
-    if isinstance(values, str):
-        raise TypeError(
-            f"{name}: expected a tensor, got the text {values!r:.80}; a class name is looked up by field.query(name, classes) "
-            "and by OfClass(name).select(splats)"
-        )
-    array = np.asarray(values)
-    if array.dtype.kind not in "biuf":
-        raise TypeError(f"{name}: expected a tensor, got {type(values).__name__}; convert it with torch.as_tensor")
-    return torch.from_numpy(np.require(array, requirements=["C", "W"]))

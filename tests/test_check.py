@@ -1,4 +1,5 @@
 import math
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import numpy as np
@@ -112,7 +113,10 @@ def test_arrays_become_tensors_that_share_their_memory():
     ("value", "advice"),
     [
         ("chair", ("str", "'chair'", "embedding")),
-        ([1.0], ("list", "torch.as_tensor")),
+        ([[1.0, 2.0], [3.0]], ("list", "torch.as_tensor")),
+        ([None, 1.0], ("list", "torch.as_tensor")),
+        (["chair"], ("list", "torch.as_tensor")),
+        ({"a": 1.0}, ("dict", "torch.as_tensor")),
         (SimpleNamespace(codewords=1), ("SimpleNamespace", ".codewords")),
         (np.array(["a"]), ("ndarray", "torch.as_tensor")),
         (None, ("NoneType",)),
@@ -121,6 +125,35 @@ def test_arrays_become_tensors_that_share_their_memory():
 def test_what_is_no_tensor_is_refused_with_advice(value, advice):
     with pytest.raises(TypeError, match=tells("rows", *advice)):
         as_tensor("rows", value)
+
+
+def test_lists_of_numbers_become_tensors():
+    rows = as_tensor("rows", [[0, 1.5], (2, 3)], floating=True)
+    assert rows.dtype == torch.float32
+    assert rows.tolist() == [[0, 1.5], [2, 3]]
+    assert as_tensor("labels", [2, 0]).dtype == torch.int64
+    assert as_tensor("mask", [True, False]).dtype == torch.bool
+    with pytest.raises(TypeError, match=tells("rows", "int64", ".float()")):
+        as_tensor("rows", [1, 2], floating=True)
+
+
+def test_arrays_that_torch_cannot_share_are_copied():
+    array = np.arange(3.0)
+    assert as_tensor("x", array[::-1]).tolist() == [2, 1, 0]
+    array.setflags(write=False)
+    assert as_tensor("x", array).tolist() == [0, 1, 2]  # torch would warn
+
+
+def test_our_own_sequences_are_not_read():
+    class Maps(Sequence):
+        def __len__(self):
+            return 3
+
+        def __getitem__(self, i):
+            raise AssertionError("this would read a file")
+
+    with pytest.raises(TypeError, match=tells("maps", "Maps", "torch.as_tensor")):
+        as_tensor("maps", Maps())
 
 
 def test_whole_numbers_where_floating_point_is_needed():

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._check import check_shapes, check_whole
-from .._rows import EPS, as_tensor, check_finite, row_norms, unit_embeddings, unit_rows
+from .._check import as_tensor, check_shapes, check_whole
+from .._rows import EPS, check_finite, row_norms, unit_embeddings, unit_rows
 from .components import component_numbers
 from .scores import Score, select_by_similarity
 from .selection import Selection

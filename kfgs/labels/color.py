@@ -9,8 +9,7 @@ import torch
 from PIL import ImageColor
 from torch import Tensor
 
-from .._check import check_choice, check_shapes
-from .._rows import as_tensor
+from .._check import as_tensor, check_choice, check_shapes
 from ..gaussians import Gaussians
 from ..splat.sh import rgb_to_sh0, sh0_to_rgb
 

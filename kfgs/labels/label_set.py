@@ -16,8 +16,8 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from .._card import html_card
+from .._check import as_tensor
 from .._files import atomic_path, read_json
-from .._rows import as_tensor
 from .names import class_index, class_indices
 
 KIND, VERSION = "label set", "1"  # of the metadata's "kfgs" and "version"

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from .._check import check_shapes
-from .._rows import as_tensor, check_finite
+from .._check import as_tensor, check_shapes
+from .._rows import check_finite
 from ..formats.splat_file import SplatFile
 from ..gaussians import Gaussians
 

@@ -9,8 +9,8 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from .._check import check_choice, check_shapes
-from .._rows import as_tensor, unit_rows
+from .._check import as_tensor, check_choice, check_shapes
+from .._rows import unit_rows
 from .label_set import LabelSet, teacher_difference, teacher_mismatch
 
 SAME = 1 - 1e-4  # cosine of one text embedded twice: half precision stays well above, other words below

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from .._card import html_card
-from .._check import check_shapes
-from .._rows import as_tensor, check_finite
+from .._check import as_tensor, check_shapes
+from .._rows import check_finite
 from .boxes import OrientedBox
 from .nearest import Array, Cloud, means_of
 

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._check import check_choice, check_range, check_shapes, check_whole
-from .._rows import as_tensor
+from .._check import as_tensor, check_choice, check_range, check_shapes, check_whole
 from ..formats.splat_file import SCORE, SplatFile
 from ..gaussians import Gaussians
 from .label_set import LabelSet
