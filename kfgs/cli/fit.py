@@ -94,7 +94,8 @@ def fit(
     """Make a semantic field of a scene and its teacher features.
 
     The features are averaged onto Gaussians in 3-D and then compressed. The Gaussians are those of --splat. Without it
-    they are trained on the pictures first; `kfgs color` with the same --out makes better ones, which are then used.
+    they are trained on the pictures first; `kfgs color` with the same --out makes better ones, which are then used if it
+    took more steps. A color.ply that is there already is never replaced.
 
     Examples:
         kfgs fit scene/ --out run/ --splat my.ply

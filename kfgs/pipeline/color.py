@@ -187,7 +187,8 @@ def fit_color(
 
     Args:
         scene: posed, undistorted views with their sparse points.
-        folder: the run folder; `folder/color.ply` receives the Gaussians.
+        folder: the run folder; `folder/color.ply` receives the Gaussians, in place of those of an earlier fit with other
+            options. Its stage stays in the folder, so the earlier call brings them back at once.
         config: the schedule; that of 3DGS when not given.
         report: receives one line per stage.
         progress: True shows a bar; a function receives the rows of the history as they appear.
@@ -200,15 +201,24 @@ def fit_color(
     config = config or ColorConfig.paper()
     scene.views(config.split)  # refuses a split without views
     check_scene(scene)
-    return make_color(Run(Path(folder), report), scene, config, training_device(device), progress)
+    return make_color(Run(Path(folder), report), scene, config, training_device(device), progress, overwrite=True)
 
 
-def make_color(run: Run, scene: Scene, config: ColorConfig, device: torch.device, progress: Progress) -> ColorResult:
-    """The colour stage of a run, and the PLY file of its Gaussians."""
+def make_color(
+    run: Run, scene: Scene, config: ColorConfig, device: torch.device, progress: Progress, *, overwrite: bool
+) -> ColorResult:
+    """The colour stage of a run, and the PLY file of its Gaussians; `overwrite`: also where another `color.ply` is there."""
     params = _color_stage(run, scene, scene.views(config.split), config, device, progress)
     result = ColorResult(params.activated().detach(), run.folder / "color.ply", run.stages)
-    if not run.look_only and not _is_saved(result):
-        write_splats(result.path, result.gaussians)
+    if run.look_only or _is_saved(result):
+        return result
+    if result.path.exists():
+        if not overwrite:
+            here = f"the {len(result.gaussians):,} of the field, which are in {result.stages[-1].folder}"
+            run.say(f"color.ply: left as it is; it holds other Gaussians than {here}")
+            return result
+        run.say(f"color.ply: replaced; Gaussians that were trained in {run.folder} before stay in its stages")
+    write_splats(result.path, result.gaussians)
     return result
 
 
@@ -229,8 +239,7 @@ def find_color(run: Run, scene: Scene, config: ColorConfig) -> Gaussians | None:
             best = steps, about.parent
     if best is None or best[0] <= config.field.steps:
         return None
-    if run.report is not None:
-        run.report(f"geometry: the colours of {best[0]:,} steps that are in {run.folder}")
+    run.say(f"geometry: the colours of {best[0]:,} steps that are in {run.folder}")
     return GaussianParams.from_tensors(load_file(best[1] / "params.safetensors")).activated().detach()
 
 

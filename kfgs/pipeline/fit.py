@@ -99,8 +99,8 @@ def _codebook_stage(job: _Job) -> tuple[Codebook, Stage]:
         check_readable(job.maps, "the codebook")
         fit = fit_codebook(job.maps, config.codebook, generator=job.generator("codebook"), progress=job.progress)
         fit.codebook.save(folder / "codebook.safetensors")
-        if fit.note is not None and run.report is not None:
-            run.report(f"note: {fit.note}")
+        if fit.note is not None:
+            run.say(f"note: {fit.note}")
         write_json(folder / "history.json", fit.history)
 
     inputs = {"features": job.features, "config": asdict(config.codebook), "seed": config.seed}
@@ -205,7 +205,8 @@ def fit_scene(
         folder: the run folder; `folder/field` receives the finished field.
         config: the method and its options.
         splat: of method `fuse`, the Gaussians to fuse onto, in the scene's frame: a splat file or its content. None trains them
-            on the pictures with `config.color` (`folder/color.ply`), or takes those of a longer `fit_color` in the same folder.
+            on the pictures with `config.color` and writes them to `folder/color.ply`, unless that file exists. If `fit_color`
+            trained for longer in the same folder, its Gaussians are taken instead.
         report: receives one line per stage.
         progress: True shows bars; a function receives the history rows of every trained stage as they appear.
 

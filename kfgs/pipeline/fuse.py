@@ -38,7 +38,8 @@ def find_geometry(
     """The Gaussians to fuse onto, and where they come from.
 
     Without a splat they are the colour field of the run. Its stage is found again if it is there. A longer colour field of the
-    same scene, as `kfgs color` makes it in the same run folder, is taken instead.
+    same scene, as `kfgs color` makes it in the same run folder, is taken instead. A shorter one is not, but its
+    `color.ply` stays.
     """
     if isinstance(splat, Gaussians):
         return splat, "given"
@@ -48,7 +49,7 @@ def find_geometry(
         return read_splats(splat).gaussians, str(splat)
     found = find_color(run, scene, config)
     if found is None:
-        found = make_color(run, scene, config, device, progress).gaussians
+        found = make_color(run, scene, config, device, progress, overwrite=False).gaussians
     return found, "trained on the pictures"
 
 

@@ -89,11 +89,11 @@ class Run:
                     "is damaged: delete the folder, and it will be made again"
                 )
             done = Stage(name, key, target, float(about["seconds"]), True)
-            self._say(f"{name}: found in {target.name} (made in {done.seconds:.1f} s)")
+            self.say(f"{name}: found in {target.name} (made in {done.seconds:.1f} s)")
         elif self.look_only:
             raise UnfinishedError(name)
         else:
-            self._say(f"{name}: working")
+            self.say(f"{name}: working")
             start = time.perf_counter()
             for left_over in target.parent.glob(f".{target.name}.*"):  # of a process that was killed
                 shutil.rmtree(left_over, ignore_errors=True)
@@ -103,7 +103,7 @@ class Run:
                 about = {"name": name, "inputs": inputs, "seconds": seconds, "files": _sizes(temporary)}
                 write_json(temporary / STAGE_FILE, about)
             done = Stage(name, key, target, seconds, False)
-            self._say(f"{name}: done in {seconds:.1f} s")
+            self.say(f"{name}: done in {seconds:.1f} s")
         self.stages.append(done)
         return done
 
@@ -135,7 +135,8 @@ class Run:
             write_json(cache_path, cache)
         return result
 
-    def _say(self, text: str) -> None:
+    def say(self, text: str) -> None:
+        """Report a line, if anyone listens."""
         if self.report is not None:
             self.report(text)
 

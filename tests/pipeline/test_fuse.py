@@ -7,6 +7,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 from small_room import make_room
 
 import kfgs
@@ -107,6 +108,26 @@ def test_without_a_splat_gaussians_are_trained_and_a_longer_colour_fit_is_taken(
     taken = fit_scene(scene, maps, tmp_path, config, report=lines.append)
     assert [stage.name for stage in taken.stages] == ["uplift"]
     assert f"geometry: the colours of 40 steps that are in {tmp_path}" in lines
+
+
+def test_the_colours_of_a_shorter_fit_are_kept(scene, maps, tmp_path):
+    quick = dataclasses.replace(CONFIG.color, field=ColorConfig.quick().field.with_steps(30), picture_scale=0.5)
+    shorter = fit_color(scene, tmp_path, dataclasses.replace(quick, field=quick.field.with_steps(20)))
+    before = shorter.path.read_bytes()
+    lines = []
+    made = fit_scene(scene, maps, tmp_path, dataclasses.replace(CONFIG, color=quick), report=lines.append)
+    assert shorter.path.read_bytes() == before
+    trained = load_file(made.stages[0].folder / "params.safetensors")
+    told = [line for line in lines if line.startswith("color.ply: left as it is")]
+    assert len(told) == 1
+    assert str(made.stages[0].folder) in told[0]
+    assert f"{len(trained['means']):,} of the field" in told[0]
+    replaced = fit_color(scene, tmp_path, quick, report=lines.append)  # asked for by name, and said
+    assert replaced.stages[0].reused
+    assert shorter.path.read_bytes() != before
+    assert sum(line.startswith("color.ply: replaced") for line in lines) == 1
+    assert fit_color(scene, tmp_path, dataclasses.replace(quick, field=quick.field.with_steps(20))).stages[0].reused
+    assert shorter.path.read_bytes() == before
 
 
 def test_the_paper_takes_no_splat(scene, maps, splat, tmp_path):
