@@ -106,6 +106,25 @@ def test_version_and_overview(capsys):
         assert hint in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("line", "choices"),
+    [
+        ("attach run/field a.ply --out b.ply --by color", ["views", "distance"]),
+        ("fit scene --out run --method paper --mode fast", ["decouple", "adc", "adc+sc"]),
+        ("fit scene --out run --level xl", ["default", "s", "m", "l"]),
+        ("features scene --check maps --level xl", ["default", "s", "m", "l"]),
+    ],
+)
+def test_a_wrong_choice_is_told_the_words_that_can_be_given(line, choices, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as stop:
+        cli.main(line.split())
+    assert stop.value.code == 2
+    said = capsys.readouterr()
+    told = re.search(r"Expected one of \((.*?)\)", said.out + said.err)
+    assert re.findall(r"'(.*?)'", told[1]) == choices
+
+
 def test_messages_name_options_as_they_are_written():
     names = cli._shown_names(cli.COMMANDS["attach"])
     assert cli._in_options("splat_scene: expected", names) == "--splat-scene: expected"

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .files import check_alone, check_file, check_folder
-from .options import Device, FieldMethod, Flag, Given, Level, MapTeacher, SceneFolder, Views, fit_config
+from .options import Device, FieldMethod, Flag, Given, GivenLevel, Level, MapTeacher, SceneFolder, Views, fit_config
 from .output import say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -22,7 +22,7 @@ def features(
     out: Given[Path] = None,
     overwrite: Flag = False,
     check: Given[Path] = None,
-    level: Given[Level] = None,
+    level: GivenLevel = None,
     device: Device = "auto",
     teacher: MapTeacher,
     views: Views,

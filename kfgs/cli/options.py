@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import tyro
 from tyro.conf import Positional as Positional
+from tyro.constructors import PrimitiveConstructorSpec
 
 from .files import check_alone, open_field
 from .output import say
@@ -22,8 +23,26 @@ Name = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint=""
 Device = Annotated[str, tyro.conf.arg(metavar="NAME")]
 Several = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="TEXT")]
 
-Level = Literal["default", "s", "m", "l"]  # of LangSplat: SAM's own choice of masks; subparts, parts, wholes
 
+def _choice(kind: Any) -> PrimitiveConstructorSpec[Any]:
+    """How tyro reads one word of a Literal, or None when the option is not given. On its own it counts None as a word."""
+    words = get_args(kind)
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="{" + ",".join(words) + "}",
+        instance_from_str=lambda given: given[0],
+        is_instance=lambda value: value is None or value in words,
+        str_from_instance=lambda value: [str(value)],
+        choices=words,
+    )
+
+
+Level = Literal["default", "s", "m", "l"]  # of LangSplat: SAM's own choice of masks; subparts, parts, wholes
+Mode = Literal["decouple", "adc", "adc+sc"]  # of the paper's Table 1
+By = Literal["views", "distance"]
+GivenLevel = Annotated[Level | None, _choice(Level), _quiet]
+GivenMode = Annotated[Mode | None, _choice(Mode), _quiet]
+GivenBy = Annotated[By | None, _choice(By), _quiet]
 
 SceneFolder = Annotated[
     Path, Positional, tyro.conf.arg(help="Folder with images and a COLMAP model or transforms.json.")
@@ -55,7 +74,7 @@ class Maps:
 
     features: Given[Path] = None
     """Folder of maps by `kfgs features`, Feature 3DGS or LangSplat; SCENE/features when not given."""
-    level: Given[Level] = None
+    level: GivenLevel = None
     """Which masks of LangSplat's maps: default, subparts (s), parts (m) or wholes (l)."""
     undistorted_features: Flag = False
     """The teacher saw undistorted pictures, so no lens has to be removed from its maps."""
@@ -104,7 +123,7 @@ class FieldMethod:
     """fuse: average the features in 3-D, then compress; paper: compress each map, then train Gaussians on it (DF-3DGS)."""
     preset: Literal["cpu", "paper"] = "cpu"
     """cpu (minutes on two cores) or paper (30,000 steps of training)."""
-    mode: Given[Literal["decouple", "adc", "adc+sc"]] = None
+    mode: GivenMode = None
     """For --method paper: adc+sc (the default: codebook and autoencoder), adc (codebook) or decouple (raw features)."""
 
 

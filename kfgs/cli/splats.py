@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from .edit_syntax import Edits, check_parts, inserted_files, parse_edits
 from .files import check_alone, check_file, check_target, open_splats
-from .options import Classes, Flag, Given, Positional, SceneOption, Several
+from .options import Classes, Flag, Given, GivenBy, Positional, SceneOption, Several
 from .output import say, say_counts, say_lost, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -23,7 +23,7 @@ def attach(
     splats: Positional[Path],
     out: Path,
     *,
-    by: Given[Literal["views", "distance"]] = None,
+    by: GivenBy = None,
     method: Literal["nearest", "vote", "mahalanobis"] = "nearest",
     distance: Given[float] = None,
     splat_scene: Given[Path] = None,
