@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 from .._check import check_range
 from ..cameras import resize_map
 from ..cameras.resample import from_bchw, to_bchw
-from ..splat.engines.table import choose
+from ..splat.engines.table import choose, load, offers
 
 Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(rendered map [H, W, D], its alpha [H, W], target [h, w, D]) -> a scalar."""
@@ -55,6 +55,8 @@ class ColorLoss:
 
     ssim_weight: float = 0.2
     """Lambda of 3DGS, in [0, 1]; 0 = L1 only."""
+    engine: str = field(default="auto", repr=False)
+    """Whose SSIM is used, as `FieldConfig.engine`. Engines that have none use kornia's."""
 
     def __post_init__(self) -> None:
         check_range("ssim_weight", self.ssim_weight, 0, 1)
@@ -70,19 +72,20 @@ class ColorLoss:
         if self.ssim_weight == 0 or min(target.shape[:2]) < SSIM_WINDOW:
             return absolute
         height, width, _ = target.shape
-        dissimilar = 1 - mean_similarity(resize_map(rendered, (height, width)), target)
+        dissimilar = 1 - mean_similarity(resize_map(rendered, (height, width)), target, self.engine)
         return (1 - self.ssim_weight) * absolute + self.ssim_weight * dissimilar
 
 
 def mean_similarity(
     picture: Tensor,  # [H, W, D]
     target: Tensor,  # [H, W, D], NaN where nothing is known
+    engine: str = "auto",
 ) -> Tensor:  # []
     """Mean SSIM over the windows without a NaN (Gaussian, 11x11, sigma 1.5); 1 if there is none. Differentiable in `picture`.
 
     Note:
-        kornia's, except on the CPU where numba is installed: there the value and the gradient come from compiled code, which
-        takes 5 ms instead of 37 (240x320, two threads). The compiled code has no gradient of the gradient.
+        The engine's, if it has a `similarity`, else kornia's. numba's compiled code takes 5 ms instead of 37 (240x320, two
+        threads). It has no gradient of the gradient.
     """
     known = _known(target)
     counted = None
@@ -92,8 +95,9 @@ def mean_similarity(
         counted = torch.nn.functional.max_pool2d(holes, SSIM_WINDOW, stride=1)[0, 0] == 0  # [H - 10, W - 10]
         if not bool(counted.any()):
             return picture.new_ones(())
-    if choose("auto", picture.device.type, picture.dtype) == "numba":
-        return _CompiledSimilarity.apply(picture, target, counted)
+    chosen = choose(engine, picture.device.type, picture.dtype)
+    if offers(chosen, "similarity"):
+        return _CompiledSimilarity.apply(picture, target, counted, chosen)
     similarity = from_bchw(ssim(to_bchw(picture), to_bchw(target), SSIM_WINDOW, eps=0.0, padding="valid"))
     return similarity.mean() if counted is None else similarity[counted].mean()
 
@@ -106,16 +110,16 @@ class _CompiledSimilarity(torch.autograd.Function):
     """Returns the gradient together with the value."""
 
     @staticmethod
-    def forward(ctx: Any, picture: Tensor, target: Tensor, counted: Tensor | None) -> Tensor:
-        from ..splat.engines.cpu.ssim import similarity  # compiles, so only when it is needed
-
+    def forward(ctx: Any, picture: Tensor, target: Tensor, counted: Tensor | None, engine: str) -> Tensor:
         window = get_gaussian_kernel1d(SSIM_WINDOW, SSIM_SIGMA, dtype=torch.float64)[0].to(picture.dtype)
-        value, slope = similarity(picture.contiguous(), target.contiguous(), counted, window, SSIM_CONSTANTS)
+        value, slope = load(engine).similarity(
+            picture.contiguous(), target.contiguous(), counted, window, SSIM_CONSTANTS
+        )
         ctx.save_for_backward(slope)
         return value
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
         (slope,) = ctx.saved_tensors
-        return grad * slope, None, None
+        return grad * slope, None, None, None

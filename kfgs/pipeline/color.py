@@ -282,7 +282,7 @@ def _color_stage(
             cameras,
             Photos(scene, views, cameras),
             with_extent(config.field, scene),
-            loss=ColorLoss(config.ssim_weight),
+            loss=ColorLoss(config.ssim_weight, config.field.engine),
             generator=generator,
             progress=progress,
             checkpoint=checkpoint,

@@ -21,6 +21,7 @@ from .project import project, project_backward
 from .simd import LANES
 from .slots import chain_slots, gather_gradients, gather_sums, number_slots
 from .square import SQUARE_SIDE, View, pack_rows
+from .ssim import similarity
 from .threads import run_bands
 from .tiles import bin
 
@@ -29,7 +30,7 @@ row_length, padded_length = (
     wide.padded_length.py_func,
 )  # in Python: one call is not worth compiling
 
-__all__ = ["accumulate", "backward", "bin", "devices", "forward", "project", "project_backward"]
+__all__ = ["accumulate", "backward", "bin", "devices", "forward", "project", "project_backward", "similarity"]
 
 MOST_BANDS, PAIRS_PER_BAND = 32, 2048
 """The most bands, and the fewest pairs of a band. More bands keep more threads busy, but more Gaussians then have a gradient
