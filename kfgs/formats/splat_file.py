@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from torch import Tensor
@@ -35,6 +35,9 @@ class SplatFile:
     """Facts about the file that JSON can hold: `format`, and what the header says. `antialiased` and `surfels` say for which
     kind of drawing the cloud was trained (`render_mode`). A format that has no place for them reports them as lost."""
 
+    writer: ClassVar[Callable[..., Written]]
+    """What `save` calls: `table.write_splats`, which sets it. The formats import this file, and the table knows the formats."""
+
     def __post_init__(self) -> None:
         for name, values in self.extra.items():
             if np.shape(values) != (len(self.gaussians),):
@@ -63,9 +66,7 @@ class SplatFile:
 
     def save(self, path: str | Path, *, format: str | None = None) -> Written:
         """Write the cloud in the format that the ending of `path` names; see `write_splats`, which this calls."""
-        table = import_module(".table", __package__)  # it imports this file
-        written: Written = table.write_splats(path, self, format=format)
-        return written
+        return SplatFile.writer(path, self, format=format)
 
     def select(self, which: Tensor) -> SplatFile:  # which: [N] bool or [n] int64
         """The Gaussians under a mask or an index, with their extra columns."""

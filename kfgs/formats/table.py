@@ -127,6 +127,9 @@ def write_splats(path: str | Path, splats: SplatFile | Gaussians, *, format: str
     return Written([path, *beside], tuple(lost), order)
 
 
+SplatFile.writer = staticmethod(write_splats)
+
+
 def _format_to_write(path: Path, name: str | None) -> ModuleType:
     known = {key: module for key, module in formats().items() if hasattr(module, "write")}
     if name is not None:
