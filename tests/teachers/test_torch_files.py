@@ -113,7 +113,7 @@ def test_an_attack_runs_nothing_and_imports_nothing(tmp_path: Path, attack: str,
     load_torch_file(honest)  # torch imports some modules when it reads the first file
     modules = set(sys.modules)
     if container == "pickle":
-        with pytest.raises(TorchFileError, match="not what torch.save writes|a text file"):
+        with pytest.raises(TorchFileError, match="torch.save|text"):
             load_torch_file(path)
     elif named is None:
         found = load_torch_file(path)
