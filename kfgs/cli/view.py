@@ -111,7 +111,7 @@ def _open(explorer: Any, place: Where, host: str, port: int) -> None:
     elif place == "window":
         open_window(explorer)
     else:
-        serve(explorer, host=host, port=port, say=say)
+        serve(explorer, host=host, port=port, report=say)
 
 
 def _meaning(source: Path, classes: Classes, teacher: Teacher) -> tuple[Any, list[Any]]:
@@ -155,7 +155,7 @@ def _words_of(label_set: Any, teacher: Teacher) -> tuple[Any, Callable[[str], An
 
 def _note(state: Any) -> None:
     """Say so if the clouds are probably in different frames."""
-    color = state.facts().get("color")
+    color = state.details().get("color")
     if color and color["total"] - color["orphaned"] < FEW * color["total"]:
         say(
             f"note: only {color['total'] - color['orphaned']:,} of {color['total']:,} colour Gaussians lie within lambda of "

@@ -1,4 +1,4 @@
-"""Looking over a folder of feature maps before a long run: everything that does not fit, by file."""
+"""Check a folder of feature maps before a long run, and report everything that does not fit, by file."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ Size = tuple[int, int] | None  # (H, W) of a picture
 
 @dataclass
 class FeatureReport:
-    """What is wrong with a folder of maps, file by file."""
+    """The problems of a folder of maps, by file."""
 
     folder: Path
     views: int
-    """The number of pictures whose map was looked for."""
+    """The number of views checked."""
     shape: Shape | None = None
     """(h, w, D) of most maps; None if none could be opened."""
     dtype: str = ""
     """The type of most maps' values: `float16`."""
     bytes: int = 0
-    """Of all maps on disk."""
+    """Size of all maps on disk."""
     problems: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     """Why a map cannot be used, by the file's name (if there is none, the name it should have)."""
     notes: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
-    """What to know about a file, or about the folder ('')."""
+    """Remarks about a file, or about the folder ('')."""
 
     @property
     def ok(self) -> bool:
@@ -61,11 +61,11 @@ class FeatureReport:
 
 
 def check_maps(finder: MapFinder, sizes: dict[str, Size], reading: Reading, *, values: bool) -> FeatureReport:
-    """Look at the map of every view; see `FeatureFolder.check`.
+    """Check the map of every view; see `FeatureFolder.check`.
 
     Args:
-        finder: of the folder.
-        sizes: of each view's picture, by stem.
+        finder: finds the maps of the folder.
+        sizes: size of each view's picture, by stem.
         reading: how to read the maps; `reading.channels` is the expected D.
         values: whether to read the values too.
     """
@@ -122,7 +122,7 @@ def check_maps(finder: MapFinder, sizes: dict[str, Size], reading: Reading, *, v
 
 
 def _find(finder: MapFinder, stems: list[str], report: FeatureReport) -> dict[str, Path]:
-    """The one file of each view that has one; what is missing, unclear or superfluous goes into the report."""
+    """The map file of each view that has exactly one; missing, unclear and superfluous files go into the report."""
     found = finder.find(stems)
     for name, text in finder.faults(found).items():
         report.problems[name].append(text)

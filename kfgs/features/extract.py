@@ -1,4 +1,4 @@
-"""A teacher's maps of a scene, written to a folder one picture at a time, and deleted when they are no longer needed."""
+"""Write a teacher's maps of a scene to a folder, one picture at a time, and delete them when no longer needed."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ def extract_features(
     progress: bool = False,
     report: Callable[[str], None] | None = None,
 ) -> Manifest:
-    """Write a teacher's map of each picture to a folder that `FeatureFolder` reads. A killed call is resumed by the next.
+    """Write a teacher's map of each picture to a folder that `FeatureFolder` reads. After a killed call, call it again.
 
     A map is `<stem>.npy`, float16 [h, w, D]. `features.json` records which teacher made it from which picture, and is
-    written after every picture. A map is made again if it is gone or damaged, or if its picture has changed. Memory holds
-    one picture and its map at a time.
+    written after every picture. A map is made again if it is missing or damaged, or if its picture has changed. Memory
+    holds one picture and its map at a time.
 
-    In a folder with `features.json`, a `<stem>.npy` without a record is taken for one that a killed process left, and is
-    overwritten; keep maps of other programs in other folders.
+    In a folder with `features.json`, a `<stem>.npy` without a record is overwritten, because a killed process may have left
+    it. Keep maps of other programs in other folders.
 
     Args:
         teacher: sees each picture, [3, H, W] RGB in [0, 1]; a teacher, or a function to [D, h, w] (see `as_teacher`).
         pictures: a scene, whose pictures are taken as they are on disk, or a list, see `pictures_of`.
         folder: for the maps; made if it does not exist.
         split: of a scene: the name of a split, `all`, or a list of view names or indices.
-        overwrite: give up maps in the folder that another teacher (or other weights, or options) made, and maps with these
-            names that other programs wrote. Maps of the same teacher are kept even so. If the call is killed,
-            `FeatureFolder` refuses the maps of other programs that are left.
+        overwrite: replace maps that were made by another teacher (or with other weights or options), and maps with these
+            names from other programs. Maps of the same teacher are kept. If the call is killed, `FeatureFolder` refuses
+            the remaining maps of other programs.
         progress: show a progress bar.
         report: receives one line about what will be done, and one per map that is made again.
 
@@ -57,9 +57,9 @@ def extract_features(
 
     Raises:
         TypeError: if `teacher` is no teacher, it returns no tensor, or JSON cannot hold its identity.
-        ValueError: if there are no pictures, two have the same stem, a map is not finite in float16, has another number of
-            channels than the others, or another size than that of a picture of equal size; if the folder holds maps of
-            another teacher, or another process is writing to it.
+        ValueError: if there are no pictures, two have the same stem, a map is not finite in float16, maps differ in
+            channels, or in size for pictures of equal size; if the folder holds maps of another teacher, or another
+            process is writing to it.
         OSError: if the folder cannot be written to, or the disk has no space for the maps.
     """
     folder, teacher, chosen = Path(folder), as_teacher(teacher), as_pictures(pictures, split, exist=True)
@@ -101,18 +101,18 @@ def discard_maps(folder: str | Path, stems: Sequence[str] | None = None, *, dry_
     """Delete maps that `extract_features` wrote, once index maps have been made from them.
 
     The manifest stays, so that finished stages of a run are still found; `extract_features` makes the maps again. Maps that
-    were copied or touched since they were written are read first, to be sure that they are the same.
+    were copied or touched since they were written are read first, to check that they are unchanged.
 
     Args:
-        folder: of the maps.
-        stems: of the views whose maps to delete; all maps of the folder if None.
-        dry_run: delete nothing; ask this before the work that makes the maps superfluous.
+        folder: the folder of maps.
+        stems: the views whose maps to delete; all maps of the folder if None.
+        dry_run: delete nothing. Call it so before a long run whose last step deletes the maps.
 
     Returns:
         The number of bytes that are (or would be) freed.
 
     Raises:
-        ValueError: if the folder has no manifest, or one without a record of a view, or of another file than is there; if
+        ValueError: if the folder has no manifest, or one without a record of a view or with another file than exists; if
             another process is writing to it. Then nothing is deleted.
         TypeError: if `stems` is a text.
     """
@@ -135,7 +135,7 @@ def discard_maps(folder: str | Path, stems: Sequence[str] | None = None, *, dry_
 
 
 def _discardable(folder: Path, manifest: Manifest, stems: Sequence[str] | None) -> list[Path]:
-    """The files of these views' maps that are there; an error if one is not as kfgs wrote it."""
+    """The existing map files of these views; an error if one has changed since kfgs wrote it."""
     if isinstance(stems, str):
         raise TypeError(f"stems: expected a list of image stems, got the text {stems!r}; put it into a list")
     wanted = list(manifest.maps) if stems is None else list(dict.fromkeys(stems))
@@ -155,7 +155,7 @@ def _discardable(folder: Path, manifest: Manifest, stems: Sequence[str] | None) 
 def _check_shape(
     name: str, picture: Picture, shape: tuple[int, ...], expected: tuple[int, ...], before: list[MapRecord]
 ) -> None:
-    """Refuse a map with other channels than the map before, or another shape than pictures of this size have."""
+    """Raise if a map's channels differ from the map before, or its shape from maps of pictures of this size."""
     if before and before[0].shape[2] != shape[2]:
         what, where, got = f"{before[0].shape[2]} channels", f"in {one_line(before[0].file, 200)}", str(shape[2])
     elif expected != shape:
@@ -169,7 +169,7 @@ def _check_shape(
 
 
 def _outlook(found: int, left: int, name: str, records: list[MapRecord]) -> str:
-    """What is there and what will be done, in one line; space and time follow from the maps that are there."""
+    """One line: maps found, maps to make, and the space and time they take, estimated from those found."""
     text = f"features: {found} maps found, {left} to make by {name}"
     if not left or not records:
         return text

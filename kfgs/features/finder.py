@@ -1,4 +1,4 @@
-"""Which file of a folder is the map of which view: by the name of its picture, and by the manifest that kfgs writes."""
+"""Find the map of each view in a folder, by the name of its picture and by the manifest that kfgs writes."""
 
 from __future__ import annotations
 
@@ -14,10 +14,7 @@ from .manifest import MANIFEST, MapRecord, read_manifest
 
 
 class MapFinder:
-    """The rules of a folder of maps.
-
-    Args:
-        path: the folder.
+    """Finds the maps in a folder.
 
     Raises:
         NotADirectoryError: if `path` is no folder.
@@ -34,7 +31,7 @@ class MapFinder:
         """The files of the maps that kfgs wrote, including discarded ones."""
 
     def record(self, stem: str, file: Path) -> MapRecord | None:
-        """The record of this very file of a view, which may have been discarded since; None if the file may have changed."""
+        """The record of a view's file, which may be discarded; None if the file is another one or may have changed."""
         record = self.records.get(stem)
         if record is None or file != self.path / record.file:
             return None
@@ -46,7 +43,7 @@ class MapFinder:
         return open_map(file, replace(reading, channels=record.shape[2]) if record else reading, self.own)
 
     def discarded(self, stem: str) -> Path | None:
-        """Where a view's map was before it was discarded; None if it is there, or was never made or never discarded."""
+        """The former path of a discarded map; None if it exists, was never made, or was not discarded."""
         if self.manifest is None or not self.manifest.discarded or stem not in self.records:
             return None
         file = self.path / self.records[stem].file
@@ -77,11 +74,11 @@ class MapFinder:
         return {stem: [file for _, _, file in sorted(files)] for stem, files in found.items()}
 
     def find(self, stems: Sequence[str]) -> dict[str, list[Path]]:
-        """Each view's map: an empty list if there is none, several files if it is not clear which one is meant.
+        """The map files of each view: an empty list if there is none, several files if it is not clear which one to use.
 
-        A view's map is in the folder under the picture's stem; if the picture is in a subfolder, so is the map. If no view
-        has a map there, the last part of the stem is looked for in the folder and all its subfolders. A discarded map is
-        the file that it was.
+        A map has the stem of its picture; if the picture is in a subfolder, so is the map. If no view has a map there, the
+        last part of the stem is searched for in the folder and all its subfolders. A discarded map counts as its former
+        file.
         """
         gone = {stem: [file] for stem in stems if (file := self.discarded(stem)) is not None}
         found = {stem: self.named(stem) for stem in stems if stem not in gone}
@@ -100,14 +97,14 @@ class MapFinder:
         return {stem: gone[stem] if stem in gone else found[stem] for stem in stems}
 
     def named(self, stem: str) -> list[Path]:
-        """The file that is called `stem` and the suffix of a layout, in a list; an empty list if there is none."""
+        """The file named `stem` with the suffix of a layout, in a list; an empty list if there is none."""
         files = ((self.path / f"{stem}{layout.suffix}", layout) for layout in LAYOUTS)
         return [file for file, layout in files if file.is_file() and layout_of(file, self.own) is layout][:1]
 
     def faults(self, found: dict[str, list[Path]]) -> dict[str, str]:
-        """What is wrong with the files that `find` returned, by the name of the file (if there is none, of the one expected).
+        """The problems of the files that `find` returned, by file name (of the expected file, if there is none).
 
-        A map without a record in a folder that kfgs filled is a fault: its teacher need not have made it.
+        In a folder that kfgs filled, a map without a record is a fault, because another teacher may have made it.
         """
         faults = {}
         for stem, files in found.items():
@@ -130,7 +127,7 @@ class MapFinder:
         return faults
 
     def explain_missing(self, stems: Sequence[str], missing: Sequence[str]) -> str:
-        """The message for views without a map: which views, and what the maps that are there are called."""
+        """The message for views without a map: which views, and the names of the maps that exist."""
         suffix = OWN.suffix if self.manifest else FEATURE_3DGS.suffix
         named = some([stem + suffix for stem in missing])
         text = f"expected a feature map for each of {len(stems)} views, {len(missing)} missing: {named}"

@@ -23,29 +23,29 @@ from .pictures import Picture, Split, as_pictures, check_stems, pictures_of
 
 
 class FeatureFolder(Sequence[Tensor]):
-    """The teacher's feature maps of some views: item i is view i's map, [h, w, D] float32, read when it is asked for.
+    """The teacher's feature maps of some views: item i is view i's map, [h, w, D] float32, read from disk at each access.
 
-    `FeatureFolder(path).of(scene, "train")` has the maps of a scene's split, which is what `fit_scene` takes.
+    `FeatureFolder(path).of(scene, "train")` has the maps of a scene's split, for `fit_scene`.
 
     These layouts are known, and may be mixed: `<stem>_fmap_CxHxW.pt` (Feature 3DGS: a tensor [D, h, w]), `<stem>_s.npy`
-    beside `<stem>_f.npy` (LangSplat: mask numbers [4, H, W], and a feature per mask), and `<stem>.npy` or
-    `<stem>.safetensors` (an array [h, w, D]; one of [D, h, w] is recognised by `channels` or the picture's aspect). Values
-    have half, single or double precision. The picture's ending may follow the stem. The map of a picture in a subfolder is
-    in a subfolder of the same name; if no view has a map there, all subfolders are searched for the last part of its name.
-    If kfgs filled the folder (it holds `features.json`), maps that other programs or a killed process left are refused.
+    with `<stem>_f.npy` (LangSplat: mask numbers [4, H, W], and a feature per mask), and `<stem>.npy` or
+    `<stem>.safetensors` (an array [h, w, D]; [D, h, w] is recognised by `channels` or the picture's aspect). Values have
+    half, single or double precision. The picture's ending may follow the stem. The map of a picture in a subfolder is in a
+    subfolder of the same name; if no view has a map there, all subfolders are searched for the last part of its name. If
+    kfgs filled the folder (it holds `features.json`), maps of other programs or of a killed process are refused.
 
     No map is kept in memory. Every map must have the same size; an all-zero feature means "unknown". Maps that kfgs wrote
-    and later discarded (`features.json` says so) need not be there until one is read.
+    and later discarded (`features.json` says so) may be missing until one is read.
 
     Args:
         path: the folder.
-        stems: image names without their ending, in the order wanted. If None, all maps of the folder, sorted, and all that
-            `features.json` lists, including those in subfolders and those discarded.
+        stems: image names without their ending, in order. If None, all maps of the folder, sorted, and all in
+            `features.json`, including those in subfolders and discarded ones.
         channels: the expected D, for instance that of the text embeddings; taken from the first map if None.
         sizes: (H, W) of each view's picture, which distinguishes [h, w, D] from [D, h, w].
         level: of LangSplat's masks: 0 to 3, or `default`, `s`, `m`, `l`.
-        stride: pixels per cell of LangSplat's masks, which are as large as the pictures; None: the least stride with no more
-            cells than 360 x 480.
+        stride: pixels per cell of LangSplat's masks, which are as large as the pictures; None: the smallest stride with at
+            most 360 x 480 cells.
 
     Raises:
         NotADirectoryError: if `path` is no folder.
@@ -80,7 +80,7 @@ class FeatureFolder(Sequence[Tensor]):
         self._finder = MapFinder(path)
         self.path, manifest = self._finder.path, self._finder.manifest
         self.identity: dict[str, Any] | None = manifest.teacher if manifest else None
-        """What decides the maps (`identify`) if kfgs made them, else None."""
+        """Identity of the teacher (`identify`) if kfgs made the maps, else None."""
         self.channels, self.sizes = channels, None if sizes is None else list(sizes)
         self.reading = Reading(channels=channels, level=parse_level(level), stride=stride)
         self._chosen = stems if stems is None or isinstance(stems, str) else list(stems)
@@ -107,21 +107,20 @@ class FeatureFolder(Sequence[Tensor]):
     def check(
         self, pictures: Scene | Sequence[Picture] | None = None, split: Split = "train", *, values: bool = True
     ) -> FeatureReport:
-        """Look at the map of every view, and report everything that does not fit.
+        """Check the map of every view, and report everything that does not fit.
 
-        A problem is: no map, or several; a file that cannot be read or holds no map of floats; unexpected channels; a size
-        that most maps do not have, or that looks transposed beside the picture; NaN or infinite values; a map with nothing
-        but zeros; a map without a record in a folder that kfgs filled. A note is: maps of one size whose aspect is not the
-        pictures', up to one cell, as encoders with a fixed grid make them; double precision; many all-zero features; maps of
-        no view; discarded maps; maps that changed since kfgs wrote them.
+        Problems: no map, or several; a file that cannot be read or holds no map of floats; unexpected channels; a size
+        that most maps do not have, or that looks transposed; NaN or infinite values; a map of zeros only; a map without a
+        record in a folder that kfgs filled. Notes: maps of one size with another aspect than the pictures by more than one
+        cell (from encoders with a fixed grid); double precision; many all-zero features; maps of no view; discarded maps;
+        maps that changed since kfgs wrote them.
 
-        One map is looked at at a time, with a few rows in memory.
+        Memory holds a few rows of one map at a time.
 
         Args:
             pictures: a scene, or a list of pictures, see `pictures_of`; the views of this FeatureFolder if None.
             split: of the scene, see `of`.
-            values: False looks at the shape and the type only, in milliseconds, and reads no value. A map that was copied
-                then looks like one that was changed.
+            values: False checks only shape and type, in milliseconds. Then a copied map looks like a changed one.
 
         Raises:
             ValueError: if there are no pictures.
@@ -149,7 +148,7 @@ class FeatureFolder(Sequence[Tensor]):
 
     @cached_property
     def files(self) -> list[Path]:
-        """The file of each view's map; the file that it was, if it has been discarded."""
+        """The file of each view's map; for a discarded map, its former file."""
         found = self._finder.find(self.stems)
         missing = [stem for stem, files in found.items() if not files]
         if missing:
@@ -173,7 +172,7 @@ class FeatureFolder(Sequence[Tensor]):
 
     @property
     def has_masks(self) -> bool:
-        """Whether a map is LangSplat's, so that `level` and `stride` matter."""
+        """Whether a map has LangSplat's layout, where `level` and `stride` matter."""
         return any(map(self._is_masks, self.files))
 
     @overload
@@ -198,11 +197,11 @@ class FeatureFolder(Sequence[Tensor]):
         return self._read(i, rows, columns).reshape(-1, self.shape[2])
 
     def digests(self) -> list[list[str]] | None:
-        """[file name, SHA-256] of each view's map if they are known without reading the maps, else None.
+        """[file name, SHA-256] of each view's map, or None if the caller should compute them from the files.
 
-        A digest is known if `features.json` has a record of this very file, or of a discarded one. LangSplat's maps are
-        digested here, both files together, and the level and the stride are part of the name. If a map is LangSplat's or
-        discarded, the caller could not compute all digests, so those that are not known are computed here as well.
+        A digest is known if `features.json` has a record of the same file, or of a discarded one. If a map is LangSplat's
+        or discarded, the caller could not compute all digests, so missing ones are computed here. For LangSplat's maps both
+        files are digested, and level and stride are part of the name.
         """
         records = [self._finder.record(stem, file) for stem, file in zip(self.stems, self.files, strict=True)]
         if None in records and not self.has_masks and all(file.is_file() for file in self.files):

@@ -10,22 +10,22 @@ from numpy.typing import NDArray
 
 from .._check import check_choice, check_whole
 
-INDEX, ROWS = "_s.npy", "_f.npy"  # what follows the stem: masks [L, H, W], and their features [M, D]
-CELLS = 360 * 480  # most cells of a map when no stride is named: those of the paper's maps, 354 MB at 512 channels
+INDEX, ROWS = "_s.npy", "_f.npy"  # endings after the stem: masks [L, H, W], and their features [M, D]
+CELLS = 360 * 480  # most cells of a map without a given stride, as in the paper's maps: 354 MB at 512 channels
 LEVELS = ("default", "s", "m", "l")  # SAM's own choice of masks; subparts, parts, wholes
 
 
 class MaskFeatures:
-    """A map [h, w, D] in which a pixel has the feature of its mask; only what is read is looked up.
+    """A map [h, w, D] in which a pixel has the feature of its mask. Features are looked up when a part is read.
 
     A pixel in no mask (index -1) has an all-zero feature, which means "unknown".
 
     Args:
-        file: `<stem>_s.npy`, whole numbers [L, H, W] (LangSplat keeps them as floats), beside `<stem>_f.npy`, floats
-            [M, D]; -1 is no mask.
+        file: `<stem>_s.npy`, whole numbers [L, H, W] (LangSplat stores floats), -1 for no mask. `<stem>_f.npy`, floats
+            [M, D], must be in the same folder.
         level: which of the L sets of masks.
         stride: pixels per cell; the map is [round(H / stride), round(W / stride), D], and a cell has the feature of the
-            pixel at its centre. None: the least stride with at most `CELLS` cells.
+            pixel at its centre. None: the smallest stride with at most `CELLS` cells.
 
     Raises:
         FileNotFoundError: if `<stem>_f.npy` is missing.
@@ -94,7 +94,7 @@ def parse_level(level: int | str) -> int:
 
 
 def _finest_stride(height: int, width: int) -> int:
-    """The least stride with at most `CELLS` cells of a picture."""
+    """The smallest stride with at most `CELLS` cells of a picture."""
     stride = 1
     while _cells(height, stride) * _cells(width, stride) > CELLS:
         stride += 1

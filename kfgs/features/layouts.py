@@ -1,4 +1,4 @@
-"""How one map of features is stored: the table of layouts, opening a file without reading its values, and writing."""
+"""The layouts of feature maps on disk: open a map without reading its values, and write one."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ class Reading:
     level: int = 0
     """Which of LangSplat's four sets of masks (`langsplat.LEVELS`)."""
     stride: int | None = None
-    """Pixels per cell of LangSplat's masks, which are as large as the picture; None: the least stride with no more cells
-    than the paper's maps."""
+    """Pixels per cell of LangSplat's masks, which are as large as the picture; None: the smallest stride with at most the
+    cells of the paper's maps."""
 
 
 class Layout(NamedTuple):
     """One way to store a view's map."""
 
-    suffix: str  # what follows the picture's stem in the file's name
+    suffix: str  # ending of the file's name after the picture's stem
     axes: Axes
     certain: bool  # whether every program that writes these files uses this order of the axes
     open: Callable[[Path, Reading], Any]  # maps the file into memory
@@ -80,7 +80,7 @@ def _open_langsplat(file: Path, reading: Reading) -> Any:
 
 
 FEATURE_3DGS = Layout("_fmap_CxHxW.pt", "D h w", True, _open_torch)  # LSeg's in half, SAM's in single precision
-LANGSPLAT = Layout(INDEX, "h w D", True, _open_langsplat)  # beside a second file with the features of the masks
+LANGSPLAT = Layout(INDEX, "h w D", True, _open_langsplat)  # a second file has the features of the masks
 OWN = Layout(".npy", "h w D", False, _open_numpy)  # kfgs's layout, which other programs use too
 LAYOUTS = (FEATURE_3DGS, LANGSPLAT, OWN, Layout(".safetensors", "h w D", False, _open_safetensors))
 """If a view has several maps, the first of this order is read."""
@@ -108,7 +108,7 @@ def layout_of(file: Path, own: Container[Path] = ()) -> Layout | None:
 
 
 def open_map(file: Path, reading: Reading = Reading(), own: Container[Path] = ()) -> StoredMap:  # [h, w, D]
-    """Map a file into memory without reading its values; its kind, its number of axes and their order are checked.
+    """Map a file into memory without reading its values; checks its type, its number of axes and their order.
 
     Args:
         file: the map.

@@ -1,4 +1,4 @@
-"""The manifest of a folder of feature maps: which teacher made them, from which pictures, and what was written."""
+"""The manifest of a folder of feature maps: the teacher, the pictures, and a record of each map file."""
 
 from __future__ import annotations
 
@@ -33,9 +33,10 @@ class MapRecord:
     seconds: float  # that the teacher took
 
     def doubt(self, file: Path, *, read: bool = True) -> str | None:
-        """Why `file` is not the recorded map, in words; None if it is.
+        """Why `file` is not the recorded map; None if it is.
 
-        If only its time is another, the file was copied, touched or changed; `read` finds out, else it counts as changed.
+        If only the time differs, the file was copied, touched or changed. With `read` its digest decides; without, it
+        counts as changed.
         """
         info = file.stat()
         if info.st_size != self.bytes:

@@ -1,4 +1,4 @@
-"""The pictures whose maps a call is about: the views of a scene, or a list."""
+"""Choose the pictures to make or find maps for: views of a scene, or a list."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ class Picture:
     """One picture: the name of its view, its file, and its size if it is known."""
 
     stem: str
-    """The view's name without its suffix; its map is called after it."""
+    """The view's name without its suffix; its map has the same stem."""
     path: Path
     size: tuple[int, int] | None = None
     """(H, W) in pixels."""
 
     def read(self) -> Tensor:  # [H, W, 3] float32 RGB in [0, 1]
-        """Read the file; see `scenes.read_image` for what it raises."""
+        """Read the file; raises as `scenes.read_image`."""
         return read_image(self.path)
 
 

@@ -1,4 +1,4 @@
-"""Maps that the teacher makes again whenever they are asked for: twice its time, and no dense map on disk."""
+"""Feature maps that run the teacher at each access: no dense map on disk, but twice the teacher's time."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from .writer import encode_half
 
 
 class RecomputedMaps(Sequence[Tensor]):
-    """A teacher's maps of some pictures: item i runs the teacher, and nothing dense is stored.
+    """A teacher's maps of some pictures: item i runs the teacher, and no map is stored.
 
-    A map is rounded to half precision as in `extract_features`, so that everything made from it is the same, bit for bit,
-    as from a folder of maps. `fit_codebook` looks at a grid of samples per map again and again; these are stored when they
-    are first asked for (29 MB for a picture of 360x480x512, a sixth of the map). So a fit runs the teacher twice per
-    picture: once for the samples and once for the index maps.
+    A map is rounded to half precision as in `extract_features`, so all results are bit for bit those from a folder of maps.
+    `fit_codebook` reads a grid of samples per map many times, so these samples are stored at the first access (29 MB for a
+    picture of 360x480x512, a sixth of the map). A fit runs the teacher twice per picture: once for the samples, once for
+    the index maps.
 
     Args:
         teacher: sees each picture, [3, H, W] RGB in [0, 1]; a teacher, or a function to [D, h, w] (see `as_teacher`).
@@ -41,7 +41,7 @@ class RecomputedMaps(Sequence[Tensor]):
     """
 
     recomputed = True
-    """Looking at a map runs the teacher, so training on raw maps (`decouple`) would take far too long."""
+    """Each access runs the teacher, so training on raw maps (`decouple`) would take far too long."""
 
     def __init__(
         self,
@@ -78,7 +78,7 @@ class RecomputedMaps(Sequence[Tensor]):
         return int(h), int(w), int(D)
 
     def digests(self) -> list[list[str]]:
-        """[name, SHA-256] of what decides each map: the teacher's identity and the picture's bytes."""
+        """[name, SHA-256] of each map's inputs: the teacher's identity and the picture's bytes."""
         return [
             [stem, digest_value({"teacher": self.identity, "image": self._image_digest(i)})]
             for i, stem in enumerate(self.stems)
@@ -88,7 +88,7 @@ class RecomputedMaps(Sequence[Tensor]):
         return encode_half(self.teacher, self.pictures[i].read(), self.pictures[i].path).float()
 
     def grid(self, i: int, step: tuple[int, int] | None = None, samples: int = SAMPLES) -> Tensor:  # [n, D] float32
-        """`sample_grid(self[i], step, samples=samples)`, from the store if it has been asked for before."""
+        """`sample_grid(self[i], step, samples=samples)`, from the store after the first access."""
         return self.grid_after(i, step, samples, change=None, key=None)
 
     def grid_after(
@@ -107,7 +107,7 @@ class RecomputedMaps(Sequence[Tensor]):
             step: of the grid.
             samples: most features to take when `step` is None.
             change: [h, w, D] -> [h, w, D].
-            key: JSON that identifies what `change` does.
+            key: JSON that identifies `change`.
         """
         settings = {"step": None if step is None else list(step), "samples": samples if step is None else None}
         about = plain_identity({"grid": {**settings, "change": key}, "image": self._image_digest(i)})

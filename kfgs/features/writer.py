@@ -1,4 +1,4 @@
-"""Writing one teacher's maps to a folder, so that a killed process can go on where it stopped."""
+"""Write one teacher's maps to a folder, so that a killed process can be resumed."""
 
 from __future__ import annotations
 
@@ -61,10 +61,10 @@ class MapWriter:
     Half-written files that a killed process left for these pictures are deleted.
 
     Args:
-        folder: of the maps.
+        folder: the folder of maps.
         identity: of the teacher, see `identify`.
-        pictures: whose maps will be written, or are there already.
-        overwrite: give up maps in the folder that another teacher or another program made.
+        pictures: the pictures whose maps will be written, or exist.
+        overwrite: replace maps that another teacher or another program made.
 
     Raises:
         TypeError: if JSON cannot hold `identity`.
@@ -87,7 +87,7 @@ class MapWriter:
                     left_over.unlink(missing_ok=True)
 
     def doubt(self, stem: str, image_digest: str) -> str | None:
-        """Why a picture's map must be made (again), in words; None if the map that is there can be used."""
+        """Why a picture's map must be made (again); None if the existing map can be used."""
         record = self.manifest.maps.get(stem)
         if record is None:
             return "new"
@@ -120,7 +120,7 @@ class MapWriter:
         self.manifest.save(self.folder)
 
     def check_space(self, maps: int, map_bytes: int) -> None:
-        """Raise an OSError unless the disk has space for so many maps of so many bytes."""
+        """Raise an OSError unless the disk has space for `maps` maps of `map_bytes` bytes."""
         needed, free = maps * map_bytes, shutil.disk_usage(self.folder).free
         if needed > free:
             raise OSError(
@@ -130,7 +130,7 @@ class MapWriter:
 
 
 def _make_room(finder: MapFinder, stems: list[str], identity: dict[str, Any], *, overwrite: bool) -> Manifest | None:
-    """The manifest, if this teacher made the maps in the folder. Other maps are an error, or given up with `overwrite`."""
+    """The manifest, if this teacher made the maps in the folder. Other maps are an error, or replaced with `overwrite`."""
     folder, found, hint = finder.path, finder.manifest, "use another folder, or pass overwrite=True (--overwrite)"
     expected = "folder: expected one without maps of other programs, got"
     files = [map_file(folder, stem) for stem in stems]

@@ -1,14 +1,14 @@
 """The compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian, quantised between the bounds of every 256.
 
-Three elements. `chunk`, one row for each 256 Gaussians: the least and largest position, natural logarithm of scale and
-base colour among them. `vertex`: position and log scale in 11, 10 and 11 bits between those bounds, the rotation's three
-smaller components in 10 bits each and 2 bits that say which is largest (w, x, y, z), colour and opacity in 8 bits each;
-fields begin at the high bit. `sh`, only where there are higher harmonics: a byte for each, channel by channel, 32 steps
-to 1 between -4 and 4. Axes are those of the 3DGS PLY. Files of SuperSplat before version 2 have no colour bounds: there
-bytes run from 0 to 1. What the viewers check of the elements leaves no room for labels, which go to a file beside it.
+A file has three elements. `chunk` has one row per 256 Gaussians: bounds of their positions, natural logarithms of scale
+and base colours. `vertex` has position and log scale in 11, 10 and 11 bits between these bounds; the rotation's three
+smaller components in 10 bits each, and 2 bits for the index of the largest (w, x, y, z); colour and opacity in 8 bits
+each. Fields begin at the high bit. `sh`, only with higher harmonics, has a byte for each, channel by channel, from -4 to
+4 in steps of 1/32. Axes are those of the 3DGS PLY. Files of SuperSplat before version 2 have no colour bounds: their bytes
+go from 0 to 1. Viewers check the elements and allow no labels, so labels go to a separate file.
 
-**Why not a library**: gsply 0.4.6 cuts values off where this module rounds them, which makes the errors twice as large,
-and brings opacities of 0 and 1 in as logits of -10 and 10; the tests have it as an independent reader and writer.
+**Why not a library**: gsply 0.4.6 truncates values instead of rounding, which doubles the errors, and reads opacities of 0
+and 1 as logits of -10 and 10. The tests use it as an independent reader and writer.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ MAGIC = b"ply"
 HOLDS_LABELS = False
 SORTS = True
 CHUNK = 256  # Gaussians between shared bounds
-LOG_SCALE_LIMIT = 20.0  # e^-20 to e^20 world units: what common writers keep of a scale
-SH_LIMIT = 4.0  # of the higher coefficients
-_AXES = (  # (columns of the least value, of the largest) of positions, log scales and colours
+LOG_SCALE_LIMIT = 20.0  # scales from e^-20 to e^20 world units, as other writers keep them
+SH_LIMIT = 4.0  # largest higher coefficient
+_AXES = (  # (columns of the minimum, of the maximum) of positions, log scales and colours
     (("min_x", "min_y", "min_z"), ("max_x", "max_y", "max_z")),
     (("min_scale_x", "min_scale_y", "min_scale_z"), ("max_scale_x", "max_scale_y", "max_scale_z")),
     (("min_r", "min_g", "min_b"), ("max_r", "max_g", "max_b")),
@@ -97,7 +97,7 @@ def read(path: Path) -> SplatFile:
 
 
 def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
-    """Write a compressed PLY file in the order given; the nearer each 256 lie together, the tighter their bounds.
+    """Write a compressed PLY file in the given order; precision is best if each 256 Gaussians lie close together.
 
     Raises:
         ValueError: if the cloud has no colours.
@@ -135,7 +135,7 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
 
 
 def precision(gaussians: Gaussians) -> Precision:
-    """Half a step between the bounds that this cloud's chunks get in Morton order, and what the fixed ranges cut off.
+    """Half a step between the bounds of this cloud's chunks in Morton order, plus what the fixed ranges cut off.
 
     `means` is [N, 3] in the order of `gaussians`; scales, colours and harmonics are those of the worst chunk.
     """
@@ -148,7 +148,7 @@ def precision(gaussians: Gaussians) -> Precision:
     log_scales = g.scales.log().numpy()
     clipped = np.abs(np.clip(log_scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT) - log_scales)
     strongest = float(g.sh[:, 1:].abs().max()) if g.sh.shape[1] > 1 and len(g) else 0.0
-    ends = SH_LIMIT - 1 / 32  # the outermost steps are read as their far ends, the others as their middles
+    ends = SH_LIMIT - 1 / 32  # the outermost steps are read as the ends of the range, the others as their middles
     return Precision(
         means=means,
         scales=math.expm1(min(float((errors[1] + clipped).max(initial=0.0)), 700.0)) * (1 + 1e-5) + 1e-6,
@@ -160,14 +160,14 @@ def precision(gaussians: Gaussians) -> Precision:
 
 
 def _quantities(g: Gaussians) -> tuple[NDArray[np.float64], ...]:  # 3 x [N, 3]
-    """What lies between bounds: positions, logarithms of scales, base colours."""
+    """The values stored between bounds: positions, logarithms of scales, base colours."""
     assert g.sh is not None
     log_scales = g.scales.log().clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
     return g.means.numpy(), log_scales.numpy(), (g.sh[:, 0] * SH_C0 + 0.5).numpy()
 
 
 def _chunk_bounds(values: NDArray[np.float64]) -> _Bounds:  # [N, 3]
-    """The least and largest value of each 256, as float32 (rounded, so a value may lie half a bit outside)."""
+    """Minimum and maximum of each 256 values as float32 (rounded, so a value may lie half a bit outside)."""
     starts = np.arange(0, len(values), CHUNK)
     if not len(starts):
         return _Bounds(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
@@ -216,7 +216,7 @@ def _unpack_rotations(packed: NDArray[np.uint32]) -> Tensor:  # [N] -> [N, 4] wx
 
 
 def _read_rest(path: Path, columns: Columns | None, n: int) -> NDArray[np.float32]:  # [N, K - 1, 3]
-    """The higher harmonics; the outermost bytes stand for the ends of the range, the others for middles of steps."""
+    """The higher harmonics; the outermost bytes mean the ends of the range, the others the middles of their steps."""
     if columns is None:
         return np.zeros((n, 0, 3), np.float32)
     names = [f"f_rest_{i}" for i in range(len(columns))]
@@ -251,7 +251,7 @@ def _read_bounds(path: Path, chunk: Columns, axes: tuple[tuple[str, ...], tuple[
 
 
 def _check_elements(path: Path, chunk: Columns, vertex: Columns) -> int:
-    """How many Gaussians there are, if the elements fit together."""
+    """Check that the elements fit together, and return the number of Gaussians."""
     wrong = [name for name in _PACKED if name not in vertex or vertex[name].dtype != np.uint32]
     if wrong:
         raise ValueError(
@@ -267,7 +267,7 @@ def _check_elements(path: Path, chunk: Columns, vertex: Columns) -> int:
 
 
 def _words_of_clipping(g: Gaussians) -> tuple[str, ...]:
-    """What lies beyond the fixed ranges."""
+    """Describe the values that the fixed ranges cut off."""
     assert g.sh is not None
     lost = []
     small = int((g.scales.log().abs() > LOG_SCALE_LIMIT).any(1).sum())

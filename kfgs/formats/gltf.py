@@ -10,11 +10,11 @@
 | COLOR_0 | red, green, blue, opacity for viewers that draw points only |
 | _CLASS_ID, _SCORE, _other | kfgs's labels and extra columns; names of classes and columns in the primitive's `extras` |
 
-**Convention**: glTF has x right, y up, z back; the 3DGS PLY has x right, y down, z forward. Values are turned by half a
-turn around x when reading and writing, harmonics with them, so a scene stands upright in any viewer.
+**Convention**: glTF has x right, y up, z back; the 3DGS PLY has x right, y down, z forward. Reading and writing turn all
+values, harmonics too, by 180 degrees around x, so a scene stands upright in any viewer.
 
-**Why not a library**: pygltflib 1.16.5 holds the JSON as objects, but leaves accessors, buffers and this extension to its
-caller, and takes a file whose accessors reach beyond its buffers; the tests have it as an independent reader and writer.
+**Why not a library**: pygltflib 1.16.5 reads the JSON, but not accessors, buffers and this extension, and accepts files
+with accessors that reach beyond their buffers. The tests use it as an independent reader and writer.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ KERNEL, COLOR_SPACE, PROJECTION, SORTING = "ellipse", "srgb_rec709_display", "pe
 _UNDERSTOOD = (EXTENSION, "KHR_mesh_quantization")
 _POINTS = 0
 _EXACT = 1 << 24  # whole numbers that float32 holds
-_LEAST_BYTES = 8  # of file per Gaussian: fewer means one buffer shown many times over
+_LEAST_BYTES = 8  # bytes per Gaussian: with fewer, the file shows one buffer many times
 
 
 class _Part(NamedTuple):
@@ -66,23 +66,23 @@ class _Part(NamedTuple):
 
 
 def matches(head: bytes) -> bool:
-    """A .glb, or JSON that speaks of accessors or of the extension."""
+    """A .glb, or JSON that mentions accessors or the extension."""
     if head.startswith(GLB):
         return True
     return head.lstrip()[:1] == b"{" and (EXTENSION.encode() in head or b'"accessors"' in head)
 
 
 def read(path: Path) -> SplatFile:
-    """Read all splat primitives of the default scene, each where its node puts it, into the axes of the 3DGS PLY.
+    """Read all splat primitives of the default scene, moved by their nodes, in the axes of the 3DGS PLY.
 
-    Drafts are read too: scales as logarithms (recognised by negative values, which the ratified text forbids), `_ROTATION` and
-    `_SCALE`, and colour and opacity from COLOR_0 where their attributes are missing.
+    Files of older drafts are read too: scales as logarithms (recognised by negative values, which the ratified text
+    forbids), `_ROTATION` and `_SCALE`, and colour and opacity from COLOR_0 if their attributes are missing.
 
     `info` has `color_space`, `primitives`, and `ignored`, the number of primitives that hold no splats.
 
     Raises:
         ValueError: if it is damaged, holds no splats, needs an extension that kfgs does not know (compressed splats), or
-            a node moves its splats in a way that they cannot follow.
+            a node mirrors or shears its splats.
     """
     document = open_document(path)
     required = document.list_of(document.root, "extensionsRequired", "extensionsRequired")
@@ -118,7 +118,7 @@ def read(path: Path) -> SplatFile:
 
 
 def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
-    """Write one primitive with float32 values; labels, score, class names and extra columns go along.
+    """Write one primitive with float32 values, with labels, score, class names and extra columns.
 
     Raises:
         ValueError: if the cloud is empty, has no colours or labels beyond 2^24, or is too large for a .glb.
@@ -233,7 +233,7 @@ def _coefficient(k: int) -> str:
 def _higher(
     document: Document, attributes: dict[str, Any], where: str, count: int
 ) -> list[NDArray[np.float32]]:  # of [N, 3]
-    """The coefficients of degrees 1 to 3 that are there; every degree has to be whole, and none skipped."""
+    """The coefficients of degrees 1 to 3, as far as present; each degree must be complete, and none skipped."""
     have = [k for k in range(1, 16) if _coefficient(k) in attributes]
     if len(have) not in (0, 3, 8, 15) or have != list(range(1, len(have) + 1)):
         raise document.wrong(f"{where}.attributes", "whole degrees of harmonics", [_coefficient(k) for k in have][-3:])
@@ -268,7 +268,7 @@ def _read_columns(
 
 
 def _join(parts: list[_Part]) -> _Part:
-    """Several primitives as one cloud: harmonics padded to the highest degree, columns kept that all have."""
+    """Join primitives to one cloud: harmonics are padded to the highest degree; columns stay if all have them."""
     if len(parts) == 1:
         return parts[0]
     clouds = [part.gaussians for part in parts]
@@ -289,7 +289,7 @@ def _join(parts: list[_Part]) -> _Part:
 
 
 def _fallback(g: Gaussians) -> NDArray[np.uint8]:  # [N, 4]
-    """What viewers without splats draw: the base colour and the opacity."""
+    """Base colour and opacity, for viewers that cannot draw splats."""
     assert g.sh is not None
     color = torch.cat([g.sh[:, 0] * SH_C0 + 0.5, g.opacities[:, None]], 1)
     return (color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
@@ -298,7 +298,7 @@ def _fallback(g: Gaussians) -> NDArray[np.uint8]:  # [N, 4]
 def _write_columns(
     splats: SplatFile, writer: AccessorWriter, attributes: dict[str, int]
 ) -> tuple[dict[str, Any], set[str]]:
-    """Add labels and extra columns; returns what `extras` says of them, and the names of the columns that fit."""
+    """Add labels and extra columns; returns their entry in `extras`, and the names of the columns that fit."""
     columns: Columns = {}
     labels = splats.gaussians.labels
     if labels is not None:

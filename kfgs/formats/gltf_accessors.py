@@ -19,10 +19,10 @@ def read_accessor(document: Document, index: object, width: int, count: int | No
     """The values of an accessor as float32 [N, width]; normalised integers become [-1, 1] or [0, 1].
 
     Args:
-        document: where it lies.
+        document: the document.
         index: which accessor.
-        width: numbers per element that are expected; 0 takes what there is.
-        count: elements that are expected, or None.
+        width: expected numbers per element; 0: any.
+        count: expected number of elements; None: any.
 
     Raises:
         ValueError: if it is damaged, sparse, or not of that width and count.
@@ -49,7 +49,7 @@ def read_accessor(document: Document, index: object, width: int, count: int | No
 def _take(
     document: Document, accessor: dict[str, Any], where: str, rows: int, width: int, dtype: np.dtype[Any]
 ) -> NDArray[Any]:  # [rows, width]
-    """A view of the bytes, strided as they lie."""
+    """A strided view of the bytes."""
     content, stride = document.view(accessor["bufferView"])
     start = document.whole(accessor, "byteOffset", where, 0)
     size = width * dtype.itemsize
@@ -72,9 +72,9 @@ class AccessorWriter:
         self._length = 0
 
     def add(self, values: NDArray[Any], *, bounds: bool = False) -> int:
-        """Add float32 values, or bytes that stand for [0, 1], [N] or [N, width]; returns the accessor's index.
+        """Add float32 values, or bytes that mean [0, 1], [N] or [N, width]; returns the accessor's index.
 
-        `bounds` adds the least and largest of each component, which glTF asks of positions.
+        `bounds` adds minimum and maximum of each component, which glTF requires for positions.
         """
         normalized = values.dtype == np.uint8
         content = np.ascontiguousarray(values if normalized else values.astype("<f4"))

@@ -1,4 +1,4 @@
-"""glTF 2.0 files as a JSON document and its buffers: `.glb`, and `.gltf` with buffers inside or beside it.
+"""glTF 2.0 files as a JSON document with buffers: `.glb`, and `.gltf` with buffers inside or in other files.
 
 Every index, offset and length is checked against the file before anything is read.
 """
@@ -19,13 +19,13 @@ MAGIC = b"glTF"
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _HEAD, _CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
 _MOST_JSON = 1 << 24  # bytes of a .glb's JSON: sixty thousand accessors take less
-_MOST_TEXT = 1 << 32  # bytes of a .gltf, whose buffers may be inside as text
-_MOST_VALUES = 1 << 20  # in the JSON; buffers as text have none of the marks that are counted
-_WHOLE = 2**53  # a JSON number beyond is no exact integer
+_MOST_TEXT = 1 << 32  # bytes of a .gltf, which may hold buffers as text
+_MOST_VALUES = 1 << 20  # values in the JSON, counted by punctuation that buffers as text do not have
+_WHOLE = 2**53  # above this, JSON numbers are not exact integers
 
 
 class Document:
-    """The JSON of a glTF file with its buffers; every look-up says which file is damaged, and where."""
+    """The JSON of a glTF file with its buffers; errors name the file and the damaged place."""
 
     def __init__(self, path: Path, root: dict[str, Any], binary: bytes | None) -> None:
         self.path, self.root = path, root
@@ -35,7 +35,7 @@ class Document:
         """Bytes of files beside the document that were read."""
 
     def wrong(self, where: str, expected: str, got: object) -> ValueError:
-        """The error of a place in the document, to be raised."""
+        """Make the error for a place in the document."""
         return ValueError(f"{self.path}: {where}: expected {expected}, got {got!r:.80}; the file is damaged")
 
     def all(self, kind: str) -> list[Any]:
@@ -123,7 +123,7 @@ class Document:
         return content
 
     def _beside(self, uri: str, where: str) -> Path:
-        """The file that a uri names, in the document's own folder or below it, wherever links lead."""
+        """The file that a uri names; after links are followed, it must lie in the document's folder or below."""
         name = unquote(uri)
         odd = urlsplit(uri).scheme or "\0" in name or PureWindowsPath(name).drive or name.startswith(("/", "\\"))
         if odd or ".." in PurePosixPath(name.replace("\\", "/")).parts:

@@ -1,4 +1,4 @@
-"""Where the nodes of a glTF scene put their meshes."""
+"""Apply the transforms of a glTF scene's nodes to their meshes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _DEEPEST = 256  # nodes below nodes
 
 
 def placed_meshes(document: Document) -> Iterator[tuple[str, int, Tensor]]:  # name of the node, mesh, [4, 4] float64
-    """Every mesh that the default scene shows, with the matrix from its own space to the scene's.
+    """Every mesh of the default scene, with the matrix from the mesh's axes to the scene's.
 
     A document without scenes shows all nodes without a parent; one without nodes shows all meshes unmoved.
 
@@ -43,7 +43,7 @@ def placed_meshes(document: Document) -> Iterator[tuple[str, int, Tensor]]:  # n
     while waiting:
         index, above, depth = waiting.pop()
         node = document.item("nodes", index)
-        if index in seen or depth > _DEEPEST:  # a node has one parent, says glTF
+        if index in seen or depth > _DEEPEST:  # in glTF a node has one parent
             raise document.wrong(f"nodes[{index}]", "a tree of nodes", "a node that is met twice")
         seen.add(index)
         matrix = above @ _local(document, node, f"nodes[{index}]")
@@ -53,7 +53,7 @@ def placed_meshes(document: Document) -> Iterator[tuple[str, int, Tensor]]:  # n
 
 
 def place(document: Document, where: str, gaussians: Gaussians, matrix: Tensor) -> Gaussians:  # matrix: [4, 4]
-    """Move the Gaussians of a mesh to where its node puts them, and turn their colours.
+    """Apply a node's matrix to the Gaussians of its mesh, and turn their colours with it.
 
     Raises:
         ValueError: if the node mirrors, shears or scales the axes differently, or moves Gaussians out of the range of

@@ -27,7 +27,7 @@ _HEADER_BYTES, _SECTION_BYTES = 4096, 1024
 _HEADER = struct.Struct("<BB2xIIIIH14xff")  # version, max sections, sections, max count, count, level, ..., sh range
 _SECTION = struct.Struct("<IIIIfH2xI4xIIH")
 _MAX_DEGREE = 2
-_SH_RANGE = 1.5  # of level 2, where the header says nothing
+_SH_RANGE = 1.5  # of level 2, if the header gives none
 
 
 class _Section(NamedTuple):
@@ -132,7 +132,7 @@ def _read_section(
             raise ValueError(f"{path}: expected bucket centres of 12 bytes, got {s.bucket_bytes}; the file is damaged")
         centres = np.frombuffer(data, "<f4", 3 * s.buckets, centres_at).reshape(-1, 3)
         quantum = s.quantum or 32767
-        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused below
+        with np.errstate(over="ignore", invalid="ignore"):  # overflow is refused below
             offsets = (means - quantum) * np.float32(s.block_size / 2 / quantum)
             means = offsets + centres[_buckets(path, s, lengths)]
     scales, quats = rows["scales"].astype(np.float32), rows["quats"].astype(np.float32)
@@ -142,7 +142,7 @@ def _read_section(
     check_finite(path, positions=means, scales=scales, rotations=quats, harmonics=sh)
     rgba = torch.from_numpy(rows["rgba"].astype(np.float32)) / 255
     rest = torch.zeros(s.size, (degree + 1) ** 2 - 1, 3)
-    if s.size:  # the degree of an empty section says nothing
+    if s.size:  # the degree of an empty section has no meaning
         rest[:, : (s.degree + 1) ** 2 - 1] = torch.from_numpy(_by_coefficient(sh))
     gaussians = Gaussians(
         means=torch.from_numpy(means),

@@ -1,4 +1,4 @@
-"""Morton order: formats that compress neighbours together store their Gaussians along this curve."""
+"""Morton order: a curve through space, along which formats that compress neighbours together sort their Gaussians."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _SPREAD = (  # (shift, mask): bit i of a 21-bit number goes to bit 3 i, in halve
 def morton_order(
     means: Tensor,  # [N, 3]
 ) -> Tensor:  # [N] int64
-    """The indices that sort positions by their Morton codes, so that neighbours in space are neighbours in the file.
+    """The indices that sort positions by their Morton codes: neighbours in space become neighbours in the file.
 
-    A code interleaves 21 bits of x, y and z between the cloud's least and largest coordinates (Morton 1966), x in the
-    lowest bit. Equal codes keep their order, so an ordered cloud stays as it is.
+    A code interleaves 21 bits each of x, y and z, scaled to the cloud's bounds (Morton 1966), with x in the lowest bit.
+    Equal codes keep their order, so a sorted cloud does not change.
 
     Raises:
         ValueError: if a position is not finite.

@@ -1,4 +1,4 @@
-"""Few values that stand for many: codebooks of 256 numbers and palettes of rows, by k-means without random numbers."""
+"""Replace many values by few: codebooks of 256 numbers and palettes of rows, by k-means without random numbers."""
 
 from __future__ import annotations
 
@@ -12,19 +12,21 @@ from torch import Tensor
 
 CODES = 256  # numbers in a codebook: an index is one byte
 _PASSES = 10  # of Lloyd's algorithm on the line
-_EVEN = 64  # numbers that start evenly between the least and the largest value, so that outliers get some
+_EVEN = 64  # numbers that start evenly spaced over the whole range, so that outliers get some
 _BINS = 512  # of the density of values
-_ROW_PASSES = 4  # on rows; 10 lower the error by 1 % and take 3 times as long (100,000 rows of 45, palette 65,536)
+_ROW_PASSES = (
+    4  # for rows; 10 passes lower the error by 1 % and take 3 times as long (100,000 rows of 45, palette 65,536)
+)
 _BLOCK = 1 << 22  # distances at a time, 16 MiB
 
 
 def fit_codebook(
     values: NDArray[np.float64],  # [N]
 ) -> NDArray[np.float32]:  # [256], ascending
-    """256 numbers near which all values lie: Lloyd's algorithm on the line, exact in each pass.
+    """Choose 256 numbers that represent all values: Lloyd's algorithm on the line, exact in each pass.
 
-    Three in four start with the spacing that is best for many numbers, in proportion to the cube root of the density
-    (Panter and Dite 1951), the others evenly. Up to 256 different values are kept as they are.
+    Three in four start spaced by the cube root of the density, which is best for many numbers (Panter and Dite 1951), the
+    others evenly. Up to 256 different values are kept exactly.
     """
     ordered = np.sort(values.ravel())
     different = np.unique(ordered.astype(np.float32))
@@ -53,13 +55,13 @@ def nearest_codes(
     codebook: NDArray[np.float32],  # [256], ascending
     values: NDArray[np.float64],  # [...]
 ) -> NDArray[np.uint8]:  # [...]
-    """The index of the number nearest to each value; of two equally near ones the smaller."""
+    """The index of the number nearest to each value; ties go to the smaller number."""
     middles = (codebook[1:].astype(np.float64) + codebook[:-1]) / 2
     return np.searchsorted(middles, values).astype(np.uint8)
 
 
 class Palette(NamedTuple):
-    """Rows that stand for many."""
+    """Representative rows."""
 
     rows: Tensor  # [K, D]
     labels: Tensor  # [N] int64 into rows
@@ -69,11 +71,11 @@ def fit_palette(
     rows: Tensor,  # [N, D]
     size: int,
 ) -> Palette:
-    """At most `size` rows near which all rows lie, by k-means in two levels.
+    """Choose at most `size` rows that represent all rows, by k-means in two levels.
 
-    The rows are parted into about sqrt(size) groups, and each group gets a share of the palette in proportion to the rows
-    in it. That costs N 2 sqrt(size) distances a pass where one level costs N size. Starting rows are evenly spaced, so
-    give rows in an order where neighbours are alike. Nothing is lost where `size` is N or more.
+    The rows are divided into about sqrt(size) groups, and each group gets a share of the palette in proportion to its
+    rows. A pass then computes 2 N sqrt(size) distances instead of N size. Starting rows are evenly spaced, so pass rows in
+    an order with similar neighbours. With `size` of N or more, nothing is lost.
     """
     if len(rows) <= size:
         return Palette(rows, torch.arange(len(rows)))
@@ -92,14 +94,14 @@ def fit_palette(
 
 
 def _share(counts: Tensor, size: int) -> list[int]:
-    """Whole parts of `size` in proportion to the counts: at least 1 for each count above 0, and never more than the count."""
+    """Divide `size` in proportion to the counts: at least 1 for each count above 0, never more than the count."""
     filled = int((counts > 0).sum())
     parts = (counts * (size - filled) // int(counts.sum())) + (counts > 0).long()
     return torch.minimum(parts, counts).tolist()
 
 
 def _fit_means(rows: Tensor, size: int) -> Palette:
-    """Lloyd's algorithm from evenly spaced rows; a mean that no row is nearest to stays where it is."""
+    """Lloyd's algorithm from evenly spaced rows; a mean without rows stays."""
     if len(rows) <= size:
         return Palette(rows, torch.arange(len(rows)))
     means = rows[torch.arange(size) * len(rows) // size].clone()

@@ -28,11 +28,11 @@ _NAMES = {
     "f4": "float",
     "f8": "double",
 }
-_HEADER_BYTES = 1 << 20  # no honest header is longer
+_HEADER_BYTES = 1 << 20  # no real header is longer
 
 
 class _Element(NamedTuple):
-    """A table that the header promises."""
+    """A table declared in the header."""
 
     name: str
     rows: int
@@ -48,7 +48,7 @@ class _Header(NamedTuple):
 
 
 def _parse_header(path: Path, file: BinaryIO) -> _Header:
-    """Read what the header says, whichever elements it names; leave `file` where the data begin."""
+    """Read the header, with any elements; leaves `file` at the start of the data."""
     head = file.read(_HEADER_BYTES)
     end = head.find(b"\nend_header") + 1
     newline = head.find(b"\n", end)
@@ -146,7 +146,7 @@ def _existing(path: str | Path) -> Path:
 
 
 def other_elements(path: str | Path) -> list[str]:
-    """Names of the elements after the vertices that hold something, such as the faces of a mesh; `read_ply` skips them.
+    """Names of the non-empty elements after the vertices, for instance the faces of a mesh; `read_ply` skips them.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -160,7 +160,7 @@ def other_elements(path: str | Path) -> list[str]:
 
 
 def read_comments(path: str | Path) -> list[str]:
-    """The comments of a PLY file's header, in order: which program wrote it, and what else it had to say.
+    """The comments of a PLY file's header, in order; programs write their name and options there.
 
     Raises:
         FileNotFoundError: if there is no such file.

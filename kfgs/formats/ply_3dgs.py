@@ -1,4 +1,4 @@
-"""The common 3DGS layout of a PLY file, as Inria's script wrote it first and most programs read it.
+"""The common 3DGS layout of a PLY file: written first by Inria's script, read by most programs.
 
 Columns x y z nx ny nz f_dc_* f_rest_* opacity scale_* rot_*, with opacity as a logit, scale as a natural logarithm,
 rotation as (w, x, y, z) and f_rest channel by channel. kfgs adds `class_id` and `score`; every other column is kept.
@@ -26,14 +26,14 @@ NORMALS = ("nx", "ny", "nz")  # always zero in 3DGS files; written, not kept
 
 
 def matches(head: bytes) -> bool:
-    """Any PLY file: compressed ones are asked for first."""
+    """Any PLY file; compressed ones are checked before."""
     return head.startswith(MAGIC)
 
 
 def read(path: Path) -> SplatFile:
     """Read a 3DGS PLY with any degree of spherical harmonics; unknown columns go to `extra`.
 
-    `info` has `antialiased` or `surfels` where a comment says so (`render_mode`).
+    `info` has `antialiased` or `surfels` if a comment says so (`render_mode`).
 
     Raises:
         ValueError: if it is damaged, no 3DGS file, or a value is not a finite number; opacities of 0 and 1, whose logits

@@ -1,15 +1,15 @@
-"""For which kind of drawing a cloud was trained: antialiased, or as flat surfels. No value of a Gaussian shows it.
+"""The kind of rendering that a cloud was trained for: antialiased, or as flat surfels. The Gaussians do not show it.
 
 `info["antialiased"]` (true or false): trained with the filter of Mip-Splatting, so a renderer that widens a Gaussian on the
-screen has to lower its opacity by as much. Drawn without, small Gaussians are too opaque. `info["surfels"]` (true): trained
-as 2D Gaussians. A file that does not say has neither.
+screen must lower its opacity in proportion; otherwise small Gaussians are too opaque. `info["surfels"]` (true): trained as
+2D Gaussians. If the file does not say, `info` has neither.
 
 - PLY and compressed PLY, in comments: `SplatRenderMode: default`, `mip` or `2dgs` (Brush), `antialiased 1` or `0` and
   `postshot.anti_aliasing=1` or `0` (Postshot);
 - SOG, in `meta.json`: `"antialias": true` (the specification), `"model": "antialiased"` or `"2dgs"` (splat-transform);
 - SPZ: a flag for antialiased, no place for surfels.
 
-The others have a place for neither.
+Other formats store neither.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def comments_of_mode(info: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def mode_from_meta(meta: Mapping[str, Any]) -> dict[str, bool]:
-    """What the `meta.json` of a SOG scene says, for `info`; `model`, which says more, counts before `antialias`."""
+    """Read the mode from the `meta.json` of a SOG scene, for `info`; `model` has priority over `antialias`."""
     model = meta.get("model")
     if isinstance(model, str) and model in _MODELS:
         return dict(_MODES[_MODELS[model]])
@@ -76,7 +76,7 @@ def meta_of_mode(info: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def describe_lost_mode(info: Mapping[str, Any], name: str, holds: tuple[str, ...] = ()) -> tuple[str, ...]:
-    """Say what a format leaves out of the mode if it can only store what it `holds`."""
+    """Describe the parts of the mode that a format cannot store."""
     return tuple(
         f"{words}: {name} has no place for it" for key, words in _WORDS.items() if info.get(key) and key not in holds
     )

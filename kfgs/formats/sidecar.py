@@ -1,4 +1,4 @@
-"""Files beside a splat file: the names of its classes, and the labels if the format has no place for them."""
+"""Extra files next to a splat file: class names, and the labels if the format cannot store them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from .._files import atomic_path, digest_file, read_json, write_json
 from .splat_file import SCORE, SplatFile
 
-_NPZ_HEADERS = 1 << 16  # bytes: what an .npz file of three arrays has beside their values
+_NPZ_HEADERS = 1 << 16  # bytes of headers in an .npz file of three arrays
 
 
 def names_path(path: str | Path) -> Path:
@@ -24,7 +24,7 @@ def names_path(path: str | Path) -> Path:
 
 
 def shared_names_path(path: str | Path) -> Path:
-    """`scene.ply` -> `scene.classes.json`: read if the file has no names of its own (older versions of kfgs wrote this name).
+    """`scene.ply` -> `scene.classes.json`, a name that older versions of kfgs wrote; read if there is no `names_path`.
 
     It may also belong to `scene.spz`, so it is never written or deleted.
     """
@@ -38,17 +38,16 @@ def labels_path(path: str | Path) -> Path:
 
 
 def write_names(path: str | Path, classes: tuple[str, ...], **facts: Any) -> Path:
-    """Write the names of a splat file's classes beside it, with facts about how its labels came about."""
+    """Write the class names of a splat file next to it, with details about how its labels were made."""
     target = names_path(path)
     write_json(target, {"class_id": dict(enumerate(classes)), "none": -1, **facts})
     return target
 
 
 def write_sidecar(path: Path, splats: SplatFile, *, holds_labels: bool) -> list[Path]:
-    """Write what the format itself could not hold, and delete the labels and names of an older `path`.
+    """Write the labels and names that the format cannot store, and delete those of an older `path`.
 
-    The names are always written beside a labelled file, even if the format holds them: people read them there, together
-    with how the labels were made.
+    Names are written for every labelled file, even if the format stores them, so that people can read them.
     """
     labels, written = splats.gaussians.labels, []
     beside = labels_path(path)
@@ -61,7 +60,7 @@ def write_sidecar(path: Path, splats: SplatFile, *, holds_labels: bool) -> list[
         written.append(beside)
     else:
         beside.unlink(missing_ok=True)
-    # An empty file of names keeps the shared one from being read for this file.
+    # an empty file of names prevents the shared one from being read
     if labels is not None and (splats.classes or shared_names_path(path).is_file()):
         facts = splats.info.get("labels", {})
         written.append(write_names(path, splats.classes, **facts))
@@ -71,10 +70,10 @@ def write_sidecar(path: Path, splats: SplatFile, *, holds_labels: bool) -> list[
 
 
 def read_sidecar(path: Path, splats: SplatFile) -> SplatFile:
-    """Add the labels and names from the files beside a splat file. What the file itself says has priority.
+    """Add labels and names from the files next to a splat file; those in the splat file have priority.
 
     Raises:
-        ValueError: if a file beside it is damaged, or its labels belong to another version of the splat file.
+        ValueError: if such a file is damaged, or its labels belong to another version of the splat file.
     """
     beside = labels_path(path)
     if splats.gaussians.labels is None and beside.is_file():
@@ -86,7 +85,7 @@ def read_sidecar(path: Path, splats: SplatFile) -> SplatFile:
 
 
 def find_names(path: str | Path) -> Path | None:
-    """The file with the names of a splat file's classes: its own, or the shared one; None if there is neither."""
+    """The file with the class names of a splat file: `names_path`, or else `shared_names_path`; None if neither exists."""
     return next((found for found in (names_path(path), shared_names_path(path)) if found.is_file()), None)
 
 
@@ -121,7 +120,7 @@ def _with_labels(beside: Path, path: Path, splats: SplatFile) -> SplatFile:
 
 
 def _load_labels(beside: Path, path: Path, count: int) -> tuple[NDArray[Any], NDArray[Any] | None, str]:
-    """`class_id`, `score` and the digest of the file they belong to; nothing is unpacked that is larger than it can be."""
+    """Read `class_id`, `score` and the digest of their splat file; sizes are checked before unpacking."""
     try:
         with zipfile.ZipFile(beside) as archive:
             sizes = {entry.filename: entry.file_size for entry in archive.infolist()}

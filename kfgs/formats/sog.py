@@ -1,14 +1,14 @@
 """PlayCanvas' SOG scenes (Spatially Ordered Gaussians): a zip file or a folder of `meta.json` and lossless images.
 
-One pixel a Gaussian, row by row. `means_l`, `means_u`: low and high byte of 16 bits between the bounds of
+Each Gaussian is one pixel, row by row. `means_l`, `means_u`: low and high byte of 16 bits between the bounds of
 sign(x) ln(1 + |x|). `quats`: three smaller components in 8 bits each, 252 + the index of the largest (w, x, y, z) as
 alpha. `scales`: indices into a codebook of natural logarithms. `sh0`: indices into a codebook of base colours, opacity
 as alpha. `shN_labels`: which row of `shN_centroids`, 64 to a line, holds the higher harmonics, as indices into a third
 codebook. Version 1 has even steps between bounds instead of codebooks, and opacity as a logit; it is read, not written.
-Axes are those of the 3DGS PLY. There is no place for labels, which go to a file beside it.
+Axes are those of the 3DGS PLY. The format cannot store labels, so they go to a separate file.
 
-**Why not a library**: gsply 0.4.6 reads SOG but does not write it, and unpacks a zip entry to any size it claims; the tests
-have it as an independent reader.
+**Why not a library**: gsply 0.4.6 reads SOG but does not write it, and unpacks a zip entry to any size it claims. The tests
+use it as an independent reader.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def matches(head: bytes) -> bool:
 def read(path: Path) -> SplatFile:
     """Read a .sog file, a folder with `meta.json`, or that `meta.json`; opacities of 0 and 1 stay 0 and 1.
 
-    `info` has `version`, and, where the scene says so, `generator`, and `antialiased` or `surfels` (`render_mode`).
+    `info` has `version`, and if the scene gives them `generator`, and `antialiased` or `surfels` (`render_mode`).
 
     Raises:
         ValueError: if it is neither, a file is missing or damaged, or sizes and indices disagree.
@@ -88,11 +88,11 @@ def read(path: Path) -> SplatFile:
         sh=torch.from_numpy(sh),
     )
     splats = SplatFile(gaussians, info={"format": NAME, **meta.facts})
-    return read_sidecar(path.parent, splats) if path.name == META else splats  # labels lie beside the folder
+    return read_sidecar(path.parent, splats) if path.name == META else splats  # labels are next to the folder
 
 
 def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
-    """Write version 2 in the order given: a zip file where the name ends in .sog, else a folder.
+    """Write version 2 in the given order: a zip file if the name ends in .sog, else a folder.
 
     Raises:
         ValueError: if the cloud has no colours, or there is a folder of that name with files that do not belong to a SOG scene.
@@ -110,9 +110,9 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
 
 
 def precision(gaussians: Gaussians) -> Precision:
-    """What this cloud's own codebooks and palette make of it; `means` is [N, 3] in the order of `gaussians`.
+    """The errors with this cloud's codebooks and palette; `means` is [N, 3] in the order of `gaussians`.
 
-    Costs as much as writing: codebooks and palette are fitted.
+    Takes as long as writing, because codebooks and palette are fitted.
     """
     g = colours_to_write(gaussians, ".sog").select(morton_order(gaussians.means).cpu())
     assert g.sh is not None
@@ -191,7 +191,7 @@ def _log_positions(means: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _encode(g: Gaussians, mode: dict[str, Any]) -> dict[str, bytes]:
-    """The files of a scene, with what `meta.json` says of how to draw it."""
+    """The files of a scene; `mode` goes into `meta.json`."""
     assert g.sh is not None
     logs = _log_positions(g.means.numpy())
     low, high = (logs.min(0), logs.max(0)) if len(g) else (np.zeros(3), np.zeros(3))
@@ -229,7 +229,7 @@ def _encode(g: Gaussians, mode: dict[str, Any]) -> dict[str, bytes]:
 
 
 def _fit_rest(sh: Tensor) -> _Rest | None:  # [N, K, 3]
-    """A palette of the higher harmonics: 1,024 rows, doubled up to 65,536 while there are as many Gaussians."""
+    """A palette of the higher harmonics: 1,024 rows, doubled up to 65,536 for more Gaussians."""
     if sh.shape[1] == 1 or not len(sh):
         return None
     size = 1024 * min(64, 2 ** int(math.log2(max(len(sh), 1024) / 1024)))
@@ -261,7 +261,7 @@ def _rest_error(sh: Tensor, rest: _Rest | None) -> float:
 
 
 def _check_folder(path: Path) -> None:
-    """A folder is replaced as a whole, so it must hold nothing but a scene."""
+    """Raise unless a folder holds only a scene, because it is replaced as a whole."""
     if not path.exists():
         return
     others = [] if path.is_dir() else [path.name]

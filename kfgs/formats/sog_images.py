@@ -1,4 +1,4 @@
-"""The container of a SOG scene: a zip file or a folder with `meta.json` and images, read in memory and within limits."""
+"""The container of a SOG scene: a zip file or a folder with `meta.json` and images, read in memory with size limits."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from PIL import Image
 
 META = "meta.json"
 _META_BYTES = 1 << 22  # three codebooks of 256 numbers and a few names take 20 KB
-_SPARE_PIXELS = 1 << 16  # an image may be a little larger than what it holds
-_EPOCH = (1980, 1, 1, 0, 0, 0)  # equal scenes give equal files
+_SPARE_PIXELS = 1 << 16  # unused pixels that an image may have
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # a fixed date, so that equal scenes give equal files
 
 
 class SogFiles:
-    """The files of one scene by name; never more bytes of one than the caller allows, and nothing written to disk."""
+    """The files of one scene by name. Reads at most as many bytes as the caller allows, and writes nothing to disk."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -102,7 +102,7 @@ class SogFiles:
             raise ValueError(f"{self.path}: expected {name!r} in the zip file, but it is damaged ({error})") from error
 
     def read_meta(self) -> dict[str, Any]:
-        """What `meta.json` says."""
+        """The content of `meta.json`."""
         data = self.read(META, _META_BYTES)
         try:
             meta = json.loads(data.decode("utf-8"))

@@ -1,4 +1,4 @@
-"""What `meta.json` of a SOG scene says, checked: both versions come out as tables of 256 values for each channel."""
+"""Check the `meta.json` of a SOG scene; both versions are read into tables of 256 values for each channel."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .render_mode import mode_from_meta
 
-_BYTES_TO_GAUSSIANS = 64  # no scene has more Gaussians to a byte: even equal ones cost a few bits each
+_BYTES_TO_GAUSSIANS = 64  # the most Gaussians per byte: even equal ones need a few bits each
 
 
 class SogMeta(NamedTuple):
@@ -31,9 +31,9 @@ def parse_meta(path: Path, meta: dict[str, Any], size: int) -> SogMeta:
     """Check version 1 (no `version`) or 2.
 
     Args:
-        path: named in errors.
+        path: the file, for errors.
         meta: the parsed JSON.
-        size: bytes of the whole scene; a count that they cannot hold is refused.
+        size: bytes of the whole scene, which limit the count of Gaussians.
 
     Raises:
         ValueError: if a key is missing or of another kind, or the count cannot be true.

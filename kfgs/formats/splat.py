@@ -1,9 +1,9 @@
 """The `.splat` file of antimatter15's viewer: 32 bytes a Gaussian, nothing else.
 
 A record is 3 float32 of position, 3 float32 of linear scale, red, green, blue and opacity as bytes, and the quaternion
-(w, x, y, z) as bytes q * 128 + 128. Axes are those of the 3DGS PLY. There is no header: a file is known by its name, and
-trusted if its size is a whole number of records and its floats can be a cloud. Order is kept as given; viewers that draw
-a file while it arrives like the large and opaque Gaussians first.
+(w, x, y, z) as bytes q * 128 + 128. Axes are those of the 3DGS PLY. There is no header: a file is recognised by its name,
+and accepted if its size is a whole number of records and its floats are plausible. The order is kept. Viewers that draw
+while loading look better if large and opaque Gaussians come first.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ NAME = "splat"
 SUFFIXES = (".splat",)
 HOLDS_LABELS = False
 RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
-_ROTATION = 0.016  # radians: 2 * 4 components half of 1/128 off, the quaternion's length taken out
+_ROTATION = 0.016  # radians: twice the error of 4 components, each half of 1/128 off, after normalising
 
 
 def matches(head: bytes) -> bool:
-    """Never: the content has no mark, the name decides."""
+    """Never: the content has no mark, so the name decides."""
     return False
 
 

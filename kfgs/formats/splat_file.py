@@ -1,4 +1,4 @@
-"""What a splat file holds, whichever program wrote it, and how exactly a format can hold it."""
+"""The content of a splat file, independent of its format, and the precision of a format."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from .._card import html_card, short_value
 from ..gaussians import Gaussians
 from .ply import Columns
 
-SCORE = "score"  # the extra column that says how sure a Gaussian's label is
+SCORE = "score"  # the extra column with the confidence of a Gaussian's label
 
 
 @dataclass(frozen=True, eq=False)
 class SplatFile:
-    """A cloud as read from, or to be written to, a splat file.
+    """A cloud with the other content of a splat file.
 
-    **Convention**: axes are those of the 3DGS PLY (x right, y down, z forward where the file keeps COLMAP's frame);
-    formats that store others turn them when reading and writing.
+    **Convention**: axes are those of the 3DGS PLY (in COLMAP's frame: x right, y down, z forward). Formats with other axes
+    are converted when reading and writing.
     """
 
     gaussians: Gaussians
@@ -32,8 +32,8 @@ class SplatFile:
     classes: tuple[str, ...] = ()
     """The name of each class index in `labels`; empty if the file has no names."""
     info: dict[str, Any] = field(default_factory=dict)
-    """Facts about the file that JSON can hold: `format`, and what the header says. `antialiased` and `surfels` say for which
-    kind of drawing the cloud was trained (`render_mode`). A format that has no place for them reports them as lost."""
+    """Details of the file, as JSON: `format`, and values of the header. `antialiased` and `surfels` are the kind of rendering
+    that the cloud was trained for (`render_mode`). A format that cannot store them reports them as lost."""
 
     writer: ClassVar[Callable[..., Written]]
     """What `save` calls: `table.write_splats`, which sets it. The formats import this file, and the table knows the formats."""
@@ -76,15 +76,15 @@ class SplatFile:
 
 
 class Written(NamedTuple):
-    """What `write_splats` left behind."""
+    """The result of `write_splats`."""
 
-    paths: list[Path]  # the file, and those beside it
-    lost: tuple[str, ...]  # what the format could not hold, in words
-    order: Tensor | None  # [N] int64: row i of the file is Gaussian order[i] of the cloud; None: the cloud's own order
+    paths: list[Path]  # the splat file, and extra files next to it
+    lost: tuple[str, ...]  # descriptions of what the format could not store
+    order: Tensor | None  # [N] int64: row i of the file is Gaussian order[i] of the cloud; None: the same order
 
 
 class Precision(NamedTuple):
-    """How far a value may be off after it was written and read again. Each format states it, and the tests hold it to that."""
+    """The largest error of a value that was written and read again. Each format states it, and the tests check it."""
 
     means: float | Tensor  # world units, per axis: one number, or [N, 3]
     scales: float  # relative, of each standard deviation
@@ -92,4 +92,4 @@ class Precision(NamedTuple):
     opacities: float  # absolute
     sh0: float  # absolute, of the degree-0 coefficients
     sh_rest: float  # absolute, of the higher coefficients
-    degree: int = 3  # highest degree of spherical harmonics that it holds
+    degree: int = 3  # highest degree of spherical harmonics

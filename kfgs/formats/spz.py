@@ -1,11 +1,10 @@
-"""SPZ, Niantic's compressed splat file: versions 1 to 4 are read, 2 to 4 written. Labels lie in an extension record.
+"""SPZ, Niantic's compressed splat file: versions 1 to 4 are read, 2 to 4 written. Labels are in an extension record.
 
-**Why not a library**: Niantic's own binding is not in the Python package index (in 2026 the `spz` there, 0.0.1, is another
-author's, with a wheel for Python 3.13 alone). gsply 0.4.6 leaves the axes as the file has them, keeps neither flags nor
-extension records, where the labels are, and unpacks a gzip stream to any size. The tests use it as an independent reader and
-writer.
+**Why not a library**: Niantic's Python binding is not in the package index (in 2026 `spz` 0.0.1 there has another author,
+and a wheel for Python 3.13 only). gsply 0.4.6 does not convert the axes, drops flags and extension records, and unpacks a
+gzip stream to any size. The tests use it as an independent reader and writer.
 
-**Labels** lie in kfgs's extension record, type 0x4B460001; other readers skip it. Its payload, little-endian:
+**Labels** are in kfgs's extension record, type 0x4B460001; other readers skip it. Its payload, little-endian:
 
 | bytes | what |
 |---|---|
@@ -49,12 +48,12 @@ from .values import UP_AND_BACK, check_splats, colours_to_write, describe_loss
 NAME = "spz"
 SUFFIXES = (".spz",)
 HOLDS_LABELS = True
-_COORDINATES = 0xADBE0003  # Adobe's record: u32, which axes the file has
+_COORDINATES = 0xADBE0003  # Adobe's record: u32, the axes of the file
 LABELS = 0x4B460001  # vendor 0x4B46 (KF), extension 1
 _LABELS_VERSION, _HAS_SCORE = 1, 0x1
 _LABELS_HEAD = struct.Struct("<HHII")
 _MAX_NAMES = 1 << 20
-_SPARSE_BITS = 8  # fewer bits after the point than this are worth a word: steps of 1/256 unit
+_SPARSE_BITS = 8  # with fewer bits after the point (steps of 1/256 unit), the loss is reported
 
 
 def matches(head: bytes) -> bool:
@@ -94,7 +93,7 @@ def read(path: Path) -> SplatFile:
 
 
 def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
-    """Write version 4 with positions as fine as their extent allows; see `write_spz`."""
+    """Write version 4 with the finest positions that the cloud's extent allows; see `write_spz`."""
     return write_spz(path, splats)
 
 
@@ -118,7 +117,7 @@ def write_spz(
             writer keeps: on a scene of degree 3 the file was 0.6 times as large, the picture at 33 instead of 49 dB.
 
     Returns:
-        What the file could not hold, in words.
+        Descriptions of what the file could not store.
 
     Raises:
         ValueError: if the cloud has no colours, values that `write_splats` refuses, or reaches further than 24 bits hold, or
@@ -149,12 +148,12 @@ def write_spz(
 
 
 def precision(gaussians: Gaussians) -> Precision:
-    """Of version 4 as `write` writes it; the cloud decides the bits of its positions."""
+    """The precision of `write`; the bits of positions depend on the cloud."""
     return precision_of(gaussians, choose_fractional_bits(gaussians.means))
 
 
 class _LabelRecord(NamedTuple):
-    """What kfgs's extension record holds."""
+    """The content of kfgs's extension record."""
 
     class_id: NDArray[np.int32]  # [N], -1 = none
     score: NDArray[np.float32] | None  # [N]
@@ -162,11 +161,7 @@ class _LabelRecord(NamedTuple):
 
 
 def _pack_labels(record: _LabelRecord) -> bytes:
-    """The payload of a record.
-
-    Raises:
-        ValueError: if the names take more than 1 MiB.
-    """
+    """The payload of a record; a ValueError if the names take more than 1 MiB."""
     names = json.dumps(list(record.classes), ensure_ascii=False).encode() if record.classes else b""
     if len(names) > _MAX_NAMES:
         raise ValueError(f"classes: expected names of at most {_MAX_NAMES} bytes, got {len(names)}; shorten them")
@@ -180,11 +175,7 @@ def _pack_labels(record: _LabelRecord) -> bytes:
 
 
 def _unpack_labels(path: Path, payload: bytes, count: int) -> _LabelRecord:
-    """Read a record of a file of `count` Gaussians.
-
-    Raises:
-        ValueError: if it is damaged, of another version, or of another number of Gaussians.
-    """
+    """Read the record of a file with `count` Gaussians; a ValueError if it is damaged or does not fit."""
     version, flags, n, names_size = (
         _LABELS_HEAD.unpack_from(payload) if len(payload) >= _LABELS_HEAD.size else (0, 0, 0, 0)
     )

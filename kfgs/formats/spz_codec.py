@@ -1,4 +1,4 @@
-"""SPZ's quantised bytes to Gaussians and back: which number a byte stands for.
+"""Convert SPZ's quantised bytes to Gaussians and back.
 
 positions: 24-bit fixed point (float16 in version 1); alphas: 255 steps of opacity; colors: 255 steps of f_dc from -0.5/0.15
 to 0.5/0.15; scales: ln(s) = byte / 16 - 10; rotations: the three smaller of x, y, z, w, 9 bits and a sign each (x, y, z as
@@ -27,7 +27,7 @@ Bytes = NDArray[np.uint8]
 _DC = 0.5 / 0.15  # the degree-0 coefficient of byte 255
 LOG_SCALES = (-10.0, 255 / 16 - 10)
 _MAX_FIXED = (1 << 23) - 1
-_COMMON_BITS, _STEPS = 12, 14  # bits that every writer uses; 2^14 steps across a cloud that is smaller
+_COMMON_BITS, _STEPS = 12, 14  # bits that every writer uses; a small cloud gets 2^14 steps across
 
 
 def unpack(path: Path, c: Container, axes: tuple[int, int, int] = UP_AND_BACK) -> Gaussians:
@@ -74,9 +74,7 @@ def pack(g: Gaussians, version: int, fractional_bits: int, sh_bits: tuple[int, i
 
 
 def choose_fractional_bits(means: Tensor) -> int:  # means: [N, 3]
-    """As many bits after the point as the cloud's extent leaves room for: 12 as is common, fewer for one beyond 2048 units
-    from the origin, more for one within 2.
-    """
+    """The bits after the point for a cloud's extent: usually 12, fewer beyond 2048 units from the origin, more within 2."""
     reach = means.abs().max().item() if len(means) else 0.0
     if reach == 0.0:
         return _COMMON_BITS
@@ -85,13 +83,13 @@ def choose_fractional_bits(means: Tensor) -> int:  # means: [N, 3]
 
 
 def most_fractional_bits(means: Tensor) -> int:  # means: [N, 3]
-    """The most bits after the point that still hold every coordinate in 24; negative where none does."""
+    """The most bits after the point with which every coordinate fits into 24 bits; negative if none fits."""
     reach = means.abs().max().item() if len(means) else 0.0
     return MAX_FRACTIONAL_BITS if reach == 0.0 else min(floor(log2(_MAX_FIXED / reach)), MAX_FRACTIONAL_BITS)
 
 
 def precision_of(g: Gaussians, fractional_bits: int) -> Precision:
-    """How exactly version 3 and 4 files hold a cloud; what they cut off is counted."""
+    """The precision of version 3 and 4 files for a cloud, including values that they cut off."""
     low, high = LOG_SCALES
     logs = g.scales.double().log()
     cut = (logs - logs.clamp(low, high)).abs().max().item() if len(g) else 0.0

@@ -27,8 +27,8 @@ _LEGACY = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fractiona
 _HEADER = struct.Struct("<4sIIBBBBI12x")  # the same, but the number of streams, and where the table begins
 _ENTRY = struct.Struct("<QQ")  # compressed and plain bytes of a stream
 _RECORD = struct.Struct("<II")
-_SLACK = 1 << 26  # bytes: promises up to here are cheap to keep, whatever the file's size
-_GZIP_RATIO, _ZSTD_RATIO = 1032, 4096  # deflate cannot do better; Zstandard can, on a cloud of equal Gaussians only
+_SLACK = 1 << 26  # bytes that may always be unpacked, whatever the file's size
+_GZIP_RATIO, _ZSTD_RATIO = 1032, 4096  # the best ratio of deflate; Zstandard exceeds its for equal Gaussians only
 _MAX_EXTENSIONS = 1 << 28  # bytes after the streams of a version 1 to 3 file
 
 
@@ -57,10 +57,10 @@ def stream_sizes(version: int, count: int, degree: int) -> dict[str, int]:
 
 
 def read_container(path: Path) -> Container:
-    """Read an SPZ file of version 1 to 4; nothing is unpacked that its size could not hold.
+    """Read an SPZ file of version 1 to 4. Sizes that the file cannot hold are refused before unpacking.
 
     Raises:
-        ValueError: if it is none, or damaged: truncated, promising more than it holds, or with bytes left over.
+        ValueError: if it is no SPZ file, or damaged: truncated, or with counts or sizes that do not fit.
     """
     data = path.read_bytes()
     if data[:2] == GZIP:
@@ -97,7 +97,7 @@ def write_container(path: Path, container: Container) -> None:
 def _check_header(
     path: Path, data: bytes | bytearray, ratio: int, size: int
 ) -> tuple[int, int, int, int, int, dict[str, int]]:
-    """The fields that all versions share, and the sizes of the streams; refused where `size` bytes cannot hold them."""
+    """Check the fields that all versions share, and that `size` bytes can hold the streams; returns their sizes."""
     _, version, count, degree, bits, flags, _ = _LEGACY.unpack_from(data)
     if not 1 <= version <= 4:
         raise ValueError(
@@ -121,13 +121,13 @@ def _check_header(
 
 
 def _inflate(path: Path, data: bytes) -> bytearray:
-    """The plain bytes of a gzip stream (one member or several), no more than its SPZ header accounts for."""
+    """The plain bytes of a gzip stream (one member or several), at most as many as its SPZ header implies."""
     plain, rest, complete = bytearray(), data, False
     try:
         limit = _plain_limit(path, zlib.decompressobj(wbits=31).decompress(data, _LEGACY.size), len(data))
         while rest[:2] == GZIP and len(plain) <= limit:
             member = zlib.decompressobj(wbits=31)
-            plain += member.decompress(rest, limit + 1 - len(plain))  # never 0, which would mean no limit
+            plain += member.decompress(rest, limit + 1 - len(plain))  # never 0: that means no limit
             complete, rest = member.eof, member.unused_data
     except zlib.error as error:
         raise ValueError(
@@ -219,7 +219,7 @@ def _unpack_frame(path: Path, name: str, data: bytes, size: int) -> bytes:
         return b""
     try:
         promised = zstandard.get_frame_parameters(data).content_size
-        if promised not in (size, zstandard.CONTENTSIZE_UNKNOWN):  # else it alone would decide what is allocated
+        if promised not in (size, zstandard.CONTENTSIZE_UNKNOWN):  # the decompressor allocates the promised size
             raise ValueError(
                 f"{path}: expected {size} bytes of {name}, got a frame of {promised} bytes; the file is damaged"
             )

@@ -1,18 +1,18 @@
-"""The formats of splat files: which module reads and writes which, found by content when reading, by name when writing.
+"""Find the format of a splat file: by content when reading, by name when writing.
 
 A format is one module of this package with
 
-- `NAME`, `SUFFIXES`: what it is called, and the endings of its files;
+- `NAME`, `SUFFIXES`: its name, and the endings of its files;
 - `MAGIC`, if all files begin with the same bytes: then the ending of a name alone never chooses this format;
-- `matches(head)`: whether a file that begins with these bytes (up to 64 KiB) is one;
+- `matches(head)`: whether a file that begins with these bytes (up to 64 KiB) has this format;
 - `read(path) -> SplatFile`;
-- `write(path, splats) -> tuple[str, ...]`: write the file, whole or not at all, and say in words what it could not hold
+- `write(path, splats) -> tuple[str, ...]`: write the file, whole or not at all, and describe what it could not store
   (formats that are only read have no `write`);
-- `precision(gaussians) -> Precision`: how exactly a written cloud comes back;
-- `HOLDS_LABELS`: whether `class_id` and `score` are stored inside. If not, they go to a file beside it (see `sidecar`, which
-  writes the names of the classes beside every labelled file);
-- `SORTS = True`, where the format packs neighbours together: `write` keeps the order that it is given, and `write_splats`
-  gives it Morton order;
+- `precision(gaussians) -> Precision`: the largest errors of a written cloud;
+- `HOLDS_LABELS`: whether the file stores `class_id` and `score`. If not, they go to a separate file (see `sidecar`, which
+  also writes the class names of every labelled file);
+- `SORTS = True`, if the format packs neighbours together: `write` keeps the given order, and `write_splats` passes Morton
+  order;
 
 and a line in `MODULES`.
 """
@@ -30,7 +30,7 @@ from .sidecar import find_names, names_path, read_sidecar, write_sidecar
 from .splat_file import SplatFile, Written
 from .values import check_splats
 
-MODULES = (  # asked in this order: compressed PLY before PLY, whose ending it shares
+MODULES = (  # tried in this order: compressed PLY before PLY, because both end in .ply
     "compressed_ply",
     "ply_3dgs",
     "spz",
@@ -43,7 +43,7 @@ _HEAD_BYTES = 1 << 16
 
 
 def formats() -> dict[str, ModuleType]:
-    """Every format by name, in the order in which they are tried on a file."""
+    """Every format by name, in the order of trial."""
     modules = [import_module(f".{name}", __package__) for name in MODULES]
     return {module.NAME: module for module in modules}
 
@@ -73,7 +73,7 @@ def find_format(path: str | Path) -> ModuleType:
 
 
 def read_splats(path: str | Path) -> SplatFile:
-    """Read a splat file of any known format, with labels and class names from the file itself or from files beside it.
+    """Read a splat file of any known format, with labels and class names from it or from the files next to it.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -95,7 +95,7 @@ def read_splats(path: str | Path) -> SplatFile:
 
 
 def write_splats(path: str | Path, splats: SplatFile | Gaussians, *, format: str | None = None) -> Written:
-    """Write a cloud in the format that the file's name asks for.
+    """Write a cloud in the format of the file's ending.
 
     **Convention**: formats that pack neighbours together (compressed PLY, SOG) store the Gaussians in Morton order, with
     their labels and scores. `Written.order` is that order: apply it to indices that you keep (an edit of `OfIndex`), or
@@ -107,12 +107,12 @@ def write_splats(path: str | Path, splats: SplatFile | Gaussians, *, format: str
         format: a format's name, if the ending does not say it.
 
     Returns:
-        The files written, what the format could not hold, and the order.
+        The files written, what the format could not store, and the order.
 
     Raises:
-        ValueError: if no format has such an ending, or the format cannot be written or cannot hold such a cloud, or a value
-            is NaN or infinite, a scale not positive, an opacity outside [0, 1] (both ends are allowed), or a label that has no
-            name in `classes`. Nothing is written then.
+        ValueError: if no format has this ending, or the format cannot be written or cannot store this cloud, or a value is
+            NaN or infinite, a scale not positive, an opacity outside [0, 1] (both ends are allowed), or a label has no name
+            in `classes`. Nothing is written then.
     """
     path = Path(path)
     if isinstance(splats, Gaussians):

@@ -1,4 +1,4 @@
-"""What the formats share: checks of values, axes that point the other way, and what a format cannot hold."""
+"""Helpers of all formats: checks of values, flipped axes, and descriptions of what a format cannot store."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SH_C0 = 0.28209479177387814  # the constant harmonic: rgb = 0.5 + SH_C0 * coeffi
 UP_AND_BACK = (1, -1, -1)  # x right, y up, z back (RUB) against x right, y down, z forward (RDF) of the 3DGS PLY
 # Signs of the coefficients under a flip of axes: which of x, y, z each harmonic is odd in, degrees 1 to 3.
 _ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
-_TINY_SCALE = 1e-10  # world units, of a Gaussian that a file gives no extent at all
+_TINY_SCALE = 1e-10  # world units, instead of a scale of 0
 _LABELS = 2**31 - 1  # the largest int32
 _EXPECTED = {
     "means": "finite numbers",
@@ -51,12 +51,7 @@ def positive_scales(path: Path, scales: NDArray[np.float32]) -> Tensor:  # [N, 3
 
 
 def flip_axes(g: Gaussians, axes: tuple[int, int, int]) -> Gaussians:
-    """Turn some axes of a cloud around: means change sign, rotations become S R S, harmonics follow their parity.
-
-    Args:
-        g: the cloud.
-        axes: 1 or -1 for x, y and z.
-    """
+    """Flip the axes with sign -1: means change sign, rotations become S R S, harmonics change sign by their parity."""
     sign = dict(zip("xyz", axes, strict=True))
     x, y, z = axes
     means, quats = g.means.new_tensor([x, y, z]), g.quats.new_tensor([1, y * z, x * z, x * y])
@@ -75,7 +70,7 @@ def unit_quats(quats: Tensor) -> Tensor:  # [N, 4] wxyz -> [N, 4] of length 1
 
 
 def check_splats(splats: SplatFile) -> None:
-    """Refuse what readers of any format refuse, before anything is written. Values are checked as float32, as files store them.
+    """Check a cloud before it is written, for the values that readers refuse. They are checked as float32, as stored.
 
     Opacities of exactly 0 and 1 are allowed: the PLY, which stores logits, keeps them within 1e-7.
 
@@ -117,11 +112,7 @@ def _check_rows(name: str, expected: str, values: Tensor, good: Tensor) -> None:
 
 
 def colours_to_write(gaussians: Gaussians, name: str) -> Gaussians:
-    """The cloud in float64 on the CPU, without its autograd history.
-
-    Raises:
-        ValueError: if it has no spherical harmonics.
-    """
+    """The cloud in float64 on the CPU, detached; a ValueError if it has no spherical harmonics."""
     if gaussians.sh is None:
         raise ValueError(
             f"splats: expected a cloud with colours (sh [N, K, 3]) for {name}, got {gaussians!r}; write a field without "
@@ -131,7 +122,7 @@ def colours_to_write(gaussians: Gaussians, name: str) -> Gaussians:
 
 
 def describe_loss(splats: SplatFile, name: str, degree: int) -> tuple[str, ...]:
-    """Say what a format leaves out that has no room for features, other columns and high degrees of harmonics."""
+    """Describe the losses of a format without features, extra columns, and harmonics above a degree."""
     g, lost = splats.gaussians, []
     if g.sh is not None and (have := int(g.sh.shape[1] ** 0.5) - 1) > degree:
         kept = "the base colour only" if degree == 0 else f"degree {degree}"
@@ -145,10 +136,7 @@ def describe_loss(splats: SplatFile, name: str, degree: int) -> tuple[str, ...]:
 
 
 def byte_error(values: Tensor, low: float, high: float) -> float:
-    """Largest error of values kept in 256 even steps from `low` to `high`: half a step, or the most that is cut off.
-
-    `values` may be empty. The ends belong to the range.
-    """
+    """Largest error of values in 256 even steps from `low` to `high`: half a step, or the largest cut-off."""
     step = (high - low) / 255
     beyond = (values - values.clamp(low, high)).abs().max().item() if values.numel() else 0.0
     return max(step / 2, beyond) * (1 + 1e-4)  # float32 rounding on the way back

@@ -1,4 +1,4 @@
-"""Dataclasses that are saved as JSON: checks of single values that name the argument, and reading and writing a dataclass."""
+"""Read and write dataclasses as JSON, with checks of single values that name the argument."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 T = TypeVar("T")
-NESTED = 32  # levels of one expression; no person writes deeper ones
+NESTED = 32  # levels of one expression; people do not write deeper ones
 
 
 def numbers_of(name: str, values: Any, count: int) -> tuple[float, ...]:
@@ -76,7 +76,7 @@ def checked_object(name: str, value: Any, kind: Any, tag: str) -> dict[str, Any]
 
 
 def build(name: str, kind: type[T], members: dict[str, Any]) -> T:
-    """Make a dataclass of what a file holds; an error begins with the place in the file."""
+    """Make a dataclass from members read from a file; errors begin with the place in the file."""
     try:
         return kind(**members)
     except (TypeError, ValueError) as error:
@@ -84,7 +84,7 @@ def build(name: str, kind: type[T], members: dict[str, Any]) -> T:
 
 
 def members_of(value: Any) -> dict[str, Any]:
-    """The fields of a dataclass by name, as values that JSON can hold: what `checked_object` reads."""
+    """The fields of a dataclass by name, as values for JSON; `checked_object` reads them."""
     return {member.name: _plain(getattr(value, member.name)) for member in fields(value) if member.init}
 
 
@@ -95,6 +95,6 @@ def _plain(value: Any) -> Any:
 
 
 def set_fields(frozen: Any, **values: Any) -> None:
-    """Replace fields of a frozen dataclass by their checked form, from its own `__post_init__`."""
+    """Replace fields of a frozen dataclass by their checked form; called in its `__post_init__`."""
     for name, value in values.items():
         object.__setattr__(frozen, name, value)

@@ -1,4 +1,4 @@
-"""An oriented box, the size and place of what was selected; and rotations by quaternions."""
+"""Oriented boxes, for the size and place of a selection, and rotations by quaternions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .._check import as_tensor, check_shapes
 from .._rows import check_finite
 from ._json import numbers_of
 
-ROUNDS = 3  # over the three faces; room_0's objects no longer change after two
+ROUNDS = 3  # over the three axes; the boxes of room_0's objects stop changing after two
 
 Array = np.ndarray[Any, Any]
 
@@ -57,11 +57,11 @@ class OrientedBox:
 
     @classmethod
     def around(cls, points: Tensor) -> OrientedBox:  # points: [N, 3]
-        """A small box around points: the smaller of two, one started at the principal axes, one at the world's.
+        """A small box around points: the smaller of two searches, from the principal axes and from the world's axes.
 
-        Each start is rotated about one of its axes after another, to the rectangle of least area around the projection of
-        the points along that axis (an edge of the hull lies on it). The volume is never more than that of the start, but
-        not always the least possible. The longest edge comes first. `contains` is true of all the points.
+        A search rotates the box about each axis in turn, to the smallest rectangle around the points seen along that axis
+        (one of its sides lies on an edge of their hull). The volume never grows, but it is not always the smallest
+        possible. The longest edge comes first. `contains` is true for all the points.
 
         Raises:
             ValueError: if there is no point, or one is not finite.
@@ -81,17 +81,19 @@ class OrientedBox:
         local = shell @ axes.T
         center = middle + (local.min(axis=0) + local.max(axis=0)) / 2 @ axes
         place, rows = torch.from_numpy(center), torch.from_numpy(axes)
-        half = _local(points.detach().cpu().double(), place, rows).abs().amax(dim=0)  # so that `contains` says yes
+        half = (
+            _local(points.detach().cpu().double(), place, rows).abs().amax(dim=0)
+        )  # exactly as `contains` computes it
         return cls(place, rows, half)
 
     @property
     def volume(self) -> float:
-        """In cubed world units; 0 for a flat box."""
+        """The volume in cubed world units; 0 for a flat box."""
         return float((2 * self.half).prod())
 
     @property
     def corners(self) -> Tensor:  # [8, 3]
-        """The eight corners, those with the lowest coordinate along the first axis first."""
+        """The eight corners, sorted by their coordinates along the first, second and third axis."""
         signs = torch.cartesian_prod(*([torch.tensor([-1.0, 1.0])] * 3)).to(self.half)
         return self.center + (signs * self.half) @ self.axes
 
@@ -116,7 +118,7 @@ def quaternion_of(name: str, values: Any) -> tuple[float, ...]:
 
 
 def rotation_matrix(quaternion: Sequence[float]) -> Any:  # (w, x, y, z) -> [3, 3]
-    """The rotation of a quaternion of any length; scipy wants (x, y, z, w)."""
+    """The rotation matrix of a quaternion of any length; scipy's order is (x, y, z, w)."""
     w, x, y, z = unit(quaternion)
     return Rotation.from_quat([x, y, z, w]).as_matrix()
 
@@ -130,7 +132,7 @@ def unit(values: Sequence[float]) -> list[float]:
 
 
 def _local(points: Tensor, center: Tensor, axes: Tensor) -> Tensor:  # [N, 3], [3], [3, 3] -> [N, 3]
-    """Coordinates along the axes, from the centre. A matrix product would round differently for other counts and devices."""
+    """Coordinates along the axes, from the centre. No matrix product: its rounding depends on the count and the device."""
     x, y, z = (points - center).unbind(dim=1)
     return torch.stack([x * axis[0] + y * axis[1] + z * axis[2] for axis in axes], dim=1)
 
@@ -145,7 +147,7 @@ def _shell(cloud: Array) -> Array:
 
 
 def _turned(shell: Array, axes: Array) -> Array:
-    """Rotate a frame about its axes, one after another, to the rectangle of least area seen along each."""
+    """Rotate a frame about each of its axes in turn, to the rectangle of least area seen along it."""
     for turn in range(3 * ROUNDS):
         a, b = (turn + 1) % 3, (turn + 2) % 3
         angle = _least_rectangle(shell @ axes[[a, b]].T)
@@ -156,7 +158,7 @@ def _turned(shell: Array, axes: Array) -> Array:
 
 
 def _least_rectangle(flat: Array) -> float:  # flat: [n, 2]
-    """The angle of the rectangle of least area around points of a plane: a side of it lies on an edge of their hull."""
+    """The angle of the smallest rectangle around points of a plane; one of its sides lies on an edge of their hull."""
     try:
         corners = flat[ConvexHull(flat).vertices]
     except (QhullError, ValueError):  # on a line, or too few

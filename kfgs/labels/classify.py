@@ -1,4 +1,4 @@
-"""Which class does a feature belong to: the most similar of several classes, or a threshold for one (Sec. 3.4)."""
+"""Classify features: the most similar of several classes, or a threshold for one class (Sec. 3.4)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CHUNK = 65_536  # rows per step: with 200 classes, 50 MB of similarities at a ti
 
 
 class CodewordLabels(NamedTuple):
-    """The class of each codeword, and why."""
+    """The class of each codeword, and the similarities behind it."""
 
     labels: Tensor  # [K] int64, -1 = none
     similarity: Tensor  # [K, C] cosine with each class
@@ -100,18 +100,18 @@ def select_by_query(
 ) -> Selection:
     """Select the features whose cosine with one query is **above** a threshold, the paper's gamma (Sec. 3.4, single target).
 
-    The paper gives no value for gamma. If none is given, it is found from the scores: in the gap below their highest mode
-    (see `similarity_threshold`), and `how` says what was found. The scores of a scene without the target have a highest
-    mode too, so look at `how` and at the scores before you trust an automatic gamma. With negatives (what the query is
-    *not*, such as the other classes of the scene) it is not needed: scores are relevancies, and gamma is 0.5.
+    The paper gives no value for gamma. If you give none, it is the gap below the highest mode of the scores (see
+    `similarity_threshold`), and `how` describes it. A scene without the target has a highest mode too, so check `how` and
+    the scores before you trust an automatic gamma. With negatives (for instance the other classes of the scene) scores are
+    relevancies, and gamma is 0.5.
 
     Args:
         features: decoded features; any scale. All-zero features score 0 and are never selected.
         query: the target's embedding, or a prototype.
         threshold: gamma, a cosine in [-1, 1], or with negatives a relevancy in [0, 1]; None finds it as above.
-        negatives: one row per thing that is not meant.
+        negatives: embeddings of things that should not be found.
         score: "cosine", "softmax" or "relevancy" (`text_scores`); None: the relevancy with negatives, else the cosine.
-        logit_scale: of the softmax, as in `text_scores`.
+        logit_scale: for the softmax, as in `text_scores`.
 
     Raises:
         ValueError: if shapes disagree, the query or a negative is all-zero, the threshold is out of range, or a number
@@ -161,7 +161,7 @@ def select_like(
     threshold: float | None = None,
     negatives: Tensor | None = None,  # [M, D]
 ) -> Selection:
-    """Select the features like those of some examples: the query is the mean of their unit vectors (a prototype).
+    """Select the features similar to some examples: the query is the mean of their unit vectors (a prototype).
 
     Args:
         features: decoded features; any scale.
@@ -195,20 +195,20 @@ def select_near(
     threshold: float | None = None,
     distance: float | None = None,
 ) -> Selection:
-    """Select the thing at a point (a click): the Gaussians that are like the nearest one and connected with it.
+    """Select the thing at a point (a click): the Gaussians that are similar to the nearest one and connected with it.
 
-    Alike are, with `labels`, those with the same label; with `features`, those more similar to it than `threshold`.
+    With `labels`, similar Gaussians have the same label; with `features`, their cosine is above `threshold`.
 
     Args:
         means: positions of all N Gaussians.
-        point: a place in the world, such as the one under the mouse.
+        point: a position in the world, for instance under the mouse.
         labels: a class for each Gaussian; give these or features.
         features: decoded features.
         threshold: gamma, a cosine; only with features. None as in `select_by_query`.
         distance: see `component_numbers`.
 
     Returns:
-        The connected part with the nearest Gaussian in it (of equally near ones the lowest index).
+        The connected part that contains the nearest Gaussian (the lowest index, if several are equally near).
 
     Raises:
         ValueError: if neither or both of labels and features are given, the nearest Gaussian has no label or an all-zero

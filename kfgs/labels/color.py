@@ -15,7 +15,7 @@ from ..splat.sh import rgb_to_sh0, sh0_to_rgb
 
 Mode = Literal["tint", "hue"]
 MODES: tuple[Mode, ...] = get_args(Mode)
-LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709 weights of R, G, B, on display values: what blending is linear in
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709 weights of R, G, B, on display values, in which blending is linear
 DARK = 1 / 255  # an object darker than one 8-bit step has no shading
 
 
@@ -23,9 +23,9 @@ def parse_color(color: str | Sequence[float] | Tensor, name: str = "rgb") -> tup
     """A colour as (red, green, blue) in [0, 1].
 
     Args:
-        color: `"#c04040"`, `"#c44"`, a CSS name such as `"teal"`, `"rgb(192, 64, 64)"`, `"hsl(0, 50%, 50%)"`; or three
-            numbers in [0, 1].
-        name: the argument that errors speak of.
+        color: `"#c04040"`, `"#c44"`, a CSS name like `"teal"`, `"rgb(192, 64, 64)"`, `"hsl(0, 50%, 50%)"`; or three numbers
+            in [0, 1].
+        name: the argument's name in errors.
 
     Raises:
         ValueError: if it is not a colour, or has an alpha channel.
@@ -66,23 +66,23 @@ def recolor(
     and blending keeps it. Alpha, and with it the geometry, stays.
 
     - `"tint"` paints it: the object's middle luminance (the median by visible area) becomes `rgb`, and ratios of
-      luminance stay, as if the albedo changed under the same light. If the middle is below 1/255 there is no shading to
-      keep and the colour is flat. White leaves no room above it: what was brighter than the middle becomes white too.
+      luminance stay, as if the albedo changed under the same light. If the middle is below 1/255, there is no shading to
+      keep, and the colour is flat. With white, everything brighter than the middle becomes white too.
     - `"hue"` keeps luminance from every direction and changes hue and saturation only: a dark plant stays dark. If a
-      channel lies outside [0, 1] before or after, the renderer's clamp changes what is seen, and luminance with it.
+      channel is outside [0, 1] before or after, the renderer clamps it, and the visible luminance changes.
 
     Args:
         gaussians: a colour field (with `sh`).
         mask: which Gaussians to paint.
         rgb: the colour, in the same (display) space as the photographs; text as `parse_color` reads it.
-        mode: what stays, see above.
+        mode: see above.
 
     Raises:
         ValueError: if there is no `sh`, the mask has another length, or `rgb` is not a colour.
         TypeError: if the mask is not boolean.
 
     Note:
-        The old hues are lost: a red flower on a green stem becomes one hue. Select them apart to keep two.
+        The old hues are lost: a red flower on a green stem becomes one hue. To keep two, recolour two selections.
         Luminance is Rec. 709 luma of display values. The paper says only "color modification".
     """
     mask = as_tensor("mask", mask)
@@ -124,12 +124,12 @@ def _middle(luminance: Tensor, opacities: Tensor, scales: Tensor) -> Tensor:  # 
 
 
 class Shades(NamedTuple):
-    """Which colour replaces each luminance: a curve from black to white through the shades and tints of one hue.
+    """The colour that replaces each luminance: a curve from black to white through the shades and tints of one hue.
 
-    The old luminance L first becomes a tone t(L): `gain L` up to the bend, then linear to white at L = 1. The colour of a
-    tone has its luminance and the hue, as saturated as the display can show it: `peak t / knee` up to the knee, then linear
-    to white. Both functions rise, so darker stays darker, and luminance in [0, 1] stays in the display's range. Only a tone
-    that reaches white at its bend (`tint` to white) is flat from there on.
+    The old luminance L first becomes a tone t(L): `gain L` up to the bend, then linear to white at L = 1. A tone is its
+    luminance in the given hue, as saturated as the display allows: `peak t / knee` up to the knee, then linear to white.
+    Both functions rise, so darker stays darker, and luminance in [0, 1] stays in the display's range. The only exception
+    is `tint` to white, which is flat after the bend.
     """
 
     peak: Tensor  # [3] the brightest colour of the hue and saturation: its largest channel is 1

@@ -12,10 +12,10 @@ from torch import Tensor
 from .._check import check_range, check_shapes
 from .nearest import Array, positions
 
-NEIGHBOURS = 8  # of each point that are joined first
+NEIGHBOURS = 8  # nearest neighbours of each point that are joined first
 NEIGHBOUR, QUANTILE = 4, 0.9  # a cloud's spacing: 90 % have their fourth neighbour within it
-SPACINGS = 1.5  # the default distance, in spacings of the selected: on room_0 2 joins the chairs, 1.2 breaks a sofa ...
-MOST_SPACINGS = 4.0  # ... and its bound, in spacings of all: a few specks across the room have a spacing of metres
+SPACINGS = 1.5  # the default distance in spacings of the selection: on room_0 2 joins the chairs, 1.2 breaks a sofa ...
+MOST_SPACINGS = 4.0  # ... and its bound in spacings of the cloud: a few specks across a room have a spacing of metres
 SAMPLE = 20_000  # Gaussians measured for a spacing
 
 
@@ -23,13 +23,13 @@ def component_distance(
     means: Tensor,  # [N, 3]
     mask: Tensor,  # [N] bool
 ) -> float:
-    """A distance that keeps each thing under a mask in one piece and different things apart, in world units.
+    """The default distance of `component_numbers`, in world units: it keeps a thing in one piece, and things apart.
 
     1.5 times the distance within which 90 % of the masked Gaussians have their fourth neighbour among themselves, but at
     most four times that of all Gaussians. Sparse things (bare walls, a sofa) get a larger distance than dense ones. On
     room_0's colour field (149,213 Gaussians; 0.03 m for the plant, 0.2 m for the door) this finds 2 chairs, 2 stools,
-    2 sofas, 3 tables and 4 heaps of cushions. No constant does: 0.08 m joins the two chairs and still breaks a sofa.
-    Measured on an evenly strided sample of at most 20,000; copies at one place count once.
+    2 sofas, 3 tables and 4 heaps of cushions. No constant works: 0.08 m joins the two chairs and still breaks a sofa.
+    Measured on an evenly strided sample of at most 20,000; copies at one position count once.
 
     Raises:
         ValueError: if shapes disagree or a position is not finite.
@@ -38,7 +38,7 @@ def component_distance(
     points = positions("means", means)
     own, all_of_them = _spacing(points[mask.cpu().numpy()]), _spacing(points)
     chosen = min(SPACINGS * own, MOST_SPACINGS * all_of_them)
-    return chosen if chosen > 0 else 1.0  # a single place: any distance joins what lies there
+    return chosen if chosen > 0 else 1.0  # all at one position: any distance joins them
 
 
 def component_numbers(
@@ -48,13 +48,13 @@ def component_numbers(
 ) -> Tensor:  # [N] int64
     """Number the connected parts of the Gaussians under a mask: 0 is the largest, -1 lies outside the mask.
 
-    Two Gaussians are connected where their means are at most `distance` apart, directly or through others under the
-    mask. Of equally large parts the one with the lowest index comes first.
+    Two Gaussians are connected if their means are at most `distance` apart, directly or through others under the mask. Of
+    equally large parts the one with the lowest index comes first.
 
     Args:
         means: positions, in world units.
-        mask: which Gaussians take part.
-        distance: in world units; None takes `component_distance`.
+        mask: which Gaussians are numbered.
+        distance: in world units; None: `component_distance`.
 
     Raises:
         ValueError: if shapes disagree, a position is not finite, or the distance is not positive.
@@ -82,20 +82,19 @@ def radius_components(
 ) -> Array:  # [n] int64
     """Number the components of the graph that joins points at most `distance` apart, exactly.
 
-    `scipy.spatial.cKDTree.query_pairs` would list all near pairs, gigabytes for a dense cloud. Here each point
-    is joined to its 8 nearest. A pair that this leaves out has more than 8 neighbours on both sides. So for
-    the points with more than 8 in range the nearest point of another part is searched, until none is in range. To search
-    for all parts at once, parts are numbered and divided into two sets by each binary digit of the number: two different
-    numbers differ in some digit.
+    `scipy.spatial.cKDTree.query_pairs` would list all near pairs: gigabytes for a dense cloud. Here each point is joined to
+    its 8 nearest. If a pair is left out, both points have more than 8 neighbours in range. So for these points the nearest
+    point of another part is searched, until none is in range. All parts are searched at once: parts are numbered, and
+    each binary digit of the number divides them into two sets. Two different numbers differ in some digit.
 
-    Numbers follow size, the largest is 0; of equal ones, that with the lowest point.
+    Part 0 is the largest; of equally large parts the one with the lowest point comes first.
 
     Note:
         100,000 points with 300 neighbours each: 0.5 s and 64 MB on one core (`query_pairs`: 2.4 s and 600 MB).
     """
     if len(points) == 0:
         return np.zeros(0, dtype=np.int64)
-    places, place = np.unique(points, axis=0, return_inverse=True)  # sorted: neighbours are asked one after another
+    places, place = np.unique(points, axis=0, return_inverse=True)  # sorted, so that queries of neighbours follow
     n = len(places)
     k = min(NEIGHBOURS + 1, n)
     near, index = (np.reshape(found, (n, k)) for found in _nearest_within(places, places, distance, k))
@@ -118,7 +117,7 @@ def radius_components(
 
 
 def _spacing(points: Array) -> float:
-    """The distance within which 90 % of the places have their fourth neighbour (the last if there are fewer); 0 for one."""
+    """The distance within which 90 % of the positions have their fourth neighbour (the last, if fewer); 0 for one position."""
     places = np.unique(points, axis=0)
     if len(places) < 2:
         return 0.0

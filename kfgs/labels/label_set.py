@@ -38,10 +38,10 @@ class LabelSet:
     names: tuple[str, ...]
     embeddings: Tensor  # [C, D], of any length
     negatives: Tensor | None = None  # [M, D]
-    """LERF's canonical words: what a query is compared with if no other classes are known."""
+    """LERF's canonical words: a query is compared with them if no other classes are known."""
     negative_names: tuple[str, ...] = ()
     info: dict[str, Any] = default(default_factory=dict)
-    """Where the rows come from, as JSON: `teacher` (`teachers.identify`), `templates`, `synonyms`."""
+    """The origin of the rows, as JSON: `teacher` (`teachers.identify`), `templates`, `synonyms`."""
 
     def __post_init__(self) -> None:
         if isinstance(self.names, str):
@@ -101,7 +101,7 @@ class LabelSet:
             return False
 
     def select(self, names: Sequence[str]) -> LabelSet:
-        """The named classes alone, in the order given; labels are numbered from 0 in this order.
+        """Keep only the named classes; their order gives the new labels, from 0.
 
         Raises:
             ValueError: if one is unknown (the message offers near ones), or named twice.
@@ -112,7 +112,7 @@ class LabelSet:
         return replace(self, names=tuple(self.names[row] for row in rows), embeddings=self.embeddings[rows])
 
     def with_class(self, name: str, embedding: Tensor) -> LabelSet:  # embedding: [D]
-        """These classes and one more at the end. The labels of the others stay.
+        """Add a class at the end. The labels of the others stay.
 
         Raises:
             ValueError: if the name is taken, or the row has another number of channels.
@@ -150,12 +150,12 @@ class LabelSet:
 
 
 def load_label_set(classes: str | Path, embeddings: str | Path | None = None) -> LabelSet:
-    """Read classes and their embeddings: from one table, or names and rows from two files.
+    """Read classes and their embeddings from one table, or from two files: names and rows.
 
     Args:
-        classes: a table (.safetensors, as `LabelSet.save` writes), or class names (a JSON list of strings).
-        embeddings: beside names: an .npy file [C, D] of floats, a row per name; or a table, of which those classes are
-            taken in that order.
+        classes: a table (.safetensors, from `LabelSet.save`), or class names (a JSON list of strings).
+        embeddings: needed with class names: an .npy file [C, D] of floats with a row per name, or a table to take these
+            classes from.
 
     Raises:
         FileNotFoundError: if a file is missing.
@@ -181,11 +181,11 @@ def load_label_set(classes: str | Path, embeddings: str | Path | None = None) ->
 
 
 def teacher_mismatch(field: dict[str, Any], words: dict[str, Any]) -> str | None:
-    """A message if a field was distilled from another teacher than the one that embedded the words; else None.
+    """A message if the field's teacher and the teacher that embedded the words differ; else None.
 
-    Two encoders may have the same number of channels and nothing else in common: of the 61 words that CLIP ViT-B/16
-    (COCO-Stuff) and ViT-B/32 (LVIS) both embedded, no pair of embeddings of one word was nearest to each other. Only the
-    name and the weights are compared; other options (window, scales) do not concern text.
+    Two encoders can have the same number of channels and unrelated spaces: of the 61 words that CLIP ViT-B/16 (COCO-Stuff)
+    and ViT-B/32 (LVIS) both embedded, no pair of embeddings of one word was nearest to each other. Only the name and the
+    weights are compared; other options (window, scales) do not affect text.
 
     Args:
         field: `info` of a SemanticField.
@@ -202,11 +202,11 @@ def teacher_mismatch(field: dict[str, Any], words: dict[str, Any]) -> str | None
 
 
 def teacher_difference(one: dict[str, Any], other: dict[str, Any]) -> tuple[str, Any, Any] | None:
-    """What differs between two teachers, "name" or "weights", with both values; None if nothing is known to differ.
+    """The key in which two teachers differ, "name" or "weights", with both values; None if no difference is known.
 
     Args:
-        one: `info` of a LabelSet or a SemanticField. It may not name its teacher: then nothing is known to differ.
-        other: `info` of another one.
+        one: `info` of a LabelSet or a SemanticField, which may not name its teacher.
+        other: the same.
     """
     ours, theirs = one.get("teacher"), other.get("teacher")
     if not isinstance(ours, dict) or not isinstance(theirs, dict):

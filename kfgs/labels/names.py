@@ -1,4 +1,4 @@
-"""From a class name to its labels; an unknown name gives an error that offers near ones."""
+"""Look up the labels of a class name; the error for an unknown name offers similar names."""
 
 from __future__ import annotations
 
@@ -63,12 +63,8 @@ def class_indices(name: str, names: Sequence[str]) -> tuple[int, ...]:
 
 
 def class_of(argument: str, value: Any) -> str | int:
-    """Check a class that a user asks for: a name, or an index, -1 for none. Errors name the `argument`.
-
-    Raises:
-        ValueError: if it is neither, or less than -1.
-    """
-    plain = value.tolist() if hasattr(value, "tolist") else value  # numpy's and torch's own numbers and strings
+    """Check that a value is a class name, or an index from -1 (none). A ValueError names the `argument`."""
+    plain = value.tolist() if hasattr(value, "tolist") else value  # numbers and strings of numpy and torch
     if isinstance(plain, str):
         return plain
     check_whole(argument, plain, -1, 2**31 - 1)
@@ -76,10 +72,6 @@ def class_of(argument: str, value: Any) -> str | int:
 
 
 def labelled(labels: Tensor, asked: str | int, classes: Sequence[str]) -> Tensor:  # [N] int64 -> [N] bool
-    """Which labels are of a class, by index or by name (see `class_indices`).
-
-    Raises:
-        ValueError: if the name is unknown.
-    """
+    """Which labels belong to a class, given by index or by name (see `class_indices`)."""
     wanted = class_indices(asked, classes) if isinstance(asked, str) else (asked,)
     return torch.isin(labels, torch.tensor(wanted, dtype=torch.int64, device=labels.device))

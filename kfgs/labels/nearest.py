@@ -1,4 +1,4 @@
-"""The nearest labelled Gaussians of each place, and lambda: the distance within which a label is carried over (Sec. 3.4)."""
+"""Find the nearest labelled Gaussians, and lambda, the distance within which a label is carried over (Sec. 3.4)."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ Cloud = Tensor | Array | Gaussians | SplatFile
 
 
 class Near(NamedTuple):
-    """The sources looked at for n destinations, by distance, then by index."""
+    """The nearest sources of n destinations, by distance, then by index."""
 
-    distance: Array  # [n, k] float64, infinite where fewer than k are in range
-    source: Array  # [n, k] int64, an index of `Sources`; 0 if there is none
+    distance: Array  # [n, k] float64, infinite after the last source in range
+    source: Array  # [n, k] int64, an index into `Sources`; 0 if there is none
 
     @property
     def hit(self) -> Array:  # [n, k] bool
@@ -57,7 +57,7 @@ class Sources:
         near, index = self._query(points, min(k + 1, len(self)), distance)  # one more shows whether the last is tied
         tied = np.flatnonzero(((near[:, 1:] == near[:, :-1]) & np.isfinite(near[:, 1:])).any(axis=1))
         wanted, columns = 2 * k, slice(0, k)
-        while tied.size:  # scipy gives equals in any order: sort them; if the last is tied, look at more first
+        while tied.size:  # scipy returns equals in any order: sort them; if the last is tied, query more first
             more, which = self._query(points[tied], min(wanted, len(self)), distance)
             order = np.lexsort((which, more), axis=1)[:, columns]
             near[tied, columns] = np.take_along_axis(more, order, axis=1)
@@ -87,7 +87,7 @@ def distinct(points: Array) -> tuple[Array, Array]:
 
 
 def neighbours_together(points: Array) -> Array:  # [N, 3] -> [N] int64
-    """An order in which neighbours follow each other: a tree asked in this order is twice as fast."""
+    """An order in which neighbours follow each other: queries of a tree in this order are twice as fast."""
     if len(points) == 0:
         return np.empty(0, dtype=np.int64)
     cell = max(float(np.ptp(points, axis=0).max()) / 64, np.finfo(np.float64).tiny)
@@ -102,11 +102,11 @@ def default_distance(
     """Lambda for two clouds, in world units. The paper gives no value for it.
 
     The distance within which 99.5 % of the destinations have a source, but at least 2 median spacings of the sources (a
-    spacing is the distance to the nearest other source) and at most 10 times the 90 % quantile of the spacings. The upper
-    bound keeps floaters and background, which only the colour field has, from taking labels across the room; it uses the
-    90 % quantile because a few large Gaussians fill a wall. With the lower bound a destination between two sources reaches
-    both. A cloud with one source position has no spacing: then only the 99.5 % count.
-    Measured on an evenly strided sample of at most 20,000 Gaussians of each cloud.
+    spacing is the distance to the nearest other source) and at most 10 times the 90 % quantile of the spacings. With the
+    lower bound a destination between two sources reaches both. The upper bound keeps floaters and background, which only
+    the colour field has, from taking labels across the room; it uses a quantile because a few large Gaussians fill a wall.
+    With a single source position only the 99.5 % count. Measured on an evenly strided sample of at most 20,000 Gaussians
+    of each cloud.
 
     Raises:
         ValueError: if a cloud is empty or a position is not finite.

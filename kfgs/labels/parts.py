@@ -1,4 +1,4 @@
-"""The connected parts of a selection ("the four chairs"): how many Gaussians, where, how large, which camera shows it best."""
+"""The connected parts of a selection ("the four chairs"): count, place, size and best view of each."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from .boxes import OrientedBox
 from .components import component_numbers
 from .selection import Selection
 
-LONGEST = 160  # pixels of the longer side of the views that are compared; on room_0 shares change by 0.3 % of the picture at most
+LONGEST = 160  # longer side in pixels of the views compared; on room_0 shares change by at most 0.3 % of the picture
 TOGETHER = 16  # parts drawn in one rendering, as channels
-SPECK = 0.05  # parts with less than this share of the largest are left out
+SPECK = 0.05  # parts smaller than this share of the largest are left out
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,12 @@ class BestView:
 
     camera: str  # its name
     index: int  # its index in the list of cameras
-    share: float  # of the picture that the selection fills, in [0, 1); what lies in front of it is not counted
+    share: float  # the visible selection's share of the picture, in [0, 1)
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A part of a selection in numbers, or the whole of it. Positions are the Gaussians' centres, in world units."""
+    """A selection or a part of it, in numbers. Positions are the Gaussians' centres, in world units."""
 
     indices: Tensor  # [n] int64, ascending
     score: float  # mean score of its Gaussians
@@ -55,10 +55,9 @@ class Part:
         return self.box.volume
 
     def selection(self, count: int) -> Selection:
-        """This part as a selection in the cloud of `count` Gaussians that was selected in.
+        """This part as a selection in the selection's cloud, which has `count` Gaussians.
 
-        Scores are 1 inside and 0 outside, because the place decides which part a Gaussian belongs to.
-        `selection & part.selection(count)` has the scores of the selection.
+        Scores are 1 inside and 0 outside. `selection & part.selection(count)` has the scores of the selection.
 
         Raises:
             ValueError: if the cloud has fewer Gaussians than the highest index needs.
@@ -104,9 +103,9 @@ def describe_selection(
     """Describe a selection as a whole; `connected_parts` describes each of its connected parts.
 
     Args:
-        gaussians: the cloud that was selected in.
+        gaussians: the selection's cloud.
         selection: at least one Gaussian.
-        cameras: views without distortion, of which the best one is found.
+        cameras: views without distortion, to find the best one.
         engine: compositing engine.
 
     Raises:
@@ -131,15 +130,15 @@ def connected_parts(
     most: int = 100,
     engine: str = "auto",
 ) -> list[Part]:
-    """Take a selection apart into its connected parts ("the four chairs"), largest first.
+    """Split a selection into its connected parts ("the four chairs"), largest first.
 
     Args:
-        gaussians: the cloud that was selected in.
-        selection: if it is empty, so is the list.
+        gaussians: the selection's cloud.
+        selection: an empty one has no parts.
         cameras: as in `describe_selection`.
         distance: Gaussians at most this far apart are connected, in world units; see `component_numbers`.
-        smallest: parts of fewer Gaussians are left out; None leaves out those below 5 % of the largest.
-        most: how many parts at most.
+        smallest: parts with fewer Gaussians are left out; None: those below 5 % of the largest.
+        most: the most parts to return.
         engine: compositing engine.
 
     Raises:
@@ -170,8 +169,8 @@ def view_shares(
 ) -> Tensor:  # [C, P]
     """The share of each camera's picture that each part fills: the mean over pixels of its rendering weights w = T alpha.
 
-    What lies in front hides a part, and a transparent part counts by its opacity. Pictures are rendered with at most 160
-    pixels a side, 16 parts at a time.
+    Hidden parts do not count, and a transparent part counts by its opacity. Pictures are rendered with at most 160 pixels
+    a side, 16 parts at a time.
 
     Args:
         gaussians: the whole cloud.

@@ -1,4 +1,4 @@
-"""Queries of a field: class names, label sets or embeddings become rows in the teacher's space."""
+"""Turn a query of a field (a class name, a label set or embeddings) into rows in the teacher's space."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Classes = LabelSet | Tensor
 
 
 class Question(NamedTuple):
-    """A target and what it is compared with."""
+    """A target and its negatives, the rows it is compared with."""
 
     row: Tensor  # [D]
     negatives: Tensor | None  # [M, D]
@@ -33,7 +33,7 @@ def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [
     Args:
         classes: a label set, or embeddings as a tensor or an array.
         dim: D of the field.
-        info: the field's, which may name its teacher.
+        info: of the field; it may name its teacher.
 
     Raises:
         TypeError: if it is neither.
@@ -58,11 +58,11 @@ def make_question(
     dim: int,
     info: dict[str, Any],
 ) -> Question:
-    """The row of a target and of what it is compared with; see `SemanticField.query`.
+    """The rows of a target and its negatives; see `SemanticField.query`.
 
-    With negatives "auto" a class, given by its name or by its own embedding, is compared with the other classes, or with the
-    canonical words if it is the only class. Anything else is compared with the canonical words, or with nothing if there are
-    none. It is not compared with the classes, because "chair" would exclude much of "office chair".
+    With negatives "auto", a class (given by name or by its embedding) is compared with the other classes, or with the
+    canonical words if it is the only class. Any other target is compared with the canonical words, or with nothing if there
+    are none: not with the classes, because "chair" would exclude much of "office chair".
     """
     if isinstance(negatives, str):
         check_choice("negatives", negatives, ("auto", "classes", "canonical", "none"))
@@ -101,7 +101,7 @@ def make_question(
 
 
 def check_rows(name: str, rows: Tensor | None, axes: Sequence[str], dim: int) -> None:
-    """Refuse rows of another shape. If only D differs, the error asks for the other teacher's text."""
+    """Raise a ValueError unless rows have this shape. If only D differs, it asks whether the text is of another teacher."""
     shape = tuple(getattr(rows, "shape", ()))
     if len(shape) == len(axes) + 1 and shape[-1] != dim:
         expected = ", ".join((*axes, str(dim)))
@@ -113,7 +113,7 @@ def check_rows(name: str, rows: Tensor | None, axes: Sequence[str], dim: int) ->
 
 
 def _canonical(classes: LabelSet | None, words: str, row: Tensor) -> Tensor | None:  # [M, D]
-    """The canonical negatives without the target, by its words or by its embedding."""
+    """The canonical negatives without the target, which is recognised by its words or its embedding."""
     if classes is None or classes.negatives is None:
         return None
     other_words = torch.tensor([word.casefold() != words.casefold() for word in classes.negative_names])
@@ -122,7 +122,7 @@ def _canonical(classes: LabelSet | None, words: str, row: Tensor) -> Tensor | No
 
 
 def _unlike(rows: Tensor, row: Tensor) -> Tensor:  # [M, D], [D] -> [M] bool
-    """Which rows are not another embedding of the same words."""
+    """Which rows are embeddings of other words."""
     return unit_rows(rows) @ unit_rows(row[None]).to(rows)[0] <= SAME
 
 

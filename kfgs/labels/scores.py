@@ -1,4 +1,4 @@
-"""From cosines with words to scores, and from scores to a selection (Sec. 3.4).
+"""Turn cosines with words into scores, and scores into a selection (Sec. 3.4).
 
 Gamma, the similarity threshold of Sec. 3.4, is the score that a selected Gaussian must exceed.
 """
@@ -16,20 +16,20 @@ from .._check import check_choice, check_range, check_shapes
 from .._rows import check_finite
 from .selection import Selection
 
-TEMPERATURE = 10.0  # LERF multiplies cosines by it (Kerr 2023)
+TEMPERATURE = 10.0  # factor of the cosines in LERF (Kerr 2023)
 CANONICAL = ("object", "things", "stuff", "texture")  # LERF's negatives for a scene without known classes
-EVEN = 0.5  # relevancy of a feature that is as similar to its nearest negative as to the query
+EVEN = 0.5  # relevancy of a feature that is equally similar to the query and to its nearest negative
 LOGIT_SCALES = {
     "raw": 1.0,  # Feature 3DGS's editing: nearly uniform
-    "lseg": 1 / 0.07,  # 14.2857, which LSeg was trained with
-    "clip": 100.0,  # where CLIP's training ended
+    "lseg": 1 / 0.07,  # 14.2857, of LSeg's training
+    "clip": 100.0,  # at the end of CLIP's training
 }
 Score = Literal["cosine", "softmax", "relevancy"]
 
 BINS = 128
 SMOOTHING = 2.0  # standard deviation, in bins
-PER = 30_000  # counts are scaled to this many features, so that a cloud and two copies of it have one threshold
-CLEAR = 0.3  # a gap is clear when its floor is at least 2 x (10^0.3) sparser than the mode on either side
+PER = 30_000  # counts are scaled to this many features, so that two copies of a cloud have the threshold of one
+CLEAR = 0.3  # a gap is clear if its floor is at least 2 x (10^0.3) sparser than the mode on either side
 SHARES = ((0.5, CLEAR), (0.75, 0.7))
 """A gap with more than half of the scene above it usually separates two parts of the background. If there is no other, up
 to three quarters may lie above it (the walls of a room), if it is 5 times sparser than the modes beside it."""
@@ -43,8 +43,8 @@ def relevancy(
     """LERF's relevancy (Kerr 2023, Sec. 3.4): how much more similar to the query than to the most similar negative.
 
     min over j of the first entry of softmax(10 [s, n_j]), which is sigmoid(10 (s - max_j n_j)). Above 0.5 the query is
-    more similar than every negative. LERF's negatives are the texts in `CANONICAL`; the scene's other classes, if they are
-    known, are better ones.
+    more similar than every negative. LERF's negatives are the texts in `CANONICAL`; other classes of the scene are better
+    if they are known.
 
     Args:
         similarity: cosine with the query.
@@ -74,12 +74,12 @@ def text_scores(
     score: Score | None = None,
     logit_scale: float | str = "clip",
 ) -> Tensor:  # [N]
-    """How well N features fit a query, from their cosines with it and with negatives (words that are not meant).
+    """How well N features fit a query, from their cosines with it and with negatives (words to exclude).
 
-    - "cosine": the cosine itself, in [-1, 1], without regard to negatives.
+    - "cosine": the cosine, in [-1, 1]; negatives do not matter.
     - "softmax": the query's entry of softmax(l [s, n_1, ..., n_M]), in (0, 1): its share among all words. **Convention**:
-      l multiplies the cosines (CLIP's logit scale), so a larger one is sharper; it is 1 / temperature.
-    - "relevancy": LERF's `relevancy`, in (0, 1): against the most similar negative alone.
+      l multiplies the cosines (CLIP's logit scale, 1 / temperature), so a larger l is sharper.
+    - "relevancy": LERF's `relevancy`, in (0, 1): against the most similar negative only.
 
     Measured on room_0 (LSeg-like teacher, scores averaged over 30 views, all other classes as negatives, gamma as
     `select_by_similarity` finds it; mean IoU over 18 classes with the data set's labels): cosine 0.88, relevancy 0.90,
@@ -89,8 +89,8 @@ def text_scores(
         similarity: cosine with the query.
         negatives: cosine with each negative.
         valid: features that are not all-zero; the others score 0.
-        score: which; None: the relevancy with negatives, the cosine without.
-        logit_scale: of the softmax: a positive number, or one of "raw" (1: Feature 3DGS), "lseg" (14.29), "clip" (100).
+        score: see above; None: the relevancy with negatives, the cosine without.
+        logit_scale: l of the softmax: a positive number, "raw" (1: Feature 3DGS), "lseg" (14.29) or "clip" (100).
 
     Raises:
         ValueError: if shapes disagree, negatives are missing, a number is not finite, or an option is unknown.
@@ -127,16 +127,16 @@ def select_by_similarity(
     score: Score | None = None,
     logit_scale: float | str = "clip",
 ) -> Selection:
-    """Select the Gaussians whose score is above gamma; the score is the cosine, or with negatives the relevancy.
+    """Select the Gaussians with a score above gamma; the score is the cosine, or with negatives the relevancy.
 
-    If gamma is not given, `similarity_threshold` finds it from the scores. For a relevancy it is 0.5: more similar to the
-    query than to any of the negatives.
+    If gamma is not given, `similarity_threshold` finds it in the scores. For a relevancy it is 0.5: more similar to the
+    query than to any negative.
 
     Args:
         similarity: cosine with the query.
         negatives: cosine with each negative, or None.
         threshold: gamma; a cosine in [-1, 1], or another score in [0, 1].
-        valid: Gaussians whose feature is not all-zero; the others are not selected, score 0, and have no part in gamma.
+        valid: Gaussians whose feature is not all-zero; the others are not selected, score 0, and do not influence gamma.
         score: as in `text_scores`.
         logit_scale: as in `text_scores`.
 
@@ -211,7 +211,7 @@ def similarity_threshold(scores: Tensor) -> tuple[float, str]:  # scores: [N]
 
 
 def _past_flank(density: np.ndarray[Any, Any], above: np.ndarray[Any, Any], share: float) -> int:
-    """The first bin with at most a share of the scores above it, after the flank of a mode that begins before it."""
+    """The first bin with at most `share` of the scores above it; if a mode rises there, the bin after its flank."""
     start = int(np.argmax(above <= share))
     while 0 < start < BINS and density[start] > density[start - 1]:
         start += 1

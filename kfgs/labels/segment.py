@@ -1,4 +1,4 @@
-"""Novel-view segmentation: a rendered latent map becomes one class per pixel (Sec. 3.4)."""
+"""Novel-view segmentation: turn a rendered latent map into one class per pixel (Sec. 3.4)."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ def label_pixels(
     covered: Tensor | None = None,  # [...] bool
     chunk: int = 8192,
 ) -> Tensor:  # [...] int64
-    """Label each rendered latent: decode it (Psi), quantise it by cosine to the codebook (Eq. 5), look its class up.
+    """Label each rendered latent: decode it (Psi), quantise it by cosine to the codebook (Eq. 5), look up its class.
 
-    `decode="exact"` is the paper's way and the reference. `decode="latent"` takes the codeword whose **latent** is nearest
-    (Euclidean): 30 times faster, without the decoder's 0.83 M multiply-adds per pixel, and the same class for 98.9 % of
-    pixels that mixed two latents (72 codewords). Without an autoencoder the map holds features, which are quantised as they
-    are. Without a codebook each decoded feature takes the class of the most similar of `embeddings`.
+    `decode="exact"` is the paper's method and the reference. `decode="latent"` takes the codeword with the nearest
+    **latent** (Euclidean): it saves the decoder's 0.83 M multiply-adds per pixel, is 30 times faster, and gives the same
+    class for 98.9 % of pixels that mixed two latents (72 codewords). Without an autoencoder the map holds features, which
+    are quantised directly. Without a codebook each decoded feature takes the class of the most similar of `embeddings`.
 
     Args:
-        latent_map: a rendered map [H, W, d], or the latents of N Gaussians [N, d]: the paper classifies both alike.
+        latent_map: a rendered map [H, W, d], or the latents of N Gaussians [N, d].
         codebook: S, or None.
         codeword_labels: from `label_codewords`, or labels [K]; not used without a codebook.
         autoencoder: the scene's autoencoder, or None.
         decode: see above.
         embeddings: class embeddings; used only without a codebook.
-        covered: the pixels where something was rendered, for instance `alpha > 0.5`; the others have label -1.
+        covered: pixels that show something, for instance `alpha > 0.5`; the others get label -1.
         chunk: latents decoded at once; the decoder's widest layer holds chunk x 1024 numbers (32 MB by default).
 
     Returns:
-        Labels on the map's device, -1 = none. All-zero features (never an all-zero latent) have none.
+        Labels on the map's device, -1 = none. All-zero features have none; an all-zero latent is a normal value.
 
     Raises:
         ValueError: if shapes disagree, `codeword_labels` or `embeddings` is missing, or `decode` is unknown.

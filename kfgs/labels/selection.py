@@ -1,4 +1,4 @@
-"""Selections: which Gaussians, how well each one fits, why, and the algebra that combines them."""
+"""Selections of Gaussians with scores, and the operators that combine them."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Selection:
     threshold: float | None = None
     """Gamma of Sec. 3.4, the score that a selected Gaussian exceeds; None if there was no threshold, or several."""
     how: str = ""
-    """How the threshold was found, or what was combined."""
+    """How the threshold was found, or which selections were combined."""
 
     @classmethod
     def of(cls, mask: Tensor | Array, how: str = "given") -> Selection:  # mask: [N] bool
@@ -82,7 +82,7 @@ class Selection:
         """The centres of the selected Gaussians as a numpy array, in world units.
 
         Args:
-            cloud: what was selected in: a splat, Gaussians, or positions [N, 3].
+            cloud: the selection's cloud: a splat, Gaussians, or positions [N, 3].
 
         Raises:
             ValueError: if the cloud has another number of Gaussians.

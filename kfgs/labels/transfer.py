@@ -1,4 +1,4 @@
-"""Labels cross from the semantic field to the colour field by distance alone (Sec. 3.4)."""
+"""Carry labels from the semantic field to the colour field by distance (Sec. 3.4)."""
 
 from __future__ import annotations
 
@@ -17,41 +17,41 @@ from .label_set import LabelSet
 from .nearest import Array, Cloud, Sources, explained_distance, means_of, neighbours_together, positions
 from .transfer_methods import Method, make_rule
 
-NEIGHBOURS = 4  # looked at by "nearest", for ambiguity alone; 8 cost half as much again
+NEIGHBOURS = 4  # sources that "nearest" checks for ambiguity; 8 take half as long again
 CHUNK = 16_384  # destinations at a time: with 16 neighbours and their covariances, 25 MB
 
 
 @dataclass(frozen=True, eq=False)
 class Transfer:
-    """Labels carried from S source Gaussians to N destination Gaussians, and what became of the rest."""
+    """Labels carried from S source Gaussians to N destination Gaussians."""
 
     labels: Tensor  # [N] int64, -1 = none
     distances: Tensor  # [N] world units, to the source that gave the label; infinite if there is none
     sources: Tensor  # [N] int64, index of that source; -1 if there is none
     distance: float  # lambda, the distance within which a label is carried over, world units
     how: str  # how lambda was found
-    shares: Tensor  # [N] the label's share of the weight of the sources looked at, in (0, 1]; 0 if there is none
-    disagree: Tensor  # [N] bool, labelled, but with another label among the sources looked at
+    shares: Tensor  # [N] the label's share in the weight of the sources considered, in (0, 1]; 0 without a label
+    disagree: Tensor  # [N] bool, labelled, but with another label among the sources considered
     method: Method = "nearest"
 
     @property
     def labelled(self) -> int:
-        """Destinations with a label."""
+        """The number of destinations with a label."""
         return int((self.labels >= 0).sum())
 
     @property
     def orphaned(self) -> int:
-        """Destinations without: no labelled source in range."""
+        """The number of destinations without a label: no labelled source in range."""
         return len(self.labels) - self.labelled
 
     @property
     def ambiguous(self) -> int:
-        """Labelled destinations with another label among the sources looked at."""
+        """The number of labelled destinations with another label among the sources considered."""
         return int(self.disagree.sum())
 
     @property
     def scores(self) -> Tensor:  # [N] in [0, 1]
-        """How sure each label is: 1 - distance / lambda for "nearest", else the label's share; 0 without a label."""
+        """The confidence of each label: 1 - distance / lambda for "nearest", else the label's share; 0 without a label."""
         if self.method != "nearest":
             return self.shares
         reach = max(self.distance, torch.finfo(self.distances.dtype).tiny)
@@ -59,13 +59,11 @@ class Transfer:
 
     @property
     def score_meaning(self) -> str:
-        """What `scores` are, in words."""
+        """The meaning of `scores`, in words."""
         return "1 - distance / lambda" if self.method == "nearest" else "the label's share of the weights in range"
 
     def select(self, which: Tensor) -> Transfer:  # which: [N] bool or [n] int64
-        """The transfer of the destinations under a mask or an index alone, to go with `Gaussians.select` of them.
-
-        `sources` keep their indices. Counts are those of the selected destinations.
+        """The transfer for some of the destinations, as `Gaussians.select` selects them. `sources` keep their indices.
 
         Raises:
             ValueError: if a mask has another length.
@@ -109,16 +107,16 @@ def transfer_labels(
       is positions, Sigma_dst = 0.
 
     Of equally near sources (as float64 distances) the lowest indices come first; of several at one position only the
-    lowest index gives a label. A Gaussian thinner than a thousandth of its length counts as that thick.
+    lowest index gives a label. Gaussians are made at least a thousandth of their length thick.
 
     Args:
         src: the semantic field, as positions (a tensor or an array), Gaussians or a splat.
         src_labels: their labels.
-        dst: what to label (the colour field), as positions, Gaussians or a splat. `label_splats` labels a splat in one call.
-        distance: lambda in world units; None takes `default_distance`.
+        dst: the colour field, as positions, Gaussians or a splat. `label_splats` labels a splat in one call.
+        distance: lambda in world units; None: `default_distance`.
         method: which label wins.
-        neighbours: how many sources "vote" and "mahalanobis" look at, at most.
-        deviations: the reach of "mahalanobis", besides `distance`.
+        neighbours: the most sources that "vote" and "mahalanobis" consider.
+        deviations: the reach of "mahalanobis", in addition to `distance`.
 
     Returns:
         Labels, shares, distances and sources on the destinations' device, with counts. Without any labelled source no
@@ -193,17 +191,17 @@ def label_splats(
 ) -> SplatFile:
     """Label a splat by distance, in one call: `label_splats(read_splats("mine.ply"), field.label(classes), classes)`.
 
-    Both must share one frame; `kfgs.attach` finds the common frame, and can let the views decide instead of the distance.
+    Both must share one frame; `kfgs.attach` finds the common frame, and can label by views instead of by distance.
 
     Args:
-        splats: what to label; labels that it has are replaced.
-        labelled: Gaussians with labels, such as `SemanticField.label` gives, or a labelled splat.
-        classes: the names of the classes; of a labelled splat its own by default.
-        distance: lambda, the distance within which a label is carried over, in world units; None takes `default_distance`.
+        splats: the splat to label; old labels are replaced.
+        labelled: Gaussians with labels, for instance from `SemanticField.label`, or a labelled splat.
+        classes: the names of the classes; by default those of a labelled splat.
+        distance: lambda, the distance within which a label is carried over, in world units; None: `default_distance`.
         method: which label wins, see `transfer_labels`.
 
     Returns:
-        The splat with `labels`, the extra column `score` (`Transfer.scores`), class names, and facts in `info["labels"]`.
+        The splat with `labels`, the extra column `score` (`Transfer.scores`), class names, and details in `info["labels"]`.
 
     Raises:
         ValueError: if `labelled` carries no labels, or as `transfer_labels`.
@@ -215,7 +213,7 @@ def label_splats(
         )
     names = classes.names if isinstance(classes, LabelSet) else tuple(classes) or source.classes
     found = transfer_labels(source.gaussians, source.gaussians.labels, splats.gaussians, distance, method=method)
-    facts = {
+    details = {
         "labelled by": "distance",
         "method": method,
         "lambda": found.distance,
@@ -227,7 +225,7 @@ def label_splats(
         gaussians=splats.gaussians.replace(labels=found.labels),
         extra=splats.extra | {SCORE: found.scores.to(torch.float32).cpu().numpy()},
         classes=names,
-        info=splats.info | {"labels": facts},
+        info=splats.info | {"labels": details},
     )
 
 

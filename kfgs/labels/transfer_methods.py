@@ -1,4 +1,4 @@
-"""Which of the sources near a destination gives its label: the nearest, a vote, or the one that overlaps most."""
+"""Choose which source near a destination gives its label: the nearest, a vote, or the largest overlap."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from ..splat.covariance import covariance_3d
 from .nearest import Array, Cloud, Near, Sources, means_of, positions
 
 Method = Literal["nearest", "vote", "mahalanobis"]
-THIN = 1e-3  # "mahalanobis" treats a Gaussian as at least this share of its length thick
+THIN = 1e-3  # "mahalanobis" makes Gaussians at least this share of their length thick
 TINY = float(np.finfo(np.float64).tiny)
 
 
 class Verdict(NamedTuple):
-    """What a rule says about n destinations."""
+    """The result of a rule for n destinations."""
 
     column: Array  # [n] int64, the column of `Near` that gives the label; -1 = none
-    share: Array  # [n] of the winning label in the weight of all sources looked at; 0 if there is none
-    ambiguous: Array  # [n] bool: another label was among them
+    share: Array  # [n] the winning label's share in the weight of all sources considered; 0 if there is none
+    ambiguous: Array  # [n] bool: another label is among these sources
 
 
 def make_rule(
@@ -34,12 +34,12 @@ def make_rule(
     dst: Cloud,
     reach: float,  # lambda; for "mahalanobis" the deviations
 ) -> Callable[[Array, Near], Verdict]:
-    """Which source gives the label, as a function of rows of the destinations [n] and the sources near them."""
+    """Make the function (rows of the destinations [n], sources near them) -> which source gives the label."""
     if method == "nearest":
         return lambda _, near: _by_nearest(sources, near)
     opacities = _opacities(src)[kept]
     if method == "vote":
-        least = 1e-9 * reach  # a source at the very place outweighs all others
+        least = 1e-9 * reach  # a source at the same position outweighs all others
 
         def vote(_: Array, near: Near) -> Verdict:
             weight = np.where(near.hit, opacities[near.source] / np.maximum(near.distance, least), 0)
@@ -72,9 +72,9 @@ def _by_nearest(sources: Sources, near: Near) -> Verdict:
 
 
 def _by_weight(sources: Sources, near: Near, weight: Array, far: Array) -> Verdict:
-    """The label with the most `weight` [n, k], given by that one of its sources that is least `far` [n, k] away.
+    """The label with the most `weight` [n, k] wins; its nearest source by `far` [n, k] gives it.
 
-    Of tied labels, the one with the least far source wins. Sources that are infinitely far take no part.
+    Of tied labels, the one with the nearest source wins. Sources at infinite distance are left out.
     """
     part = np.isfinite(far)
     found: Array = np.asarray(part.any(axis=1))
@@ -82,7 +82,7 @@ def _by_weight(sources: Sources, near: Near, weight: Array, far: Array) -> Verdi
     column = np.full(len(found), -1)
     column[found] = np.argmin(far[found], axis=1)
     share = np.where(found, 1.0, 0.0)
-    rows = np.flatnonzero(ambiguous)  # in all others one label has the whole weight
+    rows = np.flatnonzero(ambiguous)  # elsewhere one label has the whole weight
     if rows.size:
         label, weight = np.where(part[rows], sources.labels[near.source[rows]], -1), weight[rows]
         total = np.stack([(weight * (label == label[:, [j]])).sum(axis=1) for j in range(label.shape[1])], axis=1)
@@ -94,7 +94,7 @@ def _by_weight(sources: Sources, near: Near, weight: Array, far: Array) -> Verdi
 
 
 def _disagree(sources: Sources, near: Near, part: Array) -> Array:  # part: [n, k] bool -> [n] bool
-    """Whether more than one label is among the sources that take part, or at the position of one of them."""
+    """Whether the sources in `part`, or other sources at their positions, have different labels."""
     label = sources.labels[near.source]
     low = np.where(part, label, np.iinfo(np.int64).max).min(axis=1)
     high = np.where(part, label, -1).max(axis=1)

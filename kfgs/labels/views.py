@@ -1,7 +1,7 @@
-"""What the views say about each Gaussian: the mean of numbers, or a vote of classes, over the pixels that show it.
+"""Carry values from views to Gaussians: the mean of numbers, or a vote of classes, over the pixels that show a Gaussian.
 
-A Gaussian's own latent is trained only in blends with its neighbours, so it may decode to something that no view shows.
-Its rendering weights w = T alpha say how much each pixel shows it. Summing over pixels with these weights is the transpose
+A Gaussian's latent is trained only in blends with its neighbours, so it may decode to something that no view shows. Its
+rendering weights w = T alpha measure how much each pixel shows it. Summing over pixels with these weights is the transpose
 of Eq. 3.
 """
 
@@ -19,7 +19,7 @@ from ..gaussians import Gaussians
 from ..splat import accumulate_pixels, bin_tiles, project
 
 MIN_SHARE = 0.7
-"""A class needs seven votes in ten. Gaussians with less lie across a border: in the toy room about 65 % of those with a
+"""A class needs 70 % of the votes. Gaussians with less lie across a border: in the toy room about 65 % of those with a
 share below 0.8 had the right class, and about 95 % of the others."""
 
 
@@ -45,7 +45,7 @@ def sum_pixels(
     *,
     engine: str = "auto",
 ) -> tuple[Tensor, Tensor, Tensor]:  # [M] int64, [M, C], [M]
-    """The Gaussians that one view shows, and for each the signal's sum over its pixels and the sum of its weights."""
+    """Indices of the Gaussians that one view shows, with the weighted sum of the signal and the sum of weights of each."""
     projected = project(gaussians, camera, engine=engine)
     tiles = bin_tiles(projected, camera.width, camera.height, engine=engine)
     shape = projected.means2d, projected.conics, projected.opacities

@@ -1,6 +1,6 @@
-"""Questions that select Gaussians: by class, place, index or score, and their combinations. They are saved as JSON.
+"""Rules that select Gaussians by class, place, index or score, and combinations of them. They can be saved as JSON.
 
-A `Where` is a question about any cloud. Asked of one cloud it gives a `Selection`: `OfClass("chair").select(splats)`.
+A `Where` can be applied to any cloud and gives a `Selection`: `OfClass("chair").select(splats)`.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from .selection import Selection
 
 
 class Where(ABC):
-    """A question that selects some Gaussians of a cloud.
+    """A rule that selects some Gaussians of a cloud.
 
-    `a & b`, `a | b`, `a - b` and `~a` combine questions as they combine selections. `to_json` gives plain values,
-    `Where.from_json` reads them, and equal questions compare equal.
+    `a & b`, `a | b`, `a - b` and `~a` combine rules as they combine selections. `to_json` gives plain values,
+    `Where.from_json` reads them, and equal rules compare equal.
 
     Example:
         >>> (OfClass("chair") - InSphere((0, 0, 0), 1.0)).to_json()["kind"]
@@ -41,14 +41,14 @@ class Where(ABC):
     kind: ClassVar[str]
 
     def select(self, cloud: SplatFile | Gaussians, classes: Sequence[str] | LabelSet = ()) -> Selection:
-        """Ask a cloud.
+        """Apply the rule to a cloud.
 
         Args:
-            cloud: a splat with its class names and columns, or Gaussians alone.
-            classes: with Gaussians, the name of each class index in their labels.
+            cloud: a splat with its class names and columns, or Gaussians.
+            classes: only for Gaussians: the name of each class index in their labels.
 
         Raises:
-            ValueError: if the cloud lacks what is asked for: labels, a class, a column, an index.
+            ValueError: if the cloud lacks the labels, class, column or index that the rule needs.
             TypeError: if it is neither a splat nor Gaussians.
         """
         if isinstance(cloud, Gaussians):
@@ -65,7 +65,7 @@ class Where(ABC):
 
     @abstractmethod
     def _ask(self, cloud: SplatFile) -> Selection:
-        """The selection; each kind of question defines it."""
+        """The selection; each kind of rule defines it."""
 
     def __and__(self, other: Where) -> Where:
         return Both(_parts(Both, self) + _parts(Both, other)) if isinstance(other, Where) else NotImplemented
@@ -89,7 +89,7 @@ class Where(ABC):
 
         Args:
             value: plain values, from a file that anyone may have written.
-            name: where they stand in the file; errors begin with it.
+            name: their place in the file; errors begin with it.
 
         Raises:
             ValueError: if the kind is unknown, a member is missing, unknown or of a wrong type, or it nests too deep.
@@ -114,10 +114,9 @@ class OfClass(Where):
 
     kind: ClassVar[str] = "class"
     name: str | int
-    """A name, looked up exactly, then without regard to case; or an index, -1 for those without a label.
+    """A name (exact, or else without regard to case), or an index, -1 for Gaussians without a label.
 
-    If several classes have that name, it means all of them. An unknown name is an error; an index that no Gaussian
-    carries selects nothing.
+    A name selects all classes with that name. An unknown name is an error; an index that no Gaussian has selects nothing.
     """
 
     def __post_init__(self) -> None:
@@ -186,7 +185,7 @@ class InSphere(Where):
 
 @dataclass(frozen=True)
 class OfIndex(Where):
-    """The Gaussians with these indices **in the cloud that is asked**: an edit before it may have renumbered them."""
+    """The Gaussians with these indices **in the cloud it is applied to**; an earlier edit may have renumbered them."""
 
     kind: ClassVar[str] = "index"
     indices: tuple[int, ...]
@@ -216,7 +215,7 @@ class OfIndex(Where):
 
 @dataclass(frozen=True)
 class AboveScore(Where):
-    """The Gaussians with more than `threshold` in a column of the splat; `score` says how sure their label is."""
+    """The Gaussians with more than `threshold` in a column of the splat; `score` is the confidence of their label."""
 
     kind: ClassVar[str] = "score"
     threshold: float
@@ -238,7 +237,7 @@ class AboveScore(Where):
 
 @dataclass(frozen=True)
 class Component(Where):
-    """One connected part of what another question selects: the largest, or a smaller one by `rank`."""
+    """One connected part of another rule's selection: the largest, or a smaller one by `rank`."""
 
     kind: ClassVar[str] = "component"
     where: Where
@@ -264,7 +263,7 @@ class Component(Where):
 
 @dataclass(frozen=True)
 class Not(Where):
-    """The Gaussians that another question does not select."""
+    """The Gaussians that another rule does not select."""
 
     kind: ClassVar[str] = "not"
     where: Where
@@ -290,7 +289,7 @@ class _Several(Where):
 
 @dataclass(frozen=True)
 class Both(_Several):
-    """The Gaussians that all of several questions select."""
+    """The Gaussians that all of several rules select."""
 
     kind: ClassVar[str] = "both"
 
@@ -300,7 +299,7 @@ class Both(_Several):
 
 @dataclass(frozen=True)
 class Either(_Several):
-    """The Gaussians that at least one of several questions selects."""
+    """The Gaussians that at least one of several rules selects."""
 
     kind: ClassVar[str] = "either"
 

@@ -1,4 +1,4 @@
-"""From a COLMAP model and its images to a scene."""
+"""Make a scene from a COLMAP model and its images."""
 
 from __future__ import annotations
 

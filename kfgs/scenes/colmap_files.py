@@ -1,10 +1,10 @@
-"""The files of a COLMAP model, binary and text. Both hold the same fields in the same order, so one reader serves both.
+"""Read the files of a COLMAP model, binary and text. Both have the same fields in the same order, so one reader is enough.
 
-A `Table` hands out the fields of one record after the other. It compares every count with what is left of the file before it
-is used, so memory is bounded by the size of the file.
+A `Table` returns the fields of one record after the other. It compares every count with the rest of the file before using
+it, so memory is bounded by the size of the file.
 
 Fields are named by letters, as in `struct`: B, I and Q are unsigned integers of 1, 4 and 8 bytes, d is a float64. Three letters
-are ours: m is a camera model and s a sensor type (integers in .bin, words in .txt), x is a float64 that nobody needs.
+are ours: m is a camera model and s a sensor type (integers in .bin, words in .txt), x is an unused float64.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ TRACK = np.dtype([("IMAGE_ID", "<u4"), ("POINT2D_IDX", "<u4")])
 ADVICE = "copy the model again from its source, or write it again with COLMAP"
 _LARGEST = {"B": 2**8 - 1, "I": 2**32 - 1, "Q": 2**64 - 1}
 _WORDS = {"m": {name: i for i, (name, _) in CAMERA_MODELS.items()}, "s": {"CAMERA": 0, "IMU": 1}}
-_NUMERIC = frozenset("0123456789+-.eE")  # what C++ reads as a number: no '1_000', no 'nan'
+_NUMERIC = frozenset("0123456789+-.eE")  # characters of numbers in C++: no '1_000', no 'nan'
 _LONGEST_NAME = 4096  # bytes, the longest path of Linux
 
 
@@ -99,7 +99,7 @@ class _Binary:
         self.path, self.where, self.position = path, str(path), 0
         size = path.stat().st_size
         require(size >= 8, self.where, "at least the 8 bytes of a count", f"{size} bytes")
-        with path.open("rb") as file:  # mapped, so that memory follows what is kept of it
+        with path.open("rb") as file:  # mapped: only the parts that are used take memory
             self.data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
     def records(self, what: str, smallest: str) -> Iterator[str]:
@@ -140,7 +140,7 @@ class _Binary:
         return int(count)
 
     def _advance(self, length: int, what: str) -> int:
-        """Step over `length` bytes; gives where they begin."""
+        """Skip `length` bytes, and return where they begin."""
         start, left = self.position, len(self.data) - self.position
         if length > left:
             raise SceneError(

@@ -1,8 +1,8 @@
 """Read a COLMAP model (binary or text) and refuse what is damaged.
 
-This is the only reader of models in kfgs. pycolmap 4.2.1 is not safe on files from elsewhere: it loads a truncated cameras.bin
-with wrong intrinsics, a corrupt points3D.bin takes all memory, and random bytes in frames.bin never return. What this reader
-accepts, pycolmap reads as well and alike (`tests/scenes/test_colmap_model.py`).
+This is the only reader of models in kfgs. pycolmap 4.2.1 is not safe with untrusted files: it loads a truncated cameras.bin
+with wrong intrinsics, a corrupt points3D.bin takes all memory, and random bytes in frames.bin never return. If this reader
+accepts a model, pycolmap reads it with the same result (`tests/scenes/test_colmap_model.py`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from .colmap_files import CAMERA_MODELS, OBSERVATIONS, TRACK, Table, open_table,
 from .files import MAX_SIDE, SceneError
 
 FILES = ("cameras", "images", "points3D")
-QUATERNION_SLACK = 0.1  # text files are rounded; a norm further from 1 is no rotation but a wrong byte
+QUATERNION_SLACK = 0.1  # text files are rounded; a norm farther from 1 means a wrong byte
 _POSE = "QW, QX, QY, QZ, TX, TY, TZ"
 _CAMERA_SENSOR = 0
 
@@ -53,10 +53,10 @@ class ColmapImage:
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """What a COLMAP model holds."""
+    """The content of a COLMAP model."""
 
     layout: str
-    """`"binary"` or `"text"`. Binary is read where both are there, as pycolmap does."""
+    """`"binary"` or `"text"`. If both exist, binary is read, as in pycolmap."""
     cameras: dict[int, ColmapCamera]
     images: dict[int, ColmapImage]
     point_ids: NDArray[np.uint64]
@@ -251,7 +251,7 @@ def _read_sensor(table: Table, where: str) -> Sensor:
 
 
 def _read_rigs(table: Table, cameras: dict[int, ColmapCamera]) -> dict[int, dict[Sensor, Matrix | None]]:
-    """Of each rig: where each sensor stands, as a pose from rig to sensor; None where that is unknown."""
+    """For each rig, the pose of each sensor (rig to sensor); None if unknown."""
     rigs: dict[int, dict[Sensor, Matrix | None]] = {}
     for where in table.records("rig", "II"):
         (rig_id,) = table.take("I", "RIG_ID")

@@ -1,4 +1,4 @@
-"""The files of a scene: their names and order, how images are found and read, and the error that says what is wrong."""
+"""Helpers for the files of a scene: names and their order, finding and reading images, and SceneError."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .._files import read_json
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")  # what kornia decodes
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")  # kornia decodes these
 MAX_SIDE = 100_000  # pixels: beyond any sensor, so a larger number is a wrong byte
 MAX_NUMBER = 1e15  # of lengths and intrinsics: still far inside float32
 
@@ -20,7 +20,7 @@ MAX_NUMBER = 1e15  # of lengths and intrinsics: still far inside float32
 class SceneError(ValueError):
     """A scene that cannot be used as it is.
 
-    The message names the file, what was expected there, what came, and what to do.
+    The message names the file, what was expected, what was found, and what to do.
     """
 
 

@@ -28,18 +28,18 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
 
     Args:
         path: the scene folder, a model folder, or a .json file.
-        images: the image folder; None: `images/` beside the model or up to two folders above it, else the scene folder.
+        images: the image folder; None: `images/` next to the model or up to two folders above it, else the scene folder.
         split: `"auto"`: split.json if there is one, else the split of the transforms.json if it has one, else by number
             of images: from 200 the paper's (which trains on every 10th image only), from 8 `"holdout8"`, below 8 all;
             `"file"`: split.json; or a rule of `make_split`.
 
     Returns:
-        The scene, views in natural order of names, cameras with a `near` that suits the size of the scene
-        (`Scene.with_near`). Its `notes` say what is missing and what was assumed.
+        The scene, with views in natural order of names, and cameras with a `near` for the size of the scene
+        (`Scene.with_near`). Its `notes` list missing files and assumptions.
 
     Raises:
         FileNotFoundError: if there is no such folder, no image folder, or (`split="file"`) no split.json.
-        SceneError: if nothing is found there, or what is found cannot be used.
+        SceneError: if there is no scene, or it cannot be used.
         ValueError: if `split` is unknown.
     """
     path = Path(path)

@@ -18,7 +18,7 @@ from .files import SceneError
 with contextlib.suppress(ImportError):
     import PIL.Image  # noqa: F401  # see above: the order matters
 
-# What pycolmap raises on input that it cannot use (a failed CHECK is a ValueError, a missing id an IndexError).
+# Exceptions of pycolmap for unusable input (a failed CHECK is a ValueError, a missing id an IndexError).
 FAILURES = (ValueError, IndexError, KeyError, RuntimeError, MemoryError, OSError)
 
 _FATAL = 3  # glog's levels: 0 info, 1 warning, 2 error, 3 fatal

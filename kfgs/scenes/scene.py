@@ -24,9 +24,9 @@ NEAR_SHARE = (
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """V posed views of one place. Images are read when asked for, one at a time.
+    """V posed views of one place. Images are read from disk at each access.
 
-    `scene.select("train").cameras` and `.image_paths` are those of one split; `scene.image(i)` is a picture.
+    `scene.select("train").cameras` and `.image_paths` belong to one split; `scene.image(i)` is a picture.
 
     **Convention**: world to camera, pixel centres on halves (`Camera`), world units of the file. Loaders put the views in
     natural order of their names.
@@ -43,11 +43,11 @@ class Scene:
     splits: dict[str, list[int]] = field(default_factory=dict)
     """Named lists of views; loaders give at least `train` and `test`."""
     notes: tuple[str, ...] = ()
-    """What is missing and what was assumed when the scene was read."""
+    """Missing files and assumptions found when the scene was read."""
     lenses: list[Camera] | None = None
     """Only in an undistorted scene: the cameras with the distortion that the files on disk still have."""
     folder: Path | None = None
-    """Where the scene was loaded from."""
+    """The path that the scene was loaded from."""
 
     def __post_init__(self) -> None:
         check_shapes(("points", self.points, "P 3"), ("colors", self.colors, "P 3"))
@@ -152,7 +152,7 @@ class Scene:
     def with_near(self) -> Scene:
         """The same scene with every camera's `near` at 0.2 world units or, if that is less, a tenth of the extent.
 
-        The extent is that of all views, so that the split does not matter. Loaders call this. A scene made by hand keeps the
+        The extent is taken over all views, so the split does not matter. Loaders call this. A scene made by hand keeps the
         `near` of its cameras until this is called.
         """
         if len(self) == 0:
@@ -164,7 +164,7 @@ class Scene:
         """The scene with some of its views, in the order given; points stay, splits keep their names.
 
         Args:
-            which: the name of a split, such as "train"; or names of views (with or without suffix), or their indices.
+            which: the name of a split, for instance "train"; or names of views (with or without suffix), or their indices.
 
         Raises:
             ValueError: if a split or a view is unknown.

@@ -1,4 +1,4 @@
-"""Which views are for training and which are for testing."""
+"""Split views into training and test views."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 **Convention**: `transform_matrix` is camera to world with OpenGL axes (x right, y up, z backward). kfgs wants world to
 camera with y down and z forward, so the y and z columns change sign and the pose is inverted. World coordinates are those of
-the file: `applied_transform` says what was done to poses and points alike, and is not undone.
+the file: `applied_transform`, which was applied to poses and points, is not undone.
 `cx, cy` are read as in COLMAP (the centre of the first pixel is (0.5, 0.5)), because the converters of nerfstudio and
 instant-ngp copy COLMAP's numbers and both programs sample pixels at +0.5.
 """
@@ -41,7 +41,7 @@ _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  #
 
 @dataclass
 class _Reader:
-    """One file: the views that were read from it, and what was missing."""
+    """One file: the views read from it, and the missing images."""
 
     path: Path
     root: Path
@@ -166,7 +166,7 @@ def _find_image(reader: _Reader, listed: str) -> Path | None:
 
 
 def _name(reader: _Reader, file: Path) -> str:
-    """File name relative to `images/` of the scene, else to the scene folder; of a file elsewhere, the bare name."""
+    """File name relative to `images/` of the scene, or else to the scene folder; for other files, the bare name."""
     plain = _normal(file)
     for folder in (reader.images, reader.root / "images", reader.root):
         if folder is not None and plain.is_relative_to(_normal(folder)):
@@ -188,7 +188,7 @@ def _normal(path: Path) -> Path:
 
 @dataclass(frozen=True)
 class _Frame:
-    """The values of one frame; those at the top of the file count where the frame has none."""
+    """The values of one frame; if the frame lacks one, that at the top of the file."""
 
     path: Path
     where: str

@@ -1,4 +1,4 @@
-"""Pictures: one palette, flat and in space; plots, pyvista clouds with or without a display, films and pages."""
+"""Pictures: label overlays, plots, 3-D clouds (pyvista), films, standalone pages and the explorer, all in one palette."""
 
 from .animation import save_animation, save_frames
 from .boxes import add_boxes, add_names, add_selections

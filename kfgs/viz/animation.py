@@ -1,4 +1,4 @@
-"""Pictures one after the other as a file: GIF with Pillow, MP4 where ffmpeg is installed for Python."""
+"""Write pictures as a film: GIF with Pillow, MP4 with imageio-ffmpeg."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ Array = np.ndarray[Any, Any]
 Progress = Callable[[int, int], object]
 """Called after each frame with (frames done, frames in all)."""
 
-GIF_FPS = 50.0  # browsers slow down anything that shows a picture for less than 0.02 s
-LEGEND_COLORS = 64  # of a GIF frame's 256: 18 classes, ink, paper, and the greys between
+GIF_FPS = 50.0  # browsers slow down films with shorter frames than 0.02 s
+LEGEND_COLORS = 64  # of a GIF frame's 256 colours: 18 classes, ink, paper, and the greys between
 FFMPEG = "imageio_ffmpeg"
 SUFFIXES = (".gif", ".mp4")
 
@@ -38,16 +38,16 @@ def save_animation(
     names: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> Path:
-    """Draw what is shown from each camera, and write the frames as a GIF or an MP4 video.
+    """Draw a cloud, or several side by side, from each camera, and write the frames as a GIF or an MP4 video.
 
     Args:
         path: a name that ends in .gif or .mp4. The file appears whole or not at all.
-        shows: Gaussians (coloured by their labels, else by their harmonics), a function camera -> [H, W, 3] (such as
-            `show_cloud` makes), or several of them by title, which are shown side by side.
+        shows: Gaussians (coloured by their labels, else by their harmonics), a function camera -> [H, W, 3] (for instance
+            from `show_cloud`), or several of these by title, shown side by side.
         cameras: one per frame, all of one size (`kfgs.cameras.orbit_cameras`, `path_cameras`).
         fps: frames per second, at most 50 in a GIF, which counts hundredths of a second.
-        names: class names; when given, the classes of the labelled Gaussians are listed below every frame. Gaussians
-            inside functions are not listed.
+        names: class names, for a legend of the labelled Gaussians below every frame. Gaussians inside functions are not
+            listed.
         progress: called after each frame with (done, all).
 
     Returns:
@@ -55,7 +55,7 @@ def save_animation(
 
     Raises:
         ValueError: if there is nothing to show or no camera, sizes differ, or the name ends otherwise.
-        ImportError: for .mp4, where imageio-ffmpeg is not installed.
+        ImportError: for .mp4, if imageio-ffmpeg is not installed.
     """
     if not cameras:
         raise ValueError("cameras: expected at least one camera, got none; make some with kfgs.cameras.orbit_cameras")
@@ -87,17 +87,17 @@ def save_frames(
     *,
     fps: float = 15.0,
 ) -> Path:
-    """Write pictures as a GIF (256 colours a frame, repeats for ever) or an MP4 (H.264; odd sizes gain a white edge).
+    """Write pictures as a GIF (256 colours per frame, repeats for ever) or an MP4 (H.264; odd sizes get a white edge).
 
     Raises:
-        ValueError: if there is no picture, they differ in size, or the name ends neither in .gif nor in .mp4.
-        ImportError: for .mp4, where imageio-ffmpeg is not installed.
+        ValueError: if there is no picture, sizes differ, or the name ends neither in .gif nor in .mp4.
+        ImportError: for .mp4, if imageio-ffmpeg is not installed.
     """
     return _write(path, frames, fps, None)
 
 
 def _write(path: str | Path, frames: Iterable[Tensor | Array], fps: float, strip: Array | None) -> Path:
-    """`strip` is the legend below every frame; a GIF keeps its colours exactly."""
+    """Write a film. A GIF keeps the colours of `strip`, the legend below every frame, exactly."""
     target = _check_target(path, fps)
     with atomic_path(target) as temporary:
         if target.suffix.lower() == ".gif":
@@ -123,12 +123,8 @@ def _checked(frames: Iterable[Tensor | Array]) -> Iterator[Array]:
     shape: tuple[int, ...] | None = None
     for number, frame in enumerate(frames):
         picture = as_bytes(frame)
-        if (
-            picture.ndim != 3
-            or picture.shape[2] != 3
-            or 0 in picture.shape
-            or picture.shape != (shape or picture.shape)
-        ):
+        wrong = picture.ndim != 3 or picture.shape[2] != 3 or 0 in picture.shape
+        if wrong or picture.shape != (shape or picture.shape):
             wanted = "[H, W, 3]" if shape is None else f"{list(shape)} (from frames[0])"
             raise ValueError(f"frames[{number}]: expected {wanted}, got {picture.shape}; draw all of one size")
         shape = picture.shape
@@ -140,7 +136,7 @@ def _checked(frames: Iterable[Tensor | Array]) -> Iterator[Array]:
 def _write_gif(path: Path, frames: Iterator[Array], fps: float, strip: Array | None) -> None:
     legend = None if strip is None else _few_colors(strip)
     indexed = [_indexed(frame, legend) for frame in frames]
-    # one call for all frames: what does not change between two frames is not stored twice
+    # one call for all frames, so that Pillow stores only what changes between two frames
     indexed[0].save(
         path,
         format="GIF",
@@ -152,7 +148,7 @@ def _write_gif(path: Path, frames: Iterator[Array], fps: float, strip: Array | N
 
 
 def _few_colors(strip: Array) -> tuple[Array, Array]:  # [h, w, 3] -> [h, w] int64, [n, 3]
-    """The legend in its commonest colours, at most 64: the classes' are among them, edges of letters may not be."""
+    """Reduce the legend to its 64 commonest colours. They include the classes, perhaps not all edges of letters."""
     colors, inverse, counts = np.unique(strip.reshape(-1, 3), axis=0, return_inverse=True, return_counts=True)
     kept = np.argsort(-counts, kind="stable")[:LEGEND_COLORS]
     distances = np.abs(colors[:, None].astype(np.int64) - colors[kept][None].astype(np.int64)).sum(-1)
@@ -160,10 +156,7 @@ def _few_colors(strip: Array) -> tuple[Array, Array]:  # [h, w, 3] -> [h, w] int
 
 
 def _indexed(frame: Array, legend: tuple[Array, Array] | None) -> Image.Image:
-    """A frame in its own 256 colours, some of them the legend's.
-
-    Without dithering: its dots would flicker, and flat label colours stay flat.
-    """
+    """A frame in 256 colours of its own, including the legend's. No dithering: its dots would flicker."""
     index, colors = legend if legend is not None else (np.zeros((0, frame.shape[1]), np.int64), frame[:0, 0])
     picture = Image.fromarray(np.ascontiguousarray(frame[: len(frame) - len(index)]))
     free = 256 - len(colors)
@@ -178,7 +171,7 @@ def _indexed(frame: Array, legend: tuple[Array, Array] | None) -> Image.Image:
 
 def _write_mp4(path: Path, frames: Iterator[Array], fps: float) -> None:
     first = next(frames)
-    height, width = (first.shape[0] + 1) // 2 * 2, (first.shape[1] + 1) // 2 * 2  # H.264 halves the colours' size
+    height, width = (first.shape[0] + 1) // 2 * 2, (first.shape[1] + 1) // 2 * 2  # H.264 needs even sizes
     writer = _ffmpeg().write_frames(
         str(path), (width, height), fps=fps, codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="error"
     )

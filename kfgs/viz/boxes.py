@@ -1,4 +1,4 @@
-"""What was selected, in the scene: its Gaussians in a colour of their own, its oriented box, its name."""
+"""Draw selections in the scene: Gaussians in a colour per selection, oriented boxes, names."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import torch
 from .._check import check_range, check_shapes
 from ..gaussians import Gaussians
 from ..labels import OrientedBox, Selection
+from ..labels.color import LUMINANCE
 from .cloud_colors import cloud_colors
 from .clouds import CloudOptions, Style, add_cloud
 from .legends import letters
@@ -22,8 +23,7 @@ if TYPE_CHECKING:
 
 Array = np.ndarray[Any, Any]
 LETTERS = 16  # pixels
-BRIGHTNESS = np.array([0.2126, 0.7152, 0.0722])  # of red, green and blue, ITU-R BT.709
-GRAYS = (70, 225)  # of black and of white: paler than what was selected
+GRAYS = (70, 225)  # black and white become these greys, paler than the selections
 EDGES = ((0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7))
 """Pairs of `OrientedBox.corners` that differ along one axis: the third, the second, the first."""
 
@@ -47,7 +47,7 @@ def add_boxes(
 
     Args:
         plotter: where to draw.
-        boxes: B of them.
+        boxes: B boxes.
         labels: their classes; None: 0 to B - 1.
         line_width: in pixels.
 
@@ -80,13 +80,13 @@ def add_names(
     *,
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> Any:
-    """Write a name over each box, in front of everything, every one of them: names of boxes close by may overlap.
+    """Write a name over each box, in front of everything. All names are drawn, even if they overlap.
 
     Args:
         plotter: where to draw.
-        boxes: B of them.
-        names: B of them.
-        up: the world's direction to the side of the box where the name is.
+        boxes: B boxes.
+        names: B names.
+        up: the world's up: the name is on this side of the box.
 
     Raises:
         ValueError: if there is no box, or not one name for each.
@@ -104,7 +104,7 @@ def add_names(
         show_points=False, always_visible=True, font_size=LETTERS, text_color=letters(plotter), bold=True, pickable=False,
         reset_camera=False,
     )  # fmt: skip
-    actor.GetMapper().SetPlaceAllLabels(True)  # VTK would leave out those that overlap another
+    actor.GetMapper().SetPlaceAllLabels(True)  # otherwise VTK leaves out names that overlap
     return actor
 
 
@@ -118,17 +118,17 @@ def add_selections(
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
     options: CloudOptions = CloudOptions(),  # noqa: B008  frozen
 ) -> Selections:
-    """Draw what was selected, each selection in its colour, within its oriented box and under its name.
+    """Draw each selection in its colour, with its oriented box and its name.
 
     A Gaussian in several selections has the colour of the last one.
 
     Args:
         plotter: where to draw.
-        gaussians: the cloud that the selections are of.
+        gaussians: the cloud of the selections.
         selections: by name, in the order of their colours.
         style: as in `add_cloud`.
-        rest: draw what nobody selected too, in grey; where the cloud has colours, in the greys of their brightness.
-        up: where the world's up is; names are there.
+        rest: also draw all other Gaussians, in grey; if the cloud has colours, with their brightness.
+        up: the world's up: names are on this side.
         options: as in `add_cloud`.
 
     Raises:
@@ -162,11 +162,11 @@ def add_selections(
 
 
 def _colors(gaussians: Gaussians) -> Array:  # [N, 3] uint8
-    """The palette's colours; Gaussians without a label keep the brightness of their colour."""
+    """The palette's colours; Gaussians without a label get a grey as bright as their colour."""
     assert gaussians.labels is not None
     colors = palette(gaussians.labels)
     if gaussians.sh is None:
         return colors
-    gray = GRAYS[0] + (GRAYS[1] - GRAYS[0]) / 255 * (cloud_colors(gaussians, "rgb").rgb @ BRIGHTNESS)
+    gray = GRAYS[0] + (GRAYS[1] - GRAYS[0]) / 255 * (cloud_colors(gaussians, "rgb").rgb @ np.array(LUMINANCE))
     none = gaussians.labels.cpu().numpy() < 0
     return np.where(none[:, None], np.rint(gray)[:, None], colors).astype(np.uint8)

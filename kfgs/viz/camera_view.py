@@ -1,4 +1,4 @@
-"""Set a plotter's view to a posed camera, and read a posed camera from a view."""
+"""Set a plotter's view from a posed camera, and make a posed camera from a view."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 
 def look_through(plotter: pv.Plotter, camera: Camera) -> None:
-    """Set the active subplot's view to a camera, principal point and both focal lengths included.
+    """Set the active subplot's view to a camera, including its principal point and both focal lengths.
 
-    The picture fills the window; it is undistorted in shape when the window has the camera's proportions
-    (`make_plotter(camera.height, camera.width)`).
+    The picture fills the window, so make the window with the camera's proportions (`make_plotter(camera.height,
+    camera.width)`), or it is stretched.
 
     Raises:
         ValueError: if the camera's lens distorts.
@@ -37,7 +37,7 @@ def look_through(plotter: pv.Plotter, camera: Camera) -> None:
     view.SetWindowCenter(1 - 2 * cx / camera.width, 2 * cy / camera.height - 1)
     view.SetExplicitAspectRatio((camera.width / fx) / (camera.height / fy))
     view.SetUseExplicitAspectRatio(True)
-    plotter.camera_set = True  # or the first render would move the camera to see everything
+    plotter.camera_set = True  # otherwise the first render moves the camera to see everything
     plotter.renderer.ResetCameraClippingRange()
 
 
@@ -47,7 +47,7 @@ def camera_of(plotter: pv.Plotter, subplot: tuple[int, int] = (0, 0), *, near: f
     Args:
         plotter: its window may have any size.
         subplot: (row, column).
-        near: of the camera, world units: VTK's own near plane only fits the depths that it stores.
+        near: near plane of the returned camera, world units. VTK's own depends on its depth buffer, and says nothing.
 
     Returns:
         A pinhole camera (float64) with the size of the subplot, in pixels.

@@ -1,4 +1,4 @@
-"""Which colour each Gaussian of a cloud gets: by class, colour, latent, score or opacity."""
+"""The colour of each Gaussian: by class, harmonics, latent, score or opacity."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from .pictures import as_bytes
 
 Array = np.ndarray[Any, Any]
 ColorBy = Literal["label", "rgb", "view", "opacity", "feature"]
-COLORMAP = "cividis"  # grows evenly brighter, and reads the same for colour-blind eyes
+COLORMAP = "cividis"  # brightness rises evenly; looks the same to colour-blind eyes
 
 
 class CloudColors(NamedTuple):
-    """Colours, and what they stand for."""
+    """Colours and their meaning."""
 
     rgb: Array  # [N, 3] uint8
-    name: str  # of what is shown
-    values: Array | None  # [N] the numbers shown, where there is one for each Gaussian
-    clim: tuple[float, float] | None  # the numbers of the darkest and the brightest colour; None: not a scale
+    name: str  # what the colours show
+    values: Array | None  # [N] the values shown, if each Gaussian has one
+    clim: tuple[float, float] | None  # the values of the darkest and the brightest colour; None: not a scale
 
 
 def cloud_colors(
@@ -35,11 +35,11 @@ def cloud_colors(
     feature_colors: FeatureColors | None = None,
     clim: tuple[float, float] | None = None,
 ) -> CloudColors:
-    """Colour a cloud as `add_cloud` does, which explains the arguments.
+    """Colour a cloud; the arguments are those of `add_cloud`.
 
     Raises:
-        ValueError: if what to colour by is missing, or of another size.
-        TypeError: if an array is neither of integers nor of floats, or there are no Gaussians but what holds some.
+        ValueError: if what to colour by is missing or has the wrong size.
+        TypeError: if an array holds neither integers nor floats, or `gaussians` is something else.
     """
     check_gaussians(gaussians)
     if color_by is None:
@@ -64,7 +64,7 @@ def cloud_colors(
 def color_by_default(
     gaussians: Gaussians, feature_colors: FeatureColors | None
 ) -> tuple[Literal["label", "rgb", "feature", "opacity"], FeatureColors | None]:
-    """What to colour by if the caller does not say: classes, else colours, else features, else opacity."""
+    """The default of `color_by`: classes, else colours, else features, else opacity."""
     if gaussians.labels is not None:
         return "label", feature_colors
     if gaussians.sh is not None:
@@ -75,7 +75,7 @@ def color_by_default(
 
 
 def seen_from(gaussians: Gaussians, center: Array) -> Array:  # center: [3] -> [N, 3] uint8
-    """The colours of `sh` as a camera at `center` sees them, as the rasteriser evaluates them."""
+    """The colours of `sh` as a camera at `center` sees them."""
     assert gaussians.sh is not None
     place = torch.as_tensor(center, dtype=gaussians.means.dtype, device=gaussians.means.device)
     with torch.no_grad():
@@ -106,7 +106,7 @@ def _named(
 
 
 def _scale(name: str, values: Array, clim: tuple[float, float] | None) -> CloudColors:
-    """Colours of a scale; values that are not finite are grey."""
+    """Values through the colour map; values that are not finite are grey."""
     from matplotlib import colormaps
 
     finite = np.isfinite(values)
@@ -120,7 +120,7 @@ def _scale(name: str, values: Array, clim: tuple[float, float] | None) -> CloudC
 
 
 def _middle_range(values: Array) -> tuple[float, float]:
-    """The 1st to the 99th percentile, as in `FeatureColors`; all values where these are one; around a single value."""
+    """The 1st to the 99th percentile; if they are equal, all values; if these are equal too, one unit around them."""
     if values.size == 0:
         return 0.0, 1.0
     for outer in (1, 0):

@@ -1,7 +1,7 @@
 """Draw clouds with pyvista: as points, as Gaussians or as ellipsoids.
 
-Every `add_*` puts one actor into the plotter's active subplot and returns it; the caller shows the plotter. Data travel
-as named arrays on the actor's mesh (`actor.mapper.dataset["label"]`). pyvista is imported when something is drawn.
+Every `add_*` adds one actor to the plotter's active subplot and returns it; the caller shows the plotter. Data are named
+arrays on the actor's mesh (`actor.mapper.dataset["label"]`). pyvista is imported when something is drawn.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ class CloudOptions:
     """Options for drawing a cloud."""
 
     opacity: float = 1.0
-    """Of everything drawn, in (0, 1]; it multiplies the opacities of Gaussians."""
+    """Opacity of everything drawn, in (0, 1]; it multiplies the opacities of Gaussians."""
     point_size: float = 4.0
-    """Of points, in pixels."""
+    """Size of points, in pixels."""
     deviations: float = 1.0
     """Half axes of ellipsoids, in standard deviations."""
     faint: float = 0.5
-    """Gaussians of at most this opacity have no ellipsoid, in [0, 1): a surface would hide what they let through."""
+    """Gaussians up to this opacity, in [0, 1), get no ellipsoid: its surface would hide what is behind."""
     near: float = NEAR
-    """Gaussians up to this depth, in world units, are not drawn, as `Camera.near`; a haze before the view otherwise."""
+    """Gaussians up to this depth, in world units, are not drawn, as with `Camera.near`; they would be a haze."""
     sort: bool = True
-    """Draw Gaussians back to front (exact). Without it their order is averaged: five times faster, less accurate."""
+    """Draw Gaussians back to front (exact). Without sorting it is five times faster, but translucency is averaged."""
     moving: Moving = "auto"
-    """What stands for Gaussians while the mouse moves the camera: "points" (at most 50,000, evenly chosen; faint ones pale),
-    "gaussians", or "auto": points where a frame of Gaussians takes longer than 0.1 s, as in software from some 20,000 on."""
+    """What to draw while the mouse moves the camera: "points" (at most 50,000, evenly chosen; faint ones pale), "gaussians",
+    or "auto": points if a frame of Gaussians takes longer than 0.1 s (in software, from about 20,000 Gaussians)."""
 
     def __post_init__(self) -> None:
         check_range("opacity", self.opacity, 0, 1, closed=(False, True))
@@ -68,32 +68,32 @@ def add_cloud(
     clim: tuple[float, float] | None = None,
     options: CloudOptions = CloudOptions(),
 ) -> pv.Actor:
-    """Draw a cloud as points, as the anisotropic Gaussians that it consists of, or as ellipsoids.
+    """Draw a cloud as points, as anisotropic Gaussians, or as ellipsoids.
 
-    The mesh carries `index` (which Gaussian), `opacity`, `rgb` (the colours drawn, uint8) and, where there are any,
-    `label` and what `color_by` shows (`score`); with `style="gaussians"` also `scale` and `quat`. Where colours stand for
-    numbers, its field data carry `clim`, which `add_scalar_bar` reads. `recolor_cloud` exchanges the colours.
+    The mesh carries `index` (which Gaussian), `opacity`, `rgb` (the colours drawn, uint8) and, if present, `label` and the
+    values of `color_by` (`score`); with `style="gaussians"` also `scale` and `quat`. If colours mean numbers, its field
+    data carry `clim`, which `add_scalar_bar` reads. `recolor_cloud` changes the colours.
 
     Args:
-        plotter: where to draw; its active subplot receives the cloud.
+        plotter: where to draw, in the active subplot.
         gaussians: what to draw.
-        color_by: `label` (the palette), `rgb` (`sh` without its dependence on the view), `view` (`sh` as seen from where
-            the camera stands; Gaussians only), `opacity`, `feature` (through `feature_colors`); or one value for each
-            Gaussian: integers [N] are labels, floats [N] scores (not finite: grey), [N, 3] colours. None: labels if there are
-            any, else rgb, else features (in colours of this cloud alone), else opacity.
-        style: `points` is quick and can be exported to HTML; `gaussians` is VTK's EWA splatting, the picture that kfgs's
-            own rasteriser makes; `ellipsoids` are closed surfaces, for at most 100,000.
+        color_by: `label` (the palette), `rgb` (`sh` without its dependence on the view), `view` (`sh` as the camera sees
+            it; style `gaussians` only), `opacity`, `feature` (through `feature_colors`); or one value for each Gaussian:
+            integers [N] are labels, floats [N] scores (not finite: grey), [N, 3] colours. None: labels if there are any,
+            else rgb, else features (in colours of this cloud alone), else opacity.
+        style: `points` is quick and can be exported to HTML; `gaussians` is VTK's EWA splatting, adjusted to kfgs's
+            rasteriser; `ellipsoids` are closed surfaces, for at most 100,000 Gaussians.
         feature_colors: the scene's projection of features to colours.
         clim: scores of the darkest and the brightest colour; None: their 1st and 99th percentile (opacity: 0, 1).
         options: sizes, opacity, order.
 
     Raises:
-        ValueError: if there is nothing to draw, or what to colour by is missing.
+        ValueError: if the cloud is empty or lacks what to colour by.
         TypeError: if values to colour by are neither integers nor floats.
 
     Note:
-        Sorted Gaussians of two clouds in one subplot cover each other as wholes; join the clouds first (`Gaussians.cat`).
-        The first drawing of sorted Gaussians turns order-independent translucency off for that subplot.
+        VTK draws one cloud after the other, so sorted Gaussians of two clouds do not mix: join the clouds first
+        (`Gaussians.cat`). Sorted Gaussians turn off order-independent translucency for their subplot.
     """
     check_choice("style", style, get_args(Style))
     if len(gaussians) == 0:
@@ -128,19 +128,19 @@ def to_pyvista(
     *,
     feature_colors: FeatureColors | None = None,
 ) -> pv.PolyData:
-    """A cloud as a point cloud of pyvista: one point for each Gaussian, its values as named arrays.
+    """Convert a cloud to a pyvista point cloud: one point per Gaussian, values as named arrays.
 
-    The arrays are `index`, `rgb` (uint8), `opacity`, `scale` (standard deviations), `quat` (w, x, y, z), and, where there are
-    any, `label` and what `color_by` shows (`score`). `to_pyvista(cloud).plot(scalars="rgb", rgb=True)` shows it;
+    The arrays are `index`, `rgb` (uint8), `opacity`, `scale` (standard deviations), `quat` (w, x, y, z), and, if present,
+    `label` and the values of `color_by` (`score`). `to_pyvista(cloud).plot(scalars="rgb", rgb=True)` shows it;
     `add_cloud` draws true Gaussians.
 
     Args:
         gaussians: what to convert.
-        color_by: what `rgb` stands for, as in `add_cloud`.
+        color_by: the meaning of `rgb`, as in `add_cloud`.
         feature_colors: the scene's projection of features to colours.
 
     Raises:
-        ValueError: if what to colour by is missing.
+        ValueError: if the cloud lacks what to colour by.
         TypeError: if these are no Gaussians, or values to colour by are neither integers nor floats.
     """
     colors = cloud_colors(gaussians, color_by, feature_colors)
@@ -155,15 +155,15 @@ def recolor_cloud(
     colors: Array,  # [N, 3] uint8
     opacities: Array | None = None,  # [N] in [0, 1]
 ) -> None:
-    """Exchange the colours of a cloud that `add_cloud` drew, or colours and opacities; the next frame shows them.
+    """Change the colours, and optionally the opacities, of a cloud that `add_cloud` drew; the next frame shows them.
 
     Args:
-        actor: what `add_cloud` returned. One coloured by `view` takes its own colours again when the camera moves.
-        colors: in the order of the Gaussians, whatever the order of drawing.
-        opacities: likewise, of a cloud with `style="gaussians"`, which are drawn with them; None: as they are.
+        actor: the result of `add_cloud`. With `color_by="view"` the old colours return when the camera moves.
+        colors: in the order of the Gaussians.
+        opacities: in the same order, for `style="gaussians"`; None: unchanged.
 
     Raises:
-        ValueError: if there are not as many as Gaussians, or they are not uint8; if opacities are out of [0, 1].
+        ValueError: if numbers differ from the Gaussians, colours are not uint8, or opacities are out of [0, 1].
     """
     cloud: Any = actor.mapper.dataset
     count = int(cloud.field_data["count"][0])
@@ -199,7 +199,7 @@ def _add_shapes(cloud: pv.PolyData, gaussians: Gaussians) -> None:
 
 
 def _surfaces(gaussians: Gaussians, options: CloudOptions) -> pv.PolyData:
-    """Ellipsoids of those that are not faint; `index` counts all."""
+    """Ellipsoids of the Gaussians that are not faint; `index` refers to all Gaussians."""
     opaque = (gaussians.opacities.detach() > options.faint).nonzero()[:, 0]
     if len(opaque) == 0:
         raise ValueError(

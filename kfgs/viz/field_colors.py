@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 class FeatureColors:
     """One linear projection of features to RGB for a whole scene: equal features have equal colours in every view.
 
-    Fit it once, on the codewords or on the Gaussians' features, and never on a frame: the principal axes of a single
-    view change from view to view, and the colours with them.
+    Fit it once, on the codewords or on the Gaussians' features. If you fit it on each frame, the principal axes change
+    from view to view, and the colours with them.
     """
 
     mean: Tensor  # [D]
@@ -36,10 +36,10 @@ class FeatureColors:
     def fit(
         features: Tensor,  # [N, D]
     ) -> FeatureColors:
-        """Principal axes of the features; the range is their 1st to 99th percentile along each.
+        """Fit the three principal axes; colours range from the 1st to the 99th percentile along each axis.
 
-        Each axis points to the side where its largest entry is positive, so that refitting gives the same colours.
-        With fewer than three channels, or on an axis without spread, the missing colours stay in the middle.
+        The sign of an axis makes its largest entry positive, so that refitting gives the same colours. With fewer than
+        three channels, or on an axis without spread, the missing colours stay in the middle.
 
         Raises:
             ValueError: if there are no features or one is not finite.
@@ -84,21 +84,20 @@ class FeatureColors:
 
 
 def feature_colors(field: SemanticField) -> FeatureColors:
-    """One projection of this field's features to RGB, the same for every view of it, for `SemanticField.render(...).map`.
+    """The projection of a field's features to RGB, for `SemanticField.render(...).map` of every view.
 
-    Of a trained field with codebook it is fitted to the codewords' latents (mode adc: to the codewords), so that stray
-    Gaussians do not shape it. A fused field, and one without codebook, has no codewords: it is fitted to the Gaussians'
-    latents, without those that are all-zero.
+    With a codebook, it is fitted to the codewords' latents (mode adc: to the codewords), so that stray Gaussians have no
+    influence. Without a codebook, as in a fused field, it is fitted to the Gaussians' latents that are not all-zero.
 
     Note:
-        Linear latents share a main direction. The colours come from what varies about their mean, so nothing is normalised:
-        on room_0 (17 latents, lengths 0.43 to 0.96) no colour channel correlates with the length by more than 0.11, and
-        normalised latents separate the classes no better (91, 79 and 80 % of a channel's variance lies between classes,
-        with both). Unnormalised, the colour of a rendered blend is the blend of the colours.
+        Latents are not normalised, so the colour of a rendered blend is the blend of the colours. Normalising would gain
+        nothing: on room_0 (17 latents, lengths 0.43 to 0.96) no colour channel correlates with the length by more than
+        0.11, and normalised latents separate the classes no better (91, 79 and 80 % of a channel's variance lies between
+        classes, with both).
 
     Raises:
         TypeError: if it is no field.
-        ValueError: if these are not finite, or there are none.
+        ValueError: if features are missing or not finite.
     """
     if not hasattr(field, "codebook"):
         raise TypeError(
@@ -115,10 +114,6 @@ def feature_colors(field: SemanticField) -> FeatureColors:
 def colors_of_features(
     features: Tensor,  # [N, D]
 ) -> FeatureColors:
-    """The projection for Gaussians without a codebook, fitted to all features that are not all-zero.
-
-    Raises:
-        ValueError: if one is not finite, or there are none.
-    """
+    """The projection for Gaussians without a codebook, fitted to all features that are not all-zero."""
     learnt = features.detach().any(dim=-1)
     return FeatureColors.fit(features[learnt] if bool(learnt.any()) else features)

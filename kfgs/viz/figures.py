@@ -1,4 +1,4 @@
-"""What all plots share: figures away from matplotlib's global state, the colours of lines, and PNG files."""
+"""Helpers for all plots: figures without matplotlib's global state, line colours, PNG files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Array = np.ndarray[Any, Any]
 Row = Mapping[str, Any]
 """One row of a recorded history: numbers by name."""
-LINES = PALETTE[[4, 5, 2, 6, 1, 0]] / 255  # the darker ones of Okabe and Ito read well as lines
+LINES = PALETTE[[4, 5, 2, 6, 1, 0]] / 255  # Okabe and Ito's darker colours, which are readable as lines
 INK = (0.08, 0.08, 0.08)
 DPI = 110
 
@@ -43,11 +43,7 @@ def axes_for(ax: Axes | None, width: float, height: float) -> Axes:
 def panels_for(
     ax: Sequence[Axes] | Array | None, count: int, columns: int, width: float, height: float
 ) -> tuple[list[Axes], bool]:
-    """`count` axes, and whether they are of a new figure.
-
-    Raises:
-        ValueError: if the caller gives fewer.
-    """
+    """`count` axes, and whether they belong to a new figure; a ValueError if the caller gives fewer."""
     if ax is None:
         figure = new_figure(width, height)
         return [figure.add_subplot(-(-count // columns), columns, i + 1) for i in range(count)], True
@@ -60,8 +56,8 @@ def panels_for(
 
 
 def finish(axes: Axes, path: str | Path | None) -> Figure:
-    """The figure that the axes belong to, written as a PNG file if there is a path."""
-    figure: Figure = axes.figure.canvas.figure  # of subfigures the whole
+    """The figure of the axes, written as a PNG file if there is a path."""
+    figure: Figure = axes.figure.canvas.figure  # the whole figure, also for axes in a subfigure
     if path is not None:
         save_figure(figure, path)
     return figure
@@ -76,11 +72,11 @@ def save_figure(figure: Figure, path: str | Path) -> None:
     if Path(path).suffix.lower() != ".png":
         raise ValueError(f"path: expected a name that ends in .png, got {Path(path).name!r}; rename it")
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", bbox_inches="tight")  # else the label beside a square picture is cut
+        figure.savefig(temporary, format="png", bbox_inches="tight")  # otherwise labels beside square pictures are cut
 
 
 def add_legend_below(axes: Axes, own: bool) -> None:
-    """A legend under a figure of ours, or under the caller's axes."""
+    """Put a legend under our figure (`own`), or under the caller's axes."""
     if own:
         finish(axes, None).legend(loc="outside lower center", ncols=2, frameon=False)
     else:
@@ -88,17 +84,17 @@ def add_legend_below(axes: Axes, own: bool) -> None:
 
 
 def draw_curve(axes: Axes, x: Sequence[float], y: Sequence[float], panel: int, **options: Any) -> None:
-    """A line in the colour of its panel, with dots where there are few values."""
+    """Draw a line in the colour of its panel, with dots if there are few values."""
     marker = "o" if len(x) < 40 else None
     style = {"color": LINES[panel % len(LINES)], "marker": marker, "markersize": 3, "linewidth": 1.5}
-    axes.plot(x, y, clip_on=False, zorder=3, **style | options)  # zeros are seen on the frame
+    axes.plot(x, y, clip_on=False, zorder=3, **style | options)  # not clipped: zeros show over the frame
     axes.grid(alpha=0.3)
     if all(float(value).is_integer() for value in x):
         axes.locator_params(axis="x", integer=True)
 
 
 def count_from_zero(axes: Axes, y: Sequence[float]) -> None:
-    """Whole numbers upwards from zero, with room above the highest, also where all of them are zero."""
+    """Scale an axis of whole numbers from zero, with room above the highest, even if all are zero."""
     axes.set_ylim(0, 1.06 * max([1, *y]))
     axes.locator_params(axis="y", integer=True)
 

@@ -1,6 +1,6 @@
-"""The frames of an animation: pictures of clouds from any camera, drawn by kfgs's own rasteriser.
+"""The frames of a film: pictures of clouds from any camera, drawn by kfgs's rasteriser.
 
-Not by pyvista: the rasteriser needs neither a display nor OpenGL, and its pictures are those that scores are taken from.
+Unlike pyvista it needs no display and no OpenGL, and scores are computed from the same pictures.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .pictures import as_bytes, legend_strip, picture_grid
 
 Array = np.ndarray[Any, Any]
 Show = Callable[[Camera], Any]
-"""Anything that makes a picture [H, W, 3] (uint8, or floats in [0, 1]) of the size of the camera it is given."""
+"""A function from a camera to a picture [H, W, 3] of the camera's size (uint8, or floats in [0, 1])."""
 
 ColorBy = Literal["label", "rgb", "feature", "opacity"]
 
@@ -34,10 +34,10 @@ def show_cloud(
     feature_colors: FeatureColors | None = None,
     background: str | Sequence[float] = "white",
 ) -> Show:
-    """A function that draws a cloud from any camera, the picture that `rasterize` makes of it.
+    """Make a function camera -> picture [H, W, 3] uint8 that draws a cloud with `rasterize`.
 
-    Labels and features become one colour per Gaussian, and the colours are composited (Eq. 3 with three channels):
-    at borders they blend. `rgb` is the harmonics' colour, which depends on the direction.
+    Labels and features become one colour per Gaussian, and the colours are composited (Eq. 3 with three channels), so they
+    blend at borders. `rgb` is the colour of the harmonics, which depends on the direction.
 
     Args:
         gaussians: what to draw; on any device.
@@ -45,11 +45,8 @@ def show_cloud(
         feature_colors: the scene's projection of features to colours.
         background: a colour by name or three numbers in [0, 1].
 
-    Returns:
-        camera -> [H, W, 3] uint8.
-
     Raises:
-        ValueError: if there is nothing to draw, or what to colour by is missing.
+        ValueError: if the cloud is empty or lacks what to colour by.
     """
     check_gaussians(gaussians)
     if color_by is None:
@@ -69,7 +66,7 @@ def show_cloud(
 
 
 def _paint(gaussians: Gaussians, color_by: ColorBy, feature_colors: FeatureColors | None) -> Gaussians:
-    """The cloud with colours as its features, or with nothing but its harmonics."""
+    """The cloud with the colours as features; for `rgb`, with its harmonics only."""
     colors = cloud_colors(gaussians, color_by, feature_colors).rgb
     if color_by == "rgb":
         return gaussians.replace(features=None)
@@ -81,7 +78,7 @@ def draw_frame(
     camera: Camera,
     strip: Array | None = None,  # [h, w, 3] uint8
 ) -> Array:  # [h, w, 3] uint8
-    """One frame: each picture under its title, side by side; a single one without a title stays bare."""
+    """One frame: the pictures side by side under their titles; a single picture without a title stays as it is."""
     pictures = []
     for title, show in shows.items():
         picture = as_bytes(show(camera))
@@ -96,7 +93,7 @@ def draw_frame(
 
 
 def as_shows(shows: Gaussians | Show | Mapping[str, Gaussians | Show]) -> dict[str, Show]:
-    """A drawing function for each title; a single one has the title ""."""
+    """Bring the `shows` argument into one form: a drawing function for each title. A single one has the title ""."""
     named = shows if isinstance(shows, Mapping) else {"": shows}
     if not named:
         raise ValueError("shows: expected at least one thing to show, got none; pass Gaussians or a function")
@@ -119,7 +116,7 @@ def legend_under(
     names: Sequence[str],
     width: int,
 ) -> Array:  # [h, width, 3] uint8
-    """One legend for every frame: the classes of all labelled clouds shown, whether in sight or not."""
+    """The legend below every frame: the classes of all labelled clouds, visible or not."""
     things = list(shows.values()) if isinstance(shows, Mapping) else [shows]
     labels = [thing.labels.cpu() for thing in things if isinstance(thing, Gaussians) and thing.labels is not None]
     if not labels:

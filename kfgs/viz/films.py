@@ -1,4 +1,4 @@
-"""Films of a scene: once around it, or along the cameras that took its pictures."""
+"""Films of a scene: a turn around it, or a flight along its cameras."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..gaussians import Gaussians
 from .animation import Progress, save_animation
 from .film_frames import Show
 
-KEYS = 40  # cameras of a long walk that a flight passes through: enough to follow it, too few to tremble with the hand
+KEYS = 40  # cameras of a long walk that become keys: enough to follow it, few enough to smooth out a shaking hand
 
 
 def save_turntable(
@@ -27,17 +27,18 @@ def save_turntable(
     names: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> Path:
-    """Write one round about a scene as a GIF or MP4 that can repeat for ever.
+    """Write a turn around a scene as a GIF or MP4 that can repeat without a jump.
 
-    A GIF takes about 60 kB a frame of 360x480 of textured colours, and 40 kB of labels: `orbit` bounds both.
+    A GIF takes about 60 kB per frame of 360x480 with textured colours, and 40 kB with labels. `orbit` sets the number and
+    the size of frames.
 
     Args:
         path: a name that ends in .gif or .mp4.
-        shows: Gaussians, or several things by title, side by side (`save_animation`). The cameras go round the first
+        shows: Gaussians, or several things by title, side by side (`save_animation`). The cameras turn around the first
             Gaussians among them.
         orbit: number of cameras, size, elevation, ...; None: the defaults of `kfgs.cameras.Orbit`.
         up: the world's up; None: from `cameras`, else +z.
-        cameras: the cameras of the scene, from which `up` is estimated.
+        cameras: the scene's cameras, to estimate `up`.
         fps: frames per second.
         names: class names for a legend below.
         progress: called after each frame with (done, all).
@@ -46,9 +47,9 @@ def save_turntable(
         `path`.
 
     Raises:
-        ValueError: if nothing can be shown, or there are no Gaussians to go round (pass `orbit_cameras` to
-            `save_animation` then).
-        ImportError: for .mp4, where imageio-ffmpeg is not installed.
+        ValueError: if nothing can be shown, or there are no Gaussians to turn around (then pass `orbit_cameras` to
+            `save_animation`).
+        ImportError: for .mp4, if imageio-ffmpeg is not installed.
     """
     things = shows.values() if isinstance(shows, Mapping) else [shows]
     cloud = next((thing for thing in things if isinstance(thing, Gaussians)), None)
@@ -79,7 +80,7 @@ def save_flythrough(
     names: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> Path:
-    """Write a flight along posed cameras as a GIF or MP4: of labels, of edited colours, or of both side by side.
+    """Write a flight along posed cameras as a GIF or MP4.
 
     For other keys or a closed walk pass `path_cameras(...)` to `save_animation`.
 
@@ -87,7 +88,7 @@ def save_flythrough(
         path: a name that ends in .gif or .mp4.
         shows: Gaussians, a function camera -> picture, or several by title, side by side (`save_animation`).
         cameras: the scene's cameras in the order of the walk; at most about 40 of them become keys, evenly chosen.
-        frames: in all.
+        frames: number of frames.
         size: (height, width) in pixels of each picture; None: the first camera's.
         fps: frames per second.
         names: class names for a legend below.
@@ -98,7 +99,7 @@ def save_flythrough(
 
     Raises:
         ValueError: if nothing can be shown, or there are fewer than two different views.
-        ImportError: for .mp4, where imageio-ffmpeg is not installed.
+        ImportError: for .mp4, if imageio-ffmpeg is not installed.
     """
     every = max(1, round(len(cameras) / KEYS))
     walk = path_cameras(cameras, frames, every=every, size=size)

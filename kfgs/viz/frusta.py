@@ -1,4 +1,4 @@
-"""Cameras in the scene: pyramids of lines, and their pictures on the image plane."""
+"""Draw cameras in the scene: as pyramids of lines, and with their pictures on the image plane."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     import pyvista as pv
 
 Array = np.ndarray[Any, Any]
-ATLAS = 4096  # pixels along an edge of one texture: OpenGL's least common limit is higher
-PICTURE = 512  # pixels along the longer edge of a picture in it, at most
+ATLAS = 4096  # edge of the texture in pixels; every OpenGL allows more
+PICTURE = 512  # the longest edge of one picture in it, in pixels
 
 
 def add_cameras(
@@ -31,7 +31,7 @@ def add_cameras(
     line_width: float = 1.5,
     most: int | None = None,
 ) -> pv.Actor:
-    """Draw cameras as pyramids with their true opening, and a small roof on the upper edge of the picture.
+    """Draw cameras as pyramids with their true opening; a small roof marks the upper edge of the picture.
 
     Args:
         plotter: where to draw.
@@ -67,13 +67,13 @@ def add_camera_images(
 ) -> pv.Actor:
     """Draw each camera's picture on its image plane, where `add_cameras` with the same arguments puts the pyramids.
 
-    All pictures are reduced into one texture, so that a hundred of them are one actor.
+    All pictures are reduced into one texture, so that a hundred pictures need one actor only.
 
     Args:
         plotter: where to draw.
         cameras: their distortion is ignored here.
-        images: one for each camera, or a function of the camera's index, as `scene.image`: it is asked only for those
-            drawn. Any size; the picture is stretched to its camera's.
+        images: one for each camera, or a function of the camera's index, for instance `scene.image`, called only for the
+            cameras drawn. Any size; the picture is stretched to its camera's.
         size: distance of the pictures from their cameras, world units; None: as in `add_cameras`.
         opacity: of the pictures, in (0, 1].
         most: draw at most so many, evenly chosen; None: all.
@@ -101,7 +101,7 @@ def add_camera_images(
         top, left = cell * (slot // columns), cell * (slot % columns)
         height, width = small.shape[:2]
         atlas[top : top + height, left : left + width] = small
-        # half a pixel inside, or the neighbour in the texture would show at the border
+        # half a pixel inside, so that the neighbour in the texture does not show at the border
         x, y = np.array([left + 0.5, left + width - 0.5]), np.array([top + 0.5, top + height - 0.5])
         x, y = x / atlas.shape[1], 1 - y / atlas.shape[0]  # OpenGL counts rows from below
         places += [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
@@ -115,7 +115,7 @@ def add_camera_images(
 
 
 def evenly(count: int, most: int | None) -> Array:  # [min(count, most)] int64
-    """Numbers below `count`, at most `most` of them, evenly spaced with both ends; None: all."""
+    """At most `most` indices below `count`, evenly spaced, with both ends; None: all."""
     return np.unique(np.linspace(0, count - 1, count if most is None else min(most, count)).round().astype(np.int64))
 
 

@@ -1,4 +1,4 @@
-"""Anisotropic Gaussians in VTK: its EWA splatting mapper, taught the rules by which kfgs's rasteriser draws."""
+"""Draw anisotropic Gaussians with VTK's EWA splatting mapper, changed to follow the rules of kfgs's rasteriser."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 Array = np.ndarray[Any, Any]
 Moving = Literal["auto", "points", "gaussians"]
 LOW_PASS = 0.3  # pixels squared, added to each projected covariance as 3DGS does
-BOUND = 3.0  # standard deviations after which VTK stops drawing; 3.3, where ALPHA_MIN stops, agrees no better
-MOVING_FAINT = 10_000  # points beside them that let the others be seen
+BOUND = 3.0  # standard deviations at which VTK stops drawing; 3.3, where ALPHA_MIN stops, agrees no better
+MOVING_FAINT = 10_000  # faint points drawn while the camera moves: few enough to see the others
 FAINT_ALPHA = 0.12
 MOVING_POINTS = 50_000  # 0.14 s a frame of 1024 x 768 in software on two busy cores; 100,000 took 0.25 s
-STILL = 1.0  # frames per second: VTK asks for more while the mouse moves the camera, and for 0.0001 when it rests
-SLOW = 0.1  # seconds a frame from which "auto" moves points
+STILL = 1.0  # frames per second: VTK requests more while the mouse moves the camera, and 0.0001 when it rests
+SLOW = 0.1  # seconds per frame; above it, "auto" draws points while the camera moves
 
-# VTK drops a Gaussian whose centre lies further out than 1.3 times the half picture; 3DGS draws it, with the projection
-# linearised at that border, where the half picture is 1 (normalised device coordinates know no principal point)
+# VTK drops a Gaussian if its centre is farther out than 1.3 times half the picture. 3DGS draws it, with the projection
+# linearised at that border. Here half the picture is 1: normalised device coordinates have no principal point
 VERTEX_SHADER = {
     "mat3 J = getProjectionMatrix(posVC.xyz);": f"""
       vec4 centerDC = VCDCMatrix * posVC;
@@ -62,20 +62,20 @@ def as_gaussians(
 ) -> pv.Actor:
     """Draw a cloud with `index`, `rgb`, `scale`, `quat` (w, x, y, z; unit) and `opacity` as Gaussians.
 
-    Sorted, it agrees with kfgs's own rasteriser: `tests/viz/test_agreement.py`; through five cameras of room_0, 42 to 43
-    dB on the field's classes and 45 to 47 dB on the colours. Colours are bytes: where harmonics shine brighter than
-    white, as in room_0's windows, 38 to 41 dB remain. Unsorted, translucency is averaged. Depth peeling makes VTK's
-    Gaussians vanish, so do not enable it.
+    Sorted, it agrees with kfgs's rasteriser (`tests/viz/test_agreement.py`): through five cameras of room_0, 42 to 43 dB
+    on the field's classes and 45 to 47 dB on the colours. Colours are bytes, so where harmonics are brighter than white,
+    as in room_0's windows, it is 38 to 41 dB. Unsorted, translucency is averaged. Do not enable depth peeling: VTK's
+    Gaussians vanish with it.
 
     Args:
         plotter: where to draw.
-        cloud: its arrays may be exchanged later; a frame only changes their order.
+        cloud: its arrays may change later; a frame only changes their order.
         sort: draw back to front.
         moving: what to draw while the mouse moves the camera: "points" (at most 50,000, evenly chosen, and 10,000 pale ones
-            for the Gaussians of opacity at most 0.1), "gaussians", or "auto": points if a frame of Gaussians takes longer
-            than 0.1 s.
+            for Gaussians with an opacity of at most 0.1), "gaussians", or "auto": points if a frame of Gaussians takes
+            longer than 0.1 s.
         near: depth up to which nothing is drawn, world units (`Camera.near`).
-        colors_from: `rgb` in the order of `index`, given where the camera stands [3]; None: it does not change.
+        colors_from: a function from the camera's position [3] to `rgb` in the order of `index`; None: fixed colours.
     """
     actor = draw_mesh(plotter, cloud, style="points_gaussian", scalars="rgb", rgb=True, emissive=False, lighting=False)
     mapper = actor.mapper
@@ -83,10 +83,10 @@ def as_gaussians(
     mapper.SetRotationArray("quat")
     mapper.SetOpacityArray("opacity")
     mapper.SetAnisotropic(True)
-    mapper.SetScaleFactor(1.0)  # pyvista's own factor shrinks them to a point size
+    mapper.SetScaleFactor(1.0)  # pyvista's factor would shrink them to a point size
     mapper.SetBoundScale(BOUND)
-    # room_0's field: 24 dB as VTK is, 39 with the vertex shader, 43 with both, but 23 before the near plane was kfgs's,
-    # in the one view of five that needs it. A VTK whose text differs replaces nothing: test_agreement.py would show it
+    # room_0's field: 24 dB with VTK's shaders, 39 with our vertex shader, 43 with both. One view of five needs kfgs's near
+    # plane: 23 dB without. If another VTK has other shader text, nothing is replaced, and test_agreement.py fails
     for original, replacement in VERTEX_SHADER.items():
         actor.GetShaderProperty().AddVertexShaderReplacement(
             original, True, replacement.replace("{near}", f"{near:.9f}"), False
@@ -102,7 +102,7 @@ def as_gaussians(
 
 
 class _Frame:
-    """Before each frame: dilation for the window's size, order and colours for the camera, points while it moves."""
+    """Prepares each frame: low-pass filter for the window's size, order and colours for the camera, points while it moves."""
 
     def __init__(
         self,
@@ -116,14 +116,13 @@ class _Frame:
         self.renderer, self.actor, self.cloud, self.sort = renderer, actor, cloud, sort
         self.moving, self.colors_from = moving, colors_from
         self.points = np.array(cloud.points)
-        self.order = np.arange(len(self.points))  # the rows of the cloud, as numbers of Gaussians
+        self.order = np.arange(len(self.points))  # the Gaussian in each row of the cloud
         self.forward: tuple[float, ...] | None = None
         self.center: tuple[float, ...] | None = None
         self.seconds, self.began = 0.0, 0.0
-        self.stand_ins: list[Any] = []  # actors, while the camera moves
+        self.moving_actors: list[Any] = []  # actors, while the camera moves
 
     def start(self, *_: Any) -> None:
-        """The renderer is about to draw."""
         self.began = perf_counter()
         if self._moves():
             self._to_points()
@@ -142,13 +141,12 @@ class _Frame:
             self.cloud.point_data["rgb"] = self.colors_from(np.asarray(self.center))[self.order]
 
     def end(self, *_: Any) -> None:
-        """The renderer has drawn."""
-        if self.moving == "auto" and not self.stand_ins and self._drawn():
-            self.renderer.GetRenderWindow().WaitForCompletion()  # what was drawn so far was only asked for
+        if self.moving == "auto" and not self.moving_actors and self._drawn():
+            self.renderer.GetRenderWindow().WaitForCompletion()  # OpenGL draws asynchronously
             self.seconds = perf_counter() - self.began
 
     def _drawn(self) -> bool:
-        return bool(self.renderer.HasViewProp(self.actor) and (self.stand_ins or self.actor.GetVisibility()))
+        return bool(self.renderer.HasViewProp(self.actor) and (self.moving_actors or self.actor.GetVisibility()))
 
     def _moves(self) -> bool:
         if not self._drawn():
@@ -157,19 +155,19 @@ class _Frame:
         return asked and (self.moving == "points" or (self.moving == "auto" and self.seconds > SLOW))
 
     def _sort(self, forward: tuple[float, ...]) -> None:
-        if self.forward == forward:  # order along a direction does not depend on where the camera stands
+        if self.forward == forward:  # the order depends on the direction, not on the camera's position
             return
         self.forward = forward
         order = np.argsort(-(self.points @ np.asarray(forward)), kind="stable")
         row = np.empty_like(self.order)
-        row[self.order] = np.arange(len(row))  # of each Gaussian as the cloud is now
+        row[self.order] = np.arange(len(row))  # the row of each Gaussian now
         self.cloud.points = self.points[order]
         for name in self.cloud.point_data:
             self.cloud.point_data[name] = np.asarray(self.cloud.point_data[name])[row[order]]
         self.order = order
 
     def _to_points(self) -> None:
-        if self.stand_ins:
+        if self.moving_actors:
             return
         opacity = np.asarray(self.cloud.point_data["opacity"])
         clear, faint = opacity > FAINT["points"], (opacity <= FAINT["points"]) & (opacity >= ALPHA_MIN)
@@ -177,15 +175,15 @@ class _Frame:
             rows = np.flatnonzero(kept)
             if len(rows):
                 some = rows[evenly(len(rows), most)]
-                self.stand_ins.append(_few_points(self.cloud, some, alpha))
-                self.renderer.AddActor(self.stand_ins[-1])
-        self.actor.SetVisibility(not self.stand_ins)
+                self.moving_actors.append(_few_points(self.cloud, some, alpha))
+                self.renderer.AddActor(self.moving_actors[-1])
+        self.actor.SetVisibility(not self.moving_actors)
 
     def _to_gaussians(self) -> None:
-        for stand_in in self.stand_ins:
-            self.renderer.RemoveActor(stand_in)
+        for actor in self.moving_actors:
+            self.renderer.RemoveActor(actor)
             self.actor.SetVisibility(True)
-        self.stand_ins.clear()
+        self.moving_actors.clear()
 
 
 def _few_points(cloud: pv.PolyData, rows: Array, alpha: float) -> pv.Actor:

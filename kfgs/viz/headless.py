@@ -1,4 +1,4 @@
-"""Can this machine draw 3-D pictures, with or without a display? Found out where a crash does no harm."""
+"""Find out whether this machine can draw 3-D pictures (in another process, which may crash), and make plotters."""
 
 from __future__ import annotations
 
@@ -38,15 +38,14 @@ class Probe(NamedTuple):
 
 
 def prepare() -> None:
-    """Where there is no display, choose VTK's EGL window and pyvista's off-screen plotters, before the first is made.
+    """On Linux without a display, make VTK use EGL and pyvista draw off-screen. Without this VTK tries X and complains.
 
-    Sets `VTK_DEFAULT_OPENGL_WINDOW=vtkEGLRenderWindow` and `PYVISTA_OFF_SCREEN=true` in this process on Linux, and only
-    where neither DISPLAY nor WAYLAND_DISPLAY is set; values that are already there are left alone. Where a display has
-    come since (a virtual one, started by the program), the choice is taken back, from pyvista too if it was imported
-    meanwhile. Without it, VTK tries X first and complains on stderr.
+    Sets `VTK_DEFAULT_OPENGL_WINDOW=vtkEGLRenderWindow` and `PYVISTA_OFF_SCREEN=true` in this process if neither DISPLAY
+    nor WAYLAND_DISPLAY is set. Values that are already set stay. If a display appeared since the last call (a virtual one,
+    started by the program), the settings are removed again, in an imported pyvista too.
 
-    Importing `kfgs.viz` does this, for plotters that `make_plotter` does not make, and `make_plotter` does it again. A
-    program that starts a display later and makes windows of its own calls `kfgs.viz.headless.prepare()` then.
+    Importing `kfgs.viz` calls it, and so does `make_plotter`. Call it yourself if your program starts a display later and
+    makes windows without `make_plotter`.
     """
     if not sys.platform.startswith("linux"):
         return
@@ -63,7 +62,7 @@ def prepare() -> None:
 
 
 def has_display() -> bool:
-    """Whether a desktop is there to open a window on (Windows and macOS: always)."""
+    """Whether windows can be opened (Windows and macOS: always)."""
     if not sys.platform.startswith("linux"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -129,17 +128,17 @@ def make_plotter(
 
 @functools.cache
 def load_compilers() -> None:
-    """Load the rasteriser's engines before the first window is drawn, which brings an LLVM of its own.
+    """Load the rasteriser's engines before the first window is drawn, to avoid a segfault.
 
-    Mesa's software driver loads LLVM; where pycolmap or others have prepared the ground, numba's or triton's LLVM loaded
-    after it ends Python with a segfault (look at a scene, then rasterise it). Loaded before it, all get along. For plotters
-    that are not made here, `kfgs.splat.engines.table` loads the engines with their own symbols.
+    Mesa's software driver loads its own LLVM. If pycolmap or a similar library is loaded too, loading the LLVM of numba or
+    triton after Mesa's crashes Python (show a scene, then rasterise it). Loading it before Mesa's works. For plotters not
+    made here, `kfgs.splat.engines.table` loads the engines with their own symbols.
     """
-    available_engines("cpu")  # imports them to find out
+    available_engines("cpu")  # imports them
 
 
 def require() -> None:
-    """Raise a RuntimeError, rather than let VTK crash, if nothing can be drawn here."""
+    """Raise a RuntimeError if nothing can be drawn here; VTK would crash."""
     found = probe()
     if not found.works:
         raise RuntimeError(
@@ -148,4 +147,4 @@ def require() -> None:
         )
 
 
-prepare()  # before a plotter of the user's own is made
+prepare()  # before the user makes a plotter

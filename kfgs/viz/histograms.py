@@ -1,4 +1,4 @@
-"""Histograms of Sec. 3.4: the scores of a query with gamma, and the distances of a transfer with lambda."""
+"""Histograms for Sec. 3.4: scores of a query with gamma, and distances of a transfer with lambda."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BINS = 80
-TAKEN, REST = tuple(PALETTE[4] / 255), (0.75, 0.75, 0.75)  # of bars: what is selected or in reach, and what is not
-STEEP = 5.0  # where the highest bin of the selected is so much lower than that of the rest, counts are drawn in logs
-CLASSES = 5  # at most so many classes get a line, those with the most selected: more cannot be told apart
-WIDE = 88  # letters of a line over the picture
-CLOSEST = 100  # distances below the median divided by this make the axis no longer
+TAKEN, REST = tuple(PALETTE[4] / 255), (0.75, 0.75, 0.75)  # bar colours: selected or within lambda, and the rest
+STEEP = 5.0  # counts are logarithmic if the highest bin of the rest is so many times that of the selected
+CLASSES = 5  # the most classes with a line: more cannot be told apart
+WIDE = 88  # letters per line of the title
+CLOSEST = 100  # the axis begins at the median distance divided by this, or later
 
 
 def plot_scores(
@@ -33,17 +33,16 @@ def plot_scores(
     labels: Tensor | None = None,  # [N] int64, -1 = none
     ax: Axes | None = None,
 ) -> Figure:
-    """Draw how many Gaussians have which score, the selected ones in blue, the rest in grey, and gamma.
+    """Draw a histogram of scores: selected Gaussians in blue, the rest in grey, and gamma as a line between bins.
 
-    Colours are those of `plot_distances`; bins meet at gamma. The title says how many are selected and how gamma came
-    about. Counts are logarithmic where the selected would hardly be seen otherwise: where their highest bin is less than
-    a fifth as high as that of the rest.
+    The title says how many are selected and where gamma comes from. Counts are logarithmic if the highest bin of the
+    selected is less than a fifth of the highest bin of the rest.
 
     Args:
-        selection: what a query returned; without a threshold nothing is marked.
+        selection: the result of a query; without a threshold there is no gamma.
         path: a .png file to write; None writes none.
-        labels: classes of the same Gaussians. The classes with selected Gaussians (at most 5, those with the most) get a line
-            in their colour; the legend says how many of each class are selected.
+        labels: classes of the same Gaussians. The 5 classes with the most selected Gaussians get a line in their colour;
+            the legend says how many of each are selected.
         ax: axes to draw into; None makes a figure.
 
     Raises:
@@ -61,7 +60,7 @@ def plot_scores(
         axes.bar(edges[:-1], count, np.diff(edges), align="edge", color=color, label=f"{name} {count.sum():,}")
     if labels is not None:
         for name, color, count in _by_class(scores, mask, as_array(labels), edges):
-            axes.stairs(count, edges, color=color, linewidth=3.0, zorder=3)  # told from bars of any colour by its core
+            axes.stairs(count, edges, color=color, linewidth=3.0, zorder=3)  # its dark core sets it apart from bars
             axes.stairs(count, edges, color=INK, linewidth=1.0, zorder=3)
             axes.plot([], [], color=color, linewidth=3.0, label=name)
     if selection.threshold is not None:
@@ -78,14 +77,14 @@ def plot_scores(
 
 
 def score_bins(scores: Array, threshold: float | None) -> Array:  # [N] -> [B + 1]
-    """Edges of equally wide bins over all scores, about `BINS` of them; one edge is the threshold exactly."""
+    """Edges of about `BINS` equal bins over all scores; one edge is exactly the threshold."""
     low, high = float(scores.min()), float(scores.max())
     if threshold is not None:
         low, high = min(low, threshold), max(high, threshold)
-    width = max(high - low, 1e-3) / BINS  # all scores equal: a thousandth around them
+    width = max(high - low, 1e-3) / BINS  # 1e-3: also if all scores are equal
     zero = low if threshold is None else threshold
     first, last = np.floor((low - zero) / width), np.ceil((high - zero) / width)
-    return zero + width * np.arange(first - 1, last + 2)  # one empty bin on either side: no score is lost in rounding
+    return zero + width * np.arange(first - 1, last + 2)  # an empty bin on either side, so rounding loses no score
 
 
 def plot_distances(
@@ -95,10 +94,10 @@ def plot_distances(
     *,
     ax: Axes | None = None,
 ) -> Figure:
-    """Draw how far destinations are from their sources, with lambda marked, on a logarithmic axis; bins meet at lambda.
+    """Draw a histogram of the distances to the sources, on a logarithmic axis, with lambda as a line between bins.
 
-    To see what lies beyond lambda too, pass the distances of a transfer with a larger one. Distances of 0, and below a
-    hundredth of the median, are drawn in the lowest bin.
+    To see distances beyond lambda, pass those of a transfer with a larger lambda. Distances below a hundredth of the
+    median, also 0, are drawn in the lowest bin.
 
     Args:
         distances: `Transfer.distances`.
@@ -144,7 +143,7 @@ def plot_distances(
 
 def _by_class(scores: Array, mask: Array, labels: Array, edges: Array) -> list[tuple[str, Any, Array]]:
     """Name, colour and counts of the classes with the most selected, in class order."""
-    palette(labels)  # whole numbers from -1, or it says so
+    palette(labels)  # raises unless labels are integers from -1
     kinds, selected = np.unique(labels[mask], return_counts=True)
     most = np.sort(np.argsort(-selected, kind="stable")[:CLASSES])
     found = []

@@ -1,4 +1,4 @@
-"""Legends of a 3-D picture: classes by name, scores along a bar."""
+"""Legends in a 3-D picture: class names with colours, or a bar of scores."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from .._check import check_range
+from .._check import as_array, check_range
 from .cloud_colors import COLORMAP
 from .pictures import LEGEND_INK, LEGEND_PAPER, check_names, legend_column
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 Array = np.ndarray[Any, Any]
 MARGIN = 10  # pixels from a corner
-DARK = 0.5  # of a background on which letters are white
-LETTERS = 14  # pixels, in windows up to 770 pixels high; larger ones have larger letters, to be read from as far
-SMALLEST = 9  # pixels: the least that can be read
-BAR = 0.6  # of the subplot's height
+DARK = 0.5  # brightness of a background; below it, letters are white
+LETTERS = 14  # pixels, in windows up to 770 pixels high; higher windows have larger letters
+SMALLEST = 9  # pixels: the smallest size that can be read
+BAR = 0.6  # share of the subplot's height
 
 
 def add_legend(
@@ -31,17 +31,17 @@ def add_legend(
 ) -> Any:
     """List the classes present, by name and colour, in the lower left corner of the active subplot.
 
-    A small picture instead of pyvista's legend, which writes each name in its own colour: yellow on white. Where the
-    subplot is too low for all classes, letters become smaller, down to 9 pixels, then there are several columns.
+    It is a small picture. pyvista's own legend writes each name in its colour, for instance yellow on white. If the
+    subplot is too low for all classes, the letters shrink to at least 9 pixels, then the list gets several columns.
 
     Raises:
         ValueError: if there is no label, or one has no name.
         TypeError: if `names` is no list of names.
     """
-    present = np.unique(labels.cpu().numpy() if isinstance(labels, Tensor) else np.asarray(labels))
+    present = np.unique(as_array(labels, "labels"))
     if present.size == 0:
         raise ValueError("labels: expected at least one to list, got none; leave the legend out")
-    check_names(present.tolist(), names)  # now, not while a frame is drawn
+    check_names(present.tolist(), names)  # now, and not only while a frame is drawn
 
     def draw(height: int, width: int) -> Array:
         room = height - 2 * MARGIN
@@ -55,15 +55,16 @@ def add_legend(
 
 
 def add_scalar_bar(plotter: pv.Plotter, cloud: pv.Actor | tuple[float, float], title: str = "score") -> Any:
-    """Show which colour stands for which number, in a bar in the lower right corner of the active subplot.
+    """Draw a colour bar with numbers in the lower right corner of the active subplot.
 
     Args:
         plotter: where the cloud is.
-        cloud: what `add_cloud` returned for scores or opacities; or the numbers of the darkest and the brightest colour.
-        title: over the bar; broken into lines where it is wider than a fifth of the subplot.
+        cloud: the actor from `add_cloud`, coloured by scores or opacity; or the numbers of the darkest and the brightest
+            colour.
+        title: over the bar, in lines at most a fifth of the subplot wide.
 
     Raises:
-        ValueError: if the cloud's colours stand for no numbers, or two numbers do not ascend.
+        ValueError: if the cloud is not coloured by numbers, or two numbers do not ascend.
     """
     clim = cloud if isinstance(cloud, tuple | list) else cloud.mapper.dataset.field_data.get("clim")
     if clim is None:
@@ -82,14 +83,7 @@ def bar_picture(
     height: int,
     width: int,
 ) -> Array:  # [h, w, 3] uint8
-    """A bar of the colours from `clim[0]` (below) to `clim[1]`, with round numbers beside it and a title over it.
-
-    Args:
-        clim: the numbers of the darkest and the brightest colour.
-        title: broken into lines.
-        height: of the subplot, pixels.
-        width: of the subplot, pixels.
-    """
+    """A colour bar from `clim[0]` (below) to `clim[1]`, with round numbers and a title, for a subplot of this size."""
     from matplotlib import colormaps
 
     size = min(letter_size(height), max(SMALLEST, height // 16))
@@ -123,19 +117,19 @@ def round_numbers(low: float, high: float) -> list[float]:
 
 
 def letter_size(height: int) -> int:
-    """Pixels of letters in a subplot of this height."""
+    """Size of letters, in pixels, for a subplot of this height."""
     return max(LETTERS, round(height / 55))
 
 
 def letters(plotter: pv.Plotter) -> tuple[float, float, float]:
-    """A colour for text that can be read on the active subplot's background."""
+    """A text colour that can be read on the active subplot's background."""
     dark = np.mean(plotter.renderer.GetBackground()) < DARK
     ink = (255, 255, 255) if dark else LEGEND_INK
     return (ink[0] / 255, ink[1] / 255, ink[2] / 255)
 
 
 def _broken(text: str, font: Any, width: float) -> list[str]:
-    """Words in lines no wider than `width` pixels, but for single words that are."""
+    """Break text into lines of at most `width` pixels; a longer word has a line of its own."""
     lines: list[str] = []
     for word in text.split():
         longer = f"{lines[-1]} {word}" if lines else word
@@ -151,26 +145,17 @@ def pin_picture(
     draw: Callable[[int, int], Array],  # (height, width) of the subplot, pixels -> [h, w, 3] uint8
     corner: Literal["left", "right"] = "left",
 ) -> Any:
-    """Put a picture into the lower left or the lower right corner of the active subplot.
-
-    It is drawn pixel by pixel, and again when the subplot's size changes. It appears in the next frame: drawing one here could
-    take long.
+    """Put a picture into a lower corner of the active subplot; it appears in the next frame.
 
     Args:
         plotter: where to draw.
-        draw: makes the picture, best no larger than the subplot without a margin of 10 pixels on each side.
-        corner: which.
+        draw: makes the picture; called again when the subplot's size changes. Leave a margin of 10 pixels on each side.
+        corner: which lower corner.
 
     Returns:
-        The actor; `plotter.remove_actor` takes it away.
+        The actor; `plotter.remove_actor` removes it.
     """
-    from vtkmodules.vtkRenderingCore import vtkActor2D, vtkImageMapper
-
-    mapper = vtkImageMapper()
-    mapper.SetColorWindow(255)  # bytes as they are
-    mapper.SetColorLevel(127.5)
-    actor = vtkActor2D()
-    actor.SetMapper(mapper)
+    actor = picture_actor()
     pinned = _Pinned(plotter.renderer, actor, draw, corner)
     pinned.draw(*_size_of(plotter))
     plotter.add_actor(actor, reset_camera=False, pickable=False, render=False)
@@ -179,7 +164,7 @@ def pin_picture(
 
 
 class _Pinned:
-    """Follows the size of its subplot as long as its actor is there."""
+    """Redraws a picture when the size of its subplot changes, until its actor is removed."""
 
     def __init__(self, renderer: Any, actor: Any, make: Callable[[int, int], Array], corner: str) -> None:
         self.renderer, self.actor, self.make, self.corner = renderer, actor, make, corner
@@ -187,7 +172,6 @@ class _Pinned:
         self.tag = 0
 
     def before_frame(self, *_: Any) -> None:
-        """The renderer is about to draw."""
         if not self.renderer.HasViewProp(self.actor):
             self.renderer.RemoveObserver(self.tag)
             return
@@ -195,24 +179,40 @@ class _Pinned:
         self.draw(height, width)
 
     def draw(self, height: int, width: int) -> None:
-        """Make the picture for a subplot of this size, unless it is there already."""
         if self.size == (height, width):
             return
         self.size = (height, width)
         picture = self.make(height, width)
-        import pyvista as pv
-
-        rows, columns, _ = picture.shape
-        image = pv.ImageData(dimensions=(columns, rows, 1))
-        image.point_data["rgb"] = picture[::-1].reshape(-1, 3)  # VTK counts rows from below
-        image.set_active_scalars("rgb")
-        self.actor.GetMapper().SetInputData(image)
-        left = MARGIN if self.corner == "left" else max(width - columns - MARGIN, 0)
+        set_picture(self.actor, picture)
+        left = MARGIN if self.corner == "left" else max(width - picture.shape[1] - MARGIN, 0)
         self.actor.SetPosition(left, MARGIN)
 
 
+def picture_actor() -> Any:
+    """A flat VTK actor that shows a picture pixel by pixel; `set_picture` gives it one."""
+    from vtkmodules.vtkRenderingCore import vtkActor2D, vtkImageMapper
+
+    mapper = vtkImageMapper()
+    mapper.SetColorWindow(255)  # bytes stay as they are
+    mapper.SetColorLevel(127.5)
+    actor = vtkActor2D()
+    actor.SetMapper(mapper)
+    return actor
+
+
+def set_picture(actor: Any, picture: Array) -> None:  # [H, W, 3] uint8
+    """Exchange the picture of a `picture_actor`."""
+    import pyvista as pv
+
+    height, width, _ = picture.shape
+    image = pv.ImageData(dimensions=(width, height, 1))
+    image.point_data["rgb"] = picture[::-1].reshape(-1, 3)  # VTK counts rows from below
+    image.set_active_scalars("rgb")
+    actor.GetMapper().SetInputData(image)
+
+
 def _size_of(plotter: pv.Plotter) -> tuple[int, int]:
-    """(height, width) that the active subplot will have, also before the first frame."""
+    """(height, width) of the active subplot, known before the first frame."""
     width, height = plotter.window_size
     x0, y0, x1, y1 = plotter.renderer.GetViewport()
     return max(round((y1 - y0) * height), 1), max(round((x1 - x0) * width), 1)

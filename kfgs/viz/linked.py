@@ -1,4 +1,4 @@
-"""The semantic and the colour cloud side by side under one camera."""
+"""Show the semantic and the colour cloud side by side, with one camera."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .legends import add_legend, letters
 if TYPE_CHECKING:
     import pyvista as pv
 
-FAR = 99.0  # percentile of distances from the middle within which the first view looks: floaters stay outside
+FAR = 99.0  # percentile of distances from the middle that the first view shows: floaters stay outside
 TITLES = {"label": "classes", "rgb": "colours", "view": "colours", "opacity": "opacity"}
 
 
@@ -38,16 +38,16 @@ def linked_clouds(
 
     Args:
         semantic: labelled Gaussians.
-        color: Gaussians with `sh`, in the same frame; with labels (`transfer_labels`), they can be shown too.
-        names: of the classes; the legend lists those present. None: no legend.
-        color_by: what colours stand for, left and right: `label`, `rgb`, `view` or `opacity`.
+        color: Gaussians with `sh`, in the same frame; if they have labels (`transfer_labels`), these can be shown.
+        names: class names; the legend lists those present. None: no legend.
+        color_by: what the colours mean, left and right: `label`, `rgb`, `view` or `opacity`.
         style: of both clouds.
-        camera: to look through, with its proportions; None: both views see everything but floaters.
+        camera: the first view, with its proportions; None: everything but floaters.
         height: of the window, pixels.
         off_screen: as in `make_plotter`.
 
     Returns:
-        The plotter, its left subplot active: call `.show()`, or add to it first.
+        The plotter, with the left subplot active: call `.show()`, or add more first.
 
     Raises:
         ValueError: if a cloud is empty or lacks what it is coloured by, a label has no name, or the lens distorts.
@@ -78,12 +78,12 @@ def linked_clouds(
 
 
 def add_title(plotter: pv.Plotter, title: str) -> pv.CornerAnnotation:
-    """Write what the active subplot shows over it, in letters that can be read on its background."""
+    """Write a title over the active subplot, in a colour that can be read on its background."""
     return plotter.add_text(title, position="upper_edge", font_size=10, color=letters(plotter))
 
 
 def look_over(plotter: pv.Plotter, gaussians: Gaussians, up: Sequence[float] = (0.0, 0.0, 1.0)) -> None:
-    """An isometric view of all but the outermost hundredth, for all linked subplots."""
+    """Set an isometric view of all Gaussians but the outermost 1 %, for all linked subplots."""
     axis = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
     side = np.cross(axis, np.roll(axis, 1))
     if np.linalg.norm(side) < 1e-6:  # along a diagonal
@@ -102,7 +102,7 @@ def look_over(plotter: pv.Plotter, gaussians: Gaussians, up: Sequence[float] = (
 
 
 def upwards(cameras: Sequence[Camera]) -> list[float]:
-    """The world's up as cameras hold it (`estimate_up`); z where there are none, or they are not upright."""
+    """The world's up, estimated from cameras (`estimate_up`); z if there are none or they are not upright."""
     try:
         return [float(x) for x in estimate_up(cameras)]
     except ValueError:

@@ -1,4 +1,4 @@
-"""The transfer of labels by distance (Sec. 3.4) as a picture: who gave a label to whom, and who got none."""
+"""Draw the transfer of labels by distance (Sec. 3.4): who gave a label to whom, and who got none."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     import pyvista as pv
 
 Array = np.ndarray[Any, Any]
-LINES = 500  # more transfer lines than this hide what they show
+LINES = 500  # more lines than this hide the clouds
 MATCHED, AMBIGUOUS, ORPHANED = 0, 1, 2
 STATE_NAMES = ("matched", "ambiguous", "orphaned")
-STATE_COLORS = (1, 5, 7)  # in `PALETTE`: sky blue, which recedes, vermillion and deep blue; far apart for every eye
+STATE_COLORS = (1, 5, 7)  # in `PALETTE`: sky blue, vermillion and deep blue, which every eye can tell apart
 
 
 class Matches(NamedTuple):
@@ -34,7 +34,7 @@ class Matches(NamedTuple):
 
 
 def match_states(transfer: Transfer) -> Array:  # [N] int64
-    """What became of each destination: 0 matched, 1 ambiguous (labelled, but its sources disagree), 2 orphaned (no label)."""
+    """The state of each destination: 0 matched, 1 ambiguous (labelled, but its sources disagree), 2 orphaned (no label)."""
     labelled = as_array(transfer.labels) >= 0
     return np.where(labelled, np.where(as_array(transfer.disagree), AMBIGUOUS, MATCHED), ORPHANED)
 
@@ -52,15 +52,15 @@ def add_matches(
 ) -> Matches:
     """Draw the destinations as matched, ambiguous or orphaned points, lines to their sources, and how many of each.
 
-    Draw the sources with `add_cloud`. Lines are as short as lambda: `shift` takes the destinations aside.
+    Draw the sources with `add_cloud`. Lines are as short as lambda, so use `shift` to move the destinations aside.
 
     Args:
         plotter: where to draw.
         src: the Gaussians that labels came from.
         dst: the Gaussians that received them.
-        transfer: what `transfer_labels` returned for these two.
+        transfer: the result of `transfer_labels` for these two.
         shift: added to the destinations' positions, world units.
-        sample: at most so many lines, evenly chosen over the labelled destinations; the legend says how many.
+        sample: the most lines, evenly chosen among the labelled destinations; the legend says how many.
         point_size: in pixels.
         line_width: in pixels.
 
@@ -97,18 +97,18 @@ def add_transfer(
     sample: int = LINES,
     line_width: float = 1.0,
 ) -> pv.Actor:
-    """Draw where labels came from: a line from each labelled destination to the source that gave the label.
+    """Draw a line from each labelled destination to the source of its label.
 
-    Lines are as short as lambda; to see them, move one cloud aside (`dst.replace(means=dst.means + shift)`) before
+    Lines are as short as lambda. To see them, move one cloud aside (`dst.replace(means=dst.means + shift)`) before
     drawing it and its lines. Cells carry `label`, `state`, `source`, `destination`, `distance` and `rgb`.
 
     Args:
         plotter: where to draw.
         src: the Gaussians that labels came from.
         dst: the Gaussians that received them.
-        transfer: what `transfer_labels` returned for these two.
+        transfer: the result of `transfer_labels` for these two.
         color_by: the palette of labels, or whether sources agree (see `match_states`).
-        sample: at most so many lines, evenly spaced over the labelled destinations.
+        sample: the most lines, evenly chosen among the labelled destinations.
         line_width: in pixels.
 
     Raises:
@@ -145,7 +145,7 @@ def _state_colors(states: Array) -> Array:  # [N] -> [N, 3] uint8
 
 
 def _state_legend(states: Array, sample: int) -> tuple[Array, list[str]]:
-    """Labels and names for `add_legend`: the colours of states are those of three labels."""
+    """Labels and names for `add_legend`: each state borrows the colour of a label."""
     counts = np.bincount(states, minlength=len(STATE_NAMES))
     names = [""] * (max(STATE_COLORS) + 1)
     for color, name, count in zip(STATE_COLORS, STATE_NAMES, counts, strict=True):

@@ -1,4 +1,4 @@
-"""Draw a mesh so that it can still be read from its actor."""
+"""Draw a mesh and keep it alive as long as its actor."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ if TYPE_CHECKING:
 
 
 def draw_mesh(plotter: pv.Plotter, mesh: pv.PolyData, **options: Any) -> pv.Actor:
-    """`plotter.add_mesh(mesh, **options)`, and `actor.mapper.dataset` is that mesh as long as the actor lives.
+    """`plotter.add_mesh(mesh, **options)`, but `actor.mapper.dataset` stays valid as long as the actor lives.
 
-    pyvista 0.49 refers to it weakly, so the arrays of a mesh that nobody else holds are freed when the next one is drawn.
+    pyvista 0.49 holds only a weak reference, so the arrays of the mesh could be freed when the next one is drawn.
     """
     actor = plotter.add_mesh(mesh, **options)
-    actor.AddObserver("DeleteEvent", lambda *_, mesh=mesh: mesh)  # the closure holds it
+    actor.AddObserver("DeleteEvent", lambda *_, mesh=mesh: mesh)  # the default argument holds the mesh
     return actor

@@ -1,8 +1,8 @@
-"""A scene as one HTML file that turns in any browser, without a server or a connection.
+"""Write a 3-D scene as one HTML file that works in any browser, offline.
 
-vtk.js draws it, which has no Gaussians: a scene of them exports empty, without a word. Here they become points or
-ellipsoids, and the page says so. Only trame-vtk is used (its serialisers and its viewer): `plotter.trame.export_html` of
-trame-pyvista writes the same file, but starts a server for it, which tries to download a viewer it does not need.
+vtk.js draws it. It has no Gaussians and would silently leave them out, so they become points or ellipsoids, and the page
+says so. Only trame-vtk is used (its serialisers and its viewer). `plotter.trame.export_html` of trame-pyvista writes the
+same file, but starts a server, which tries to download a viewer that it does not need.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from torch import Tensor
 
-from .._check import check_choice, check_whole
+from .._check import as_array, check_choice, check_whole
 from .._files import atomic_path
 from .palette import palette
 from .pictures import check_names
@@ -42,11 +42,11 @@ class Page(NamedTuple):
 
     path: Path
     drawn: int
-    """Gaussians that became points or ellipsoids."""
+    """Gaussians drawn as points or ellipsoids."""
     left_out: int
     """Gaussians that are not in the page: too faint, or too many."""
     note: str
-    """What the page says about it; empty where the scene had no Gaussians."""
+    """The remark in the page about this; empty if the scene has no Gaussians."""
 
 
 def save_page(
@@ -59,21 +59,20 @@ def save_page(
     names: Sequence[str] | None = None,
     title: str = "kfgs",
 ) -> Page:
-    """Write a plotter's scene as a standalone page: points, lines, meshes and textures; Gaussians as something simpler.
+    """Write a plotter's scene as a standalone page. Gaussians become points or ellipsoids.
 
-    The page opens at the plotter's view. It carries the viewer (1 MB) and asks for nothing from anywhere. Legends and
-    other flat actors are not part of it: pass `labels` and `names` for one.
+    The page opens at the plotter's view. It contains the viewer (1 MB) and loads nothing. Legends and other flat actors
+    are not exported: pass `labels` and `names` for a legend.
 
     Args:
         path: a name that ends in .html.
-        plotter: with at least one actor; it is left as it was.
-        instead: what Gaussians become: `points` of their means, or `ellipsoids`, the surfaces on which
-            their alpha is 1/2.
-        limit: at most so many Gaussians of each cloud, the strongest (opacity times area); None: 400,000 points or
-            10,000 ellipsoids. Those with an opacity up to 0.1 (points) or 1/2 (ellipsoids) are left out in any case.
+        plotter: with at least one actor; it does not change.
+        instead: what replaces Gaussians: `points` at their means, or `ellipsoids`, the surfaces where alpha is 1/2.
+        limit: the most Gaussians of each cloud, the strongest (opacity times area); None: 400,000 points or 10,000
+            ellipsoids. Opacities up to 0.1 (points) or 1/2 (ellipsoids) are always left out.
         labels: the labels in the scene, for the legend.
         names: class names by index, for the legend.
-        title: of the page.
+        title: title of the page.
 
     Raises:
         ValueError: if the name does not end in .html, there is nothing to show, or a label has no name.
@@ -90,7 +89,7 @@ def save_page(
         raise ValueError("plotter: expected at least one actor, got an empty scene; add a cloud first")
     serializers, viewer = _trame("trame_vtk.modules.vtk.serializers"), _trame("trame_vtk.tools.vtksz2html")
     for renderer in plotter.renderers:
-        if not renderer.camera_set:  # nothing has been drawn yet
+        if not renderer.camera_set:  # nothing was drawn yet
             renderer.camera_position = renderer.get_default_cam_pos()
             renderer.reset_camera()
         renderer.UpdateLightsGeometryToFollowCamera()
@@ -118,7 +117,7 @@ def _trame(module: str) -> Any:
 
 
 def _scene(plotter: pv.Plotter, serializers: Any) -> bytes:
-    """The render window as vtk.js reads it: a zip with one JSON, arrays in base64 by their hashes."""
+    """The render window in vtk.js's format: a zip with one JSON, and arrays in base64 by their hashes."""
     serializers.initialize_serializers()
     context = serializers.SynchronizationContext()
     context.set_ignore_last_dependencies(True)
@@ -137,10 +136,10 @@ def _scene(plotter: pv.Plotter, serializers: Any) -> bytes:
 
 
 def _turn_about_middle(state: dict[str, Any], camera_id: str, renderer: Any) -> None:
-    """Give a serialised camera its view angle, which is not serialised, and a focal point in the middle of what it shows.
+    """Add the view angle to a serialised camera (VTK leaves it out), and move its focal point into the scene.
 
-    Dragging turns about the focal point; `look_through` leaves it one unit before the camera. Here it lies straight
-    ahead, at the median depth of the points in front: a few far ones do not move it.
+    Dragging turns about the focal point, which `look_through` puts one unit before the camera. Here it lies straight
+    ahead, at the median depth of the points in front, which a few far points cannot move.
     """
     view = renderer.GetActiveCamera()
     position, forward = np.array(view.GetPosition()), np.array(view.GetDirectionOfProjection())
@@ -169,7 +168,7 @@ def _parts(state: dict[str, Any]) -> Iterator[dict[str, Any]]:
 def _legend(labels: Tensor | Array | None, names: Sequence[str] | None) -> str:
     if labels is None or names is None:
         return ""
-    present = [int(label) for label in np.unique(np.asarray(labels.cpu() if isinstance(labels, Tensor) else labels))]
+    present = [int(label) for label in np.unique(as_array(labels, "labels"))]
     check_names(present, names)
     lines = []
     for label in present:
@@ -180,14 +179,14 @@ def _legend(labels: Tensor | Array | None, names: Sequence[str] | None) -> str:
 
 
 def _furnish(page: str, title: str, note: str, legend: str) -> str:
-    """Our title for the viewer's own, and a box with the legend and the note over the scene."""
+    """Replace the viewer's title, and add a box with the legend and the note."""
     page = re.sub(
         r"<title>.*?</title>", lambda _: f"<title>{html.escape(title)}</title>", page, count=1, flags=re.DOTALL
     )
     if not (note or legend):
         return page
     box = f'<div id="kfgs" style="{STYLE}">\n{legend}\n<div>{html.escape(note)}</div>\n</div>\n'
-    # The viewer empties the body when it starts, so the box hangs on the root element. "<\\/": no end of the script.
+    # The viewer empties the body when it starts, so the box is added to the root element. "<\\/" does not end the script.
     text = json.dumps(box).replace("</", "<\\/")
     script = (
         '<script>addEventListener("DOMContentLoaded", () => '

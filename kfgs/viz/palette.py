@@ -1,18 +1,19 @@
-"""One palette for every picture, 2-D and 3-D: label k always has colour k, and -1 is grey."""
+"""The palette of every picture, 2-D and 3-D: label k always has colour k, and -1 is grey."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
+
+from .._check import as_array
 
 UNLABELLED = (128, 128, 128)  # grey: label -1
 
-# Okabe and Ito's seven colours without black, then greedily the colour farthest (CIE76) from all before it, from grey, black and
-# white, for the worst of three kinds of eyes: normal, protanopia, deuteranopia (Machado 2009). Smallest distance among
-# the first 20: 17; of 64: 9; of 256: 4. The recipe is tests/oracles_palette.py, which makes this table again.
+# Okabe and Ito's seven colours without black. Each next colour is the farthest (CIE76) from all earlier ones, grey, black
+# and white, for the worst of three kinds of eyes: normal, protanopia, deuteranopia (Machado 2009). Smallest distance among
+# the first 20: 17; of 64: 9; of 256: 4. tests/oracles_palette.py computes this table.
 _HEX = """
 e69f00 56b4e9 009e73 f0e442 0072b2 d55e00 cc79a7 0000ff 781e00 a5f096 6969ff 3c3c5a 3c1ea5 3c4b3c 4bb45a a5d2b4
 6996ff a5e1ff 4b783c 003c87 d2e169 2d3ce1 3c5ac3 b42d00 785a87 96d2d2 2dd287 96b4d2 695a69 d2f0c3 2d5a2d c3b44b
@@ -52,7 +53,7 @@ def palette(labels: Tensor | np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:  # [
         >>> palette(torch.tensor([0, -1])).tolist()
         [[230, 159, 0], [128, 128, 128]]
     """
-    values = labels.detach().cpu().numpy() if isinstance(labels, torch.Tensor) else np.asarray(labels)
+    values = as_array(labels, "labels")
     if not np.issubdtype(values.dtype, np.integer):
         raise TypeError(f"labels: expected integers, got {values.dtype}; convert them first")
     values = values.astype(np.int64)

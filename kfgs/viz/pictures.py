@@ -1,4 +1,4 @@
-"""Flat pictures: labels over a photograph, legends, pictures in rows and columns, PNG files."""
+"""2-D pictures: labels over a photograph, legends, grids of pictures, PNG files."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def overlay_labels(
 ) -> Array:  # [H + legend, W, 3] uint8
     """Blend label colours over a photograph, draw the borders between labels, and add a legend below.
 
-    Colours come from `palette`, so a class has the same colour in every view (skimage's `label2rgb` colours by the order
-    of the labels present, and jumps between views). Pixels without a label are blended with grey.
+    Colours come from `palette`, so a class has the same colour in every view. (skimage's `label2rgb` colours by the order
+    of the labels present, which changes between views.) Pixels without a label are blended with grey.
 
     Args:
         image: the photograph or a rendering; values outside [0, 1] are clipped.
@@ -63,7 +63,7 @@ def legend_strip(
     names: Sequence[str],
     width: int,
 ) -> Array:  # [h, width, 3] uint8
-    """A strip that lists the classes present, each with its colour, wrapped to `width` pixels.
+    """A legend of the classes present, from left to right, wrapped at `width` pixels.
 
     Raises:
         ValueError: if a label has no name.
@@ -78,13 +78,13 @@ def legend_column(
     *,
     height: int | None = None,
 ) -> Array:  # [h, w, 3] uint8
-    """A column that lists the classes present, one per line, with letters of `size` pixels.
+    """A legend of the classes present, one per line.
 
     Args:
         labels: the classes present are listed.
         names: class names by index.
         size: of the letters, pixels.
-        height: begin another column where one would be higher than this many pixels; None: never.
+        height: the largest height of a column in pixels, before another begins; None: no limit.
 
     Raises:
         ValueError: if a label has no name.
@@ -95,7 +95,7 @@ def legend_column(
 def _draw_legend(
     labels: Tensor | Array, names: Sequence[str], width: int | None, size: int, height: int | None = None
 ) -> Array:
-    """Entries from left to right, wrapped at `width`; without a width one per line, in columns up to `height`."""
+    """With a width: entries from left to right, wrapped. Without: one per line, in columns up to `height`."""
     present = [int(label) for label in np.unique(as_array(labels, "labels"))]
     check_names(present, names)
     font = ImageFont.load_default(size=size)
@@ -158,13 +158,13 @@ def picture_grid(
     Args:
         rows: R rows of C pictures, of one size unless a `width` is given.
         titles: C titles, or none.
-        width: pixels across each picture; the height follows from the shape of the first one, and all others are brought
-            to that size: a feature map in colours beside its photograph, or small pictures of large photographs.
-            Shrinking averages, enlarging repeats pixels, so that a coarse map looks as coarse as it is.
+        width: width of each picture in pixels; all pictures are resized to it and to the proportions of the first, for
+            instance a feature map beside its photograph. Shrinking averages pixels. Enlarging repeats them, so that a
+            coarse map looks coarse.
 
     Raises:
-        ValueError: if there is no picture, rows or titles differ in number, pictures in size without a `width`, or `width`
-            is no positive whole number.
+        ValueError: if there is no picture, rows or titles differ in number, pictures differ in size without a `width`, or
+            `width` is no positive whole number.
 
     Example:
         >>> photo, coarse = np.zeros((60, 80, 3)), np.ones((6, 8, 3))
@@ -237,7 +237,7 @@ def _resize_alike(pictures: list[list[Array]], width: int) -> list[list[Array]]:
         raise ValueError("rows: expected pictures of at least one pixel, got an empty one; leave it out")
     high, wide = pictures[0][0].shape[:2]
     size = int(width), max(1, round(high * int(width) / wide))  # Pillow's order
-    # a box filter is the mean of the pixels covered, and where fewer than one is covered the pixel itself
+    # a box filter takes the mean of the pixels covered; when enlarging, the pixel itself
     return [
         [np.asarray(Image.fromarray(np.ascontiguousarray(p)).resize(size, Resampling.BOX)) for p in row]
         for row in pictures

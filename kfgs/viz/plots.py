@@ -1,7 +1,6 @@
-"""Training curves, confusion, IoU by class, and quality against storage, drawn with matplotlib.
+"""Plots with matplotlib: training curves, confusion, IoU by class, and quality against storage.
 
-Every function returns its figure, draws into the caller's axes if given some (`ax`), and writes a PNG file only if given a
-path.
+Every function returns its figure, draws into `ax` if given, and writes a PNG file only if given a path.
 """
 
 from __future__ import annotations
@@ -34,15 +33,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-STEPS = ("step", "iteration", "epoch")  # what may run along the bottom
-CLOCK = ("seconds",)  # a nearly straight line, which tells nothing about how training went
-COUNTS = {"size", "added", "pruned", "count", "gaussians"}  # recorded numbers that are whole, drawn from zero
+STEPS = ("step", "iteration", "epoch")  # keys for the x axis
+CLOCK = ("seconds",)  # not drawn by default: a nearly straight line
+COUNTS = {"size", "added", "pruned", "count", "gaussians"}  # whole numbers, drawn from zero
 
 
 def plot_codebook_history(
     history: Sequence[Row], path: str | Path | None = None, *, ax: Sequence[Axes] | Array | None = None
 ) -> Figure:
-    """Draw how the codebook grew (Sec. 3.3.1): its size, and what else each round of growth or epoch recorded.
+    """Draw how the codebook grew (Sec. 3.3.1): its size and all other recorded numbers.
 
     Args:
         history: `CodebookFit.history`: one row per round of growth, or per epoch of the paper's method (with a loss).
@@ -62,7 +61,7 @@ def plot_training(
     leave_out: Sequence[str] = CLOCK,
     ax: Sequence[Axes] | Array | None = None,
 ) -> Figure:
-    """Draw every number that a training recorded against its step: the loss first, one panel each.
+    """Draw every number that a training recorded over its steps, one panel each, the loss first.
 
     Args:
         history: rows with `step` (or `iteration`, or `epoch`) and numbers, for instance `FieldFit.history`.
@@ -85,14 +84,14 @@ def plot_confusion(
     misses: Tensor | Array | None = None,  # [C] counts
     ax: Axes | None = None,
 ) -> Figure:
-    """Draw a confusion matrix: rows are true classes, in per cent of each row; classes that never occur are left out.
+    """Draw a confusion matrix in per cent of each row. Rows are true classes; classes that never occur are left out.
 
     Args:
         matrix: counts of (truth, prediction), for instance `ConfusionMatrix.matrix`.
         names: class names.
         path: a .png file to write; None writes none.
-        misses: pixels of each class that were predicted as none (`ConfusionMatrix.misses`); where there are any, they
-            get a last column and count in their row.
+        misses: pixels of each class predicted as "no class" (`ConfusionMatrix.misses`); if there are any, they get a last
+            column and count in their row.
         ax: axes to draw into; None makes a figure.
 
     Raises:
@@ -132,17 +131,17 @@ def plot_iou(
     title: str = "Intersection over union by class (%)",
     ax: Axes | None = None,
 ) -> Figure:
-    """Draw the IoU of each class as a bar in its colour, the best first, with the mean as a line; in per cent.
+    """Draw the IoU of each class as a bar in its colour, best first, with the mean as a line; in per cent.
 
-    The mean is over the classes that occur, as in `ConfusionMatrix.miou`. Classes that do not (NaN) are left out; the label
-    of the axis says how many. Equal classes stay in class order.
+    Classes that do not occur (NaN) are left out of the bars and the mean, as in `ConfusionMatrix.miou`; the axis label says
+    how many. Ties stay in class order.
 
     Args:
         iou: for instance `ConfusionMatrix.iou()` or `SegmentationReport.iou`.
         names: class names.
         path: a .png file to write; None writes none.
-        reference: what to compare with, marked on each bar: the 2-D teacher's own IoU, or another method's.
-        reference_name: what the legend calls it.
+        reference: IoU to compare with, marked on each bar: of the 2-D teacher, or of another method.
+        reference_name: its name in the legend.
         title: over the picture.
         ax: axes to draw into; None makes a figure.
 
@@ -161,7 +160,7 @@ def plot_iou(
     for row, value in enumerate(values[shown]):
         axes.text(101, row, f"{value:.1f}", va="center", fontsize=9)
     mean = float(values[shown].mean())
-    axes.axvline(mean, color="white", linewidth=2.6, alpha=0.8)  # seen on dark bars as well
+    axes.axvline(mean, color="white", linewidth=2.6, alpha=0.8)  # makes the line visible on dark bars
     axes.axvline(mean, color=INK, linestyle="--", linewidth=1.3, label=f"mIoU {mean:.1f}")
     if reference is not None:
         theirs = 100 * _shares("reference", reference)
@@ -185,12 +184,12 @@ def plot_quality_storage(
     reference: Mapping[str, tuple[float, float]] | None = None,
     ax: Axes | None = None,
 ) -> Figure:
-    """Draw segmentation quality against size: mIoU in per cent over MiB (logarithmic), every point with its name.
+    """Draw segmentation quality against size: mIoU in per cent over MiB (logarithmic), with the name of each point.
 
     Args:
         points: name to (storage in MiB, mIoU in [0, 1]).
         path: a .png file to write; None writes none.
-        reference: published points to compare with, drawn hollow: for instance rows of Table 1, whose "MB" are MiB.
+        reference: published points, drawn hollow: for instance rows of Table 1, whose "MB" are MiB.
         ax: axes to draw into; None makes a figure.
 
     Raises:
@@ -216,7 +215,7 @@ def plot_quality_storage(
     if points and reference:
         add_legend_below(axes, own=ax is None)
     figure = finish(axes, None)
-    figure.draw_without_rendering()  # the layout decides where points are
+    figure.draw_without_rendering()  # computes the layout, and so the positions of the points
     if ax is None:
         figure.set_layout_engine("none")
     _name_points(axes, places)
@@ -226,7 +225,7 @@ def plot_quality_storage(
 def _plot_rows(
     history: Sequence[Row], path: str | Path | None, ax: Sequence[Axes] | Array | None, *, first: str, title: str
 ) -> Figure:
-    """One panel per recorded number; counts start at zero."""
+    """One panel per recorded number; the axes of counts start at zero."""
     if not history:
         raise ValueError("history: expected at least one row, got none; was anything trained?")
     step = next((name for name in STEPS if name in history[0]), None)
@@ -270,7 +269,7 @@ def _quality_point(name: str, pair: tuple[float, float]) -> tuple[float, float]:
 
 
 def _name_points(axes: Axes, places: Sequence[tuple[str, float, float]]) -> None:
-    """Write each name beside its point, on the first side where it covers neither a point nor an earlier name."""
+    """Write each name beside its point, on the side where it covers the fewest points and earlier names."""
     spots = axes.transData.transform([(x, y) for _, x, y in places])
     frame = axes.get_window_extent()
     taken: list[Any] = []

@@ -1,4 +1,4 @@
-"""Points or ellipsoids in place of Gaussians, for viewers and files that cannot draw Gaussians."""
+"""Draw points or ellipsoids instead of Gaussians, for viewers and files that have no Gaussians."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 
 Array = np.ndarray[Any, Any]
 Instead = Literal["points", "ellipsoids"]
-FACES = ((5_000, 2), (20_000, 1))  # up to so many have 320 faces each, or 80; more have 20
+FACES = ((5_000, 2), (20_000, 1))  # up to 5,000 ellipsoids have 320 faces each, up to 20,000 have 80; more have 20
 MOST = 100_000  # 2 million faces: 1.2 s a frame in software
 MOST_EXPORTED = {"points": 400_000, "ellipsoids": 10_000}
-"""Most Gaussians of a cloud in a page: 8 and 20 MB."""
+"""The most Gaussians of a cloud in a page: 8 and 20 MB."""
 FAINT = {"points": 0.1, "ellipsoids": 0.5}
-"""Gaussians up to this opacity are left out: points and ellipsoids are opaque, and would hide what is behind. An ellipsoid is
-the surface on which alpha is 1/2, so it vanishes when its Gaussian's opacity is 1/2."""
+"""Gaussians up to this opacity are left out, because points and ellipsoids are opaque and would hide what is behind. An
+ellipsoid is the surface where alpha is 1/2; it has size zero if the Gaussian's opacity is 1/2."""
 POINT_SIZE = 4.0  # pixels
 
 
 def ellipsoids(gaussians: Gaussians, deviations: float) -> pv.PolyData:
-    """A mesh of N ellipsoids with a point array `index`: the Gaussian of each vertex.
+    """A mesh of N ellipsoids; its point array `index` names the Gaussian of each vertex.
 
     Args:
-        gaussians: N of them.
+        gaussians: N Gaussians.
         deviations: half axes, in standard deviations.
 
     Raises:
@@ -64,7 +64,7 @@ def ellipsoids(gaussians: Gaussians, deviations: float) -> pv.PolyData:
 
 @contextmanager
 def without_gaussians(plotter: pv.Plotter, instead: Instead, limit: int) -> Iterator[list[int]]:
-    """Replace a plotter's clouds of Gaussians by points or ellipsoids for a while; yields [drawn, left out]."""
+    """Replace a plotter's Gaussians by points or ellipsoids inside a `with` block; yields the counts [drawn, left out]."""
     counts, hidden, added = [0, 0], [], []
     try:
         for renderer in plotter.renderers:
@@ -91,9 +91,9 @@ def without_gaussians(plotter: pv.Plotter, instead: Instead, limit: int) -> Iter
 
 
 def strongest(cloud: pv.PolyData, limit: int, faint: float) -> Array:  # [n] int64, ascending
-    """The rows of a cloud that are drawn: not faint, and if there are too many, the largest and most opaque.
+    """The rows of a cloud to draw: those that are not faint, and at most `limit` of them.
 
-    The measure is opacity times the product of the two larger scales: what a splat covers of a picture.
+    The largest values of opacity times the product of the two larger scales win: this is what a splat covers of a picture.
     """
     opacity = np.asarray(cloud["opacity"], dtype=np.float64)
     rows = np.flatnonzero(opacity > faint)

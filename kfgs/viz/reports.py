@@ -1,4 +1,4 @@
-"""Pictures of a codebook: similarity, usage, the nearest words of each codeword, and its growth (Figure 6)."""
+"""Plots of a codebook: similarity, usage, the nearest words of each codeword, and its growth (Figure 6)."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SHOWN = 150
-"""Most codewords in one report: more rows than that are too small to read, or the picture too large to open."""
+"""The most codewords in one report: more rows are too small to read, or the picture is too large to open."""
 ROW = 0.145
-"""Height of a codeword's row in inches: letters of 7 points with a little room."""
+"""Height of a row in inches: letters of 7 points with a little room."""
 
 
 class CodebookRows(NamedTuple):
@@ -57,13 +57,13 @@ def codebook_rows(
     usage: Tensor | None = None,  # [K]
     words: int = 3,
 ) -> CodebookRows:
-    """Order codewords for reading: by class, within a class the most used first (or in book order without `usage`).
+    """Order codewords for reading: by class, and within a class by usage (without `usage`, in book order).
 
     Args:
         codewords: the codebook S.
         embeddings: one row per class, in the same space.
-        usage: features of each codeword, for instance `CodebookFit.usage`. Of more than 150 codewords the most used
-            150 are kept; without usage the first 150.
+        usage: number of features of each codeword, for instance `CodebookFit.usage`. At most 150 codewords are kept: the
+            most used, or without usage the first.
         words: how many nearest classes of each codeword to name.
 
     Raises:
@@ -97,8 +97,8 @@ def plot_codebook_report(
 ) -> Figure:
     """Draw a codebook in one figure: similarity matrix, usage, nearest words of each codeword, and growth below.
 
-    Rows are codewords, ordered by their class (the nearest text, Sec. 3.4) and within it by usage; a class has its
-    colour of `palette`. Usage is logarithmic; a codeword that nothing uses is marked "unused". The figure's size follows from
+    Rows are codewords, ordered by their class (the nearest text, Sec. 3.4) and within it by usage. Classes have the
+    colours of `palette`. Usage is logarithmic, with "unused" for codewords without features. The figure's size depends on
     the number of codewords, so it takes no `ax`.
 
     Args:
@@ -106,8 +106,8 @@ def plot_codebook_report(
         names: class names, for instance `LabelSet.names`.
         embeddings: one row per class, for instance `LabelSet.embeddings`.
         path: a .png file to write; None writes none.
-        usage: features of each codeword (`CodebookFit.usage`); without it that panel is left out.
-        history: `CodebookFit.history`; without it the growth is left out.
+        usage: number of features of each codeword (`CodebookFit.usage`); without it there is no such panel.
+        history: `CodebookFit.history`; without it there is no growth panel.
         words: how many nearest classes of each codeword to name.
 
     Raises:
@@ -144,7 +144,7 @@ def plot_codebook_growth(
     *,
     ax: Sequence[Axes] | np.ndarray[Any, Any] | None = None,
 ) -> Figure:
-    """Draw how codebooks grew, scene by scene (Figure 6): their size, what was added and pruned, and the coverage.
+    """Draw how codebooks grew, a line per scene (Figure 6): size, codewords added and pruned, and coverage.
 
     Args:
         histories: scene name to `CodebookFit.history`, or one history alone.
@@ -191,7 +191,7 @@ def _draw_similarity(axes: Axes, rows: CodebookRows, names: Sequence[str]) -> No
 
 def _draw_usage(axes: Axes, used: np.ndarray[Any, Any], rows: CodebookRows) -> None:
     colors = palette(rows.labels) / 255
-    length = np.maximum(used - 0.5, 0)  # from 0.5, so that a bar ends at its count, and a count of 1 is seen
+    length = np.maximum(used - 0.5, 0)  # bars start at 0.5 and end at their count, so that a count of 1 can be seen
     axes.barh(range(len(used)), length, left=0.5, color=colors, edgecolor=INK, linewidth=0.4, height=0.8)
     axes.set_xscale("log")
     axes.set_xlim(0.5, max(10.0, 2 * float(used.max())))
@@ -221,7 +221,7 @@ def _draw_words(axes: Axes, rows: CodebookRows, names: Sequence[str]) -> None:
 
 
 def _draw_growth(axes: Sequence[Axes], histories: Mapping[str, Sequence[Row]]) -> None:
-    """Size, what came and went (pruned dashed), and coverage, over epochs."""
+    """Size, codewords added and (dashed) pruned, and coverage, over epochs."""
     drawn: list[list[float]] = [[], [], []]
     for i, (name, history) in enumerate(histories.items()):
         if not any(is_number(row.get("size")) for row in history):

@@ -1,4 +1,4 @@
-"""What an edit is, and the edits of presence and look: remove, extract, recolour, opacity."""
+"""The interface of edits, and the edits remove, extract, recolour and opacity."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ HIDDEN = 1e-6  # an opacity that every renderer skips (alpha < 1/255) and every 
 
 
 class Edit(ABC):
-    """One edit: frozen plain data, so that it can be compared, saved and replayed.
+    """One edit: frozen plain data that can be compared, saved and replayed.
 
-    `op` names it in JSON. `apply` returns a new cloud and changes nothing in place.
+    `op` is its name in JSON. `apply` returns a new cloud and changes nothing in place.
     """
 
     op: ClassVar[str]
@@ -48,10 +48,10 @@ class Edit(ABC):
 
 @dataclass(frozen=True)
 class OnSelection(Edit):
-    """An edit of the Gaussians that a question selects."""
+    """An edit of the Gaussians that a `Where` selects."""
 
     where: Where
-    """A question; a class name stands for `OfClass(name)`, a `Selection` for the `OfIndex` of its Gaussians."""
+    """Which Gaussians; a class name becomes `OfClass(name)`, a `Selection` becomes the `OfIndex` of its Gaussians."""
     _: KW_ONLY
     allow_empty: bool = False
     """False: it is an error if nothing is selected."""
@@ -90,11 +90,11 @@ class OnSelection(Edit):
 
 @dataclass(frozen=True)
 class Remove(OnSelection):
-    """Take Gaussians away ("delete the chair").
+    """Remove Gaussians ("delete the chair").
 
-    A transfer of labels leaves unlabelled Gaussians around an object, which would stay behind as a halo. `grow` also takes
-    the **unlabelled** Gaussians (label -1; all others if the cloud has no labels) that are closer than `grow` to a removed
-    one, and no farther from it than from any labelled one that stays. Labelled neighbours are never taken.
+    A transfer of labels leaves unlabelled Gaussians around an object, which would stay behind as a halo. `grow` also
+    removes **unlabelled** Gaussians (label -1; all others if the cloud has no labels) that are closer than `grow` to a
+    removed one, unless a labelled one that stays is closer still. Labelled neighbours are never removed.
     """
 
     op: ClassVar[str] = "remove"
@@ -129,9 +129,9 @@ class Recolor(OnSelection):
 
     op: ClassVar[str] = "recolor"
     rgb: tuple[float, float, float]
-    """Red, green, blue in [0, 1], or text such as `"#c04040"` or `"teal"`."""
+    """Red, green, blue in [0, 1], or text like `"#c04040"` or `"teal"`."""
     mode: Mode = "tint"
-    """`"tint"`: the object's middle luminance becomes `rgb`. `"hue"`: luminance stays as far as the display can show it."""
+    """`"tint"`: the object's middle luminance becomes `rgb`. `"hue"`: luminance stays."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -147,8 +147,8 @@ class Recolor(OnSelection):
 class Opacity(OnSelection):
     """Multiply opacities: 1 changes nothing, 0 hides.
 
-    Hidden Gaussians stay in the cloud, with opacity 1e-6 (or less, if they had less): no renderer draws them, all indices
-    stay, and files that hold logits can hold them. `Remove` takes them out.
+    Hidden Gaussians stay in the cloud with opacity 1e-6 (or less, if they had less). No renderer draws them, indices stay,
+    and file formats with logits can store them. `Remove` deletes them.
     """
 
     op: ClassVar[str] = "opacity"

@@ -21,10 +21,10 @@ OPS: dict[str, type[Edit]] = {op.op: op for op in (Remove, Extract, Recolor, Opa
 
 @dataclass(frozen=True)
 class EditList:
-    """Edits that are applied one after the other, each to what the one before left.
+    """Edits that are applied one after the other, each to the result of the one before.
 
-    Nothing is changed in place: `then`, `undo` and `redo` give new lists, `apply` a new cloud. Every edit selects in what
-    the edits before it left, so `Remove` after `Insert` sees what was inserted.
+    Nothing is changed in place: `then`, `undo` and `redo` give new lists, `apply` a new cloud. `Remove` after `Insert` can
+    remove inserted Gaussians.
 
     Example:
         >>> edits = EditList().then(Recolor("plant", "#c04040")).then(Remove("chair"))
@@ -33,9 +33,9 @@ class EditList:
     """
 
     edits: tuple[Edit, ...] = ()
-    """What `apply` does, in order."""
+    """The edits that `apply` applies, in order."""
     undone: tuple[Edit, ...] = ()
-    """What `redo` brings back, starting with the last."""
+    """The edits that `redo` restores, the last one first."""
 
     def __post_init__(self) -> None:
         for name in ("edits", "undone"):
@@ -55,11 +55,11 @@ class EditList:
         return iter(self.edits)
 
     def then(self, edit: Edit) -> EditList:
-        """The list with one more edit. Undone edits can no longer be redone."""
+        """The list with one more edit, and without undone edits."""
         return EditList((*self.edits, edit))
 
     def undo(self) -> EditList:
-        """The list without its last edit, which `redo` brings back.
+        """The list without its last edit; `redo` restores it.
 
         Raises:
             ValueError: if there is nothing to undo.
@@ -117,8 +117,8 @@ class EditList:
         """Read what `save` wrote.
 
         Args:
-            path: the JSON file; files to insert are looked for beside it.
-            anywhere: also allow files to insert that lie outside its folder.
+            path: the JSON file. Paths of files to insert are relative to its folder.
+            anywhere: also allow files to insert from outside this folder.
 
         Raises:
             FileNotFoundError: if there is no such file, or a file to insert is missing.

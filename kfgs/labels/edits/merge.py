@@ -19,7 +19,7 @@ def join(first: SplatFile, second: SplatFile) -> SplatFile:
     - Labels: classes with the same name are the same class. If the first cloud has the name twice, the lowest label is
       used. New names that occur are added after those of the first. A class without a name is called `class 7` if the
       other cloud has names; if neither has names, indices are kept.
-    - What one cloud lacks: labels become -1 (none), features 0, extra columns 0.
+    - If one cloud lacks them: labels become -1 (none), features 0, extra columns 0.
 
     Raises:
         ValueError: if one has colours and the other has none, or their features have different channels.

@@ -1,4 +1,4 @@
-"""Edits of place: move, rotate and resize Gaussians about a pivot, or a copy of them."""
+"""Edits that move, rotate and resize Gaussians about a pivot, or a copy of them."""
 
 from __future__ import annotations
 
@@ -50,17 +50,17 @@ class Turn:
 
 @dataclass(frozen=True)
 class _Motion(OnSelection):
-    """What `Move` and `Duplicate` share: x' = scale R (x - pivot) + pivot + translation."""
+    """Base of `Move` and `Duplicate`: x' = scale R (x - pivot) + pivot + translation."""
 
     translation: tuple[float, ...] = (0.0, 0.0, 0.0)
     """World units."""
     rotation: Turn | tuple[float, ...] | None = None
-    """A `Turn`, a pair such as `("z", 90)` (axis, degrees), or a quaternion (w, x, y, z)."""
+    """A `Turn`, a pair (axis, degrees) like `("z", 90)`, or a quaternion (w, x, y, z)."""
     scale: float = 1.0
     """> 0"""
     pivot: str | tuple[float, ...] = "centroid"
-    """The point that rotation and scale leave in place: `"centroid"` (the mean of the selected positions, weighted by
-    opacity; the plain mean if every opacity is 0) or (x, y, z)."""
+    """The fixed point of rotation and scale: (x, y, z), or `"centroid"` (the mean of the selected positions, weighted by
+    opacity; the plain mean if every opacity is 0)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -107,7 +107,7 @@ class Move(_Motion):
 
 @dataclass(frozen=True)
 class Duplicate(_Motion):
-    """Add a copy of Gaussians, moved as `Move` does, with labels and other columns. Copies come after the originals."""
+    """Add a copy of Gaussians, moved like `Move`, with labels and other columns. Copies come after the originals."""
 
     op: ClassVar[str] = "duplicate"
 

@@ -1,4 +1,4 @@
-"""The explorer: both clouds side by side, asked in words, in a window, a browser or a notebook."""
+"""The explorer: search two clouds side by side by class or text, in a window, a browser or a notebook."""
 
 from .desktop import open_window
 from .entry import explore

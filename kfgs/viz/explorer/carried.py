@@ -1,4 +1,4 @@
-"""The colour side of an exploration: who gives each colour Gaussian its label, found once for every lambda."""
+"""For each colour Gaussian, the semantic Gaussian that gives it a label: computed once, valid for every lambda."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ SPAN = 30.0  # the lambda slider reaches from a 30th of the suggestion to 30 tim
 
 
 class Carried:
-    """The nearest labelled semantic Gaussian of each colour Gaussian, whatever its distance.
+    """The nearest labelled semantic Gaussian of each colour Gaussian, at any distance.
 
-    `transfer_labels(..., method="nearest")` for all lambdas at once: its answer for one lambda is what `within` gives. Ties
-    go to the lowest index.
+    The same as `transfer_labels(..., method="nearest")`, for all lambdas at once; `within` applies one. Ties go to the
+    lowest index.
 
     Args:
-        semantic: with labels; those of label -1 are no sources.
-        color: what is labelled, N Gaussians.
+        semantic: with labels; Gaussians with label -1 are not used.
+        color: N Gaussians that take the labels.
     """
 
     def __init__(self, semantic: Gaussians, color: Gaussians) -> None:
@@ -45,5 +45,4 @@ class Carried:
 
     def within(self, distance: float) -> Array:  # [N] bool
         """Which colour Gaussians have a labelled source strictly closer than lambda."""
-        within: Array = self.far < distance
-        return within
+        return np.less(self.far, distance)

@@ -1,4 +1,4 @@
-"""The classes that a window or a page lists, each with a box that hides it: one list for every face."""
+"""The list of classes that the window and the page show, with a box to hide each."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ NO_CLASS = "no class"
 
 
 def class_list(state: Exploration) -> list[tuple[int, str]]:
-    """(label, name) of the classes in this scene, in label order, and last -1 for what has none.
+    """(label, name) of the classes in this scene, in label order, with -1 ("no class") last.
 
-    With a colour cloud -1 is always there: whether one of its Gaussians has a class depends on lambda.
+    With a colour cloud, -1 is always listed: lambda decides how many of its Gaussians have no class.
     """
     labels = state.labels("semantic")
     rows = [(int(label), state.meaning.names[label]) for label in np.unique(labels[labels >= 0])]

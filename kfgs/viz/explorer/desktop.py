@@ -1,4 +1,4 @@
-"""The explorer in a desktop window: a panel of controls beside the clouds, keys, and the mouse."""
+"""The explorer in a desktop window: a panel of controls, keys and the mouse."""
 
 from __future__ import annotations
 
@@ -17,24 +17,23 @@ from .query_line import QueryLine
 if TYPE_CHECKING:
     from .explorer import Explorer
 
-FIRST = 100.0  # priority of our observers: before pyvista's and VTK's own, which they can stop
-STILL = 3  # pixels: a click may move this far before it is a drag
-BUSY = 0.15  # seconds: where the clouds take longer to draw, they follow a dragged slider half of the time
+FIRST = 100.0  # priority of our observers: they run before those of pyvista and VTK, and can stop them
+STILL = 3  # pixels that a click may move; further is a drag
+BUSY = 0.15  # seconds: clouds that take longer to draw follow a dragged slider only half of the time
 STYLES = ("gaussians", "points")
 ACTIONS = ("save picture", "save selection", "reset view")
 KEYS = ("/ ask: Tab, Enter, Esc; 1-4 colours; r view", "p picture; s selection; q close; click picks")
 
 
 def open_window(explorer: Explorer) -> None:
-    """Show an explorer in a window, until the user closes it.
+    """Show an explorer in a window until the user closes it.
 
-    Right of the clouds lies a panel: the question (press "/" or click it, Tab completes a class, Enter asks, Escape
-    drops), sliders for gamma and (logarithmic) lambda, what colours stand for, saving, and the classes. A click on a cloud
-    that does not turn it picks the Gaussian there. What goes wrong is said in the panel. VTK's and pyvista's own keys are
-    off, but for q.
+    A panel on the right holds the question (press "/" or click it; Tab completes a class, Enter asks, Escape clears),
+    sliders for gamma and lambda (logarithmic), the colours, buttons to save, the classes, and error messages. A click on a
+    cloud picks a Gaussian; a drag turns the clouds. The keys of VTK and pyvista are off, except q.
 
     Args:
-        explorer: one that draws into a window. Afterwards it draws off-screen, with what was asked and picked.
+        explorer: one that draws into a window. Afterwards it draws off-screen, with its question and picked Gaussian.
 
     Raises:
         RuntimeError: if there is no display, or the explorer draws off-screen.
@@ -49,24 +48,24 @@ def open_window(explorer: Explorer) -> None:
             "explorer: expected one that draws into a window, got one that draws off-screen; make it with off_screen=False"
         )
     desktop = Desktop(explorer)
-    with warnings.catch_warnings():  # where the system destroys the window with its button, pyvista closes the plotter
+    with warnings.catch_warnings():  # pyvista closes the plotter if the system destroys the window
         warnings.filterwarnings("ignore", ".*auto_close. ignored", UserWarning)
         explorer.plotter.show(title="kfgs", auto_close=False)
     desktop.leave()
 
 
 class Desktop:
-    """Turns the events of an explorer's window into its verbs, and says in a panel what they did."""
+    """Connects a window's events to the explorer's methods, and shows the results in the panel."""
 
     def __init__(self, explorer: Explorer) -> None:
         self.explorer = explorer
-        self.line: QueryLine | None = None  # while a question is typed
+        self.line: QueryLine | None = None  # the text line while a question is typed
         self.note = self.error = ""
         self.scroll = 0
         self._drag: tuple[Slider, Spot] | None = None
-        self._handle: float | None = None  # the dragged slider's value, where the clouds may not have followed
-        self._pressed: tuple[int, int] | None = None  # on a cloud
-        self._applied = self._took = 0.0  # when the clouds followed a slider, and how long that took
+        self._handle: float | None = None  # value of the dragged slider; the clouds may still show an older one
+        self._pressed: tuple[int, int] | None = None  # where the mouse was pressed on a cloud
+        self._applied = self._took = 0.0  # when the clouds last followed a slider, and how long that took
         self._calling = False
         self._classes = class_list(explorer.state)
         self.pane = PanelPane(explorer.plotter, self.view)
@@ -85,15 +84,15 @@ class Desktop:
                 "MouseWheelBackwardEvent": self._on_wheel,
             }.items()
         }
-        # while a cloud turns, events reach the interactor's style alone
+        # while a cloud turns, only the interactor's style gets events
         explorer.plotter.iren.add_observer("LeftButtonReleaseEvent", self._on_cloud_release)
         explorer.listen(self._on_change)
         explorer.set_legend(False)  # the panel lists the classes itself
 
     def leave(self) -> None:
-        """Close the window and let the explorer draw off-screen, as large as before, without the panel."""
+        """Close the window; from now on the explorer draws off-screen, in the same size, without the panel."""
         plotter = self.explorer.plotter
-        if plotter.render_window is None:  # the system has destroyed the window
+        if plotter.render_window is None:  # the system destroyed the window
             return
         for tag in self._tags.values():
             plotter.iren.interactor.RemoveObserver(tag)
@@ -105,7 +104,7 @@ class Desktop:
         self.explorer.set_legend(True)
 
     def view(self) -> PanelView:
-        """What the panel has to say now."""
+        """The current content of the panel."""
         state, line = self.explorer.state, self.line
         asked = "" if state.asked is None else state.asked.words
         return PanelView(
@@ -113,7 +112,7 @@ class Desktop:
             hint="" if line is None else line.hint,
             typing=line is not None,
             sliders=self._sliders(),
-            choices=(("show", state.shows, state.show), ("style", STYLES, self.explorer.style)),
+            choices=(("show", state.show_choices, state.show), ("style", STYLES, self.explorer.style)),
             actions=ACTIONS,
             classes=self._classes,
             hidden=state.hidden,
@@ -134,26 +133,26 @@ class Desktop:
             sliders.append(Slider("lambda", distance, *state.distance_range, logarithmic=True))
         return sliders
 
-    # ---- verbs
+    # ---- actions
 
     def call(self, action: Callable[[], str | None]) -> None:
-        """Call a action, and say what it did or what went wrong, which VTK's event loop would swallow.
+        """Run an action and show its result or its error in the panel; VTK's event loop would swallow an error.
 
-        There is one frame at the end: pyvista draws one for each actor that is added or removed.
+        Renders once at the end: pyvista would render for each actor that is added or removed.
         """
         plotter = self.explorer.plotter
         self.note = self.error = ""
         self._calling = plotter.suppress_rendering = True
         try:
             self.note = action() or ""
-        except Exception as error:  # the window stays, whatever it is
+        except Exception as error:  # the window stays open after any error
             self.error = error_line(error)
         finally:
             self._calling = plotter.suppress_rendering = False
         self.pane.refresh(clouds=True)
 
     def ask(self, words: str | None) -> None:
-        """Ask, which may take seconds for a phrase; None drops the question."""
+        """Ask a question; None clears it. A phrase can take seconds, so the panel says that it is being asked."""
         self.line = None
         if words:
             self.note, self.error = f"asking for {words!r} ...", ""
@@ -161,7 +160,7 @@ class Desktop:
         self.call(lambda: self.explorer.ask(words) and None)
 
     def act(self, kind: str, value: Any) -> None:
-        """Do what a button, a class or the question stands for."""
+        """Do what a clicked spot of the panel stands for."""
         explorer = self.explorer
         if kind == "question":
             self.line = QueryLine(explorer.state.meaning.names)
@@ -192,7 +191,7 @@ class Desktop:
         return f"saved {len(paths)} files in {paths[0].parent}"
 
     def _slide(self, x: float, last: bool) -> None:
-        """Move the dragged handle; the clouds follow at once where they are quick, and in the end."""
+        """Move the dragged handle. Quick clouds follow at once, slow ones sometimes, and all at the end (`last`)."""
         assert self._drag is not None
         slider, spot = self._drag
         left, _, right, _ = spot.box
@@ -209,8 +208,7 @@ class Desktop:
         self._took = self._applied - began
 
     def _on_change(self) -> None:
-        """A action was called, by this window, which refreshes the panel afterwards, or by a program."""
-        if not self._calling:
+        if not self._calling:  # `call` refreshes the panel itself; here a program changed the explorer
             self.pane.refresh()
 
     # ---- keys
@@ -218,7 +216,7 @@ class Desktop:
     def _on_key(self, interactor: Any, event: str) -> None:
         key, character = str(interactor.GetKeySym() or ""), str(interactor.GetKeyCode() or "")
         if self.line is None and key == "q":
-            return  # pyvista's and VTK's own: close
+            return  # pyvista and VTK close the window
         self._stop(interactor, event)
         if self.line is None:
             self._command(key, character)
@@ -233,13 +231,13 @@ class Desktop:
                 self.pane.refresh()
 
     def _on_character(self, interactor: Any, event: str) -> None:
-        """VTK's own keys, such as e for exit and w for wires, wait for this event."""
+        """Stop VTK's own keys, for instance e for exit and w for wires, which use this event."""
         if self.line is not None or interactor.GetKeySym() != "q":
             self._stop(interactor, event)
 
     def _command(self, key: str, character: str) -> None:
-        """A key while nothing is typed."""
-        shows = self.explorer.state.shows
+        """Handle a key while no question is typed."""
+        shows = self.explorer.state.show_choices
         if character == "/" or key in ("slash", "KP_Divide"):
             self.act("question", None)
         elif key == "Escape":
@@ -252,7 +250,7 @@ class Desktop:
     # ---- mouse
 
     def _where(self, interactor: Any) -> tuple[int, int]:
-        """The mouse, with y from the top."""
+        """The mouse position, with y from the top."""
         x, y = interactor.GetEventPosition()
         return x, int(self.explorer.plotter.render_window.GetSize()[1]) - 1 - y
 
@@ -302,5 +300,5 @@ class Desktop:
             self.pane.refresh()
 
     def _stop(self, interactor: Any, event: str) -> None:
-        """Nobody after us hears of this event."""
+        """Keep this event from all later observers."""
         interactor.GetCommand(self._tags[event]).SetAbortFlag(True)

@@ -1,4 +1,4 @@
-"""One side of the explorer on the screen: its cloud as Gaussians or as points, what is selected, and what is picked."""
+"""One side of the explorer on the screen: its cloud as Gaussians or points, with the selection and the picked Gaussian."""
 
 from __future__ import annotations
 
@@ -30,33 +30,33 @@ if TYPE_CHECKING:
 Array = np.ndarray[Any, Any]
 Drawn = Literal["gaussians", "points"]
 
-POINT_SIZES = ((30_000, 5.0), (150_000, 4.0))  # of so many points, in pixels; more have 3
-REST_POINTS = 30_000  # of what is not selected, evenly chosen: so many leave the selection visible behind them
-REST_ALPHA = 0.12  # of such a point
+POINT_SIZES = ((30_000, 5.0), (150_000, 4.0))  # (up to so many points, their size in pixels); more have 3
+REST_POINTS = 30_000  # points for what is not selected, evenly chosen: more would hide the selection
+REST_ALPHA = 0.12  # opacity of these points
 
 
 class Pane:
-    """A subplot with one cloud, whose colours, selection and style can be exchanged.
+    """A subplot with one cloud, whose colours, selection and style can change.
 
     Args:
         plotter: where to draw.
-        column: of the subplot.
-        cloud: what is drawn, at least one Gaussian.
+        column: the subplot.
+        cloud: at least one Gaussian.
         near: depth up to which Gaussians are not drawn, world units.
     """
 
     def __init__(self, plotter: pv.Plotter, column: int, cloud: Gaussians, near: float = NEAR) -> None:
         self.plotter, self.column, self.cloud, self.near = plotter, column, cloud, near
         self.renderer: Any = plotter.renderers[column]
-        self.visible = np.ones(len(cloud), dtype=bool)  # [N] drawn and not faint
-        self.faint = ~self.visible  # [N] drawn, and faint
+        self.visible = np.ones(len(cloud), dtype=bool)  # [N] drawn bright
+        self.faint = ~self.visible  # [N] drawn faint
         self._opacities: Array = cloud.opacities.detach().cpu().numpy()
         self._means: Array = cloud.means.detach().cpu().numpy().astype(np.float32)
         self._gaussians: Any = None
-        self._points: list[Any] | None = None  # what is clearly seen, the rest, and few of the first
-        self._said: Any = None
+        self._points: list[Any] | None = None  # actors: bright points, faint points, a sample of the bright ones
+        self._annotated: Any = None
         self._notes: list[Any] = []
-        self._mark = Ring(self.renderer)
+        self.ring = Ring(self.renderer)  # around the picked Gaussian
 
     def draw(
         self,
@@ -66,17 +66,17 @@ class Pane:
         selected: Array | None,  # [N] bool
         rest: float,
     ) -> None:
-        """Show the Gaussians that are drawn; with a selection, the others of them are faint.
+        """Draw the Gaussians in `drawn`, those in `selected` bright and the others faint.
 
         Args:
-            style: `gaussians`, the picture of kfgs's own rasteriser, or `points`.
+            style: `gaussians` (as kfgs's rasteriser draws them) or `points`.
             colors: of all N.
             drawn: which are drawn at all.
-            selected: which are clearly seen; None: all.
+            selected: which are bright; None: all.
             rest: factor on the opacity of the others.
         """
         strong = drawn if selected is None else drawn & selected
-        others = drawn & ~strong & (self._opacities * rest >= ALPHA_MIN)  # fainter ones are no part of a picture
+        others = drawn & ~strong & (self._opacities * rest >= ALPHA_MIN)  # the rasteriser leaves out fainter ones
         self.plotter.subplot(0, self.column)
         if style == "gaussians":
             self.visible, self.faint = strong, others
@@ -84,38 +84,34 @@ class Pane:
         else:
             opaque = self._opacities > FAINT["points"]
             self.visible, self.faint = strong & opaque, np.zeros_like(others)
-            self.faint[_some(np.flatnonzero(others & opaque), REST_POINTS)] = True
+            self.faint[_sample(np.flatnonzero(others & opaque), REST_POINTS)] = True
             self._draw_points(colors)
-        self._put(self._gaussians, style == "gaussians")
+        self._set_present(self._gaussians, style == "gaussians")
         for actor in self._points or ():
-            self._put(actor, style == "points" and int(actor.mapper.dataset.field_data["shown"][0]) > 0)
+            self._set_present(actor, style == "points" and int(actor.mapper.dataset.field_data["shown"][0]) > 0)
 
-    def say(
+    def annotate(
         self,
         title: str,
         labels: Sequence[int] = (),
         names: Sequence[str] = (),
         clim: tuple[float, float] | None = None,
     ) -> None:
-        """Write a title; list the labels, where there are any; draw a bar of scores, where there is a `clim`."""
-        said = title, tuple(labels), clim
-        if said == self._said:
+        """Write a title, a legend if there are `labels`, and a bar of scores if there is a `clim`."""
+        content = title, tuple(labels), clim
+        if content == self._annotated:
             return
         self.plotter.subplot(0, self.column)
         for actor in self._notes:
             self.plotter.remove_actor(actor, render=False)
-        self._said, self._notes = said, [add_title(self.plotter, title)]
+        self._annotated, self._notes = content, [add_title(self.plotter, title)]
         if len(labels):
             self._notes.append(add_legend(self.plotter, np.array(labels), names))
         if clim is not None:
             self._notes.append(add_scalar_bar(self.plotter, clim))
 
-    def mark(self, place: tuple[float, float, float] | None) -> None:
-        """Draw a ring around a place in the world; None: no ring."""
-        self._mark.move(place)
-
     def within(self, x: float, y: float) -> tuple[float, float] | None:
-        """A place of the window (y from its top) in this subplot's pixels; None: it is in another.
+        """Convert a pixel of the window (y from its top) to a pixel of this subplot; None if it lies outside.
 
         Raises:
             TypeError: if x or y is no number.
@@ -130,17 +126,17 @@ class Pane:
         return (x, y) if 0 <= x < width and 0 <= y < height else None
 
     def gaussian_at(self, camera: Camera, x: float, y: float) -> int | None:
-        """The Gaussian that is seen at a place of this subplot: one that is clearly seen, else one of the faint rest."""
+        """The Gaussian seen at a pixel of this subplot: a bright one if there is one, else a faint one."""
         for mask in (self.visible, self.visible | self.faint):
             index = gaussian_at(self.cloud, camera, x, y, torch.from_numpy(mask))
             if index is not None:
                 return index
         return None
 
-    def _put(self, actor: Any, there: bool) -> None:
-        """In or out; a cloud's visibility is its own matter: points stand for it while the camera moves."""
-        if actor is not None and bool(self.renderer.HasViewProp(actor)) != there:
-            (self.renderer.AddActor if there else self.renderer.RemoveActor)(actor)
+    def _set_present(self, actor: Any, present: bool) -> None:
+        """Add or remove an actor. Its visibility stays: a cloud hides itself while points replace it."""
+        if actor is not None and bool(self.renderer.HasViewProp(actor)) != present:
+            (self.renderer.AddActor if present else self.renderer.RemoveActor)(actor)
 
     def _draw_gaussians(self, colors: Array, strong: Array, drawn: Array, rest: float) -> None:
         if self._gaussians is None:
@@ -151,7 +147,7 @@ class Pane:
 
     def _draw_points(self, colors: Array) -> None:
         clear, others = np.flatnonzero(self.visible), np.flatnonzero(self.faint)
-        few = _some(clear, MOVING_POINTS) if len(clear) > MOVING_POINTS else clear[:0]
+        few = _sample(clear, MOVING_POINTS) if len(clear) > MOVING_POINTS else clear[:0]
         parts = [self._part(rows, colors) for rows in (clear, others, few)]
         if self._points is not None:
             for actor, part in zip(self._points, parts, strict=True):
@@ -168,7 +164,7 @@ class Pane:
         self.renderer.AddObserver("StartEvent", self._before_frame)
 
     def _before_frame(self, *_: Any) -> None:
-        """While the camera moves, few points stand for many."""
+        """While the camera moves, draw only a sample of the points."""
         assert self._points is not None
         clear, _, few = self._points
         moves = self.renderer.HasViewProp(few) and self.renderer.GetRenderWindow().GetDesiredUpdateRate() >= STILL
@@ -176,7 +172,7 @@ class Pane:
         few.SetVisibility(bool(moves))
 
     def _part(self, rows: Array, colors: Array) -> pv.PolyData:
-        """Points for some Gaussians; `shown` in the field data says how many (pyvista draws no empty mesh)."""
+        """Points for some Gaussians; field data `shown` is their number (pyvista refuses an empty mesh, so one stays)."""
         import pyvista as pv
 
         kept = rows if len(rows) else np.zeros(1, dtype=np.int64)
@@ -187,6 +183,5 @@ class Pane:
         return part
 
 
-def _some(rows: Array, most: int) -> Array:
-    """At most so many of some rows, evenly chosen."""
+def _sample(rows: Array, most: int) -> Array:
     return rows[evenly(len(rows), most)]

@@ -1,4 +1,4 @@
-"""One call from a field to looking at it: in a window, in the browser, in a notebook, or as a picture."""
+"""`explore`: open a field or a labelled splat in a window, a browser, a notebook, or as a picture."""
 
 from __future__ import annotations
 
@@ -38,35 +38,31 @@ def explore(
     where: Where = "auto",
     options: ExploreOptions = ExploreOptions(),  # noqa: B008  frozen
 ) -> Explorer:
-    """Look at what a scene means: ask for words, move gamma and lambda, pick Gaussians, save what was found.
+    """Explore a scene: search by text, change gamma and lambda, pick Gaussians, save selections.
 
-    The semantic cloud is on the left, the colour cloud on the right; what is selected on the left lights up on the right
-    through lambda (Sec. 3.4). Everything that can be clicked can also be called on the explorer that comes back:
-    `ask("chair")`, `set_gamma(0.6)`, `set_distance(0.05)`, `pick(x, y)`, `screenshot("chair.png")`, `save_selection()`.
+    The semantic cloud is on the left, the colour cloud on the right. A selection on the left also lights up on the right:
+    each colour Gaussian takes the label of the nearest semantic one within lambda (Sec. 3.4). Everything you can click
+    you can also call on the returned explorer: `ask("chair")`, `set_gamma(0.6)`, `set_distance(0.05)`, `pick(x, y)`,
+    `screenshot("chair.png")`, `save_selection()`.
 
     Args:
-        source: a semantic field, asked by text; or a labelled splat, asked by class.
+        source: a semantic field (search by text) or a labelled splat (search by class).
         color: the colour scene, in the same frame; None shows the source alone.
-        classes: names and embeddings in the teacher's space; None: those that the field remembers. None for a splat, which
-            has its own.
-        cameras: views among which those that see a picked Gaussian are named; None given: the field's own. A field without
-            fused features finds them from these views; without any each Gaussian's own latent decides, which is noisy.
-        embed: the teacher's text encoder, word -> [D], to ask for more than the classes.
+        classes: names and embeddings in the teacher's space; None: those that the field remembers. A splat has its own.
+        cameras: views to search for those that see a picked Gaussian; empty: the field's own. A field without fused
+            features computes them from these views. Without any view, it uses each Gaussian's own latent, which is noisy.
+        embed: the teacher's text encoder, text -> [D], to search for more than the classes.
         distance: lambda, world units; None: from the clouds' spacing.
-        where: `window` (blocks until it is closed), `browser` (a page that only this machine can open; blocks until
-            Ctrl-C), `notebook` (the page within the cell, or a picture and the line to install where the extra `web` is
-            missing; running the cell again closes the explorer that it made before), `picture` (nothing opens; in a
-            notebook the explorer shows as a picture). `auto`: the notebook if there is one, else a window where there is
-            a display, else a picture.
+        where: `window` (blocks until you close it), `browser` (a page that only this machine can open; blocks until
+            Ctrl-C), `notebook` (the page inside the cell; running the cell again closes the earlier explorer; without
+            the extra `web`, a picture and the install line), or `picture` (opens nothing). `auto`: the notebook if there
+            is one, else a window if there is a display, else a picture.
         options: size, style, where files are saved.
 
-    Returns:
-        The explorer.
-
     Raises:
-        ValueError: if there is nothing to look at, or arguments contradict each other.
-        ImportError: if `browser` is asked for and the extra `web` is missing, or `notebook` and IPython is.
-        RuntimeError: if nothing can be drawn here, or a window is asked for and there is no display.
+        ValueError: if there is nothing to show, or arguments contradict each other.
+        ImportError: if the extra `web` is missing for `browser`, or IPython for `notebook`.
+        RuntimeError: if nothing can be drawn here, or there is no display for a window.
     """
     check_choice("where", where, get_args(Where))
     place = find_place() if where == "auto" else where
@@ -92,10 +88,10 @@ def meaning_of(
     cameras: Sequence[Camera] = (),
     embed: Callable[[str], Tensor] | None = None,
 ) -> Meaning:
-    """What can be asked of a field (by text) or a labelled splat (by class).
+    """Wrap a field (searched by text) or a labelled splat (searched by class).
 
     Raises:
-        ValueError: if classes are neither given for a field nor remembered by it, or are given beside a splat.
+        ValueError: if a field has no classes and none are given, or classes are given for a splat.
     """
     if isinstance(source, SplatFile):
         for name, given in (("classes", classes), ("embed", embed)):
@@ -108,19 +104,14 @@ def meaning_of(
 
 
 def find_place() -> Where:
-    """The notebook where there is one, else a window where there is a display, else a picture."""
+    """Choose the value of `where` for "auto"."""
     if in_notebook():
         return "notebook"
     return "window" if has_display() else "picture"
 
 
 def check_place(place: Where) -> None:
-    """Refuse a place that is not there, before anything is computed.
-
-    Raises:
-        ImportError: if the browser's page is asked for and the extra `web` is missing.
-        RuntimeError: if a window is asked for and there is no display.
-    """
+    """Raise an ImportError or a RuntimeError if the browser page or a window is impossible here."""
     if place == "browser":
         require_web()
     if place == "window" and not has_display():
@@ -131,7 +122,7 @@ def check_place(place: Where) -> None:
 
 
 def show(explorer: Explorer, place: Where) -> None:
-    """Open an explorer's face; a picture needs none."""
+    """Open the explorer at a place; a picture opens nothing."""
     if place == "window":
         open_window(explorer)
     elif place == "browser":

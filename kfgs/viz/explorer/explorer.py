@@ -1,4 +1,4 @@
-"""The explorer: one state, one drawing, and the methods that a window, a page or a notebook calls."""
+"""The explorer: a state, a plotter, and the methods that the window, the page and notebooks call."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ if TYPE_CHECKING:
 
 Array = np.ndarray[Any, Any]
 
-NAMES: dict[Side, str] = {"semantic": "semantic field", "color": "colour field"}
-WORDS: dict[Show, str] = {"labels": "classes", "rgb": "colours", "score": "scores", "latents": "latents"}
-HIGHLIGHT = np.array((255, 120, 0))  # lies over a selection in its own colours, or a white sofa fades into the paper
+SIDE_NAMES: dict[Side, str] = {"semantic": "semantic field", "color": "colour field"}
+SHOW_NAMES: dict[Show, str] = {"labels": "classes", "rgb": "colours", "score": "scores", "latents": "latents"}
+HIGHLIGHT = np.array((255, 120, 0))  # tints a selection shown in its own colours: a white sofa is hard to see on white
 
 
 class Explorer:
-    """Both clouds side by side, and methods that change what is asked, shown and picked.
+    """Both clouds side by side, with methods that change the question, the colours and the picked Gaussian.
 
     Each method changes `state`, draws, and then calls the listeners. Nothing opens by itself: `plotter` draws with and
-    without a display. Calls from several threads wait for each other, but OpenGL belongs to one thread: after the first
-    picture, call the methods from the thread that drew it. A closed explorer raises a RuntimeError.
+    without a display. A lock makes calls from several threads wait for each other. But OpenGL works in one thread only:
+    after the first picture, call the methods from the thread that drew it. A closed explorer raises a RuntimeError.
 
     Args:
         exploration: the state.
         options: size, style, where files are saved.
-        camera: to look through first; None: the first of the state's, else everything but floaters is seen.
-        off_screen: draw without a window; None: only where there is no display.
+        camera: the first view; None: the first of the state's cameras, else a view of everything but floaters.
+        off_screen: draw without a window; None: only if there is no display.
 
     Raises:
         ValueError: if the camera's lens distorts, or an option is out of range.
@@ -69,7 +69,7 @@ class Explorer:
         self.lock = RLock()
         self._listeners: list[Callable[[], None]] = []
         self._at_close: list[Callable[[], None]] = []
-        self._closed, self._listed = False, True
+        self._closed, self._legend_shown = False, True
         count = len(exploration.sides)
         self.plotter: pv.Plotter = make_plotter(
             options.height, options.width * count // 2, shape=(1, count), off_screen=off_screen,
@@ -93,10 +93,10 @@ class Explorer:
 
     @while_open
     def ask(self, words: str | None) -> Asked | None:
-        """Ask for a class or a phrase; what answers lights up, the rest is faint. None or "" drops the question.
+        """Search for a class or a phrase: matching Gaussians stay bright, the rest become faint. None or "" clears the search.
 
         Raises:
-            ValueError: for words that cannot be answered; the question of before stays.
+            ValueError: if there is no answer to these words; the earlier question stays.
         """
         self.state.ask(words)
         self._changed()
@@ -104,27 +104,23 @@ class Explorer:
 
     @while_open
     def set_gamma(self, gamma: float) -> None:
-        """Select what scores above gamma.
+        """Select the Gaussians that score above gamma.
 
         Raises:
-            ValueError: if nothing is asked, or gamma is out of range.
+            ValueError: if no question is asked, or gamma is out of range.
         """
         self.state.set_gamma(gamma)
         self._changed()
 
     @while_open
     def set_distance(self, distance: float) -> None:
-        """Let labels travel to colour Gaussians closer than this lambda, world units.
-
-        Raises:
-            ValueError: if it is not positive.
-        """
+        """Set lambda: colour Gaussians closer than this to a semantic one take its label. In world units, positive."""
         self.state.set_distance(distance)
         self._changed()
 
     @while_open
     def set_show(self, show: Show) -> None:
-        """Choose what the colours stand for.
+        """Choose what the colours mean: classes, own colours, scores or latents.
 
         Raises:
             ValueError: if it is unknown, or these clouds do not have it.
@@ -134,21 +130,17 @@ class Explorer:
 
     @while_open
     def set_hidden(self, labels: Iterable[int | str]) -> None:
-        """Hide classes, by label (-1: what has none) or by name; all others are drawn.
+        """Hide these classes, by label (-1: no class) or name, and show all others.
 
         Raises:
-            ValueError: if there is no such class.
+            ValueError: if a class does not exist.
         """
         self.state.set_hidden(labels)
         self._changed()
 
     @while_open
     def set_style(self, style: Style) -> None:
-        """Draw Gaussians or points; `auto`: points if a frame of Gaussians takes over 1 s.
-
-        Raises:
-            ValueError: if it is unknown.
-        """
+        """Draw Gaussians or points; `auto`: points if a frame of Gaussians takes over 1 s."""
         check_choice("style", style, get_args(Style))
         self._style = "points" if style == "points" else "gaussians"
         self._draw()
@@ -162,9 +154,9 @@ class Explorer:
 
     @while_open
     def pick(self, x: float, y: float) -> Picked | None:
-        """Point at what is seen at a place of the window; None (and no mark) where that is the background.
+        """Pick the Gaussian seen at a pixel of the window; None, and no ring, for the background.
 
-        What is clearly seen comes first; where nothing of it is, the faint rest answers.
+        Bright Gaussians come first; faint ones are picked only if there is no bright one.
 
         Args:
             x: pixels from the window's left edge.
@@ -183,7 +175,7 @@ class Explorer:
 
     @while_open
     def look_from(self, camera: Camera) -> None:
-        """Look through a posed camera: all that it sees, in its own proportions.
+        """Look through a posed camera: its whole picture, at its aspect ratio.
 
         Raises:
             ValueError: if its lens distorts.
@@ -197,7 +189,7 @@ class Explorer:
 
     @while_open
     def reset_view(self) -> None:
-        """Look from where the first view was."""
+        """Go back to the first view."""
         if self._camera is not None:
             self.look_from(self._camera)
         else:
@@ -209,28 +201,28 @@ class Explorer:
 
     @while_open
     def screenshot(self, path: str | Path | None = None) -> Array:  # [H, W, 3] uint8
-        """The picture of now; with a path also as a PNG file."""
-        listed = self._listed
+        """Take a picture of the current view, with a legend; with a path, also write it as a PNG file."""
+        legend_shown = self._legend_shown
         self.set_legend(True)
         try:
-            self.plotter.render()  # pyvista's pictures are of the last frame
+            self.plotter.render()  # pyvista takes its pictures from the last frame
             picture: Array = np.array(self.plotter.screenshot(return_img=True))[..., :3]
         finally:
-            self.set_legend(listed)
+            self.set_legend(legend_shown)
         if path is not None:
             save_picture(path, picture)
         return picture
 
     @while_open
     def save_picture(self) -> Path:
-        """Write the picture of now as the next numbered file of `options.out`."""
+        """Write the current view as the next numbered file of `options.out`."""
         with numbered_path(self.options.out, "picture", ".png") as path:
             self.screenshot(path)
         return path
 
     @while_open
     def save_selection(self) -> list[Path]:
-        """Write numbers and Gaussians of what is selected into the next numbered folder of `options.out`.
+        """Write the selection (numbers and Gaussians) into the next numbered folder of `options.out`.
 
         Raises:
             ValueError: if nothing is selected.
@@ -239,37 +231,37 @@ class Explorer:
             return self.state.save_selection(folder)
 
     def lines(self) -> list[str]:
-        """What there is to say: the question, gamma, lambda, counts, what is picked."""
+        """The status as lines of text: question, gamma, lambda, counts, picked Gaussian."""
         picked = self.state.picked
         return self.state.lines() + ([] if picked is None else picked.lines())
 
     def set_legend(self, shown: bool) -> None:
-        """List the classes in the panes, or not: a window or page that lists them itself. Pictures always do.
+        """Show or hide the legend in the panes. Windows and pages hide it and list the classes themselves.
 
-        Of a closed explorer it changes nothing: a face that ends may call it.
+        Screenshots always have a legend. Does nothing on a closed explorer.
         """
-        if shown != self._listed and not self.closed:
-            self._listed = shown
+        if shown != self._legend_shown and not self.closed:
+            self._legend_shown = shown
             self._draw()
 
     def listen(self, callback: Callable[[], None]) -> None:
-        """Have a function called after each change. It may call methods of the explorer, but not wait for other threads."""
+        """Call a function after each change. It may call the explorer's methods, but must not wait for other threads."""
         self._listeners.append(callback)
 
     @property
     def closed(self) -> bool:
-        """Whether there is nothing to draw into any more."""
-        return self._closed or self.plotter.render_window is None  # a desktop may destroy a window by itself
+        """Whether the explorer or its window is closed."""
+        return self._closed or self.plotter.render_window is None  # the desktop can destroy a window
 
     def on_close(self, callback: Callable[[], None]) -> None:
-        """Have a function called once, when the explorer is closed; at once if it is."""
+        """Call a function once, when the explorer closes; immediately if it is closed."""
         if self._closed:
             callback()
         else:
             self._at_close.append(callback)
 
     def close(self) -> None:
-        """Free the window; a second time does nothing."""
+        """Close the window; a second call does nothing."""
         with self.lock:
             if self._closed:
                 return
@@ -289,38 +281,38 @@ class Explorer:
 
     def _repr_png_(self) -> bytes | None:
         if self.closed:
-            return None  # a notebook shows the line above
+            return None  # the notebook shows __repr__ instead
         stream = io.BytesIO()
         Image.fromarray(self.screenshot()).save(stream, format="PNG")
         return stream.getvalue()
 
     def _changed(self) -> None:
         self._draw()
-        self._tell()
+        self._notify()
 
     def _moved(self) -> None:
         for pane in self.panes:
-            pane.renderer.camera_set = True  # or the first render would move it to see everything
+            pane.renderer.camera_set = True  # otherwise the first render moves the camera to see everything
             pane.renderer.ResetCameraClippingRange()
-        self._tell()
+        self._notify()
 
-    def _tell(self) -> None:
-        if not self.plotter.off_screen:  # there a frame is drawn when somebody wants to see one
-            self.plotter.render()  # nothing before the window is shown
+    def _notify(self) -> None:
+        if not self.plotter.off_screen:  # off-screen, a frame is drawn only when a picture is needed
+            self.plotter.render()  # does nothing before the window is shown
         for callback in self._listeners:
             callback()
 
     def _draw(self) -> None:
-        """Bring what is drawn up to the state, without a frame: pyvista draws one for each thing that is added."""
-        with self.lock:  # a face may ask for it while another thread calls a method
+        """Update the actors from the state, without rendering: pyvista would render after each actor added."""
+        with self.lock:  # a window or page may draw while another thread calls a method
             before = self.plotter.suppress_rendering
             self.plotter.suppress_rendering = True
             try:
-                self._exchange()
+                self._update_panes()
             finally:
                 self.plotter.suppress_rendering = before
 
-    def _exchange(self) -> None:
+    def _update_panes(self) -> None:
         state, picked = self.state, self.state.picked
         for side, pane in zip(state.sides, self.panes, strict=True):
             selected = None if state.asked is None else state.selected(side)
@@ -328,18 +320,15 @@ class Explorer:
             if selected is not None and state.show == "rgb":
                 colors = np.where(selected[:, None], (colors + HIGHLIGHT) // 2, colors).astype(np.uint8)
             pane.draw(self._style, colors, state.drawn(side), selected, self.options.rest)
-            pane.mark(None if picked is None else picked.position)
-            words = "" if state.asked is None else f"{state.asked.words!r}, "
-            labels = (
-                sorted(state.present - state.hidden)
-                if self._listed and state.show == "labels" and pane is self.panes[0]
-                else []
-            )
+            pane.ring.move(None if picked is None else picked.position)
+            question = "" if state.asked is None else f"{state.asked.words!r}, "
+            has_legend = self._legend_shown and state.show == "labels" and pane is self.panes[0]
+            labels = sorted(state.present - state.hidden) if has_legend else []
             clim = state.clim if state.show == "score" and pane is self.panes[-1] else None
-            pane.say(f"{NAMES[side]}: {words}{WORDS[state.show]}", labels, state.meaning.names, clim)
+            pane.annotate(f"{SIDE_NAMES[side]}: {question}{SHOW_NAMES[state.show]}", labels, state.meaning.names, clim)
 
     def _choose_style(self, style: Style) -> None:
-        """Draw a frame to look at the clock, where "auto" is not sure; a window waits for its first frame."""
+        """For "auto" with many Gaussians: time a frame now, or, in a window, time the first frame it draws."""
         self._first.waits = style == "auto"
         if self._first.waits and self._first.unsure and self.plotter.off_screen:
             self.screenshot()

@@ -1,4 +1,4 @@
-"""Whether the first frame of Gaussians is quick enough for sliders: what the style "auto" goes by."""
+"""Time the first frame of Gaussians: style "auto" draws points if it is slow."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from collections.abc import Callable
 from time import perf_counter, process_time
 from typing import Any
 
-SLOW = 1.0  # seconds a frame from which "auto" draws points: a slider that follows later feels broken
-SURE = 150_000  # Gaussians that "auto" draws without looking at the clock: half a second in software
+SLOW = 1.0  # seconds per frame; with slower frames a slider feels broken
+SURE = 150_000  # up to so many Gaussians "auto" does not measure: they take half a second in software
 
 
 class FirstFrame:
-    """Looks at the clock for one frame of a window, and calls a function if that was slow.
+    """Times one frame of a VTK window, and calls `on_slow` if it took longer than `SLOW`.
 
     Args:
         window: VTK's render window.
-        count: of the Gaussians drawn in it.
-        on_slow: what to do then.
+        count: number of Gaussians drawn in it.
+        on_slow: called after a slow frame.
     """
 
     def __init__(self, window: Any, count: int, on_slow: Callable[[], None]) -> None:
-        self.waits = False  # for a frame to be judged
+        self.waits = False  # whether the next frame is timed
         self._window, self._on_slow = window, on_slow
         self.unsure = count > SURE
         self._began = 0.0, 0.0
@@ -37,6 +37,6 @@ class FirstFrame:
         self.waits = False
         self._window.WaitForCompletion()
         wall, work = perf_counter() - self._began[0], process_time() - self._began[1]
-        # in software all cores draw; other programs on them do not count
+        # software rendering uses all cores; the CPU time per core leaves out the load of other programs
         if self.unsure and min(wall, work / (os.cpu_count() or 1)) > SLOW:
             self._on_slow()

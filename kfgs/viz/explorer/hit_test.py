@@ -1,6 +1,6 @@
-"""Which Gaussian is under a pixel, which views see one, and which are near it: computed from the Gaussians themselves.
+"""Find the Gaussian under a pixel, the views that see a Gaussian, and its neighbours.
 
-Not by VTK's picker, which knows points: this answers for what is drawn by w = T alpha (Eq. 3), whatever the style.
+Computed from rendering weights w = T alpha (Eq. 3), because VTK's picker only knows points.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from ...splat import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, project
 from ...splat.project import FIELD_OF_VIEW_MARGIN
 from ..gaussian_actor import LOW_PASS
 
-BACKGROUND = 0.05  # a pixel that less than this is drawn over shows the background
-LEAST_WEIGHT = 0.01  # of a view that sees a Gaussian
+BACKGROUND = 0.05  # a pixel covered less than this shows the background
+LEAST_WEIGHT = 0.01  # a view sees a Gaussian if its weight there is above this
 
 
 @dataclass(frozen=True)
 class Sight:
     """A view that sees a Gaussian."""
 
-    name: str  # the camera's
-    index: int  # its place among the cameras asked
-    weight: float  # w = T alpha of the Gaussian at its own projected centre, in (0.01, 0.99]
+    name: str  # of the camera
+    index: int  # of the camera in the list
+    weight: float  # w = T alpha of the Gaussian at its projected centre, in (0.01, 0.99]
 
 
 def gaussian_at(
@@ -38,7 +38,7 @@ def gaussian_at(
     y: float,
     mask: Tensor | None = None,  # [N] bool
 ) -> int | None:
-    """The Gaussian that shows most at a pixel: the one with the largest rendering weight w = T alpha there (Eq. 3).
+    """The Gaussian with the largest rendering weight w = T alpha at a pixel (Eq. 3).
 
     **Convention**: pixels, x to the right and y down; the centre of the first pixel is (0.5, 0.5).
 
@@ -47,11 +47,11 @@ def gaussian_at(
         camera: the view, without distortion.
         x: column.
         y: row.
-        mask: which Gaussians are drawn; None: all. The others neither show nor hide anything.
+        mask: which Gaussians exist here; None: all.
 
     Returns:
-        Its index, of equal weights the nearest one's; None where less than 5 % of the pixel is covered (background), or
-        the pixel is outside of the picture.
+        Its index; of equal weights, that of the nearest. None if less than 5 % of the pixel is covered (background), or
+        the pixel is outside the picture.
 
     Raises:
         ValueError: if shapes disagree, a number is not finite, or the camera has distortion.
@@ -69,12 +69,12 @@ def gaussian_at(
 
 
 def views_seeing(gaussians: Gaussians, index: int, cameras: Sequence[Camera]) -> list[Sight]:
-    """The views in which a Gaussian shows at its own centre with a weight T alpha above 0.01, the best first.
+    """The views that see a Gaussian: its weight T alpha at its projected centre is above 0.01. Best views first.
 
     Args:
-        gaussians: the whole cloud: what stands in front hides.
+        gaussians: the whole cloud, because Gaussians in front hide others.
         index: which Gaussian.
-        cameras: views without distortion; of equal ones the first come first.
+        cameras: views without distortion; equally good ones stay in their order.
 
     Raises:
         ValueError: if there is no such Gaussian, or a camera has distortion.
@@ -102,7 +102,7 @@ def neighbours_of(
     index: int,
     count: int = 8,
 ) -> tuple[Tensor, Tensor]:  # [n] int64, [n]
-    """The nearest other Gaussians by the distance of their means, nearest first, and these distances in world units.
+    """The nearest other Gaussians, nearest first, and the distances of their means in world units.
 
     Raises:
         ValueError: if there is no such Gaussian, or `count` is not positive.
@@ -117,7 +117,7 @@ def neighbours_of(
 
 
 def _bounds(gaussians: Gaussians) -> tuple[Tensor, Tensor]:  # [N], [N]
-    """What bounds a footprint in any view: d^T C d where alpha falls to 1/255, and the largest variance."""
+    """Bounds of a footprint in any view: d^T C d where alpha falls to 1/255, and the largest variance."""
     return 2 * torch.log(gaussians.opacities / ALPHA_MIN), gaussians.scales.amax(dim=1).square()
 
 
@@ -128,7 +128,7 @@ def _weights_at(
     place: tuple[float, float],  # (x, y)
     mask: Tensor | None = None,  # [N] bool
 ) -> tuple[Tensor, Tensor]:  # [m] int64, [m]
-    """The weights of the Gaussians composited at a place, front to back, as the engines' contract has it (its point 2)."""
+    """Weights of the Gaussians composited at a place, front to back (point 2 of the engines' contract)."""
     index = _near_ray(gaussians, bounds, camera, place)
     if mask is not None:
         index = index[mask.to(index.device)[index]]
@@ -141,14 +141,14 @@ def _weights_at(
     alphas = alphas[order]
     after = torch.cumprod(1 - alphas, dim=0)
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
-    drawn = after >= TRANSMITTANCE_MIN  # it falls, so these are the first ones
+    drawn = after >= TRANSMITTANCE_MIN  # `after` decreases, so these come first
     return index[seen.index[order]][drawn], (alphas * before)[drawn]
 
 
 def _near_ray(
     gaussians: Gaussians, bounds: tuple[Tensor, Tensor], camera: Camera, place: tuple[float, float]
 ) -> Tensor:  # [m] int64, ascending
-    """The Gaussians that can reach a place in the picture: a bound that knows no rotations, as that of `project`."""
+    """The Gaussians that can reach a place in the picture, by the bound of `project` without rotations."""
     camera = camera.to(gaussians.means)
     reach, largest = bounds
     points = gaussians.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
@@ -160,5 +160,5 @@ def _near_ray(
         middle, half = (size / 2 - c) / f, FIELD_OF_VIEW_MARGIN * size / 2 / f
         slope = 1 + tangent.clamp(middle - half, middle + half).square()  # of row `axis` of J, squared, times (z / f)^2
         variance = largest * slope * (f / z).square() + LOW_PASS
-        near &= (f * tangent + (c - place[axis])).square() <= 1.01 * reach * variance + 1e-3  # a bound after rounding
+        near &= (f * tangent + (c - place[axis])).square() <= 1.01 * reach * variance + 1e-3  # room for rounding
     return near.nonzero()[:, 0]

@@ -1,4 +1,4 @@
-"""What a semantic cloud can be asked: a field by text (Sec. 3.4), a labelled splat by class."""
+"""Answers to questions: a field answers any text (Sec. 3.4), a labelled splat its classes."""
 
 from __future__ import annotations
 
@@ -14,13 +14,7 @@ from ...cameras import Camera
 from ...formats import SplatFile
 from ...formats.splat_file import SCORE
 from ...gaussians import Gaussians
-from ...labels import (
-    LabelSet,
-    OfClass,
-    Selection,
-    class_index,
-    class_indices,
-)
+from ...labels import LabelSet, OfClass, Selection, class_index, class_indices
 from ...labels.questions import class_rows, make_question
 from ..field_colors import FeatureColors, colors_of_features, feature_colors
 
@@ -33,61 +27,61 @@ UNIT = (0.0, 1.0)
 class Asked(NamedTuple):
     """A question and its answer: a score for each Gaussian, and the gamma that it suggests."""
 
-    words: str  # as asked; a class's own spelling where it is one
-    selection: Selection  # threshold: the gamma it suggests
-    low: float  # the least gamma that makes a difference: 0 of a relevancy, else the least score
-    high: float  # the largest: 1, or the largest score
-    known: bool  # one of the classes
-    valid: Tensor  # [N] bool, whether anything is known of a Gaussian; the others are never selected
+    words: str  # as asked; for a class, in the spelling of the class list
+    selection: Selection  # its threshold is the suggested gamma
+    low: float  # the smallest useful gamma: 0 for a relevancy, else the lowest score
+    high: float  # the largest useful gamma: 1, or the highest score
+    known: bool  # whether it is one of the classes
+    valid: Tensor  # [N] bool, whether anything is known about a Gaussian; the others are never selected
 
 
 class Meaning(Protocol):
-    """What a semantic cloud can be asked."""
+    """A semantic cloud that answers questions."""
 
     gaussians: Gaussians
     """With labels, [N] int64, -1 = none; features [N, d] or None."""
     names: tuple[str, ...]
-    """Of the classes, in label order."""
+    """Class names in label order."""
     scores: Tensor
-    """[N] of the labels."""
+    """[N] scores of the labels."""
     by: str
-    """One line: how labels and scores came about."""
+    """One line: how labels and scores were found."""
     phrases: bool
-    """Whether anything but a class can be asked."""
+    """Whether it answers more than class names."""
 
     def ask(self, words: str) -> Asked:
-        """The answer to a class's name or, where `phrases`, to any words.
+        """Answer a class name or, if `phrases`, any text.
 
         Raises:
-            ValueError: for words that cannot be answered; near names are offered.
+            ValueError: if there is no answer; the message offers similar names.
         """
         ...
 
     def feature_colors(self) -> FeatureColors:
-        """The scene's one projection of features to colours; asked for only where there are features."""
+        """The scene's projection of features to colours; called only if there are features."""
         ...
 
 
 class FieldMeaning:
-    """A semantic field asked by text: labels are those of `SemanticField.classify`, answers those of `SemanticField.query`.
+    """A semantic field: labels come from `SemanticField.classify`, answers from `SemanticField.query`.
 
-    A class is compared with the other classes, anything else with the canonical words (`classes.negatives`): the score is a
-    relevancy, gamma 0.5. Where there are none it is the cosine, and gamma is read off the scores.
+    A class is compared with the other classes, any other text with the canonical words (`classes.negatives`). The score
+    is then a relevancy, with gamma 0.5. If there is nothing to compare with, the score is the cosine, and gamma is
+    derived from the scores.
 
     Args:
         field: a finished field.
         classes: names and embeddings in the teacher's space; None: those that the field remembers.
-        cameras: used only if the field has no fused features yet: views to find them from (`SemanticField.with_answers`),
-            those that it was trained with. None given: the field's own. Without any each Gaussian's own latent decides, as
-            in the paper.
-        embed: the teacher's text encoder, words -> [D]; without it only classes can be asked.
+        cameras: the training views, used only to compute fused features if the field has none yet
+            (`SemanticField.with_answers`); empty: the field's own. Without any view, each Gaussian's own latent decides,
+            as in the paper.
+        embed: the teacher's text encoder, text -> [D]; without it only classes can be asked.
 
     Raises:
-        ValueError: if the embeddings have another number of channels than the field's features, or classes are neither
-            given nor remembered.
+        ValueError: if the embeddings and the field's features differ in channels, or there are no classes.
 
     Note:
-        Warns where the classes were embedded by another teacher than the field's, as far as both are known.
+        Warns if the classes were embedded by another teacher than the field's, when both are known.
     """
 
     def __init__(
@@ -99,8 +93,8 @@ class FieldMeaning:
         embed: Callable[[str], Tensor] | None = None,
     ) -> None:
         classes = field.label_set() if classes is None else classes
-        class_rows(classes, field.dim, field.info)  # refuses them before views are rendered
-        self._classes = replace(classes, info={})  # the teacher has been compared: one warning, not one per question
+        class_rows(classes, field.dim, field.info)  # checks them before views are rendered
+        self._classes = replace(classes, info={})  # the teachers were compared just now: warn once, not per question
         self._field, self.by = _with_answers(field, cameras or field.cameras)
         labels, self.scores = self._field.classify(self._classes)
         self._embed = embed
@@ -110,11 +104,10 @@ class FieldMeaning:
         self.gaussians = field.gaussians.replace(labels=labels)
 
     def ask(self, words: str) -> Asked:
-        """The answer to a class's name or, with an encoder, to any words; the second time it is at hand.
+        """Answer a class name or, with an encoder, any text. Answers are cached.
 
         Raises:
-            ValueError: for a word that is no class where there is no encoder (near names are offered), or an encoder of
-                another teacher.
+            ValueError: if it is no class and there is no encoder, or the encoder belongs to another teacher.
         """
         words = words.strip()
         known = self._classes.knows(words)
@@ -125,14 +118,14 @@ class FieldMeaning:
         return self._answers[words]
 
     def feature_colors(self) -> FeatureColors:
-        """The field's own projection: latents have the colours that they have in its rendered views."""
+        """The field's projection, so latents have the same colours as in its rendered views."""
         return feature_colors(self._field)
 
     def _phrase(self, words: str) -> Tensor:  # [D]
         if self._embed is None or not words:
             try:
                 class_indices(words, self.names)
-            except ValueError as error:  # says which classes there are, and which are near
+            except ValueError as error:  # its message lists the classes and similar names
                 more = "" if self.phrases else "; other words need the teacher's text encoder (embed)"
                 raise ValueError(f"{error}{more}") from None
         assert self._embed is not None
@@ -151,13 +144,13 @@ class FieldMeaning:
 
 
 class SplatMeaning:
-    """A labelled splat asked by class: its Gaussians of that class, with the file's score where there is one, else 1.
+    """A labelled splat: the answer to a class is its Gaussians, with the scores of the file, or 1 if it has none.
 
     Args:
         splats: with labels; classes without a name are called "class 3".
 
     Raises:
-        ValueError: if the splat carries no labels.
+        ValueError: if the splat has no labels.
     """
 
     phrases = False
@@ -180,10 +173,10 @@ class SplatMeaning:
         self._answers: dict[str, Asked] = {}
 
     def ask(self, words: str) -> Asked:
-        """The Gaussians of a class; gamma is suggested below all of their scores, so all are selected.
+        """Answer a class name; the suggested gamma lies below all scores of the class, so that all are selected.
 
         Raises:
-            ValueError: if there is no such class (near names are offered).
+            ValueError: if there is no such class; the message offers similar names.
         """
         words = self.names[class_indices(words.strip(), self.names)[0]]
         if words not in self._answers:
@@ -193,7 +186,7 @@ class SplatMeaning:
             low, high = (float(own.min()), float(own.max())) if len(own) else UNIT
             if len(own) == 0 or (low > 0 and high <= 1):
                 low, high = UNIT
-            else:  # strictly below the least score, also once it is rounded to the scores' precision
+            else:  # strictly below the lowest score, even after rounding to the precision of the scores
                 below = float(torch.nextafter(own.min(), own.new_tensor(-torch.inf)))
                 low = min(low - 0.01 * max(high - low, 1e-3), below)
             found = Selection(member & (scores > low), scores, low, "all of the class")
@@ -201,13 +194,13 @@ class SplatMeaning:
         return self._answers[words]
 
     def feature_colors(self) -> FeatureColors:
-        """A projection fitted to the features of all Gaussians that have any."""
+        """A projection fitted to the features of the Gaussians that have some."""
         assert self.gaussians.features is not None
         return colors_of_features(self.gaussians.features)
 
 
 def _with_answers(field: SemanticField, cameras: Sequence[Camera]) -> tuple[SemanticField, str]:
-    """A field with fused features if it has them or there are views to find them from, and where its answers come from."""
+    """Compute fused features if they are missing and there are views; also say where the answers come from."""
     if field.linear is not None:
         return field, "what the training views show of each Gaussian"
     if not cameras:
@@ -217,7 +210,7 @@ def _with_answers(field: SemanticField, cameras: Sequence[Camera]) -> tuple[Sema
 
 
 def _file_scores(gaussians: Gaussians, score: np.ndarray | None) -> Tensor:  # type: ignore[type-arg]  # [N]
-    """A file's scores; those that are not finite count as the least of the others."""
+    """A file's scores; scores that are not finite become the lowest finite one."""
     if score is None:
         return torch.ones_like(gaussians.opacities)
     values = torch.from_numpy(np.asarray(score)).to(gaussians.means)
@@ -226,7 +219,7 @@ def _file_scores(gaussians: Gaussians, score: np.ndarray | None) -> Tensor:  # t
 
 
 def _asked(words: str, found: Selection, valid: Tensor, relevant: bool, known: bool) -> Asked:
-    """With the range in which a gamma makes a difference."""
+    """Add the range of useful gammas."""
     if relevant or not bool(valid.any()):
         return Asked(words, found, *UNIT, known, valid)
     own = found.scores[valid]

@@ -1,4 +1,4 @@
-"""The explorer inside a notebook: a picture that stays, and over it the page while the kernel runs."""
+"""The explorer in a notebook: a picture that stays, replaced by the page while the kernel runs."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from PIL import Image
 
-from .web import Listening, require_open, require_web
+from .web import Listening, loop_runs, require_open, require_web
 
 if TYPE_CHECKING:
     from .explorer import Explorer
 
-LEAST = 640  # pixels of the page's height, for its controls
-QUALITY = 80  # of the JPEG that a saved notebook keeps: some 60 kB
-# The page is asked for again until the kernel, which may be busy, answers; a picture that only the page's server has is
-# what tells that it does. A kernel on another machine never answers, and the picture stays.
+LEAST = 640  # height of the page in pixels: its controls need so much
+QUALITY = 80  # of the JPEG kept in a saved notebook: about 60 kB
+# The script loads a small picture from the page's server again and again, until the kernel, which may be busy, answers.
+# Then it shows the page. A kernel on another machine never answers, and the picture stays.
 SCRIPT = """(() => {
   const box = document.getElementById(ID), url = URL_, probe = () => {
     const image = new Image();
@@ -45,13 +45,13 @@ SCRIPT = """(() => {
 
 
 class Run(NamedTuple):
-    """One run of a notebook's cell."""
+    """One run of a notebook cell."""
 
     cell: str
     number: int
 
 
-_open: dict[Explorer, tuple[Listening, asyncio.Task[None]]] = {}  # while the page is served
+_open: dict[Explorer, tuple[Listening, asyncio.Task[None]]] = {}  # explorers whose page is being served
 _shown: weakref.WeakKeyDictionary[Explorer, Run] = weakref.WeakKeyDictionary()
 _made: weakref.WeakKeyDictionary[Explorer, Run] = weakref.WeakKeyDictionary()
 
@@ -62,15 +62,14 @@ def in_notebook() -> bool:
 
 
 def show_in_notebook(explorer: Explorer) -> None:
-    """Show an explorer in the output of the cell: its page where the kernel runs on this machine, else a picture.
+    """Show an explorer in the cell's output: its page if the kernel runs on this machine, else a picture.
 
-    The page is served by the kernel itself, to this machine only; it shows what cells do to the explorer, and cells see
-    what was done in it. The saved notebook keeps the picture. Without the extra `web`, or without a kernel, there is the
-    picture alone, and a line that says how to get the controls. `explorer.close()` ends the page. An explorer that was
-    shown so is shown so again where a later cell displays it.
+    The kernel serves the page, to this machine only. Cells and page change the same explorer. The saved notebook keeps the
+    picture. Without the extra `web`, or without a kernel, there is only the picture, with a line on how to get the
+    controls. `explorer.close()` ends the page. If a later cell displays the explorer, the page moves there.
 
     Args:
-        explorer: what to look at, with a plotter that is off the screen.
+        explorer: one that draws off-screen.
 
     Raises:
         RuntimeError: if the explorer is closed.
@@ -90,15 +89,15 @@ def show_in_notebook(explorer: Explorer) -> None:
         _open[explorer] = listening, task
         task.add_done_callback(partial(_ended, explorer))
     url, height = _open[explorer][0].url, max(explorer.plotter.render_window.GetSize()[1], LEAST)
-    name = f"kfgs-{secrets.token_hex(8)}"  # of the output: a cell may be run twice
+    name = f"kfgs-{secrets.token_hex(8)}"  # id of this output, because a cell can run twice
     script = SCRIPT.replace("ID", json.dumps(name)).replace("URL_", json.dumps(url)).replace("HEIGHT", str(height))
     _display(f'<div id="{name}">{picture}</div><script>{script}</script>', f"the explorer is open at {url}")
 
 
 def close_earlier(explorer: Explorer) -> None:
-    """Close what this cell made when it ran before, now that it has made this explorer, or each run would leave one open.
+    """Close the explorer that an earlier run of this cell made.
 
-    A front end tells which cell runs; where none does, the same words are the same cell.
+    The front end usually tells which cell runs; if not, cells with the same text count as the same.
     """
     run = _this_run()
     if run is None:
@@ -111,10 +110,10 @@ def close_earlier(explorer: Explorer) -> None:
 
 
 def _display_again(explorer: Explorer) -> None:
-    """What a cell shows of its last value: nothing where the page is there, the page where it is not."""
+    """Display an explorer as a cell's last value: its page, unless this cell already shows it."""
     run = _this_run()
     if explorer.closed or explorer not in _shown or run is None:
-        raise NotImplementedError  # IPython goes on to the picture
+        raise NotImplementedError  # makes IPython show the picture
     if _shown[explorer] != run:
         show_in_notebook(explorer)
 
@@ -125,7 +124,7 @@ def _shell() -> Any:
 
 
 def _this_run() -> Run | None:
-    """Which cell runs now; None without a kernel."""
+    """The cell that runs now; None without a kernel."""
     if not in_notebook():
         return None
     shell = _shell()
@@ -135,16 +134,14 @@ def _this_run() -> Run | None:
 
 
 def _reason() -> str | None:
-    """Why there are no controls here; None where there are."""
+    """Why there are no controls here; None if there are."""
     if not in_notebook():
         return "controls need a Jupyter kernel: open this in a notebook, or look with where='browser'"
     try:
         require_web()
     except ImportError:
         return 'controls need the extra "web": pip install "kfgs[web]"'
-    try:
-        asyncio.get_running_loop()
-    except RuntimeError:
+    if not loop_runs():
         return "controls need a kernel with an event loop (ipykernel); look with where='browser'"
     return None
 
@@ -161,7 +158,7 @@ def _ended(explorer: Explorer, task: asyncio.Task[None]) -> None:
 
 
 def _free_port() -> int:
-    """The link is shown before the server starts, in the same cell."""
+    """Choose the port before the server starts, because the link is shown first."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -176,7 +173,7 @@ def _picture(explorer: Explorer) -> str:
 
 
 class _Output:
-    """Both for a notebook and for what shows only words."""
+    """A page for notebooks, plain text for anything else."""
 
     def __init__(self, page: str, words: str) -> None:
         self.page, self.words = page, words

@@ -1,4 +1,4 @@
-"""The next numbered file or folder, taken before it is written: two programs that save into one folder lose nothing."""
+"""Reserve the next numbered file or folder, so that two programs can save into one folder without loss."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import Path
 
 @contextmanager
 def numbered_path(folder: Path, stem: str, suffix: str = "") -> Iterator[Path]:
-    """Make the first free `stem_001` of a folder, to be written over: a file, or without a suffix a folder.
+    """Create the first free `stem_001`, a file or (without a suffix) a folder, for the caller to fill.
 
-    What was made goes again where writing fails.
+    Removes it again if the caller's code raises.
     """
     new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
@@ -20,7 +20,7 @@ def numbered_path(folder: Path, stem: str, suffix: str = "") -> Iterator[Path]:
     try:
         yield path
     except BaseException:
-        with suppress(OSError):  # a folder that holds something stays
+        with suppress(OSError):  # a folder that is not empty stays
             path.unlink() if suffix else path.rmdir()
             if new:
                 folder.rmdir()

@@ -1,4 +1,4 @@
-"""How the explorer draws, and where it saves."""
+"""Options of the explorer."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ class ExploreOptions:
     """How the explorer draws, and where it saves."""
 
     height: int = 600
-    """Of the window, pixels."""
+    """Height of the window, pixels."""
     width: int = 1200
-    """Of the window with both panes, pixels; of one pane alone, half of it."""
+    """Width of a window with two panes, pixels; one pane alone has half of it."""
     style: Style = "auto"
-    """`gaussians` (what kfgs's own rasteriser draws), `points`, or `auto`: points where a frame takes over 1 s."""
+    """`gaussians` (as kfgs's rasteriser draws them), `points`, or `auto`: points if a frame takes over 1 s."""
     rest: float = 0.04
-    """Factor on the opacity of what is not selected, in [0, 1)."""
+    """Factor on the opacity of Gaussians that are not selected, in [0, 1)."""
     background: str = "white"
     """A colour that pyvista knows."""
     out: Path = Path("kfgs_view")
-    """A folder for pictures and selections."""
+    """Folder for saved pictures and selections."""
 
     def __post_init__(self) -> None:
         check_whole("height", self.height, 1)

@@ -1,4 +1,4 @@
-"""The desktop window's panel as a picture, and what lies where in it: no window, no events."""
+"""Draw the desktop window's panel as a picture, with the boxes that can be clicked. Knows no window and no events."""
 
 from __future__ import annotations
 
@@ -20,20 +20,15 @@ WIDTH = 300  # pixels
 LETTERS, MARGIN, LINE = 13, 10, 20  # pixels
 PAPER, FIELD, PALE, MUTED = (244, 244, 246), (255, 255, 255), (214, 214, 220), (104, 104, 112)
 CHOSEN, ALARM = (0, 100, 165), (176, 0, 32)
-LEAST_ROWS = 4  # of classes, however much there is to say below them
+LEAST_ROWS = 4  # rows of classes, however long the text below
 
 
 class Spot(NamedTuple):
     """Something in the panel that can be clicked."""
 
     kind: str  # question, slider, show, style, do, box, name, all
-    value: Any  # which one: a slider's name, a action, a label
+    value: Any  # a slider's name, an action, a label
     box: Box
-
-    def holds(self, x: float, y: float) -> bool:
-        """Whether a point lies in it."""
-        left, top, right, bottom = self.box
-        return left <= x < right and top <= y < bottom
 
 
 @dataclass(frozen=True)
@@ -42,69 +37,73 @@ class Slider:
 
     name: str
     value: float | None
-    """None: there is nothing to set; the slider is pale and cannot be dragged."""
+    """None: the slider is pale and cannot be dragged."""
     low: float
     high: float
     logarithmic: bool = False
 
     def share(self, value: float) -> float:
-        """Where a value lies between the ends, in [0, 1]."""
+        """The position of a value between the ends, in [0, 1]."""
         low, high, x = (log(v) if self.logarithmic else v for v in (self.low, self.high, self._inside(value)))
         return (x - low) / (high - low) if high > low else 0.0
 
     def at(self, share: float) -> float:
-        """The value at a share of the way, which is cut to [0, 1]."""
+        """The value at a position, which is clipped to [0, 1]."""
         part = min(max(share, 0.0), 1.0)
         if not self.logarithmic:
             return self._inside(self.low + part * (self.high - self.low))
         return self._inside(exp(log(self.low) + part * (log(self.high) - log(self.low))))
 
-    def _inside(self, value: float) -> float:  # rounding must not leave the range
+    def _inside(self, value: float) -> float:  # rounding could leave the range
         return min(max(value, self.low), self.high)
 
 
 @dataclass(frozen=True)
 class PanelView:
-    """What the panel says."""
+    """The content of the panel."""
 
     question: str = ""
-    """What was asked, or what has been typed so far."""
+    """The question, or the text typed so far."""
     hint: str = ""
-    """What Tab would add to what is typed."""
+    """The text that Tab would add."""
     typing: bool = False
     sliders: Sequence[Slider] = ()
     choices: Sequence[tuple[str, Sequence[str], str]] = ()
-    """(kind, its buttons, the one that is on), one row each."""
+    """Rows of buttons: (kind, names, the chosen one)."""
     actions: Sequence[str] = ()
     classes: Sequence[tuple[int, str]] = ()
     """(label, name)."""
     hidden: frozenset[int] = frozenset()
     scroll: int = 0
-    """Rows of classes above the first one shown."""
+    """Number of class rows scrolled past."""
     lines: Sequence[str] = ()
     note: str = ""
-    """What the last action did."""
+    """The result of the last action."""
     error: str = ""
-    """What the last action complained of."""
+    """The error of the last action."""
     keys: Sequence[str] = ()
 
 
 class Panel(NamedTuple):
-    """The picture, what can be clicked in it, and how far the classes can be scrolled."""
+    """The picture, the boxes that can be clicked, and the largest useful `scroll`."""
 
     picture: Array  # [H, W, 3] uint8
     spots: list[Spot]
     last_scroll: int
 
     def find(self, x: float, y: float) -> Spot | None:
-        """What lies at a point: pixels from the upper left corner."""
-        return next((spot for spot in self.spots if spot.holds(x, y)), None)
+        """The spot at a point: pixels from the upper left corner."""
+        for spot in self.spots:
+            left, top, right, bottom = spot.box
+            if left <= x < right and top <= y < bottom:
+                return spot
+        return None
 
 
 def draw_panel(view: PanelView, height: int, width: int = WIDTH) -> Panel:
-    """Draw what a view says: the question, sliders and buttons above, classes between, status and keys below.
+    """Draw the panel: question, sliders and buttons above, classes in the middle, status and keys below.
 
-    Classes go into two columns where one is not enough, and are scrolled where two are not.
+    If one column of classes is not enough there are two, and if two are not enough they scroll.
     """
     pen = _Pen(height, width)
     _draw_question(pen, view)
@@ -114,20 +113,20 @@ def draw_panel(view: PanelView, height: int, width: int = WIDTH) -> Panel:
         pen.buttons(kind, buttons, chosen)
     pen.buttons("do", view.actions, None)
     below = [(line, MUTED) for text in view.keys for line in pen.wrap(text)]
-    said = [(line, LEGEND_INK) for text in view.lines for line in pen.wrap(text)]
-    said += [(line, CHOSEN) for line in pen.wrap(view.note)] + [(line, ALARM) for line in pen.wrap(view.error)]
+    status = [(line, LEGEND_INK) for text in view.lines for line in pen.wrap(text)]
+    status += [(line, CHOSEN) for line in pen.wrap(view.note)] + [(line, ALARM) for line in pen.wrap(view.error)]
     room = (height - MARGIN - pen.y) // LINE - LEAST_ROWS - 2 - len(below)
-    if len(said) > max(room, 0):  # what came last, the error or the picked Gaussian, is what was asked for last
-        said = said[len(said) - max(room, 0) :]
-    bottom = height - MARGIN - LINE * (len(said) + len(below))
+    if len(status) > max(room, 0):  # keep the end: the error or the picked Gaussian is the newest
+        status = status[len(status) - max(room, 0) :]
+    bottom = height - MARGIN - LINE * (len(status) + len(below))
     last = _draw_classes(pen, view, bottom - LINE // 2)
-    for row, (line, ink) in enumerate(said + below):
+    for row, (line, ink) in enumerate(status + below):
         pen.text(MARGIN, bottom + LINE * row + LINE // 2, line, ink)
     return Panel(np.asarray(pen.image), pen.spots, last)
 
 
 class _Pen:
-    """Draws from the top downwards, and notes what can be clicked."""
+    """Draws from the top downwards, and records the spots that can be clicked."""
 
     def __init__(self, height: int, width: int) -> None:
         self.image = Image.new("RGB", (width, height), PAPER)
@@ -143,7 +142,7 @@ class _Pen:
         return float(self.font.getlength(words))
 
     def fit(self, words: str, room: float) -> str:
-        """The words, or their beginning and dots."""
+        """The text, cut with "..." if it is too long."""
         if self.length(words) <= room:
             return words
         kept = words
@@ -152,7 +151,7 @@ class _Pen:
         return kept + "..."
 
     def wrap(self, words: str) -> list[str]:
-        """Lines no wider than the panel; a word that is wider is cut."""
+        """Break text into lines that fit the panel; a word that is too long is cut."""
         lines: list[str] = []
         for word in words.split():
             longer = f"{lines[-1]} {word}" if lines else word
@@ -171,7 +170,7 @@ class _Pen:
         )  # fmt: skip
 
     def buttons(self, kind: str, names: Sequence[str], chosen: str | None) -> None:
-        """A row of them, as wide as their words want."""
+        """A row of buttons, each as wide as its text needs."""
         wanted = [self.length(name) for name in names]
         spare = (self.width - 2 * MARGIN - 4 * (len(names) - 1) - sum(wanted)) / max(len(names), 1)
         left = float(MARGIN)
@@ -189,7 +188,7 @@ def _draw_question(pen: _Pen, view: PanelView) -> None:
     pen.draw.rounded_rectangle((box[0], box[1], box[2] - 1, box[3] - 1), 4, FIELD, CHOSEN if view.typing else PALE)
     if view.typing:
         typed = view.question
-        while pen.length(typed) > room:  # the end is where one types
+        while pen.length(typed) > room:  # show the end, where the cursor is
             typed = typed[1:]
         end = MARGIN + 8 + pen.length(typed)
         pen.text(MARGIN + 8, middle, typed)
@@ -218,7 +217,7 @@ def _draw_slider(pen: _Pen, slider: Slider) -> None:
 
 
 def _draw_classes(pen: _Pen, view: PanelView, bottom: int) -> int:
-    """Boxes and names down to `bottom`; how many rows lie beyond."""
+    """Draw boxes and names down to `bottom`; returns the number of rows that do not fit."""
     if not view.classes:
         return 0
     pen.text(MARGIN, pen.y + LINE // 2, pen.fit("classes: box shows, name asks", pen.width - 90), MUTED)
@@ -234,7 +233,7 @@ def _draw_classes(pen: _Pen, view: PanelView, bottom: int) -> int:
     for place, (label, name) in enumerate(view.classes[first : first + rows * columns]):
         column, row = (place // rows, place % rows) if last == 0 else (place % columns, place // columns)
         _draw_class(pen, label, name, (MARGIN + column * step, pen.y + row * LINE), step, label not in view.hidden)
-    if last:  # how much of all there is to see, and where
+    if last:  # a scroll bar
         x, top, tall = pen.width - 6, pen.y, rows * LINE
         all_rows = last + rows
         begin = top + tall * min(view.scroll, last) / all_rows

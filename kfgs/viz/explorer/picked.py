@@ -1,4 +1,4 @@
-"""What is known of one Gaussian that a person points at."""
+"""What the explorer tells about a picked Gaussian."""
 
 from __future__ import annotations
 
@@ -14,40 +14,40 @@ from .hit_test import Sight, neighbours_of, views_seeing
 from .meaning import Asked, Meaning
 
 Side = Literal["semantic", "color"]
-SPOKEN: dict[Side, str] = {"semantic": "semantic", "color": "colour"}
+SIDE_WORDS: dict[Side, str] = {"semantic": "semantic", "color": "colour"}
 SHOWN = 4  # views and neighbours named in a line
 NEIGHBOURS = 8
-MOST_VIEWS = 30  # asked who sees a Gaussian: 0.2 s among 600,000
+MOST_VIEWS = 30  # views checked for a picked Gaussian: 0.2 s with 600,000 Gaussians
 
 
 @dataclass(frozen=True)
 class Picked:
-    """One Gaussian of one side."""
+    """One picked Gaussian."""
 
     side: Side
     index: int
-    name: str | None  # of its class; None where it has none
+    name: str | None  # its class; None if it has none
     label: int  # -1 = none
-    score: float | None  # of the question, else of its label; None where nothing is known
+    score: float | None  # for the question, or of its label without one; None if unknown
     position: tuple[float, float, float]  # world units
     opacity: float
-    source: int | None  # colour side: the nearest labelled semantic Gaussian, in range or not
-    distance: float | None  # to it, world units
-    neighbours: list[tuple[int, float, str | None]]  # the nearest of its own side: index, distance, class
-    views: list[Sight]  # that see it, the best first
+    source: int | None  # colour side: the nearest labelled semantic Gaussian, within lambda or not
+    distance: float | None  # to `source`, world units
+    neighbours: list[tuple[int, float, str | None]]  # the nearest ones of the same side: index, distance, class
+    views: list[Sight]  # the views that see it, best first
 
     def lines(self) -> list[str]:
-        """For a person."""
+        """A few lines of text."""
         place = ", ".join(f"{x:.3f}" for x in self.position)
         score = "" if self.score is None else f", score {self.score:.3f}"
         lines = [
-            f"{SPOKEN[self.side]} Gaussian {self.index}: {self.name or 'no class'}{score}",
+            f"{SIDE_WORDS[self.side]} Gaussian {self.index}: {self.name or 'no class'}{score}",
             f"at ({place}), opacity {self.opacity:.2f}",
         ]
         if self.source is not None:
-            said = "label from" if self.label >= 0 else "nearest labelled"
+            relation = "label from" if self.label >= 0 else "nearest labelled"
             reach = "" if self.label >= 0 else ": out of reach"
-            lines.append(f"{said} semantic Gaussian {self.source}, {self.distance:.3g} away{reach}")
+            lines.append(f"{relation} semantic Gaussian {self.source}, {self.distance:.3g} away{reach}")
         if self.neighbours:
             near = [f"{name or 'no class'} {distance:.2g}" for _, distance, name in self.neighbours[:SHOWN]]
             lines.append(f"near it: {', '.join(near)}")
@@ -59,7 +59,7 @@ class Picked:
 
 
 class Describe:
-    """Says what is known of a Gaussian under a question and a lambda; what depends on neither is found once."""
+    """Describes a Gaussian under a question and a lambda; neighbours and views, which depend on neither, are cached."""
 
     def __init__(
         self,
@@ -76,7 +76,7 @@ class Describe:
         self._around: dict[tuple[Side, int], tuple[list[tuple[int, float]], list[Sight]]] = {}
 
     def __call__(self, side: Side, index: int, asked: Asked | None, distance: float) -> Picked:
-        """One Gaussian, as it is now."""
+        """Describe one Gaussian."""
         cloud, label = self._clouds[side], self._label(side, index, distance)
         near, views = self._surroundings(side, index)
         nearest = -1 if side == "semantic" or self._carried is None else int(self._carried.source[index])
@@ -105,7 +105,7 @@ class Describe:
         return self._around[key]
 
     def _source(self, side: Side, index: int, distance: float) -> int | None:
-        """The semantic Gaussian that speaks for one of a side, if one does."""
+        """The semantic Gaussian that gives this one its label and score, if there is one."""
         if side == "semantic" or self._carried is None:
             return index
         return int(self._carried.source[index]) if self._carried.far[index] < distance else None
@@ -115,7 +115,7 @@ class Describe:
         return -1 if source is None else int(self._labels[source])
 
     def _score(self, source: int | None, asked: Asked | None) -> float | None:
-        """The score of one Gaussian, as `Exploration.scores` has it."""
+        """The score of one Gaussian, as in `Exploration.scores`."""
         if source is None:
             return None
         if asked is None:

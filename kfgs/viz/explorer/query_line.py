@@ -1,4 +1,4 @@
-"""A line of text that a question is typed into: no window, only keys and what they make of it."""
+"""The text line for questions: turns key presses into text, with completion. Knows no window."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ LONGEST = 200  # characters
 
 
 class QueryLine:
-    """What has been typed, and what Tab would make of it. Keys have the names that X and VTK give them ("keysyms")."""
+    """The typed text and its completion. Keys have X and VTK names ("keysyms")."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = tuple(names)
         self.text = ""
-        self._stem: str | None = None  # what was typed before the first of several Tabs
+        self._stem: str | None = None  # the text before the first of several Tabs
         self._turn = 0
 
     @property
     def hint(self) -> str:
-        """What Tab would add; "" where no class begins like this."""
+        """The text that Tab would add; "" if no class begins like this."""
         found = self._matches(self.text)
         return found[0][len(self.text) :] if self.text and found else ""
 
     def press(self, key: str, character: str) -> Verdict:
-        """Take a key, and say whether the line is to be asked, dropped, or goes on.
+        """Handle a key; returns whether to ask the question, drop it, or go on typing.
 
         Args:
-            key: its name, such as "Return" or "a".
-            character: what it types, or "" or a control character.
+            key: its name, for instance "Return" or "a".
+            character: the character it types; may be "" or a control character.
         """
         if key in ("Return", "KP_Enter"):
             return "ask"
@@ -46,7 +46,7 @@ class QueryLine:
         return "typing"
 
     def _complete(self, step: int) -> None:
-        """The next class that begins with what was typed; after the last, the first again."""
+        """Go to the next class that begins with the typed text; after the last, to the first."""
         if self._stem is None:
             self._stem, self._turn = self.text, -1 if step > 0 else 0
         found = self._matches(self._stem)

@@ -1,4 +1,4 @@
-"""A ring around a place in the world, in front of everything and of one size in pixels."""
+"""A ring around a point of the world, drawn over everything, with a fixed size in pixels."""
 
 from __future__ import annotations
 
@@ -7,16 +7,12 @@ from typing import Any
 import numpy as np
 
 RADII = ((9.0, 5.0, (1.0, 1.0, 1.0)), (9.0, 2.5, (0.86, 0.0, 0.45)))
-"""Radius and line width in pixels, and colour: the white one below lets the other be seen on every cloud."""
+"""Radius and line width in pixels, and colour: a white ring below the red one, so that it shows on every cloud."""
 SIDES = 48
 
 
 class Ring:
-    """A ring in one renderer; it vanishes while its place is behind the camera, where VTK would mirror it.
-
-    Args:
-        renderer: VTK's.
-    """
+    """A ring in one VTK renderer; hidden while its point is behind the camera, where VTK would mirror it."""
 
     def __init__(self, renderer: Any) -> None:
         self.renderer = renderer
@@ -24,7 +20,7 @@ class Ring:
         self.rings: list[Any] = []
 
     def move(self, place: tuple[float, float, float] | None) -> None:
-        """Put the ring around a place; None: nowhere."""
+        """Put the ring around a point; None hides it."""
         if place is not None and not self.rings:
             self.rings = [_ring(*parts) for parts in RADII]
             for ring in self.rings:

@@ -1,4 +1,4 @@
-"""A selection as files: numbers as JSON, Gaussians as PLY, all of them or none."""
+"""Write a selection as files: numbers as JSON, Gaussians as PLY; either all files or none."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from ...formats.splat_file import SCORE
 from ...gaussians import Gaussians
 from ...labels import Selection, connected_parts
 from ..frusta import evenly
-from .picked import SPOKEN, Side
+from .picked import SIDE_WORDS, Side
 
-MOST_PARTS = 16  # listed: as many as `connected_parts` draws in one rendering of a view
-MOST_VIEWS = 30  # compared, evenly chosen
+MOST_PARTS = 16  # parts listed: as many as `connected_parts` renders in one pass of a view
+MOST_VIEWS = 30  # views compared, evenly chosen
 
 
 class SelectedSide(NamedTuple):
-    """What is selected in one cloud."""
+    """The selection in one cloud."""
 
     cloud: Gaussians
     selection: Selection
@@ -35,7 +35,7 @@ class SelectedSide(NamedTuple):
 
 def save_sides(
     sides: Mapping[Side, SelectedSide],
-    facts: dict[str, Any],
+    details: dict[str, Any],
     names: Sequence[str],
     cameras: Sequence[Camera],
     folder: Path,
@@ -44,12 +44,12 @@ def save_sides(
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".selection.", dir=folder.parent) as name:
         made = Path(name)
-        write_json(made / "selection.json", facts | {"parts": {side: _parts(sides[side], cameras) for side in sides}})
+        write_json(made / "selection.json", details | {"parts": {side: _parts(sides[side], cameras) for side in sides}})
         for side, chosen in sides.items():
             write_splats(made / f"selection_{side}.ply", _splats(chosen, names))
         paths = [folder / path.name for path in sorted(made.iterdir())]
         folder.mkdir(exist_ok=True)
-        for side in SPOKEN:  # of an older selection
+        for side in SIDE_WORDS:  # remove files of an older selection
             for path in folder.glob(f"selection_{side}.ply*"):
                 if path not in paths:
                     path.unlink()
@@ -59,7 +59,7 @@ def save_sides(
 
 
 def _parts(side: SelectedSide, cameras: Sequence[Camera]) -> list[dict[str, Any]]:
-    """The connected parts, each with the view that shows it best: its index among all cameras."""
+    """The connected parts as JSON, each with its best view as an index into `cameras`."""
     places = evenly(len(cameras), MOST_VIEWS).tolist() if cameras else []
     views = [cameras[place] for place in places]
     parts = [part.to_json() for part in connected_parts(side.cloud, side.selection, views or None, most=MOST_PARTS)]
@@ -70,7 +70,7 @@ def _parts(side: SelectedSide, cameras: Sequence[Camera]) -> list[dict[str, Any]
 
 
 def _splats(side: SelectedSide, names: Sequence[str]) -> SplatFile:
-    """The selected Gaussians with labels, names and, if all of them have one, scores."""
+    """The selected Gaussians with labels, names and, if every one has a score, scores."""
     mask = side.selection.mask
     cloud = side.cloud.detach().to("cpu").replace(labels=side.labels).select(mask)
     scores = side.scores[mask].numpy()

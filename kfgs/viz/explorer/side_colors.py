@@ -1,4 +1,4 @@
-"""The colours of both sides that no question changes: their own, each other's, and those of latents."""
+"""Colours of both sides that do not depend on the question: harmonics and latents, computed once."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..._check import as_array
 from ...gaussians import Gaussians
 from ...splat import sh0_to_rgb
 from ..cloud_colors import cloud_colors
@@ -21,12 +22,12 @@ GREY = np.array(UNLABELLED, dtype=np.uint8)
 
 
 class SideColors:
-    """Colours that are computed once, when first asked for.
+    """Colours that are computed once, when first needed.
 
     Args:
-        clouds: of each side.
-        carried: who gives each colour Gaussian its label.
-        projection: gives the scene's projection of latents to colours.
+        clouds: the Gaussians of each side.
+        carried: the source of each colour Gaussian's label.
+        projection: returns the scene's projection of latents to colours.
     """
 
     def __init__(
@@ -40,22 +41,22 @@ class SideColors:
             shows.append("rgb")
         if clouds["semantic"].features is not None:
             shows.append("latents")
-        self.shows = tuple(shows)
+        self.show_choices = tuple(shows)
 
     def rgb(self, side: Side) -> Array:  # [N, 3] uint8
-        """A side's own colour, else that of the nearest Gaussian of the other."""
+        """The colours of a side; if it has none, those of the nearest Gaussians of the other side."""
         if side not in self._rgb:
             own = self._clouds[side]
             if own.sh is not None:
                 self._rgb[side] = as_bytes(sh0_to_rgb(own.sh[:, 0].detach()))
             else:
                 other: Side = "color" if side == "semantic" else "semantic"
-                tree = cKDTree(_points(self._clouds[other]), balanced_tree=False, compact_nodes=False)
-                self._rgb[side] = self.rgb(other)[tree.query(_points(own), workers=-1)[1]]
+                tree = cKDTree(as_array(self._clouds[other].means), balanced_tree=False, compact_nodes=False)
+                self._rgb[side] = self.rgb(other)[tree.query(as_array(own.means), workers=-1)[1]]
         return self._rgb[side]
 
     def latents(self, side: Side, distance: float) -> Array:  # [N, 3] uint8
-        """The scene's projection of the latents; grey where one was never learnt, or none is in reach of lambda."""
+        """The latents as colours; grey if a latent was never learnt, or none is within lambda."""
         features = self._clouds["semantic"].features
         assert features is not None
         if self._latents is None:
@@ -68,10 +69,5 @@ class SideColors:
         return np.where(self._carried.within(distance)[:, None], self._latents[self._carried.source], GREY)
 
     def of_scores(self, side: Side, scores: Array, clim: tuple[float, float]) -> Array:  # [N] -> [N, 3] uint8
-        """The colour map of scores; NaN is grey."""
+        """Scores through the colour map; NaN is grey."""
         return cloud_colors(self._clouds[side], scores, clim=clim).rgb
-
-
-def _points(cloud: Gaussians) -> Array:  # [N, 3] float64
-    points: Array = cloud.means.detach().cpu().double().numpy()
-    return points

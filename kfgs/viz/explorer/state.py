@@ -1,4 +1,4 @@
-"""The state of an exploration: a question, gamma and lambda, what is shown and hidden, what is picked. Nothing is drawn here."""
+"""The explorer's state: question, gamma, lambda, colours, hidden classes, picked Gaussian. Draws nothing."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ...labels.nearest import positions
 from ..palette import palette
 from .carried import SPAN, Array, Carried
 from .meaning import Asked, Meaning
-from .picked import SPOKEN, Describe, Picked, Side
+from .picked import SIDE_WORDS, Describe, Picked, Side
 from .saved import SelectedSide, save_sides
 from .side_colors import SideColors
 
@@ -26,16 +26,16 @@ Show = Literal["labels", "rgb", "score", "latents"]
 
 
 class Exploration:
-    """What one looks at, and how: the verbs change it, the other methods say what to draw.
+    """What the explorer shows: `Explorer`'s methods change it, the other methods say what to draw.
 
-    A colour Gaussian has the label of the nearest labelled semantic Gaussian, where that is strictly closer than lambda
-    (Sec. 3.4); it is selected where that one is. Which one it is, is found once, so moving lambda or gamma costs
+    A colour Gaussian takes the label of the nearest labelled semantic Gaussian if that is strictly closer than lambda
+    (Sec. 3.4), and is selected if that one is. The nearest one is computed once, so changing lambda or gamma takes
     milliseconds.
 
     Args:
-        meaning: what the semantic cloud can be asked.
+        meaning: the semantic cloud and its answers.
         color: the colour cloud, in the same frame; None: the semantic side alone.
-        cameras: views that tell who sees a picked Gaussian, without distortion; of many 30, evenly chosen.
+        cameras: views without distortion, to find those that see a picked Gaussian; at most 30 are used, evenly chosen.
         distance: lambda, world units; None: from the clouds' spacing (`labels.default_distance`).
 
     Raises:
@@ -74,7 +74,7 @@ class Exploration:
         self._carried = None if color is None else Carried(meaning.gaussians, color)
         self._own_labels = as_array(meaning.gaussians.labels).astype(np.int64)
         self._colors = SideColors(clouds, self._carried, meaning.feature_colors)
-        self.shows: tuple[Show, ...] = ("labels", *self._colors.shows, "score")
+        self.show_choices: tuple[Show, ...] = ("labels", *self._colors.show_choices, "score")
         self.show: Show = "labels"
         self.asked: Asked | None = None
         self.gamma: float | None = None
@@ -85,29 +85,24 @@ class Exploration:
         if distance is not None:
             self.set_distance(distance)
         self.distance_range = min(suggested / SPAN, self.distance), max(suggested * SPAN, self.distance)
-        self._mark: tuple[Side, int] | None = None
+        self._picked: tuple[Side, int] | None = None
         self._describe = Describe(meaning, clouds, self._carried, self.cameras)
 
     @property
     def gamma_range(self) -> tuple[float, float]:
-        """The least and the largest gamma that make a difference; 0 and 1 without a question."""
+        """The smallest and the largest useful gamma; 0 and 1 without a question."""
         return (0.0, 1.0) if self.asked is None else (self.asked.low, self.asked.high)
 
     @property
     def picked(self) -> Picked | None:
-        """The Gaussian pointed at, as it is under the question and lambda of now; None once it is hidden."""
-        if self._mark is None:
+        """The picked Gaussian under the current question and lambda; None if it is hidden."""
+        if self._picked is None:
             return None
-        picked = self._describe(*self._mark, self.asked, self.distance)
+        picked = self._describe(*self._picked, self.asked, self.distance)
         return None if picked.label in self.hidden else picked
 
     def ask(self, words: str | None) -> Asked | None:
-        """Ask for a class or a phrase, with the gamma that the answer suggests; None or "" drops the question.
-
-        Raises:
-            TypeError: if they are no text.
-            ValueError: for words that cannot be answered; the question of before stays.
-        """
+        """See `Explorer.ask`. Sets gamma to the value that the answer suggests."""
         if not isinstance(words, str | None):
             raise TypeError(
                 f"words: expected text, got {words!r} ({type(words).__name__}); ask for one class or phrase"
@@ -120,12 +115,7 @@ class Exploration:
         return self.asked
 
     def set_gamma(self, gamma: float) -> None:
-        """Select what scores above gamma.
-
-        Raises:
-            TypeError: if it is no number.
-            ValueError: if nothing is asked, or gamma is out of `gamma_range`.
-        """
+        """See `Explorer.set_gamma`; the range is `gamma_range`."""
         if self.asked is None:
             raise ValueError(f"gamma: expected a question that it applies to, got none (gamma {gamma!r}); ask first")
         check_number("gamma", gamma)
@@ -135,37 +125,24 @@ class Exploration:
         self.gamma, self.gamma_how = min(max(float(gamma), low), high), "given"
 
     def set_distance(self, distance: float) -> None:
-        """Let labels travel to what is strictly closer than this lambda, in world units.
-
-        Raises:
-            TypeError: if it is no number.
-            ValueError: if it is not positive.
-        """
+        """See `Explorer.set_distance`."""
         check_number("distance", distance)
         check_range("distance", distance, 0, closed=(False, False))
         self.distance, self.distance_how = float(distance), "given"
 
     def set_show(self, show: Show) -> None:
-        """Choose what the colours stand for.
-
-        Raises:
-            ValueError: if it is unknown, or these clouds do not have it.
-        """
+        """See `Explorer.set_show`."""
         check_choice("show", show, get_args(Show))
-        if show not in self.shows:
+        if show not in self.show_choices:
             lacking = "harmonics (sh)" if show == "rgb" else "features"
             raise ValueError(
-                f"show: expected one of {', '.join(self.shows)} (no cloud has {lacking}), got {show!r}; choose one of these"
+                f"show: expected one of {', '.join(self.show_choices)} (no cloud has {lacking}), got {show!r}; "
+                "choose one of these"
             )
         self.show = show
 
     def set_hidden(self, labels: Iterable[int | str]) -> None:
-        """Draw no Gaussian of these classes, by label or by name; -1 hides those without a class.
-
-        Raises:
-            TypeError: if it is no list.
-            ValueError: if one is no label or name of this scene.
-        """
+        """See `Explorer.set_hidden`."""
         if isinstance(labels, str) or not isinstance(labels, Iterable):
             raise TypeError(f"labels: expected a list of labels or names, got {labels!r}; pass [{labels!r}]")
         wanted: list[int] = []
@@ -178,21 +155,17 @@ class Exploration:
         self.hidden = frozenset(wanted)
 
     def cloud(self, side: Side) -> Gaussians:
-        """The Gaussians of a side.
-
-        Raises:
-            ValueError: if there is no such side.
-        """
+        """The Gaussians of a side."""
         check_choice("side", side, self.sides)
         return self._clouds[side]
 
     def labels(self, side: Side) -> Array:  # [N] int64
-        """The class of each Gaussian of a side, -1 = none."""
+        """The label of each Gaussian of a side, -1 = none."""
         self.cloud(side)
         return self._own_labels if self._carried is None or side == "semantic" else self._take(self._own_labels, -1)
 
     def selected(self, side: Side) -> Array:  # [N] bool
-        """Which Gaussians of a side answer the question, hidden or not; none without a question."""
+        """Which Gaussians of a side are selected, hidden or not; none without a question."""
         cloud = self.cloud(side)
         if self.asked is None or self.gamma is None:
             return np.zeros(len(cloud), dtype=bool)
@@ -200,17 +173,17 @@ class Exploration:
         return own if side == "semantic" else self._take(own, False)
 
     def drawn(self, side: Side) -> Array:  # [N] bool
-        """Which Gaussians of a side are of no hidden class."""
+        """Which Gaussians of a side are not in a hidden class."""
         labels = self.labels(side)
         return ~np.isin(labels, list(self.hidden)) if self.hidden else np.ones(len(labels), dtype=bool)
 
     @property
     def present(self) -> frozenset[int]:
-        """The labels that Gaussians of either side have now, -1 where one has none, hidden or not."""
+        """The labels present on either side now, hidden or not; -1 included if a Gaussian has none."""
         return frozenset(int(label) for side in self.sides for label in np.unique(self.labels(side)))
 
     def scores(self, side: Side) -> Array:  # [N] float64
-        """The score of the question, without one that of each label; NaN where nothing is known."""
+        """Scores of the question, or of the labels if there is no question; NaN if unknown."""
         self.cloud(side)
         if self.asked is None:
             values, known = self.meaning.scores, self._own_labels >= 0
@@ -221,7 +194,7 @@ class Exploration:
 
     @property
     def clim(self) -> tuple[float, float]:
-        """The scores of the darkest and the brightest colour, the same on both sides."""
+        """The scores of the darkest and the brightest colour, equal on both sides."""
         if self.asked is not None:
             return self.gamma_range
         own = self.scores("semantic")
@@ -229,7 +202,7 @@ class Exploration:
         return (float(own.min()), float(own.max())) if own.size and own.min() < own.max() else (0.0, 1.0)
 
     def colors(self, side: Side) -> Array:  # [N, 3] uint8
-        """The colours of a side for what is shown; grey where nothing is known."""
+        """The colours of a side under the current `show`; grey if unknown."""
         self.cloud(side)
         if self.show == "labels":
             return palette(self.labels(side))
@@ -240,47 +213,43 @@ class Exploration:
         return self._colors.latents(side, self.distance)
 
     def pick(self, side: Side, index: int) -> Picked:
-        """Point at a Gaussian.
-
-        Raises:
-            ValueError: if there is no such side or Gaussian.
-        """
+        """Pick a Gaussian."""
         check_whole("index", index, 0, len(self.cloud(side)) - 1)
-        self._mark = side, int(index)
-        return self._describe(*self._mark, self.asked, self.distance)
+        self._picked = side, int(index)
+        return self._describe(*self._picked, self.asked, self.distance)
 
     def drop_pick(self) -> None:
-        """Point at nothing."""
-        self._mark = None
+        """Pick nothing."""
+        self._picked = None
 
-    def facts(self) -> dict[str, Any]:
-        """The state as JSON: question, gamma, lambda, and how many Gaussians of each side have which class.
+    def details(self) -> dict[str, Any]:
+        """The state as JSON: question, gamma, lambda, and the count of each class on each side.
 
         Classes are [name, count] pairs in label order, because two classes may have the same name.
         """
-        facts: dict[str, Any] = {
+        details: dict[str, Any] = {
             "words": None if self.asked is None else self.asked.words,
             "gamma": self.gamma,
             "gamma_how": self.gamma_how,
             "by": self.meaning.by,
         }
         if "color" in self.sides:
-            facts |= {"lambda": self.distance, "lambda_how": self.distance_how}
+            details |= {"lambda": self.distance, "lambda_how": self.distance_how}
         for side in self.sides:
             labels = self.labels(side)
             counts = np.bincount(labels + 1, minlength=len(self.meaning.names) + 1)
-            facts[side] = {
+            details[side] = {
                 "total": len(labels),
                 "selected": int(self.selected(side).sum()),
                 "classes": [[name, int(count)] for name, count in zip(self.meaning.names, counts[1:], strict=True)],
                 "none": int(counts[0]),
             }
         if "color" in self.sides:
-            facts["color"]["orphaned"] = facts["color"]["none"]
-        return facts
+            details["color"]["orphaned"] = details["color"]["none"]
+        return details
 
     def lines(self) -> list[str]:
-        """The state for a person, in a few lines."""
+        """The state as a few lines of text."""
         lines = []
         if self.asked is not None:
             lines.append(f"{self.asked.words!r}: score > {self.gamma:.3g} ({self.gamma_how})")
@@ -288,18 +257,17 @@ class Exploration:
             total, chosen = len(self.cloud(side)), ""
             if self.asked is not None:
                 chosen = f"{int(self.selected(side).sum()):,} of "
-            lines.append(f"{SPOKEN[side]}: {chosen}{total:,} Gaussians")
+            lines.append(f"{SIDE_WORDS[side]}: {chosen}{total:,} Gaussians")
         if "color" in self.sides:
             orphaned = int((self.labels("color") < 0).sum())
             lines.append(f"lambda {self.distance:.3g} ({self.distance_how}), {orphaned:,} out of reach")
         return lines
 
     def save_selection(self, folder: str | Path) -> list[Path]:
-        """Write what is selected: numbers as selection.json, the Gaussians of each side as selection_<side>.ply.
+        """Write the selection: numbers as selection.json, the Gaussians of each side as selection_<side>.ply.
 
-        The connected parts of the selection are listed, the 16 largest at most, with the view among at most 30 of the
-        cameras, evenly chosen, that shows each best. Selected Gaussians are written whether hidden or not. All files
-        appear or none; a side in which nothing is selected has no file.
+        selection.json lists the connected parts (at most the 16 largest), each with the best of at most 30 evenly chosen
+        views. Hidden Gaussians are written too. Either all files appear or none; a side without a selection has no file.
 
         Raises:
             ValueError: if nothing is selected on any side.
@@ -321,13 +289,13 @@ class Exploration:
             raise ValueError(
                 f"selection: expected at least one Gaussian, got none ({words}); ask first, or lower gamma"
             )
-        return save_sides(sides, self.facts(), self.meaning.names, self.cameras, Path(folder))
+        return save_sides(sides, self.details(), self.meaning.names, self.cameras, Path(folder))
 
     def selection(self, side: Side) -> Selection:
-        """What is selected on a side, with scores (0 where nothing is known), gamma and how.
+        """The selection on a side, with its scores (0 if unknown) and gamma.
 
         Raises:
-            ValueError: if nothing is asked.
+            ValueError: if no question is asked.
         """
         if self.asked is None:
             raise ValueError("selection: expected a question, got none; ask for something first")
@@ -336,12 +304,12 @@ class Exploration:
         return Selection(mask, scores, self.gamma, self.gamma_how)
 
     def _take(self, values: Array, nothing: Any) -> Array:
-        """Carry values of the semantic Gaussians to the colour side; `nothing` where none is in reach."""
+        """Carry values of the semantic Gaussians to the colour side; `nothing` beyond lambda."""
         assert self._carried is not None
         return np.where(self._carried.within(self.distance), values[self._carried.source], nothing)
 
 
 def check_number(name: str, value: object) -> None:
-    """Raise a TypeError unless it is a number; a bool is none."""
+    """Raise a TypeError unless `value` is a number and no bool."""
     if not isinstance(value, numbers.Real) or isinstance(value, bool):
         raise TypeError(f"{name}: expected a number, got {value!r} ({type(value).__name__}); pass a float")

@@ -1,4 +1,4 @@
-"""The explorer in a browser: a server on this machine, whose page only those open who have its link."""
+"""The explorer in a browser: a server on this machine; only who has its link can open the page."""
 
 from __future__ import annotations
 
@@ -27,11 +27,7 @@ MODULES = ("trame", "trame_vtk", "aiohttp")
 
 
 def require_web() -> None:
-    """Refuse early where the page cannot be served.
-
-    Raises:
-        ImportError: with the install line, if the extra `web` is missing.
-    """
+    """Raise an ImportError with the install line if the extra `web` is missing."""
     missing = [name for name in MODULES if importlib.util.find_spec(name) is None]
     if missing:
         raise ImportError(
@@ -46,44 +42,39 @@ def serve(
     port: int = 0,
     open_browser: bool = True,
     *,
-    say: Callable[[str], object] | None = None,
+    report: Callable[[str], object] | None = None,
 ) -> None:
-    """Show an explorer in the browser until Ctrl-C. Closing the tab ends nothing: its link opens the page again.
+    """Show an explorer in the browser until Ctrl-C or `explorer.close()`. A closed tab can be opened again by its link.
 
-    The page listens on this machine only, and its link holds a secret: other pages in the same browser, other people who
-    reach the port, and other machines' names are refused. Several tabs show the same state, and the same picture in the
-    size of the tab that was resized last. It saves into the explorer's own folder (`ExploreOptions.out`) under names of
-    its own. `explorer.close()` ends the page.
+    By default the page can be reached from this machine only. Its link holds a secret, so other pages in the same browser
+    and other users of the machine are refused. Several tabs show the same state and the same picture, in the size of the
+    tab that was resized last. The page saves into `ExploreOptions.out`; the browser cannot choose file names.
 
     Args:
-        explorer: what to look at, with a plotter that is off the screen.
-        host: address to listen on. Any other than this machine's own lets everyone who reaches it and has the link look
-            and steer what all see, and save pictures and selections here; nothing on the way is encrypted.
-        port: of the page; 0: a free one.
-        open_browser: open the link in the default browser, where there is a display.
-        say: told the link, line by line; None: lines on standard error.
+        explorer: one that draws off-screen.
+        host: address to listen on. With an address that other machines can reach, everyone who has the link can look,
+            change what all see, and save pictures and selections here; nothing is encrypted.
+        port: port of the page; 0: a free one.
+        open_browser: open the link in the default browser, if there is a display.
+        report: called with the link and hints, line by line; None: standard error.
 
     Raises:
         ImportError: if the extra `web` is missing.
         ValueError: if the address is not one of this machine, or the port is taken.
-        RuntimeError: if an event loop runs already, as in a notebook, or the explorer is closed.
+        RuntimeError: if an event loop already runs, as in a notebook, or the explorer is closed.
     """
     require_web()
     check_whole("port", port, 0, 65535)
-    if _loop_runs():
+    if loop_runs():
         raise RuntimeError(
             "serve: expected no running event loop, got one, as in a notebook; use show_in_notebook or where='notebook'"
         )
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(_serve(explorer, host, port, open_browser, say or _to_stderr))
+        asyncio.run(_serve(explorer, host, port, open_browser, report or _to_stderr))
 
 
 def require_open(explorer: Explorer) -> None:
-    """Refuse an explorer that has nothing to draw into.
-
-    Raises:
-        RuntimeError: if it is closed.
-    """
+    """Raise a RuntimeError if the explorer is closed."""
     if explorer.closed:
         raise RuntimeError(
             "explorer: expected an open one to show, got one that is closed; make another with explore(...) or "
@@ -91,30 +82,25 @@ def require_open(explorer: Explorer) -> None:
         )
 
 
-async def _serve(explorer: Explorer, host: str, port: int, open_browser: bool, say: Callable[[str], object]) -> None:
+async def _serve(explorer: Explorer, host: str, port: int, open_browser: bool, report: Callable[[str], object]) -> None:
     async with Listening(explorer, host, port) as listening:
-        say(f"the explorer is open at {listening.url}")
+        report(f"the explorer is open at {listening.url}")
         if not is_loopback(host):
-            say(
+            report(
                 f"note: it listens on {host}: everyone who reaches it and has the link can look, steer, and save pictures "
                 f"and selections into {explorer.options.out}; nothing on the way is encrypted"
             )
-        say("Ctrl-C ends it; closing the tab does not")
-        if open_browser and has_display():  # without one, Python would open a browser within the terminal
+        report("Ctrl-C ends it; closing the tab does not")
+        if open_browser and has_display():  # without a display, Python would open a browser in the terminal
             webbrowser.open(listening.url)
         await listening.ended()
 
 
 class Listening:
-    """A page that is served while this context lasts, in the event loop that runs.
-
-    Args:
-        explorer: what to look at.
-        host: address to listen on.
-        port: 0 for a free one.
+    """An async context that serves the page in the running event loop; arguments as in `serve`.
 
     Raises:
-        ValueError: on entering, if the address is not one of this machine, or the port is taken; at once, if it is none.
+        ValueError: if `host` is empty; on entering, if it is no address of this machine or the port is taken.
         RuntimeError: if the explorer is closed.
     """
 
@@ -139,7 +125,7 @@ class Listening:
         self._server = server = get_server(self._name, client_type="vue3")
         self.page = ExplorerPage(self._explorer, server)
         server.enable_module(module)
-        # everything lies below /secret/, the websocket too, so reloading the page keeps what lets it in
+        # every path, the websocket's too, begins with /secret/, so a reload keeps the secret
         server.serve = {f"{self.secret}/{place}": folder for place, folder in server.serve.items()}
         server.serve[self.secret] = vue3.www
         server.controller.on_server_bind.add(self._guard)
@@ -162,7 +148,7 @@ class Listening:
 
     @property
     def url(self) -> str:
-        """The link of the page, with its secret."""
+        """The link of the page, with the secret."""
         name = socket.gethostname() if self._host in ("0.0.0.0", "::") else self._host
         name = f"[{name}]" if ":" in name else name
         return f"http://{name}:{self._port or self._server.port}/{self.secret}/index.html"
@@ -170,7 +156,7 @@ class Listening:
     async def ended(self) -> None:
         """Wait until the server stops, or the explorer is closed."""
         closed = asyncio.ensure_future(self._closed.wait())
-        try:  # a plain await would hand a cancellation on to wslink, which stumbles
+        try:  # a plain await would pass a cancellation on to wslink, which cannot handle it
             await asyncio.wait([self._tasks[0], closed], return_when=asyncio.FIRST_COMPLETED)
         finally:
             closed.cancel()
@@ -190,19 +176,19 @@ class Listening:
             self.page.explorer,
             self.page.pictures,
             self.page.view,
-        )  # trame keeps widgets, and they the page
+        )  # trame keeps the widgets for ever, and they refer to the page
 
     def _leave(self, loop: asyncio.AbstractEventLoop) -> None:
-        """The explorer was closed, perhaps by another thread, or long after the page."""
+        """Called when the explorer closes: perhaps in another thread, perhaps long after the page ended."""
         if not loop.is_closed():
             loop.call_soon_threadsafe(self._closed.set)
 
     def _guard(self, wslink: Any, **_: Any) -> None:
         wslink.app.middlewares.append(make_guard(self.secret, self._host))
-        self._server.protocol.stopServer = lambda: None  # wslink lets any tab end the server
+        self._server.protocol.stopServer = lambda: None  # else any tab could stop the server
 
     def _forget(self) -> None:
-        """Trame keeps every server for ever, by name, and the last one."""
+        """Remove the server from trame, which keeps every server for ever."""
         from trame.app.core import AVAILABLE_SERVERS
         from trame_server.protocol import CoreServer  # type: ignore[import-untyped]
         from trame_vtk.modules.vtk import HELPERS_PER_SERVER
@@ -215,7 +201,7 @@ class Listening:
 
 @contextlib.contextmanager
 def _own_arguments(arguments: str) -> Iterator[None]:
-    """Trame reads the command line of the program; here it reads ours instead."""
+    """Give trame these arguments; it would read the program's command line."""
     before = os.environ.get("TRAME_ARGS")
     os.environ["TRAME_ARGS"] = arguments
     try:
@@ -229,7 +215,7 @@ def _own_arguments(arguments: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _closed_tabs() -> Iterator[None]:
-    """A tab that is closed while a picture is on its way to it is nothing to tell of; wslink and asyncio would."""
+    """Silence wslink and asyncio when a tab closes while a picture is being sent to it."""
     loop, logger = asyncio.get_running_loop(), logging.getLogger("wslink.protocol")
     before = loop.get_exception_handler()
 
@@ -258,7 +244,8 @@ def _refused(host: str, port: int, error: BaseException | None) -> BaseException
     return error or RuntimeError("serve: expected a server that runs, got one that ended at once; set another port")
 
 
-def _loop_runs() -> bool:
+def loop_runs() -> bool:
+    """Whether an event loop runs in this thread."""
     try:
         asyncio.get_running_loop()
     except RuntimeError:

@@ -1,4 +1,4 @@
-"""Who may reach the explorer's page: whoever has its link, from the page itself."""
+"""Protect the explorer's page: only requests with its secret link, from the page itself, are answered."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ REFUSED = "This page opens with the whole link that kfgs gave.\n"
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a server that listens there is reached from this machine only."""
+    """Whether a server on this address can be reached from this machine only."""
     try:
         return ip_address(host.strip("[]")).is_loopback
     except ValueError:  # a name
@@ -20,16 +20,16 @@ def is_loopback(host: str) -> bool:
 
 
 def make_guard(secret: str, host: str) -> Callable[[Any, Callable[[Any], Awaitable[Any]]], Awaitable[Any]]:
-    """A middleware of aiohttp for a page whose whole address begins with /secret/.
+    """An aiohttp middleware for a page whose address begins with /secret/.
 
-    Refused with 403, before anything is read: a path without the secret; a request, such as a websocket of another page,
-    whose Origin is not the page's own; and, while only this machine is listened to, another machine's name in Host (a
-    name that was made to point at 127.0.0.1). Refused with 400: the websocket's address, opened as a page, which wslink
-    stumbles over. Answers, refusals too, forbid the browser to load anything from elsewhere.
+    Status 403, before anything is read: a path without the secret; an Origin other than the page (for instance a
+    websocket of another page); and, if the server listens on this machine only, a Host that names another machine (a
+    name made to point at 127.0.0.1). Status 400: the websocket's address opened as a page, which wslink cannot handle.
+    Every answer forbids the browser to load anything from elsewhere.
 
     Args:
-        secret: what only the link tells.
-        host: the address listened on.
+        secret: known only from the link.
+        host: the address the server listens on.
     """
     from aiohttp import web
 
@@ -55,9 +55,9 @@ def make_guard(secret: str, host: str) -> Callable[[Any, Callable[[Any], Awaitab
         except web.HTTPException as refusal:
             refusal.headers.update(_headers(request.host))
             raise
-        except ConnectionError:  # the tab was closed in the midst of a picture
+        except ConnectionError:  # the tab was closed while it loaded a picture
             return web.Response()
-        if not response.prepared:  # a websocket is under way
+        if not response.prepared:  # the headers of a websocket were sent before
             response.headers.update(_headers(request.host))
         return response
 
@@ -65,7 +65,7 @@ def make_guard(secret: str, host: str) -> Callable[[Any, Callable[[Any], Awaitab
 
 
 def _headers(host: str) -> dict[str, str]:
-    """What a browser may load: only from here. Vue compiles the page's template, hence unsafe-eval."""
+    """Headers that allow the browser to load from here only. Vue compiles the page's template: hence unsafe-eval."""
     policy = {
         "default-src": "'self'",
         "script-src": "'self' 'unsafe-inline' 'unsafe-eval'",
@@ -77,7 +77,7 @@ def _headers(host: str) -> dict[str, str]:
     }
     return {
         "Content-Security-Policy": "; ".join(f"{name} {value}" for name, value in policy.items()),
-        "Referrer-Policy": "no-referrer",  # the address is the secret
+        "Referrer-Policy": "no-referrer",  # the address holds the secret
         "X-Content-Type-Options": "nosniff",
         "Cache-Control": "no-cache",
     }

@@ -1,4 +1,4 @@
-"""The mouse of the page's tabs: VTK's own handling, and an end to it where a tab closes in the midst of a drag."""
+"""The mouse in the page's tabs: handled by VTK, and released if a tab closes during a drag."""
 
 from __future__ import annotations
 
@@ -11,12 +11,7 @@ BUTTONS_AND_KEYS = ("buttonLeft", "buttonMiddle", "buttonRight", "shiftKey", "ct
 
 
 def make_mouse(pictures: Pictures, delivery: Any) -> Any:
-    """The protocol that takes the mouse, in the place of trame-vtk's own.
-
-    Args:
-        pictures: of the plotter that is turned.
-        delivery: of `make_delivery`.
-    """
+    """The protocol for mouse events, instead of trame-vtk's; `delivery` is that of `make_delivery`."""
     from trame_vtk.modules.vtk.protocols import vtkWebMouseHandler
     from wslink import register
 
@@ -27,12 +22,12 @@ def make_mouse(pictures: Pictures, delivery: Any) -> Any:
                 return None if pictures.gone else super().mouse_interaction(event)
 
         @register("viewport.mouse.zoom.wheel")
-        def update_zoomFromWheel(self, event: Any) -> Any:  # noqa: N802  wslink calls it so
+        def update_zoomFromWheel(self, event: Any) -> Any:  # noqa: N802  wslink's name
             with pictures.lock:
                 return None if pictures.gone else super().update_zoomFromWheel(event)
 
-        def onClose(self, client_id: str) -> None:  # noqa: N802  wslink calls it so
-            """Let go of the buttons that a closed tab cannot; another tab that drags presses again as it moves."""
+        def onClose(self, client_id: str) -> None:  # noqa: N802  wslink's name
+            """Release the mouse buttons of a closed tab; another tab that drags presses them again as it moves."""
             window: Any = pictures.plotter.render_window
             if pictures.gone or not (delivery.views_in_animations or window.GetDesiredUpdateRate() >= STILL):
                 return
@@ -40,6 +35,6 @@ def make_mouse(pictures: Pictures, delivery: Any) -> Any:
             still = {"view": self.get_global_id(window), "action": "up", "x": x / width, "y": y / height}
             super().mouse_interaction(still | dict.fromkeys(BUTTONS_AND_KEYS, False))
             delivery.views_in_animations.clear()
-            self.app.InvokeEvent("UpdateEvent")  # a picture for those who are left
+            self.app.InvokeEvent("UpdateEvent")  # a new picture for the other tabs
 
     return Mouse()

@@ -1,11 +1,10 @@
-"""The explorer's page: what it shows, and what its buttons, sliders and clicks do. It only calls the explorer's verbs."""
+"""The explorer's page: sends its content to the browser, and turns buttons, sliders and clicks into method calls."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
 from math import isfinite, log
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -32,7 +31,7 @@ TITLES = {
     "points": "points",
 }
 CLOUDS = 'class="clouds" role="application" tabindex="-1" aria-label="both clouds: drag to turn, click to pick"'
-# a click is a left press and release within 3 pixels of the page; where, as shares of the clouds' width and height
+# a click is a left press and release within 3 pixels; its position is sent as shares of the clouds' width and height
 PRESS = '@pointerdown.capture="$event.currentTarget.press = [$event.clientX, $event.clientY, $event.button]"'
 CLICK = (
     '@pointerup.capture="$event.button === 0 && $event.currentTarget.press && $event.currentTarget.press[2] === 0'
@@ -46,32 +45,23 @@ STEP = 5e-4  # half a step of the sliders, which go from 0 to 1
 LONGEST = 200  # characters of a question
 
 log_ = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class _Drawing:
-    """An action that draws by itself."""
-
-    action: Callable[[], object]
-
-    def __call__(self) -> object:
-        return self.action()
+Action = Callable[[], object]
 
 
 class ExplorerPage:
     """An explorer in a browser.
 
-    Events of the browser are put into a queue and done one after the other; of a slider only the latest position is, so
-    dragging does not outrun the drawing. Whatever changes the explorer, a cell of a notebook too, changes the page.
+    Events of the browser wait in a queue. Of a slider only the latest position is kept, so that drawing can follow. Every
+    change of the explorer, also by a notebook cell, changes the page.
 
     Args:
-        explorer: what is looked at.
-        server: a trame server of its own, not yet started.
+        explorer: the explorer to show.
+        server: a trame server for this page alone, not yet started.
     """
 
     def __init__(self, explorer: Explorer, server: Any) -> None:
         self.explorer, self.server = explorer, server
-        self._waiting: dict[str, Callable[[], object]] = {}
+        self._waiting: dict[str, tuple[Action, bool]] = {}
         self._wake = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._asked: str | None = None
@@ -96,9 +86,9 @@ class ExplorerPage:
         protocol.registerLinkProtocol(make_mouse(self.pictures, delivery))
 
     async def work(self) -> None:
-        """Do what the browser asks for, until cancelled or the explorer is closed."""
+        """Run the browser's actions until cancelled or the explorer is closed."""
         self._loop = asyncio.get_running_loop()
-        self._wake.set()  # a notebook's cells may have changed the explorer before
+        self._wake.set()  # a notebook cell may have changed the explorer before
         while True:
             await self._wake.wait()
             self._wake.clear()
@@ -108,44 +98,41 @@ class ExplorerPage:
                 await self._tell_working(True)
                 self._error = ""
             while self._waiting:
-                self._do(self._waiting.pop(next(iter(self._waiting))))
+                self._do(*self._waiting.pop(next(iter(self._waiting))))
             self._show()
             await self._tell_working(False)
 
-    def _do(self, action: Callable[[], object]) -> None:
-        with self.explorer.lock:
-            self._do_alone(action)
-
-    def _do_alone(self, action: Callable[[], object]) -> None:
+    def _do(self, action: Action, draws: bool = False) -> None:
+        """Run an action. `_show` renders afterwards; an action that `draws` needs pictures before: to save or time them."""
         plotter = self.explorer.plotter
-        # `_show` draws, once, unless a picture is needed before: to save it, or to see how long it takes
-        self._acting, plotter.suppress_rendering = True, not isinstance(action, _Drawing)
-        try:
-            action()
-        except ValueError as error:
-            self._error = str(error)
-        except Exception as error:  # a page that stops answering would tell less
-            log_.exception("the explorer's page could not do what was asked")
-            self._error = error_line(error)
-        finally:
-            self._acting, plotter.suppress_rendering = False, False
+        with self.explorer.lock:
+            self._acting, plotter.suppress_rendering = True, not draws
+            try:
+                action()
+            except ValueError as error:
+                self._error = str(error)
+            except Exception as error:  # show it: the page must go on
+                log_.exception("the explorer's page could not do what was asked")
+                self._error = error_line(error)
+            finally:
+                self._acting, plotter.suppress_rendering = False, False
 
     async def _tell_working(self, working: bool) -> None:
         with self.server.state as state:
             state.working = working
-        await asyncio.sleep(0)  # what was published is sent
+        await asyncio.sleep(0)  # lets trame send it
 
-    def _queue(self, key: str, action: Callable[[], object]) -> None:
+    def _queue(self, key: str, action: Action, draws: bool = False) -> None:
         self._waiting.pop(key, None)
-        self._waiting[key] = action
+        self._waiting[key] = action, draws
         self._wake.set()
 
     def _changed(self) -> None:
-        """The explorer has changed, by a cell of a notebook or by another page."""
+        """Called after each change of the explorer, for instance by a notebook cell or another page."""
         if not self._acting and self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._wake.set)
 
-    # What the browser sends. It may be anything: verbs check values, words are only words, and no path is among them.
+    # Events from the browser. They may hold anything: the explorer checks values, and none of them is used as a path.
 
     def _on_ask(self, words: object) -> None:
         said = str(words)
@@ -161,7 +148,7 @@ class ExplorerPage:
         self._queue("show", lambda: self.explorer.set_show(value))  # type: ignore[arg-type]
 
     def _on_set_style(self, value: object) -> None:
-        self._queue("style", _Drawing(lambda: self.explorer.set_style(value)))  # type: ignore[arg-type]
+        self._queue("style", lambda: self.explorer.set_style(value), draws=True)  # type: ignore[arg-type]
 
     def _on_hide(self, label: object, hidden: object) -> None:
         def action() -> None:
@@ -184,21 +171,21 @@ class ExplorerPage:
         self._queue("pick", action)
 
     def _on_save_picture(self) -> None:
-        self._queue("picture", _Drawing(lambda: self._say_saved([self.explorer.save_picture()])))
+        self._queue("picture", lambda: self._set_saved([self.explorer.save_picture()]), draws=True)
 
     def _on_save_selection(self) -> None:
-        self._queue("selection", lambda: self._say_saved(self.explorer.save_selection()))
+        self._queue("selection", lambda: self._set_saved(self.explorer.save_selection()))
 
     def _on_reset_view(self) -> None:
         self._queue("view", self._fit)
 
     def _resized(self) -> None:
-        """The panes have another shape: whoever has not turned them sees all of the scene again."""
+        """The panes changed shape: if the user has not turned the view, show the whole scene again."""
         if self.pictures.camera == self._fitted and not self._acting:
             self._do(self._fit)
 
     def _fit(self) -> None:
-        """The first view, from further away where panes are narrow: VTK fits the height."""
+        """Go to the first view, and move back if panes are narrow, because VTK fits the height."""
         self.explorer.reset_view()
         renderers = self.explorer.plotter.renderers
         width, height = renderers[0].GetSize()
@@ -218,10 +205,10 @@ class ExplorerPage:
         if _differs(distance_at, self._distance_at()):
             self._queue("distance", lambda: self.explorer.set_distance(low * (high / low) ** _share(distance_at)))
 
-    # What the page shows.
+    # The content of the page.
 
     def _fill(self) -> None:
-        """What does not change, and first values of what does."""
+        """Set the page's constants and first values."""
         from .options import Style
 
         state = self.explorer.state
@@ -231,7 +218,7 @@ class ExplorerPage:
             "names": list(dict.fromkeys(state.meaning.names)),
             "hint": state.meaning.names[0] if state.meaning.names else "",
             "has_color": "color" in state.sides,
-            "shows": [{"value": value, "title": TITLES.get(value, value)} for value in state.shows],
+            "shows": [{"value": value, "title": TITLES.get(value, value)} for value in state.show_choices],
             "styles": [{"value": value, "title": TITLES.get(value, value)} for value in get_args(Style)],
             "working": False,
             "gamma_at": 0.0,
@@ -258,7 +245,7 @@ class ExplorerPage:
             "saved": self._saved,
         })  # fmt: skip
         for name, here in (("gamma_at", self._gamma_at()), ("distance_at", self._distance_at())):
-            if _differs(page[name], here):  # an own position that is close enough stays under the hand
+            if _differs(page[name], here):  # a slider that is close enough stays where the user holds it
                 page[name] = here
 
     def _classes(self) -> list[dict[str, Any]]:
@@ -278,13 +265,13 @@ class ExplorerPage:
         ]
 
     def _show(self) -> None:
-        """Send what changed: numbers, then the picture."""
+        """Send the new numbers, then the new picture."""
         with self.server.state:
             self._write()
         self.pictures.changes += 1
         self.view.update()
 
-    def _say_saved(self, paths: list[Path]) -> None:
+    def _set_saved(self, paths: list[Path]) -> None:
         self._saved = "saved " + ", ".join(str(path) for path in paths)
 
     def _gamma_at(self) -> float:
@@ -297,7 +284,7 @@ class ExplorerPage:
         return min(max(log(self.explorer.state.distance / low) / log(high / low), 0.0), 1.0)
 
     def _lay_out(self) -> Any:
-        """The template (`page/page.html`) and the view of the clouds. Names of a scene travel as data, never as template."""
+        """Build the page from `page/page.html` and the view of the clouds. A scene's names are data, never template."""
         from trame.ui.html import DivLayout
         from trame.widgets import html
         from trame_vtk.widgets.vtk import VtkRemoteView
@@ -313,7 +300,6 @@ class ExplorerPage:
 
 
 def _label(value: object) -> int:
-    """A class from the browser."""
     if isinstance(value, bool) or not isinstance(value, int):
         raise ValueError(f"label: expected a whole number, got {str(value)[:40]!r}; reload the page")
     return value
@@ -331,7 +317,6 @@ def _share(value: object) -> float:
 
 
 def _number(name: str, text: object) -> float:
-    """What was typed into a field for numbers."""
     try:
         return float(str(text)[:40].replace(",", "."))
     except ValueError:

@@ -1,4 +1,4 @@
-"""The picture of the clouds on its way to the browser: drawn once for each change, however often it is asked for."""
+"""Pictures of the clouds for the browser: drawn once per change, however often they are requested."""
 
 from __future__ import annotations
 
@@ -17,50 +17,37 @@ if TYPE_CHECKING:
     import pyvista as pv
 
 Array = np.ndarray[Any, Any]
-LEAST = 10  # pixels: a tab in the background has no size
-MOST = 8192  # pixels: what any browser's window has
+LEAST = 10  # pixels: a tab in the background has size 0
+MOST = 8192  # pixels: no browser window is larger
 
 
 class Frame(NamedTuple):
-    """A picture and what it shows."""
+    """A picture, and the state that it shows."""
 
     key: tuple[Any, ...]
-    still: bool  # not drawn in the midst of a movement, when points may stand for Gaussians
+    still: bool  # the camera did not move; while it moves, points may replace Gaussians
     number: int
     picture: Array  # [H, W, 3] uint8
 
 
-class Camera(NamedTuple):
-    """What a view of VTK's depends on; its time stamp also counts clipping planes."""
-
-    position: tuple[float, ...]
-    focal_point: tuple[float, ...]
-    up: tuple[float, ...]
-    lens: tuple[float, ...]
-
-    @classmethod
-    def of(cls, renderer: Any) -> Camera:
-        """Of a renderer's active camera."""
-        camera = renderer.GetActiveCamera()
-        lens = (
-            camera.GetViewAngle(),
-            camera.GetParallelScale(),
-            camera.GetParallelProjection(),
-            *camera.GetWindowCenter(),
-        )
-        return cls(camera.GetPosition(), camera.GetFocalPoint(), camera.GetViewUp(), lens)
+def camera_key(renderer: Any) -> tuple[float, ...]:
+    """Everything that decides a renderer's view. VTK's time stamp of a camera would also count clipping planes."""
+    camera = renderer.GetActiveCamera()
+    pose = (*camera.GetPosition(), *camera.GetFocalPoint(), *camera.GetViewUp())
+    lens = (camera.GetViewAngle(), camera.GetParallelScale(), camera.GetParallelProjection(), *camera.GetWindowCenter())
+    return pose + lens
 
 
 class Pictures:
     """The latest picture of a plotter.
 
-    VTK's own web application draws twice for each picture: it encodes in another thread, sends the picture of before, and
+    VTK's own web application draws each picture twice: it encodes in another thread, sends the previous picture, and
     draws again to fetch the new one.
 
     Args:
-        plotter: what is drawn.
-        resized: called when the browser has changed the window's size, before it is drawn.
-        lock: held while something is drawn, as verbs of other threads hold it while they change what is drawn.
+        plotter: the plotter to draw.
+        resized: called before drawing if the browser changed the window's size.
+        lock: held while drawing; other threads hold it while they change the actors.
     """
 
     def __init__(self, plotter: pv.Plotter, resized: Callable[[], object], lock: AbstractContextManager[Any]) -> None:
@@ -73,15 +60,15 @@ class Pictures:
         return self.plotter.render_window is None
 
     @property
-    def camera(self) -> Camera:
-        """From where the clouds are seen."""
-        return Camera.of(self.plotter.renderers[0])
+    def camera(self) -> tuple[float, ...]:
+        """The current view."""
+        return camera_key(self.plotter.renderers[0])
 
     def now(self) -> Frame:
-        """The picture of now; drawn if anything has changed since the last, or that one was made while moving."""
+        """The current picture; drawn only if something changed, or the last one was drawn while the camera moved."""
         window: Any = self.plotter.render_window
         still = window.GetDesiredUpdateRate() < STILL
-        views = [(Camera.of(renderer), renderer.GetViewProps().GetMTime()) for renderer in self.plotter.renderers]
+        views = [(camera_key(renderer), renderer.GetViewProps().GetMTime()) for renderer in self.plotter.renderers]
         key = (self.changes, tuple(window.GetSize()), *views)
         last = self.frame
         if last is None or last.key != key or (still and not last.still):
@@ -97,19 +84,19 @@ def _draw(window: Any) -> Array:  # [H, W, 3] uint8
     window.Render()
     width, height = window.GetSize()
     pixels = vtkUnsignedCharArray()
-    window.GetPixelData(0, 0, width - 1, height - 1, 0, pixels, 0)  # of the back buffer, the left eye
+    window.GetPixelData(0, 0, width - 1, height - 1, 0, pixels, 0)  # back buffer, left eye
     return np.ascontiguousarray(vtk_to_numpy(pixels).reshape(height, width, 3)[::-1])
 
 
 def make_delivery(pictures: Pictures) -> Any:
-    """The protocol that sends pictures, in the place of trame-vtk's own."""
+    """The protocol that sends pictures, instead of trame-vtk's."""
     from trame_vtk.modules.vtk.protocols import vtkWebPublishImageDelivery
     from wslink import register
 
     class Delivery(vtkWebPublishImageDelivery):  # type: ignore[misc]
         def __init__(self) -> None:
             super().__init__(decode=False)
-            self.asked_for = False  # by someone who may have none yet
+            self.asked_for = False  # by a tab that may have no picture yet
 
         @register("viewport.image.push")
         def image_push(self, options: Any) -> None:

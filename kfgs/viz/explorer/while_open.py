@@ -1,4 +1,4 @@
-"""The decorator of the explorer's public methods: one thread at a time, and only while the explorer is open."""
+"""Decorator for the explorer's public methods: takes the lock, and raises if the explorer is closed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Concatenate, ParamSpec, Protocol, TypeVar
 
 
 class Closable(Protocol):
-    """An object with a lock that can be closed."""
+    """Something with a lock that can be closed."""
 
     lock: RLock  # type: ignore[valid-type]
 
@@ -24,11 +24,7 @@ Result = TypeVar("Result")
 
 
 def while_open(method: Callable[Concatenate[Owner, Given], Result]) -> Callable[Concatenate[Owner, Given], Result]:
-    """Let a method wait for those of other threads, and refuse a closed explorer before anything changes.
-
-    Raises:
-        RuntimeError: if the explorer is closed.
-    """
+    """Run a method under the explorer's lock; a RuntimeError if the explorer is closed."""
 
     @wraps(method)
     def act(self: Owner, /, *args: Given.args, **options: Given.kwargs) -> Result:

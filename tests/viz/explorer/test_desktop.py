@@ -82,11 +82,11 @@ def test_an_unknown_word_is_said_and_nothing_is_raised(desktop, capfd):
 
 def test_keys_choose_what_colours_stand_for(desktop):
     state = desktop.explorer.state
-    for number, show in enumerate(state.shows, start=1):
+    for number, show in enumerate(state.show_choices, start=1):
         press(desktop, str(number))
         assert state.show == show
-    press(desktop, str(len(state.shows) + 1))
-    assert state.show == state.shows[-1]
+    press(desktop, str(len(state.show_choices) + 1))
+    assert state.show == state.show_choices[-1]
 
 
 def test_a_verb_from_outside_is_shown(desktop):

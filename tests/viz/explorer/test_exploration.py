@@ -21,7 +21,7 @@ def test_the_colour_side_is_labelled_as_transfer_labels_does(distance):
     made.set_distance(distance)
     expected = transfer_labels(semantic, semantic.labels, color, distance)
     assert made.labels("color").tolist() == expected.labels.tolist()
-    assert made.facts()["color"]["orphaned"] == expected.orphaned
+    assert made.details()["color"]["orphaned"] == expected.orphaned
     made.ask("chair")
     scores = made.meaning.ask("chair").selection.scores
     reached = expected.sources >= 0
@@ -115,7 +115,7 @@ def test_the_same_splat_on_both_sides():
     assert made.labels("color").tolist() == [0, 1, -1, 3]
     made.ask("chair")
     assert made.selected("color").tolist() == [False, True, False, False]
-    for show in made.shows:
+    for show in made.show_choices:
         made.set_show(show)
         if show != "latents":
             assert made.colors("color").tolist() == made.colors("semantic").tolist()
@@ -174,7 +174,7 @@ def test_clouds_that_cannot_be_explored():
 def test_facts_are_json_and_lines_say_them():
     made = line()
     made.ask("chair")
-    facts = json.loads(json.dumps(made.facts(), allow_nan=False))
+    facts = json.loads(json.dumps(made.details(), allow_nan=False))
     assert facts["words"] == "chair"
     assert (facts["gamma"], facts["gamma_how"]) == (0.0, "all of the class")
     assert (facts["lambda"], facts["lambda_how"], facts["by"]) == (1.0, "given", "the file's classes and scores")

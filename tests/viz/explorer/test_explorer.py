@@ -158,7 +158,7 @@ def test_a_closed_explorer_refuses_all_verbs_alike(tmp_path):
     explorer.ask("chair")
     explorer.close()
     assert explorer.closed
-    before = explorer.state.facts()
+    before = explorer.state.details()
     verbs = {
         "ask": ["sofa"],
         "set_gamma": [0.9],
@@ -177,7 +177,7 @@ def test_a_closed_explorer_refuses_all_verbs_alike(tmp_path):
         message = ("explorer:", name, "explore(")
         with pytest.raises(RuntimeError, match=tells(*message)):
             getattr(explorer, name)(*arguments)
-    assert explorer.state.facts() == before
+    assert explorer.state.details() == before
     assert not (tmp_path / "view").exists()
     explorer.set_legend(False)  # what a page does when it ends
     assert explorer.lines()[0].startswith("'chair': score >")
@@ -213,7 +213,7 @@ def test_who_waits_for_the_end_is_told_once():
 
 def test_verbs_of_two_threads_leave_a_window_that_draws(monkeypatch):
     """Without a lock the second finds drawing suppressed by the first, and leaves it so."""
-    inside, both, exchange = Event(), Event(), Explorer._exchange
+    inside, both, exchange = Event(), Event(), Explorer._update_panes
 
     def slowly(self):
         if not inside.is_set():
@@ -225,7 +225,7 @@ def test_verbs_of_two_threads_leave_a_window_that_draws(monkeypatch):
         exchange(self)
 
     with an_explorer() as explorer:  # of which no frame was drawn yet
-        monkeypatch.setattr(Explorer, "_exchange", slowly)
+        monkeypatch.setattr(Explorer, "_update_panes", slowly)
         one = Thread(target=explorer.ask, args=["chair"])
         two = Thread(target=explorer.ask, args=["sofa"])
         one.start()

@@ -31,7 +31,7 @@ def test_a_selection_is_saved_and_read_again(tmp_path):
         torch.testing.assert_close(read.gaussians.means, made.cloud(side).means[mask])
         np.testing.assert_allclose(read.extra["score"], made.scores(side)[mask], rtol=1e-6)
     facts = json.loads(paths[0].read_text())
-    assert {key: value for key, value in facts.items() if key != "parts"} == made.facts()
+    assert {key: value for key, value in facts.items() if key != "parts"} == made.details()
     expected = connected_parts(made.cloud("color"), made.selection("color"), cameras())
     assert facts["parts"]["color"] == [part.to_json() for part in expected]
     assert facts["parts"]["color"][0]["best_view"]["camera"].startswith("view_")

@@ -31,7 +31,7 @@ def test_colours_of_labels_and_scores():
 
 def test_colours_of_the_other_side_and_of_latents():
     made = line()
-    assert made.shows == ("labels", "rgb", "latents", "score")
+    assert made.show_choices == ("labels", "rgb", "latents", "score")
     made.set_show("rgb")
     assert made.colors("color").tolist() == [[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 0], [0, 0, 0]]
     assert made.colors("semantic").tolist() == [[255, 0, 0], [0, 0, 255], [255, 255, 0]]  # the nearest one's
@@ -55,7 +55,7 @@ def test_latents_that_were_never_learnt_are_grey():
 
 def test_what_no_cloud_has_cannot_be_shown():
     plain = Exploration(SplatMeaning(splat_file(cloud(torch.eye(3), [0, 1, 2]))))
-    assert (plain.sides, plain.shows) == (("semantic",), ("labels", "score"))
+    assert (plain.sides, plain.show_choices) == (("semantic",), ("labels", "score"))
     with pytest.raises(ValueError, match=tells("show:", "labels, score", "harmonics", "got 'rgb'")):
         plain.set_show("rgb")
     with pytest.raises(ValueError, match=tells("show:", "no cloud has features", "got 'latents'")):
@@ -67,15 +67,15 @@ def test_what_no_cloud_has_cannot_be_shown():
     bare = Exploration(SplatMeaning(splat_file(cloud(torch.eye(3), [0, 1, 2], sh=torch.zeros(3, 1, 3)))), cloud(LINE))
     bare.set_show("rgb")
     assert bare.colors("color").tolist() == [[128, 128, 128]] * 4  # sh of 0 is a middle grey
-    assert "latents" not in bare.shows
+    assert "latents" not in bare.show_choices
 
 
 def test_none_labelled_leaves_the_colour_side_grey():
     made = Exploration(SplatMeaning(splat_file(cloud(LINE, [-1] * 4, features=torch.eye(4)))), cloud(LINE))
-    for show in made.shows:
+    for show in made.show_choices:
         made.set_show(show)
         assert made.colors("color").tolist() == [GREY] * 4
-    assert made.facts()["color"]["orphaned"] == 4
+    assert made.details()["color"]["orphaned"] == 4
     assert made.pick("color", 1).source is None
     made.ask("chair")
     assert not made.selected("semantic").any()

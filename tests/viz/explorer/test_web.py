@@ -111,10 +111,10 @@ def test_listening_to_others_is_told_and_trame_forgets_the_server(explorer, monk
     opened = []
     monkeypatch.setattr(web.webbrowser, "open", opened.append)
     monkeypatch.setattr(web, "has_display", lambda: False)
-    serve(explorer, say=lambda _: None)
+    serve(explorer, report=lambda _: None)
     assert opened == []  # no browser within the terminal
     monkeypatch.setattr(web, "has_display", lambda: True)
-    serve(explorer, host="0.0.0.0", say=said.append)
+    serve(explorer, host="0.0.0.0", report=said.append)
     assert said[0] == f"the explorer is open at {opened[0]}"
     assert "everyone who reaches it and has the link can look, steer, and save" in said[1]
     assert str(explorer.options.out) in said[1]
