@@ -80,7 +80,7 @@ def test_range_and_its_ends(value, closed, good):
 
 @pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
 def test_range_without_an_end_is_still_finite(value):
-    with pytest.raises(ValueError, match=tells("distance:", "(-inf, inf)")):
+    with pytest.raises(ValueError, match=tells("distance:", "(-inf, inf)", f"got {value}")):
         check_range("distance", value, -math.inf)
 
 
@@ -92,7 +92,7 @@ def test_range_prints_an_endless_side_as_open():
 @pytest.mark.parametrize("value", [2.0, 2.5, math.nan, True, "2"])
 def test_whole_numbers_are_integers(value):
     check_whole("epochs", 2, 1)
-    with pytest.raises(ValueError, match=tells("epochs:", "whole number", "int")):
+    with pytest.raises(ValueError, match=tells("epochs:", "whole number", f"got {value!r}")):
         check_whole("epochs", value, 1)
     with pytest.raises(ValueError, match=tells("epochs:", "[1, inf)", "got 0")):
         check_whole("epochs", 0, 1)

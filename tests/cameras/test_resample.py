@@ -116,5 +116,5 @@ def test_resample_refusals():
     with pytest.raises(TypeError, match=tells("labels:", "got torch.float32", "resize_map")):
         resize_labels(torch.zeros(4, 5), (2, 2))
     for size in ((0, 2), (2.5, 2), (1, 2, 3)):
-        with pytest.raises(ValueError, match=tells("size:", "(height, width)")):
+        with pytest.raises(ValueError, match=tells("size:", "(height, width)", f"got {size}")):
             resize_map(torch.zeros(4, 5, 1), size)

@@ -324,7 +324,7 @@ def test_foreign_maps_that_were_given_up_do_not_pass_for_ours_when_the_call_dies
     with pytest.raises(KeyboardInterrupt):
         extract_features(_Broken(dies), pictures, folder, overwrite=True)  # at the second
     assert np.load(folder / "b.npy").max() == 7
-    with pytest.raises(ValueError, match=tells("b.npy: expected a map that features.json lists")):
+    with pytest.raises(ValueError, match=tells("b.npy:", "features.json")):
         FeatureFolder(folder, ["a", "b"])
     extract_features(Counting(), pictures, folder)
     assert FeatureFolder(folder, ["a", "b"])[1].max() < 7
@@ -473,7 +473,7 @@ def test_bad_requests_are_refused_before_any_work(pictures, tmp_path):
     with pytest.raises(ValueError, match=tells("pictures", "each stem once", "a", "rename")):
         extract_features(teacher, [pictures[0], pictures[0]], tmp_path / "maps")
     for stem in ("../a", "/a", ""):
-        with pytest.raises(ValueError, match=tells("stem:", "folder", "rename")):
+        with pytest.raises(ValueError, match=tells("stem:", f"got {stem!r}", "rename")):
             extract_features(teacher, [Picture(stem, pictures[0].path)], tmp_path / "maps")
     with pytest.raises(FileNotFoundError, match=tells("gone.png:", "'gone'")):
         extract_features(teacher, [Picture("gone", tmp_path / "gone.png")], tmp_path / "maps")

@@ -132,7 +132,7 @@ def test_a_file_that_is_no_tensor_is_refused(tmp_path):
     with pytest.raises(TypeError, match=tells("a_fmap_CxHxW.pt:", "tensor", "got a dict")):
         FeatureFolder(tmp_path, ["a"])[0]
     save_pt(tmp_path, "s", features(0).to_sparse())
-    with pytest.raises(ValueError, match=tells("s_fmap_CxHxW.pt", "something else than dense tensors", "sparse")):
+    with pytest.raises(ValueError, match=tells("s_fmap_CxHxW.pt", "dense tensors", "sparse")):
         FeatureFolder(tmp_path, ["s"])[0]
     save_pt(tmp_path, "b", features(0).long())
     with pytest.raises(ValueError, match=tells("b_fmap_CxHxW.pt:", "got torch.int64")):
@@ -420,13 +420,13 @@ def test_masks_of_three_things_make_a_codebook_of_three(tmp_path):
 def test_a_map_among_kfgss_own_that_the_manifest_does_not_tell_of_is_refused(tmp_path):
     records = {stem: own_map(tmp_path, stem, features(i)) for i, stem in enumerate(("a", "b"))}
     Manifest({"name": "t"}, {"a": records["a"]}).save(tmp_path)
-    said = tells("b.npy: expected a map that features.json lists", "without a record", "(1 of 2 views)", "move it away")
+    said = tells("b.npy:", "features.json", "without a record", "(1 of 2 views)", "move it away")
     for stems in (["a", "b"], ["b", "a"], None):
         with pytest.raises(ValueError, match=said):
             _ = FeatureFolder(tmp_path, stems).files
     assert torch.equal(FeatureFolder(tmp_path, ["a"])[0], features(0).half().float())  # nobody asked for b
     save_pt(tmp_path, "a", features(2).permute(2, 0, 1))  # read before .npy
-    with pytest.raises(ValueError, match=tells("a_fmap_CxHxW.pt: expected a map that features.json lists")):
+    with pytest.raises(ValueError, match=tells("a_fmap_CxHxW.pt:", "features.json")):
         FeatureFolder(tmp_path, ["a"])
 
 
@@ -463,7 +463,7 @@ def test_a_map_saved_by_a_training_run_needs_no_gradient(tmp_path):
 def test_a_map_that_repeats_a_few_bytes_is_refused(tmp_path):
     save_pt(tmp_path, "a", torch.ones(1, 1, 1).expand(100_000, 100_000, 10_000))  # 4 bytes on disk, 400 TB read
     assert (tmp_path / "a_fmap_CxHxW.pt").stat().st_size < 4000
-    said = ("a_fmap_CxHxW.pt: expected a feature map", "its values are repeated by strides", "save it contiguous")
+    said = ("a_fmap_CxHxW.pt:", "strides", "contiguous")
     with pytest.raises(ValueError, match=tells(*said)):
         FeatureFolder(tmp_path, ["a"])[0]
 

@@ -137,13 +137,16 @@ def test_empty_clouds_survive_the_file(tmp_path, degree):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"f_rest_44": None}, ("f_rest_0", "f_rest_1", "24", "45", "got 44", "f_rest_*")),
-        ({"f_rest_7": None}, ("f_rest_7", "f_rest_44", "got none", "f_rest_*")),
-        ({"f_rest_7": None, "f_rest_x": "f_rest_7"}, ("f_rest_7", "f_rest_x", "got none")),
-        ({"f_dc_1": None}, ("f_dc_1", "f_dc_2", "got none")),
-        ({"f_dc_2": None}, ("f_dc_0", "f_dc_1", "got 2", "f_dc_*")),
-        ({"f_dc_0": None, "f_dc_1": None, "f_dc_2": None}, ("f_rest_*", "f_dc_0", "f_dc_2", "got 0", "f_dc_*")),
-        ({"semantic_3": None}, ("semantic_3", "semantic_8", "got none")),
+        ({"f_rest_44": None}, ("columns:", "f_rest_0, f_rest_1, ", "24", "45", "got 44", "f_rest_*")),
+        ({"f_rest_7": None}, ("columns:", "f_rest_7", "f_rest_44", "got none", "f_rest_*")),
+        ({"f_rest_7": None, "f_rest_x": "f_rest_7"}, ("columns:", "f_rest_7", "f_rest_x", "got none")),
+        ({"f_dc_1": None}, ("columns:", "f_dc_1", "f_dc_2", "got none")),
+        ({"f_dc_2": None}, ("columns:", "f_dc_0, f_dc_1, ", "got 2", "f_dc_*")),
+        (
+            {"f_dc_0": None, "f_dc_1": None, "f_dc_2": None},
+            ("columns:", "f_rest_*", "f_dc_0", "f_dc_2", "got 0", "f_dc_*"),
+        ),
+        ({"semantic_3": None}, ("columns:", "semantic_3", "semantic_8", "got none")),
     ],
 )
 def test_odd_columns_are_named(changes, message):

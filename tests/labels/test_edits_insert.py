@@ -133,7 +133,7 @@ def test_wrong_input_is_named(tmp_path):
     with pytest.raises(TypeError, match=tells("source:", "SplatFile", "got ''")):
         Insert("")
     for impossible in ("a\0b", "\ud800"):
-        with pytest.raises(ValueError, match=tells("source:", "path", "rename")):
+        with pytest.raises(ValueError, match=tells("source:", f"got {impossible!r}", "rename")):
             Insert(impossible)
     with pytest.raises(TypeError, match=tells("similarity:", "got Tensor", "Similarity(")):
         Insert("a.ply", torch.eye(4))

@@ -30,18 +30,17 @@ def test_several_labels_of_one_name():
 @pytest.mark.parametrize(
     ("name", "near"),
     [
-        ("chiar", "did you mean 'chair'"),
-        ("chairs", "did you mean 'chair' or 'armchair'"),
-        ("window blinds", "did you mean 'Window blind'"),
-        ("blind", "did you mean 'Window blind'"),
-        ("zebra", "add its embedding to the classes"),
-        ("", "add its embedding to the classes"),
+        ("chiar", "'chair'"),
+        ("chairs", "'chair' or 'armchair'"),
+        ("window blinds", "'Window blind'"),
+        ("blind", "'Window blind'"),
+        ("zebra", "embedding"),
+        ("", "embedding"),
     ],
 )
 def test_an_unknown_name_meets_the_near_ones(name, near):
-    with pytest.raises(ValueError, match=tells("class:", "wall, Window blind, chair, armchair")) as caught:
+    with pytest.raises(ValueError, match=tells("class:", "wall, Window blind, chair, armchair", f"got {name!r}", near)):
         class_index(name, NAMES)
-    assert near in str(caught.value)
 
 
 def test_a_long_list_is_cut_and_no_names_are_named():

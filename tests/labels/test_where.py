@@ -196,7 +196,7 @@ def nested(depth):
         ({"kind": "both", "parts": []}, ("where.parts:", "got ()")),
         ({"kind": "either", "parts": [{"kind": "class", "name": []}]}, ("where.parts[0].name:", "got []")),
         ({"kind": "component", "where": {"kind": "everything"}, "rank": -1}, ("where.rank:", "got -1")),
-        (nested(40), ("32", "got more")),
+        (nested(40), ("32 levels", "got more")),
     ],
 )
 def test_json_of_others_is_refused_with_the_place(value, message):

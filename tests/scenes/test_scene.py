@@ -122,7 +122,7 @@ def test_select_by_split_name_stem_and_index(tmp_path: Path) -> None:
     for order in (range(1, 3), torch.tensor([1, 2]), np.array([1, 2])):
         assert scene.select(order).splits == {"train": [0], "test": [1]}
     for which, message in (
-        ("val", ("['test', 'train']", "got 'val'", "list")),
+        ("val", ("which:", "['test', 'train']", "got 'val'", "list")),
         (["rgb_1"], ("which:", "got 'rgb_1'", "'rgb_0.png'")),
         ([3], ("which:", "3 views", "got 3")),
         ([-1], ("which:", "3 views", "got -1")),

@@ -70,7 +70,7 @@ def test_images_that_share_nothing_are_refused(tmp_path: Path) -> None:
 
 def test_a_split_scene_is_refused_with_counts_and_advice() -> None:
     names = [str(i) for i in range(90)]
-    message = ("81 of 90", "72, 19", "matching='exhaustive'")
+    message = ("images:", "81 of 90", "72, 19", "matching='exhaustive'")
     with pytest.raises(SceneError, match=tells(*message)):
         _require_one_model(Path("images"), (72, 19), names, SfmConfig(matching="sequential"))
     _require_one_model(Path("images"), (81, 9), names, SfmConfig())

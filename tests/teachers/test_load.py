@@ -141,10 +141,10 @@ def test_modules_are_found_beside_the_command_but_the_path_stays(write):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("def f(:\n", ("got 'mine:f'", "(SyntaxError: ", "mine.py, line 1")),
-        ("raise RuntimeError('no GPU\\nat all')\n", ("got 'mine:f'", "(RuntimeError: no GPU)")),
-        ("import sys\nsys.exit(3)\n", ("got 'mine:f'", "(SystemExit: 3)")),
-        ("import absent_package\n", ("got 'mine:f'", "'absent_package'")),
+        ("def f(:\n", ("teacher:", "got 'mine:f'", "(SyntaxError: ", "mine.py, line 1")),
+        ("raise RuntimeError('no GPU\\nat all')\n", ("teacher:", "got 'mine:f'", "(RuntimeError: no GPU)")),
+        ("import sys\nsys.exit(3)\n", ("teacher:", "got 'mine:f'", "(SystemExit: 3)")),
+        ("import absent_package\n", ("teacher:", "got 'mine:f'", "'absent_package'")),
         (
             "f = 3\n",
             ("got int", "'mine:f'", "encode_image", "encode_text", "kfgs.teachers.Teacher"),
@@ -164,7 +164,7 @@ def test_a_class_that_does_not_take_the_options_is_named(write):
         ValueError, match=tells("weights, options:", "'mine:Scaled'", "(factor)", "got nothing (missing")
     ):
         load_teacher("mine:Scaled")
-    words = ("'factor'", "got weights, factor")
+    words = ("weights, options:", "'factor'", "got weights, factor")
     with pytest.raises(ValueError, match=tells(*words)):
         load_teacher("mine:Scaled", "w.pt", factor=2)
     with pytest.raises(ValueError, match=tells("weights, options:", "got size (")):

@@ -111,7 +111,7 @@ def test_rows_of_a_teacher_in_inference_mode_can_be_trained_with():
         (["wall", "wall;side"], {}, ("names:", "got 'wall'")),
         (["wall"], {"synonyms": {"wal": ["side"]}}, ("synonyms:", "'wal'")),
         (["wall"], {"synonyms": {"wall": "side"}}, ("synonyms:", "'wall'", "got 'side'")),
-        (["wall"], {"templates": "clip8"}, ("got 'clip8'", "'clip7'")),
+        (["wall"], {"templates": "clip8"}, ("templates:", "got 'clip8'", "'clip7'")),
         (["wall"], {"templates": ("{}", "a photo")}, ("templates:", "{}", "got 'a photo'")),
         (["wall"], {"templates": ()}, ("templates:", "bare, clip7, tcl9, siglip", "got 'none'")),
     ],

@@ -471,5 +471,5 @@ def test_torch_reads_the_pickle_that_was_checked(tmp_path: Path, container) -> N
     with zipfile.ZipFile(tmp_path / "a.pt") as seen:
         assert seen.read("x/data.pkl") == good
     assert torch._C.PyTorchFileReader(str(tmp_path / "a.pt")).get_record("data.pkl") == evil
-    with pytest.raises(TorchFileError, match=tells("two readers read differently")):
+    with pytest.raises(TorchFileError, match=tells("two readers")):
         load_torch_file(tmp_path / "a.pt")

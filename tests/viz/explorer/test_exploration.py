@@ -140,11 +140,11 @@ def test_numbers_out_of_range():
         made.set_gamma(0.5)
     made.ask("chair")
     for gamma in (-0.1, 1.1, float("nan")):
-        with pytest.raises(ValueError, match=tells("gamma:", "number in [")):
+        with pytest.raises(ValueError, match=tells("gamma:", f"got {gamma}")):
             made.set_gamma(gamma)
     assert made.gamma == 0.0
     for distance in (0.0, -1.0, float("inf"), float("nan")):
-        with pytest.raises(ValueError, match=tells("distance:", "(0, inf)")):
+        with pytest.raises(ValueError, match=tells("distance:", "(0, inf)", f"got {distance}")):
             made.set_distance(distance)
     with pytest.raises(ValueError, match=tells("labels:", "[-1, 3]", "got 4")):
         made.set_hidden([1, 4])
