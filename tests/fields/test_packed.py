@@ -4,8 +4,9 @@ import pytest
 import torch
 import zstandard
 
-from kfgs.fields import SemanticField, pack_field, unpack_field
+from kfgs.fields import SemanticField, pack_field
 from kfgs.fields import packed as packed_module
+from kfgs.fields.packed import unpack_field
 from kfgs.formats.smallest_three import rotation_error
 from kfgs.gaussians import Gaussians
 from kfgs.quant import LinearLatents

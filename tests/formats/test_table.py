@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from kfgs.formats import SplatFile, find_format, formats, morton_order, read_splats, write_splats
+from kfgs.formats import SplatFile, find_format, formats, read_splats, write_splats
 from kfgs.formats import table as module_table
+from kfgs.formats.order import morton_order
 from kfgs.formats.sidecar import labels_path, names_path
 from kfgs.gaussians import Gaussians
 

@@ -2,7 +2,7 @@ import oracles_quant as oracle
 import pytest
 import torch
 
-from kfgs.quant import class_balanced_loss
+from kfgs.quant.loss import class_balanced_loss
 
 
 def example(seed=0, n=30, K=6, dim=5):

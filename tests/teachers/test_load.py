@@ -7,8 +7,9 @@ import sys
 import pytest
 import torch
 
-from kfgs.teachers import Teacher, embed_labels, identify
+from kfgs.teachers import Teacher, identify
 from kfgs.teachers.load import load_teacher, teacher_names
+from kfgs.teachers.prompts import embed_labels
 
 CLASS = (
     "import torch\n"

@@ -3,7 +3,8 @@ import pytest
 import torch
 from oracles_palette import OKABE_ITO, make_palette, worst_distance
 
-from kfgs.viz import PALETTE, palette
+from kfgs.viz import palette
+from kfgs.viz.palette import PALETTE
 
 
 def test_table_follows_its_recipe():
