@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from torch import Tensor
 
-from .._card import html_card, short_value
+from .._card import html_card, short_repr, short_value
 from ..gaussians import Gaussians
 from .ply import Columns
 
@@ -82,6 +82,9 @@ class Written(NamedTuple):
     lost: tuple[str, ...]  # what the format could not hold, in words
     order: Tensor | None  # [N] int64: row i of the file is Gaussian order[i] of the cloud; None: the cloud's own order
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 class Precision(NamedTuple):
     """How far a value may be off after it was written and read again. Each format states it, and the tests hold it to that."""
@@ -93,3 +96,6 @@ class Precision(NamedTuple):
     sh0: float  # absolute, of the degree-0 coefficients
     sh_rest: float  # absolute, of the higher coefficients
     degree: int = 3  # highest degree of spherical harmonics that it holds
+
+    def __repr__(self) -> str:
+        return short_repr(self)

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..._card import short_repr
 from ...cameras import Camera
 from ...formats import SplatFile
 from ...formats.splat_file import SCORE
@@ -39,6 +40,9 @@ class Asked(NamedTuple):
     high: float  # the largest: 1, or the largest score
     known: bool  # one of the classes
     valid: Tensor  # [N] bool, whether anything is known of a Gaussian; the others are never selected
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 class Meaning(Protocol):
