@@ -17,7 +17,7 @@ from kfgs import read_splats
 from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
 from kfgs.labels import EditList, InBox, OfClass, Recolor, Remove, Where, connected_parts
-from kfgs.pipeline import render_color
+from kfgs.pipeline.compare import render_color
 from kfgs.scenes import Scene, load_scene
 from kfgs.viz.pictures import picture_grid
 

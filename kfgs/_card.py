@@ -8,6 +8,7 @@ from html import escape
 from typing import Any
 
 LONGEST = 100  # characters of one value in a line
+LINE = 199  # characters of a whole line: two lines of a terminal
 STYLE = "text-align:left;padding:1px 10px 1px 0"  # notebooks centre cells by default
 
 
@@ -32,7 +33,7 @@ def html_card(title: str, facts: Mapping[str, object]) -> str:
 
 
 def short_repr(thing: Any) -> str:
-    """A line for `__repr__` of a dataclass or a named tuple: its fields, tensors by shape and type only.
+    """A line for `__repr__` of a dataclass or a named tuple: its fields, tensors by shape and type only; at most `LINE` long.
 
     Fields that are None, and fields declared with `repr=False`, are left out.
 
@@ -48,7 +49,7 @@ def short_repr(thing: Any) -> str:
     names = [field.name for field in fields(thing) if field.repr] if is_dataclass(thing) else thing._fields
     values = {name: getattr(thing, name) for name in names}
     inside = ", ".join(f"{name}={short_value(value)}" for name, value in values.items() if value is not None)
-    return f"{type(thing).__name__}({inside})"
+    return _cut(f"{type(thing).__name__}({inside})", LINE)
 
 
 def short_value(value: object) -> str:
@@ -63,7 +64,11 @@ def short_value(value: object) -> str:
         device = str(getattr(value, "device", "cpu"))
         return f"{list(shape)} {value.dtype}".replace("torch.", "") + ("" if device == "cpu" else f" on {device}")
     if isinstance(value, Mapping):
-        return f"{len(value)} entries" if len(value) > 3 else _cut(", ".join(f"{k}: {v!r}" for k, v in value.items()))
+        return (
+            f"{len(value)} entries"
+            if len(value) > 3
+            else _cut(", ".join(f"{k}: {short_value(v)}" for k, v in value.items()))
+        )
     if isinstance(value, list | tuple) and not hasattr(value, "_fields"):
         simple = len(value) <= 4 and all(isinstance(item, str | int | float) for item in value)
         kinds = sorted({type(item).__name__ for item in value})
@@ -75,6 +80,6 @@ def _plain(value: object) -> str:
     return _cut(value) if isinstance(value, str) else f"{value:,}" if type(value) is int else short_value(value)
 
 
-def _cut(text: str) -> str:
+def _cut(text: str, longest: int = LONGEST) -> str:
     line = " ".join(text.split())
-    return line if len(line) <= LONGEST else line[: LONGEST - 3] + "..."
+    return line if len(line) <= longest else line[: longest - 3] + "..."

@@ -1,5 +1,12 @@
+import builtins
 import importlib
-from dataclasses import dataclass, field
+import inspect
+import pkgutil
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -7,6 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import kfgs
 from kfgs import Autoencoder, Camera, Codebook, Gaussians, SemanticField, rasterize
 from kfgs._card import LONGEST, html_card, short_repr, short_value
 from kfgs.quant import CodebookFit, LinearLatents, Nearest
@@ -117,3 +125,108 @@ def test_lines_stay_short_and_cards_are_tables():
         assert card.startswith("<table>")
         assert all(fact in card for fact in facts)
         assert len(card) < 2_000
+
+
+class Anything(type):
+    """What stands for names that are imported for type checkers alone: it has every attribute."""
+
+    def __getattr__(cls, name):
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return cls
+
+
+class Nothing(metaclass=Anything):
+    pass
+
+
+class Names(dict):
+    """The names that the annotations of a module are read with."""
+
+    def __missing__(self, name):
+        return getattr(builtins, name, Nothing)
+
+
+BOX = kfgs.labels.OrientedBox(torch.zeros(3), torch.eye(3), torch.ones(3))
+KNOWN = {
+    Camera: Camera(torch.eye(4), torch.eye(3), 4, 3, name="view.png"),
+    kfgs.Similarity: kfgs.Similarity.identity(),
+    kfgs.labels.Part: kfgs.labels.Part(torch.arange(40), 1.0, torch.ones(3), BOX, (torch.ones(3),) * 2, None, "name"),
+    str: "name",
+    Path: Path("/a/folder/name"),
+}
+
+
+def field_names(kind):
+    return [one.name for one in fields(kind)] if is_dataclass(kind) else list(getattr(kind, "_fields", ()))
+
+
+def made_up(kind):
+    """A value of an annotated type. Tensors and arrays have 120 numbers; objects are not checked, but filled in."""
+    origin, inside = typing.get_origin(kind), typing.get_args(kind)
+    if kind in KNOWN:
+        return KNOWN[kind]
+    if Tensor in (kind, origin) or np.ndarray in (kind, origin):
+        return torch.rand(40, 3) if kind is Tensor else np.random.default_rng(0).random((40, 3))
+    if origin in (typing.Annotated, typing.Union, types.UnionType):
+        return made_up(Tensor if Tensor in inside else inside[0])
+    if origin is typing.Literal:
+        return inside[0]
+    if origin is tuple:
+        return tuple(made_up(one) for one in (inside[:1] * 3 if inside[-1] is Ellipsis else inside))
+    if inspect.isclass(origin) and issubclass(origin, Mapping):
+        return {f"name {i}": made_up(inside[1]) for i in range(3)}
+    if inspect.isclass(origin) and issubclass(origin, Sequence):
+        return [made_up(inside[0])] * 3
+    if kind in (int, float, bool):
+        return kind(1)
+    return filled(kind) if inspect.isclass(kind) and kind.__module__.startswith("kfgs") and field_names(kind) else None
+
+
+def filled(kind):
+    hints = typing.get_type_hints(kind, {}, Names(vars(importlib.import_module(kind.__module__))))
+    values = {name: made_up(hints[name]) for name in field_names(kind)}
+    if hasattr(kind, "_make"):
+        return kind._make(values.values())
+    thing = object.__new__(kind)
+    for name, value in values.items():
+        object.__setattr__(thing, name, value)
+    return thing
+
+
+def holds_numbers(value):
+    """Whether a tensor or an array lies in it, at any depth."""
+    if isinstance(value, Mapping):
+        return any(map(holds_numbers, value.values()))
+    if isinstance(value, list | tuple):
+        return any(map(holds_numbers, value))
+    inside = is_dataclass(value) and any(holds_numbers(getattr(value, name)) for name in field_names(value))
+    return inside or isinstance(value, Tensor | np.ndarray)
+
+
+def kinds():
+    """The dataclasses and named tuples of all files of kfgs whose libraries are installed, without those of the engines."""
+    for entry in pkgutil.walk_packages(kfgs.__path__, "kfgs."):
+        if ".engines" in entry.name or entry.name == "kfgs.__main__":
+            continue
+        try:
+            module = importlib.import_module(entry.name)
+        except ImportError:  # an extra
+            continue
+        for name, kind in vars(module).items():
+            own = inspect.isclass(kind) and kind.__module__ == module.__name__ and not inspect.isabstract(kind)
+            if own and field_names(kind) and not name.startswith("_"):
+                yield kind
+
+
+def test_every_object_with_tensors_shows_itself_in_a_short_line():
+    seen, long = 0, []
+    for kind in kinds():
+        thing = KNOWN.get(kind) or filled(kind)
+        if holds_numbers(thing):
+            seen += 1
+            line = repr(thing)
+            if len(line) >= 200 or "\n" in line:
+                long.append(f"{kind.__module__}.{kind.__name__}: {line[:80]}")
+    assert seen > 60
+    assert long == []

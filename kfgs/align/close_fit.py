@@ -9,6 +9,7 @@ import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from .._card import short_repr
 from ..cameras.similarity import Similarity
 from .clouds import Array, median_spacing, nearest, nearest_rotation, robust_weights, to_similarity
 from .starts import thin
@@ -32,6 +33,9 @@ class Cloud(NamedTuple):
     normals: Array  # [n, 3]
     tree: cKDTree
     spacing: float
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
     @staticmethod
     def of(points: Array, count: int, rng: np.random.Generator) -> Cloud:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from .._card import short_repr
 from .clouds import Array, nearest, robust_weights
 
 GRID = 40  # cells along a side of the lookup grid: 64,000 nearest points, found once in a tenth of a second
@@ -24,6 +25,9 @@ class Moves(NamedTuple):
     rotations: Array  # [S, 3, 3]
     scales: Array  # [S]
     translations: Array  # [S, 3]
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
     @staticmethod
     def of(rotations: Array, scales: Sequence[float]) -> Moves:

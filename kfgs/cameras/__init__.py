@@ -1,7 +1,6 @@
 """Posed cameras, paths of cameras, projection, lens distortion and resampling, carried by kornia."""
 
 from .camera import Camera, Distortion
-from .distortion import fold_radius
 from .kornia_camera import from_kornia, to_kornia
 from .orbits import Orbit, estimate_up, orbit_cameras
 from .paths import path_cameras
@@ -18,7 +17,6 @@ __all__ = [
     "camera_to_pixel",
     "estimate_up",
     "fit_similarity",
-    "fold_radius",
     "from_kornia",
     "orbit_cameras",
     "path_cameras",

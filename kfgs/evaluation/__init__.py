@@ -1,17 +1,13 @@
 """Scores that carry the name of their protocol."""
 
 from ..labels.label_set import LabelSet, load_label_set
-from .color import ColorReport, score_views
-from .editing import RecolorReport, RemovalReport, score_recolor, score_removal
-from .segmentation import PROTOCOL, SegmentationReport, evaluate_segmentation, load_label_map
+from .color import score_views
+from .editing import score_recolor, score_removal
+from .segmentation import SegmentationReport, evaluate_segmentation, load_label_map
 from .surface_density import surface_density
 
 __all__ = [
-    "PROTOCOL",
-    "ColorReport",
     "LabelSet",
-    "RecolorReport",
-    "RemovalReport",
     "SegmentationReport",
     "evaluate_segmentation",
     "load_label_map",

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._card import short_repr
 from .._files import read_json
 from ..cameras.camera import Camera
 from ..scenes.load import load_scene
@@ -28,6 +29,9 @@ class TrueView(NamedTuple):
     inside: Tensor  # [H, W] bool: the class is seen here
     far: Tensor  # [H, W] bool: neither here nor within BORDER pixels
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 @dataclass(frozen=True, eq=False)
 class SceneTruth:
@@ -40,6 +44,8 @@ class SceneTruth:
     """The views that are looked at."""
     pixels: int
     """How many of their pixels show the class."""
+
+    __repr__ = short_repr
 
     @staticmethod
     def open(folder: str | Path, name: str, split: str) -> SceneTruth:

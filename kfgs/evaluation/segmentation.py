@@ -12,6 +12,7 @@ import torch
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
+from .._card import short_repr
 from ..cameras import resize_labels
 from ..metrics import ConfusionMatrix, Score
 
@@ -54,6 +55,8 @@ class SegmentationReport:
     miou: Score
     accuracy: Score
     views: int
+
+    __repr__ = short_repr
 
     def __str__(self) -> str:
         rows = [f"{self.miou}", f"{self.accuracy}", f"over {self.views} views; IoU by class:"]

@@ -1,18 +1,14 @@
 """Feature maps on disk: written by a teacher, or found as other programs left them."""
 
-from .check import FeatureReport
 from .extract import discard_maps, extract_features
 from .folder import FeatureFolder
 from .layouts import save_feature_map, write_npy_map
-from .manifest import Manifest, MapRecord, read_manifest
+from .manifest import read_manifest
 from .pictures import Picture, pictures_of
 from .recompute import RecomputedMaps
 
 __all__ = [
     "FeatureFolder",
-    "FeatureReport",
-    "Manifest",
-    "MapRecord",
     "Picture",
     "RecomputedMaps",
     "discard_maps",

@@ -2,39 +2,31 @@
 
 from .answers import Answers, Seen, fused_answers
 from .config import FieldConfig
-from .densify import Densified, GradientStatistics, densify
 from .examples import Box, Clicks, Mask, Picked, label_set_from_examples, read_examples
 from .fit import FieldFit, fit_field
 from .loss import ColorLoss, Loss, l1_loss
-from .merge import Merged, merge_gaussians
-from .optimizer import FieldOptimizer
-from .packed import pack_field, unpack_field
+from .merge import merge_gaussians
+from .packed import pack_field
 from .params import GaussianParams
 from .remembered import recall_scene, remember
 from .semantic_field import Rule, SemanticField
-from .uplift import UpliftConfig, Uplifted, uplift_maps
+from .uplift import UpliftConfig, uplift_maps
 
 __all__ = [
     "Answers",
     "Box",
     "Clicks",
     "ColorLoss",
-    "Densified",
     "FieldConfig",
     "FieldFit",
-    "FieldOptimizer",
     "GaussianParams",
-    "GradientStatistics",
     "Loss",
     "Mask",
-    "Merged",
     "Picked",
     "Rule",
     "Seen",
     "SemanticField",
     "UpliftConfig",
-    "Uplifted",
-    "densify",
     "fit_field",
     "fused_answers",
     "l1_loss",
@@ -44,6 +36,5 @@ __all__ = [
     "read_examples",
     "recall_scene",
     "remember",
-    "unpack_field",
     "uplift_maps",
 ]

@@ -14,6 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from .._card import short_repr
 from .._files import atomic_path, digest_value
 from ..cameras import Camera
 from ..cameras.camera import NEAR
@@ -29,6 +30,8 @@ class Checkpoint:
 
     tensors: dict[str, Tensor]
     state: dict[str, Any]
+
+    __repr__ = short_repr
 
 
 def identify_fit(

@@ -1,17 +1,14 @@
 """Read and write the splat files of other programs, with labels: 3DGS PLY, compressed PLY, .splat, SPZ, SOG, .ksplat, glTF."""
 
-from .order import morton_order
-from .splat_file import Precision, SplatFile, Written
+from .splat_file import SplatFile, Written
 from .spz import write_spz
 from .table import find_format, formats, read_splats, write_splats
 
 __all__ = [
-    "Precision",
     "SplatFile",
     "Written",
     "find_format",
     "formats",
-    "morton_order",
     "read_splats",
     "write_splats",
     "write_spz",

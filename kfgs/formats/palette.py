@@ -10,6 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .._card import short_repr
+
 CODES = 256  # numbers in a codebook: an index is one byte
 _PASSES = 10  # of Lloyd's algorithm on the line
 _EVEN = 64  # numbers that start evenly spaced over the whole range, so that outliers get some
@@ -65,6 +67,9 @@ class Palette(NamedTuple):
 
     rows: Tensor  # [K, D]
     labels: Tensor  # [N] int64 into rows
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def fit_palette(

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .._card import short_repr
 from .render_mode import mode_from_meta
 
 _BYTES_TO_GAUSSIANS = 64  # the most Gaussians per byte: even equal ones need a few bits each
@@ -25,6 +26,9 @@ class SogMeta(NamedTuple):
     palette: int | None  # rows of shN; None in version 1
     degree: int | None  # of shN; None in version 1
     facts: dict[str, Any]  # for `SplatFile.info`
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def parse_meta(path: Path, meta: dict[str, Any], size: int) -> SogMeta:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from torch import Tensor
 
-from .._card import html_card, short_value
+from .._card import html_card, short_repr, short_value
 from ..gaussians import Gaussians
 from .ply import Columns
 
@@ -82,6 +82,9 @@ class Written(NamedTuple):
     lost: tuple[str, ...]  # descriptions of what the format could not store
     order: Tensor | None  # [N] int64: row i of the file is Gaussian order[i] of the cloud; None: the same order
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 class Precision(NamedTuple):
     """The largest error of a value that was written and read again. Each format states it, and the tests check it."""
@@ -93,3 +96,6 @@ class Precision(NamedTuple):
     sh0: float  # absolute, of the degree-0 coefficients
     sh_rest: float  # absolute, of the higher coefficients
     degree: int = 3  # highest degree of spherical harmonics
+
+    def __repr__(self) -> str:
+        return short_repr(self)

@@ -16,6 +16,7 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
+from .._card import short_repr
 from .._files import atomic_path
 
 MAGIC = b"NGSP"
@@ -46,6 +47,8 @@ class Container:
     """The bytes of each attribute, as many as `stream_sizes` says."""
     extensions: list[tuple[int, bytes]] = field(default_factory=list)
     """Records as (type, payload)."""
+
+    __repr__ = short_repr
 
 
 def stream_sizes(version: int, count: int, degree: int) -> dict[str, int]:

@@ -12,24 +12,23 @@ from .classify import (
     select_near,
 )
 from .color import parse_color, recolor
-from .components import component_distance, component_numbers
+from .components import component_numbers
 from .edits import Duplicate, Edit, EditList, Extract, Insert, Move, Opacity, Recolor, Remove, Turn, join
-from .label_set import LabelSet, load_label_set, teacher_mismatch
+from .label_set import LabelSet, load_label_set
 from .names import class_index, class_indices
 from .nearest import default_distance
-from .parts import BestView, Part, connected_parts, describe_selection, view_shares
-from .scores import CANONICAL, LOGIT_SCALES, Score, relevancy, select_by_similarity, similarity_threshold, text_scores
+from .parts import Part, connected_parts, describe_selection
+from .scores import CANONICAL, LOGIT_SCALES, Score, relevancy, select_by_similarity
 from .segment import label_pixels, nearest_codeword
 from .selection import Selection
 from .transfer import Transfer, label_splats, transfer_labels
-from .views import ViewAverage, Votes, average_views, vote_labels
+from .views import average_views, vote_labels
 from .where import AboveScore, Both, Component, Either, Everything, InBox, InSphere, Not, OfClass, OfIndex, Where
 
 __all__ = [
     "CANONICAL",
     "LOGIT_SCALES",
     "AboveScore",
-    "BestView",
     "Both",
     "Classification",
     "CodewordLabels",
@@ -57,14 +56,11 @@ __all__ = [
     "Selection",
     "Transfer",
     "Turn",
-    "ViewAverage",
-    "Votes",
     "Where",
     "average_views",
     "class_index",
     "class_indices",
     "classify",
-    "component_distance",
     "component_numbers",
     "connected_parts",
     "default_distance",
@@ -83,10 +79,6 @@ __all__ = [
     "select_by_similarity",
     "select_like",
     "select_near",
-    "similarity_threshold",
-    "teacher_mismatch",
-    "text_scores",
     "transfer_labels",
-    "view_shares",
     "vote_labels",
 ]

@@ -13,6 +13,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import as_tensor, check_shapes
 from .._rows import check_finite
 from ._json import numbers_of
@@ -33,6 +34,8 @@ class OrientedBox:
     center: Tensor  # [3]
     axes: Tensor  # [3, 3] orthonormal rows
     half: Tensor  # [3] >= 0
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         check_shapes(("center", self.center, "3"), ("axes", self.axes, "3 3"), ("half", self.half, "3"))

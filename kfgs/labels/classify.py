@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import as_tensor, check_shapes, check_whole
 from .._rows import EPS, check_finite, row_norms, unit_embeddings, unit_rows
 from .components import component_numbers
@@ -23,12 +24,18 @@ class CodewordLabels(NamedTuple):
     labels: Tensor  # [K] int64, -1 = none
     similarity: Tensor  # [K, C] cosine with each class
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 class Classification(NamedTuple):
     """The class of each feature and its cosine with that class."""
 
     labels: Tensor  # [N] int64, -1 = none
     scores: Tensor  # [N] cosine with the winning class; 0 if there is none
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def label_codewords(

@@ -9,6 +9,7 @@ import torch
 from PIL import ImageColor
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import as_tensor, check_choice, check_shapes
 from ..gaussians import Gaussians
 from ..splat.sh import rgb_to_sh0, sh0_to_rgb
@@ -136,6 +137,9 @@ class Shades(NamedTuple):
     knee: Tensor  # [] its luminance
     gain: Tensor  # [] ratio of new to old luminance
     bend: Tensor  # [] old luminance up to which the ratio holds; infinite if it holds throughout
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
     def __call__(self, luminance: Tensor) -> tuple[Tensor, Tensor]:  # [n] -> [n, 3], [n, 3]
         """The colour of each luminance, and by how much it changes per unit of luminance."""

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import as_tensor, check_shapes
 from .._rows import check_finite
 from ..formats.splat_file import SplatFile
@@ -29,6 +30,9 @@ class Near(NamedTuple):
 
     distance: Array  # [n, k] float64, infinite after the last source in range
     source: Array  # [n, k] int64, an index into `Sources`; 0 if there is none
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
     @property
     def hit(self) -> Array:  # [n, k] bool

@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import as_tensor, check_choice, check_shapes
 from .._rows import unit_rows
 from .label_set import LabelSet, teacher_difference, teacher_mismatch
@@ -25,6 +26,9 @@ class Question(NamedTuple):
     row: Tensor  # [D]
     negatives: Tensor | None  # [M, D]
     words: str
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [C, D]

@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 
+from .._card import short_repr
 from .._rows import check_finite
 from ..gaussians import Gaussians
 from ..splat.covariance import covariance_3d
@@ -24,6 +25,9 @@ class Verdict(NamedTuple):
     column: Array  # [n] int64, the column of `Near` that gives the label; -1 = none
     share: Array  # [n] the winning label's share in the weight of all sources considered; 0 if there is none
     ambiguous: Array  # [n] bool: another label is among these sources
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def make_rule(

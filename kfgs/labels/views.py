@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import check_range
 from ..cameras import Camera
 from ..gaussians import Gaussians
@@ -29,6 +30,9 @@ class ViewAverage(NamedTuple):
     values: Tensor  # [N, C] mean over the pixels, weighted by how much each shows the Gaussian; 0 if none does
     weights: Tensor  # [N] the number of pixels, in all views, that the Gaussian fills
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 class Votes(NamedTuple):
     """The outcome of a vote."""
@@ -36,6 +40,9 @@ class Votes(NamedTuple):
     labels: Tensor  # [N] int64, -1 = no view shows this Gaussian, or the views do not agree on it
     shares: Tensor  # [N] the winner's share of the votes, 0 if there were none
     weights: Tensor  # [N] votes cast: the number of pixels, in all views, that the Gaussian fills
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def sum_pixels(

@@ -13,37 +13,31 @@ from .apply import (
     write_report,
     write_training_pictures,
 )
-from .attach import Attached, attach
-from .color import ColorConfig, ColorResult, fit_color
-from .compare import render_color, views_of_change, write_comparison
+from .attach import attach
+from .color import ColorConfig, fit_color
+from .compare import views_of_change, write_comparison
 from .config import FitConfig
 from .describe import describe
-from .fit import FitResult, fit_scene, load_history
+from .fit import fit_scene
 from .fuse import uplift
 from .plan import Plan, plan_scene
 from .plan_maps import NamedTeacher
-from .stages import Run, Stage
+from .stages import Run
 
 __all__ = [
-    "Attached",
     "ColorConfig",
-    "ColorResult",
     "FitConfig",
-    "FitResult",
     "NamedTeacher",
     "Plan",
     "Run",
-    "Stage",
     "attach",
     "describe",
     "feature_colors",
     "fit_color",
     "fit_scene",
     "label_cloud",
-    "load_history",
     "plan_scene",
     "read_cloud",
-    "render_color",
     "save_labelled",
     "score_scene",
     "score_teacher",

@@ -13,6 +13,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import check_range, check_whole
 from .._files import read_json
 from .._progress import Progress
@@ -129,6 +130,8 @@ class ColorResult:
     path: Path
     """The 3DGS PLY file it was saved to."""
     stages: list[Stage]
+
+    __repr__ = short_repr
 
     @property
     def seconds(self) -> float:

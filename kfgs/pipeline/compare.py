@@ -29,11 +29,6 @@ def render_color(gaussians: Gaussians, camera: Camera) -> Tensor:  # [H, W, 3] i
         return rasterize(gaussians.replace(features=None), camera).map.clamp(0, 1)
 
 
-def changed_share(before: Gaussians, after: Gaussians, camera: Camera) -> float:
-    """The share of a (small) picture in which an edit shows."""
-    return _share(*(render_color(cloud, _small(camera)) for cloud in (before, after)))
-
-
 def views_of_change(before: Gaussians, after: Gaussians, cameras: Sequence[Camera], count: int = 2) -> list[int]:
     """The viewpoints that show an edit best. Each looks in a different direction than those before it, if possible.
 

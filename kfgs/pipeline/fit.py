@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._card import short_repr
 from .._files import digest_value, read_json, write_json
 from .._progress import Progress
 from ..cameras import Camera
@@ -55,6 +56,8 @@ class FitResult:
     field: SemanticField
     folder: Path
     stages: list[Stage]
+
+    __repr__ = short_repr
 
     @property
     def field_path(self) -> Path:

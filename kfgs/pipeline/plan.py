@@ -142,8 +142,9 @@ def plan_scene(
     Args:
         scene: whose views of `config.split` are learnt from.
         teacher: makes the maps that are missing: a teacher, a function from [3, H, W] to [D, h, w], or a name, see
-            `NamedTeacher`. None: whose maps exist, or else `lseg`.
-        config: the method and its options, and where teacher and field run; those of `fit_scene` when not given.
+            `NamedTeacher`. It runs on the device it is on, as in `extract_features`; one given by name, on that of `config`.
+            None: whose maps exist, or else `lseg`.
+        config: the method and its options, and the device; those of `fit_scene` when not given.
         dense: what becomes of the dense maps: `keep`, `discard` once the field is made of them, or `recompute` them
             instead of storing any.
         features: the folder of maps, in any layout that `FeatureFolder` reads; need not exist. Maps that are there are not

@@ -112,7 +112,11 @@ def find_stored(scene: Scene, split: str, folder: Path, teacher: Any) -> StoredM
 def run_teacher(
     scene: Scene, sizes: Sizes, teacher: Any, device: torch.device, folder: Path
 ) -> tuple[Sizes, FeatureFolder | None, str, list[str]]:
-    """Let the teacher see a picture of each size: sizes with what that tells, its map, its name, and notes."""
+    """Let the teacher see a picture of each size: sizes with what that tells, its map, its name, and notes.
+
+    A teacher that is loaded here by its name is moved to `device`. One that the caller made is left on its own device, where
+    `extract_features` runs it, too.
+    """
     teacher = NamedTeacher("lseg") if teacher is None else teacher
     notes, name = list[str](), getattr(teacher, "name", None) or as_teacher(teacher).name
     before, loaded = memory_now(), teacher
@@ -121,7 +125,7 @@ def run_teacher(
         notes += [] if note is None else [note]
         if loaded is None:
             return sizes, None, name, notes
-    loaded = loaded.to(device) if hasattr(loaded, "to") else loaded
+        loaded = loaded.to(device) if hasattr(loaded, "to") else loaded
     views, found = scene.views(sizes.config.split), dict[tuple[int, int], EncodedPicture]()
     counts = Counter(sizes.pictures[i] for i in sizes.missing)
     for size, _ in counts.most_common(MOST_SIZES):

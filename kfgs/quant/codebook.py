@@ -37,6 +37,9 @@ class Compared(NamedTuple):
     product: Tensor  # [...] of the feature with that unit row, in the rows' precision
     length: Tensor  # [...] of the feature, in at least single precision
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 def compare(
     features: Tensor,  # [..., D]

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from .._card import short_repr
 from .._rows import unit_rows
 
 LEAST_GAIN = 0.05  # of a cell's cosine distance; isotropic noise in n dimensions gains about 2 / (pi n) from a split
@@ -23,6 +24,9 @@ class Cells(NamedTuple):
     index: Tensor  # type: ignore[assignment]  # [n] int64
     similarity: Tensor  # [n]
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 class Grown(NamedTuple):
     """What `grow` made."""
@@ -31,6 +35,9 @@ class Grown(NamedTuple):
     history: list[dict[str, Any]]  # per round: size, added, mean_similarity before it grew
     similarity: list[Tensor]  # [n] of each round, before it grew
     full: bool  # whether a split that pays was left out because the book was full
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def grow(

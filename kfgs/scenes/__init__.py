@@ -1,14 +1,12 @@
 """Scenes: posed images and points, read from files of COLMAP, nerfstudio, instant-ngp and Blender, or estimated."""
 
 from ..cameras.bounds import Bounds, robust_bounds
-from .colmap import load_colmap
 from .colmap_model import ColmapModel, read_model
-from .files import SceneError, file_stem, list_images, natural_key, read_image
+from .files import SceneError, file_stem, list_images, read_image
 from .load import load_scene
 from .scene import Scene
-from .sfm import SfmConfig, SfmReport, run_sfm
-from .splits import make_split, read_split, split_every
-from .transforms import load_transforms
+from .sfm import SfmConfig, run_sfm
+from .splits import make_split
 from .undistort import undistort_scene
 
 __all__ = [
@@ -17,19 +15,13 @@ __all__ = [
     "Scene",
     "SceneError",
     "SfmConfig",
-    "SfmReport",
     "file_stem",
     "list_images",
-    "load_colmap",
     "load_scene",
-    "load_transforms",
     "make_split",
-    "natural_key",
     "read_image",
     "read_model",
-    "read_split",
     "robust_bounds",
     "run_sfm",
-    "split_every",
     "undistort_scene",
 ]

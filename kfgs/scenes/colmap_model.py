@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
+from .._card import short_repr
 from .colmap_files import CAMERA_MODELS, OBSERVATIONS, TRACK, Table, open_table, require
 from .files import MAX_SIDE, SceneError
 
@@ -49,6 +50,8 @@ class ColmapImage:
     """[4, 4] world to camera; None: the place of the camera in its rig is unknown."""
     observed: NDArray[np.int64]
     """[n] the id of the 3-D point that each 2-D point sees, -1 = none."""
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True)

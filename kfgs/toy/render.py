@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from .._card import short_repr
 from ..cameras.camera import Camera
 from .geometry import Array, Solid, cast, normals, occluded, pixel_rays
 from .room import CLASSES, ROOM
@@ -26,6 +27,9 @@ class View(NamedTuple):
     depth: Array  # [H, W] z-depth at the pixel's centre, metres
     labels: NDArray[np.uint8]  # [H, W] class index
     solids: NDArray[np.int64]  # [H, W] index of the solid
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def _look_at(position: Array, target: Array, roll: float) -> Array:  # [4, 4] world to camera

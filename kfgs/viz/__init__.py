@@ -1,6 +1,6 @@
 """Pictures: label overlays, plots, 3-D clouds (pyvista), films, standalone pages and the explorer, all in one palette."""
 
-from .animation import save_animation, save_frames
+from .animation import save_animation
 from .boxes import add_boxes, add_names, add_selections
 from .camera_view import look_through
 from .clouds import CloudOptions, add_cloud, recolor_cloud, to_pyvista
@@ -14,21 +14,18 @@ from .histograms import plot_distances, plot_scores
 from .legends import add_legend, add_scalar_bar
 from .linked import linked_clouds
 from .matches import Matches, add_matches, add_transfer, match_states
-from .page import Page, save_page
-from .palette import PALETTE, palette
-from .pictures import legend_column, legend_strip, overlay_labels, picture_grid, save_picture
+from .page import save_page
+from .palette import palette
+from .pictures import legend_strip, overlay_labels, picture_grid, save_picture
 from .plots import plot_codebook_history, plot_confusion, plot_iou, plot_quality_storage, plot_training
-from .reports import CodebookRows, codebook_rows, plot_codebook_growth, plot_codebook_report
+from .reports import plot_codebook_growth, plot_codebook_report
 
 __all__ = [
-    "PALETTE",
     "CloudOptions",
-    "CodebookRows",
     "ExploreOptions",
     "Explorer",
     "FeatureColors",
     "Matches",
-    "Page",
     "add_boxes",
     "add_camera_images",
     "add_cameras",
@@ -40,10 +37,8 @@ __all__ = [
     "add_selections",
     "add_transfer",
     "available",
-    "codebook_rows",
     "explore",
     "feature_colors",
-    "legend_column",
     "legend_strip",
     "linked_clouds",
     "look_through",
@@ -64,7 +59,6 @@ __all__ = [
     "recolor_cloud",
     "save_animation",
     "save_flythrough",
-    "save_frames",
     "save_page",
     "save_picture",
     "save_turntable",

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import as_array, check_choice, check_range, check_shapes
 from ..gaussians import Gaussians, check_gaussians
 from ..splat.sh import evaluate_sh, sh0_to_rgb
@@ -27,6 +28,9 @@ class CloudColors(NamedTuple):
     name: str  # what the colours show
     values: Array | None  # [N] the values shown, if each Gaussian has one
     clim: tuple[float, float] | None  # the values of the darkest and the brightest colour; None: not a scale
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def cloud_colors(

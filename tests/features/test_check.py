@@ -8,7 +8,9 @@ from messages import tells
 
 from kfgs._files import digest_file
 from kfgs.cameras import Camera
-from kfgs.features import FeatureFolder, FeatureReport, Manifest, MapRecord, Picture
+from kfgs.features import FeatureFolder, Picture
+from kfgs.features.check import FeatureReport
+from kfgs.features.manifest import Manifest, MapRecord
 from kfgs.scenes import Scene
 
 SIZE = (60, 80)  # of the pictures; maps are 6 x 8

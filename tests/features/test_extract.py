@@ -18,7 +18,8 @@ from PIL import Image
 
 import kfgs
 from kfgs.cameras import Camera
-from kfgs.features import FeatureFolder, Manifest, Picture, discard_maps, extract_features, read_manifest
+from kfgs.features import FeatureFolder, Picture, discard_maps, extract_features, read_manifest
+from kfgs.features.manifest import Manifest
 from kfgs.features.writer import LOCK
 from kfgs.scenes import Scene
 

@@ -1,5 +1,5 @@
-from kfgs.features import Manifest, MapRecord
 from kfgs.features.finder import MapFinder
+from kfgs.features.manifest import Manifest, MapRecord
 
 
 def touch(folder, *names: str) -> None:

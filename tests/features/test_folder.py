@@ -11,7 +11,8 @@ from messages import tells
 from safetensors.torch import save_file
 
 from kfgs._files import digest_file
-from kfgs.features import FeatureFolder, Manifest, MapRecord, save_feature_map, write_npy_map
+from kfgs.features import FeatureFolder, save_feature_map, write_npy_map
+from kfgs.features.manifest import Manifest, MapRecord
 from kfgs.quant import CodebookConfig, fit_codebook, sample_grid
 
 

@@ -3,7 +3,8 @@ import json
 import pytest
 from messages import tells
 
-from kfgs.features import FeatureFolder, Manifest, MapRecord, read_manifest
+from kfgs.features import FeatureFolder, read_manifest
+from kfgs.features.manifest import Manifest, MapRecord
 
 RECORD = MapRecord("sub/a.npy", (3, 4, 5), 248, 17, "d" * 64, "a.png", "e" * 64, 0.25)
 

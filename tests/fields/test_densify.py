@@ -4,8 +4,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from kfgs.fields import FieldConfig, GaussianParams, GradientStatistics, densify
-from kfgs.fields.densify import lowered_opacities
+from kfgs.fields import FieldConfig, GaussianParams
+from kfgs.fields.densify import GradientStatistics, densify, lowered_opacities
 
 CONFIG = FieldConfig()
 EXTENT = 10.0  # cloned up to scale 0.1, pruned beyond scale 1

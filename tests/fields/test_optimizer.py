@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from kfgs.fields import FieldConfig, FieldOptimizer, GaussianParams
+from kfgs.fields import FieldConfig, GaussianParams
+from kfgs.fields.optimizer import FieldOptimizer
 
 CONFIG = FieldConfig(steps=100)
 RATES = {"quats": 0.001, "log_scales": 0.005, "logit_opacities": 0.05, "features": 0.005}

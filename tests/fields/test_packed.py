@@ -5,8 +5,9 @@ import torch
 import zstandard
 from messages import tells
 
-from kfgs.fields import SemanticField, pack_field, unpack_field
+from kfgs.fields import SemanticField, pack_field
 from kfgs.fields import packed as packed_module
+from kfgs.fields.packed import unpack_field
 from kfgs.formats.smallest_three import rotation_error
 from kfgs.gaussians import Gaussians
 from kfgs.quant import LinearLatents

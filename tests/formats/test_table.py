@@ -5,8 +5,9 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.formats import SplatFile, find_format, formats, morton_order, read_splats, write_splats
+from kfgs.formats import SplatFile, find_format, formats, read_splats, write_splats
 from kfgs.formats import table as module_table
+from kfgs.formats.order import morton_order
 from kfgs.formats.sidecar import labels_path, names_path
 from kfgs.gaussians import Gaussians
 

@@ -8,8 +8,8 @@ from messages import tells
 from oracles_selection import components as oracle
 
 from kfgs.gaussians import Gaussians
-from kfgs.labels import Selection, component_distance, component_numbers, connected_parts, select_near
-from kfgs.labels.components import radius_components
+from kfgs.labels import Selection, component_numbers, connected_parts, select_near
+from kfgs.labels.components import component_distance, radius_components
 
 
 def clumps(n, heaps, spread, seed):

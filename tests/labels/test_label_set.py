@@ -6,7 +6,8 @@ import torch
 from messages import tells
 from safetensors.torch import save_file
 
-from kfgs.labels import LabelSet, classify, load_label_set, teacher_mismatch
+from kfgs.labels import LabelSet, classify, load_label_set
+from kfgs.labels.label_set import teacher_mismatch
 from kfgs.quant import Codebook
 
 

@@ -7,7 +7,8 @@ from messages import tells
 
 from kfgs.cameras import Camera, Similarity
 from kfgs.gaussians import Gaussians
-from kfgs.labels import Selection, connected_parts, describe_selection, view_shares
+from kfgs.labels import Selection, connected_parts, describe_selection
+from kfgs.labels.parts import view_shares
 from kfgs.splat import rasterize, transform_gaussians
 
 

@@ -7,17 +7,9 @@ import torch
 from messages import tells
 from oracles_words import softmax_share
 
-from kfgs.labels import (
-    LOGIT_SCALES,
-    relevancy,
-    select_by_category,
-    select_by_query,
-    select_by_similarity,
-    select_like,
-    similarity_threshold,
-    text_scores,
-)
+from kfgs.labels import LOGIT_SCALES, relevancy, select_by_category, select_by_query, select_by_similarity, select_like
 from kfgs.labels.classify import classify
+from kfgs.labels.scores import similarity_threshold, text_scores
 
 
 def oracle(similarity, negatives):

@@ -10,9 +10,9 @@ from PIL import Image
 
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
+from kfgs.pipeline import compare
 from kfgs.pipeline.compare import (
     PhotoPictures,
-    changed_share,
     render_color,
     views_of_change,
     views_of_edits,
@@ -37,6 +37,11 @@ def camera(degrees, name="a.png", size=(48, 64)):
     viewmat[2, :3] = torch.tensor([math.sin(a), 0.0, math.cos(a)])
     height, width = size
     return Camera(viewmat, torch.tensor([[60.0, 0, width / 2], [0, 60, height / 2], [0, 0, 1]]), width, height, name)
+
+
+def changed_share(before, after, camera):
+    """The share of the small picture in which an edit shows."""
+    return compare._share(*(render_color(cloud, compare._small(camera)) for cloud in (before, after)))
 
 
 AHEAD, RIGHT = (0.0, 0.0, 5.0), (5.0, 0.0, 0.0)

@@ -10,7 +10,8 @@ from kfgs.cameras import Distortion
 from kfgs.evaluation import load_label_set
 from kfgs.features import FeatureFolder, save_feature_map
 from kfgs.fields import SemanticField
-from kfgs.pipeline import fit_scene, load_history, score_scene, score_teacher, segment_scene, true_labels
+from kfgs.pipeline import fit_scene, score_scene, score_teacher, segment_scene, true_labels
+from kfgs.pipeline.fit import load_history
 from kfgs.scenes import load_scene
 
 

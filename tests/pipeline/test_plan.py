@@ -307,6 +307,37 @@ def test_views_of_two_sizes_are_added_up(untimed, room, tmp_path):
     assert found.stages[0].disk_bytes == 2 * 6 * (4 * 15 * 20 + 2 * 8 * 10)
 
 
+class Moving:
+    """A teacher that writes down where it is told to go, and where it is when it looks at a picture."""
+
+    name = "moving"
+
+    def __init__(self):
+        self.device, self.seen = "meta", []
+
+    def to(self, device):
+        self.device = str(device)
+        return self
+
+    def encode_image(self, image):
+        self.seen.append(self.device)
+        return thumbnails(image)
+
+    def encode_text(self, prompts):
+        raise NotImplementedError
+
+
+def test_a_teacher_stays_on_its_device(untimed, room, tmp_path, monkeypatch):
+    teacher = Moving()
+    found = plan_scene(room, teacher=teacher, features=tmp_path / "none", config=FitConfig(device="cpu"))
+    assert (set(teacher.seen), teacher.device) == ({"meta"}, "meta")
+    assert found.stages[0].seconds > 0
+    named = Moving()  # loaded for the plan alone
+    monkeypatch.setattr(NamedTeacher, "load", lambda self: (named, None))
+    plan_scene(room, teacher="moving", features=tmp_path / "none", config=FitConfig(device="cpu"))
+    assert set(named.seen) == {"cpu"}
+
+
 def test_a_teacher_that_cannot_be_run_is_told(untimed, room, tmp_path):
     missing = {"features": tmp_path / "none"}
     found = plan_scene(room, teacher="clip", **missing)

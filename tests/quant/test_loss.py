@@ -3,7 +3,7 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.quant import class_balanced_loss
+from kfgs.quant.loss import class_balanced_loss
 
 
 def example(seed=0, n=30, K=6, dim=5):

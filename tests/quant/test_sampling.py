@@ -3,7 +3,8 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.quant import choose_grid_step, farthest_points, grid_slices, sample_grid
+from kfgs.quant import choose_grid_step, grid_slices, sample_grid
+from kfgs.quant.sampling import farthest_points
 
 
 def test_grid_of_the_paper_is_rows_1_2_columns_1_3():

@@ -16,8 +16,8 @@ from colmap_models import (
 from messages import tells
 
 from kfgs.cameras.projection import camera_to_pixel
-from kfgs.scenes import SceneError, load_colmap
-from kfgs.scenes.colmap import SUPPORTED_MODELS, convert_intrinsics
+from kfgs.scenes import SceneError
+from kfgs.scenes.colmap import SUPPORTED_MODELS, convert_intrinsics, load_colmap
 
 INTRINSICS = {
     "SIMPLE_PINHOLE": [50.0, 31, 25],

@@ -11,7 +11,8 @@ from messages import tells
 
 from kfgs.cameras.projection import project_points
 from kfgs.formats.ply import write_ply
-from kfgs.scenes import SceneError, load_transforms
+from kfgs.scenes import SceneError
+from kfgs.scenes.transforms import load_transforms
 
 TOP = {"w": 64, "h": 48, "fl_x": 50.0, "fl_y": 55.0, "cx": 31.0, "cy": 25.0}
 # camera at (1, 2, 3), looking along world +x with world +z up: OpenGL axes right = -y, up = +z, back = -x

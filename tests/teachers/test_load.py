@@ -8,8 +8,9 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.teachers import Teacher, embed_labels, identify
+from kfgs.teachers import Teacher, identify
 from kfgs.teachers.load import load_teacher, teacher_names
+from kfgs.teachers.prompts import embed_labels
 
 CLASS = (
     "import torch\n"

@@ -8,9 +8,10 @@ from oracles_palette import linear
 
 from kfgs.formats import SplatFile
 from kfgs.labels import LabelSet
-from kfgs.viz import add_cloud, add_legend, add_scalar_bar, legend_column, palette
+from kfgs.viz import add_cloud, add_legend, add_scalar_bar, palette
 from kfgs.viz.cloud_colors import cloud_colors
 from kfgs.viz.legends import bar_picture, letter_size, pin_picture, round_numbers
+from kfgs.viz.pictures import legend_column
 
 NAMES = [f"class {i}" for i in range(18)]
 WHITE = np.array([255, 255, 255])

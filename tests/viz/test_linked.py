@@ -3,8 +3,9 @@ import pytest
 from cases_viz import some_camera, some_gaussians
 from messages import tells
 
-from kfgs.viz import available, headless, legend_column, make_plotter, palette
+from kfgs.viz import available, headless, make_plotter, palette
 from kfgs.viz.linked import linked_clouds, look_over
+from kfgs.viz.pictures import legend_column
 
 
 @pytest.fixture(autouse=True)

@@ -4,7 +4,8 @@ import torch
 from messages import tells
 from oracles_palette import OKABE_ITO, make_palette, worst_distance
 
-from kfgs.viz import PALETTE, palette
+from kfgs.viz import palette
+from kfgs.viz.palette import PALETTE
 
 
 def test_table_follows_its_recipe():

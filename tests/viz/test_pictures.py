@@ -4,8 +4,8 @@ import torch
 from messages import tells
 from PIL import Image
 
-from kfgs.viz import FeatureColors, legend_column, legend_strip, overlay_labels, palette, save_picture
-from kfgs.viz.pictures import GAP, picture_grid
+from kfgs.viz import FeatureColors, legend_strip, overlay_labels, palette, save_picture
+from kfgs.viz.pictures import GAP, legend_column, picture_grid
 
 
 def two_halves(height=20, width=60):

@@ -3,11 +3,11 @@
 from .desktop import open_window
 from .entry import explore
 from .explorer import Explorer
-from .hit_test import Sight, gaussian_at, neighbours_of, views_seeing
+from .hit_test import gaussian_at
 from .meaning import Asked, FieldMeaning, Meaning, SplatMeaning
 from .notebook import show_in_notebook
 from .options import ExploreOptions
-from .picked import Picked, Side
+from .picked import Picked
 from .state import Exploration, Show
 from .web import serve
 
@@ -20,14 +20,10 @@ __all__ = [
     "Meaning",
     "Picked",
     "Show",
-    "Side",
-    "Sight",
     "SplatMeaning",
     "explore",
     "gaussian_at",
-    "neighbours_of",
     "open_window",
     "serve",
     "show_in_notebook",
-    "views_seeing",
 ]

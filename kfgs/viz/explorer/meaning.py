@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..._card import short_repr
 from ...cameras import Camera
 from ...formats import SplatFile
 from ...formats.splat_file import SCORE
@@ -33,6 +34,9 @@ class Asked(NamedTuple):
     high: float  # the largest useful gamma: 1, or the highest score
     known: bool  # whether it is one of the classes
     valid: Tensor  # [N] bool, whether anything is known about a Gaussian; the others are never selected
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 class Meaning(Protocol):

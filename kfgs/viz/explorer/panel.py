@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from ..._card import short_repr
 from ..palette import palette
 from ..pictures import LEGEND_INK
 
@@ -90,6 +91,9 @@ class Panel(NamedTuple):
     picture: Array  # [H, W, 3] uint8
     spots: list[Spot]
     last_scroll: int
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
     def find(self, x: float, y: float) -> Spot | None:
         """The spot at a point: pixels from the upper left corner."""

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from torch import Tensor
 
+from ..._card import short_repr
 from ..._files import write_json
 from ...cameras import Camera
 from ...formats import SplatFile, write_splats
@@ -31,6 +32,9 @@ class SelectedSide(NamedTuple):
     selection: Selection
     labels: Tensor  # [N]
     scores: Tensor  # [N], NaN where a Gaussian has none
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def save_sides(

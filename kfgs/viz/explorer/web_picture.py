@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from PIL import Image
 
+from ..._card import short_repr
 from ..gaussian_actor import STILL
 
 if TYPE_CHECKING:
@@ -28,6 +29,9 @@ class Frame(NamedTuple):
     still: bool  # the camera did not move; while it moves, points may replace Gaussians
     number: int
     picture: Array  # [H, W, 3] uint8
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def camera_key(renderer: Any) -> tuple[float, ...]:

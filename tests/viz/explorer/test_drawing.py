@@ -4,9 +4,10 @@ import torch
 from cases_viz import some_camera
 from cases_window import LEGEND, NAMES, TITLE, agreement, panes
 
-from kfgs.viz import gaussian_actor, legend_column, palette
+from kfgs.viz import gaussian_actor, palette
 from kfgs.viz.explorer import drawing
 from kfgs.viz.legends import bar_picture
+from kfgs.viz.pictures import legend_column
 
 pytestmark = pytest.mark.usefixtures("driver")
 
