@@ -210,6 +210,20 @@ def test_help_is_quick_to_ask_for_and_names_every_command():
     assert done.stdout.strip().endswith("False")  # no heavy import for a help text
 
 
+def test_a_progress_bar_does_not_flood_a_log():
+    code = """if True:
+        import time
+        from kfgs.cli import main
+        main(["--version"])
+        from tqdm import tqdm
+        for _ in tqdm(range(100)):
+            time.sleep(0.01)
+    """
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "100/100" in done.stderr
+    assert done.stderr.count("it/s") <= 2  # the start and the end; a terminal gets ten a second
+
+
 def test_a_scene_without_points_is_told_before_features_are_asked_for(room, tmp_path, capsys):
     (tmp_path / "images").mkdir()
     frames = []
