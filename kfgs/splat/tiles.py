@@ -2,39 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
-from .._card import short_repr
 from .._check import check_range, check_shapes
 from .engines import ops
-from .engines.contract import ALPHA_MIN
+from .engines.contract import ALPHA_MIN, Tiles
 from .engines.table import choose_compiled
 from .project import Projected, pixel_box
 
-
-class Tiles(NamedTuple):
-    """For every tile, the rows of `Projected` that touch it, in order of depth, then of Gaussian index.
-
-    Tile t = row * columns + column owns `rows[offsets[t]:offsets[t + 1]]`. Tiles at the right and lower border reach
-    beyond the image where its size is no multiple of the tile's.
-    """
-
-    rows: Tensor  # [P] int32
-    offsets: Tensor  # [T + 1] int64
-    width: int  # pixels
-    height: int  # pixels
-    tile_size: int  # pixels
-
-    def __repr__(self) -> str:
-        return short_repr(self)
-
-    @property
-    def grid(self) -> tuple[int, int]:
-        """Number of tiles as (rows, columns)."""
-        return -(-self.height // self.tile_size), -(-self.width // self.tile_size)
+__all__ = ["Tiles", "bin_tiles"]
 
 
 @torch.no_grad()

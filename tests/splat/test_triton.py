@@ -13,6 +13,7 @@ import torch
 triton = pytest.importorskip("triton", reason="the Triton engine needs `pip install triton`")
 
 from kfgs.splat import accumulate_pixels, composite  # noqa: E402
+from kfgs.splat.engines.contract import Composited, Splats, Tiles  # noqa: E402
 from kfgs.splat.engines.triton import engine as triton_gpu  # noqa: E402 - only where triton is installed
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -150,14 +151,14 @@ def test_devices():
 
 def _on_cpu(dtype):
     """Arguments of `forward`, `backward` and `accumulate`."""
-    splats = [torch.zeros(1, n, dtype=dtype) for n in (2, 3)] + [torch.zeros(1, dtype=dtype)]
-    inputs = [*splats, torch.zeros(1, 4, dtype=dtype), torch.zeros(4, dtype=dtype)]
-    lists = (torch.zeros(1, dtype=torch.int32), torch.tensor([0, 1]), 6, 5, 16)
+    footprints = [torch.zeros(1, n, dtype=dtype) for n in (2, 3)] + [torch.zeros(1, dtype=dtype)]
+    splats = Splats(*footprints, torch.zeros(1, 4, dtype=dtype), torch.zeros(4, dtype=dtype), None)
+    tiles = Tiles(torch.zeros(1, dtype=torch.int32), torch.tensor([0, 1]), 6, 5, 16)
     maps, alphas = torch.zeros(5, 6, 4, dtype=dtype), torch.zeros(5, 6, dtype=dtype)
     return {
-        "forward": (*inputs, None, *lists),
-        "backward": (maps, alphas, (True,) * 5, *inputs, None, *lists, maps, alphas, alphas.int()),
-        "accumulate": (*splats, maps, *lists),
+        "forward": (splats, tiles),
+        "backward": ((maps, alphas), (True,) * 5, splats, tiles, Composited(maps, alphas, alphas.int())),
+        "accumulate": (*footprints, maps, tiles),
     }
 
 

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from ..._check import check_shapes
 from . import ops
-from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Splats, Tiles
 from .cpu.memory import free_memory
 from .ops import check_values
 from .table import available_engines, choose, load, offers
-
-if TYPE_CHECKING:
-    from ..tiles import Tiles
 
 __all__ = [
     "ALPHA_MAX",
@@ -82,11 +77,12 @@ def composite(
     if background is None:
         background = features.new_zeros(features.shape[1])
     values = (value.contiguous() for value in (means2d, conics, opacities, features, background))
-    view = tiles.rows.contiguous(), tiles.offsets.contiguous(), tiles.width, tiles.height, tiles.tile_size
+    means2d, conics, opacities, features, background = values
+    splats, tiles = Splats(means2d, conics, opacities, features, background, index), _contiguous(tiles)
     if offers(name, "composite"):  # differentiable as it stands
-        check_values(len(means2d), len(features), index, *view[:2])
-        return load(name).composite(*values, index, tiles)
-    maps, alphas, _ = ops.composite(*values, index, *view, name)
+        check_values(len(means2d), len(features), index, tiles)
+        return load(name).composite(splats, tiles)
+    maps, alphas, _ = ops.composite(*splats, *tiles, name)
     return maps, alphas
 
 
@@ -128,11 +124,15 @@ def accumulate_pixels(
     _check_tiles(tiles, means2d)
     name = choose(engine, means2d.device.type, means2d.dtype)
     values = (value.detach().contiguous() for value in (means2d, conics, opacities, pixels))
-    view = tiles.rows.contiguous(), tiles.offsets.contiguous(), tiles.width, tiles.height, tiles.tile_size
+    tiles = _contiguous(tiles)
     if offers(name, "composite"):  # its results are parts of one tensor, which an operator's must not be
-        check_values(len(means2d), len(means2d), None, *view[:2])
-        return load(name).accumulate(*values, *view)
-    return ops.accumulate(*values, *view, name)
+        check_values(len(means2d), len(means2d), None, tiles)
+        return load(name).accumulate(*values, tiles)
+    return ops.accumulate(*values, *tiles, name)
+
+
+def _contiguous(tiles: Tiles) -> Tiles:
+    return tiles._replace(rows=tiles.rows.contiguous(), offsets=tiles.offsets.contiguous())
 
 
 def _check_kinds(others: dict[str, Tensor | None], means2d: Tensor) -> None:

@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..tiles import Tiles
-from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Splats, Tiles
 
 CHUNK = 64
 """Gaussians of a tile composited at once; pixels that stop are noticed between chunks."""
@@ -35,18 +34,11 @@ class _Chunk(NamedTuple):
     stopped: Tensor  # [B, P] pixels that had stopped before
 
 
-def composite(
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    background: Tensor,
-    index: Tensor | None,
-    tiles: Tiles,
-) -> tuple[Tensor, Tensor]:
-    """Composite as `kfgs.splat.engines.contract` says; called through `kfgs.splat.engines.composite`."""
+def composite(splats: Splats, tiles: Tiles) -> tuple[Tensor, Tensor]:  # maps [H, W, D], alphas [H, W]
+    """Composite as the contract says; called through `kfgs.splat.engines.composite`."""
+    *footprints, features, background, index = splats
     features = features if index is None else features[index]
-    sums, transmittance = _Composite.apply(means2d, conics, opacities, features, tiles)
+    sums, transmittance = _Composite.apply(*footprints, features, tiles)
     sums = sums + transmittance[..., None] * background
     return _to_image(sums, tiles), 1 - _to_image(transmittance[..., None], tiles)[..., 0]
 
@@ -60,27 +52,18 @@ def devices() -> tuple[str, ...]:
 
 
 def accumulate(
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    pixels: Tensor,  # [H, W, D]
-    rows: Tensor,
-    offsets: Tensor,
-    width: int,
-    height: int,
-    tile_size: int,
+    means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, tiles: Tiles
 ) -> tuple[Tensor, Tensor]:  # sums [M, D], weights [M]
     """Sum pixels into the Gaussians by compositing weight, in one walk over the chunks."""
-    view = Tiles(rows, offsets, width, height, tile_size)
-    signal = _to_tiles(torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=2), view)  # [T, P, D + 1]
+    signal = _to_tiles(torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=2), tiles)  # [T, P, D + 1]
     T, P = signal.shape[:2]
     transmittance, stopped = pixels.new_ones(T, P), torch.zeros(T, P, dtype=torch.bool, device=pixels.device)
     sums = pixels.new_zeros(len(means2d), signal.shape[2])
-    for batch in _batches(view):
-        for tile, which, present in _front_to_back(view, batch, stopped):
+    for batch in _batches(tiles):
+        for tile, which, present in _front_to_back(tiles, batch, stopped):
             chunk = _Chunk(tile, which, present, transmittance[tile], stopped[tile])
             splats = (value[which] for value in (means2d, conics, opacities))
-            weights, transmittance[tile], stopped[tile] = _weigh_chunk(chunk, view, chunk.transmittance, *splats)
+            weights, transmittance[tile], stopped[tile] = _weigh_chunk(chunk, tiles, chunk.transmittance, *splats)
             sums.index_add_(0, which.flatten(), (weights.mT @ signal[tile]).flatten(0, 1))
     return sums[:, :-1], sums[:, -1]
 

@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 
 from ...project import FIELD_OF_VIEW_MARGIN
+from ..contract import Pinhole
 
 BATCH = 64
 MEAN, QUAT, SCALE = 0, 3 * BATCH, 7 * BATCH
@@ -47,8 +48,10 @@ class Lens(NamedTuple):
     rounding: Any  # relative, of a pixel box's edges
 
 
-def make_lens(viewmat: Any, K: Any, width: int, height: int, near: float, low_pass: float) -> Lens:
-    """Take viewmat [4, 4] and K [3, 3] apart; the tangents' limits are those of `project`."""
+def make_lens(pinhole: Pinhole) -> Lens:
+    """Take the camera apart; the tangents' limits are those of `project`."""
+    viewmat, K = (value.detach().numpy() for value in pinhole[:2])
+    _, _, width, height, near, low_pass = pinhole
     kind = K.dtype.type
     focal, principal = (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2])
     size = kind(width), kind(height)
