@@ -95,11 +95,14 @@ class TestOnGpu:
         inputs = [value.requires_grad_() for value in inputs]
         torch.cuda.set_sync_debug_mode("error")
         try:
+            with pytest.raises(RuntimeError, match="synchronizing"):  # torch reports a wait
+                cotangents[0].sum().item()
             outputs = composite(*inputs[:4], tiles, background=inputs[4], index=index, engine="triton")
-            torch.autograd.grad(outputs, inputs, cotangents)
-            accumulate_pixels(*inputs[:3], cotangents[0], tiles, engine="triton")
+            grads = torch.autograd.grad(outputs, inputs, cotangents)
+            sums = accumulate_pixels(*inputs[:3], cotangents[0], tiles, engine="triton")
         finally:
             torch.cuda.set_sync_debug_mode("default")
+        assert all(value.is_cuda and bool(value.isfinite().all()) for value in (*outputs, *grads, *sums))
 
 
 # compiled for GPUs that are not there ---------------------------------------------------------------------------------
