@@ -24,6 +24,7 @@ from torch import Tensor
 
 from kfgs.splat import Tiles, accumulate_pixels, bin_tiles, composite, rasterize
 from kfgs.splat.engines import ops
+from kfgs.splat.engines.contract import Composited, Splats
 
 GRADS = ("means2d", "conics", "opacities", "features", "background")
 OF_FRAME = ("means", "quats", "scales", "opacities", "features", "background")
@@ -145,9 +146,9 @@ def check_manners(
     from kfgs.splat.engines.triton import engine as triton_gpu
 
     facts: dict[str, float | bool] = {}
-    view = (index, *tiles)
     values = [value.detach() for value in inputs]
-    outputs, again = (ops.composite(*values, *view, "triton") for _ in range(2))  # with the trace
+    splats = Splats(*values, index)
+    outputs, again = (Composited(*ops.composite(*splats, *tiles, "triton")) for _ in range(2))  # with the trace
     facts["forward repeats to the bit"] = all(torch.equal(a, b) for a, b in zip(again, outputs, strict=True))
     for k, name in enumerate(GRADS):
         leaves = [value.clone().requires_grad_(j == k) for j, value in enumerate(values)]
@@ -155,7 +156,7 @@ def check_manners(
         (alone,) = torch.autograd.grad(seen, leaves[k], cotangents)
         facts[f"{name} wanted alone"] = largest(alone - grads[k]) <= 1e-5 * largest(grads[k])
         # autograd drops what is not wanted; the engine must not have computed it
-        given = triton_gpu.backward(*cotangents, tuple(k == j for j in range(5)), *values, *view, *outputs)
+        given = triton_gpu.backward(cotangents, tuple(k == j for j in range(5)), splats, tiles, outputs)
         facts[f"nothing but {name} computed"] = all(value.numel() == 0 for j, value in enumerate(given) if j != k)
     return facts
 

@@ -2,48 +2,25 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
-from .._card import short_repr
 from .._check import check_range, check_shapes
 from .engines import ops
-from .engines.contract import ALPHA_MIN
+from .engines.contract import ALPHA_MIN, Tiles
 from .engines.table import choose_compiled
 from .project import Projected, pixel_box
 
-
-class Tiles(NamedTuple):
-    """For every tile, the rows of `Projected` that touch it, in order of depth, then of Gaussian index.
-
-    Tile t = row * columns + column owns `rows[offsets[t]:offsets[t + 1]]`. Tiles at the right and lower border reach
-    beyond the image where its size is no multiple of the tile's.
-    """
-
-    rows: Tensor  # [P] int32
-    offsets: Tensor  # [T + 1] int64
-    width: int  # pixels
-    height: int  # pixels
-    tile_size: int  # pixels
-
-    def __repr__(self) -> str:
-        return short_repr(self)
-
-    @property
-    def grid(self) -> tuple[int, int]:
-        """Number of tiles as (rows, columns)."""
-        return -(-self.height // self.tile_size), -(-self.width // self.tile_size)
+__all__ = ["Tiles", "bin_tiles"]
 
 
 @torch.no_grad()
 def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16, *, engine: str = "auto") -> Tiles:
     """List the Gaussians of every tile.
 
-    A Gaussian is listed where alpha reaches 1/255 somewhere in the rectangle spanned by the tile's pixel centres: the
-    smallest value of its quadratic form there is compared with 2 ln(255 opacity), and in doubt of rounding it is kept.
-    So no pair that an engine would composite is missing, and few are listed for nothing.
+    A Gaussian is listed if alpha reaches 1/255 somewhere in the rectangle spanned by the tile's pixel centres: the smallest
+    value of its quadratic form there is compared with 2 ln(255 opacity), with room for rounding. So no pair is missing
+    that an engine would composite, and few are superfluous.
 
     Args:
         projected: M projected Gaussians in increasing order of index, as `project` returns them.
@@ -51,7 +28,7 @@ def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16
         height: of the image, pixels.
         tile_size: side of a tile, pixels.
         engine: as in `composite`. "numba", which "auto" takes on the CPU, finds the same lists with compiled code; all
-            others are functions of torch.
+            others use torch.
 
     Returns:
         The P (tile, Gaussian) pairs, grouped by tile; equally deep Gaussians are in order of their index.
@@ -122,10 +99,8 @@ def _touches_tile(
     a, b, c = (column[rows] for column in projected.conics.unbind(1))
     left, top = left + 0.5 - x[rows], top + 0.5 - y[rows]  # relative to the mean from here on
     right, bottom = left + (tile_size - 1), top + (tile_size - 1)
-    near_x, near_y = (
-        left.clamp(min=0) + right.clamp(max=0),
-        top.clamp(min=0) + bottom.clamp(max=0),
-    )  # closest to the mean
+    near_x = left.clamp(min=0) + right.clamp(max=0)  # closest to the mean
+    near_y = top.clamp(min=0) + bottom.clamp(max=0)
     along_y = torch.minimum(torch.maximum(-b / c * near_x, top), bottom)  # on the side x = near_x
     along_x = torch.minimum(torch.maximum(-b / a * near_y, left), right)  # on the side y = near_y
     smallest = torch.minimum(

@@ -15,6 +15,7 @@ triton = pytest.importorskip("triton", reason="the Triton engine needs `pip inst
 from messages import tells  # noqa: E402
 
 from kfgs.splat import accumulate_pixels, composite  # noqa: E402
+from kfgs.splat.engines.contract import Composited, Splats, Tiles  # noqa: E402
 from kfgs.splat.engines.triton import engine as triton_gpu  # noqa: E402 - only where triton is installed
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -96,11 +97,14 @@ class TestOnGpu:
         inputs = [value.requires_grad_() for value in inputs]
         torch.cuda.set_sync_debug_mode("error")
         try:
+            with pytest.raises(RuntimeError, match="synchronizing"):  # torch reports a wait
+                cotangents[0].sum().item()
             outputs = composite(*inputs[:4], tiles, background=inputs[4], index=index, engine="triton")
-            torch.autograd.grad(outputs, inputs, cotangents)
-            accumulate_pixels(*inputs[:3], cotangents[0], tiles, engine="triton")
+            grads = torch.autograd.grad(outputs, inputs, cotangents)
+            sums = accumulate_pixels(*inputs[:3], cotangents[0], tiles, engine="triton")
         finally:
             torch.cuda.set_sync_debug_mode("default")
+        assert all(value.is_cuda and bool(value.isfinite().all()) for value in (*outputs, *grads, *sums))
 
 
 # compiled for GPUs that are not there ---------------------------------------------------------------------------------
@@ -152,14 +156,14 @@ def test_devices():
 
 def _on_cpu(dtype):
     """Arguments of `forward`, `backward` and `accumulate`."""
-    splats = [torch.zeros(1, n, dtype=dtype) for n in (2, 3)] + [torch.zeros(1, dtype=dtype)]
-    inputs = [*splats, torch.zeros(1, 4, dtype=dtype), torch.zeros(4, dtype=dtype)]
-    lists = (torch.zeros(1, dtype=torch.int32), torch.tensor([0, 1]), 6, 5, 16)
+    footprints = [torch.zeros(1, n, dtype=dtype) for n in (2, 3)] + [torch.zeros(1, dtype=dtype)]
+    splats = Splats(*footprints, torch.zeros(1, 4, dtype=dtype), torch.zeros(4, dtype=dtype), None)
+    tiles = Tiles(torch.zeros(1, dtype=torch.int32), torch.tensor([0, 1]), 6, 5, 16)
     maps, alphas = torch.zeros(5, 6, 4, dtype=dtype), torch.zeros(5, 6, dtype=dtype)
     return {
-        "forward": (*inputs, None, *lists),
-        "backward": (maps, alphas, (True,) * 5, *inputs, None, *lists, maps, alphas, alphas.int()),
-        "accumulate": (*splats, maps, *lists),
+        "forward": (splats, tiles),
+        "backward": ((maps, alphas), (True,) * 5, splats, tiles, Composited(maps, alphas, alphas.int())),
+        "accumulate": (*footprints, maps, tiles),
     }
 
 

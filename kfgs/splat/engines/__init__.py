@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from ..._check import check_shapes
 from . import ops
-from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Splats, Tiles
 from .cpu.memory import free_memory
 from .ops import check_values
 from .table import available_engines, choose, load, offers
-
-if TYPE_CHECKING:
-    from ..tiles import Tiles
 
 __all__ = [
     "ALPHA_MAX",
@@ -41,7 +36,7 @@ def composite(
 ) -> tuple[Tensor, Tensor]:  # maps [H, W, D], alphas [H, W]
     """Composite the projected Gaussians of each tile front to back (Eq. 1-2 of 3DGS, for any number of channels).
 
-    What every engine promises is written in `kfgs.splat.engines.contract`.
+    `kfgs.splat.engines.contract` says exactly what is computed.
 
     Args:
         means2d: centres; the centre of the first pixel is (0.5, 0.5).
@@ -50,22 +45,21 @@ def composite(
         features: what is composited; any number of channels from 1.
         tiles: from `bin_tiles` on the same Gaussians.
         background: what shows through, zeros if None.
-        index: which row of `features` each Gaussian shows, as `Projected.index`; None: row m for Gaussian m, N = M.
-            It saves a copy of the visible rows, and another one of their gradients.
+        index: the row of `features` that each Gaussian shows, as `Projected.index`; None: row m for Gaussian m, N = M.
+            It saves copies of the visible rows and of their gradients.
         engine: a name of `available_engines()`, or "auto": the fastest one for the tensors' device.
 
     Returns:
         The composited features and the opacity of every pixel, differentiable in all tensors but `tiles`.
 
     Raises:
-        ValueError: if shapes, dtypes or devices disagree, `tiles` or `index` are of other Gaussians, or the engine is
-            unknown or does not run on the device or in the dtype.
+        ValueError: if shapes, dtypes or devices disagree, `tiles` or `index` belong to other Gaussians, or the engine is
+            unknown or does not know the device or the dtype.
         ImportError: if the named engine's package is missing.
-        NotImplementedError: if a gradient of a gradient is asked of a compiled engine.
+        NotImplementedError: at the gradient of a gradient of a compiled engine.
 
     Note:
-        On the CPU, the largest arrays of the last frames are kept for the next ones, up to 1 GiB per thread;
-        `free_memory` hands them back.
+        On the CPU, large arrays are kept for the next frames, up to 1 GiB per thread; `free_memory` frees them.
     """
     check_shapes(
         ("means2d", means2d, "M 2"),
@@ -82,11 +76,12 @@ def composite(
     if background is None:
         background = features.new_zeros(features.shape[1])
     values = (value.contiguous() for value in (means2d, conics, opacities, features, background))
-    view = tiles.rows.contiguous(), tiles.offsets.contiguous(), tiles.width, tiles.height, tiles.tile_size
+    means2d, conics, opacities, features, background = values
+    splats, tiles = Splats(means2d, conics, opacities, features, background, index), _contiguous(tiles)
     if offers(name, "composite"):  # differentiable as it stands
-        check_values(len(means2d), len(features), index, *view[:2])
-        return load(name).composite(*values, index, tiles)
-    maps, alphas, _ = ops.composite(*values, index, *view, name)
+        check_values(len(means2d), len(features), index, tiles)
+        return load(name).composite(splats, tiles)
+    maps, alphas, _ = ops.composite(*splats, *tiles, name)
     return maps, alphas
 
 
@@ -101,8 +96,8 @@ def accumulate_pixels(
 ) -> tuple[Tensor, Tensor]:  # sums [M, D], weights [M]
     """Sum per-pixel values into the Gaussians, each weighted by how much the Gaussian shows at the pixel.
 
-    The sums are weights^T · pixels, the adjoint of `composite` in `features`: what uplifting features without training,
-    visibility and pruning by importance need. Both results come from one walk over the view, and carry no gradient.
+    The sums are weights^T · pixels, the adjoint of `composite` in `features`. Uplifting, visibility and pruning by
+    importance need them. Both results come from one walk over the view, and carry no gradient.
 
     Args:
         means2d: as in `composite`.
@@ -113,7 +108,7 @@ def accumulate_pixels(
         engine: as in `composite`.
 
     Returns:
-        The sums, and each Gaussian's own sum of weights, by which to divide for a mean.
+        The sums, and the sum of each Gaussian's weights: divide by it for a mean.
 
     Raises:
         ValueError: as `composite`, and if `pixels` is not as large as the image of `tiles`.
@@ -128,11 +123,15 @@ def accumulate_pixels(
     _check_tiles(tiles, means2d)
     name = choose(engine, means2d.device.type, means2d.dtype)
     values = (value.detach().contiguous() for value in (means2d, conics, opacities, pixels))
-    view = tiles.rows.contiguous(), tiles.offsets.contiguous(), tiles.width, tiles.height, tiles.tile_size
+    tiles = _contiguous(tiles)
     if offers(name, "composite"):  # its results are parts of one tensor, which an operator's must not be
-        check_values(len(means2d), len(means2d), None, *view[:2])
-        return load(name).accumulate(*values, *view)
-    return ops.accumulate(*values, *view, name)
+        check_values(len(means2d), len(means2d), None, tiles)
+        return load(name).accumulate(*values, tiles)
+    return ops.accumulate(*values, *tiles, name)
+
+
+def _contiguous(tiles: Tiles) -> Tiles:
+    return tiles._replace(rows=tiles.rows.contiguous(), offsets=tiles.offsets.contiguous())
 
 
 def _check_kinds(others: dict[str, Tensor | None], means2d: Tensor) -> None:

@@ -1,8 +1,7 @@
 """The engines as operators of torch: what autograd, `torch.compile` and `torch.export` see of them.
 
-An engine works on plain tensors and has no gradients. Here its functions become opaque operators, `kfgs::composite`,
-`kfgs::project`, `kfgs::bin_tiles` and `kfgs::accumulate`, with backward passes and with fake kernels that give the shapes.
-Importing `kfgs.splat` registers them, which an exported program needs.
+An engine's functions become opaque operators with backward passes, and with fake kernels that give the shapes. Importing
+`kfgs.splat` registers them; an exported program needs that. torch demands flat schemas.
 """
 
 from __future__ import annotations
@@ -13,17 +12,28 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.library import infer_schema, register_autograd, register_fake
+from torch.library import register_autograd, register_fake
 
+from .contract import Cloud, Composited, Pinhole, Splats, Tiles
 from .table import load
 
+SPLATS = "Tensor means2d, Tensor conics, Tensor opacities, Tensor features, Tensor background, Tensor? index"
+TILES = "Tensor rows, Tensor offsets, SymInt width, SymInt height, SymInt tile_size"
+CLOUD = "Tensor means, Tensor quats, Tensor scales, Tensor opacities"
+PINHOLE = "Tensor viewmat, Tensor K, SymInt width, SymInt height, float near, float low_pass"
+"""The fields of the contract's tuples, as schemas name them. The functions below get them flat, in this order."""
 
-def _operator(function: Callable[..., Any]) -> Any:
+
+def _operator(schema: str) -> Callable[[Callable[..., Any]], Any]:
     """The function as `torch.ops.kfgs.<its name>`. torch.library.custom_op would import the compiler, for a second."""
-    name = function.__name__
-    torch.library.define(f"kfgs::{name}", infer_schema(function, mutates_args=()))
-    torch.library.impl(f"kfgs::{name}", "default", function)
-    return getattr(torch.ops.kfgs, name).default
+
+    def define(function: Callable[..., Any]) -> Any:
+        name = function.__name__
+        torch.library.define(f"kfgs::{name}", schema)
+        torch.library.impl(f"kfgs::{name}", "default", function)
+        return getattr(torch.ops.kfgs, name).default
+
+    return define
 
 
 def _refuse(ctx: Any, *grads: Tensor) -> None:
@@ -34,12 +44,13 @@ def _refuse(ctx: Any, *grads: Tensor) -> None:
     )
 
 
-def check_values(count: int, sources: int, index: Tensor | None, rows: Tensor, offsets: Tensor) -> None:
-    """Refuse what a compiled engine would read from foreign memory. Not asked of a GPU, where it would cost a wait.
+def check_values(count: int, sources: int, index: Tensor | None, tiles: Tiles) -> None:
+    """Refuse numbers with which a compiled engine would read foreign memory; on a GPU the check would cost a wait.
 
     Raises:
         ValueError: if `index` or `rows` point beyond what there is, or `offsets` do not rise from 0 to P.
     """
+    rows, offsets = tiles.rows, tiles.offsets
     if rows.device.type != "cpu":
         return
     again = "bin the tiles again from these Gaussians"
@@ -64,97 +75,35 @@ def check_values(count: int, sources: int, index: Tensor | None, rows: Tensor, o
         )
 
 
-@_operator
-def composite(
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    background: Tensor,
-    index: Tensor | None,
-    rows: Tensor,
-    offsets: Tensor,
-    width: int,
-    height: int,
-    tile_size: int,
-    engine: str,
-) -> tuple[Tensor, Tensor, Tensor]:
+@_operator(f"({SPLATS}, {TILES}, str engine) -> (Tensor, Tensor, Tensor)")
+def composite(*inputs: Any) -> Composited:
     """Maps, alphas and the engine's trace, see `kfgs.splat.engines.composite`."""
-    check_values(len(means2d), len(features), index, rows, offsets)
-    splats = means2d, conics, opacities, features, background
-    return load(engine).forward(*splats, index, rows, offsets, width, height, tile_size)
+    splats, tiles = Splats(*inputs[:6]), Tiles(*inputs[6:11])
+    check_values(len(splats.means2d), len(splats.features), splats.index, tiles)
+    return load(inputs[11]).forward(splats, tiles)
 
 
 @register_fake("kfgs::composite")
-def _(
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    background: Tensor,
-    index: Tensor | None,
-    rows: Tensor,
-    offsets: Tensor,
-    width: int,
-    height: int,
-    tile_size: int,
-    engine: str,
-) -> tuple[Tensor, Tensor, Tensor]:
-    maps = features.new_empty(height, width, features.shape[1])
-    trace = rows.new_empty(torch.library.get_ctx().new_dynamic_size(), dtype=torch.int32)
-    return maps, features.new_empty(height, width), trace
+def _(*inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
+    features, tiles = inputs[3], Tiles(*inputs[6:11])
+    maps = features.new_empty(tiles.height, tiles.width, features.shape[1])
+    trace = tiles.rows.new_empty(torch.library.get_ctx().new_dynamic_size(), dtype=torch.int32)
+    return maps, features.new_empty(tiles.height, tiles.width), trace
 
 
-@_operator
-def composite_backward(
-    grad_maps: Tensor,
-    grad_alphas: Tensor,
-    wanted: list[bool],
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    background: Tensor,
-    index: Tensor | None,
-    rows: Tensor,
-    offsets: Tensor,
-    width: int,
-    height: int,
-    tile_size: int,
-    maps: Tensor,
-    alphas: Tensor,
-    trace: Tensor,
-    engine: str,
-) -> list[Tensor]:
+@_operator(
+    f"(Tensor grad_maps, Tensor grad_alphas, bool[] wanted, {SPLATS}, {TILES}, "
+    "Tensor maps, Tensor alphas, Tensor trace, str engine) -> Tensor[]"
+)
+def composite_backward(grad_maps: Tensor, grad_alphas: Tensor, wanted: list[bool], *inputs: Any) -> list[Tensor]:
     """Gradients of the five differentiable inputs, empty where not wanted."""
-    splats = means2d, conics, opacities, features, background
-    view = index, rows, offsets, width, height, tile_size
-    return load(engine).backward(grad_maps, grad_alphas, wanted, *splats, *view, maps, alphas, trace)
+    splats, tiles, result = Splats(*inputs[:6]), Tiles(*inputs[6:11]), Composited(*inputs[11:14])
+    return load(inputs[14]).backward((grad_maps, grad_alphas), wanted, splats, tiles, result)
 
 
 @register_fake("kfgs::composite_backward")
-def _(
-    grad_maps: Tensor,
-    grad_alphas: Tensor,
-    wanted: list[bool],
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    background: Tensor,
-    index: Tensor | None,
-    rows: Tensor,
-    offsets: Tensor,
-    width: int,
-    height: int,
-    tile_size: int,
-    maps: Tensor,
-    alphas: Tensor,
-    trace: Tensor,
-    engine: str,
-) -> list[Tensor]:
-    inputs = means2d, conics, opacities, features, background
-    return [torch.empty_like(v) if want else v.new_empty(0) for v, want in zip(inputs, wanted, strict=True)]
+def _(grad_maps: Tensor, grad_alphas: Tensor, wanted: list[bool], *inputs: Any) -> list[Tensor]:
+    return [torch.empty_like(v) if want else v.new_empty(0) for v, want in zip(inputs[:5], wanted, strict=True)]
 
 
 def _save_composite(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor, Tensor]) -> None:
@@ -175,123 +124,45 @@ def _differentiate_composite(ctx: Any, grad_maps: Tensor, grad_alphas: Tensor, _
 register_autograd("kfgs::composite", _differentiate_composite, setup_context=_save_composite)
 
 
-@_operator
-def accumulate(
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    pixels: Tensor,
-    rows: Tensor,
-    offsets: Tensor,
-    width: int,
-    height: int,
-    tile_size: int,
-    engine: str,
-) -> tuple[Tensor, Tensor]:
+@_operator(f"(Tensor means2d, Tensor conics, Tensor opacities, Tensor pixels, {TILES}, str engine) -> (Tensor, Tensor)")
+def accumulate(means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, *view: Any) -> tuple[Tensor, Tensor]:
     """Sums and weights, see `kfgs.splat.engines.accumulate_pixels`; without gradient."""
-    check_values(len(means2d), len(means2d), None, rows, offsets)
-    return load(engine).accumulate(means2d, conics, opacities, pixels, rows, offsets, width, height, tile_size)
+    tiles = Tiles(*view[:5])
+    check_values(len(means2d), len(means2d), None, tiles)
+    return load(view[5]).accumulate(means2d, conics, opacities, pixels, tiles)
 
 
 @register_fake("kfgs::accumulate")
-def _(
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    pixels: Tensor,
-    rows: Tensor,
-    offsets: Tensor,
-    width: int,
-    height: int,
-    tile_size: int,
-    engine: str,
-) -> tuple[Tensor, Tensor]:
+def _(means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, *view: Any) -> tuple[Tensor, Tensor]:
     return pixels.new_empty(len(means2d), pixels.shape[2]), pixels.new_empty(len(means2d))
 
 
-@_operator
-def project(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    near: float,
-    low_pass: float,
-    engine: str,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+@_operator(f"({CLOUD}, {PINHOLE}, str engine) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)")
+def project(*inputs: Any) -> tuple[Tensor, ...]:
     """The six tensors of `kfgs.splat.Projected`."""
-    return load(engine).project(means, quats, scales, opacities, viewmat, K, width, height, near, low_pass)
+    return load(inputs[10]).project(Cloud(*inputs[:4]), Pinhole(*inputs[4:10]))
 
 
 @register_fake("kfgs::project")
-def _(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    near: float,
-    low_pass: float,
-    engine: str,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+def _(means: Tensor, *others: Any) -> tuple[Tensor, ...]:
     M = torch.library.get_ctx().new_dynamic_size()
-    means2d, conics, depths, seen, extents = (means.new_empty(shape) for shape in ((M, 2), (M, 3), (M,), (M,), (M, 2)))
-    return means2d, conics, depths, seen, extents, means.new_empty(M, dtype=torch.int64)
+    floats = (means.new_empty(shape) for shape in ((M, 2), (M, 3), (M,), (M,), (M, 2)))
+    return *floats, means.new_empty(M, dtype=torch.int64)
 
 
-@_operator
-def project_backward(
-    grad_means2d: Tensor,
-    grad_conics: Tensor,
-    grad_depths: Tensor,
-    grad_opacities: Tensor,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    near: float,
-    low_pass: float,
-    index: Tensor,
-    engine: str,
-) -> list[Tensor]:
+@_operator(
+    "(Tensor grad_means2d, Tensor grad_conics, Tensor grad_depths, Tensor grad_opacities, "
+    f"{CLOUD}, {PINHOLE}, Tensor index, str engine) -> Tensor[]"
+)
+def project_backward(*inputs: Any) -> list[Tensor]:
     """Gradients of means, quats, scales and opacities."""
-    grads = grad_means2d, grad_conics, grad_depths, grad_opacities
-    gaussians = means, quats, scales, opacities
-    options = viewmat, K, width, height, near, low_pass, index
-    return load(engine).project_backward(*grads, *gaussians, *options)
+    cloud, pinhole, (index, engine) = Cloud(*inputs[4:8]), Pinhole(*inputs[8:14]), inputs[14:]
+    return load(engine).project_backward(inputs[:4], cloud, pinhole, index)
 
 
 @register_fake("kfgs::project_backward")
-def _(
-    grad_means2d: Tensor,
-    grad_conics: Tensor,
-    grad_depths: Tensor,
-    grad_opacities: Tensor,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    near: float,
-    low_pass: float,
-    index: Tensor,
-    engine: str,
-) -> list[Tensor]:
-    return [torch.empty_like(value) for value in (means, quats, scales, opacities)]
+def _(*inputs: Any) -> list[Tensor]:
+    return [torch.empty_like(value) for value in inputs[4:8]]
 
 
 def _save_project(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -308,34 +179,18 @@ def _differentiate_project(ctx: Any, *grads: Tensor) -> tuple[Any, ...]:
 register_autograd("kfgs::project", _differentiate_project, setup_context=_save_project)
 
 
-@_operator
-def bin_tiles(
-    means2d: Tensor,
-    conics: Tensor,
-    depths: Tensor,
-    opacities: Tensor,
-    extents: Tensor,
-    width: int,
-    height: int,
-    tile_size: int,
-    engine: str,
-) -> tuple[Tensor, Tensor]:
+@_operator(
+    "(Tensor means2d, Tensor conics, Tensor depths, Tensor opacities, Tensor extents, "
+    "SymInt width, SymInt height, SymInt tile_size, str engine) -> (Tensor, Tensor)"
+)
+def bin_tiles(*inputs: Any) -> tuple[Tensor, Tensor]:
     """Rows and offsets of `kfgs.splat.Tiles`."""
-    return load(engine).bin(means2d, conics, depths, opacities, extents, width, height, tile_size)
+    return load(inputs[-1]).bin(*inputs[:-1])
 
 
 @register_fake("kfgs::bin_tiles")
-def _(
-    means2d: Tensor,
-    conics: Tensor,
-    depths: Tensor,
-    opacities: Tensor,
-    extents: Tensor,
-    width: int,
-    height: int,
-    tile_size: int,
-    engine: str,
-) -> tuple[Tensor, Tensor]:
+def _(*inputs: Any) -> tuple[Tensor, Tensor]:
+    means2d, (width, height, tile_size) = inputs[0], inputs[5:8]
     pairs = torch.library.get_ctx().new_dynamic_size()
     tiles = -(-width // tile_size) * -(-height // tile_size)
     return means2d.new_empty(pairs, dtype=torch.int32), means2d.new_empty(tiles + 1, dtype=torch.int64)

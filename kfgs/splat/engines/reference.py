@@ -1,9 +1,8 @@
 """The reference engine: compositing in plain torch, many tiles at a time, with gradients by autograd.
 
-It states the contract as directly as tensors allow, runs on any device torch runs on, and is what faster engines are
-compared with. Tiles with similarly many Gaussians are stacked (B tiles), and walked front to back in chunks of C
-Gaussians at P pixels. Autograd over a whole picture would keep every alpha alive, so the backward pass replays one chunk
-after another, last to first, from the transmittance that each started with.
+It states the contract as directly as tensors allow, and faster engines are compared with it. B tiles with similarly many
+Gaussians are stacked, and walked front to back in chunks of C Gaussians at P pixels. Autograd over a whole picture would
+keep every alpha. So the backward pass replays the chunks, last to first, from the transmittance that each started with.
 """
 
 from __future__ import annotations
@@ -15,14 +14,13 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..tiles import Tiles
-from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Splats, Tiles
 
 CHUNK = 64
 """Gaussians of a tile composited at once; pixels that stop are noticed between chunks."""
 
 BATCH = 1 << 20
-"""Largest B * P * C: elements of one intermediate tensor, a few megabytes, as large as caches and memory like."""
+"""Largest B * P * C: elements of one intermediate tensor, a few megabytes."""
 
 
 class _Chunk(NamedTuple):
@@ -35,18 +33,11 @@ class _Chunk(NamedTuple):
     stopped: Tensor  # [B, P] pixels that had stopped before
 
 
-def composite(
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    background: Tensor,
-    index: Tensor | None,
-    tiles: Tiles,
-) -> tuple[Tensor, Tensor]:
-    """Composite as `kfgs.splat.engines.contract` says; called through `kfgs.splat.engines.composite`."""
+def composite(splats: Splats, tiles: Tiles) -> tuple[Tensor, Tensor]:  # maps [H, W, D], alphas [H, W]
+    """Composite as the contract says; called through `kfgs.splat.engines.composite`."""
+    *footprints, features, background, index = splats
     features = features if index is None else features[index]
-    sums, transmittance = _Composite.apply(means2d, conics, opacities, features, tiles)
+    sums, transmittance = _Composite.apply(*footprints, features, tiles)
     sums = sums + transmittance[..., None] * background
     return _to_image(sums, tiles), 1 - _to_image(transmittance[..., None], tiles)[..., 0]
 
@@ -60,27 +51,18 @@ def devices() -> tuple[str, ...]:
 
 
 def accumulate(
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    pixels: Tensor,  # [H, W, D]
-    rows: Tensor,
-    offsets: Tensor,
-    width: int,
-    height: int,
-    tile_size: int,
+    means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, tiles: Tiles
 ) -> tuple[Tensor, Tensor]:  # sums [M, D], weights [M]
     """Sum pixels into the Gaussians by compositing weight, in one walk over the chunks."""
-    view = Tiles(rows, offsets, width, height, tile_size)
-    signal = _to_tiles(torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=2), view)  # [T, P, D + 1]
+    signal = _to_tiles(torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=2), tiles)  # [T, P, D + 1]
     T, P = signal.shape[:2]
     transmittance, stopped = pixels.new_ones(T, P), torch.zeros(T, P, dtype=torch.bool, device=pixels.device)
     sums = pixels.new_zeros(len(means2d), signal.shape[2])
-    for batch in _batches(view):
-        for tile, which, present in _front_to_back(view, batch, stopped):
+    for batch in _batches(tiles):
+        for tile, which, present in _front_to_back(tiles, batch, stopped):
             chunk = _Chunk(tile, which, present, transmittance[tile], stopped[tile])
             splats = (value[which] for value in (means2d, conics, opacities))
-            weights, transmittance[tile], stopped[tile] = _weigh_chunk(chunk, view, chunk.transmittance, *splats)
+            weights, transmittance[tile], stopped[tile] = _weigh_chunk(chunk, tiles, chunk.transmittance, *splats)
             sums.index_add_(0, which.flatten(), (weights.mT @ signal[tile]).flatten(0, 1))
     return sums[:, :-1], sums[:, -1]
 
@@ -187,7 +169,7 @@ def _pixel_centers(tile: Tensor, tiles: Tiles, dtype: torch.dtype) -> Tensor:  #
 
 
 def _batches(tiles: Tiles) -> Iterator[Tensor]:
-    """Tiles that have Gaussians, stacked with their likes in number: [B] int64 each."""
+    """Tiles that have Gaussians, stacked with those that have about as many: [B] int64 each."""
     counts = tiles.offsets.diff()
     order = torch.argsort(counts, descending=True, stable=True)[: int((counts > 0).sum())]
     if len(order):
@@ -195,7 +177,7 @@ def _batches(tiles: Tiles) -> Iterator[Tensor]:
 
 
 def _front_to_back(tiles: Tiles, batch: Tensor, stopped: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Chunks (tile [B], rows [B, C], present [B, C]) of a batch, leaving out the tiles that are done."""
+    """Chunks (tile [B], rows [B, C], present [B, C]) of a batch, without the tiles that are done."""
     counts = tiles.offsets.diff()[batch]
     for start in range(0, int(counts.max()), CHUNK):
         going = (counts > start) & ~stopped[batch].all(dim=1)

@@ -54,11 +54,17 @@ numba_cache = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(numba_cache)
 import kernels
 
+
+def probe():  # a call of Python, which the profiler must see
+    pass
+
+
 kernel = kernels.decorate(numba_cache.cached_njit)
 pair, out = kernels.Pair(np.arange(3, dtype=dtype), np.ones(3, dtype)), np.zeros(3, dtype)
 kernel(pair, out)
 python_calls = []
 sys.setprofile(lambda frame, event, _: python_calls.append(frame.f_code.co_name) if event == "call" else None)
+probe()
 kernel(pair, out)
 sys.setprofile(None)
 print(json.dumps({
@@ -95,7 +101,7 @@ def test_later_processes_take_the_kernel_from_the_disk_until_a_file_changes(tmp_
         assert done.returncode == 0, done.stderr
         found = json.loads(done.stdout)
         assert (found["hits"], found["misses"], found["out"]) == (hits, 1 - hits, [1, 3, 5]), (change, dtype)
-        assert set(found["python calls"]) <= {"kernel"}  # numba reports the kernel itself
+        assert [name for name in found["python calls"] if name != "kernel"] == ["probe"]  # numba may report the kernel
 
 
 def _load(file):

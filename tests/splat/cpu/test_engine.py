@@ -21,6 +21,7 @@ from torch.utils.data import DataLoader
 numba = pytest.importorskip("numba")
 
 from kfgs.splat import Tiles, accumulate_pixels, bin_tiles, composite  # noqa: E402
+from kfgs.splat.engines.contract import Splats  # noqa: E402
 from kfgs.splat.engines.cpu import engine as numba_cpu  # noqa: E402
 from kfgs.splat.engines.cpu import square as numba_square  # noqa: E402
 from kfgs.splat.engines.cpu.simd import bits, load  # noqa: E402
@@ -413,9 +414,9 @@ def test_nothing_is_looked_at_behind_what_is_opaque():
     means2d, conics = torch.full((count, 2), 8.0), torch.tensor([[1e-13, 0, 1e-13]]).repeat(count, 1)
     opacities, features = torch.full((count,), 0.005), torch.ones(count, 1)
     opacities[opaque : opaque + 3] = 0.98
-    inputs = means2d, conics, opacities, features, torch.zeros(1), None
+    splats = Splats(means2d, conics, opacities, features, torch.zeros(1), None)
     tiles = _everywhere(count, 16, 16, 16)
-    _, alphas, trace = numba_cpu.forward(*inputs, tiles.rows, tiles.offsets, 16, 16, 16)
+    _, alphas, trace = numba_cpu.forward(splats, tiles)
     assert float(alphas.min()) > 0.999
     looked_at = trace[-count - 1]  # one tile of one square: how many, and then the blocks of each
     assert int(looked_at) == 2 * CHUNK
@@ -469,7 +470,7 @@ def test_bands_cover_all_tiles_once_and_do_not_depend_on_threads(many_bands):
     try:
         for n in (1, 5):
             torch.set_num_threads(n)
-            views.append(numba_cpu._view(tiles.rows, tiles.offsets, width, height, 16))
+            views.append(numba_cpu._view(tiles))
     finally:
         torch.set_num_threads(threads)
     bounds = views[0].bounds
@@ -517,7 +518,7 @@ def test_what_was_in_memory_before_is_never_read(channels, dtype, monkeypatch, m
 
 @pytest.mark.parametrize("tiles", [1, 2, 40])
 def test_bands_of_few_tiles(tiles):
-    view = numba_cpu._view(torch.zeros(0, dtype=torch.int32), torch.zeros(tiles + 1).long(), 16 * tiles, 16, 16)
+    view = numba_cpu._view(Tiles(torch.zeros(0).int(), torch.zeros(tiles + 1).long(), 16 * tiles, 16, 16))
     assert (view.bounds[0], view.bounds[-1]) == (0, tiles)
     assert (np.diff(view.bounds) >= 0).all()
 

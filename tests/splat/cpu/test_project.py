@@ -16,6 +16,7 @@ numba = pytest.importorskip("numba")
 
 from messages import tells  # noqa: E402
 
+from kfgs.splat.engines.contract import Pinhole  # noqa: E402
 from kfgs.splat.engines.cpu import project as numba_project  # noqa: E402
 from kfgs.splat.engines.cpu import project_backward as numba_project_backward  # noqa: E402
 from kfgs.splat.engines.cpu import project_forward as numba_project_forward  # noqa: E402
@@ -276,8 +277,7 @@ def test_inputs_may_be_strided():
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="reads x86-64 assembly")
 def test_batches_are_vectorised_and_stay_in_float32():
-    matrix = np.eye(4, dtype=np.float32)
-    lens = numba_project_math.make_lens(matrix, matrix[:3, :3], 4, 4, 0.1, 0.3)
+    lens = numba_project_math.make_lens(Pinhole(torch.eye(4), torch.eye(3), 4, 4, 0.1, 0.3))
     for module, name in ((numba_project_forward, "_project_batch"), (numba_project_backward, "_differentiate_batch")):
         kernel = getattr(module, name)
         kernel(np.ones(module._STATE, np.float32), lens)

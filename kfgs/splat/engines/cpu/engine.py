@@ -1,17 +1,15 @@
-"""The CPU engine: compositing compiled by numba, with its own backward pass.
-
-The data alone decide how the tiles are cut into bands. Each band writes its own pixels and its own gradient rows, and the
-rows are summed in the order of the bands. So reruns are equal to the bit, on any number of threads.
-"""
+"""The CPU engine: compositing compiled by numba, with its own backward pass. README.md explains its parts."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ..contract import Composited, Splats, Tiles
 from . import square, wide
 from .bands import accumulate_band, composite_narrow, composite_wide
 from .bands_backward import differentiate_narrow, differentiate_wide
@@ -25,16 +23,13 @@ from .ssim import similarity
 from .threads import run_bands
 from .tiles import bin
 
-row_length, padded_length = (
-    square.row_length.py_func,
-    wide.padded_length.py_func,
-)  # in Python: one call is not worth compiling
+row_length, padded_length = square.row_length.py_func, wide.padded_length.py_func  # one call is not worth compiling
 
 __all__ = ["accumulate", "backward", "bin", "devices", "forward", "project", "project_backward", "similarity"]
 
 MOST_BANDS, PAIRS_PER_BAND = 32, 2048
-"""The most bands, and the fewest pairs of a band. More bands keep more threads busy, but more Gaussians then have a gradient
-row in several bands. The number of bands depends on the data alone."""
+"""The most bands, and the fewest pairs of a band. More bands keep more threads busy, but give more Gaussians a gradient row
+in several bands."""
 
 NARROW_CHANNELS = len(FIRST) + LANES
 """The most channels that are summed in registers, one vector each; more are multiplied as small matrices."""
@@ -48,28 +43,17 @@ def devices() -> tuple[str, ...]:
     return ("cpu",)
 
 
-def forward(
-    means2d: Tensor,  # [M, 2]
-    conics: Tensor,  # [M, 3]
-    opacities: Tensor,  # [M]
-    features: Tensor,  # [N, D]
-    background: Tensor,  # [D]
-    index: Tensor | None,  # [M] int64
-    rows: Tensor,  # [P]
-    offsets: Tensor,  # [T + 1]
-    width: int,
-    height: int,
-    tile_size: int,
-) -> tuple[Tensor, Tensor, Tensor]:  # maps [H, W, D], alphas [H, W], trace int32
-    """Composite as `contract` promises; a Gaussian whose conic is not positive definite is not drawn."""
-    channels = features.shape[1]
-    view = _view(rows, offsets, width, height, tile_size)
+def forward(splats: Splats, tiles: Tiles) -> Composited:
+    """Composite as the contract says."""
+    means2d, conics, opacities, features, background, index = splats
+    channels, view = features.shape[1], _view(tiles)
     bands = len(view.bounds) - 1
-    maps, alphas = take_memory(features, height, width, channels), features.new_empty(height, width)
+    maps = take_memory(features, view.height, view.width, channels)
+    alphas = features.new_empty(view.height, view.width)
     trace, packed, finals, ends = _make_trace(view, means2d, channels)
     ends[: view.across**2 * (len(view.offsets) - 1)] = 0
-    splats = _flat(means2d), _flat(conics), _flat(opacities)
-    run_bands(pack_rows, bands, bands, splats, _flat(features), _packed(channels), _index(index), packed)
+    footprints = _flat(means2d), _flat(conics), _flat(opacities)
+    run_bands(pack_rows, bands, bands, footprints, _flat(features), _packed(channels), _index(index), packed)
     images, length = (_flat(maps), _flat(alphas), finals), row_length(_packed(channels))
     behind = _padded(background, padded_length(channels))
     if channels <= NARROW_CHANNELS:
@@ -78,35 +62,19 @@ def forward(
     else:
         shared = (view, packed, length, _flat(features), _begins(index, len(means2d), channels), behind, images, ends)
         run_bands(composite_wide, bands, *shared)
-    return maps, alphas, trace
+    return Composited(maps, alphas, trace)
 
 
 def backward(
-    grad_maps: Tensor,  # [H, W, D]
-    grad_alphas: Tensor,  # [H, W]
-    wanted: list[bool],
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    background: Tensor,
-    index: Tensor | None,
-    rows: Tensor,
-    offsets: Tensor,
-    width: int,
-    height: int,
-    tile_size: int,
-    maps: Tensor,
-    alphas: Tensor,
-    trace: Tensor,
+    grads: Sequence[Tensor], wanted: Sequence[bool], splats: Splats, tiles: Tiles, result: Composited
 ) -> list[Tensor]:
-    """Gradients of means2d, conics, opacities, features and background; empty where not wanted."""
-    channels = features.shape[1]
-    view = _view(rows, offsets, width, height, tile_size)
+    """Gradients as the contract says, given those in the maps and in the alphas."""
+    means2d, conics, opacities, features, background, index = splats
+    channels, view = features.shape[1], _view(tiles)
     bands = len(view.bounds) - 1
     slots, firsts, total, chains = _number(view, len(means2d))
-    packed, finals, ends = _read_trace(trace, view, means2d, channels)
-    images = _flat(maps), _flat(grad_maps), finals, _flat(grad_alphas)
+    packed, finals, ends = _read_trace(result.trace, view, means2d, channels)
+    images = _flat(result.maps), _flat(grads[0]), finals, _flat(grads[1])
     length, behind = row_length(_packed(channels)), _padded(background, padded_length(channels))
     row, column = (length, MOMENTS) if channels <= NARROW_CHANNELS else (LANES + padded_length(channels), LANES)
     out = take_memory(means2d, total * row).numpy()
@@ -117,36 +85,21 @@ def backward(
         source = _flat(features), _begins(index, len(means2d), channels), channels
         shared = (view, packed, length, source, behind, images, ends, slots, firsts, out, any(wanted[:3]))
         run_bands(differentiate_wide, bands, *shared)
-    grads = [
-        torch.empty_like(means2d),
-        torch.empty_like(conics),
-        torch.empty_like(opacities),
-        torch.zeros_like(features),
-    ]
+    found = [*(torch.empty_like(value) for value in splats[:3]), torch.zeros_like(features)]
     which, layout = _index(index), (row, column, channels)
     shares = bands if _increasing(which) else 1  # two Gaussians that show the same row must not meet
-    splats, targets = (_flat(conics), _flat(opacities)), tuple(_flat(value) for value in grads)
-    run_bands(gather_gradients, shares, shares, splats, chains, out, layout, which, targets)
-    grads.append(
-        (grad_maps * torch.from_numpy(finals).view_as(alphas)[..., None]).sum((0, 1)) if wanted[4] else background
-    )
-    return [value if want else value.new_empty(0) for value, want in zip(grads, wanted, strict=True)]
+    values, targets = (_flat(conics), _flat(opacities)), tuple(_flat(value) for value in found)
+    run_bands(gather_gradients, shares, shares, values, chains, out, layout, which, targets)
+    light = torch.from_numpy(finals).view_as(result.alphas)[..., None]
+    found.append((grads[0] * light).sum((0, 1)) if wanted[4] else background)
+    return [value if want else value.new_empty(0) for value, want in zip(found, wanted, strict=True)]
 
 
 def accumulate(
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    pixels: Tensor,  # [H, W, D]
-    rows: Tensor,
-    offsets: Tensor,
-    width: int,
-    height: int,
-    tile_size: int,
+    means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, tiles: Tiles
 ) -> tuple[Tensor, Tensor]:  # sums [M, D], weights [M]
     """Sum pixels into the Gaussians by compositing weight, in one walk."""
-    channels = pixels.shape[2]
-    view = _view(rows, offsets, width, height, tile_size)
+    channels, view = pixels.shape[2], _view(tiles)
     bands = len(view.bounds) - 1
     slots, firsts, total, chains = _number(view, len(means2d))
     packed = torch.empty(len(means2d) * row_length(0), dtype=pixels.dtype).numpy()
@@ -216,8 +169,9 @@ def _padded(background: Tensor, channels: int) -> np.ndarray:
     return behind
 
 
-def _view(rows: Tensor, offsets: Tensor, width: int, height: int, tile_size: int) -> View:
+def _view(tiles: Tiles) -> View:
     """The tiles, and bands of consecutive tiles with about equally many pairs (an empty tile has a cost too)."""
+    rows, offsets, width, height, tile_size = tiles
     ends = offsets.numpy().astype(np.int64, copy=False)
     cost = ends + 4 * np.arange(len(ends))
     bands = min(MOST_BANDS, 1 + int(cost[-1]) // PAIRS_PER_BAND)

@@ -1,11 +1,10 @@
 """What the compiled projection and its gradient share: the lens as numbers, planes of scratch memory, the footprint.
 
-Gaussians are worked on in batches of BATCH, gathered into planes: entry i of plane p is `state[p + i]`. The inner loop
-over a batch has no branches, always the same length, and planes at constant distances, so that LLVM computes 8 or 16
-Gaussians per instruction; and since it has no remainder, what comes out does not depend on a Gaussian's neighbours.
+Gaussians are gathered into planes, BATCH at a time: entry i of plane p is `state[p + i]`. The inner loop over a batch has no
+branches, a constant length, and planes at constant distances. So LLVM computes 8 or 16 Gaussians per instruction, and
+results do not depend on a Gaussian's neighbours.
 
-Arrays with several numbers per Gaussian are passed flat, so that these numbers' distance is known to the compiler, too;
-`max(row, 0)` tells it that an index does not wrap around.
+Arrays are passed flat, so that the compiler knows all distances; `max(row, 0)` tells it that an index does not wrap around.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ import numpy as np
 from numba import njit
 
 from ...project import FIELD_OF_VIEW_MARGIN
+from ..contract import Pinhole
 
 BATCH = 64
 MEAN, QUAT, SCALE = 0, 3 * BATCH, 7 * BATCH
@@ -47,8 +47,10 @@ class Lens(NamedTuple):
     rounding: Any  # relative, of a pixel box's edges
 
 
-def make_lens(viewmat: Any, K: Any, width: int, height: int, near: float, low_pass: float) -> Lens:
-    """Take viewmat [4, 4] and K [3, 3] apart; the tangents' limits are those of `project`."""
+def make_lens(pinhole: Pinhole) -> Lens:
+    """Take the camera apart; the tangents' limits are those of `project`."""
+    viewmat, K = (value.detach().numpy() for value in pinhole[:2])
+    _, _, width, height, near, low_pass = pinhole
     kind = K.dtype.type
     focal, principal = (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2])
     size = kind(width), kind(height)
@@ -87,12 +89,8 @@ def to_camera(state: Any, i: int, lens: Lens) -> tuple[Any, Any, Any]:
 @njit(fastmath=PLAIN, **OPTIONS)
 def normalize(state: Any, i: int) -> tuple[Any, Any, Any, Any, Any]:
     """Quaternion (w, x, y, z) of the batch's Gaussian i divided by its norm, and the norm."""
-    w, x, y, z = (
-        state[QUAT + i],
-        state[QUAT + BATCH + i],
-        state[QUAT + 2 * BATCH + i],
-        state[QUAT + 3 * BATCH + i],
-    )
+    w, x = state[QUAT + i], state[QUAT + BATCH + i]
+    y, z = state[QUAT + 2 * BATCH + i], state[QUAT + 3 * BATCH + i]
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     scale = state.dtype.type(1) / max(norm, state.dtype.type(QUAT_FLOOR))
     return w * scale, x * scale, y * scale, z * scale, norm

@@ -1,13 +1,12 @@
 """SSIM of two pictures and its gradient in one of them, compiled by numba: some ten times faster than convolutions.
 
-Pictures stay as they are, row by row with their channels side by side: the same channel of the next pixel is so many
-numbers further on, and every inner loop runs over neighbouring numbers. Each row of windows is blurred downwards, then
-along; the gradient takes the same two steps back. Shares of rows write what no other share does.
+Channels stay side by side, so every inner loop runs over neighbouring numbers. Each row of windows is blurred downwards,
+then along; the gradient takes the same two steps back. No two shares of rows write the same memory.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -36,7 +35,7 @@ def similarity(
     window: Tensor,  # [11] weights of the window along an axis; symmetric, sum 1
     constants: tuple[float, float],
 ) -> tuple[Tensor, Tensor]:  # [] , [H, W, D]
-    """Mean SSIM over the windows inside the picture, or those of them that are counted, and its gradient in `picture`.
+    """Mean SSIM over the (counted) windows inside the picture, and its gradient in `picture`.
 
     Args:
         picture: contiguous float32 or float64 on the CPU, at least 11 pixels on each side.
@@ -55,9 +54,18 @@ def similarity(
     bands = -(-rows // _BAND)
     sums = np.empty(bands)
     weights, limits = window.numpy(), (kind(constants[0]), kind(constants[1]))
-    run_bands(compare_band, bands, bands, weights, limits, a, b, channels, mask, slopes, sums)
-    run_bands(spread_band, bands, bands, weights, kind(1 / count), a, b, channels, slopes, out)
+    pair = Pair(a, b, channels)
+    run_bands(compare_band, bands, bands, weights, limits, pair, mask, slopes, sums)
+    run_bands(spread_band, bands, bands, weights, kind(1 / count), pair, slopes, out)
     return picture.new_tensor(sums.sum() / count), torch.from_numpy(out).view_as(picture)
+
+
+class Pair(NamedTuple):
+    """Two pictures, their channels side by side."""
+
+    picture: Any  # [H, W D]
+    target: Any  # [H, W D]
+    channels: int  # D
 
 
 @njit(fastmath=_FAST, inline="always", **OPTIONS)
@@ -79,14 +87,13 @@ def compare_band(
     bands: int,
     window: Any,  # [11]
     constants: tuple[Any, Any],
-    picture: Any,  # [H, W D]
-    target: Any,  # [H, W D]
-    channels: int,
+    pair: Pair,
     counted: Any,  # [H - 10, (W - 10) D] bool, or empty
     slopes: Any,  # [3, H - 10, (W - 10) D], written
     sums: Any,  # [bands], written
 ) -> None:
     """Sum SSIM over a share of the windows; keep its slopes in the windows' means of a, a^2 and a b."""
+    picture, target, channels = pair
     rows, length = picture.shape[0] - 10, picture.shape[1]
     across = length - 10 * channels
     w = (window[0], window[1], window[2], window[3], window[4], window[5])
@@ -142,13 +149,12 @@ def spread_band(
     bands: int,
     window: Any,  # [11]
     factor: Any,
-    picture: Any,  # [H, W D]
-    target: Any,  # [H, W D]
-    channels: int,
+    pair: Pair,
     slopes: Any,  # [3, H - 10, (W - 10) D]
     out: Any,  # [H, W D], written
 ) -> None:
     """Carry the windows' slopes back to a share of the picture's rows, times `factor`."""
+    picture, target, channels = pair
     height, length = picture.shape
     across, first = length - 10 * channels, 10 * channels
     w = (window[0], window[1], window[2], window[3], window[4], window[5])

@@ -1,14 +1,15 @@
 """The GPU engine: compositing by Triton kernels, float32, any number of channels.
 
-Nothing here waits for the GPU: sizes come from shapes, and where each pixel stopped is handed from the forward to the
-backward pass as a tensor. Programs add their gradients to a Gaussian's by atomics, in the order in which they happen to
-finish: two runs of the backward pass, and of `accumulate`, agree to rounding, not to the bit. The forward pass does.
+Nothing here waits for the GPU: sizes come from shapes, and where each pixel stopped is a tensor. Programs add to a
+Gaussian's gradients by atomics, in any order. So two runs of the backward pass, and of `accumulate`, agree to rounding;
+two runs of the forward pass agree to the bit. Kernels have more than eight parameters, because a launch takes flat pointers.
 
 With TRITON_INTERPRET=1 in the environment before triton is imported, the same kernels run on CPU tensors, slowly.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ import torch
 import triton
 from torch import Tensor
 
+from ..contract import Composited, Splats, Tiles
 from .kernels import accumulate_kernel, composite_kernel
 from .kernels_backward import differentiate_kernel
 
@@ -66,27 +68,17 @@ def devices() -> tuple[str, ...]:
     return ("cuda", "cpu") if INTERPRETED else ("cuda",)
 
 
-def forward(
-    means2d: Tensor,  # [M, 2]
-    conics: Tensor,  # [M, 3]
-    opacities: Tensor,  # [M]
-    features: Tensor,  # [N, D]
-    background: Tensor,  # [D]
-    index: Tensor | None,  # [M] int64
-    rows: Tensor,  # [P] int32 or int64
-    offsets: Tensor,  # [T + 1] int32 or int64
-    width: int,
-    height: int,
-    tile_size: int,
-) -> tuple[Tensor, Tensor, Tensor]:  # maps [H, W, D], alphas [H, W], trace [2 * H * W] int32
-    """Composite as `contract` promises.
+def forward(splats: Splats, tiles: Tiles) -> Composited:
+    """Composite as the contract says.
 
-    `trace` is for the backward pass: how many Gaussians of its tile's list each pixel passed before it stopped, and the
+    The trace, [2 * H * W], is how many Gaussians of its tile's list each pixel passed before it stopped, and the
     bits of its final transmittance, of which 1 - alpha would keep few digits behind what is opaque.
 
     Raises:
         ValueError: if the tensors are not float32, or not on a device that the kernels run on.
     """
+    means2d, conics, opacities, features, background, index = splats
+    rows, offsets, width, height, tile_size = tiles
     _check(means2d=means2d, conics=conics, opacities=opacities, features=features, background=background)
     D = features.shape[1]
     maps, alphas = features.new_empty(height, width, D), features.new_empty(height, width)
@@ -95,94 +87,66 @@ def forward(
     if len(rows) == 0:
         stops.zero_()
         lights.fill_(1.0)
-        return maps.copy_(background.expand_as(maps)), alphas.zero_(), trace.view(-1)
+        return Composited(maps.copy_(background.expand_as(maps)), alphas.zero_(), trace.view(-1))
     options = launch_options("composite", D, tile_size)
-    grid = _programs(options, width, height), -(-D // options["BLOCK"])
+    grid = _programs(options, tiles), -(-D // options["BLOCK"])
     with _on(means2d):
         composite_kernel[grid](
             means2d, conics, opacities, features, background, index, rows, offsets,
-            maps, alphas, stops, lights, width, height, -(-width // tile_size), D, **options,
+            maps, alphas, stops, lights, width, height, tiles.grid[1], D, **options,
         )  # fmt: skip
-    return maps, alphas, trace.view(-1)
+    return Composited(maps, alphas, trace.view(-1))
 
 
 def backward(
-    grad_maps: Tensor,  # [H, W, D]
-    grad_alphas: Tensor,  # [H, W]
-    wanted: tuple[bool, bool, bool, bool, bool],
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    background: Tensor,
-    index: Tensor | None,
-    rows: Tensor,
-    offsets: Tensor,
-    width: int,
-    height: int,
-    tile_size: int,
-    maps: Tensor,
-    alphas: Tensor,
-    trace: Tensor,
+    grads: Sequence[Tensor], wanted: Sequence[bool], splats: Splats, tiles: Tiles, result: Composited
 ) -> list[Tensor]:
-    """Gradients of means2d, conics, opacities, features and background; one not `wanted` is an empty tensor.
-
-    Args:
-        grad_maps: gradient of the loss in the maps.
-        grad_alphas: gradient of the loss in the alphas.
-        wanted: which of the five gradients are asked for.
-        means2d: this and all up to `tile_size`: as given to `forward`.
-        maps: this and the rest: as `forward` returned them.
+    """Gradients as the contract says, given those in the maps and in the alphas.
 
     Raises:
         ValueError: as `forward`.
     """
+    (grad_maps, grad_alphas), (maps, alphas, trace) = grads, result
+    means2d, conics, opacities, features, background, index = splats
+    rows, offsets, width, height, tile_size = tiles
     _check(grad_maps=grad_maps, grad_alphas=grad_alphas, means2d=means2d, features=features)
     of_splats, of_features = any(wanted[:3]), bool(wanted[3])
     trace = trace.view(2, height, width)
     stops, lights = trace[0], trace[1].view(torch.float32)
-    values = (means2d, conics, opacities, features)
     computed = (of_splats, of_splats, of_splats, of_features)
-    grads = [torch.zeros_like(v) if c else v.new_empty(0) for v, c in zip(values, computed, strict=True)]
+    found = [torch.zeros_like(v) if c else v.new_empty(0) for v, c in zip(splats[:4], computed, strict=True)]
     if (of_splats or of_features) and len(rows):
         D = features.shape[1]
         options = launch_options("differentiate", D, tile_size)
         with _on(means2d):
-            differentiate_kernel[(_programs(options, width, height),)](
+            differentiate_kernel[(_programs(options, tiles),)](
                 means2d, conics, opacities, features, index, rows, offsets, maps, alphas, stops,
-                grad_maps.contiguous(), grad_alphas.contiguous(), *grads,
-                width, height, -(-width // tile_size), D, **options, OF_SPLATS=of_splats, OF_FEATURES=of_features,
+                grad_maps.contiguous(), grad_alphas.contiguous(), *found,
+                width, height, tiles.grid[1], D, **options, OF_SPLATS=of_splats, OF_FEATURES=of_features,
             )  # fmt: skip
-    grads.append(torch.einsum("hwd,hw->d", grad_maps, lights) if wanted[4] else background.new_empty(0))
-    return [grad if want else grad.new_empty(0) for grad, want in zip(grads, wanted, strict=True)]
+    found.append(torch.einsum("hwd,hw->d", grad_maps, lights) if wanted[4] else background.new_empty(0))
+    return [grad if want else grad.new_empty(0) for grad, want in zip(found, wanted, strict=True)]
 
 
 def accumulate(
-    means2d: Tensor,  # [M, 2]
-    conics: Tensor,  # [M, 3]
-    opacities: Tensor,  # [M]
-    pixels: Tensor,  # [H, W, D]
-    rows: Tensor,
-    offsets: Tensor,
-    width: int,
-    height: int,
-    tile_size: int,
+    means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, tiles: Tiles
 ) -> tuple[Tensor, Tensor]:  # sums [M, D], weights [M]
-    """weights^T · pixels, and the sum of each Gaussian's weights, in one walk over the view.
+    """Sum pixels into the Gaussians by compositing weight, in one walk.
 
     Raises:
         ValueError: as `forward`.
     """
     _check(means2d=means2d, conics=conics, opacities=opacities, pixels=pixels)
+    rows, offsets, width, height, tile_size = tiles
     M, D = len(opacities), pixels.shape[2]
     sums, weights = pixels.new_zeros(M, D), pixels.new_zeros(M)
     if len(rows):
         options = launch_options("accumulate", D, tile_size)
-        grid = _programs(options, width, height), -(-D // options["BLOCK"])
+        grid = _programs(options, tiles), -(-D // options["BLOCK"])
         with _on(means2d):
             accumulate_kernel[grid](
                 means2d, conics, opacities, pixels.contiguous(), rows, offsets, sums, weights,
-                width, height, -(-width // tile_size), D, **options,
+                width, height, tiles.grid[1], D, **options,
             )  # fmt: skip
     return sums, weights
 
@@ -210,9 +174,8 @@ def launch_options(kernel: str, channels: int, tile_size: int) -> dict[str, Any]
     }
 
 
-def _programs(options: dict[str, Any], width: int, height: int) -> int:
-    side = options["SIDE"]
-    return -(-width // side) * -(-height // side) * options["PARTS"]
+def _programs(options: dict[str, Any], tiles: Tiles) -> int:
+    return tiles.grid[0] * tiles.grid[1] * options["PARTS"]
 
 
 def _on(tensor: Tensor) -> AbstractContextManager[Any]:
