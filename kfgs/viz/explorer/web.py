@@ -215,7 +215,7 @@ class Listening:
 
 @contextlib.contextmanager
 def _own_arguments(arguments: str) -> Iterator[None]:
-    """Trame reads the command line of the program; here it reads ours instead."""
+    """Give trame these arguments. It would read the command line of the program."""
     before = os.environ.get("TRAME_ARGS")
     os.environ["TRAME_ARGS"] = arguments
     try:
@@ -229,7 +229,7 @@ def _own_arguments(arguments: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _closed_tabs() -> Iterator[None]:
-    """A tab that is closed while a picture is on its way to it is nothing to tell of; wslink and asyncio would."""
+    """Hide the errors of a tab that is closed while a picture is sent to it. wslink and asyncio would print them."""
     loop, logger = asyncio.get_running_loop(), logging.getLogger("wslink.protocol")
     before = loop.get_exception_handler()
 
