@@ -193,7 +193,7 @@ def test_select_asks_a_field_by_text(field, truth, room, capsys):
     # Each Gaussian carries its class's own embedding.
     assert f"lamp: {int((truth == names.index('lamp')).sum())} of 4000 Gaussians" in said
     assert "12 negatives" in said
-    assert "note: this field was made before fields kept what the views show of each Gaussian" in said
+    assert "note: this field was made by an older kfgs and does not hold what the views show of each Gaussian" in said
     assert main(["select", "lamp", str(field), "--scene", str(room)]) == 0
     said = capsys.readouterr().out
     assert "own latent" not in said

@@ -147,7 +147,7 @@ def test_a_table_in_the_scene_is_found(field, room, truth, names, tmp_path, caps
     assert capsys.readouterr().out == ""
     whole = Classes(scene, text=scene / "text.safetensors").load_classes()
     assert whole.names == tuple(reversed(names))
-    assert "note: labels count the classes of" in capsys.readouterr().out
+    assert "note: label numbers follow the class list of" in capsys.readouterr().out
     np.save(scene / "text.npy", np.ones((len(names), 3), np.float32))
     assert Classes(scene).load_classes().embeddings.shape == (len(names), 3)  # the pair of old goes first
 

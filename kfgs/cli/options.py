@@ -193,8 +193,8 @@ class Classes(SceneOption):
     def load_classes(self) -> Any:
         """The label set of these files.
 
-        If the scene has a `classes.json`, it chooses and orders the classes of the scene's table, because label pictures
-        hold indices into it. A table given by name is taken whole unless --classes is given too.
+        Label pictures hold indices into the scene's `classes.json`. If there is one, only its classes are taken from the
+        scene's table, in its order. A table that is named by --text is used whole, unless --classes is given too.
         """
         from ..labels import load_label_set
 
@@ -211,25 +211,25 @@ class Classes(SceneOption):
 
             if tuple(read_json(listed)) != label_set.names:
                 say(
-                    f"note: labels count the classes of {self.text}; those of {listed} differ. "
-                    f"Pass --classes {listed} to use them"
+                    f"note: label numbers follow the class list of {self.text}, which differs from {listed}. "
+                    f"Pass --classes {listed} to use that list"
                 )
         return label_set
 
     def of_field(self, field: Any) -> Any:
-        """The label set that these options name; if they name none, the one that the field remembers."""
+        """The label set that these options name, or the one that the field remembers."""
         given = any(path is not None for path in (self.scene, self.classes, self.text))
         return self.load_classes() if given or "classes" not in field.info else field.label_set()
 
     def open_field(self, name: str, path: Path) -> Any:
-        """A field with what its views show of each Gaussian; an old field asks the views of --scene, if that is given."""
+        """Open a field. One that lacks what its views show of each Gaussian gets it from the views of --scene."""
         field = open_field(name, path)
         if field.linear is not None and (field.cameras or self.scene is None):
             return field
         if self.scene is None:
             say(
-                "note: this field was made before fields kept what the views show of each Gaussian; each one's own latent "
-                "answers, which is noisy. Pass --scene, or fit it again"
+                "note: this field was made by an older kfgs and does not hold what the views show of each Gaussian. Its answers "
+                "are noisier. Pass --scene, or fit it again"
             )
             return field
         loaded = self.load_scene().undistorted()

@@ -201,7 +201,7 @@ class Listening:
 
 @contextlib.contextmanager
 def _own_arguments(arguments: str) -> Iterator[None]:
-    """Give trame these arguments; it would read the program's command line."""
+    """Give trame these arguments. It would read the command line of the program."""
     before = os.environ.get("TRAME_ARGS")
     os.environ["TRAME_ARGS"] = arguments
     try:
@@ -215,7 +215,7 @@ def _own_arguments(arguments: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _closed_tabs() -> Iterator[None]:
-    """Silence wslink and asyncio when a tab closes while a picture is being sent to it."""
+    """Hide the errors of a tab that is closed while a picture is sent to it. wslink and asyncio would print them."""
     loop, logger = asyncio.get_running_loop(), logging.getLogger("wslink.protocol")
     before = loop.get_exception_handler()
 
