@@ -1,10 +1,12 @@
 """Bad input to the commands of colour scenes: one line that says what to do, exit code 1, nothing written."""
 
+import re
 from pathlib import Path
 
 import pytest
 import torch
 from cases_color import make_field, make_splat
+from messages import tells
 from small_room import make_room
 
 from kfgs.cli import main
@@ -14,142 +16,157 @@ from kfgs.labels.edits import EditList, Remove
 TWICE = ["--views", "view_001", "--views", "view_001.png"]
 ERRORS = {
     "attach": [
-        (["{splat}", "{field}", "--scene", "{room}", "--out", "{o}.ply"], "FIELD: expected the folder that `kfgs fit`"),
-        (["{run}", "{splat}", "--scene", "{room}", "--out", "{o}.ply"], "a run folder; pass {field}"),
-        (["{tmp}/no", "{splat}", "--scene", "{room}", "--out", "{o}.ply"], "no such folder; make one with `kfgs fit`"),
+        (["{splat}", "{field}", "--scene", "{room}", "--out", "{o}.ply"], ("FIELD:", "`kfgs fit`", "got {splat}")),
+        (["{run}", "{splat}", "--scene", "{room}", "--out", "{o}.ply"], ("got {run}", "pass {field}")),
+        (
+            ["{tmp}/no", "{splat}", "--scene", "{room}", "--out", "{o}.ply"],
+            ("FIELD:", "got {tmp}/no", "no such folder", "`kfgs fit`"),
+        ),
         (
             ["{field}", "{field}", "--scene", "{room}", "--out", "{o}.ply"],
-            "SPLATS: expected a splat file, got {field}, a",
+            ("SPLATS:", "got {field}", "a colour splat"),
         ),
-        (["{field}", "{run}", "--scene", "{room}", "--out", "{o}.ply"], "{run}, a semantic field; pass a colour splat"),
-        (["{field}", "{tmp}/no.ply", "--scene", "{room}", "--out", "{o}.ply"], "{tmp}/no.ply: no such file"),
-        (["{field}", "{splat}", "--out", "{o}.ply"], "pass --classes and --text, or --scene"),
+        (["{field}", "{run}", "--scene", "{room}", "--out", "{o}.ply"], ("SPLATS:", "got {run}", "a colour splat")),
+        (["{field}", "{tmp}/no.ply", "--scene", "{room}", "--out", "{o}.ply"], ("{tmp}/no.ply:", "no such file")),
+        (["{field}", "{splat}", "--out", "{o}.ply"], ("--classes, --text:", "got none", "--scene", "`kfgs text`")),
         (
             ["{field}", "{splat}", "--scene", "{room}", "--out", "{o}.ksplat"],
-            "--out: expected a file whose name ends in one",
+            ("--out:", ".compressed.ply, .ply", "got {o}.ksplat"),
         ),
-        (["{field}", "{splat}", "--scene", "{room}", "--out", "{splat}"], "--out: expected another file than {splat}"),
-        (["{field}", "{splat}", "--scene", "{room}", "--out", "{splat}/a.ply"], "below the file {splat}; give another"),
+        (["{field}", "{splat}", "--scene", "{room}", "--out", "{splat}"], ("--out:", "{splat}", "got the same")),
+        (
+            ["{field}", "{splat}", "--scene", "{room}", "--out", "{splat}/a.ply"],
+            ("--out:", "got {splat}/a.ply", "file {splat}"),
+        ),
         (
             ["{field}", "{splat}", "--out", "{o}.ply", "--by", "views", *["--classes", "a", "--text", "b"]],
-            "--by: expected --scene",
+            ("--by:", "--scene", "got none"),
         ),
         (
             ["{field}", "{splat}", "--out", "{o}.ply", "--splat-scene", "{room}"],
-            "--splat-scene: expected --scene beside it",
+            ("--splat-scene:", "--scene", "got none"),
         ),
         (
             ["{field}", "{splat}", "--out", "{o}.ply", "--images", "{room}/images"],
-            "--images: expected none without --scene",
+            ("--images:", "--scene", "got {room}"),
         ),
         (
             ["{field}", "{splat}", "--out", "{o}.ply", "--scene", "{room}", "--splat-scene", "{room}", "--same-frame"],
-            "--same-frame: expected it alone",
+            ("--same-frame:", "alone", "got --splat-scene"),
         ),
         (
             ["{field}", "{splat}", "--scene", "{room}", "--out", "{o}.ply", "--distance", "-1"],
-            "--distance: expected a number",
+            ("--distance:", "(0, inf)", "got -1.0"),
         ),
         (
             ["{field}", "{four}", "--scene", "{room}", "--out", "{o}.ply"],
-            "SPLATS: no frame found in which field and splat",
+            ("SPLATS:", "frame", "got 4"),
         ),
     ],
     "select": [
-        (["{labelled}", "chair"], "QUERY, SOURCE: expected a class, then a file"),
-        (["chiar", "{labelled}", "--out", "{o}"], "did you mean 'chair'?"),
+        (["{labelled}", "chair"], ("QUERY, SOURCE:", "got '{labelled}', 'chair'")),
+        (["chiar", "{labelled}", "--out", "{o}"], ("class:", "got 'chiar'", "'chair'?")),
         (
             ["chair", "{splat}"],
-            "SOURCE: expected a splat with classes, got {splat} without; `kfgs attach` gives it some",
+            ("SOURCE:", "classes", "got {splat}", "`kfgs attach`"),
         ),
-        (["chair", "{tmp}/no.ply"], "{tmp}/no.ply: no such file"),
-        (["chair", "{field}"], "pass --classes and --text, or --scene"),
-        (["chair", "{run}"], "a run folder; pass {field}"),
-        (["chair", "{labelled}", "--threshold", "2"], "--threshold: expected a number in [0, 1], got 2"),
-        (["chair", "{labelled}", "--threshold", "1", "--out", "{o}"], "QUERY: expected Gaussians to save, got none"),
-        (["chair", "{labelled}", "--text", "x.npy"], "--text: expected none beside a splat, which has its own classes"),
-        (["chair", "{labelled}", "--negatives", "none"], "--negatives: expected none beside a splat"),
-        (["chair", "{labelled}", "--teacher", "lseg"], "--teacher: expected none beside a splat"),
-        (["chair", "{labelled}", "--images", "{room}"], "--images: expected none without --scene"),
-        (["chair", "{labelled}", "--out", "{splat}"], "--out: expected a folder or nothing at {splat}, got a file"),
+        (["chair", "{tmp}/no.ply"], ("{tmp}/no.ply:", "no such file")),
+        (["chair", "{field}"], ("--classes, --text:", "got none", "--scene", "`kfgs text`")),
+        (["chair", "{run}"], ("got {run}", "pass {field}")),
+        (["chair", "{labelled}", "--threshold", "2"], ("--threshold:", "[0, 1]", "got 2.0")),
+        (["chair", "{labelled}", "--threshold", "1", "--out", "{o}"], ("QUERY:", "got none")),
+        (["chair", "{labelled}", "--text", "x.npy"], ("--text:", "splat", "got x.npy")),
+        (["chair", "{labelled}", "--negatives", "none"], ("--negatives:", "splat", "got none")),
+        (["chair", "{labelled}", "--teacher", "lseg"], ("--teacher:", "splat", "got lseg")),
+        (["chair", "{labelled}", "--images", "{room}"], ("--images:", "--scene", "got {room}")),
+        (["chair", "{labelled}", "--out", "{splat}"], ("--out:", "{splat}", "got a file")),
     ],
     "edit": [
-        (["{labelled}", "--out", "{o}.ply"], "edits: expected at least one, got none; give --remove"),
-        (["{labelled}", "--out", "{o}.ply", "--remove", "chiar"], "edits[0] (remove): class: expected one of wall"),
-        (["{labelled}", "--out", "{o}.ply", "--recolor", "chair:rde"], "--recolor: expected a colour such as"),
-        (["{labelled}", "--out", "{o}.ply", "--move", "chair:1,2"], "--move: expected 3 numbers between commas"),
-        (["{labelled}", "--out", "{o}.ply", "--insert", "{tmp}/no.ply"], "--insert: expected a splat file"),
+        (["{labelled}", "--out", "{o}.ply"], ("edits:", "got none", "--remove")),
+        (
+            ["{labelled}", "--out", "{o}.ply", "--remove", "chiar"],
+            ("edits[0] (remove): class:", "wall, floor", "got 'chiar'"),
+        ),
+        (
+            ["{labelled}", "--out", "{o}.ply", "--recolor", "chair:rde"],
+            ("--recolor:", "'#c04040', 'teal'", "'rgb(192, 64, 64)'", "got 'rde'"),
+        ),
+        (["{labelled}", "--out", "{o}.ply", "--move", "chair:1,2"], ("--move:", "got 'chair:1,2'")),
+        (["{labelled}", "--out", "{o}.ply", "--insert", "{tmp}/no.ply"], ("--insert:", "got '{tmp}/no.ply'")),
         (
             ["{labelled}", "--out", "{o}.ply", "--insert", "{room}/text.npy"],
-            "edits[0] (insert): {room}/text.npy: expected",
+            ("edits[0] (insert): {room}/text.npy:", "compressed_ply"),
         ),
-        (["{labelled}", "--out", "{splat}", "--insert", "{splat}"], "--out: expected another file than {splat}"),
-        (["{labelled}", "--out", "{labelled}", "--remove", "chair"], "--out: expected another file than {labelled}"),
+        (["{labelled}", "--out", "{splat}", "--insert", "{splat}"], ("--out:", "{splat}", "got the same")),
+        (["{labelled}", "--out", "{labelled}", "--remove", "chair"], ("--out:", "{labelled}", "got the same")),
         (
             ["{labelled}", "--out", "{o}.ksplat", "--remove", "chair"],
-            "--out: expected a file whose name ends in one of",
+            ("--out:", ".compressed.ply, .ply", "got {o}.ksplat"),
         ),
-        (["{labelled}", "--out", "{o}", "--remove", "chair"], "got {o}; the ending chooses the format"),
-        (["{splat}", "--out", "{o}.ply", "--remove", "chair"], "SPLATS: expected a splat with classes, got {splat}"),
+        (["{labelled}", "--out", "{o}", "--remove", "chair"], ("--out:", ".compressed.ply, .ply", "got {o}")),
+        (["{splat}", "--out", "{o}.ply", "--remove", "chair"], ("SPLATS:", "classes", "got {splat}", "`kfgs attach`")),
         (
             ["{field}", "--out", "{o}.ply", "--remove", "chair"],
-            "SPLATS: expected a splat file, got {field}, a semantic",
+            ("SPLATS:", "got {field}", "a colour splat"),
         ),
         (
             ["{labelled}", "--out", "{o}.ply", "--remove", "chair", "--views", "view_001"],
-            "--views: expected none without",
+            ("--views:", "--scene", "got view_001"),
         ),
         (
             ["{labelled}", "--out", "{o}.ply", "--remove", "chair", "--scene", "{room}", "--views", "view_01"],
-            "--views: expected names of the scene's 9 views, got 'view_01'; did you mean 'view_001.png' or",
+            ("--views:", "9 views", "got 'view_01'", "'view_001.png'"),
         ),
         (
             ["{labelled}", "--out", "{o}.ply", "--remove", "rug", "--scene", "{room}", *TWICE],
-            "--views: expected each view once, got 'view_001.png' twice; name it once",
+            ("--views:", "got 'view_001.png' twice"),
         ),
         (
             ["{labelled}", "--out", "{same}.ply", "--replay", "{same}.edits.json"],
-            "--replay: expected another file than {same}.edits.json, where the edits behind {same}.ply are saved, got the same",
+            ("--replay:", "{same}.edits.json", "{same}.ply", "got the same", "--out"),
         ),
         (
             ["{labelled}", "--out", "{taken}.ply", "--remove", "rug"],
-            "a file or nothing at {taken}.edits.json, got a folder",
+            ("--out:", "{taken}.edits.json", "got a folder"),
         ),
         (
             ["{labelled}", "--out", "{o}.ply", "--remove", "chair/0"],
-            "--remove: expected parts counted from 1, got 'chair/0'",
+            ("--remove:", "got 'chair/0'"),
         ),
         (
             ["{labelled}", "--out", "{o}.ply", "--remove", "chair/99"],
-            "chair/99: expected a part from chair/1 to chair/",
+            ("chair/99:", "chair/1 to chair/", "`kfgs select chair"),
         ),
         (
             ["{labelled}", "--out", "{o}.ply", "--remove", "chair", "--pictures", "-1"],
-            "--pictures: expected a number in",
+            ("--pictures:", "[0, inf)", "got -1"),
         ),
-        (["{labelled}", "--out", "{o}.ply", "--replay", "{tmp}/no.json"], "{tmp}/no.json: no such file"),
-        (["{labelled}", "--out", "{o}.ply", "--replay", "{room}/classes.json"], "expected edits that kfgs saved"),
+        (["{labelled}", "--out", "{o}.ply", "--replay", "{tmp}/no.json"], ("{tmp}/no.json:", "no such file")),
+        (
+            ["{labelled}", "--out", "{o}.ply", "--replay", "{room}/classes.json"],
+            ("{room}/classes.json:", "'kfgs.edits'"),
+        ),
         (
             ["{plain}", "--out", "{o}.ply", "--remove", "chair", "--scene", "{room}"],
-            "--scene: expected a splat with colours",
+            ("--scene:", "colours", "got SplatFile("),
         ),
     ],
     "color": [
-        (["{room}", "--out", "{splat}"], "--out: expected a folder or nothing at {splat}, got a file"),
-        (["{room}", "--out", "{o}", "--pictures", "-1"], "--pictures: expected a number in"),
-        (["{room}", "--out", "{o}", "--steps", "0"], "--steps: expected a whole number of at least 1, got 0"),
-        (["{room}", "--out", "{o}", "--split", "val"], "--split: expected one of train, test, got 'val'"),
-        (["{tmp}", "--out", "{o}"], "expected a COLMAP model"),
+        (["{room}", "--out", "{splat}"], ("--out:", "{splat}", "got a file")),
+        (["{room}", "--out", "{o}", "--pictures", "-1"], ("--pictures:", "[0, inf)", "got -1")),
+        (["{room}", "--out", "{o}", "--steps", "0"], ("--steps:", "got 0")),
+        (["{room}", "--out", "{o}", "--split", "val"], ("--split:", "train, test", "got 'val'")),
+        (["{tmp}", "--out", "{o}"], ("{tmp}:", "COLMAP", "`kfgs sfm")),
     ],
     "convert": [
-        (["{splat}", "{splat}"], "TARGET: expected another file than {splat}, got the same"),
+        (["{splat}", "{splat}"], ("TARGET:", "{splat}", "got the same")),
         (
             ["{splat}", "{o}.ksplat"],
-            "TARGET: expected a file whose name ends in one of .compressed.ply, .ply, .spz, .sog",
+            ("TARGET:", ".compressed.ply, .ply", "got {o}.ksplat"),
         ),
-        (["{field}", "{o}.ply"], "SOURCE: expected a splat file, got {field}, a semantic field"),
-        (["{room}/text.npy", "{o}.ply"], "expected a splat file of a known format, got something else"),
-        (["{tmp}", "{o}.ply"], "expected a splat file of a known format"),
+        (["{field}", "{o}.ply"], ("SOURCE:", "got {field}", "a colour splat")),
+        (["{room}/text.npy", "{o}.ply"], ("{room}/text.npy:", "known", "compressed_ply")),
+        (["{tmp}", "{o}.ply"], ("{tmp}:", "known", "compressed_ply")),
     ],
 }
 
@@ -193,7 +210,7 @@ def test_bad_input_ends_with_1_one_line_and_no_files(command, arguments, message
     assert main([command, *(one.format(**places) for one in arguments)]) == 1
     said = capsys.readouterr().err.strip().splitlines()[-1]
     assert said.startswith("error: ")
-    assert message.format(**places) in said
+    assert re.search(tells(*(part.format(**places) for part in message)), said)
     assert list(tmp_path.iterdir()) == []
     assert before == {name: Path(path).read_bytes() for name, path in sources.items()}
 

@@ -6,6 +6,7 @@ import stat
 
 import pytest
 import torch
+from messages import tells
 from safetensors.torch import save_file
 
 from kfgs import _files
@@ -152,22 +153,22 @@ def test_json_round_trip(tmp_path):
 @pytest.mark.parametrize("number", [math.nan, math.inf])
 def test_json_refuses_what_json_cannot_hold(tmp_path, number):
     write_json(tmp_path / "value.json", 1)
-    with pytest.raises(ValueError, match="not JSON compliant"):
+    with pytest.raises(ValueError, match=tells("JSON")):
         write_json(tmp_path / "value.json", {"loss": number})
     assert read_json(tmp_path / "value.json") == 1
 
 
 def test_missing_json(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"split.json: no such file; expected a JSON file there"):
+    with pytest.raises(FileNotFoundError, match=tells("split.json:", "no such file", "JSON")):
         read_json(tmp_path / "split.json")
-    with pytest.raises(FileNotFoundError, match="no such file"):
+    with pytest.raises(FileNotFoundError, match=tells("no such file")):
         read_json(tmp_path)  # a folder
 
 
 @pytest.mark.parametrize("content", [b'{"a": 1', b"\xff\xfe{}", b"", b"1" * 5000])
 def test_broken_json_names_the_file(tmp_path, content):
     (tmp_path / "split.json").write_bytes(content)
-    with pytest.raises(ValueError, match=r"split.json: expected a JSON file, but it cannot be parsed \("):
+    with pytest.raises(ValueError, match=tells("split.json:", "JSON", "parsed (")):
         read_json(tmp_path / "split.json")
 
 

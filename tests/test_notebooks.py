@@ -10,6 +10,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from messages import tells
 
 jupytext = pytest.importorskip("jupytext", reason='the notebooks need: pip install "kfgs[notebook]"')
 pytest.importorskip("nbclient", reason='the notebooks need: pip install "kfgs[notebook]"')
@@ -167,7 +168,7 @@ def test_a_cell_that_ends_python_or_never_ends_is_reported(runner, tmp_path):
 def test_unknown_numbers_are_refused(runner, tmp_path, capsys):
     write_source(tmp_path, "1")
     assert [path.name for path in runner.find_sources(tmp_path)] == ["1_tiny.py"]
-    with pytest.raises(ValueError, match=r"N: expected one of \[1\] .*got 4; give a notebook's number"):
+    with pytest.raises(ValueError, match=tells("N:", "[1]", "got 4")):
         runner.find_sources(tmp_path, [1, 4])
     with pytest.raises(SystemExit):
         runner.main(["4", "--sources", str(tmp_path)])

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from messages import tells
 
 import kfgs
 
@@ -35,7 +36,7 @@ def test_every_name_of_a_package_exists_and_functions_are_documented(package):
 
 
 def test_an_unknown_name_is_an_attribute_error():
-    with pytest.raises(AttributeError, match="no attribute 'fit_everything'; public names: Autoencoder"):
+    with pytest.raises(AttributeError, match=tells("'fit_everything'", "Autoencoder")):
         _ = kfgs.fit_everything
 
 

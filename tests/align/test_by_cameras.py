@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from oracles_cameras import align_similarity
 from scipy.spatial.transform import Rotation
 
@@ -127,22 +128,20 @@ def test_the_report_is_json_with_the_worst_cameras():
 def test_too_few_common_names_are_refused():
     cameras = some_cameras(5)
     others = [replace(camera, name=f"other_{i}") for i, camera in enumerate(cameras)]
-    with pytest.raises(
-        SceneError, match=r"at least two names that both have, got 0 .*view_0.*other_0.*align the clouds"
-    ):
+    with pytest.raises(SceneError, match=tells("cameras:", "names", "got 0", "view_0", "other_0", "clouds")):
         align_by_cameras(cameras, others)
 
 
 def test_cameras_at_one_place_have_no_scale():
     cameras = some_cameras(centers=np.ones((4, 3)))
-    with pytest.raises(SceneError, match="different places, got 4 at one"):
+    with pytest.raises(SceneError, match=tells("cameras:", "places", "got 4 at one")):
         align_by_cameras(cameras, moved(cameras, a_similarity()))
 
 
 def test_unrelated_poses_are_refused():
     cameras = some_cameras(20, seed=0)
     others = [replace(c, name=f"view_{i}.png") for i, c in enumerate(some_cameras(20, seed=1))]
-    with pytest.raises(SceneError, match="at least half of the 20 common cameras"):
+    with pytest.raises(SceneError, match=tells("cameras:", "20", "got 0")):
         align_by_cameras(cameras, others)
 
 
@@ -150,14 +149,14 @@ def test_shuffled_names_are_refused():
     """The poses are those of the scene, each under another's name: no two cameras agree in orientation."""
     cameras = some_cameras(18)
     others = [replace(c, name=f"view_{(7 * i + 3) % 18}.png") for i, c in enumerate(moved(cameras, a_similarity()))]
-    with pytest.raises(SceneError, match="at least half of the 18 common cameras to fit one similarity, got"):
+    with pytest.raises(SceneError, match=tells("cameras:", "18", "got 0")):
         align_by_cameras(cameras, others)
 
 
 def test_two_names_swapped_are_refused():
     cameras = some_cameras(2)
     others = [replace(c, name=f"view_{1 - i}.png") for i, c in enumerate(moved(cameras, a_similarity()))]
-    with pytest.raises(SceneError, match="at least half of the 2 common cameras to fit one similarity, got 0"):
+    with pytest.raises(SceneError, match=tells("cameras:", "got 0")):
         align_by_cameras(cameras, others)
 
 

@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from messages import tells
 
 from kfgs.scenes import load_scene, robust_bounds
 
@@ -42,7 +43,7 @@ def test_room_0_is_a_room(shared_data: Path) -> None:
 
 
 def test_arguments_are_checked() -> None:
-    with pytest.raises(ValueError, match="points: expected at least one point"):
+    with pytest.raises(ValueError, match=tells("points:", "got none")):
         robust_bounds(torch.zeros(0, 3))
-    with pytest.raises(ValueError, match="coverage: expected a number"):
+    with pytest.raises(ValueError, match=tells("coverage:", "got 0.0")):
         robust_bounds(torch.zeros(2, 3), coverage=0.0)

@@ -78,48 +78,48 @@ def test_gradient_reaches_pose_and_intrinsics():
 @pytest.mark.parametrize(
     ("change", "error", "match"),
     [
-        ({"K": torch.eye(4)}, ValueError, r"K: expected \[3, 3\]"),
-        ({"viewmat": torch.eye(3)}, ValueError, r"viewmat: expected \[4, 4\]"),
-        ({"K": torch.eye(3, dtype=torch.int64)}, TypeError, r"K: expected floating point, got torch.int64; .*float"),
-        ({"width": 0}, ValueError, "width: expected a positive whole number of pixels, got 0"),
-        ({"height": 3.5}, ValueError, "height: expected a positive whole number of pixels, got 3.5"),
-        ({"width": float("nan")}, ValueError, "width: expected a positive whole number of pixels, got nan; pass an"),
-        ({"height": float("inf")}, ValueError, "height: expected a positive whole number of pixels, got inf; pass an"),
-        ({"width": "64"}, ValueError, "width: expected a positive whole number of pixels, got '64'; pass an integer"),
-        ({"K": changed(K, 0, 0, float("nan"))}, ValueError, r"finite.*camera 'a.png'.*leave this view out"),
-        ({"viewmat": changed(torch.eye(4), 0, 3, float("inf"))}, ValueError, "viewmat, K: expected finite"),
-        ({"K": changed(K, 0, 1, 0.1)}, ValueError, r"K: expected .* without skew"),
-        ({"K": changed(K, 2, 2, 2.0)}, ValueError, r"K: expected \[\[fx"),
-        ({"K": changed(K, 0, 0, -1.0)}, ValueError, r"K\[0, 0\] \(fx\): expected a number in \(0, inf\)"),
-        ({"K": changed(K, 1, 1, 0.0)}, ValueError, r"K\[1, 1\] \(fy\)"),
-        ({"viewmat": torch.diag(torch.tensor([2.0, 2, 2, 1]))}, ValueError, "rigid motion.*remove any scale"),
-        ({"viewmat": torch.diag(torch.tensor([1.0, 1, -1, 1]))}, ValueError, "reflection.*handedness"),
-        ({"viewmat": changed(torch.eye(4), 3, 0, 1.0)}, ValueError, "last row 0 0 0 1"),
-        ({"near": True}, TypeError, "near: expected a number in world units, got bool"),
-        ({"near": 0.0}, ValueError, r"near: expected a number in \(0, inf\), got 0.0"),
-        ({"near": float("nan")}, ValueError, r"near: expected a number in \(0, inf\), got nan"),
-        ({"near": float("inf")}, ValueError, r"near: expected a number in \(0, inf\), got inf"),
-        ({"near": "0.2"}, TypeError, "near: expected a number in world units, got str; pass a float"),
+        ({"K": torch.eye(4)}, ValueError, ("K:", "[3, 3]", "got (4, 4)")),
+        ({"viewmat": torch.eye(3)}, ValueError, ("viewmat:", "[4, 4]", "got (3, 3)")),
+        ({"K": torch.eye(3, dtype=torch.int64)}, TypeError, ("K:", "got torch.int64", ".float()")),
+        ({"width": 0}, ValueError, ("width:", "got 0")),
+        ({"height": 3.5}, ValueError, ("height:", "got 3.5")),
+        ({"width": float("nan")}, ValueError, ("width:", "got nan")),
+        ({"height": float("inf")}, ValueError, ("height:", "got inf")),
+        ({"width": "64"}, ValueError, ("width:", "got '64'")),
+        ({"K": changed(K, 0, 0, float("nan"))}, ValueError, ("viewmat, K:", "'a.png'", "got NaN")),
+        ({"viewmat": changed(torch.eye(4), 0, 3, float("inf"))}, ValueError, ("viewmat, K:", "got NaN")),
+        ({"K": changed(K, 0, 1, 0.1)}, ValueError, ("K:", "skew")),
+        ({"K": changed(K, 2, 2, 2.0)}, ValueError, ("K:", "[[fx", "got [[")),
+        ({"K": changed(K, 0, 0, -1.0)}, ValueError, ("K[0, 0] (fx):", "(0, inf)", "got -1.0")),
+        ({"K": changed(K, 1, 1, 0.0)}, ValueError, ("K[1, 1] (fy):", "got 0.0")),
+        ({"viewmat": torch.diag(torch.tensor([2.0, 2, 2, 1]))}, ValueError, ("viewmat:", "rigid", "scale")),
+        ({"viewmat": torch.diag(torch.tensor([1.0, 1, -1, 1]))}, ValueError, ("viewmat:", "reflection", "axes")),
+        ({"viewmat": changed(torch.eye(4), 3, 0, 1.0)}, ValueError, ("viewmat:", "0 0 0 1")),
+        ({"near": True}, TypeError, ("near:", "got bool")),
+        ({"near": 0.0}, ValueError, ("near:", "(0, inf)", "got 0.0")),
+        ({"near": float("nan")}, ValueError, ("near:", "(0, inf)", "got nan")),
+        ({"near": float("inf")}, ValueError, ("near:", "(0, inf)", "got inf")),
+        ({"near": "0.2"}, TypeError, ("near:", "got str")),
     ],
 )
 def test_refuses(change, error, match):
     good = {"viewmat": torch.eye(4), "K": K, "width": 96, "height": 64, "name": "a.png"}
     Camera(**good)
-    with pytest.raises(error, match=match):
+    with pytest.raises(error, match=tells(*match)):
         Camera(**good | change)
 
 
 @pytest.mark.parametrize(
     ("model", "coefficients", "match"),
     [
-        ("fov", (0.1,), "model: expected one of 'brown_conrady', 'kannala_brandt', got 'fov'"),
-        ("brown_conrady", (0.1,), "expected 4 or 5 or 8 numbers for brown_conrady, got 1; pad with zeros"),
-        ("kannala_brandt", (0.1, 0, 0, 0, 0), "expected 4 numbers for kannala_brandt, got 5"),
-        ("brown_conrady", (0.1, float("nan"), 0, 0), r"coefficients\[1\]: expected a number in \(-inf, inf\), got nan"),
+        ("fov", (0.1,), ("model:", "'brown_conrady', 'kannala_brandt'", "got 'fov'")),
+        ("brown_conrady", (0.1,), ("coefficients:", "expected 4 or 5 or 8", "brown_conrady", "got 1")),
+        ("kannala_brandt", (0.1, 0, 0, 0, 0), ("coefficients:", "expected 4", "kannala_brandt", "got 5")),
+        ("brown_conrady", (0.1, float("nan"), 0, 0), ("coefficients[1]:", "(-inf, inf)", "got nan")),
     ],
 )
 def test_distortion_refuses(model, coefficients, match):
-    with pytest.raises(ValueError, match=match):
+    with pytest.raises(ValueError, match=tells(*match)):
         Distortion(model, coefficients)
 
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 from kornia.geometry import create_meshgrid
 from kornia.geometry.camera import PinholeCamera
+from messages import tells
 from oracles_cameras import project_pinhole
 
 from kfgs.cameras import Camera, Distortion, from_kornia, project_points, to_kornia, unproject_depth
@@ -138,26 +139,24 @@ def test_a_zero_padded_matrix_is_read_as_kornia_reads_it():
 
 def test_distortion_is_refused():
     bent = replace(CAMERAS[1], distortion=Distortion("kannala_brandt", (0.1, 0, 0, 0)))
-    with pytest.raises(
-        ValueError, match=r"cameras\[1\]: expected a pinhole camera, got kannala_brandt .*'b.png'.*undistort it first"
-    ):
+    with pytest.raises(ValueError, match=tells("cameras[1]:", "got kannala_brandt", "'b.png'")):
         to_kornia([CAMERAS[0], bent])
 
 
 def test_other_errors_say_what_to_do():
-    with pytest.raises(ValueError, match="cameras: expected at least one Camera, got none; select a view"):
+    with pytest.raises(ValueError, match=tells("cameras:", "got none")):
         to_kornia([])
     elsewhere = replace(CAMERAS[1])
     object.__setattr__(elsewhere, "K", K.to("meta"))  # a second device without a GPU
-    with pytest.raises(ValueError, match=r"cameras: expected matrices on one device, got cpu, meta; move them with"):
+    with pytest.raises(ValueError, match=tells("cameras:", "camera.to(device)")):
         to_kornia([CAMERAS[0], elsewhere])
-    with pytest.raises(TypeError, match=r"pinhole: expected a kornia.*PinholeCamera, got Camera; build one"):
+    with pytest.raises(TypeError, match=tells("pinhole:", "PinholeCamera", "got Camera", "kfgs.Camera")):
         from_kornia(CAMERAS[0])
     pinhole = to_kornia(CAMERAS)
-    with pytest.raises(ValueError, match=r"names: expected 2 \(one per camera\), got 1; give one for each"):
+    with pytest.raises(ValueError, match=tells("names:", "expected 2", "got 1")):
         from_kornia(pinhole, ["a"])
     stacked = PinholeCamera(pinhole.intrinsics[:, None], pinhole.extrinsics[:, None], pinhole.height, pinhole.width)
-    with pytest.raises(ValueError, match=r"pinhole.intrinsics: expected \[B, 4, 4\], got \(2, 1, 4, 4\)"):
+    with pytest.raises(ValueError, match=tells("pinhole.intrinsics:", "[B, 4, 4]", "got (2, 1, 4, 4)")):
         from_kornia(stacked)
-    with pytest.raises(ValueError, match=r"whole number of pixels, got 28\.[78]"):
+    with pytest.raises(ValueError, match=tells("width:", "got 28.")):
         from_kornia(to_kornia(CAMERAS[:1]).scale(torch.tensor([0.3], dtype=torch.float64)))

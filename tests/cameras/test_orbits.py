@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from messages import tells
 
 from kfgs.cameras import Camera, Orbit, estimate_up, orbit_cameras, project_points
 
@@ -84,39 +85,39 @@ def test_up_of_cameras_that_look_one_way_is_their_own():
 
 
 def test_up_of_nothing_or_of_pictures_upside_down_is_refused():
-    with pytest.raises(ValueError, match="cameras: expected at least one camera"):
+    with pytest.raises(ValueError, match=tells("cameras:", "got none")):
         estimate_up([])
     views = [Camera.look_at(ORIGIN, (1, 0, 0), up=(0, 0, z)) for z in (1, -1)]
-    with pytest.raises(ValueError, match="held upright, got 2 whose upper edges cancel"):
+    with pytest.raises(ValueError, match=tells("cameras:", "upright", "got 2")):
         estimate_up(views)
 
 
 @pytest.mark.parametrize(
     ("points", "up", "message"),
     [
-        (torch.zeros(0, 3), TILTED, "points: expected at least one point"),
-        (torch.full((4, 3), math.nan), TILTED, "points: expected finite positions, got 4 rows"),
-        (torch.zeros(4, 3), (0.0, 0.0, 0.0), "up: expected a vector with a direction"),
-        (torch.zeros(4, 3), (0.0, 1.0), r"up: expected \[3\]"),
+        (torch.zeros(0, 3), TILTED, ("points:", "got none")),
+        (torch.full((4, 3), math.nan), TILTED, ("points:", "got 4")),
+        (torch.zeros(4, 3), (0.0, 0.0, 0.0), ("up:", "got [0.0, 0.0, 0.0]")),
+        (torch.zeros(4, 3), (0.0, 1.0), ("up:", "[3]", "got (2,)")),
     ],
 )
 def test_what_cannot_be_gone_round_is_refused(points, up, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         orbit_cameras(points, up=up)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"frames": 0}, "frames: expected a number"),
-        ({"size": (0, 4)}, r"size \(height\): expected"),
-        ({"size": (4, 4, 3)}, r"size: expected \(height, width\), got \(4, 4, 3\)"),
-        ({"elevation_degrees": 90}, "elevation_degrees: expected"),
-        ({"fov_degrees": 180}, "fov_degrees: expected"),
-        ({"zoom": 0}, "zoom: expected"),
-        ({"cut": 2}, "cut: expected"),
+        ({"frames": 0}, ("frames:", "got 0")),
+        ({"size": (0, 4)}, ("size (height):", "got 0")),
+        ({"size": (4, 4, 3)}, ("size:", "(height, width)", "got (4, 4, 3)")),
+        ({"elevation_degrees": 90}, ("elevation_degrees:", "got 90")),
+        ({"fov_degrees": 180}, ("fov_degrees:", "got 180")),
+        ({"zoom": 0}, ("zoom:", "got 0")),
+        ({"cut": 2}, ("cut:", "got 2")),
     ],
 )
 def test_an_orbit_out_of_range_is_refused(options, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         Orbit(**options)

@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from messages import tells
 
 from kfgs.cameras import Camera, Distortion, path_cameras
 
@@ -98,13 +99,13 @@ def test_lenses_run_linearly_and_sizes_are_the_askers():
 @pytest.mark.parametrize(
     ("keys", "options", "message"),
     [
-        ([], {}, r"cameras: expected at least two different views, got 0"),
-        ([camera((0, 0, 0))] * 3, {}, r"cameras: expected at least two different views, got 1 \(of 3"),
-        ([camera((0, 0, 0)), camera((1, 0, 0))], {"frames": 1}, "frames: expected a number"),
-        ([camera((0, 0, 0)), camera((1, 0, 0))], {"every": 0}, "every: expected a number"),
-        ([camera((0, 0, 0)), camera((1, 0, 0))], {"size": (5, 2.5)}, r"size \(width\): expected a whole number"),
+        ([], {}, ("cameras:", "got 0")),
+        ([camera((0, 0, 0))] * 3, {}, ("cameras:", "got 1")),
+        ([camera((0, 0, 0)), camera((1, 0, 0))], {"frames": 1}, ("frames:", "got 1")),
+        ([camera((0, 0, 0)), camera((1, 0, 0))], {"every": 0}, ("every:", "got 0")),
+        ([camera((0, 0, 0)), camera((1, 0, 0))], {"size": (5, 2.5)}, ("size (width):", "got 2.5")),
     ],
 )
 def test_what_is_no_walk_is_refused(keys, options, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         path_cameras(keys, **options)

@@ -3,6 +3,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from messages import tells
 from oracles_cameras import HEIGHT, LENSES, WIDTH, colmap_pixels, project_pinhole
 
 from kfgs.cameras import (
@@ -218,23 +219,19 @@ def test_moving_world_and_camera_together_changes_nothing():
 def test_refusals():
     camera, bent = posed(), posed(Distortion("brown_conrady", (0.1, 0, 0, 0)))
     points = torch.ones(2, 3, dtype=torch.float64)
-    with pytest.raises(ValueError, match=r"points: expected \[N, 3\], got \(2, 2\)"):
+    with pytest.raises(ValueError, match=tells("points:", "[N, 3]", "got (2, 2)")):
         project_points(camera, points[:, :2])
-    with pytest.raises(
-        TypeError, match=r"points: expected floating point, got torch.int64; convert it with .float\(\)"
-    ):
+    with pytest.raises(TypeError, match=tells("points:", "got torch.int64", ".float()")):
         world_to_camera(camera, points.long())
-    with pytest.raises(TypeError, match="points_cam: expected floating point"):
+    with pytest.raises(TypeError, match=tells("points_cam:", "got torch.int64")):
         camera_to_pixel(camera, points.long())
-    with pytest.raises(ValueError, match="near: expected a number in"):
+    with pytest.raises(ValueError, match=tells("near:", "got -1")):
         project_points(camera, points, near=-1)
-    with pytest.raises(
-        ValueError, match="expected a pinhole camera, got brown_conrady .*'posed'.*undistort its images"
-    ):
+    with pytest.raises(ValueError, match=tells("camera:", "got brown_conrady", "'posed'")):
         projection_jacobian(bent, points)
-    with pytest.raises(ValueError, match="expected a pinhole camera"):
+    with pytest.raises(ValueError, match=tells("camera:", "got brown_conrady")):
         unproject_depth(bent, torch.ones(camera.size))
-    with pytest.raises(ValueError, match=r"depth: expected \[64, 96\], got \(96, 64\)"):
+    with pytest.raises(ValueError, match=tells("depth:", "[64, 96]", "got (96, 64)")):
         unproject_depth(camera, torch.ones(WIDTH, HEIGHT))
-    with pytest.raises(TypeError, match="depth: expected floating point"):
+    with pytest.raises(TypeError, match=tells("depth:", "got torch.int32")):
         unproject_depth(camera, torch.ones(camera.size, dtype=torch.int32))

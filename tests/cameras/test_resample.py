@@ -1,5 +1,6 @@
 import pytest
 import torch
+from messages import tells
 
 from kfgs.cameras import resize_labels, resize_map
 from kfgs.cameras.resample import from_bchw, to_bchw
@@ -106,14 +107,14 @@ def test_labels_invent_nothing(dtype):
 
 
 def test_resample_refusals():
-    with pytest.raises(ValueError, match=r"map: expected \[H, W, D\], got \(4, 5\)"):
+    with pytest.raises(ValueError, match=tells("map:", "[H, W, D]", "got (4, 5)")):
         resize_map(torch.zeros(4, 5), (2, 2))
-    with pytest.raises(TypeError, match="map: expected floating point, got torch.int64; use resize_labels"):
+    with pytest.raises(TypeError, match=tells("map:", "got torch.int64", "resize_labels")):
         resize_map(torch.zeros(4, 5, 1, dtype=torch.int64), (2, 2))
-    with pytest.raises(ValueError, match=r"labels: expected \[H, W\], got \(4, 5, 1\)"):
+    with pytest.raises(ValueError, match=tells("labels:", "[H, W]", "got (4, 5, 1)")):
         resize_labels(torch.zeros(4, 5, 1, dtype=torch.int64), (2, 2))
-    with pytest.raises(TypeError, match="labels: expected integers, got torch.float32; use resize_map"):
+    with pytest.raises(TypeError, match=tells("labels:", "got torch.float32", "resize_map")):
         resize_labels(torch.zeros(4, 5), (2, 2))
     for size in ((0, 2), (2.5, 2), (1, 2, 3)):
-        with pytest.raises(ValueError, match=r"size: expected \(height, width\) in pixels, got"):
+        with pytest.raises(ValueError, match=tells("size:", "(height, width)", f"got {size}")):
             resize_map(torch.zeros(4, 5, 1), size)

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from scipy.spatial.transform import Rotation
 
 from kfgs.cameras import Camera, Similarity, fit_similarity, world_to_camera
@@ -121,27 +122,33 @@ def test_mirrored_points_get_the_best_rotation():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: Similarity(0.0, QUARTER, torch.zeros(3)), r"scale: expected a number in \(0"),
-        (lambda: Similarity(1.0, 2 * QUARTER, torch.zeros(3)), "rotation: expected a rotation .* divide by the scale"),
-        (lambda: Similarity(1.0, QUARTER * torch.nan, torch.zeros(3)), "rotation: expected a rotation"),
-        (lambda: Similarity(1.0, MIRROR, torch.zeros(3)), "rotation: expected a rotation, got a reflection"),
-        (lambda: Similarity(1.0, QUARTER, torch.tensor([0.0, torch.inf, 0.0])), "translation: expected finite"),
-        (lambda: Similarity(1.0, QUARTER, torch.zeros(4)), r"translation: expected \[3\]"),
-        (lambda: Similarity.from_matrix(torch.ones(4, 4)), "matrix: expected the last row 0 0 0 1"),
-        (lambda: Similarity.from_matrix(torch.block_diag(2 * MIRROR, torch.ones(1, 1))), "matrix: .*determinant -8"),
-        (lambda: Similarity.from_matrix(torch.diag(torch.tensor([1.0, 2.0, 3.0, 1.0]))), "matrix: expected a rotation"),
-        (lambda: Similarity.identity().apply(torch.zeros(2, 4)), r"points: expected \[N, 3\]"),
-        (lambda: fit_similarity(cloud(5), cloud(6)), r"dst: expected \[N, 3\] with N = 5"),
-        (lambda: fit_similarity(cloud(2), cloud(2)), "src: expected at least 3 pairs of positive weight, got 2"),
-        (lambda: fit_similarity(cloud(3), cloud(3), torch.tensor([1.0, 1.0, 0.0])), "positive weight, got 2"),
-        (lambda: fit_similarity(cloud(3), cloud(3), torch.tensor([1.0, 1.0, -2.0])), "weights: expected numbers >= 0"),
-        (lambda: fit_similarity(cloud(3) * torch.nan, cloud(3)), "src: expected finite"),
-        (lambda: fit_similarity(cloud(9), cloud(9)[:, :1].repeat(1, 3)), "dst: .*points on a line"),
-        (lambda: fit_similarity(torch.ones(9, 3), cloud(9)), "src: .*points on a line"),
+        (lambda: Similarity(0.0, QUARTER, torch.zeros(3)), ("scale:", "got 0.0")),
+        (lambda: Similarity(1.0, 2 * QUARTER, torch.zeros(3)), ("rotation:", "divide")),
+        (lambda: Similarity(1.0, QUARTER * torch.nan, torch.zeros(3)), ("rotation:", "rotation", "got [[nan")),
+        (lambda: Similarity(1.0, MIRROR, torch.zeros(3)), ("rotation:", "reflection")),
+        (
+            lambda: Similarity(1.0, QUARTER, torch.tensor([0.0, torch.inf, 0.0])),
+            ("translation:", "got [0.0, inf, 0.0]"),
+        ),
+        (lambda: Similarity(1.0, QUARTER, torch.zeros(4)), ("translation:", "[3]", "got (4,)")),
+        (lambda: Similarity.from_matrix(torch.ones(4, 4)), ("matrix:", "0 0 0 1")),
+        (lambda: Similarity.from_matrix(torch.block_diag(2 * MIRROR, torch.ones(1, 1))), ("matrix:", "determinant -8")),
+        (
+            lambda: Similarity.from_matrix(torch.diag(torch.tensor([1.0, 2.0, 3.0, 1.0]))),
+            ("matrix:", "rotation", "got [["),
+        ),
+        (lambda: Similarity.identity().apply(torch.zeros(2, 4)), ("points:", "[N, 3]", "got (2, 4)")),
+        (lambda: fit_similarity(cloud(5), cloud(6)), ("dst:", "[N, 3]", "N = 5", "got (6, 3)")),
+        (lambda: fit_similarity(cloud(2), cloud(2)), ("src:", "weight", "got 2")),
+        (lambda: fit_similarity(cloud(3), cloud(3), torch.tensor([1.0, 1.0, 0.0])), ("src:", "weight", "got 2")),
+        (lambda: fit_similarity(cloud(3), cloud(3), torch.tensor([1.0, 1.0, -2.0])), ("weights:", "got -2")),
+        (lambda: fit_similarity(cloud(3) * torch.nan, cloud(3)), ("src:", "got NaN")),
+        (lambda: fit_similarity(cloud(9), cloud(9)[:, :1].repeat(1, 3)), ("dst:", "line")),
+        (lambda: fit_similarity(torch.ones(9, 3), cloud(9)), ("src:", "line")),
     ],
 )
 def test_wrong_input_is_named(build, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         build()
 
 
@@ -165,7 +172,7 @@ def test_a_matrix_inverted_in_float32_is_read():
     close(Similarity.from_matrix(rounded), Similarity.from_matrix(matrix))
     for row in ([0, 0, 0, 1.001], [0, 1e-3, 0, 1], [0, 0, torch.nan, 1]):
         rounded[3] = torch.tensor(row)
-        with pytest.raises(ValueError, match="matrix: expected the last row 0 0 0 1"):
+        with pytest.raises(ValueError, match=tells("matrix:", "0 0 0 1")):
             Similarity.from_matrix(rounded)
 
 

@@ -2,6 +2,7 @@ import kornia.geometry
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from oracles_cameras import HEIGHT, LENSES, WIDTH, colmap_camera, colmap_pixels, pixel_rays
 
 from kfgs.cameras import Camera, Distortion, undistort, undistort_labels
@@ -172,13 +173,13 @@ def test_dtype_follows_the_picture(dtype):
 
 def test_undistort_refusals():
     camera = camera_of("OPENCV")
-    with pytest.raises(ValueError, match=r"image: expected \[64, 96, C\], got \(96, 64, 3\)"):
+    with pytest.raises(ValueError, match=tells("image:", "[64, 96, C]", "got (96, 64, 3)")):
         undistort(torch.zeros(WIDTH, HEIGHT, 3), camera)
-    with pytest.raises(TypeError, match=r"image: expected floating point, got torch.uint8; convert it with"):
+    with pytest.raises(TypeError, match=tells("image:", "got torch.uint8", ".float()")):
         undistort(torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8), camera)
-    with pytest.raises(ValueError, match=r"labels: expected \[64, 96\], got"):
+    with pytest.raises(ValueError, match=tells("labels:", "[64, 96]", "got (64, 96, 1)")):
         undistort_labels(torch.zeros(HEIGHT, WIDTH, 1, dtype=torch.int64), camera)
-    with pytest.raises(TypeError, match="labels: expected integers, got torch.float32"):
+    with pytest.raises(TypeError, match=tells("labels:", "got torch.float32")):
         undistort_labels(torch.zeros(HEIGHT, WIDTH), camera)
-    with pytest.raises(ValueError, match=r"fill: expected a value that torch.uint8 can hold, got -1; pass labels.long"):
+    with pytest.raises(ValueError, match=tells("fill:", "torch.uint8", "got -1", "labels.long")):
         undistort_labels(torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8), camera)

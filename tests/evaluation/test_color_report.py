@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from oracles_color import ssim_windows
 from PIL import Image
 
@@ -75,7 +76,7 @@ def test_what_the_lens_did_not_see_is_not_scored(tmp_path):
 
 def test_without_colours_there_is_nothing_to_score(tmp_path):
     scene = make_scene(tmp_path)
-    with pytest.raises(ValueError, match=r"gaussians: expected colours sh \[N, K, 3\], got None; pass a colour field"):
+    with pytest.raises(ValueError, match=tells("gaussians:", "[N, K, 3]", "got None", "fit_color")):
         score_views(cloud().replace(sh=None, features=torch.zeros(9, 3)), scene)
-    with pytest.raises(ValueError, match="split: expected one of train, test, got 'val'"):
+    with pytest.raises(ValueError, match=tells("split:", "train, test", "got 'val'")):
         score_views(cloud(), scene, "val")

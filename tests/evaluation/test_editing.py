@@ -8,6 +8,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from oracles_editing import paint_room
 from PIL import Image
 
@@ -177,17 +178,17 @@ def test_the_border_is_two_pixels_wide(room):
 
 
 def test_what_cannot_be_scored_is_named(room, cloud, tmp_path):
-    with pytest.raises(ValueError, match="name: expected one of wall, floor, .* got 'dragon'"):
+    with pytest.raises(ValueError, match=tells("name:", "wall, floor", "got 'dragon'")):
         score_removal(cloud, cloud, room, "dragon")
-    with pytest.raises(ValueError, match="split: expected one of .* got 'holdout'"):
+    with pytest.raises(ValueError, match=tells("split:", "got 'holdout'")):
         score_removal(cloud, cloud, room, "chair", split="holdout")
-    with pytest.raises(ValueError, match="before, after: expected colour fields with sh .* got None"):
+    with pytest.raises(ValueError, match=tells("before, after:", "sh ", "got None")):
         score_removal(cloud, cloud.replace(sh=None), room, "chair")
-    with pytest.raises(ValueError, match=r"rgb: expected three numbers in \[0, 1\], got \(255, 0, 0\)"):
+    with pytest.raises(ValueError, match=tells("rgb:", "[0, 1]", "got (255, 0, 0)")):
         score_recolor(cloud, cloud, room, "chair", (255, 0, 0))
-    with pytest.raises(ValueError, match="rgb: expected a colour with a hue, got the grey"):
+    with pytest.raises(ValueError, match=tells("rgb:", "hue", "(0.5, 0.5, 0.5)")):
         score_recolor(cloud, cloud, room, "chair", (0.5, 0.5, 0.5))
-    with pytest.raises(FileNotFoundError, match="classes.json: no such file"):
+    with pytest.raises(FileNotFoundError, match=tells("classes.json:", "no such file")):
         score_removal(cloud, cloud, tmp_path, "chair")
 
 
@@ -196,20 +197,20 @@ def test_a_scene_without_truth_is_named(room, cloud, tmp_path):
     shutil.copytree(room, copy, ignore=shutil.ignore_patterns("features", "depth"))
     surface = copy / "surface.npz"
     np.savez(surface, points=np.zeros((1, 3), np.float32))
-    with pytest.raises(ValueError, match="surface.npz: expected the arrays 'points' and 'labels'"):
+    with pytest.raises(ValueError, match=tells("surface.npz:", "'points' and 'labels'")):
         score_removal(cloud, cloud, copy, "chair")
     surface.write_bytes(b"PK nonsense")
-    with pytest.raises(ValueError, match="surface.npz: expected the arrays .* make the room again"):
+    with pytest.raises(ValueError, match=tells("surface.npz:", "arrays", "room")):
         score_removal(cloud, cloud, copy, "chair")
     surface.unlink()
-    with pytest.raises(FileNotFoundError, match="surface.npz: no such file; expected points of all surfaces"):
+    with pytest.raises(FileNotFoundError, match=tells("surface.npz:", "no such file", "surfaces")):
         score_removal(cloud, cloud, copy, "chair")
     scene = load_scene(copy)
     picture = copy / "labels" / f"{scene.stem(scene.views('test')[0])}.png"
     Image.fromarray(np.full((5, 6), 5, np.uint8)).save(picture)
-    with pytest.raises(ValueError, match="expected 120x160 values .* got 5x6; make the room again"):
+    with pytest.raises(ValueError, match=tells("view_001.png:", "120x160", "got 5x6")):
         score_recolor(cloud, cloud, copy, "chair", BLUE)
     names = copy / "classes.json"
     names.write_text(json.dumps([*json.loads(names.read_text()), "ghost"]))
-    with pytest.raises(ValueError, match="name: expected a class that is seen in some of the 2 views .* got 'ghost'"):
+    with pytest.raises(ValueError, match=tells("name:", "got 'ghost'")):
         score_removal(cloud, cloud, copy, "ghost")

@@ -3,6 +3,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from oracles_editing import density
 
 from kfgs.evaluation import surface_density
@@ -50,5 +51,5 @@ def test_nothing_gives_nothing():
 
 
 def test_shapes_are_checked():
-    with pytest.raises(ValueError, match=r"points: expected \[P, 3\], got \(3, 2\)"):
+    with pytest.raises(ValueError, match=tells("points:", "[P, 3]", "got (3, 2)")):
         surface_density(_cloud(), torch.zeros(3, 2))

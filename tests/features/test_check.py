@@ -80,7 +80,7 @@ def test_all_that_does_not_fit_is_reported_at_once_by_file(folder):
     assert lines[0].startswith(f"{folder}: 3 of 11 views have a map that fits; 6 x 8 x 16 float16")
     assert len(lines) == 9
     assert sum(line.startswith("turned.npy: ") and "; expected the aspect" in line for line in lines) == 1
-    with pytest.raises(ValueError, match=r"each of 11 views, got 8 that do not: .* \| and 3 more; encode these"):
+    with pytest.raises(ValueError, match=tells("11 views", "got 8", "3 more")):
         report.raise_if_bad()
 
 
@@ -245,7 +245,7 @@ def test_a_map_without_a_record_among_kfgss_own_is_a_problem(tmp_path):
     ((name, (text,)),) = report.problems.items()
     assert name == "b.npy"
     assert text.startswith("expected a map that features.json lists")
-    with pytest.raises(ValueError, match=tells("b.npy: expected a map that features.json lists")):
+    with pytest.raises(ValueError, match=tells("b.npy:", "features.json")):
         FeatureFolder(tmp_path, ["a_s", "a_f", "b"])
 
 

@@ -130,7 +130,7 @@ def test_another_teachers_maps_are_neither_mixed_nor_lost(other, pictures, tmp_p
     extract_features(Counting(), pictures, folder)
     whole = contents(folder)
     what = "weights: w1 there, w2 now" if other.identity["weights"] == "w2" else "cell: 2 there, 1 now"
-    with pytest.raises(ValueError, match=rf"same teacher as now, got others in .*maps \({what}\); use another folder"):
+    with pytest.raises(ValueError, match=tells("folder:", "same teacher", f"maps ({what})")):
         extract_features(other, pictures[:1], folder)
     assert contents(folder) == whole
     manifest = extract_features(other, pictures[:1], folder, overwrite=True)
@@ -143,18 +143,18 @@ def test_maps_of_other_programs_are_left_alone(pictures, tmp_path):
     folder = tmp_path / "maps"
     folder.mkdir()
     np.save(folder / "a.npy", np.ones((3, 4, 5)))
-    with pytest.raises(ValueError, match=r"maps of other programs, got .*a.npy and no features.json.*overwrite=True"):
+    with pytest.raises(ValueError, match=tells("folder:", "a.npy", "features.json", "overwrite=True")):
         extract_features(Counting(), pictures, folder)
     assert np.load(folder / "a.npy").sum() == 60
     extract_features(Counting(), pictures, folder, overwrite=True)
     (folder / "a_s.npy").touch()
     extract_features(Counting(), pictures, folder)  # half of what LangSplat writes is nothing
     (folder / "a_f.npy").touch()
-    with pytest.raises(ValueError, match=r"got .*a_s.npy, which would be read instead of ours"):
+    with pytest.raises(ValueError, match=tells("folder:", "a_s.npy")):
         extract_features(Counting(), pictures, folder)
     (folder / "a_s.npy").unlink()
     (folder / "b_fmap_CxHxW.pt").touch()
-    with pytest.raises(ValueError, match=r"got .*b_fmap_CxHxW.pt, which would be read instead of ours"):
+    with pytest.raises(ValueError, match=tells("folder:", "b_fmap_CxHxW.pt")):
         extract_features(Counting(), pictures, folder, overwrite=True)
 
 
@@ -238,12 +238,12 @@ def test_only_what_kfgs_wrote_is_discarded(pictures, tmp_path):
     folder = tmp_path / "maps"
     extract_features(Counting(), pictures, folder)
     np.save(folder / "b.npy", np.ones(1000))
-    with pytest.raises(ValueError, match=r"as they were written, got another file in .*b.npy; move it away"):
+    with pytest.raises(ValueError, match=tells("folder:", "another file", "b.npy")):
         discard_maps(folder)
     assert len(contents(folder)) == 3
     (tmp_path / "outside.npy").write_bytes(b"mine")
     whole = (folder / "features.json").read_text()
-    for name, said in (("../outside.npy", tells("file", "../outside")), ("b.npy", r"got another file in .*b\.npy")):
+    for name, said in (("../outside.npy", tells("file", "../outside")), ("b.npy", tells("another file", "b.npy"))):
         about = json.loads(whole)
         about["maps"] = {"a": about["maps"]["a"] | {"file": name, "bytes": 4}}
         (folder / "features.json").write_text(json.dumps(about))
@@ -252,7 +252,7 @@ def test_only_what_kfgs_wrote_is_discarded(pictures, tmp_path):
     assert (tmp_path / "outside.npy").exists()
     assert len(contents(folder)) == 3
     (tmp_path / "other").mkdir()
-    with pytest.raises(ValueError, match=r"expected maps that kfgs made \(with features.json\), got none in .*other"):
+    with pytest.raises(ValueError, match=tells("folder:", "features.json", "got none")):
         discard_maps(tmp_path / "other")
     assert list((tmp_path / "other").iterdir()) == []  # no lock either
 
@@ -263,7 +263,7 @@ def test_a_map_of_the_same_length_that_changed_stops_the_deletion_and_a_copied_o
     whole = contents(folder)
     (folder / "b.npy").write_bytes(whole["b.npy"][:-1] + b"\x01")
     for dry_run in (False, True):
-        with pytest.raises(ValueError, match=r"as they were written, got another file in .*b.npy; move it away"):
+        with pytest.raises(ValueError, match=tells("folder:", "another file", "b.npy")):
             discard_maps(folder, dry_run=dry_run)
     assert len(contents(folder)) == 3
     (folder / "b.npy").write_bytes(whole["b.npy"])
@@ -287,7 +287,7 @@ def test_only_the_maps_of_the_views_that_are_named_are_discarded(pictures, tmp_p
     assert maps.digests() == before
     assert maps.shape == (3, 4, 5)
     assert np.array_equal(maps[1].numpy(), np.load(folder / "b.npy"))
-    with pytest.raises(FileNotFoundError, match=r"a\.npy: .* discarded once"):
+    with pytest.raises(FileNotFoundError, match=tells("a.npy:", "discarded")):
         _ = maps[0]
     assert discard_maps(folder, ["a"]) == 0
     again, lines = Counting(), []
@@ -305,7 +305,7 @@ def test_views_without_a_record_are_named_before_any_is_deleted(pictures, tmp_pa
             discard_maps(folder, ["a", "x"], dry_run=dry_run)
         with pytest.raises(TypeError, match=tells("stems", "list", "'ab'")):
             discard_maps(folder, "ab", dry_run=dry_run)
-        with pytest.raises(ValueError, match=r"expected maps that kfgs made \(with features.json\), got none"):
+        with pytest.raises(ValueError, match=tells("folder:", "features.json", "got none")):
             discard_maps(tmp_path / "images", ["a"], dry_run=dry_run)
     assert len(contents(folder)) == 3
     assert discard_maps(folder, []) == 0
@@ -324,7 +324,7 @@ def test_foreign_maps_that_were_given_up_do_not_pass_for_ours_when_the_call_dies
     with pytest.raises(KeyboardInterrupt):
         extract_features(_Broken(dies), pictures, folder, overwrite=True)  # at the second
     assert np.load(folder / "b.npy").max() == 7
-    with pytest.raises(ValueError, match=tells("b.npy: expected a map that features.json lists")):
+    with pytest.raises(ValueError, match=tells("b.npy:", "features.json")):
         FeatureFolder(folder, ["a", "b"])
     extract_features(Counting(), pictures, folder)
     assert FeatureFolder(folder, ["a", "b"])[1].max() < 7
@@ -335,7 +335,7 @@ def test_what_a_manifest_says_of_its_teacher_is_shown_in_one_line(pictures, tmp_
     evil = {"name": "a\n\x1b[31mOK", "k\ney": {"deep": ["b\n\x07"]}, "weights": "\r" + "x" * 100}
     folder.mkdir()
     Manifest(evil).save(folder)
-    with pytest.raises(ValueError, match="expected maps of the same teacher as now") as caught:
+    with pytest.raises(ValueError, match=tells("folder:", "same teacher")) as caught:
         extract_features(Counting(), pictures, folder)
     text = str(caught.value)
     assert text.isprintable()
@@ -363,7 +363,7 @@ def test_a_function_is_a_teacher_and_other_things_are_none(pictures, tmp_path):
     manifest = extract_features(thumbnail, pictures, tmp_path / "maps")
     assert manifest.teacher["name"] == "thumbnail"
     assert manifest.maps["a"].shape == (3, 4, 3)
-    with pytest.raises(TypeError, match="teacher: expected an object with name, .*, got str"):
+    with pytest.raises(TypeError, match=tells("teacher:", "got str")):
         extract_features("lseg", pictures, tmp_path / "other")
     assert not (tmp_path / "other").exists()
 
@@ -383,23 +383,23 @@ class _Broken(Counting):
     [
         (
             lambda f: f.index_fill(0, torch.tensor([1]), torch.nan),
-            r"finite features for .*b.png, got 12 NaN or infinite",
+            ("finite", "b.png", "got 12 NaN"),
         ),
-        (lambda f: f * 0 + 70_000, r"below 65504 .*float16\) for .*b.png, got values up to 70000; scale them"),
+        (lambda f: f * 0 + 70_000, ("65504", "float16", "b.png", "70000", "scale")),
         (
             lambda f: f.index_fill(1, torch.tensor([2]), 1e-9),
-            r"above 6e-8 .*float16\) for .*b.png, got 4 that become all-zero; scale them",
+            ("6e-8", "float16", "b.png", "got 4", "scale"),
         ),
-        (lambda f: f[:3], r"expected 5 channels for .*b.png as in a.npy, got 3; use one teacher"),
+        (lambda f: f[:3], ("expected 5", "b.png", "a.npy", "got 3")),
         (
             lambda f: f[:, 1:],
-            r"\(h, w, D\) = \(3, 4, 5\) for .*b.png as for other pictures of its size, got \(2, 4, 5\)",
+            ("(h, w, D)", "(3, 4, 5)", "b.png", "got (2, 4, 5)"),
         ),
-        (lambda f: f[None], r"expected floats \[D, h, w\] for one picture, got torch.float32 \(1, 5, 3, 4\)"),
+        (lambda f: f[None], ("[D, h, w]", "got torch.float32", "(1, 5, 3, 4)")),
     ],
 )
 def test_what_a_teacher_may_not_return_is_named_and_the_maps_before_stay(change, message, pictures, tmp_path):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         extract_features(_Broken(change), pictures, tmp_path / "maps")
     assert list(contents(tmp_path / "maps")) == ["a.npy"]
 
@@ -408,7 +408,9 @@ def test_a_resumed_run_checks_sizes_against_the_maps_that_are_there(pictures, tm
     extract_features(Counting(), pictures[:1], tmp_path / "maps")
     changed = Counting()
     changed.cell = 1  # its identity does not tell
-    with pytest.raises(ValueError, match=r"expected a map of \(h, w, D\) = \(3, 4, 5\) for .*b.png"):
+    with pytest.raises(
+        ValueError, match=tells("teacher 'counting':", "(h, w, D)", "(3, 4, 5)", "b.png", "got (6, 8, 5)")
+    ):
         extract_features(changed, pictures, tmp_path / "maps")
 
 
@@ -416,9 +418,7 @@ def test_a_map_that_is_named_after_its_record_is_shown_in_one_line(pictures, tmp
     folder = tmp_path / "maps"
     named = Picture("a\n\x1b[31m", pictures[0].path)  # a name that Linux allows
     extract_features(Counting(dim=5), [named], folder)
-    with pytest.raises(
-        ValueError, match=r"expected 5 channels for .*b\.png as in a\\n\\x1b\[31m\.npy, got 4"
-    ) as caught:
+    with pytest.raises(ValueError, match=tells("expected 5", "b.png", "a\\n\\x1b[31m.npy", "got 4")) as caught:
         extract_features(Counting(dim=4), [pictures[1]], folder)
     assert str(caught.value).isprintable()
 
@@ -434,7 +434,7 @@ def test_a_full_disk_is_refused_before_the_first_map_with_numbers(pictures, tmp_
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**9, 10**9, 300))
     needed = 3 * 3 * 4 * 5 * 2  # maps, cells, channels, bytes
     assert needed > 300
-    with pytest.raises(OSError, match=r"expected 0.0 MB free for 3 maps, got 0.0 MB where .*RecomputedMaps"):
+    with pytest.raises(OSError, match=tells("folder:", "MB", "3 maps", "RecomputedMaps")):
         extract_features(Counting(), pictures, tmp_path / "maps")
     assert contents(tmp_path / "maps") == {}
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**9, 10**9, needed))
@@ -443,7 +443,7 @@ def test_a_full_disk_is_refused_before_the_first_map_with_numbers(pictures, tmp_
     extract_features(Counting(), pictures, tmp_path / "maps")  # nothing to do needs nothing
     (tmp_path / "maps" / "a.npy").unlink()
     known = Counting()
-    with pytest.raises(OSError, match="for 1 maps"):
+    with pytest.raises(OSError, match=tells("folder:", "1 maps")):
         extract_features(known, pictures, tmp_path / "maps")
     assert known.calls == []  # the size was known from the records
 
@@ -453,16 +453,16 @@ def test_two_processes_on_one_folder_are_refused(pictures, tmp_path):
     folder.mkdir()
     with (folder / LOCK).open("a") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
-        with pytest.raises(ValueError, match=r"no other process writes to, got .*maps, which is in use"):
+        with pytest.raises(ValueError, match=tells("folder:", "process", "maps", "in use")):
             extract_features(Counting(), pictures, folder)
     extract_features(Counting(), pictures, folder)
 
 
 def test_a_folder_that_cannot_be_written_to_is_named(pictures, tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(OSError, match=r"folder that can be written to, got .*file \(File exists\); choose another"):
+    with pytest.raises(OSError, match=tells("folder:", "written", "file (File exists)")):
         extract_features(Counting(), pictures, tmp_path / "file")
-    with pytest.raises(OSError, match=r"folder that can be written to, got /sys/maps \(.*\); choose another"):
+    with pytest.raises(OSError, match=tells("folder:", "written", "got /sys/maps (")):
         extract_features(Counting(), pictures, "/sys/maps")  # where even root may make nothing
 
 
@@ -473,13 +473,13 @@ def test_bad_requests_are_refused_before_any_work(pictures, tmp_path):
     with pytest.raises(ValueError, match=tells("pictures", "each stem once", "a", "rename")):
         extract_features(teacher, [pictures[0], pictures[0]], tmp_path / "maps")
     for stem in ("../a", "/a", ""):
-        with pytest.raises(ValueError, match="expected a name within the folder of maps, got"):
+        with pytest.raises(ValueError, match=tells("stem:", f"got {stem!r}", "rename")):
             extract_features(teacher, [Picture(stem, pictures[0].path)], tmp_path / "maps")
-    with pytest.raises(FileNotFoundError, match=r"gone.png: no such file; expected the picture of view 'gone'"):
+    with pytest.raises(FileNotFoundError, match=tells("gone.png:", "'gone'")):
         extract_features(teacher, [Picture("gone", tmp_path / "gone.png")], tmp_path / "maps")
     assert not (tmp_path / "maps").exists()
     teacher.identity = {"name": "x", "model": object()}
-    with pytest.raises(TypeError, match=r"teacher.identity: expected plain values that JSON can hold"):
+    with pytest.raises(TypeError, match=tells("teacher.identity:", "JSON")):
         extract_features(teacher, pictures, tmp_path / "maps")
     assert teacher.calls == []
 

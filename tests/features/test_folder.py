@@ -84,23 +84,23 @@ def test_saved_map_comes_back_rounded_to_half(tmp_path):
 
 def test_missing_views_are_named(tmp_path):
     save_pt(tmp_path, "a", features(0).permute(2, 0, 1))
-    with pytest.raises(FileNotFoundError, match=r"each of 3 views, 2 missing: b_fmap_CxHxW\.pt, c_fmap_CxHxW\.pt \("):
+    with pytest.raises(FileNotFoundError, match=tells("3 views", "2 missing", "b_fmap_CxHxW.pt, c_fmap_CxHxW.pt")):
         FeatureFolder(tmp_path, ["a", "b", "c"])
 
 
 def test_bad_arguments(tmp_path):
-    with pytest.raises(NotADirectoryError, match="expected a folder of feature maps"):
+    with pytest.raises(NotADirectoryError, match=tells("path:", "folder", "nowhere")):
         FeatureFolder(tmp_path / "nowhere", ["a"])
     with pytest.raises(ValueError, match=tells("stems", tmp_path, "at least one view", "none")):
         len(FeatureFolder(tmp_path))
     with pytest.raises(ValueError, match=tells("stems", "at least one view", "none")):
         FeatureFolder(tmp_path, [])
-    with pytest.raises(TypeError, match="list of image stems, got the text 'a'"):
+    with pytest.raises(TypeError, match=tells("stems", "list", "'a'")):
         FeatureFolder(tmp_path, "a")
     save_pt(tmp_path, "a", features(0).permute(2, 0, 1))
     with pytest.raises(ValueError, match=tells("stems", "each stem once", "a")):
         FeatureFolder(tmp_path, ["a", "a"])
-    with pytest.raises(ValueError, match=r"a_fmap_CxHxW\.pt: expected 512 channels, got 8 in a map of 3 x 4"):
+    with pytest.raises(ValueError, match=tells("a_fmap_CxHxW.pt:", "expected 512", "got 8")):
         _ = FeatureFolder(tmp_path, ["a"], channels=512)[0]
 
 
@@ -109,7 +109,7 @@ def test_a_map_of_another_size_is_refused_by_name(tmp_path, size):
     save_pt(tmp_path, "a", features(0).permute(2, 0, 1))
     save_pt(tmp_path, "b", features(0, size).permute(2, 0, 1))
     maps = FeatureFolder(tmp_path, ["a", "b"])
-    with pytest.raises(ValueError, match=r"b_fmap_CxHxW\.pt: expected a map of \(h, w, D\) = \(3, 4, 8\) as in a_fmap"):
+    with pytest.raises(ValueError, match=tells("b_fmap_CxHxW.pt:", "(h, w, D) = (3, 4, 8)", "a_fmap")):
         maps[1]
 
 
@@ -118,32 +118,32 @@ def test_values_that_are_not_finite_are_refused_by_name(tmp_path, value):
     bad = features(0)
     bad[1, 2, 3] = value
     np.save(tmp_path / "a.npy", bad.numpy())
-    with pytest.raises(ValueError, match=r"a\.npy: expected finite features, got 1 NaN or infinite"):
+    with pytest.raises(ValueError, match=tells("a.npy:", "finite", "got 1 NaN")):
         FeatureFolder(tmp_path, ["a"])[0]
-    with pytest.raises(ValueError, match="finite values below 65504"):
+    with pytest.raises(ValueError, match=tells("features:", "finite", "65504")):
         save_feature_map(tmp_path, "b", bad)
-    with pytest.raises(ValueError, match="finite values below 65504"):
+    with pytest.raises(ValueError, match=tells("features:", "finite", "65504")):
         save_feature_map(tmp_path, "b", features(0) * 1e6)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npy"]
 
 
 def test_a_file_that_is_no_tensor_is_refused(tmp_path):
     save_pt(tmp_path, "a", {"features": features(0)})
-    with pytest.raises(TypeError, match="expected one dense tensor .*, got a dict"):
+    with pytest.raises(TypeError, match=tells("a_fmap_CxHxW.pt:", "tensor", "got a dict")):
         FeatureFolder(tmp_path, ["a"])[0]
     save_pt(tmp_path, "s", features(0).to_sparse())
-    with pytest.raises(ValueError, match=tells("s_fmap_CxHxW.pt", "something else than dense tensors", "sparse")):
+    with pytest.raises(ValueError, match=tells("s_fmap_CxHxW.pt", "dense tensors", "sparse")):
         FeatureFolder(tmp_path, ["s"])[0]
     save_pt(tmp_path, "b", features(0).long())
-    with pytest.raises(ValueError, match=r"floating-point features, got torch\.int64"):
+    with pytest.raises(ValueError, match=tells("b_fmap_CxHxW.pt:", "got torch.int64")):
         FeatureFolder(tmp_path, ["b"])[0]
     save_pt(tmp_path, "m", torch.empty(8, 3, 4, device="meta"))
     save_pt(tmp_path, "n", torch.nested.nested_tensor([torch.ones(3, 4), torch.ones(2, 4)], layout=torch.jagged))
     for stem in ("m", "n"):
-        with pytest.raises(ValueError, match=rf"{stem}_fmap_CxHxW\.pt: expected a feature map, but it cannot be read"):
+        with pytest.raises(ValueError, match=tells(f"{stem}_fmap_CxHxW.pt:", "feature map", "read")):
             FeatureFolder(tmp_path, [stem])[0]
     np.save(tmp_path / "c.npy", np.ones((3, 4), np.float32))
-    with pytest.raises(ValueError, match=r"c\.npy: expected a map \[h, w, D\], got \(3, 4\)"):
+    with pytest.raises(ValueError, match=tells("c.npy:", "[h, w, D]", "got (3, 4)")):
         FeatureFolder(tmp_path, ["c"])[0]
 
 
@@ -158,9 +158,9 @@ def test_damaged_and_hostile_files_are_named(tmp_path):
     header = b"{'descr':'<f4','fortran_order':False,'shape':(99999999999,9999999999,99999999)}".ljust(118)
     (tmp_path / "huge.npy").write_bytes(b"\x93NUMPY\x01\x00v\x00" + header)
     for stem in ("cut", "junk", "code", "empty", "object", "huge"):
-        with pytest.raises(ValueError, match=rf"{stem}.*: expected a feature map, but it cannot be read"):
+        with pytest.raises(ValueError, match=tells(stem, "feature map", "read")):
             FeatureFolder(tmp_path, [stem])[0]
-    with pytest.raises(ValueError, match="mmap length is greater than file size"):
+    with pytest.raises(ValueError, match=tells("huge.npy:", "mmap", "size")):
         FeatureFolder(tmp_path, ["huge"])[0]
 
 
@@ -209,18 +209,18 @@ def test_grid_looks_at_nothing_else(tmp_path, layout):
     save_any(tmp_path, "a", layout, want)
     maps = FeatureFolder(tmp_path, ["a"])
     assert torch.equal(maps.grid(0, (2, 3), 1), want[1::2, 1::3].reshape(-1, 8))
-    with pytest.raises(ValueError, match=r"a.*: expected finite features, got 14000 NaN"):
+    with pytest.raises(ValueError, match=tells("a", "finite", "got 14000 NaN")):
         maps[0]
-    with pytest.raises(ValueError, match=r"a.*: expected finite features, got 4760 NaN"):
+    with pytest.raises(ValueError, match=tells("a", "finite", "got 4760 NaN")):
         maps.grid(0, (1, 3), 1)
-    with pytest.raises(ValueError, match=r"step\[0\]: expected a number"):
+    with pytest.raises(ValueError, match=tells("step[0]:", "got 0")):
         maps.grid(0, (0, 3), 1)
 
 
 def test_grid_of_a_map_of_another_size_is_refused_by_name(tmp_path):
     np.save(tmp_path / "a.npy", features(0).numpy())
     np.save(tmp_path / "b.npy", features(0, (4, 4, 8)).numpy())
-    with pytest.raises(ValueError, match=r"b\.npy: expected a map of \(h, w, D\) = \(3, 4, 8\) as in a\.npy"):
+    with pytest.raises(ValueError, match=tells("b.npy:", "(h, w, D) = (3, 4, 8)", "a.npy", "got (4, 4, 8)")):
         FeatureFolder(tmp_path).grid(1, (1, 1), 1)
 
 
@@ -234,9 +234,9 @@ def test_langsplat_maps_by_level_and_stride(tmp_path):
         assert torch.equal(maps[:][i], want)
         assert torch.equal(maps.grid(i, (2, 3), 1), sample_grid(want, (2, 3)))
     assert FeatureFolder(tmp_path, ["b"]).shape == (6, 8, 8)
-    with pytest.raises(ValueError, match="level: expected one of"):
+    with pytest.raises(ValueError, match=tells("level:", "got 4")):
         FeatureFolder(tmp_path, level=4)
-    with pytest.raises(ValueError, match="stride: expected a number in"):
+    with pytest.raises(ValueError, match=tells("stride:", "got 0")):
         FeatureFolder(tmp_path, stride=0)
 
 
@@ -271,9 +271,7 @@ def test_pictures_in_subfolders_have_their_maps_there(tmp_path):
     maps = FeatureFolder(tmp_path, ["right/0001", "left/0001"])
     assert torch.equal(maps[0], features(1))
     assert torch.equal(maps[1], features(0))
-    with pytest.raises(
-        ValueError, match=r"expected one map for view '0001', got 2: left.0001\.npy, right.0001\.npy; name"
-    ):
+    with pytest.raises(ValueError, match=tells("'0001'", "got 2", "left/0001.npy, right/0001.npy")):
         FeatureFolder(tmp_path, ["0001"])
 
 
@@ -283,9 +281,9 @@ def test_last_parts_of_names_are_looked_for_when_nothing_else_fits(tmp_path):
     np.save(tmp_path / "a.npy", features(0).numpy())
     maps = FeatureFolder(tmp_path, ["train/a", "train/b"])
     assert [file.relative_to(tmp_path).as_posix() for file in maps.files] == ["a.npy", "feat/b.npy"]
-    with pytest.raises(FileNotFoundError, match=r"2 views, 1 missing: b_fmap"):
+    with pytest.raises(FileNotFoundError, match=tells("2 views", "1 missing", "b_fmap")):
         FeatureFolder(tmp_path, ["a", "b"])  # a fits as it is: then so must b
-    with pytest.raises(FileNotFoundError, match=r"2 views, 2 missing: left/a_fmap"):
+    with pytest.raises(FileNotFoundError, match=tells("2 views", "2 missing", "left/a_fmap")):
         FeatureFolder(tmp_path, ["left/a", "right/a"])  # which of them?
 
 
@@ -304,7 +302,7 @@ def test_pictures_sizes_tell_the_order_of_the_axes(tmp_path):
     assert torch.equal(maps[0], want)
     assert torch.equal(maps[1:][0], want)
     assert torch.equal(FeatureFolder(tmp_path, ["a"], channels=20)[0], want)
-    with pytest.raises(ValueError, match=r"sizes: expected 2 \(one per view\), got 1"):
+    with pytest.raises(ValueError, match=tells("sizes:", "expected 2", "got 1")):
         FeatureFolder(tmp_path, ["a", "b"], sizes=[(60, 80)])
 
 
@@ -323,7 +321,7 @@ def test_a_map_of_the_manifest_is_rows_first_whatever_it_looks_like(tmp_path):
     want = torch.zeros(512, 9, 100)
     want[300, 2, 7] = 3.0
     record = own_map(tmp_path, "a", want)
-    with pytest.raises(ValueError, match="which may also be"):
+    with pytest.raises(ValueError, match=tells("a.npy:", "got (512, 9, 100)", "[D, h, w]")):
         _ = FeatureFolder(tmp_path).shape
     Manifest({"name": "t"}, {"a": record}).save(tmp_path)
     assert torch.equal(FeatureFolder(tmp_path)[0], want)
@@ -336,20 +334,22 @@ def test_discarded_maps_keep_shape_and_digests_and_say_so_when_read(tmp_path):
     before = whole.digests(), whole.shape, whole.files
     for stem in records:
         (tmp_path / f"{stem}.npy").unlink()
-    with pytest.raises(FileNotFoundError, match="2 views, 2 missing"):  # deleted, but nobody said why
+    with pytest.raises(
+        FileNotFoundError, match=tells("2 views", "2 missing", "b.npy, a.npy")
+    ):  # deleted, but nobody said why
         FeatureFolder(tmp_path, ["b", "a"])
     Manifest({"name": "t"}, records, discarded=True).save(tmp_path)
     maps = FeatureFolder(tmp_path, ["b", "a"])
     assert (maps.digests(), maps.shape, maps.files) == before
     assert FeatureFolder(tmp_path).stems == ["a", "b"]
     for read in (lambda: maps[1], lambda: maps.grid(1, None, 10)):
-        with pytest.raises(FileNotFoundError, match=r"a\.npy: .* discarded once .* make it again with `kfgs features`"):
+        with pytest.raises(FileNotFoundError, match=tells("a.npy:", "discarded", "`kfgs features`")):
             read()
     with pytest.raises(
-        FileNotFoundError, match=r"3 views, 1 missing: c\.npy; make them with `kfgs features .*--split all"
+        FileNotFoundError, match=tells("3 views", "1 missing", "c.npy", "`kfgs features", "--split all")
     ):
         FeatureFolder(tmp_path, ["a", "b", "c"])
-    with pytest.raises(ValueError, match=r"b\.npy: expected 512 channels, got 8"):
+    with pytest.raises(ValueError, match=tells("b.npy:", "expected 512", "got 8")):
         _ = FeatureFolder(tmp_path, ["b"], channels=512).shape
 
 
@@ -377,7 +377,7 @@ def test_maps_of_subfolders_are_listed_before_and_after_they_are_discarded(tmp_p
         assert (maps.stems, maps.files) == (["a", "left/b"], [tmp_path / "a.npy", tmp_path / "left" / "b.npy"])
         (tmp_path / "left" / "b.npy").unlink(missing_ok=True)
     Manifest({"name": "t"}, records).save(tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"each of 2 views, 1 missing: left/b\.npy; make them with"):
+    with pytest.raises(FileNotFoundError, match=tells("2 views", "1 missing", "left/b.npy", "`kfgs features")):
         _ = FeatureFolder(tmp_path).files  # deleted by nobody knows whom: not left out in silence
 
 
@@ -420,13 +420,13 @@ def test_masks_of_three_things_make_a_codebook_of_three(tmp_path):
 def test_a_map_among_kfgss_own_that_the_manifest_does_not_tell_of_is_refused(tmp_path):
     records = {stem: own_map(tmp_path, stem, features(i)) for i, stem in enumerate(("a", "b"))}
     Manifest({"name": "t"}, {"a": records["a"]}).save(tmp_path)
-    said = tells("b.npy: expected a map that features.json lists", "without a record", "(1 of 2 views)", "move it away")
+    said = tells("b.npy:", "features.json", "without a record", "(1 of 2 views)", "move it away")
     for stems in (["a", "b"], ["b", "a"], None):
         with pytest.raises(ValueError, match=said):
             _ = FeatureFolder(tmp_path, stems).files
     assert torch.equal(FeatureFolder(tmp_path, ["a"])[0], features(0).half().float())  # nobody asked for b
     save_pt(tmp_path, "a", features(2).permute(2, 0, 1))  # read before .npy
-    with pytest.raises(ValueError, match=tells("a_fmap_CxHxW.pt: expected a map that features.json lists")):
+    with pytest.raises(ValueError, match=tells("a_fmap_CxHxW.pt:", "features.json")):
         FeatureFolder(tmp_path, ["a"])
 
 
@@ -463,7 +463,7 @@ def test_a_map_saved_by_a_training_run_needs_no_gradient(tmp_path):
 def test_a_map_that_repeats_a_few_bytes_is_refused(tmp_path):
     save_pt(tmp_path, "a", torch.ones(1, 1, 1).expand(100_000, 100_000, 10_000))  # 4 bytes on disk, 400 TB read
     assert (tmp_path / "a_fmap_CxHxW.pt").stat().st_size < 4000
-    said = ("a_fmap_CxHxW.pt: expected a feature map", "its values are repeated by strides", "save it contiguous")
+    said = ("a_fmap_CxHxW.pt:", "strides", "contiguous")
     with pytest.raises(ValueError, match=tells(*said)):
         FeatureFolder(tmp_path, ["a"])[0]
 

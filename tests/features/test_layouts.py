@@ -42,9 +42,9 @@ def test_own_map_is_half_precision_rows_first(tmp_path, rows):
 def test_what_half_precision_cannot_hold_is_refused_and_leaves_no_file(tmp_path, value):
     bad = features(0, (40, 4, 8))
     bad[39, 1, 2] = value
-    with pytest.raises(ValueError, match=r"finite values below 65504 .*, got others for 'a\.npy'; normalise"):
+    with pytest.raises(ValueError, match=tells("features:", "65504", "'a.npy'")):
         write_npy_map(tmp_path / "a.npy", bad)
-    with pytest.raises(ValueError, match=r"features: expected \[h, w, D\], got \(4, 8\)"):
+    with pytest.raises(ValueError, match=tells("features:", "[h, w, D]", "got (4, 8)")):
         write_npy_map(tmp_path / "a.npy", bad[0])
     assert list(tmp_path.iterdir()) == []
 
@@ -58,13 +58,13 @@ def test_safetensors_of_one_tensor(tmp_path, dtype):
 
 def test_safetensors_of_another_kind_are_refused(tmp_path):
     save_file({"x": features(0), "y": features(1)}, tmp_path / "two.safetensors")
-    with pytest.raises(ValueError, match=r"two\.safetensors: .* cannot be read .*expected one tensor, got 2: x, y"):
+    with pytest.raises(ValueError, match=tells("two.safetensors:", "read", "one tensor", "got 2: x, y")):
         open_map(tmp_path / "two.safetensors")
     save_file({"x": features(0).int()}, tmp_path / "whole.safetensors")
-    with pytest.raises(ValueError, match=r"whole\.safetensors: expected floating-point features, got torch\.int32"):
+    with pytest.raises(ValueError, match=tells("whole.safetensors:", "got torch.int32")):
         open_map(tmp_path / "whole.safetensors")
     (tmp_path / "junk.safetensors").write_bytes(b"junk")
-    with pytest.raises(ValueError, match=r"junk\.safetensors: expected a feature map, but it cannot be read"):
+    with pytest.raises(ValueError, match=tells("junk.safetensors:", "feature map", "read")):
         open_map(tmp_path / "junk.safetensors")
 
 
@@ -97,7 +97,7 @@ def test_order_of_the_axes(tmp_path, shape, reading, order):
 
 @pytest.mark.parametrize("shape", [(512, 90, 120), (512, 480, 640), (256, 64, 48)])
 def test_an_order_in_doubt_is_refused_when_nothing_is_known(shape):
-    with pytest.raises(ValueError, match=r"a\.npy: expected a map \[h, w, D\], got .*, which may also be \[D, h, w\]"):
+    with pytest.raises(ValueError, match=tells("a.npy:", "[h, w, D]", "[D, h, w]")):
         find_axes("a.npy", shape)
 
 
@@ -164,17 +164,17 @@ def test_a_file_with_code_in_it_is_named_and_runs_nothing(tmp_path, zipped):
 def test_objects_of_classes_are_not_made(tmp_path):
     file = tmp_path / "a_fmap_CxHxW.pt"
     torch.save(argparse.Namespace(a=1), file)
-    with pytest.raises(ValueError, match=tells(file, "cannot be read", "objects beside tensors, which are not run")):
+    with pytest.raises(ValueError, match=tells(file, "cannot be read", "objects", "not run")):
         open_map(file)
 
 
 @pytest.mark.parametrize(
     ("start", "words"),
-    [(b"\x89PNG\r\n\x1a\n" + bytes(100), "a PNG picture"), (b"", "an empty file"), (b"junk", "a text file")],
+    [(b"\x89PNG\r\n\x1a\n" + bytes(100), ("PNG",)), (b"", ("empty",)), (b"junk", ("text", "'junk'"))],
 )
 def test_what_torch_did_not_save_is_named_in_a_few_words(tmp_path, start, words):
     file = tmp_path / "a_fmap_CxHxW.pt"
     file.write_bytes(start)
-    with pytest.raises(ValueError, match=rf"a_fmap_CxHxW\.pt: .* cannot be read \({words}") as caught:
+    with pytest.raises(ValueError, match=tells("a_fmap_CxHxW.pt:", "read", *words)) as caught:
         open_map(file)
     assert len(str(caught.value)) < len(str(file)) + 150

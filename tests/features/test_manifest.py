@@ -1,5 +1,4 @@
 import json
-import re
 
 import pytest
 from messages import tells
@@ -99,14 +98,14 @@ def test_another_format_is_named(tmp_path, text):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("{", "expected a JSON file, but it cannot be parsed (Expecting property name"),
-        ("[" * 100_000 + "]" * 100_000, "(nested too deeply)"),
-        ('{"seconds": ' + "1" * 5000 + "}", "expected a JSON file, but it cannot be parsed (Exceeds the limit"),
+        ("{", ("JSON", "(Expecting")),
+        ("[" * 100_000 + "]" * 100_000, ("nested",)),
+        ('{"seconds": ' + "1" * 5000 + "}", ("JSON", "(Exceeds")),
     ],
 )
 def test_what_is_no_json_says_the_way_out(tmp_path, text, words):
     (tmp_path / "features.json").write_text(text)
-    with pytest.raises(ValueError, match=re.escape(words)) as caught:
+    with pytest.raises(ValueError, match=tells(*words)) as caught:
         read_manifest(tmp_path)
     assert str(caught.value).startswith(f"{tmp_path / 'features.json'}: expected a ")
     assert str(caught.value).endswith(f"; {WAY_OUT}")

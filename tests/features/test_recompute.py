@@ -152,12 +152,12 @@ def test_bad_input_is_refused_before_the_teacher_runs(scene, tmp_path):
     with pytest.raises(ValueError, match=tells("pictures", "at least one", "none")):
         RecomputedMaps(teacher, scene, [], tmp_path / "store")
     scene.image_paths[1].unlink()
-    with pytest.raises(FileNotFoundError, match=r"view_1.png: no such file; expected the picture of view 'view_1'"):
+    with pytest.raises(FileNotFoundError, match=tells("view_1.png:", "'view_1'")):
         RecomputedMaps(teacher, scene, [0, 1], tmp_path / "store")
     teacher.matrix = teacher.matrix * torch.nan
-    with pytest.raises(ValueError, match=r"finite features for .*view_0.png, got 480 NaN"):
+    with pytest.raises(ValueError, match=tells("teacher 'mixer':", "finite", "view_0.png", "got 480 NaN")):
         RecomputedMaps(teacher, scene, [0], tmp_path / "store").grid(0, None, 40)
-    with pytest.raises(ValueError, match=r"finite features for .*view_0.png"):
+    with pytest.raises(ValueError, match=tells("teacher 'mixer':", "finite", "view_0.png")):
         _ = RecomputedMaps(teacher, scene, [0], tmp_path / "store")[0]
 
 
@@ -176,7 +176,5 @@ def test_a_function_is_a_teacher_and_other_things_are_none(scene, tmp_path):
     pictures = pictures_of(scene)
     assert torch.equal(maps[1], pictures[1].read()[::2, ::2].half().float())
     assert maps.identity["name"] == "thumbnail"
-    with pytest.raises(
-        TypeError, match="teacher: expected an object with name, encode_image and encode_text, .*, got str"
-    ):
+    with pytest.raises(TypeError, match=tells("teacher:", "encode_image", "encode_text", "got str")):
         RecomputedMaps("lseg", scene, [0], tmp_path / "store")

@@ -6,6 +6,7 @@ import oracles_uplift
 import pytest
 import torch
 from cases_splat import a_camera, gaussians_before
+from messages import tells
 
 from kfgs import Camera, Gaussians
 from kfgs.fields import answers, fused_answers
@@ -136,5 +137,5 @@ def test_chunks_change_nothing(monkeypatch):
 
 
 def test_no_camera_is_named():
-    with pytest.raises(ValueError, match="views: expected at least one camera, got none"):
+    with pytest.raises(ValueError, match=tells("views:", "got none")):
         fused_answers(trained("adc"), codebook(), None, [])

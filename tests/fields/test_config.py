@@ -1,4 +1,5 @@
 import pytest
+from messages import tells
 
 from kfgs.fields import FieldConfig
 
@@ -28,19 +29,19 @@ def test_with_steps_keeps_the_schedule_in_proportion():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"steps": 0}, "steps: expected a whole number of at least 1, got 0"),
-        ({"steps": 2.5}, "steps: expected a whole number"),
-        ({"reset_every": -1}, "reset_every: expected a whole number of at least 0"),
-        ({"max_gaussians": 0}, "max_gaussians: expected a whole number of at least 1"),
-        ({"means_lr": 0.0}, "means_lr: expected a number in"),
-        ({"features_lr": -1.0}, "features_lr: expected a number in"),
-        ({"reset_opacity": 1.0}, "reset_opacity: expected a number in"),
-        ({"render_scale": 0.0}, "render_scale: expected a number in"),
-        ({"densify_gradient_size": "image"}, "densify_gradient_size: expected one of 'render', 'target', got 'image'"),
+        ({"steps": 0}, ("steps:", "got 0")),
+        ({"steps": 2.5}, ("steps:", "got 2.5")),
+        ({"reset_every": -1}, ("reset_every:", "got -1")),
+        ({"max_gaussians": 0}, ("max_gaussians:", "got 0")),
+        ({"means_lr": 0.0}, ("means_lr:", "got 0.0")),
+        ({"features_lr": -1.0}, ("features_lr:", "got -1.0")),
+        ({"reset_opacity": 1.0}, ("reset_opacity:", "got 1.0")),
+        ({"render_scale": 0.0}, ("render_scale:", "got 0.0")),
+        ({"densify_gradient_size": "image"}, ("densify_gradient_size:", "'render', 'target'", "got 'image'")),
     ],
 )
 def test_wrong_values(change, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         FieldConfig(**change)
 
 
@@ -73,15 +74,15 @@ def test_a_very_short_schedule_keeps_one_pair_per_step():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"sh0_lr": -1.0}, "sh0_lr: expected a number in"),
-        ({"sh_degree_every": -1}, "sh_degree_every: expected a whole number of at least 0"),
-        ({"coarse": ((10, 0),)}, "coarse: divisor: expected a whole number of at least 1, got 0"),
-        ({"coarse": ((10, 2, 3),)}, r"coarse: expected pairs \(last step, divisor\), got \(10, 2, 3\); give two"),
-        ({"coarse": ((20, 2), (10, 1))}, "coarse: expected pairs in increasing order .* sort them"),
-        ({"coarse": ((10, 2), (10, 4))}, "coarse: expected pairs in increasing order .* sort them"),
-        ({"coarse": ((10, 2),), "render_scale": 2.0}, r"coarse: expected \(\) with render_scale = 2.0"),
+        ({"sh0_lr": -1.0}, ("sh0_lr:", "got -1.0")),
+        ({"sh_degree_every": -1}, ("sh_degree_every:", "got -1")),
+        ({"coarse": ((10, 0),)}, ("coarse:", "divisor:", "got 0")),
+        ({"coarse": ((10, 2, 3),)}, ("coarse:", "got (10, 2, 3)")),
+        ({"coarse": ((20, 2), (10, 1))}, ("coarse:", "increasing")),
+        ({"coarse": ((10, 2), (10, 4))}, ("coarse:", "increasing")),
+        ({"coarse": ((10, 2),), "render_scale": 2.0}, ("coarse:", "()", "render_scale = 2.0")),
     ],
 )
 def test_wrong_values_of_colours(change, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         FieldConfig(**change)

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from messages import tells
 
 from kfgs import Camera, Gaussians, rasterize
 from kfgs.cameras import Distortion, resize_map
@@ -208,14 +209,14 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
     path = tmp_path / "fit.safetensors"
     short = replace(SHORT, steps=5)
     fit_field(start(), cameras, targets, short, extent=2.0, checkpoint=path)
-    with pytest.raises(ValueError, match="got one with other config; delete it"):
+    with pytest.raises(ValueError, match=tells("checkpoint:", "config", "delete")):
         fit_field(start(), cameras, targets, replace(short, features_lr=0.1), extent=2.0, checkpoint=path)
-    with pytest.raises(ValueError, match="other cameras, targets;"):
+    with pytest.raises(ValueError, match=tells("checkpoint:", "cameras, targets", "delete")):
         fit_field(start(), cameras[:2], targets[:2], short, extent=2.0, checkpoint=path)
     nearer = [replace(camera, near=0.1) for camera in cameras]
-    with pytest.raises(ValueError, match="other cameras;"):
+    with pytest.raises(ValueError, match=tells("checkpoint:", "cameras;", "delete")):
         fit_field(start(), nearer, targets, short, extent=2.0, checkpoint=path)
-    with pytest.raises(ValueError, match="other extent, generator, params"):
+    with pytest.raises(ValueError, match=tells("checkpoint:", "extent, generator, params")):
         fit_field(
             start(61), cameras, targets, short, extent=3.0, checkpoint=path, generator=torch.Generator().manual_seed(9)
         )
@@ -230,9 +231,9 @@ def test_a_damaged_or_foreign_checkpoint_is_refused(tmp_path):
     damaged, foreign = tmp_path / "damaged", tmp_path / "foreign"
     damaged.write_bytes(b"nothing of the kind")
     save_file({"x": torch.zeros(2)}, foreign)
-    with pytest.raises(ValueError, match="checkpoint: expected a kfgs field checkpoint at .*damaged, but it cannot"):
+    with pytest.raises(ValueError, match=tells("checkpoint:", "damaged", "read")):
         fit_field(start(), cameras, targets, SHORT, extent=2.0, checkpoint=damaged)
-    with pytest.raises(ValueError, match="got other tensors"):
+    with pytest.raises(ValueError, match=tells("checkpoint:", "foreign", "tensors")):
         fit_field(start(), cameras, targets, SHORT, extent=2.0, checkpoint=foreign)
 
 
@@ -291,18 +292,16 @@ def test_l1_loss_is_the_mean_over_pixels_and_channels_after_the_resize():
 
 def test_wrong_arguments():
     cameras, targets = scene(2)
-    with pytest.raises(ValueError, match=r"targets: expected one map per camera \(2, at least one\), got 1"):
+    with pytest.raises(ValueError, match=tells("targets:", "got 1")):
         fit_field(start(), cameras, targets[:1], SHORT, extent=2.0)
-    with pytest.raises(
-        ValueError, match=r"targets\[\d\]: expected \[h, w, D\] with D = 5 \(from params\), got \(24, 32, 3\)"
-    ):
+    with pytest.raises(ValueError, match=tells("targets[", "[h, w, D]", "D = 5", "got (24, 32, 3)")):
         fit_field(start(channels=5), cameras, targets, SHORT, extent=2.0)
-    with pytest.raises(ValueError, match="extent: expected a number in"):
+    with pytest.raises(ValueError, match=tells("extent:", "got 0.0")):
         fit_field(start(), cameras, targets, SHORT, extent=0.0)
-    with pytest.raises(ValueError, match="params: expected at least one Gaussian"):
+    with pytest.raises(ValueError, match=tells("params:", "got none")):
         fit_field(start().map(lambda value: value[:0]), cameras, targets, SHORT, extent=2.0)
     bent = replace(cameras[0], distortion=Distortion("brown_conrady", (0.1, 0.0, 0.0, 0.0)))
-    with pytest.raises(ValueError, match="cameras: expected cameras without distortion, got brown_conrady"):
+    with pytest.raises(ValueError, match=tells("cameras:", "got brown_conrady")):
         fit_field(start(), [bent], targets[:1], SHORT, extent=2.0)
 
 
@@ -321,12 +320,12 @@ def test_unknown_pixels_count_nowhere():
 
 def test_an_infinite_target_stops_the_fit():
     cameras, targets = scene(1)
-    with pytest.raises(FloatingPointError, match=r"loss: expected a finite number at step 1, got inf"):
+    with pytest.raises(FloatingPointError, match=tells("loss:", "step 1", "got inf")):
         fit_field(start(), cameras, [targets[0] + torch.inf], SHORT, extent=2.0)
 
 
 def test_losing_every_gaussian_says_so():
     cameras, targets = scene(1)
     config = replace(SHORT, prune_opacity=0.9)
-    with pytest.raises(ValueError, match="config: expected some Gaussian to outlast pruning, got none at step 10"):
+    with pytest.raises(ValueError, match=tells("config:", "got none", "step 10")):
         fit_field(start(), cameras, targets, config, extent=2.0)

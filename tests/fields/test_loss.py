@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from oracles_color import ssim_windows
 
 from kfgs.fields import ColorLoss, l1_loss, loss
@@ -93,5 +94,5 @@ def test_color_loss_mixes_l1_and_dissimilarity():
 
 
 def test_a_weight_outside_0_and_1_is_refused():
-    with pytest.raises(ValueError, match=r"ssim_weight: expected a number in \[0, 1\], got 1.5"):
+    with pytest.raises(ValueError, match=tells("ssim_weight:", "[0, 1]", "got 1.5")):
         ColorLoss(1.5)

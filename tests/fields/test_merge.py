@@ -4,6 +4,7 @@ import numpy as np
 import oracles_merge
 import pytest
 import torch
+from messages import tells
 
 from kfgs.fields import merge_gaussians as merge_any
 from kfgs.gaussians import Gaussians
@@ -279,16 +280,16 @@ def test_merged_gaussians_keep_dtype():
 
 def test_wrong_input_is_named():
     cloud, weights = random_cloud(10)
-    with pytest.raises(ValueError, match=r"gaussians: expected features \[N, d\], got None; uplift some first"):
+    with pytest.raises(ValueError, match=tells("gaussians:", "[N, d]", "got None")):
         merge_gaussians(cloud.replace(features=None), weights, 5)
-    with pytest.raises(ValueError, match="weights: expected Gaussians that some view shows, got none; do"):
+    with pytest.raises(ValueError, match=tells("weights:", "got none")):
         merge_gaussians(cloud, torch.zeros(10), 5)
-    with pytest.raises(ValueError, match=r"weights: expected \[N\] with N = 10 .*, got \(3,\)"):
+    with pytest.raises(ValueError, match=tells("weights:", "[N]", "N = 10", "got (3,)")):
         merge_gaussians(cloud, torch.ones(3), 5)
     for maximum in (0, 2.0):
-        with pytest.raises(ValueError, match="maximum: expected"):
+        with pytest.raises(ValueError, match=tells("maximum:", f"got {maximum}")):
             merge_gaussians(cloud, weights, maximum)
-    with pytest.raises(ValueError, match="clusters: expected"):
+    with pytest.raises(ValueError, match=tells("clusters:", "got 0")):
         merge_gaussians(cloud, weights, 5, clusters=0)
-    with pytest.raises(ValueError, match="faint: expected"):
+    with pytest.raises(ValueError, match=tells("faint:", "got 1.0")):
         merge_any(cloud, weights, 5, faint=1.0)

@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from messages import tells
 
 from kfgs import Gaussians
 from kfgs.fields import GaussianParams
@@ -79,9 +80,9 @@ def test_near_duplicates_are_held_above_the_lower_bound():
 def test_two_points_and_identical_points():
     two = GaussianParams.from_points(torch.tensor([[0.0, 0, 0], [0, 0, 2]]), 1)
     torch.testing.assert_close(two.log_scales.exp(), torch.full((2, 3), 2.0))
-    with pytest.raises(ValueError, match=r"at least two different points, got 5 point\(s\) at 1 place"):
+    with pytest.raises(ValueError, match=tells("points:", "got 5")):
         GaussianParams.from_points(torch.ones(5, 3), 1)
-    with pytest.raises(ValueError, match=r"at least two different points, got 0 point"):
+    with pytest.raises(ValueError, match=tells("points:", "got 0")):
         GaussianParams.from_points(torch.ones(0, 3), 1)
 
 
@@ -99,16 +100,16 @@ def test_subset_is_seeded_and_of_the_asked_size():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"initial_opacity": 1.0}, r"initial_opacity: expected a number in \(0, 1\)"),
-        ({"channels": 0}, "channels: expected a number in"),
-        ({"outlier_range": 0.0}, "outlier_range: expected a positive number"),
-        ({"points": torch.full((4, 3), torch.nan)}, "points: expected finite floating-point"),
-        ({"points": torch.ones(4, 2)}, r"points: expected \[P, 3\], got \(4, 2\)"),
+        ({"initial_opacity": 1.0}, ("initial_opacity:", "(0, 1)", "got 1.0")),
+        ({"channels": 0}, ("channels:", "got 0")),
+        ({"outlier_range": 0.0}, ("outlier_range:", "got 0.0")),
+        ({"points": torch.full((4, 3), torch.nan)}, ("points:", "finite", "got others")),
+        ({"points": torch.ones(4, 2)}, ("points:", "[P, 3]", "got (4, 2)")),
     ],
 )
 def test_wrong_arguments(change, message):
     arguments = {"points": cloud(10), "channels": 3} | change
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         GaussianParams.from_points(**arguments)
 
 
@@ -126,7 +127,7 @@ def test_activation_and_its_inverse():
     again = params.activated()
     for name in ("means", "quats", "scales", "opacities", "features"):
         torch.testing.assert_close(getattr(again, name), getattr(gaussians, name))
-    with pytest.raises(ValueError, match="gaussians: expected features"):
+    with pytest.raises(ValueError, match=tells("gaussians:", "got neither")):
         GaussianParams.from_gaussians(gaussians.replace(features=None))
 
 
@@ -157,7 +158,7 @@ def test_tensors_round_trip_and_missing_name():
     assert all(
         torch.equal(a, b) for a, b in zip(params.to_tensors().values(), again.to_tensors().values(), strict=True)
     )
-    with pytest.raises(ValueError, match=r"without \['quats'\]"):
+    with pytest.raises(ValueError, match=tells("tensors:", "['quats']")):
         GaussianParams.from_tensors({k: v for k, v in params.to_tensors().items() if k != "quats"})
 
 
@@ -221,33 +222,33 @@ def test_a_colour_cloud_and_back(K):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"sh0": None}, "features, sh0: expected one of them, got neither"),
-        ({"features": torch.zeros(4, 2)}, "features, sh0: expected one of them, got both"),
-        ({"sh_rest": torch.zeros(4, 5, 3)}, r"sh_rest: expected 3, 8 or 15 coefficients .* got 5; leave it None"),
+        ({"sh0": None}, ("features, sh0:", "got neither")),
+        ({"features": torch.zeros(4, 2)}, ("features, sh0:", "got both")),
+        ({"sh_rest": torch.zeros(4, 5, 3)}, ("sh_rest:", "expected 3, 8 or 15", "got 5", "degree 0")),
         (
             {"sh0": None, "features": torch.zeros(4, 2), "sh_rest": torch.zeros(4, 3, 3)},
-            "sh_rest: .* got 3 without sh0",
+            ("sh_rest:", "got 3", "sh0"),
         ),
-        ({"sh0": torch.zeros(5, 3)}, r"sh0: expected \[N, 3\] with N = 4 \(from means\), got \(5, 3\)"),
+        ({"sh0": torch.zeros(5, 3)}, ("sh0:", "[N, 3]", "N = 4", "got (5, 3)")),
     ],
 )
 def test_a_field_has_features_or_colours(change, message):
     tensors = GaussianParams.from_points(cloud(4), colors=torch.zeros(4, 3), sh_degree=0).to_tensors()
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         GaussianParams(**(tensors | change))
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"colors": torch.full((10, 3), 2.0)}, r"colors: expected uint8, or floating point in \[0, 1\]"),
-        ({"colors": torch.zeros(10, 3, dtype=torch.int64)}, "colors: expected uint8"),
-        ({"colors": torch.zeros(9, 3)}, r"colors: expected \[P, 3\] with P = 10 \(from points\), got \(9, 3\)"),
-        ({"colors": None}, "channels, colors: expected one of them, got neither"),
-        ({"channels": 3}, "channels, colors: expected one of them, got both"),
-        ({"sh_degree": 4}, r"sh_degree: expected a number in \[0, 3\], got 4"),
+        ({"colors": torch.full((10, 3), 2.0)}, ("colors:", "uint8", "[0, 1]", "got torch.float32")),
+        ({"colors": torch.zeros(10, 3, dtype=torch.int64)}, ("colors:", "uint8", "got torch.int64")),
+        ({"colors": torch.zeros(9, 3)}, ("colors:", "[P, 3]", "P = 10", "got (9, 3)")),
+        ({"colors": None}, ("channels, colors:", "got neither")),
+        ({"channels": 3}, ("channels, colors:", "got both")),
+        ({"sh_degree": 4}, ("sh_degree:", "[0, 3]", "got 4")),
     ],
 )
 def test_wrong_colours(change, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         GaussianParams.from_points(cloud(10), **({"colors": torch.zeros(10, 3)} | change))

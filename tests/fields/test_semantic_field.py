@@ -210,7 +210,7 @@ def test_a_query_of_fused_answers(mode):
     assert unseen.known.tolist() == [False, True, True, True]
     assert unseen.classify(embeddings()).labels.tolist() == [-1, 1, 2, 2]
     assert unseen.classify(embeddings(), rule="paper").labels.tolist() == [0, 1, 2, 2]  # its own latent says so
-    with pytest.raises(ValueError, match="cameras: expected at least one, got none"):
+    with pytest.raises(ValueError, match=tells("cameras:", "got none")):
         made.with_answers([])
 
 
@@ -230,7 +230,7 @@ def test_query_with_negatives(mode):
         assert against.mask.tolist() == [False, False, True, True]
         assert against.threshold == 0.5
         assert torch.equal(asked.query(embeddings()[2], embeddings()).scores, against.scores)  # the other classes
-    with pytest.raises(ValueError, match=r"negatives: expected \[M, 16\], got \(2, 5\)"):
+    with pytest.raises(ValueError, match=tells("negatives:", "[M, 16]", "got (2, 5)")):
         made.query(embeddings()[0], negatives=torch.ones(2, 5))
 
 
@@ -249,7 +249,7 @@ def test_query_by_any_score(mode):
     torch.testing.assert_close(relevant.scores[2:], torch.sigmoid(torch.tensor([10 * root] * 2)))
     by_views = made.with_answers([camera()]).query(embeddings()[2], threshold=0.3, score="softmax", **against)
     assert by_views.mask.tolist() == [False, False, True, True]
-    with pytest.raises(ValueError, match="negatives: expected some for score 'relevancy', got none"):
+    with pytest.raises(ValueError, match=tells("negatives:", "'relevancy'", "got none")):
         made.query(embeddings()[2], score="relevancy")
 
 
@@ -260,7 +260,7 @@ def test_an_unknown_rule_is_named():
         lambda: field().segment(camera(), embeddings(), rule="views"),
         lambda: field().cosines(embeddings(), rule="views"),
     ):
-        with pytest.raises(ValueError, match="rule: expected one of 'fused', 'paper', got 'views'"):
+        with pytest.raises(ValueError, match=tells("rule:", "'fused', 'paper'", "got 'views'")):
             ask()
 
 
@@ -271,11 +271,9 @@ def test_text_of_another_size_is_guessed_to_be_another_teachers():
         lambda: field().segment(camera(), torch.ones(2, 7)),
         lambda: field().query(torch.ones(16), negatives=torch.ones(2, 7)),
     ):
-        with pytest.raises(
-            ValueError, match=r"16\], got \((2, )?7,?\): text of another teacher\? Embed the words with"
-        ):
+        with pytest.raises(ValueError, match=tells("16], got (", "7", "teacher")):
             ask()
-    with pytest.raises(ValueError, match=r"embedding: expected \[16\], got \(1, 16\); pass a tensor"):
+    with pytest.raises(ValueError, match=tells("embedding:", "[16]", "got (1, 16)")):
         field().query(torch.ones(1, 16))
 
 
@@ -304,7 +302,7 @@ def test_decoding_in_chunks_changes_nothing(monkeypatch, mode, rule):
 
 def test_codeword_labels():
     assert field().codeword_labels(embeddings()).labels.tolist() == [0, 1, 2, 2]
-    with pytest.raises(ValueError, match="codebook: expected one, got None in this field"):
+    with pytest.raises(ValueError, match=tells("codebook:", "got None", "classify")):
         field("decouple").codeword_labels(embeddings())
 
 
@@ -417,22 +415,22 @@ def test_saving_replaces_an_older_field_and_nothing_else(tmp_path):
     precious = tmp_path / "thesis"
     precious.mkdir()
     (precious / "chapter1.tex").write_text("...")
-    with pytest.raises(FileExistsError, match="path: expected a new folder or an older field at .*thesis"):
+    with pytest.raises(FileExistsError, match=tells("path:", "folder", "thesis")):
         field().save(precious)
     assert (precious / "chapter1.tex").exists()
-    with pytest.raises(FileExistsError, match="path: expected a new folder"):
+    with pytest.raises(FileExistsError, match=tells("path:", "folder", "chapter1.tex")):
         field().save(precious / "chapter1.tex")
 
 
 def test_info_must_be_json(tmp_path):
     bad = SemanticField(field().gaussians, codebook(), autoencoder(), {"loss": float("nan")})
-    with pytest.raises(ValueError, match="info: expected what JSON can hold"):
+    with pytest.raises(ValueError, match=tells("info:", "got Out")):
         bad.save(tmp_path / "field")
     assert not (tmp_path / "field").exists()
 
 
 def test_missing_foreign_and_damaged_folders(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"expected the folder of a saved field, found no field\.json"):
+    with pytest.raises(FileNotFoundError, match=tells("field.json", "folder")):
         SemanticField.load(tmp_path)
     path = tmp_path / "field"
     field().save(path)
@@ -442,21 +440,21 @@ def test_missing_foreign_and_damaged_folders(tmp_path):
         (path / "field.json").write_text(json.dumps(description | changes))
 
     rewrite(format="other")
-    with pytest.raises(ValueError, match=r"expected a field \(kfgs\.semantic_field\), got 'other'"):
+    with pytest.raises(ValueError, match=tells("kfgs.semantic_field", "got 'other'")):
         SemanticField.load(path)
     rewrite(version=99)
-    with pytest.raises(ValueError, match="expected format version 1 or 2, got 99"):
+    with pytest.raises(ValueError, match=tells("field:", "version 1 or 2", "got 99")):
         SemanticField.load(path)
     (path / "field.json").write_text("{")
-    with pytest.raises(ValueError, match="expected a JSON file"):
+    with pytest.raises(ValueError, match=tells("field.json:", "JSON")):
         SemanticField.load(path)
     rewrite()
     whole = (path / "field.safetensors").read_bytes()
     (path / "field.safetensors").write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
-    with pytest.raises(ValueError, match=r"expected field\.safetensors as it was saved, got another"):
+    with pytest.raises(ValueError, match=tells("field:", "field.safetensors", "another")):
         SemanticField.load(path)
     (path / "field.safetensors").unlink()
-    with pytest.raises(ValueError, match=r"expected field\.safetensors as it was saved, got none"):
+    with pytest.raises(ValueError, match=tells("field:", "field.safetensors", "got none")):
         SemanticField.load(path)
 
 
@@ -471,41 +469,41 @@ def test_a_pickle_under_the_right_name_is_not_opened(tmp_path):
     (path / "field.safetensors").write_bytes(content)
     description = json.loads((path / "field.json").read_text())
     (path / "field.json").write_text(json.dumps(description | {"sha256": hashlib.sha256(content).hexdigest()}))
-    with pytest.raises(ValueError, match="its parts do not fit together"):
+    with pytest.raises(ValueError, match=tells("field:", "parts", "header")):
         SemanticField.load(path)
 
 
 def test_parts_must_belong_together():
-    with pytest.raises(ValueError, match="gaussians: expected features"):
+    with pytest.raises(ValueError, match=tells("gaussians:", "got None")):
         SemanticField(field().gaussians.replace(features=None))
-    with pytest.raises(ValueError, match="codebook: expected the one that the autoencoder was fitted to, got None"):
+    with pytest.raises(ValueError, match=tells("codebook:", "autoencoder", "got None")):
         SemanticField(field().gaussians, None, autoencoder())
-    with pytest.raises(ValueError, match=r"gaussians: expected 16 features each .* got 4"):
+    with pytest.raises(ValueError, match=tells("gaussians:", "expected 16", "got 4")):
         SemanticField(field().gaussians, codebook())
-    with pytest.raises(ValueError, match=r"autoencoder: expected 5 decoded channels \(from codebook\), got 16"):
+    with pytest.raises(ValueError, match=tells("autoencoder:", "expected 5", "got 16")):
         SemanticField(field().gaussians, Codebook(torch.eye(5)), autoencoder())
-    with pytest.raises(ValueError, match=r"gaussians: expected 4 features each .* got 16"):
+    with pytest.raises(ValueError, match=tells("gaussians:", "expected 4", "got 16")):
         SemanticField(field("adc").gaussians, codebook(), autoencoder())
-    with pytest.raises(ValueError, match=r"gaussians\.features: expected \[N, 4\] with N = 4 .*, got \(4, 16\)"):
+    with pytest.raises(ValueError, match=tells("gaussians.features:", "[N, 4]", "N = 4", "got (4, 16)")):
         SemanticField(field("decouple").gaussians, linear=linear())
-    with pytest.raises(ValueError, match=r"answers: expected \[N, 4\] with N = 4 .*, got \(3, 4\)"):
+    with pytest.raises(ValueError, match=tells("answers:", "[N, 4]", "N = 4", "got (3, 4)")):
         SemanticField(field("adc").gaussians, codebook(), linear=linear(), answers=torch.ones(3, 4))
-    with pytest.raises(ValueError, match="codebook: expected none for linear latents, got one; pass answers, or leave"):
+    with pytest.raises(ValueError, match=tells("codebook:", "got one")):
         SemanticField(field("fused").gaussians, codebook(), linear=linear())
-    with pytest.raises(ValueError, match="linear: expected what the answers stand for, got None"):
+    with pytest.raises(ValueError, match=tells("linear:", "got None")):
         SemanticField(field("adc").gaussians, codebook(), answers=torch.ones(4, 4))
 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_wrong_embeddings(mode):
     made = field(mode)
-    with pytest.raises(ValueError, match=r"embeddings: expected \[C, 16\], got \(2, 5\)"):
+    with pytest.raises(ValueError, match=tells("embeddings:", "[C, 16]", "got (2, 5)")):
         made.classify(torch.ones(2, 5))
-    with pytest.raises(ValueError, match=r"embeddings: expected \[C, 16\], got \(2, 5\)"):
+    with pytest.raises(ValueError, match=tells("embeddings:", "[C, 16]", "got (2, 5)")):
         made.segment(camera(), torch.ones(2, 5))
-    with pytest.raises(ValueError, match=r"embedding: expected \[16\], got \(5,\)"):
+    with pytest.raises(ValueError, match=tells("embedding:", "[16]", "got (5,)")):
         made.query(torch.ones(5))
-    with pytest.raises(ValueError, match=r"latents: expected \[\.\.\., d\]"):
+    with pytest.raises(ValueError, match=tells("latents:", "[..., d]", "got (2, 99)")):
         made.decode(torch.ones(2, 99))
 
 

@@ -2,6 +2,7 @@ import gsply
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from oracles_packed import compressed_gaussian
 from oracles_precision import assert_within, rotation_angles
 
@@ -239,16 +240,16 @@ def _damage(elements, what):
 @pytest.mark.parametrize(
     ("what", "message"),
     [
-        ("chunks", "expected 3 chunks for 600 Gaussians, 256 each, got 2; the file is damaged"),
-        ("bound", "expected finite bounds, got .*inf.* at Gaussian 1"),
-        ("overflow", "expected finite scales, got .*inf"),
-        ("column", "expected 'chunk' with float .*, min_scale_z missing"),
-        ("type", "expected 'chunk' with float .*, min_x missing"),
-        ("colour", "expected 'chunk' with float min_r.*, max_b missing"),
-        ("packed", "expected 'vertex' with uint .*, packed_scale missing; write the file again"),
-        ("sh rows", r"expected 'sh' of 600 rows \(from vertex\), got 599"),
-        ("sh columns", "expected an 'sh' element of 9, 24 or 45 bytes f_rest_0, f_rest_1, ..., got 8 columns"),
-        ("sh type", "expected an 'sh' element of 9, 24 or 45 bytes"),
+        ("chunks", ("expected 3", "600", "256", "got 2")),
+        ("bound", ("finite", "bounds", "inf", "Gaussian 1")),
+        ("overflow", ("finite", "scales", "inf")),
+        ("column", ("'chunk'", "min_scale_z")),
+        ("type", ("'chunk'", "min_x")),
+        ("colour", ("'chunk'", "min_r", "max_b")),
+        ("packed", ("'vertex'", "packed_scale")),
+        ("sh rows", ("'sh'", "600", "got 599")),
+        ("sh columns", ("'sh'", "24", "45", "f_rest_0", "f_rest_1", "got 8")),
+        ("sh type", ("'sh'", "24", "45", "got 9")),
     ],
 )
 def test_damaged_files_are_named(tmp_path, what, message):
@@ -256,7 +257,7 @@ def test_damaged_files_are_named(tmp_path, what, message):
     elements = read_ply_elements(tmp_path / "a.compressed.ply")
     _damage(elements, what)
     write_ply_elements(tmp_path / "bad.ply", elements)
-    with pytest.raises(ValueError, match=f"bad.ply: {message}"):
+    with pytest.raises(ValueError, match=tells("bad.ply:", *message)):
         read_splats(tmp_path / "bad.ply")
 
 
@@ -265,18 +266,18 @@ def test_a_truncated_file_is_named(tmp_path):
     content = (tmp_path / "a.compressed.ply").read_bytes()
     for end in (len(content) - 1, len(content) // 2, 1500):
         (tmp_path / "bad.ply").write_bytes(content[:end])
-        with pytest.raises(ValueError, match="bad.ply: the header promises .* truncated"):
+        with pytest.raises(ValueError, match=tells("bad.ply:", "truncated")):
             read_splats(tmp_path / "bad.ply")
     (tmp_path / "bad.ply").write_bytes(content.replace(b"element vertex 600", b"element vertex 99999999999"))
-    with pytest.raises(ValueError, match="bad.ply: the header promises 99999999999 vertices"):
+    with pytest.raises(ValueError, match=tells("bad.ply:", "99999999999")):
         read_splats(tmp_path / "bad.ply")
 
 
 def test_clouds_that_cannot_be_written_are_named(tmp_path):
-    with pytest.raises(ValueError, match="splats: expected a cloud with colours"):
+    with pytest.raises(ValueError, match=tells("splats:", "colours", ".compressed.ply")):
         write(tmp_path / "a.compressed.ply", SplatFile(_cloud().replace(sh=None)))
     means = _cloud().means.clone()
     means[5, 1] = torch.nan
-    with pytest.raises(ValueError, match="means: expected finite"):
+    with pytest.raises(ValueError, match=tells("means:", "finite", "nan")):
         write_splats(tmp_path / "a.compressed.ply", _cloud().replace(means=means))
     assert list(tmp_path.iterdir()) == []

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from cases_gltf import bent_gltf, random_cloud
+from messages import tells
 from scipy.spatial.transform import Rotation
 
 from kfgs.cameras import Camera, Similarity
@@ -59,7 +60,7 @@ def test_a_node_that_moves_beyond_float32_is_named(tmp_path):
     root["nodes"] = [{"children": [1], "scale": [1e25] * 3}, root["nodes"][0]]
     root["scenes"][0]["nodes"] = [0]
     path.write_text(json.dumps(root))
-    with pytest.raises(ValueError, match=r"bent.gltf: expected finite positions, got .*inf"):
+    with pytest.raises(ValueError, match=tells("bent.gltf:", "got [inf, -inf, -inf]")):
         read_splats(path)
 
 

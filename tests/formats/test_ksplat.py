@@ -3,6 +3,7 @@ import struct
 import numpy as np
 import pytest
 import torch
+from messages import tells
 
 from kfgs.formats import read_splats, write_splats
 from kfgs.formats.ksplat import matches, read
@@ -101,7 +102,7 @@ def test_it_is_known_by_its_content(tmp_path):
 
 def test_it_is_only_read(tmp_path, shared_data):
     splats = read_splats(shared_data / "splats" / "minimal.ksplat")
-    with pytest.raises(ValueError, match="expected a name that ends in one of .*splat, got 'a.ksplat'"):
+    with pytest.raises(ValueError, match=tells("path:", "got 'a.ksplat'")):
         write_splats(tmp_path / "a.ksplat", splats)
 
 
@@ -109,25 +110,25 @@ _S = _section(1, [0, 1], 1, 1, [1])
 _NAN = bytearray(_file(0, [_section(0, [0], 0, 1, [])], 1))
 _NAN[-44:-40] = np.float32(np.nan).tobytes()
 BAD = {
-    "short": (bytes(100), "header of 4096 bytes, got 100"),
-    "version": (_file(1, [_S], 2, major=1), r"version 0.1 or later and compression level 0 to 2, got 1.1 and 1"),
-    "minor": (_file(1, [_S], 2, minor=0), "got 0.0 and 1"),
-    "level": (_file(7, [_S], 2), "got 0.1 and 7"),
-    "sections": (_file(1, [_S], 2, most=4_000_000_000), "promises 4000000000 sections"),
-    "count": (_file(1, [_S], 5), "expected 5 Gaussians .* got 2 in"),
-    "none": (_file(1, [], 0), "expected 0 Gaussians .* got 0"),
-    "capacity": (_file(1, [_section(1, [0], 0, 1, [], capacity=4_000_000_000)], 1), "promises 4000000000 Gaussians"),
-    "size": (_file(1, [_section(1, [0], 0, 1, [], size=9)], 1), "at most 1 Gaussians .* got 9 of degree 0"),
-    "degree": (_file(1, [_section(1, [0], 0, 1, [], sh_degree=77)], 1), "degree 0 to 2 .* of degree 77"),
-    "buckets": (_file(1, [_section(1, [0, 1], 0, 2, [], buckets=1, bucket=7)], 2), "file is"),
-    "full": (_file(1, [_section(1, [0, 1], 0, 1, [0])], 2), "2 buckets for 2 Gaussians, got 1 of 1 and 1 of 0"),
-    "bytes": (_file(1, [_section(1, [0], 0, 1, [], bytes=11)], 1), "bucket centres of 12 bytes, got 11"),
-    "cut": (_file(1, [_S], 2)[:-1], "promises 2 Gaussians of 42 bytes .* truncated"),
-    "more": (_file(1, [_S], 2) + b"x", "expected 2 Gaussians in .* the file is damaged"),
-    "nan": (bytes(_NAN), "finite positions, got .*nan"),
-    "wide block": (_file(1, [_section(1, [0], 0, 1, [], block=3e38, quantum=1)], 1), "finite positions, got .*inf"),
-    "block": (_file(1, [_section(1, [0], 0, 1, [], block=float("nan"))], 1), "finite positions, got .*nan"),
-    "half": (_file(1, [_S], 2)[:-2] + b"\x00\x7c", "finite harmonics, got .*inf.* at Gaussian 1"),
+    "short": (bytes(100), ("4096", "got 100")),
+    "version": (_file(1, [_S], 2, major=1), ("version 0.1", "got 1.1 and 1")),
+    "minor": (_file(1, [_S], 2, minor=0), ("got 0.0 and 1",)),
+    "level": (_file(7, [_S], 2), ("got 0.1 and 7",)),
+    "sections": (_file(1, [_S], 2, most=4_000_000_000), ("4000000000 sections",)),
+    "count": (_file(1, [_S], 5), ("expected 5 Gaussians", "got 2")),
+    "none": (_file(1, [], 0), ("expected 0 Gaussians", "got 0")),
+    "capacity": (_file(1, [_section(1, [0], 0, 1, [], capacity=4_000_000_000)], 1), ("4000000000 Gaussians",)),
+    "size": (_file(1, [_section(1, [0], 0, 1, [], size=9)], 1), ("1 Gaussians", "got 9", "degree 0")),
+    "degree": (_file(1, [_section(1, [0], 0, 1, [], sh_degree=77)], 1), ("degree 0 to 2", "degree 77")),
+    "buckets": (_file(1, [_section(1, [0, 1], 0, 2, [], buckets=1, bucket=7)], 2), ("damaged",)),
+    "full": (_file(1, [_section(1, [0, 1], 0, 1, [0])], 2), ("2 buckets", "2 Gaussians", "got 1 of 1 and 1 of 0")),
+    "bytes": (_file(1, [_section(1, [0], 0, 1, [], bytes=11)], 1), ("bucket", "12", "got 11")),
+    "cut": (_file(1, [_S], 2)[:-1], ("2 Gaussians", "42 bytes", "truncated")),
+    "more": (_file(1, [_S], 2) + b"x", ("expected 2 Gaussians", "damaged")),
+    "nan": (bytes(_NAN), ("got [nan, -2.0, 3.25]",)),
+    "wide block": (_file(1, [_section(1, [0], 0, 1, [], block=3e38, quantum=1)], 1), ("got [inf, inf, inf]",)),
+    "block": (_file(1, [_section(1, [0], 0, 1, [], block=float("nan"))], 1), ("got [nan, nan, nan]",)),
+    "half": (_file(1, [_S], 2)[:-2] + b"\x00\x7c", ("finite", "inf", "Gaussian 1")),
 }
 
 
@@ -135,5 +136,5 @@ BAD = {
 def test_damage_is_named(tmp_path, case):
     content, message = BAD[case]
     (tmp_path / "bad.ksplat").write_bytes(content)
-    with pytest.raises(ValueError, match=f"bad.ksplat.*{message}"):
+    with pytest.raises(ValueError, match=tells("bad.ksplat:", *message)):
         read_splats(tmp_path / "bad.ksplat")

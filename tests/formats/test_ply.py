@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from messages import tells
 
 from kfgs.formats.ply import (
     other_elements,
@@ -77,39 +78,48 @@ def test_file_of_another_program_opens(shared_data):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"hello", "expected a PLY file"),
+        (b"hello", ("PLY", "'end_header'")),
         (
             b"ply\nformat binary_little_endian 1.0\nelement vertex 5\nproperty float x\nend_header\n" + b"\0" * 19,
-            "truncated",
+            ("truncated",),
         ),
         (
             b"ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n",
-            "truncated",
+            ("truncated",),
         ),
-        (b"ply\nformat binary_little_endian 1.0\nelement vertex -5\nproperty float x\nend_header\n", "vertex count"),
-        (b"ply\nformat ascii 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n1\n", "truncated"),
-        (b"ply\nformat binary_little_endian 1.0\nelement face 5\nproperty float x\nend_header\n", "first element"),
-        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n", "scalar"),
-        (b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n", "with properties"),
-        (b"ply\nformat exotic 1.0\nelement vertex 0\nproperty float x\nend_header\n", "format 'exotic'"),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex -5\nproperty float x\nend_header\n",
+            ("vertex", "got '-5'"),
+        ),
+        (b"ply\nformat ascii 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n1\n", ("truncated",)),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement face 5\nproperty float x\nend_header\n",
+            ("'vertex'", "got 'face'"),
+        ),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n",
+            ("scalar", "'property list uchar int x'"),
+        ),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n", ("'vertex'", "properties", "got 0")),
+        (b"ply\nformat exotic 1.0\nelement vertex 0\nproperty float x\nend_header\n", ("'exotic'",)),
     ],
 )
 def test_bad_files_are_named(tmp_path, content, message):
     (tmp_path / "bad.ply").write_bytes(content)
-    with pytest.raises(ValueError, match=f"bad.ply.*{message}"):
+    with pytest.raises(ValueError, match=tells("bad.ply:", *message)):
         read_ply(tmp_path / "bad.ply")
 
 
 def test_missing_file_and_columns(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no such file"):
+    with pytest.raises(FileNotFoundError, match=tells("none.ply:", "no such file")):
         read_ply(tmp_path / "none.ply")
-    with pytest.raises(ValueError, match="y, z missing"):
+    with pytest.raises(ValueError, match=tells("columns:", "y, z", "got ['x']")):
         points_from_columns({"x": np.zeros(1)})
-    with pytest.raises(ValueError, match="scale_0.*plain point cloud"):
+    with pytest.raises(ValueError, match=tells("columns:", "scale_0")):
         gaussians_from_columns({"x": np.zeros(1), "y": np.zeros(1), "z": np.zeros(1), "opacity": np.zeros(1)})
-    with pytest.raises(ValueError, match="one length"):
+    with pytest.raises(ValueError, match=tells("columns:", "length", "{'x': 1, 'y': 2}")):
         write_ply(tmp_path / "a.ply", {"x": np.zeros(1), "y": np.zeros(2)})
-    with pytest.raises(ValueError, match="astype"):
+    with pytest.raises(ValueError, match=tells("columns:", "got {'x': 'i8'}", "astype")):
         write_ply(tmp_path / "a.ply", {"x": np.zeros(1, np.int64)})
     assert list(tmp_path.iterdir()) == []
 
@@ -127,13 +137,16 @@ def test_empty_clouds_survive_the_file(tmp_path, degree):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"f_rest_44": None}, r"f_rest_0, f_rest_1, .* of 0 or 9 or 24 or 45 columns .*got 44 f_rest_\*"),
-        ({"f_rest_7": None}, r"expected f_rest_7 beside f_rest_44, got none; number f_rest_\* from 0"),
-        ({"f_rest_7": None, "f_rest_x": "f_rest_7"}, r"expected f_rest_7 beside f_rest_x, got none"),
-        ({"f_dc_1": None}, r"expected f_dc_1 beside f_dc_2, got none"),
-        ({"f_dc_2": None}, r"f_dc_0, f_dc_1, .* of 0 or 3 columns .*got 2 f_dc_\*"),
-        ({"f_dc_0": None, "f_dc_1": None, "f_dc_2": None}, r"f_rest_\* only with f_dc_0 to f_dc_2\), got 0 f_dc_\*"),
-        ({"semantic_3": None}, r"expected semantic_3 beside semantic_8, got none"),
+        ({"f_rest_44": None}, ("columns:", "f_rest_0, f_rest_1, ", "24", "45", "got 44", "f_rest_*")),
+        ({"f_rest_7": None}, ("columns:", "f_rest_7", "f_rest_44", "got none", "f_rest_*")),
+        ({"f_rest_7": None, "f_rest_x": "f_rest_7"}, ("columns:", "f_rest_7", "f_rest_x", "got none")),
+        ({"f_dc_1": None}, ("columns:", "f_dc_1", "f_dc_2", "got none")),
+        ({"f_dc_2": None}, ("columns:", "f_dc_0, f_dc_1, ", "got 2", "f_dc_*")),
+        (
+            {"f_dc_0": None, "f_dc_1": None, "f_dc_2": None},
+            ("columns:", "f_rest_*", "f_dc_0", "f_dc_2", "got 0", "f_dc_*"),
+        ),
+        ({"semantic_3": None}, ("columns:", "semantic_3", "semantic_8", "got none")),
     ],
 )
 def test_odd_columns_are_named(changes, message):
@@ -142,16 +155,14 @@ def test_odd_columns_are_named(changes, message):
     for name, source in changes.items():
         if source is None:
             del columns[name]
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         gaussians_from_columns(columns | values)
 
 
 def test_ascii_that_is_no_number_names_the_file(tmp_path):
     head = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nend_header\n"
     (tmp_path / "a.ply").write_text(head + "0 1\n2 banana\n")
-    with pytest.raises(
-        ValueError, match=r"a.ply: expected 2 rows of numbers, but they .*banana.*; write the file again"
-    ):
+    with pytest.raises(ValueError, match=tells("a.ply:", "expected 2", "banana")):
         read_ply(tmp_path / "a.ply")
 
 
@@ -170,7 +181,7 @@ def test_a_mesh_is_read_and_its_faces_are_told(tmp_path, layout):
 def test_a_cloud_has_no_other_elements(tmp_path):
     write_ply(tmp_path / "a.ply", columns_from_gaussians(_cloud()))
     assert other_elements(tmp_path / "a.ply") == []
-    with pytest.raises(FileNotFoundError, match="none.ply: no such file; expected a PLY"):
+    with pytest.raises(FileNotFoundError, match=tells("none.ply:", "no such file", "PLY")):
         other_elements(tmp_path / "none.ply")
 
 
@@ -194,7 +205,7 @@ def test_several_elements_survive_the_file(tmp_path):
     write_ply_elements(tmp_path / "a.ply", TABLES, comments=("first", "and second"))
     _assert_same(read_ply_elements(tmp_path / "a.ply"), TABLES)
     assert read_comments(tmp_path / "a.ply") == ["first", "and second"]
-    with pytest.raises(ValueError, match="expected 'vertex' as the first element, got 'chunk'; re-export"):
+    with pytest.raises(ValueError, match=tells("a.ply:", "'vertex'", "got 'chunk'")):
         read_ply(tmp_path / "a.ply")
 
 
@@ -218,19 +229,19 @@ def test_elements_that_cannot_be_read_are_named(tmp_path):
     write_ply_elements(tmp_path / "a.ply", TABLES)
     content = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "short.ply").write_bytes(content[:-1])
-    with pytest.raises(ValueError, match="promises 3 rows of 'sh' of 1 bytes, but only 2 bytes follow; .*truncated"):
+    with pytest.raises(ValueError, match=tells("short.ply:", "'sh'")):
         read_ply_elements(tmp_path / "short.ply")
     head = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\n"
     (tmp_path / "face.ply").write_bytes(head + b"element face 1\nproperty list uchar int i\nend_header\n" + b"\0" * 9)
-    with pytest.raises(ValueError, match="face.ply: expected scalar face properties, got 'property list"):
+    with pytest.raises(ValueError, match=tells("face.ply:", "scalar", "got 'property list")):
         read_ply_elements(tmp_path / "face.ply")
     (tmp_path / "twice.ply").write_bytes(head + b"element vertex 1\nproperty float y\nend_header\n" + b"\0" * 8)
-    with pytest.raises(ValueError, match="elements of different names"):
+    with pytest.raises(ValueError, match=tells("twice.ply:", "got ['vertex', 'vertex']")):
         read_ply_elements(tmp_path / "twice.ply")
     (tmp_path / "empty.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
-    with pytest.raises(ValueError, match="expected one 'vertex' element, got none"):
+    with pytest.raises(ValueError, match=tells("empty.ply:", "'vertex'", "got none")):
         read_ply(tmp_path / "empty.ply")
-    with pytest.raises(FileNotFoundError, match="none.ply: no such file"):
+    with pytest.raises(FileNotFoundError, match=tells("none.ply:", "no such file")):
         read_comments(tmp_path / "none.ply")
 
 

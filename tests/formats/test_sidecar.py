@@ -76,31 +76,29 @@ def test_labels_of_another_version_are_refused(path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"class_id": np.zeros(5, np.int32)}, "got those of another version"),
-        ({"class_id": np.zeros(6, np.float32)}, "expected whole numbers as class_id, got float32; delete it"),
-        ({"class_id": np.full(6, "a")}, "expected whole numbers as class_id"),
-        ({"class_id": np.full(6, -2)}, "expected class_id of -1 or more"),
-        ({"class_id": None}, "it cannot be read .*class_id.*; delete it"),
-        ({"of": None}, "it cannot be read .*of.*; delete it"),
-        ({"of": np.array("other")}, "got those of another version"),
-        ({"score": np.full(6, np.nan)}, "finite scores"),
-        ({"score": np.zeros(7)}, "finite scores of as many Gaussians"),
-        ({"score": np.zeros(100_000)}, "it cannot be read .800.* bytes for 6 Gaussians"),
-        ({"class_id": np.array([None] * 6)}, "it cannot be read"),  # pickled objects are never loaded
+        ({"class_id": np.zeros(5, np.int32)}, ("a.splat", "another version")),
+        ({"class_id": np.zeros(6, np.float32)}, ("class_id", "got float32")),
+        ({"class_id": np.full(6, "a")}, ("class_id", "got <U1")),
+        ({"class_id": np.full(6, -2)}, ("class_id", "-1")),
+        ({"class_id": None}, ("read", "class_id", "delete")),
+        ({"of": None}, ("read", "'of is", "delete")),
+        ({"of": np.array("other")}, ("a.splat", "another version")),
+        ({"score": np.full(6, np.nan)}, ("finite", "scores")),
+        ({"score": np.zeros(7)}, ("finite", "scores", "as many")),
+        ({"score": np.zeros(100_000)}, ("(800", "6 Gaussians")),
+        ({"class_id": np.array([None] * 6)}, ("read", "a.splat")),  # pickled objects are never loaded
     ],
 )
 def test_damaged_labels_are_named(path, changes, message):
     _bend(path, **changes)
-    with pytest.raises(ValueError, match=f"a.splat.labels.npz: .*{message}"):
+    with pytest.raises(ValueError, match=tells("a.splat.labels.npz:", *message)):
         read_splats(path)
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"hello" * 100, np.arange(6).tobytes()])
 def test_what_is_no_archive_is_named(path, content):
     labels_path(path).write_bytes(content)
-    with pytest.raises(
-        ValueError, match=r"a.splat.labels.npz: expected labels of a.splat, but it cannot be read .* delete"
-    ):
+    with pytest.raises(ValueError, match=tells("a.splat.labels.npz:", "read", "delete")):
         read_splats(path)
 
 
@@ -108,7 +106,7 @@ def test_a_single_array_is_no_archive(path):
     buffer = io.BytesIO()
     np.save(buffer, np.zeros(6, np.int32))
     labels_path(path).write_bytes(buffer.getvalue())
-    with pytest.raises(ValueError, match="cannot be read"):
+    with pytest.raises(ValueError, match=tells("a.splat.labels.npz:", "read")):
         read_splats(path)
 
 
@@ -116,7 +114,7 @@ def test_an_archive_that_unpacks_to_gigabytes_is_not_unpacked(path):
     with zipfile.ZipFile(labels_path(path), "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("class_id.npy", b"\0" * (64 << 20))
     assert labels_path(path).stat().st_size < 100_000
-    with pytest.raises(ValueError, match=r"67108864 bytes for 6 Gaussians"):
+    with pytest.raises(ValueError, match=tells("a.splat.labels.npz:", "67108864", "6 Gaussians")):
         read_splats(path)
 
 
@@ -124,7 +122,7 @@ def test_every_cut_of_the_labels_is_refused(path):
     content = labels_path(path).read_bytes()
     for cut in range(0, len(content), 13):
         labels_path(path).write_bytes(content[:cut])
-        with pytest.raises(ValueError, match=r"labels.npz"):
+        with pytest.raises(ValueError, match=tells("a.splat.labels.npz:")):
             read_splats(path)
 
 
@@ -138,15 +136,15 @@ def test_names_survive(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("[]", "expected 'class_id' with the names of classes 0, 1, ..., got NoneType"),
-        ('{"class_id": {"0": "a", "2": "b"}}', "expected 'class_id' with the names"),
-        ('{"class_id": {"0": 5}}', r"expected names, got \(5,\); write each class as a string"),
-        ("{", "cannot be parsed"),
+        ("[]", ("'class_id'", "got NoneType")),
+        ('{"class_id": {"0": "a", "2": "b"}}', ("'class_id'", "names", "got dict")),
+        ('{"class_id": {"0": 5}}', ("names", "got (5,)", "string")),
+        ("{", ("JSON",)),
     ],
 )
 def test_damaged_names_are_named(path, content, message):
     names_path(path).write_text(content)
-    with pytest.raises(ValueError, match=f"a.splat.classes.json: .*{message}"):
+    with pytest.raises(ValueError, match=tells("a.splat.classes.json:", *message)):
         read_splats(path)
 
 

@@ -6,6 +6,7 @@ import gsply.sog_reader
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from oracles_packed import smallest_three
 from oracles_precision import assert_within, rotation_angles
 from oracles_sog import decode, encode, pack, sog_gaussian, unpack, version_1
@@ -118,7 +119,7 @@ def test_a_folder_and_its_meta_are_read_like_the_zip(tmp_path):
         assert_within(back.gaussians, cloud.select(order), stated._replace(means=stated.means[order]))
     write_splats(tmp_path / "scene", cloud, format="sog")  # over a scene, as a whole
     (tmp_path / "scene" / "notes.txt").write_text("mine")
-    with pytest.raises(ValueError, match=r"path: expected a new folder, .* with notes.txt; choose another name"):
+    with pytest.raises(ValueError, match=tells("path:", "notes.txt", ".sog")):
         write_splats(tmp_path / "scene", cloud, format="sog")
     assert (tmp_path / "scene" / "notes.txt").read_text() == "mine"
 
@@ -182,7 +183,7 @@ def test_what_is_lost_is_told(tmp_path):
         "4 features per Gaussian: .sog has no place for them",
         "the columns id: .sog has no place for them",
     )
-    with pytest.raises(ValueError, match="splats: expected a cloud with colours"):
+    with pytest.raises(ValueError, match=tells("splats:", "colours", "got Gaussians")):
         write(tmp_path / "b.sog", SplatFile(_cloud(10).replace(sh=None)))
     assert not (tmp_path / "b.sog").exists()
 
@@ -203,35 +204,35 @@ def _changed(scene, *keys, to):
 @pytest.mark.parametrize(
     ("keys", "to", "message"),
     [
-        (("version",), 3, "expected SOG version 1 or 2, got 3; export it as version 2"),
-        (("count",), 10**12, "expected a count of Gaussians that .* bytes can hold, got 1000000000000"),
-        (("count",), -1, "expected a count of Gaussians"),
-        (("count",), 70.0, "expected a count of Gaussians"),
-        (("count",), 5000, "means_l.webp' to be a lossless image of 5000 values .*, got 12 x 8 pixels"),
-        (("version",), ..., r"expected 'means.shape' in meta.json"),
-        (("means", "mins"), [0.0, math.nan, 0.0], "expected 3 finite numbers in 'means.mins'"),
-        (("means", "maxs"), [0.0, 1.0], "expected 3 finite numbers in 'means.maxs'"),
-        (("means", "maxs"), [200.0, 1.0, 1.0], "expected finite means, got .*inf"),
-        (("means", "files"), ["means_l.webp"], "expected 2 names in 'means.files'"),
-        (("means", "files"), ["means_l.webp", "../means_u.webp"], "got '../means_u.webp'; paths are refused"),
-        (("quats", "files"), ["/etc/passwd"], "the name of a file beside meta.json, got '/etc/passwd'"),
-        (("quats", "files"), ["a\\b"], "paths are refused"),
-        (("quats", "files"), [7], "the name of a file beside meta.json, got 7"),
-        (("quats", "files"), ["none.webp"], "expected 'none.webp' in the zip file, got no such entry"),
-        (("quats",), ..., "expected 'quats.files' in meta.json, got None"),
-        (("scales", "codebook"), "abc", "expected 1 finite numbers in 'scales.codebook'"),
-        (("scales", "codebook"), [1.0], "expected finite scales, got .*nan"),
-        (("scales", "codebook"), [1000.0] * 256, "expected finite scales, got .*inf"),
-        (("sh0", "codebook"), [True] * 256, "finite numbers in 'sh0.codebook'"),
-        (("shN", "bands"), 4, "expected 'shN.bands' from 1 to 3 in meta.json, got 4"),
-        (("shN", "bands"), 2, "'shN_centroids.webp' to be a lossless image of 1024 values"),
-        (("shN", "count"), 10**6, "expected 'shN.count' from 1 to 65536"),
-        (("shN", "count"), 10, "expected labels below 10 in 'shN_labels.webp', got 69"),
+        (("version",), 3, ("version 1 or 2", "got 3", "version 2")),
+        (("count",), 10**12, ("got 1000000000000",)),
+        (("count",), -1, ("got -1", "Gaussians")),
+        (("count",), 70.0, ("got 70.0",)),
+        (("count",), 5000, ("means_l.webp", "5000", "got 12")),
+        (("version",), ..., ("'means.shape'", "meta.json")),
+        (("means", "mins"), [0.0, math.nan, 0.0], ("expected 3", "'means.mins'", "got [0.0, nan, 0.0]")),
+        (("means", "maxs"), [0.0, 1.0], ("expected 3", "'means.maxs'", "got [0.0, 1.0]")),
+        (("means", "maxs"), [200.0, 1.0, 1.0], ("finite", "means", "inf")),
+        (("means", "files"), ["means_l.webp"], ("expected 2", "'means.files'", "got ['means_l.webp']")),
+        (("means", "files"), ["means_l.webp", "../means_u.webp"], ("meta.json", "got '../means_u.webp'")),
+        (("quats", "files"), ["/etc/passwd"], ("meta.json", "got '/etc/passwd'")),
+        (("quats", "files"), ["a\\b"], ("meta.json", "got 'a\\\\b'")),
+        (("quats", "files"), [7], ("meta.json", "got 7")),
+        (("quats", "files"), ["none.webp"], ("'none.webp'", "entry")),
+        (("quats",), ..., ("'quats.files'", "meta.json", "got None")),
+        (("scales", "codebook"), "abc", ("expected 1", "'scales.codebook'", "got 'abc'")),
+        (("scales", "codebook"), [1.0], ("finite", "scales", "got [nan, nan, nan]")),
+        (("scales", "codebook"), [1000.0] * 256, ("finite", "scales", "got [inf, inf, inf]")),
+        (("sh0", "codebook"), [True] * 256, ("'sh0.codebook'", "got [True")),
+        (("shN", "bands"), 4, ("'shN.bands'", "meta.json", "got 4")),
+        (("shN", "bands"), 2, ("'shN_centroids.webp'", "1024", "got 192")),
+        (("shN", "count"), 10**6, ("'shN.count'", "65536", "got 1000000")),
+        (("shN", "count"), 10, ("10", "'shN_labels.webp'", "got 69")),
     ],
 )
 def test_a_damaged_meta_is_named(tmp_path, scene, keys, to, message):
     path = pack(tmp_path / "bad.sog", _changed(scene, *keys, to=to))
-    with pytest.raises(ValueError, match=f"bad.sog: .*{message}"):
+    with pytest.raises(ValueError, match=tells("bad.sog:", *message)):
         read_splats(path)
 
 
@@ -243,52 +244,48 @@ def test_damaged_images_are_named(tmp_path, scene):
     quats = decode(scene["quats.webp"])
     quats[0, 3, 3] = 200
     cases = {
-        "expected rotations whose alpha is 252 to 255, got 200 at Gaussian 3; was the image saved with loss": scene
-        | {"quats.webp": encode(quats)},
-        "expected 'sh0.webp' to be a lossless image": scene | {"sh0.webp": scene["sh0.webp"][:-40]},
-        "expected 'scales.webp' to be a lossless image .*cannot identify": scene
-        | {"scales.webp": b"GIF89a" + bytes(99)},
-        "expected 'means_u.webp' to be .* got 2000 x 2000 pixels": scene
-        | {"means_u.webp": encode(np.zeros((2000, 2000, 3)))},
-        "expected 'sh0.webp' of at most .* bytes .from the count., got more": scene | {"sh0.webp": bytes(10**7)},
-        "expected '192' x|expected 'shN_centroids.webp' of 192 x 2 pixels, got 96 x 8": scene
-        | {"shN_centroids.webp": encode(np.zeros((8, 96, 3)))},
+        ("252 to 255", "got 200", "Gaussian 3", "loss"): scene | {"quats.webp": encode(quats)},
+        ("'sh0.webp'", "lossless"): scene | {"sh0.webp": scene["sh0.webp"][:-40]},
+        ("'scales.webp'", "lossless", "cannot identify"): scene | {"scales.webp": b"GIF89a" + bytes(99)},
+        ("'means_u.webp'", "got 2000 x 2000"): scene | {"means_u.webp": encode(np.zeros((2000, 2000, 3)))},
+        ("'sh0.webp'", "bytes", "count", "got more"): scene | {"sh0.webp": bytes(10**7)},
+        ("'shN_centroids.webp'", "192 x 2", "got 96 x 8"): scene | {"shN_centroids.webp": encode(np.zeros((8, 96, 3)))},
     }
     for i, (message, files) in enumerate(cases.items()):
         path = pack(tmp_path / f"bad{i}.sog", files)
-        with pytest.raises(ValueError, match=f"bad{i}.sog: .*({message})"):
+        with pytest.raises(ValueError, match=tells(f"bad{i}.sog:", *message)):
             read_splats(path)
 
 
 def test_zip_files_that_are_none_or_hostile_are_named(tmp_path, scene):
     path = tmp_path / "bad.sog"
     path.write_bytes(b"PK\x03\x04 and then nothing of the kind")
-    with pytest.raises(ValueError, match="bad.sog: expected a zip file, but it cannot be opened"):
+    with pytest.raises(ValueError, match=tells("bad.sog:", "zip", "opened")):
         read_splats(path)
     pack(path, {"other.txt": b"x"})
-    with pytest.raises(ValueError, match="bad.sog: expected 'meta.json' in the zip file, got no such entry"):
+    with pytest.raises(ValueError, match=tells("bad.sog:", "'meta.json'", "entry")):
         read_splats(path)
     pack(path, {"meta.json": bytes(10**8)})  # 100 KB that would become 100 MB
-    with pytest.raises(ValueError, match="bad.sog: expected 'meta.json' of at most 4194304 bytes"):
+    with pytest.raises(ValueError, match=tells("bad.sog:", "'meta.json'", "4194304")):
         read_splats(path)
     for text, message in (
-        (b"{", "cannot be parsed"),
-        (b"[1]", "expected an object"),
-        (b"[" * 100000, "cannot be parsed"),
+        (b"{", ("meta.json", "JSON")),
+        (b"[1]", ("meta.json", "object", "got list")),
+        (b"[" * 100000, ("meta.json", "JSON")),
     ):
-        with pytest.raises(ValueError, match=f"bad.sog: .*{message}"):
+        with pytest.raises(ValueError, match=tells("bad.sog:", *message)):
             read_splats(pack(path, {"meta.json": text}))
     with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
         archive.writestr("meta.json", scene["meta.json"])
-    with pytest.raises(ValueError, match="stored or deflated, got zip method 14"):
+    with pytest.raises(ValueError, match=tells("bad.sog:", "zip method 14")):
         read_splats(path)
     whole = pack(path, scene).read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(ValueError, match="bad.sog: expected a zip file"):
+    with pytest.raises(ValueError, match=tells("bad.sog:", "zip")):
         read_splats(path)
     at = whole.index(b"meta.json") + 60
     path.write_bytes(whole[:at] + bytes(20) + whole[at + 20 :])
-    with pytest.raises(ValueError, match="bad.sog: expected 'meta.json' in the zip file, but it is damaged"):
+    with pytest.raises(ValueError, match=tells("bad.sog:", "'meta.json'", "damaged")):
         read_splats(path)
 
 
@@ -299,5 +296,5 @@ def test_a_folder_without_all_files_is_named(tmp_path, scene):
         (folder / name).write_bytes(data)
     assert len(read_splats(folder)) == 70
     (folder / "sh0.webp").unlink()
-    with pytest.raises(ValueError, match="scene: expected 'sh0.webp' in the folder, got no such file; copy all"):
+    with pytest.raises(ValueError, match=tells("scene:", "'sh0.webp'", "no such file")):
         read_splats(folder)

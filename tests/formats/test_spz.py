@@ -5,6 +5,7 @@ import gsply
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from oracles_precision import assert_within, rotation_angles
 from oracles_spz import legacy_payload, smallest_three
 
@@ -311,24 +312,24 @@ def test_bad_requests_are_named(tmp_path):
     cloud = _cloud()
     path = tmp_path / "a.spz"
     cases = [
-        ({"version": 1}, {}, r"version: expected one of 2, 3, 4, got 1"),
-        ({"fractional_bits": 25}, {}, r"fractional_bits: expected a number in \[0, 24\], got 25"),
-        ({"fractional_bits": 23}, {}, r"means: expected coordinates within 1 units .* choose 20 bits or fewer"),
-        ({"sh_bits": (8, 0)}, {}, r"sh_bits: expected a number in \[1, 8\], got 0"),
-        ({}, {"means": cloud.means * 1e9}, r"means: expected coordinates within 8.38861e\+06 .* remove far Gaussians"),
+        ({"version": 1}, {}, ("version:", "2, 3, 4", "got 1")),
+        ({"fractional_bits": 25}, {}, ("fractional_bits:", "[0, 24]", "got 25")),
+        ({"fractional_bits": 23}, {}, ("means:", "1 units", "20 bits")),
+        ({"sh_bits": (8, 0)}, {}, ("sh_bits:", "[1, 8]", "got 0")),
+        ({}, {"means": cloud.means * 1e9}, ("means:", "8.38861e+06")),
         (
             {},
             {"means": cloud.means * float("nan")},
-            r"means: expected finite numbers .* at 0 and others at 39 more of 40",
+            ("means:", "39", "40", "got [nan, nan, nan]"),
         ),
-        ({}, {"scales": cloud.scales - 0.2}, r"scales: expected finite numbers above 0"),
-        ({}, {"sh": None}, r"splats: expected a cloud with colours .* got Gaussians\(40 .* as .ply"),
-        ({}, {"labels": torch.full((40,), -3)}, r"labels: expected -1 .none. to 2147483647 .* got \[-3\]"),
+        ({}, {"scales": cloud.scales - 0.2}, ("scales:", "above 0")),
+        ({}, {"sh": None}, ("splats:", "colours", "got Gaussians(40", ".ply")),
+        ({}, {"labels": torch.full((40,), -3)}, ("labels:", "-1", "2147483647", "got [-3]")),
     ]
     for options, changes, message in cases:
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(ValueError, match=tells(*message)):
             write_spz(path, SplatFile(cloud.replace(**changes)), **options)
     names = SplatFile(cloud.replace(labels=torch.zeros(40, dtype=torch.int64)), classes=("a" * (1 << 20),))
-    with pytest.raises(ValueError, match="classes: expected names of at most 1048576 bytes, got .*; shorten"):
+    with pytest.raises(ValueError, match=tells("classes:", "1048576", "got 1048580")):
         write(path, names)
     assert list(tmp_path.iterdir()) == []

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import zstandard
+from messages import tells
 from oracles_spz import legacy_payload
 
 from kfgs.formats import SplatFile, read_splats, write_spz
@@ -65,65 +66,65 @@ def _with_labels(payload):
 
 
 BAD = {
-    "not spz": (b"hello", "expected an SPZ file"),
-    "only magic": (b"NGSP\x04", "expected an SPZ file"),
-    "other gzip": (gzip.compress(b"x" * 99), "expected an SPZ header in the gzip stream"),
-    "cut gzip": (gzip.compress(_GOOD)[:-9], "expected a whole gzip stream.*truncated"),
-    "very short gzip": (gzip.compress(_GOOD)[:14], "header in the gzip stream.*truncated"),
-    "damaged gzip": (gzip.compress(_GOOD)[:-8] + bytes(8), "gzip stream, but it cannot be unpacked"),
-    "bytes after gzip": (gzip.compress(_GOOD) + b"abc", "after the gzip stream, got 3 bytes more"),
-    "bytes in gzip": (gzip.compress(_GOOD + b"x"), "plain bytes by its header, got more"),
-    "bytes after raw": (_GOOD + b"x", "expected 76 bytes for 3 Gaussians, got 77"),
-    "cut raw": (_GOOD[:-1], "promises 3 Gaussians .60 bytes., which a file of 59 bytes cannot hold"),
-    "gzip bomb": (gzip.compress(_BOMB), "plain bytes by its header, got more"),
-    "4 billion in gzip": (gzip.compress(_GOOD[:8] + b"\xff\xff\xff\xff" + _GOOD[12:]), "promises 4294967295 Gaussians"),
-    "4 billion": (_v4()[:8] + b"\xff\xff\xff\xff" + _v4()[12:], "promises 4294967295 Gaussians"),
-    "short after promise": (gzip.compress(_GOOD[:8] + b"\x63" + _GOOD[9:]), "promises 99 Gaussians .* cannot hold"),
-    "degree 7": (gzip.compress(_GOOD[:12] + b"\x07" + _GOOD[13:]), "degree 0 to 4, got 7"),
-    "40 bits": (gzip.compress(_GOOD[:13] + b"\x28" + _GOOD[14:]), "0 to 24 fractional bits, got 40"),
-    "version 5": (_v4()[:4] + b"\x05" + _v4()[5:], "version 1 to 4, got 5"),
-    "version 0": (_GOOD[:4] + b"\x00" + _GOOD[5:], "version 1 to 4, got 0"),
-    "version 4 in gzip": (gzip.compress(_GOOD[:4] + b"\x04" + _GOOD[5:]), "version 1 to 3 in a gzip stream, got 4"),
-    "infinite half": (gzip.compress(_HALF), "finite positions, got .*inf.* at Gaussian 0"),
-    "short header": (_v4()[:30], "header of 32 bytes, got 30"),
-    "few streams": (_v4(number=3), "a table of 5 streams .* got 3 streams"),
-    "table outside": (_v4(start=4000), "a table of 5 streams .* at byte 4000"),
-    "table in header": (_v4(start=8), "a table of 5 streams .* at byte 8"),
-    "cut streams": (_v4()[:-1], "bytes of rotations within .* truncated"),
-    "garbage after": (_v4() + b"xyz", "3 bytes more"),
+    "not spz": (b"hello", ("SPZ", "NGSP")),
+    "only magic": (b"NGSP\x04", ("SPZ", "NGSP")),
+    "other gzip": (gzip.compress(b"x" * 99), ("header", "gzip", "got b'xxxx'")),
+    "cut gzip": (gzip.compress(_GOOD)[:-9], ("gzip", "truncated")),
+    "very short gzip": (gzip.compress(_GOOD)[:14], ("header", "gzip", "got b'NGS'")),
+    "damaged gzip": (gzip.compress(_GOOD)[:-8] + bytes(8), ("gzip", "unpacked")),
+    "bytes after gzip": (gzip.compress(_GOOD) + b"abc", ("gzip", "got 3")),
+    "bytes in gzip": (gzip.compress(_GOOD + b"x"), ("header", "got more")),
+    "bytes after raw": (_GOOD + b"x", ("expected 76", "got 77")),
+    "cut raw": (_GOOD[:-1], ("3 Gaussians", "60", "59")),
+    "gzip bomb": (gzip.compress(_BOMB), ("header", "got more")),
+    "4 billion in gzip": (gzip.compress(_GOOD[:8] + b"\xff\xff\xff\xff" + _GOOD[12:]), ("4294967295 Gaussians",)),
+    "4 billion": (_v4()[:8] + b"\xff\xff\xff\xff" + _v4()[12:], ("4294967295 Gaussians",)),
+    "short after promise": (gzip.compress(_GOOD[:8] + b"\x63" + _GOOD[9:]), ("99 Gaussians",)),
+    "degree 7": (gzip.compress(_GOOD[:12] + b"\x07" + _GOOD[13:]), ("degree 0 to 4", "got 7")),
+    "40 bits": (gzip.compress(_GOOD[:13] + b"\x28" + _GOOD[14:]), ("0 to 24", "bits", "got 40")),
+    "version 5": (_v4()[:4] + b"\x05" + _v4()[5:], ("version 1 to 4", "got 5")),
+    "version 0": (_GOOD[:4] + b"\x00" + _GOOD[5:], ("version 1 to 4", "got 0")),
+    "version 4 in gzip": (gzip.compress(_GOOD[:4] + b"\x04" + _GOOD[5:]), ("version 1 to 3", "got 4")),
+    "infinite half": (gzip.compress(_HALF), ("Gaussian 0", "got [inf, 0.0, 0.0]")),
+    "short header": (_v4()[:30], ("header", "32", "got 30")),
+    "few streams": (_v4(number=3), ("5 streams", "got 3")),
+    "table outside": (_v4(start=4000), ("5 streams", "byte 4000")),
+    "table in header": (_v4(start=8), ("5 streams", "byte 8")),
+    "cut streams": (_v4()[:-1], ("rotations", "truncated")),
+    "garbage after": (_v4() + b"xyz", ("got 3", "end")),
     "size in table": (
         _v4(sizes=[18, 2, 6, 6, 1 << 40]),
-        "expected a stream of 8 bytes of rotations .* got 1099511627776",
+        ("8 bytes", "rotations", "got 1099511627776"),
     ),
     "frame promises": (
         _v4(streams=[zstandard.compress(bytes(1 << 26)), *[zstandard.compress(bytes(n)) for n in (2, 6, 6, 8)]]),
-        "expected 18 bytes of positions, got a frame of 67108864 bytes",
+        ("expected 18", "positions", "67108864"),
     ),
-    "no zstd": (_v4(streams=[b"rubbish!"] * 5), "Zstandard stream of positions"),
+    "no zstd": (_v4(streams=[b"rubbish!"] * 5), ("Zstandard", "positions")),
     "data after frame": (
         _v4(streams=[zstandard.compress(bytes(n)) + b"more" * (n == 18) for n in (18, 2, 6, 6, 8)]),
-        "Zstandard stream of positions, but",
+        ("Zstandard", "positions"),
     ),
     "unsized frame, short": (
         _v4(streams=[_unsized(bytes(n - 1)) for n in (18, 2, 6, 6, 8)]),
-        "18 bytes of positions, got 17",
+        ("expected 18", "positions", "got 17"),
     ),
-    "unsized frame, long": (_v4(streams=[_unsized(bytes(1 << 20))] * 5), "Zstandard stream of positions, but"),
-    "long record": (_v4(start=44, flags=2, extensions=_ext(7, b"abcd", 99)), "extension records .* ends after them"),
-    "cut record": (_v4(start=36, flags=2, extensions=b"abcd"), "extension records .* ends after them"),
+    "unsized frame, long": (_v4(streams=[_unsized(bytes(1 << 20))] * 5), ("Zstandard", "positions")),
+    "long record": (_v4(start=44, flags=2, extensions=_ext(7, b"abcd", 99)), ("extension", "records")),
+    "cut record": (_v4(start=36, flags=2, extensions=b"abcd"), ("extension", "records")),
     "axes": (
         _v4(start=44, flags=2, extensions=_ext(0xADBE0003, b"\x0c\0\0\0")),
-        "coordinate system of 1 to 8 .* got 12",
+        ("coordinate system", "1 to 8", "got 12"),
     ),
-    "labels of 9": (_with_labels(_labels(9)), "labels of 1 Gaussians .* got 9"),
-    "labels layout 2": (_with_labels(_labels(version=2)), "labels of layout 1, got 2"),
-    "labels cut": (_with_labels(_labels()[:-3]), "labels, but they cannot be read"),
-    "short labels": (_with_labels(b"\x01"), "labels of layout 1, got 0"),
-    "labels bomb": (_with_labels(_labels(rest=zstandard.compress(bytes(1 << 26)))), "labels, but .*another size"),
-    "labels below": (_with_labels(_labels(rest=zstandard.compress(struct.pack("<i", -2)))), "class_id of -1 or more"),
-    "names no json": (_with_labels(_labels(names=b"[nope")), "labels, but they cannot be read"),
-    "names no list": (_with_labels(_labels(names=b'{"a": 1}')), "a list of names"),
-    "long names": (_with_labels(struct.pack("<HHII", 1, 0, 1, 1 << 30)), "at most 1048576 bytes of names"),
+    "labels of 9": (_with_labels(_labels(9)), ("labels", "1 Gaussians", "got 9")),
+    "labels layout 2": (_with_labels(_labels(version=2)), ("layout 1", "got 2")),
+    "labels cut": (_with_labels(_labels()[:-3]), ("labels", "read")),
+    "short labels": (_with_labels(b"\x01"), ("layout 1", "got 0")),
+    "labels bomb": (_with_labels(_labels(rest=zstandard.compress(bytes(1 << 26)))), ("labels", "size")),
+    "labels below": (_with_labels(_labels(rest=zstandard.compress(struct.pack("<i", -2)))), ("class_id", "-1")),
+    "names no json": (_with_labels(_labels(names=b"[nope")), ("labels", "read")),
+    "names no list": (_with_labels(_labels(names=b'{"a": 1}')), ("list", "names")),
+    "long names": (_with_labels(struct.pack("<HHII", 1, 0, 1, 1 << 30)), ("1048576", "names")),
 }
 
 
@@ -133,7 +134,7 @@ def test_damage_is_named_and_costs_no_memory(tmp_path, case):
     (tmp_path / "bad.spz").write_bytes(content)
     tracemalloc.start()
     try:
-        with pytest.raises(ValueError, match=f"bad.spz.*{message}"):
+        with pytest.raises(ValueError, match=tells("bad.spz:", *message)):
             read(tmp_path / "bad.spz")
         assert tracemalloc.get_traced_memory()[1] < 1 << 22
     finally:
@@ -164,7 +165,7 @@ def test_every_cut_of_a_file_is_refused(tmp_path):
         data = (tmp_path / name).read_bytes()
         for end in range(0, len(data), 7):
             (tmp_path / "cut.spz").write_bytes(data[:end])
-            with pytest.raises(ValueError, match="cut.spz"):
+            with pytest.raises(ValueError, match=tells("cut.spz:")):
                 read(tmp_path / "cut.spz")
 
 

@@ -3,6 +3,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from messages import tells
 
 from kfgs.formats import SplatFile, find_format, formats, morton_order, read_splats, write_splats
 from kfgs.formats import table as module_table
@@ -74,22 +75,18 @@ def test_what_is_lost_is_said(tmp_path):
 
 
 def test_bad_requests_are_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"none.ply: no such file; expected a splat file there"):
+    with pytest.raises(FileNotFoundError, match=tells("none.ply:", "no such file", "splat")):
         read_splats(tmp_path / "none.ply")
     (tmp_path / "a.txt").write_text("hello")
-    with pytest.raises(
-        ValueError, match=r"a.txt: expected a splat file of a known format, got something else; known are "
-    ):
+    with pytest.raises(ValueError, match=tells("a.txt:", "compressed_ply")):
         read_splats(tmp_path / "a.txt")
-    with pytest.raises(ValueError, match=r"expected a splat file of a known format"):
+    with pytest.raises(ValueError, match=tells("splat", "known", "compressed_ply")):
         read_splats(tmp_path)
-    with pytest.raises(
-        ValueError, match=r"path: expected a name that ends in one of .*, got 'a.obj'; rename it or pass"
-    ):
+    with pytest.raises(ValueError, match=tells("path:", "got 'a.obj'")):
         write_splats(tmp_path / "a.obj", _cloud())
-    with pytest.raises(ValueError, match=r"format: expected one of .*, got 'obj'; leave it out"):
+    with pytest.raises(ValueError, match=tells("format:", "got 'obj'")):
         write_splats(tmp_path / "a.ply", _cloud(), format="obj")
-    with pytest.raises(ValueError, match=r"expected a name that ends in"):  # read only
+    with pytest.raises(ValueError, match=tells("path:", "got 'a.ksplat'")):  # read only
         write_splats(tmp_path / "a.ksplat", _cloud())
     assert [file.name for file in tmp_path.iterdir()] == ["a.txt"]
 
@@ -99,9 +96,7 @@ def test_labels_beyond_the_names_are_refused(tmp_path):
     write_splats(path, SplatFile(_cloud(), classes=("a", "b")))
     assert read_splats(path).classes == ("a", "b")
     names_path(path).write_text('{"class_id": {"0": "a"}}')
-    with pytest.raises(
-        ValueError, match=r"a.ply: expected labels from -1 to 0 \(the named classes\), got -1 to 1; .* in a.ply.classes"
-    ):
+    with pytest.raises(ValueError, match=tells("a.ply:", "got -1 to 1", "a.ply.classes")):
         read_splats(path)
 
 
@@ -148,55 +143,51 @@ def _with(name, row, value):
         (
             "means",
             float("nan"),
-            r"means: expected finite numbers in every Gaussian, got \[nan, nan, nan\] at 3 and others",
+            ("means:", "got [nan, nan, nan]"),
         ),
-        ("means", float("inf"), "means: expected finite"),
-        ("quats", float("-inf"), "quats: expected finite"),
-        ("scales", 0.0, r"scales: expected finite numbers above 0 in every Gaussian, got \[0.0, 0.0, 0.0\] at 3"),
-        ("scales", -1.0, "scales: expected finite numbers above 0"),
-        ("scales", float("inf"), "scales: expected finite numbers above 0"),
+        ("means", float("inf"), ("means:", "finite", "inf")),
+        ("quats", float("-inf"), ("quats:", "finite", "-inf")),
+        ("scales", 0.0, ("scales:", "above 0", "got [0.0, 0.0, 0.0] at 3")),
+        ("scales", -1.0, ("scales:", "above 0")),
+        ("scales", float("inf"), ("scales:", "above 0")),
         (
             "opacities",
             1.01,
-            "opacities: expected numbers from 0 to 1 in every Gaussian, got .*1.0099.* at 3 and others at 0",
+            ("opacities:", "1.0099"),
         ),
-        ("opacities", -0.01, "opacities: expected numbers from 0 to 1"),
-        ("opacities", float("nan"), "opacities: expected numbers from 0 to 1"),
+        ("opacities", -0.01, ("opacities:", "0 to 1")),
+        ("opacities", float("nan"), ("opacities:", "0 to 1")),
         (
             "sh",
             float("nan"),
-            "sh: expected finite .* more of 9; correct them, or leave these Gaussians out with select",
+            ("sh:", "got [nan, nan, nan]"),
         ),
-        ("labels", -2, r"labels: expected -1 \(none\) to 2147483647 in every Gaussian, got \[-2\] at 3"),
+        ("labels", -2, ("labels:", "-1", "2147483647", "got [-2] at 3")),
     ],
 )
 @pytest.mark.parametrize("file", ["a.ply", "a.compressed.ply", "a.sog", "a.spz", "a.splat", "a.glb", "a.gltf"])
 def test_what_readers_refuse_is_not_written(tmp_path, file, name, value, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         write_splats(tmp_path / file, _with(name, 3, value))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_double_that_float32_cannot_hold_is_refused(tmp_path):
     wide = _cloud().to(torch.float64)
-    with pytest.raises(ValueError, match="means: expected finite numbers"):
+    with pytest.raises(ValueError, match=tells("means:", "got [-inf, -inf, -inf]")):
         write_splats(tmp_path / "a.ply", wide.replace(means=wide.means * 1e300))
-    with pytest.raises(ValueError, match="scales: expected finite numbers above 0"):
+    with pytest.raises(ValueError, match=tells("scales:", "above 0")):
         write_splats(tmp_path / "a.ply", wide.replace(scales=wide.scales * 1e-60))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_features_scores_and_labels_beyond_the_names_are_checked(tmp_path):
     path, cloud = tmp_path / "a.ply", _cloud()
-    with pytest.raises(ValueError, match="features: expected finite numbers"):
+    with pytest.raises(ValueError, match=tells("features:", "got [inf, inf]")):
         write_splats(path, cloud.replace(features=torch.full((9, 2), torch.inf)))
-    with pytest.raises(
-        ValueError, match=r"labels: expected -1 \(none\) to 0 \(the named classes\) .* at 2 and others at 2 more"
-    ):
+    with pytest.raises(ValueError, match=tells("labels:", "expected -1", "got [1]")):
         write_splats(path, SplatFile(cloud, classes=("a",)))
-    with pytest.raises(
-        ValueError, match=r"score: expected finite numbers in every Gaussian, got \[nan\] at 0 .* 8 more of 9"
-    ):
+    with pytest.raises(ValueError, match=tells("score:", "got [nan]")):
         write_splats(path, SplatFile(cloud, {"score": np.full(9, np.nan)}))
     assert list(tmp_path.iterdir()) == []
     write_splats(path, SplatFile(_cloud(labels=False), {"score": np.full(9, np.nan)}))  # a column like any other

@@ -67,15 +67,15 @@ def test_dtype_follows_the_features():
 @pytest.mark.parametrize(
     ("features", "embeddings", "message"),
     [
-        (torch.ones(4, 3), torch.eye(2), r"embeddings: expected \[C, D\] with D = 3 \(from features\)"),
-        (torch.ones(4, 3), torch.empty(0, 3), "expected at least one class"),
-        (torch.ones(4, 2), torch.tensor([[1.0, 0.0], [0.0, 0.0]]), "all zeros in row 1"),
-        (torch.tensor([[1.0, 1.0], [math.nan, 0.0]]), torch.eye(2), "features: expected finite numbers.*row 1"),
-        (torch.ones(1, 2), torch.tensor([[math.inf, 0.0]]), "embeddings: expected finite numbers"),
+        (torch.ones(4, 3), torch.eye(2), ("embeddings:", "[C, D]", "D = 3", "got (2, 2)")),
+        (torch.ones(4, 3), torch.empty(0, 3), ("embeddings:", "class", "got (0, 3)")),
+        (torch.ones(4, 2), torch.tensor([[1.0, 0.0], [0.0, 0.0]]), ("embeddings:", "zeros", "row 1")),
+        (torch.tensor([[1.0, 1.0], [math.nan, 0.0]]), torch.eye(2), ("features:", "row 1", "got NaN")),
+        (torch.ones(1, 2), torch.tensor([[math.inf, 0.0]]), ("embeddings:", "got NaN")),
     ],
 )
 def test_wrong_input_is_named(features, embeddings, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         classify(features, embeddings)
 
 
@@ -108,15 +108,15 @@ def test_automatic_threshold_finds_the_target():
 
 
 @pytest.mark.parametrize(
-    ("value", "message"), [(1.5, r"threshold: expected a number in \[-1, 1\]"), (math.nan, "threshold")]
+    ("value", "message"), [(1.5, ("threshold:", "[-1, 1]", "got 1.5")), (math.nan, ("threshold:", "got nan"))]
 )
 def test_threshold_that_is_no_cosine_is_refused(value, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         select_by_query(torch.eye(2), torch.tensor([1.0, 0.0]), value)
 
 
 def test_query_without_a_direction_is_refused():
-    with pytest.raises(ValueError, match="query: expected rows with a direction"):
+    with pytest.raises(ValueError, match=tells("query:", "direction", "row 0")):
         select_by_query(torch.eye(2), torch.zeros(2))
 
 

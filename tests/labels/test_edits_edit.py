@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from messages import tells
 
 from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
@@ -103,8 +104,7 @@ def test_nothing_selected_is_an_error_unless_allowed(edit):
     splats = scene()
     with pytest.raises(
         ValueError,
-        match=r"where: expected a selection of some of 9 Gaussians, got none from OfClass\(name='plant'\); "
-        r"classes present are wall \(4\), chair \(2\): select one of them, or allow none",
+        match=tells("where:", "got none", "OfClass(name=", "'plant'", "(4)", "(2)"),
     ):
         edit(OfClass("plant")).apply(splats)
     result = edit(OfClass("plant"), allow_empty=True).apply(splats)
@@ -114,30 +114,30 @@ def test_nothing_selected_is_an_error_unless_allowed(edit):
 def test_nothing_selected_in_a_cloud_without_labels():
     splats = scene()
     splats = splats.replace(gaussians=splats.gaussians.replace(labels=None))
-    with pytest.raises(ValueError, match="the cloud carries no labels: widen the box or sphere"):
+    with pytest.raises(ValueError, match=tells("where:", "got none", "no labels", "box")):
         Remove(OfIndex([])).apply(splats)
 
 
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: Remove(3), TypeError, "where: expected a Where, such as OfClass"),
-        (lambda: Remove("chair", grow=-1), ValueError, "grow: expected a number in"),
-        (lambda: Remove("chair", grow="1"), TypeError, "grow: expected a number, got '1'"),
-        (lambda: Remove("chair", allow_empty=1), TypeError, "allow_empty: expected true or false, got 1"),
-        (lambda: Opacity("chair", 1.5), ValueError, r"factor: expected a number in \[0, 1\], got 1.5"),
-        (lambda: Recolor("chair", "reddish"), ValueError, "rgb: expected a colour such as '#c04040'"),
-        (lambda: Recolor("chair", "red", "paint"), ValueError, "mode: expected one of 'tint', 'hue', got 'paint'"),
+        (lambda: Remove(3), TypeError, ("where:", "OfClass", "got 3")),
+        (lambda: Remove("chair", grow=-1), ValueError, ("grow:", "got -1.0")),
+        (lambda: Remove("chair", grow="1"), TypeError, ("grow:", "got '1'")),
+        (lambda: Remove("chair", allow_empty=1), TypeError, ("allow_empty:", "got 1")),
+        (lambda: Opacity("chair", 1.5), ValueError, ("factor:", "[0, 1]", "got 1.5")),
+        (lambda: Recolor("chair", "reddish"), ValueError, ("rgb:", "'#c04040'", "got 'reddish'")),
+        (lambda: Recolor("chair", "red", "paint"), ValueError, ("mode:", "'tint', 'hue'", "got 'paint'")),
     ],
 )
 def test_wrong_input_is_named(make, error, message):
-    with pytest.raises(error, match=message):
+    with pytest.raises(error, match=tells(*message)):
         make()
 
 
 def test_a_cloud_without_colours_cannot_be_painted():
     splats = scene()
-    with pytest.raises(ValueError, match=r"gaussians.sh: expected spherical harmonics"):
+    with pytest.raises(ValueError, match=tells("gaussians.sh:", "got None")):
         Recolor(Everything(), "red").apply(splats.replace(gaussians=splats.gaussians.replace(sh=None)))
 
 
@@ -146,7 +146,7 @@ def test_grow_names_a_position_that_is_none():
     means = splats.gaussians.means.clone()
     means[5] = torch.nan
     broken = splats.replace(gaussians=splats.gaussians.replace(means=means))
-    with pytest.raises(ValueError, match="gaussians.means: expected finite numbers, got NaN or infinity in row 5"):
+    with pytest.raises(ValueError, match=tells("gaussians.means:", "got NaN", "row 5")):
         Remove("chair", grow=0.5).apply(broken)
     assert len(Remove("chair").apply(broken)) == 7
 
@@ -154,7 +154,7 @@ def test_grow_names_a_position_that_is_none():
 def test_classes_of_one_name_are_counted_together():
     splats = scene().replace(classes=("wall", "wall", "plant"))
     assert len(Remove("wall").apply(splats)) == 3
-    with pytest.raises(ValueError, match=r"classes present are wall \(6\): select one of them"):
+    with pytest.raises(ValueError, match=tells("where:", "got none", "wall (6)")):
         Remove("plant").apply(splats)
 
 

@@ -4,6 +4,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import torch
+from messages import tells
 
 from kfgs.cameras import Similarity
 from kfgs.formats import SplatFile, write_splats
@@ -89,9 +90,9 @@ def test_undo_and_redo_are_new_lists():
     assert back.then(third) == EditList([first, third])
     splats = scene()
     same(back.apply(splats), EditList([first]).apply(splats))
-    with pytest.raises(ValueError, match="edits: expected an edit to undo, got an empty list"):
+    with pytest.raises(ValueError, match=tells("edits:", "empty")):
         EditList().undo()
-    with pytest.raises(ValueError, match="undone: expected an edit to redo, got none"):
+    with pytest.raises(ValueError, match=tells("undone:", "got none")):
         back.then(third).redo()
 
 
@@ -139,15 +140,15 @@ def test_hand_written_json_may_be_short(tmp_path):
 def test_files_elsewhere_need_a_word(tmp_path):
     write_splats(tmp_path / "vase.ply", scene(3))
     path = EditList([Insert(tmp_path / "vase.ply")]).save(tmp_path / "sub" / "edits.json")
-    message = r"edits.json: edits\[0\].source: expected a file in .*sub or below, got '.*vase.ply'; copy it there"
-    with pytest.raises(ValueError, match=message):
+    message = ("edits.json:", "edits[0].source:", "sub", "vase.ply'", "copy")
+    with pytest.raises(ValueError, match=tells(*message)):
         EditList.load(path)
     assert EditList.load(path, anywhere=True).edits[0].source == (tmp_path / "vase.ply").resolve()
     (tmp_path / "sub" / "link.ply").symlink_to(tmp_path / "vase.ply")
     for trick in ("../vase.ply", "a/../../vase.ply", "link.ply", "..\\vase.ply", "C:\\vase.ply", "\\\\host\\vase.ply"):
         content = {"format": "kfgs.edits", "version": 1, "edits": [{"op": "insert", "source": trick}]}
         path.write_text(json.dumps(content))
-        with pytest.raises(ValueError, match=r"edits\[0\].source: expected a file in .*sub or below"):
+        with pytest.raises(ValueError, match=tells("edits[0].source:", "sub", "got '")):
             EditList.load(path)
 
 
@@ -155,19 +156,19 @@ def test_a_missing_file_is_named(tmp_path):
     path = tmp_path / "edits.json"
     content = {"format": "kfgs.edits", "version": 1, "edits": [{"op": "insert", "source": "vase.ply"}]}
     path.write_text(json.dumps(content))
-    with pytest.raises(FileNotFoundError, match=r"edits\[0\].source: expected a splat file at .*vase.ply, got none"):
+    with pytest.raises(FileNotFoundError, match=tells("edits[0].source:", "vase.ply", "got none")):
         EditList.load(path)
     content["edits"][0]["source"] = "a" * 5000  # longer than any file system takes
     path.write_text(json.dumps(content))
     for anywhere in (False, True):
-        with pytest.raises(FileNotFoundError, match=r"edits\[0\].source: expected a splat file at .*aaa, got none"):
+        with pytest.raises(FileNotFoundError, match=tells("edits[0].source:", "aaa", "got none")):
             EditList.load(path, anywhere=anywhere)
-    with pytest.raises(FileNotFoundError, match="no such file; expected a JSON file"):
+    with pytest.raises(FileNotFoundError, match=tells("none.json:", "JSON")):
         EditList.load(tmp_path / "none.json")
 
 
 def test_a_cloud_in_memory_cannot_be_saved(tmp_path):
-    with pytest.raises(ValueError, match=r"edits\[0\].source: expected a path to save this edit, got a SplatFile"):
+    with pytest.raises(ValueError, match=tells("edits[0].source:", "SplatFile")):
         EditList([Insert(scene(2))]).save(tmp_path / "edits.json")
     assert not (tmp_path / "edits.json").exists()
 
@@ -175,23 +176,23 @@ def test_a_cloud_in_memory_cannot_be_saved(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ([], "expected edits that kfgs saved"),
-        ({"format": "kfgs.semantic_field", "version": 1}, "expected edits that kfgs saved"),
+        ([], ("kfgs.edits",)),
+        ({"format": "kfgs.semantic_field", "version": 1}, ("kfgs.edits",)),
         (
             {"format": "kfgs.edits", "version": 2, "edits": []},
-            "expected version 1 of kfgs.edits, got 2; install the kfgs",
+            ("version 1", "kfgs.edits", "got 2"),
         ),
-        ({"format": "kfgs.edits", "version": True, "edits": []}, "expected version 1 of kfgs.edits, got True"),
-        ({"format": "kfgs.edits", "version": 1.0, "edits": []}, "expected version 1 of kfgs.edits, got 1.0"),
-        ({"format": "kfgs.edits", "version": 1}, r"edits: expected a list of edits, got \[\]"),
-        ({"format": "kfgs.edits", "version": 1, "edits": {}}, r"edits: expected a list of edits, got \{\}"),
-        ({"format": "kfgs.edits", "version": 1, "edits": [], "run": "x"}, "expected 'edits' and 'undone', got 'run'"),
+        ({"format": "kfgs.edits", "version": True, "edits": []}, ("version 1", "kfgs.edits", "got True")),
+        ({"format": "kfgs.edits", "version": 1.0, "edits": []}, ("version 1", "kfgs.edits", "got 1.0")),
+        ({"format": "kfgs.edits", "version": 1}, ("edits:", "list", "got []")),
+        ({"format": "kfgs.edits", "version": 1, "edits": {}}, ("edits:", "list", "got {}")),
+        ({"format": "kfgs.edits", "version": 1, "edits": [], "run": "x"}, ("'edits' and 'undone'", "got 'run'")),
     ],
 )
 def test_files_that_are_no_edits(tmp_path, content, message):
     path = tmp_path / "edits.json"
     path.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match="edits.json: " + message):
+    with pytest.raises(ValueError, match=tells("edits.json:", *message)):
         EditList.load(path)
 
 
@@ -201,41 +202,44 @@ PLAIN = {"scale": 1, "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "translation
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (3, r"edits\[0\]: expected an edit whose 'op' is one of remove, extract, recolor, .*, got 3"),
-        ({"op": "explode"}, r"edits\[0\]: expected an edit whose 'op' is one of"),
-        ({"op": ["remove"]}, r"edits\[0\]: expected an edit whose 'op' is one of"),
-        ({"op": "remove"}, r"edits\[0\]: expected 'where' for op 'remove', got none; add it"),
+        (3, ("edits[0]:", "remove, extract, recolor", "'op'", "got 3")),
+        ({"op": "explode"}, ("edits[0]:", "got {'op': 'explode'}")),
+        ({"op": ["remove"]}, ("edits[0]:", "got {'op': ['remove']}")),
+        ({"op": "remove"}, ("edits[0]:", "'where'", "'remove'", "got none")),
         (
             {"op": "remove", "where": "a", "gorw": 1},
-            r"edits\[0\]: expected op 'remove' with where, .*grow, got 'gorw'",
+            ("edits[0]:", "'remove'", "got 'gorw'"),
         ),
-        ({"op": "remove", "where": 3}, r"edits\[0\].where: expected a Where"),
-        ({"op": "remove", "where": {"kind": "no"}}, r"edits\[0\].where: expected a selection whose 'kind'"),
-        ({"op": "remove", "where": "a", "grow": "1"}, r"edits\[0\].grow: expected a number, got '1'"),
-        ({"op": "remove", "where": "a", "grow": 1e999}, r"edits\[0\].grow: expected a finite number"),
-        ({"op": "opacity", "where": "a", "factor": 2}, r"edits\[0\].factor: expected a number in \[0, 1\]"),
-        ({"op": "recolor", "where": "a", "rgb": [1, 2, 3]}, r"edits\[0\].rgb: expected three numbers in \[0, 1\]"),
-        ({"op": "recolor", "where": "a", "rgb": None}, r"edits\[0\].rgb: expected three numbers"),
-        ({"op": "move", "where": "a", "rotation": {"axis": "z"}}, r"edits\[0\].rotation: expected axis and degrees"),
-        ({"op": "move", "where": "a", "rotation": {"axis": 1, "degrees": 1}}, r"edits\[0\].rotation.axis: expected 3"),
-        ({"op": "move", "where": "a", "rotation": 90}, r"edits\[0\].rotation: expected 4 numbers, got 90"),
-        ({"op": "move", "where": "a", "pivot": None}, r"edits\[0\].pivot: expected 3 numbers, got None"),
-        ({"op": "insert", "source": 3}, r"edits\[0\].source: expected the path of a splat file, got 3"),
-        ({"op": "insert", "source": "\ud800"}, r"edits\[0\].source: expected the path of a splat file, got '.*ud800'"),
+        ({"op": "remove", "where": 3}, ("edits[0].where:", "got 3")),
+        ({"op": "remove", "where": {"kind": "no"}}, ("edits[0].where:", "got {'kind': 'no'}")),
+        ({"op": "remove", "where": "a", "grow": "1"}, ("edits[0].grow:", "got '1'")),
+        ({"op": "remove", "where": "a", "grow": 1e999}, ("edits[0].grow:", "got inf")),
+        ({"op": "opacity", "where": "a", "factor": 2}, ("edits[0].factor:", "[0, 1]", "got 2.0")),
+        ({"op": "recolor", "where": "a", "rgb": [1, 2, 3]}, ("edits[0].rgb:", "[0, 1]", "got [1, 2, 3]")),
+        ({"op": "recolor", "where": "a", "rgb": None}, ("edits[0].rgb:", "got None")),
+        ({"op": "move", "where": "a", "rotation": {"axis": "z"}}, ("edits[0].rotation:", "degrees", "got axis")),
+        (
+            {"op": "move", "where": "a", "rotation": {"axis": 1, "degrees": 1}},
+            ("edits[0].rotation.axis:", "expected 3", "got 1"),
+        ),
+        ({"op": "move", "where": "a", "rotation": 90}, ("edits[0].rotation:", "expected 4", "got 90")),
+        ({"op": "move", "where": "a", "pivot": None}, ("edits[0].pivot:", "expected 3", "got None")),
+        ({"op": "insert", "source": 3}, ("edits[0].source:", "got 3")),
+        ({"op": "insert", "source": "\ud800"}, ("edits[0].source:", "got '\\ud800'")),
         (
             {"op": "insert", "source": "."},
-            r"edits\[0\].source: expected a splat file at .*, got a folder; name the file",
+            ("edits[0].source:", "folder"),
         ),
-        ({"op": "insert", "source": "a\0b"}, r"edits\[0\].source: expected the path of a splat file"),
-        ({"op": "insert", "source": "a.ply", "similarity": 1}, r"edits\[0\].similarity: expected scale, rotation"),
-        ({"op": "insert", "source": "a.ply", "similarity": PLAIN | {"scale": -1}}, r"similarity.scale: expected"),
+        ({"op": "insert", "source": "a\0b"}, ("edits[0].source:", "got 'a\\x00b'")),
+        ({"op": "insert", "source": "a.ply", "similarity": 1}, ("edits[0].similarity:", "got 1")),
+        ({"op": "insert", "source": "a.ply", "similarity": PLAIN | {"scale": -1}}, ("similarity.scale:", "got -1.0")),
         (
             {"op": "insert", "source": "a.ply", "similarity": PLAIN | {"scale": "1"}},
-            r"similarity.scale: expected a num",
+            ("similarity.scale:", "got '1'"),
         ),
         (
             {"op": "insert", "source": "a.ply", "similarity": PLAIN | {"rotation": [[1, 0, 0]] * 3}},
-            r"edits\[0\].similarity.rotation: expected a rotation",
+            ("edits[0].similarity.rotation:",),
         ),
     ],
 )
@@ -243,30 +247,28 @@ def test_edits_of_others_are_refused_with_the_place(tmp_path, edit, message):
     (tmp_path / "a.ply").touch()
     path = tmp_path / "edits.json"
     path.write_text(json.dumps({"format": "kfgs.edits", "version": 1, "edits": [edit]}))
-    with pytest.raises(ValueError, match="edits.json: .*" + message):
+    with pytest.raises(ValueError, match=tells("edits.json:", *message)):
         EditList.load(path)
 
 
 def test_json_that_nests_without_end(tmp_path):
     path = tmp_path / "edits.json"
     path.write_text("[" * 200_000)
-    with pytest.raises(ValueError, match="edits.json: expected saved edits, got JSON that nests too deep"):
+    with pytest.raises(ValueError, match=tells("edits.json:", "got JSON")):
         EditList.load(path)
 
 
 def test_an_edit_that_fails_is_numbered():
-    with pytest.raises(ValueError, match=r"edits\[1\] \(opacity\): where: expected a selection .* got none"):
+    with pytest.raises(ValueError, match=tells("edits[1] (opacity):", "where:", "got none")):
         EditList([Remove("chair"), Opacity("chair", 0.5)]).apply(scene())
-    with pytest.raises(
-        ValueError, match=r"edits\[0\] \(remove\): class: expected one of wall, chair, plant, got 'chiar'"
-    ):
+    with pytest.raises(ValueError, match=tells("edits[0] (remove):", "class:", "wall, chair, plant", "got 'chiar'")):
         EditList([Remove("chiar")]).apply(scene())
 
 
 def test_lists_of_something_else():
-    with pytest.raises(TypeError, match="edits: expected a list of edits, got Remove"):
+    with pytest.raises(TypeError, match=tells("edits:", "got Remove")):
         EditList(Remove("chair"))
-    with pytest.raises(TypeError, match=r"edits\[1\]: expected an edit, got 'chair'; use one of Remove, Extract"):
+    with pytest.raises(TypeError, match=tells("edits[1]:", "got 'chair'", "Remove, Extract")):
         EditList([Remove("chair"), "chair"])
 
 

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from scipy.spatial.transform import Rotation
 
 from kfgs.cameras import Camera
@@ -140,7 +141,7 @@ def test_duplicates_follow_the_originals_with_their_labels_and_columns():
 @pytest.mark.parametrize("edit", [Move, Duplicate])
 def test_nothing_selected(edit):
     splats = scene()
-    with pytest.raises(ValueError, match="where: expected a selection of some of 10 Gaussians, got none"):
+    with pytest.raises(ValueError, match=tells("where:", "10", "got none")):
         edit(OfClass(5)).apply(splats)
     assert len(edit(OfIndex([]), allow_empty=True).apply(splats)) == 10
 
@@ -148,22 +149,22 @@ def test_nothing_selected(edit):
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: Move("a", (1, 2)), ValueError, "translation: expected 3 finite numbers"),
-        (lambda: Move("a", scale=0), ValueError, "scale: expected a number in"),
-        (lambda: Move("a", scale=-1), ValueError, "scale: expected a number in"),
-        (lambda: Move("a", rotation=(0, 0, 0, 0)), ValueError, "rotation: expected a quaternion .* got zeros"),
-        (lambda: Move("a", rotation=(1, 2, 3)), ValueError, "rotation: expected 4 finite numbers"),
-        (lambda: Move("a", rotation="z"), TypeError, "rotation: expected 4 numbers, got 'z'"),
-        (lambda: Move("a", rotation=("w", 90)), TypeError, "axis: expected 3 numbers, got 'w'"),
-        (lambda: Move("a", rotation=((0, 0, 0), 90)), ValueError, "axis: expected a direction, got"),
-        (lambda: Move("a", rotation=("z", "90")), TypeError, "degrees: expected a number, got '90'"),
-        (lambda: Move("a", pivot="corner"), ValueError, r"pivot: expected 'centroid' or \[x, y, z\], got 'corner'"),
-        (lambda: Duplicate("a", pivot=(0, 0)), ValueError, "pivot: expected 3 finite numbers"),
-        (lambda: Duplicate("a", allow_empty="no"), TypeError, "allow_empty: expected true or false, got 'no'"),
+        (lambda: Move("a", (1, 2)), ValueError, ("translation:", "expected 3", "got (1, 2)")),
+        (lambda: Move("a", scale=0), ValueError, ("scale:", "got 0.0")),
+        (lambda: Move("a", scale=-1), ValueError, ("scale:", "got -1.0")),
+        (lambda: Move("a", rotation=(0, 0, 0, 0)), ValueError, ("rotation:", "got zeros")),
+        (lambda: Move("a", rotation=(1, 2, 3)), ValueError, ("rotation:", "expected 4", "got (1, 2, 3)")),
+        (lambda: Move("a", rotation="z"), TypeError, ("rotation:", "expected 4", "got 'z'")),
+        (lambda: Move("a", rotation=("w", 90)), TypeError, ("axis:", "expected 3", "got 'w'")),
+        (lambda: Move("a", rotation=((0, 0, 0), 90)), ValueError, ("axis:", "got (0, 0, 0)")),
+        (lambda: Move("a", rotation=("z", "90")), TypeError, ("degrees:", "got '90'")),
+        (lambda: Move("a", pivot="corner"), ValueError, ("pivot:", "'centroid'", "[x, y, z]", "got 'corner'")),
+        (lambda: Duplicate("a", pivot=(0, 0)), ValueError, ("pivot:", "expected 3", "got (0, 0)")),
+        (lambda: Duplicate("a", allow_empty="no"), TypeError, ("allow_empty:", "got 'no'")),
     ],
 )
 def test_wrong_input_is_named(make, error, message):
-    with pytest.raises(error, match=message):
+    with pytest.raises(error, match=tells(*message)):
         make()
 
 

@@ -31,21 +31,21 @@ def test_real_text_embeddings_open(shared_data):
 
 
 def test_bad_input_is_named(tmp_path):
-    with pytest.raises(ValueError, match="C = 2.*got float32 \\(3, 4\\)"):
+    with pytest.raises(ValueError, match=tells("text.npy:", "C = 2", "got float32", "(3, 4)")):
         load_label_set(*_write(tmp_path, ["a", "b"], np.zeros((3, 4), np.float32)))
-    with pytest.raises(ValueError, match="finite floats"):
+    with pytest.raises(ValueError, match=tells("text.npy:", "finite", "got float32")):
         load_label_set(*_write(tmp_path, ["a"], np.full((1, 4), np.nan, np.float32)))
-    with pytest.raises(ValueError, match="JSON list of class names"):
+    with pytest.raises(ValueError, match=tells("classes.json:", "got dict")):
         load_label_set(*_write(tmp_path, {"a": 1}, np.zeros((1, 4), np.float32)))
     (tmp_path / "text.npy").write_bytes(b"not an array")
     (tmp_path / "classes.json").write_text('["a"]')
-    with pytest.raises(ValueError, match="text.npy: expected an .npy file"):
+    with pytest.raises(ValueError, match=tells("text.npy:", ".npy", "read")):
         load_label_set(tmp_path / "classes.json", tmp_path / "text.npy")
-    with pytest.raises(FileNotFoundError, match="one embedding row per class"):
+    with pytest.raises(FileNotFoundError, match=tells("none.npy:", "embedding", "class")):
         load_label_set(tmp_path / "classes.json", tmp_path / "none.npy")
-    with pytest.raises(ValueError, match="different names"):
+    with pytest.raises(ValueError, match=tells("names:", "got ['a', 'a']")):
         LabelSet(("a", "a"), torch.zeros(2, 3))
-    with pytest.raises(ValueError, match="expected one of wall, got 'chair'"):
+    with pytest.raises(ValueError, match=tells("class:", "wall", "got 'chair'")):
         LabelSet(("wall",), torch.zeros(1, 3)).index("chair")
 
 
@@ -85,62 +85,60 @@ def test_select_and_with_class():
     assert more.negative_names == ("object", "stuff")
     assert (more.knows("Lamp"), more.knows("lam")) == (True, False)
     assert "LabelSet(4 classes: wall, chair" in repr(more)
-    with pytest.raises(ValueError, match="got 'char'; did you mean 'chair'"):
+    with pytest.raises(ValueError, match=tells("class:", "got 'char'", "'chair'")):
         more.select(["char"])
-    with pytest.raises(ValueError, match="names: expected different names"):
+    with pytest.raises(ValueError, match=tells("names:", "got ['wall', 'wall']")):
         more.select(["wall", "wall"])
-    with pytest.raises(ValueError, match="names: expected different names.*rename or leave out repeats"):
+    with pytest.raises(ValueError, match=tells("names:", "different", "'wall'")):
         more.with_class("wall", torch.ones(3))
-    with pytest.raises(TypeError, match="names: expected a list of class names, got the text 'wall'"):
+    with pytest.raises(TypeError, match=tells("names:", "'wall'")):
         more.select("wall")
-    with pytest.raises(ValueError, match=r"embedding: expected \(3,\) .*got \(4,\); text of another teacher\?"):
+    with pytest.raises(ValueError, match=tells("embedding:", "(3,)", "got (4,)")):
         more.with_class("door", torch.ones(4))
 
 
 def test_a_table_that_is_none_is_named(tmp_path):
     path = tmp_path / "t.safetensors"
-    with pytest.raises(
-        FileNotFoundError, match="no such file; expected a table of words there, which `kfgs text` makes"
-    ):
+    with pytest.raises(FileNotFoundError, match=tells("t.safetensors:", "no such file", "`kfgs text`")):
         load_label_set(path)
     path.write_bytes(b"\x08\0\0\0\0\0\0\0nonsense")
-    with pytest.raises(ValueError, match="expected a kfgs label set, but it cannot be read"):
+    with pytest.raises(ValueError, match=tells("t.safetensors:", "label set", "read")):
         load_label_set(path)
     Codebook(torch.eye(3)).save(path)
-    with pytest.raises(ValueError, match="expected a kfgs label set, version 1, got codebook"):
+    with pytest.raises(ValueError, match=tells("t.safetensors:", "version 1", "got codebook")):
         load_label_set(path)
     head = {"kfgs": "label set", "version": "1", "names": '["a"]', "negative_names": "[]", "info": "{}"}
     for changed, words in [
-        ({"names": "null"}, "cannot be read"),
-        ({"names": "[1]"}, "names: expected words"),
-        ({"names": '["a'}, "cannot be read"),
-        ({"info": "3"}, "cannot be read"),
-        ({"names": '["a", "b"]'}, r"embeddings: expected \[C, D\] with C = 2"),
-        ({"negative_names": '["stuff"]'}, r"negatives: expected \(1, 3\) .*got None; embed them"),
+        ({"names": "null"}, ("read",)),
+        ({"names": "[1]"}, ("names:", "got [1]")),
+        ({"names": '["a'}, ("read",)),
+        ({"info": "3"}, ("read",)),
+        ({"names": '["a", "b"]'}, ("embeddings:", "[C, D]", "C = 2", "got (1, 3)")),
+        ({"negative_names": '["stuff"]'}, ("negatives:", "(1, 3)", "got None")),
     ]:
         save_file({"embeddings": torch.ones(1, 3)}, path, metadata=head | changed)
-        with pytest.raises(ValueError, match=words):
+        with pytest.raises(ValueError, match=tells(*words)):
             load_label_set(path)
     save_file({"embeddings": torch.full((1, 3), torch.nan)}, path, metadata=head)
-    with pytest.raises(ValueError, match="expected finite rows of embeddings, got others; make it again"):
+    with pytest.raises(ValueError, match=tells("t.safetensors:", "finite", "embeddings", "`kfgs text`")):
         load_label_set(path)
     save_file({"others": torch.ones(1, 3)}, path, metadata=head)
-    with pytest.raises(ValueError, match="cannot be read .*embeddings"):
+    with pytest.raises(ValueError, match=tells("t.safetensors:", "read", "'embeddings'")):
         load_label_set(path)
 
 
 def test_what_cannot_be_a_table_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="path: expected a file name that ends in .safetensors, got .*text.npy"):
+    with pytest.raises(ValueError, match=tells("path:", ".safetensors", "text.npy")):
         _words().save(tmp_path / "text.npy")
-    with pytest.raises(ValueError, match="info: expected what JSON can hold"):
+    with pytest.raises(ValueError, match=tells("info:", "got Out")):
         LabelSet(("a",), torch.ones(1, 2), info={"seconds": float("nan")}).save(tmp_path / "t.safetensors")
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(ValueError, match="embeddings: expected none beside the table"):
+    with pytest.raises(ValueError, match=tells("embeddings:", "none", "t.npy")):
         load_label_set(tmp_path / "t.safetensors", tmp_path / "t.npy")
     (tmp_path / "classes.json").write_text('["a"]')
-    with pytest.raises(ValueError, match="embeddings: expected an .npy file of one row per name in .*got none"):
+    with pytest.raises(ValueError, match=tells("embeddings:", ".npy", "got none")):
         load_label_set(tmp_path / "classes.json")
-    with pytest.raises(ValueError, match=r"negatives: expected \(1, 2\) \(from negative_names and embeddings\), got"):
+    with pytest.raises(ValueError, match=tells("negatives:", "(1, 2)", "negative_names", "got (1, 3)")):
         LabelSet(("a",), torch.ones(1, 2), torch.ones(1, 3), ("stuff",))
 
 

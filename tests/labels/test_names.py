@@ -1,4 +1,5 @@
 import pytest
+from messages import tells
 
 from kfgs.labels import class_index, class_indices
 
@@ -13,7 +14,7 @@ def test_a_name_is_its_place():
 def test_a_name_in_another_case():
     assert class_index("window BLIND", NAMES) == 1
     assert class_indices("chair", ["Chair", "chair", "CHAIR"]) == (1,)  # its own case wins
-    with pytest.raises(ValueError, match="got 'chAir'; did you mean 'CHAIR' or 'Chair' or 'chair'"):
+    with pytest.raises(ValueError, match=tells("class:", "got 'chAir'", "'CHAIR' or 'Chair' or 'chair'")):
         class_indices("chAir", ["Chair", "chair", "CHAIR"])
 
 
@@ -22,31 +23,28 @@ def test_several_labels_of_one_name():
     assert class_indices("chair", names) == (0, 2)
     assert class_indices("WALL", names) == (1,)
     assert class_indices("CHAIR", ["Chair", "wall", "Chair"]) == (0, 2)
-    with pytest.raises(
-        ValueError, match=r"class: expected one class called 'chair', got 2 \(labels 0, 2\); rename all"
-    ):
+    with pytest.raises(ValueError, match=tells("class:", "'chair'", "got 2")):
         class_index("chair", names)
 
 
 @pytest.mark.parametrize(
     ("name", "near"),
     [
-        ("chiar", "did you mean 'chair'"),
-        ("chairs", "did you mean 'chair' or 'armchair'"),
-        ("window blinds", "did you mean 'Window blind'"),
-        ("blind", "did you mean 'Window blind'"),
-        ("zebra", "add its embedding to the classes"),
-        ("", "add its embedding to the classes"),
+        ("chiar", "'chair'"),
+        ("chairs", "'chair' or 'armchair'"),
+        ("window blinds", "'Window blind'"),
+        ("blind", "'Window blind'"),
+        ("zebra", "embedding"),
+        ("", "embedding"),
     ],
 )
 def test_an_unknown_name_meets_the_near_ones(name, near):
-    with pytest.raises(ValueError, match="class: expected one of wall, Window blind, chair, armchair, got") as caught:
+    with pytest.raises(ValueError, match=tells("class:", "wall, Window blind, chair, armchair", f"got {name!r}", near)):
         class_index(name, NAMES)
-    assert near in str(caught.value)
 
 
 def test_a_long_list_is_cut_and_no_names_are_named():
-    with pytest.raises(ValueError, match="thing 19 and 80 more, got 'sky'"):
+    with pytest.raises(ValueError, match=tells("class:", "19", "80", "got 'sky'")):
         class_index("sky", [f"thing {i}" for i in range(100)])
-    with pytest.raises(ValueError, match="class: expected class names to look 'sky' up in, got none"):
+    with pytest.raises(ValueError, match=tells("class:", "'sky'", "got none")):
         class_index("sky", ())

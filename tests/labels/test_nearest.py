@@ -1,5 +1,6 @@
 import pytest
 import torch
+from messages import tells
 
 from kfgs.labels import default_distance, transfer_labels
 
@@ -66,7 +67,7 @@ def test_a_sparse_wall_does_not_cut_the_reach_short():
 
 
 def test_default_distance_needs_two_clouds():
-    with pytest.raises(ValueError, match="src_means: expected at least one Gaussian"):
+    with pytest.raises(ValueError, match=tells("src_means:", "got none")):
         default_distance(torch.empty(0, 3), torch.ones(1, 3))
-    with pytest.raises(ValueError, match="dst_means: expected at least one Gaussian"):
+    with pytest.raises(ValueError, match=tells("dst_means:", "got none")):
         default_distance(torch.ones(1, 3), torch.empty(0, 3))

@@ -3,6 +3,7 @@ import math
 
 import pytest
 import torch
+from messages import tells
 
 from kfgs.cameras import Camera, Similarity
 from kfgs.gaussians import Gaussians
@@ -91,9 +92,7 @@ def test_nothing_selected_has_no_parts():
     gaussians = scene()
     nothing = Selection(torch.zeros(10, dtype=torch.bool), torch.zeros(10), 0.7, "given")
     assert connected_parts(gaussians, nothing, [camera()]) == []
-    with pytest.raises(
-        ValueError, match=r"selection: expected at least one Gaussian, got none \(score > 0.7 \(given\)\)"
-    ):
+    with pytest.raises(ValueError, match=tells("selection:", "got none", "score > 0.7")):
         describe_selection(gaussians, nothing)
 
 
@@ -171,11 +170,9 @@ def test_a_part_fits_no_smaller_cloud():
     gaussians = scene()
     one = describe_selection(gaussians, chosen(gaussians, 5))
     assert len(one.selection(5).mask) == 5
-    with pytest.raises(
-        ValueError, match=r"count: expected more than 4 \(the part's highest index\), got 4; pass len of"
-    ):
+    with pytest.raises(ValueError, match=tells("count:", "more than 4", "got 4")):
         one.selection(4)
-    with pytest.raises(ValueError, match="count: expected a whole number, got 5.0"):
+    with pytest.raises(ValueError, match=tells("count:", "got 5.0")):
         one.selection(5.0)
 
 
@@ -194,14 +191,12 @@ def test_json_round_trip():
 
 def test_wrong_input_is_named():
     gaussians = scene()
-    with pytest.raises(
-        ValueError, match=r"selection.mask: expected \[N\] with N = 10 \(from gaussians.means\), got \(4,\)"
-    ):
+    with pytest.raises(ValueError, match=tells("selection.mask:", "[N]", "N = 10", "gaussians.means", "got (4,)")):
         describe_selection(gaussians, Selection.of(torch.ones(4, dtype=torch.bool)))
-    with pytest.raises(ValueError, match=r"selection.mask: expected \[N\] with N = 10"):
+    with pytest.raises(ValueError, match=tells("selection.mask:", "[N]", "N = 10", "got (4,)")):
         connected_parts(gaussians, Selection.of(torch.ones(4, dtype=torch.bool)))
     broken = gaussians.replace(means=gaussians.means.clone().index_fill_(0, torch.tensor([1]), math.nan))
-    with pytest.raises(ValueError, match="means: expected finite numbers, got NaN or infinity in row 1"):
+    with pytest.raises(ValueError, match=tells("gaussians.means:", "got NaN", "row 1")):
         describe_selection(broken, chosen(gaussians))
-    with pytest.raises(ValueError, match="most: expected a number in"):
+    with pytest.raises(ValueError, match=tells("most:", "got 0")):
         connected_parts(gaussians, chosen(gaussians), most=0)

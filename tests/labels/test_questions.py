@@ -113,28 +113,22 @@ def test_names_and_embeddings_of_classes_give_the_same_labels():
 
 def test_missing_negatives_are_named():
     bare = LabelSet(("wall",), FIVE[:1])
-    with pytest.raises(ValueError, match="negatives: expected other classes than 'wall', got none; use 'canonical'"):
+    with pytest.raises(ValueError, match=tells("negatives:", "'wall'", "got none", "'canonical'")):
         field().query("wall", bare, negatives="classes")
-    with pytest.raises(ValueError, match="negatives: expected canonical words in the classes' table, got none; make"):
+    with pytest.raises(ValueError, match=tells("negatives:", "got none", "`kfgs text`")):
         field().query("wall", bare, negatives="canonical")
-    with pytest.raises(
-        ValueError, match="negatives: expected one of 'auto', 'classes', 'canonical', 'none', got 'all'"
-    ):
+    with pytest.raises(ValueError, match=tells("negatives:", "'auto', 'classes', 'canonical', 'none'", "got 'all'")):
         field().query("wall", bare, negatives="all")
 
 
 def test_a_name_needs_classes_and_classes_are_a_label_set_or_rows():
-    with pytest.raises(
-        ValueError, match="classes: expected a LabelSet to look 'wall' up in, got Tensor; pass one, or an"
-    ):
+    with pytest.raises(ValueError, match=tells("classes:", "LabelSet", "'wall'", "got Tensor")):
         field().query("wall", FIVE)
-    with pytest.raises(ValueError, match="classes: expected a label set, or a field that remembers the classes"):
+    with pytest.raises(ValueError, match=tells("classes:", "got neither")):
         field().query("wall")
-    with pytest.raises(
-        TypeError, match=r"classes: expected a LabelSet or embeddings \[C, 5\], got list; load_label_set"
-    ):
+    with pytest.raises(TypeError, match=tells("classes:", "LabelSet", "[C, 5]", "got list", "load_label_set")):
         class_rows(["wall"], 5, {})
-    with pytest.raises(ValueError, match="sofa"):
+    with pytest.raises(ValueError, match=tells("class:", "got 'sofa'")):
         field().query("sofa", CLASSES)
 
 
@@ -147,7 +141,7 @@ def test_words_of_another_teacher_are_warned_of():
         lambda: clip.label(CLASSES),
         lambda: clip.segment(CAMERA, CLASSES),
     ):
-        with pytest.warns(UserWarning, match="expected text of the field's teacher .name 'clip'.*another .'lseg'"):
+        with pytest.warns(UserWarning, match=tells("classes:", "'clip'", "'lseg'")):
             ask()
     unknown = dataclasses.replace(CLASSES, info={})
     assert len(clip.query("wall", unknown, 0.5)) == 1  # no warning, which would be an error here
@@ -165,8 +159,7 @@ def test_words_of_other_channels_are_refused_before_any_view_is_drawn(monkeypatc
     ):
         with pytest.raises(
             ValueError,
-            match=r"classes: expected embeddings \[C, 5\] \(from the field\), got \(2, 7\): text of another teacher\? "
-            r"\(name 'clip' in place of 'lseg'\) Embed the words",
+            match=tells("classes:", "[C, 5]", "got (2, 7)", "'clip'", "'lseg'"),
         ):
             ask()
 

@@ -82,21 +82,21 @@ def test_like_an_example_or_the_mean_of_some():
 
 def test_wrong_input_is_named():
     rows = features(4)
-    with pytest.raises(ValueError, match="negatives: expected at least one column, got none"):
+    with pytest.raises(ValueError, match=tells("negatives:", "got none")):
         relevancy(torch.ones(3), torch.ones(3, 0))
-    with pytest.raises(ValueError, match=r"negatives: expected \[N, M\] with N = 3 \(from similarity\)"):
+    with pytest.raises(ValueError, match=tells("negatives:", "[N, M]", "N = 3", "got (4, 1)")):
         relevancy(torch.ones(3), torch.ones(4, 1))
-    with pytest.raises(ValueError, match="similarity: expected finite numbers, got NaN or infinity in row 1"):
+    with pytest.raises(ValueError, match=tells("similarity:", "got NaN", "row 1")):
         select_by_similarity(torch.tensor([0.0, math.nan]))
-    with pytest.raises(ValueError, match=r"threshold: expected a number in \[0, 1\], got -0.5"):
+    with pytest.raises(ValueError, match=tells("threshold:", "[0, 1]", "got -0.5")):
         select_by_similarity(torch.ones(2), torch.ones(2, 1), -0.5)
-    with pytest.raises(ValueError, match="negatives: expected rows with a direction, got all zeros in row 0"):
+    with pytest.raises(ValueError, match=tells("negatives:", "direction", "row 0")):
         select_by_query(rows, rows[0], negatives=torch.zeros(1, 6))
-    with pytest.raises(ValueError, match=r"category: expected a number in \[0, 1\], got 2"):
+    with pytest.raises(ValueError, match=tells("category:", "[0, 1]", "got 2")):
         select_by_category(rows, rows[:2], 2)
-    with pytest.raises(ValueError, match="like: expected indices from 0 to 3, got 4 to 4"):
+    with pytest.raises(ValueError, match=tells("like:", "got 4 to 4")):
         select_like(rows, 4)
-    with pytest.raises(ValueError, match="like: expected at least one index below 4"):
+    with pytest.raises(ValueError, match=tells("like:", "index below 4")):
         select_like(rows, torch.zeros(4, dtype=torch.bool))
 
 
@@ -164,17 +164,17 @@ def test_a_softmax_finds_its_threshold_in_the_scores_and_says_its_scale():
 
 def test_wrong_options_are_named():
     similarity, negatives = cosines()
-    with pytest.raises(ValueError, match="score: expected one of 'cosine', 'softmax', 'relevancy', got 'dot'"):
+    with pytest.raises(ValueError, match=tells("score:", "'cosine', 'softmax', 'relevancy'", "got 'dot'")):
         text_scores(similarity, score="dot")
     with pytest.raises(ValueError, match=tells("negatives", "'softmax'", "got none")):
         text_scores(similarity, score="softmax")
-    with pytest.raises(ValueError, match="logit_scale: expected one of 'raw', 'lseg', 'clip', got 'hot'"):
+    with pytest.raises(ValueError, match=tells("logit_scale:", "'raw', 'lseg', 'clip'", "got 'hot'")):
         text_scores(similarity, negatives, score="softmax", logit_scale="hot")
-    with pytest.raises(ValueError, match=r"logit_scale: expected a number in \(0, inf\), got 0"):
+    with pytest.raises(ValueError, match=tells("logit_scale:", "(0, inf)", "got 0")):
         text_scores(similarity, negatives, score="softmax", logit_scale=0)
-    with pytest.raises(ValueError, match=r"threshold: expected a number in \[0, 1\], got -0.5"):
+    with pytest.raises(ValueError, match=tells("threshold:", "[0, 1]", "got -0.5")):
         select_by_similarity(similarity, negatives, -0.5, score="softmax")
-    with pytest.raises(ValueError, match="negatives: expected finite numbers, got NaN"):
+    with pytest.raises(ValueError, match=tells("negatives:", "got NaN")):
         text_scores(similarity, negatives.masked_fill(negatives < 0, float("nan")), score="softmax")
     assert set(LOGIT_SCALES) == {"raw", "lseg", "clip"}
 

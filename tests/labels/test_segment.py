@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from oracles_labels import most_similar
 
 from kfgs.labels import label_codewords, label_pixels, nearest_codeword
@@ -104,13 +105,13 @@ def test_nearest_codeword_is_euclidean_and_ties_go_low():
 
 def test_missing_pieces_are_named(setting):
     autoencoder, codebook, _, _, rendered = setting
-    with pytest.raises(ValueError, match="codeword_labels: expected labels .6. of the codebook, got None"):
+    with pytest.raises(ValueError, match=tells("codeword_labels:", "[6]", "got None")):
         label_pixels(rendered, codebook, None, autoencoder)
-    with pytest.raises(ValueError, match=r"embeddings: expected \[C, D\] because there is no codebook"):
+    with pytest.raises(ValueError, match=tells("embeddings:", "[C, D]", "got None")):
         label_pixels(rendered, None, None, autoencoder)
-    with pytest.raises(ValueError, match=r"codeword_labels: expected \[K\] with K = 6"):
+    with pytest.raises(ValueError, match=tells("codeword_labels:", "[K]", "K = 6", "got (5,)")):
         label_pixels(rendered, codebook, torch.arange(5), autoencoder)
-    with pytest.raises(ValueError, match="decode: expected one of 'exact', 'latent', got 'fast'"):
+    with pytest.raises(ValueError, match=tells("decode:", "'exact', 'latent'", "got 'fast'")):
         label_pixels(rendered, codebook, torch.arange(K), autoencoder, decode="fast")
-    with pytest.raises(ValueError, match=r"covered: expected a mask \(5, 7\)"):
+    with pytest.raises(ValueError, match=tells("covered:", "(5, 7)", "got (7, 5)")):
         label_pixels(rendered, codebook, torch.arange(K), autoencoder, covered=torch.ones(7, 5, dtype=torch.bool))

@@ -166,36 +166,36 @@ def test_a_selection_shows_itself_in_short():
 
 def test_wrong_input_is_named():
     a, gaussians = some(0), cloud([0, 1])
-    with pytest.raises(ValueError, match="other: expected a selection among the same 40 Gaussians, got one among 39"):
+    with pytest.raises(ValueError, match=tells("other:", "40 Gaussians", "39")):
         a & some(1, n=39)
-    with pytest.raises(ValueError, match="other: expected a selection among the same 40"):
+    with pytest.raises(ValueError, match=tells("other:", "40 Gaussians", "39")):
         a ^ some(1, n=39)
-    with pytest.raises(TypeError, match="other: expected a Selection, got Tensor; make one"):
+    with pytest.raises(TypeError, match=tells("other:", "got Tensor", "Selection.of(mask)")):
         a - a.mask
-    with pytest.raises(TypeError, match="mask: expected a boolean mask, got torch.float32"):
+    with pytest.raises(TypeError, match=tells("mask:", "got torch.float32")):
         Selection.of(torch.ones(3))
-    with pytest.raises(ValueError, match=r"scores: expected \[N\] with N = 3 \(from mask\), got \(4,\)"):
+    with pytest.raises(ValueError, match=tells("scores:", "[N]", "N = 3", "got (4,)")):
         Selection(torch.ones(3, dtype=torch.bool), torch.ones(4))
-    with pytest.raises(ValueError, match="scores: expected finite numbers, got NaN or infinity in row 1"):
+    with pytest.raises(ValueError, match=tells("scores:", "got NaN", "row 1")):
         Selection(torch.ones(2, dtype=torch.bool), torch.tensor([0.0, math.nan]))
-    with pytest.raises(ValueError, match="class: expected one of wall, chair, got 'chiar'; did you mean 'chair'?"):
+    with pytest.raises(ValueError, match=tells("class:", "wall, chair", "got 'chiar'", "'chair'")):
         OfClass("chiar").select(gaussians, ("wall", "chair"))
     for wrong in (1.5, [1, 2.0], True, None, b"chair"):
-        with pytest.raises(ValueError, match="name: expected a whole number, got .*; pass an int"):
+        with pytest.raises(ValueError, match=tells("name:", "whole number", f"got {wrong!r}")):
             OfClass(wrong)
-    with pytest.raises(ValueError, match=r"name: expected a number in \[-1, .*got -2"):
+    with pytest.raises(ValueError, match=tells("name:", "[-1, ", "got -2")):
         OfClass(-2)
-    with pytest.raises(ValueError, match="gaussians.labels: expected labels"):
+    with pytest.raises(ValueError, match=tells("gaussians.labels:", "got None")):
         OfClass(1).select(gaussians.replace(labels=None))
-    with pytest.raises(ValueError, match="half: expected half edges >= 0"):
+    with pytest.raises(ValueError, match=tells("half:", "got [0.5, 0.5, -0.5]")):
         OrientedBox.between([0, 0, 1], [1, 1, 0])
     with pytest.raises(ValueError, match=tells("max", "min")):
         InBox([0, 0, 1], [1, 1, 0])
-    with pytest.raises(ValueError, match=r"radius: expected a number in \(0, inf\), got -1"):
+    with pytest.raises(ValueError, match=tells("radius:", "(0, inf)", "got -1")):
         InSphere([0, 0, 0], -1)
-    with pytest.raises(ValueError, match="center: expected 3 finite numbers"):
+    with pytest.raises(ValueError, match=tells("center:", "expected 3", "got [0, nan, 0]")):
         InSphere([0, math.nan, 0], 1)
     broken = placed(torch.tensor([[0.0, 0, 0], [math.nan, 0, 0]]))
     for where in (InSphere([0, 0, 0], 1), InBox([0, 0, 0], [1, 1, 1])):
-        with pytest.raises(ValueError, match="means: expected finite numbers, got NaN or infinity in row 1"):
+        with pytest.raises(ValueError, match=tells("gaussians.means:", "got NaN", "row 1")):
             where.select(broken)

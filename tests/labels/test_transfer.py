@@ -108,16 +108,23 @@ def test_dtypes_of_the_result():
 @pytest.mark.parametrize(
     ("src", "labels", "dst", "distance", "error", "message"),
     [
-        (torch.ones(2, 3), torch.zeros(3), torch.ones(1, 3), 1.0, ValueError, r"src_labels: expected \[S\] with S = 2"),
-        (torch.ones(2, 3), torch.zeros(2), torch.ones(1, 3), 1.0, TypeError, "src_labels: expected integer labels"),
-        (torch.ones(2, 3), torch.tensor([0, -5]), torch.ones(1, 3), 1.0, ValueError, "class indices or -1, got -5"),
+        (
+            torch.ones(2, 3),
+            torch.zeros(3),
+            torch.ones(1, 3),
+            1.0,
+            ValueError,
+            ("src_labels:", "[S]", "S = 2", "got (3,)"),
+        ),
+        (torch.ones(2, 3), torch.zeros(2), torch.ones(1, 3), 1.0, TypeError, ("src_labels:", "got torch.float32")),
+        (torch.ones(2, 3), torch.tensor([0, -5]), torch.ones(1, 3), 1.0, ValueError, ("src_labels:", "-1", "got -5")),
         (
             torch.ones(2, 3),
             torch.tensor([0, 1]),
             torch.ones(1, 3),
             0.0,
             ValueError,
-            r"distance: expected a number in \(0",
+            ("distance:", "got 0.0"),
         ),
         (
             torch.ones(1, 3),
@@ -125,13 +132,13 @@ def test_dtypes_of_the_result():
             torch.full((1, 3), math.nan),
             1.0,
             ValueError,
-            "dst_means: .*finite.*row 0",
+            ("dst_means:", "row 0", "got NaN"),
         ),
-        (torch.full((1, 3), math.inf), torch.tensor([0]), torch.ones(1, 3), 1.0, ValueError, "src_means: .*finite"),
+        (torch.full((1, 3), math.inf), torch.tensor([0]), torch.ones(1, 3), 1.0, ValueError, ("src_means:", "got NaN")),
     ],
 )
 def test_wrong_input_is_named(src, labels, dst, distance, error, message):
-    with pytest.raises(error, match=message):
+    with pytest.raises(error, match=tells(*message)):
         transfer_labels(src, labels, dst, distance)
 
 
@@ -170,7 +177,7 @@ def test_a_destination_says_itself_whether_its_sources_disagree():
 
 def test_a_mask_of_other_destinations_is_named():
     transfer = transfer_labels(points(5, 6), torch.arange(5), points(4, 7))
-    with pytest.raises(ValueError, match=r"which: expected a mask \[N\] with N = 4 .*got \(5,\); select in the cloud"):
+    with pytest.raises(ValueError, match=tells("which:", "[N]", "N = 4", "got (5,)")):
         transfer.select(torch.ones(5, dtype=torch.bool))
 
 

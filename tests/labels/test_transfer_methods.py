@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from oracles_labels import vote as oracle
 from oracles_splat import covariance
 
@@ -180,18 +181,24 @@ def test_nothing_in_nothing_out(method):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"method": "average"}, "method: expected one of 'nearest', 'vote', 'mahalanobis'"),
-        ({"method": "vote", "neighbours": 0}, "neighbours: expected a number in"),
-        ({"method": "vote", "neighbours": 2.5}, "neighbours: expected a whole number"),
-        ({"method": "mahalanobis", "deviations": 0.0}, r"deviations: expected a number in \(0"),
-        ({"method": "mahalanobis", "src": torch.ones(4, 3)}, "src: expected Gaussians for method 'mahalanobis'"),
-        ({"method": "mahalanobis", "src": ball([[math.nan, 0, 0]] * 4)}, "src_means: .*finite.*row 0"),
-        ({"method": "mahalanobis", "src": ball([[0.0, 0, 0]] * 4, math.inf)}, "src.scales, src.quats: .*row 0"),
-        ({"method": "mahalanobis", "dst": ball([[0.0, 0, 0]] * 4, math.nan)}, "dst.scales, dst.quats: .*row 0"),
-        ({"method": "vote", "src": ball([[0.0, 0, 0]] * 4, 1.0, math.nan)}, "src.opacities: .*finite.*row 0"),
+        ({"method": "average"}, ("method:", "'nearest', 'vote', 'mahalanobis'", "got 'average'")),
+        ({"method": "vote", "neighbours": 0}, ("neighbours:", "got 0")),
+        ({"method": "vote", "neighbours": 2.5}, ("neighbours:", "got 2.5")),
+        ({"method": "mahalanobis", "deviations": 0.0}, ("deviations:", "got 0.0")),
+        ({"method": "mahalanobis", "src": torch.ones(4, 3)}, ("src:", "Gaussians", "'mahalanobis'")),
+        ({"method": "mahalanobis", "src": ball([[math.nan, 0, 0]] * 4)}, ("src_means:", "row 0", "got NaN")),
+        (
+            {"method": "mahalanobis", "src": ball([[0.0, 0, 0]] * 4, math.inf)},
+            ("src.scales, src.quats:", "row 0", "got NaN"),
+        ),
+        (
+            {"method": "mahalanobis", "dst": ball([[0.0, 0, 0]] * 4, math.nan)},
+            ("dst.scales, dst.quats:", "row 0", "got NaN"),
+        ),
+        ({"method": "vote", "src": ball([[0.0, 0, 0]] * 4, 1.0, math.nan)}, ("src.opacities:", "row 0", "got NaN")),
     ],
 )
 def test_wrong_options_are_named(options, message):
     options = {"src": cloud(4, 0), "dst": cloud(4, 1), **options}
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         transfer_labels(src_labels=torch.arange(4), distance=1.0, **options)

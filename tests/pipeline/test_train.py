@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from messages import tells
 
 from kfgs.pipeline.train import training_device
 
@@ -17,5 +18,5 @@ def test_a_named_device_is_taken():
 
 @pytest.mark.parametrize("device", ["gpu", "mps", "cuda:99"])
 def test_what_is_not_there_is_refused(device):
-    with pytest.raises(ValueError, match="device: expected"):
+    with pytest.raises(ValueError, match=tells("device:", f"got {device!r}")):
         training_device(device)

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from messages import tells
 
 from kfgs.quant import spherical_kmeans
 
@@ -102,10 +103,10 @@ def test_a_seed_fixes_the_result_and_seed_0_is_the_default():
 
 def test_wrong_input_is_named():
     for features, weights in ((torch.zeros(3, 2), torch.ones(3)), (torch.ones(3, 2), torch.zeros(3))):
-        with pytest.raises(ValueError, match="features: expected a nonzero row with a weight, got 3 without; check"):
+        with pytest.raises(ValueError, match=tells("features:", "zero", "weight", "got 3")):
             spherical_kmeans(features, weights, 2)
-    with pytest.raises(ValueError, match=r"weights: expected \[n\] with n = 3 \(from features\), got \(2,\)"):
+    with pytest.raises(ValueError, match=tells("weights:", "[n]", "n = 3", "got (2,)")):
         spherical_kmeans(torch.ones(3, 2), torch.ones(2), 2)
     for name in ("clusters", "rounds"):
-        with pytest.raises(ValueError, match=f"{name}: expected a number in"):
+        with pytest.raises(ValueError, match=tells(f"{name}:", "got 0")):
             spherical_kmeans(torch.ones(3, 2), torch.ones(3), **({"clusters": 2} | {name: 0}))

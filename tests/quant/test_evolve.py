@@ -1,6 +1,7 @@
 import oracles_quant as oracle
 import pytest
 import torch
+from messages import tells
 
 from kfgs.quant import expand, prune
 from kfgs.quant.evolve import RowAdam
@@ -89,13 +90,13 @@ def test_one_codeword_stays():
 
 
 def test_bad_input():
-    with pytest.raises(ValueError, match=r"features: expected \[n, D\] with D = 2 \(from codewords\), got \(4, 3\)"):
+    with pytest.raises(ValueError, match=tells("features:", "[n, D]", "D = 2", "got (4, 3)")):
         expand(torch.ones(1, 2), torch.ones(4, 3))
-    with pytest.raises(ValueError, match=r"threshold: expected a number in \[-1, 1\], got 90"):
+    with pytest.raises(ValueError, match=tells("threshold:", "[-1, 1]", "got 90")):
         expand(torch.ones(1, 2), torch.ones(4, 2), threshold=90)
-    with pytest.raises(ValueError, match=r"threshold: expected a number in \[-1, 1\], got nan"):
+    with pytest.raises(ValueError, match=tells("threshold:", "[-1, 1]", "got nan")):
         prune(torch.ones(1, 2), threshold=float("nan"))
-    with pytest.raises(ValueError, match=r"codewords: expected \[K, D\], got \(2,\)"):
+    with pytest.raises(ValueError, match=tells("codewords:", "[K, D]", "got (2,)")):
         prune(torch.ones(2))
 
 

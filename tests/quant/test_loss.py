@@ -1,6 +1,7 @@
 import oracles_quant as oracle
 import pytest
 import torch
+from messages import tells
 
 from kfgs.quant import class_balanced_loss
 
@@ -60,7 +61,7 @@ def test_no_features_no_loss():
 
 
 def test_bad_shapes():
-    with pytest.raises(ValueError, match=r"codewords: expected \[K, D\] with D = 3 \(from features\), got \(2, 4\)"):
+    with pytest.raises(ValueError, match=tells("codewords:", "[K, D]", "D = 3", "got (2, 4)")):
         class_balanced_loss(torch.ones(5, 3), torch.ones(2, 4), torch.zeros(5, dtype=torch.int64))
-    with pytest.raises(ValueError, match=r"index: expected \[n\] with n = 5 \(from features\), got \(4,\)"):
+    with pytest.raises(ValueError, match=tells("index:", "[n]", "n = 5", "got (4,)")):
         class_balanced_loss(torch.ones(5, 3), torch.ones(2, 3), torch.zeros(4, dtype=torch.int64))

@@ -129,10 +129,10 @@ def test_every_truncation_of_every_binary_file_is_refused(tmp_path: Path, rigs: 
         whole = file.read_bytes()
         for length in range(len(whole)):
             file.write_bytes(whole[:length])
-            with pytest.raises(SceneError, match=file.name):
+            with pytest.raises(SceneError, match=tells(file.name)):
                 read_model(folder)
         file.write_bytes(whole + b"\0")
-        with pytest.raises(SceneError, match="expected the end of the file"):
+        with pytest.raises(SceneError, match=tells("end", "got 1")):
             read_model(folder)
         file.write_bytes(whole)
     read_model(folder)
@@ -189,7 +189,7 @@ def test_a_huge_count_is_refused_before_anything_is_allocated(tmp_path: Path) ->
         whole = file.read_bytes()
         for count in (2**40, 2**64 - 1):
             file.write_bytes(struct.pack("<Q", count) + whole[8:])
-            with pytest.raises(SceneError, match=rf"{name}.bin: expected at most \d+ .*, got {count}"):
+            with pytest.raises(SceneError, match=tells(f"{name}.bin:", f"got {count}")):
                 read_model(folder)
         file.write_bytes(whole)
 
@@ -300,13 +300,13 @@ def test_nobody_needs_the_error_of_a_point(tmp_path: Path) -> None:
 
 
 def test_missing_folder_and_files_are_named(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="no such folder; expected a COLMAP model"):
+    with pytest.raises(FileNotFoundError, match=tells("nothing:", "no such folder", "COLMAP")):
         read_model(tmp_path / "nothing")
-    with pytest.raises(SceneError, match="got none of these files"):
+    with pytest.raises(SceneError, match=tells("COLMAP", "points3D", "got none")):
         read_model(tmp_path)
     folder = write_model(tmp_path / "m", ["a.png"])
     shutil.move(folder / "points3D.bin", tmp_path / "elsewhere.bin")
-    with pytest.raises(SceneError, match=r"all as .bin or all as .txt.*got cameras.bin, images.bin; copy the missing"):
+    with pytest.raises(SceneError, match=tells(".bin", ".txt", "got cameras.bin, images.bin", "copy")):
         read_model(folder)
 
 

@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from messages import tells
 
 from kfgs.scenes import SceneError
 from kfgs.scenes.pycolmap_import import import_pycolmap, quiet_pycolmap, scene_errors
@@ -25,10 +26,10 @@ def test_a_process_that_is_asked_to_end_says_nothing():
 
 
 def test_pycolmap_failures_become_scene_errors(tmp_path: Path) -> None:
-    with pytest.raises(SceneError, match=r"x: expected a model \(IndexError: unordered_map::at\); do this"):  # noqa: SIM117
+    with pytest.raises(SceneError, match=tells("x:", "a model", "(IndexError: unordered_map::at)", "do this")):  # noqa: SIM117
         with scene_errors("x: expected a model", "do this"):
             raise IndexError("unordered_map::at")
-    with pytest.raises(SceneError, match="MemoryError: no text"), scene_errors("x", "y"):
+    with pytest.raises(SceneError, match=tells("MemoryError: no text")), scene_errors("x", "y"):
         raise MemoryError
     with pytest.raises(KeyboardInterrupt), scene_errors("x", "y"):
         raise KeyboardInterrupt

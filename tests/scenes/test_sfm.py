@@ -6,6 +6,7 @@ import pytest
 import torch
 from kornia.geometry import resize
 from kornia.io import write_image
+from messages import tells
 from oracles_cameras import align_similarity
 from tqdm import tqdm
 
@@ -62,46 +63,42 @@ def test_images_that_share_nothing_are_refused(tmp_path: Path) -> None:
     images.mkdir()
     for i in range(3):
         write_image(str(images / f"{i}.png"), torch.randint(0, 255, (3, 60, 80), generator=g, dtype=torch.uint8))
-    with pytest.raises(
-        SceneError, match=r"expected at least 3 of 3 images .*min_registered = 0.9\), got 0; take overlap"
-    ):
+    with pytest.raises(SceneError, match=tells("images:", "3 of 3", "min_registered = 0.9", "got 0")):
         run_sfm(images, tmp_path / "out", config=SfmConfig(num_threads=1))
     assert not (tmp_path / "out").exists()
 
 
 def test_a_split_scene_is_refused_with_counts_and_advice() -> None:
     names = [str(i) for i in range(90)]
-    message = r"expected at least 81 of 90 images .*split into 2 unconnected models of 72, 19 images; use matching='exh"
-    with pytest.raises(SceneError, match=message):
+    message = ("images:", "81 of 90", "72, 19", "matching='exhaustive'")
+    with pytest.raises(SceneError, match=tells(*message)):
         _require_one_model(Path("images"), (72, 19), names, SfmConfig(matching="sequential"))
     _require_one_model(Path("images"), (81, 9), names, SfmConfig())
     _require_one_model(Path("images"), (72, 19), names, SfmConfig(min_registered=0.8))
-    with pytest.raises(
-        SceneError, match="got 80; take overlapping photos between the parts, or pass single_camera=False"
-    ):
+    with pytest.raises(SceneError, match=tells("images:", "got 80", "single_camera=False")):
         _require_one_model(Path("images"), (80,), names, SfmConfig())
 
 
 def test_folders_without_enough_images(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="expected the images there"):
+    with pytest.raises(FileNotFoundError, match=tells("nothing:", "no such folder", "images")):
         run_sfm(tmp_path / "nothing", tmp_path / "out")
     (tmp_path / "a.png").write_bytes(b"")
-    with pytest.raises(SceneError, match="expected at least 3 images .*got 1; add views"):
+    with pytest.raises(SceneError, match=tells("3 images", "got 1")):
         run_sfm(tmp_path, tmp_path / "out")
 
 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"matching": "vocabulary"}, "matching: expected one of 'exhaustive', 'sequential'"),
-        ({"camera_model": "FOV"}, "camera_model: expected one of 'SIMPLE_PINHOLE'"),
-        ({"min_registered": 0.0}, "min_registered: expected a number"),
-        ({"max_features": 5}, "max_features: expected a number"),
-        ({"num_threads": 0}, "num_threads: expected a number"),
+        ({"matching": "vocabulary"}, ("matching:", "'exhaustive', 'sequential'", "got 'vocabulary'")),
+        ({"camera_model": "FOV"}, ("camera_model:", "'SIMPLE_PINHOLE'", "got 'FOV'")),
+        ({"min_registered": 0.0}, ("min_registered:", "got 0.0")),
+        ({"max_features": 5}, ("max_features:", "got 5")),
+        ({"num_threads": 0}, ("num_threads:", "got 0")),
     ],
 )
 def test_config_is_checked(values: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         SfmConfig(**values)  # type: ignore[arg-type]
 
 
@@ -147,5 +144,5 @@ def test_sequential_matching_compares_9_with_10_and_not_1_with_12(tmp_path: Path
 
 def test_sequential_matching_of_names_with_blanks(tmp_path: Path) -> None:
     assert _matched(tmp_path / "a", ["a 1.png", "a 2.png"]) == {frozenset(("a 1.png", "a 2.png"))}
-    with pytest.raises(SceneError, match=r"expected names without blanks, or padded.*got a 9.png, a 10.png; rename"):
+    with pytest.raises(SceneError, match=tells("images:", "got a 9.png, a 10.png", "rename")):
         _matched(tmp_path / "b", ["a 9.png", "a 10.png"])

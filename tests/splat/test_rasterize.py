@@ -195,19 +195,19 @@ def test_gradients_of_colour_reach_harmonics_and_means():
 
 def test_something_to_render_is_needed():
     camera = a_camera()
-    with pytest.raises(ValueError, match=r"gaussians: expected features or sh to render, got neither; add them"):
+    with pytest.raises(ValueError, match=tells("gaussians:", "got neither", "gaussians.replace()")):
         rasterize(gaussians_before(camera, 3, seed=0).replace(features=None), camera)
 
 
 def test_camera_with_distortion_is_refused():
     camera = replace(a_camera(), distortion=Distortion("kannala_brandt", (0.1, 0.0, 0.0, 0.0)))
-    with pytest.raises(ValueError, match="camera: expected a camera without distortion, got kannala_brandt"):
+    with pytest.raises(ValueError, match=tells("camera:", "got kannala_brandt")):
         rasterize(gaussians_before(camera, 3, seed=0), camera)
 
 
 def test_background_has_one_value_per_channel():
     camera = a_camera()
-    with pytest.raises(ValueError, match=r"background: expected \[D\] with D = 3 \(from features\), got \(4,\)"):
+    with pytest.raises(ValueError, match=tells("background:", "[D]", "D = 3", "got (4,)")):
         rasterize(gaussians_before(camera, 3, seed=0), camera, background=torch.zeros(4).double())
 
 

@@ -2,6 +2,7 @@ import numpy as np
 import oracles_splat as oracle
 import pytest
 import torch
+from messages import tells
 from scipy.spatial.transform import Rotation
 
 from kfgs.splat import SH_C0, evaluate_sh, rgb_to_sh0, rotate_sh, sh0_to_rgb
@@ -68,12 +69,12 @@ def test_gradients():
 
 
 def test_number_of_coefficients_must_be_a_full_degree():
-    with pytest.raises(ValueError, match=r"sh: expected 1, 4, 9 or 16 coefficients .* got 5; cut it"):
+    with pytest.raises(ValueError, match=tells("sh:", "expected 1, 4, 9 or 16", "got 5")):
         evaluate_sh(torch.zeros(2, 5, 3), torch.ones(2, 3))
 
 
 def test_one_direction_per_gaussian():
-    with pytest.raises(ValueError, match=r"directions: expected \[N, 3\] with N = 2 \(from sh\), got \(1, 3\)"):
+    with pytest.raises(ValueError, match=tells("directions:", "[N, 3]", "N = 2", "got (1, 3)")):
         evaluate_sh(torch.zeros(2, 4, 3), torch.ones(1, 3))
 
 
@@ -125,9 +126,9 @@ def test_turned_colours_keep_dtype_and_have_gradients():
 
 
 def test_what_cannot_turn_colours_is_named():
-    with pytest.raises(ValueError, match="rotation: expected a rotation, got a reflection"):
+    with pytest.raises(ValueError, match=tells("rotation:", "reflection")):
         rotate_sh(_coefficients(4), torch.diag(torch.tensor([1.0, 1.0, -1.0])))
-    with pytest.raises(ValueError, match="rotation: expected a rotation .* divide by the scale"):
+    with pytest.raises(ValueError, match=tells("rotation:", "divide")):
         rotate_sh(_coefficients(4), 2 * torch.eye(3))
-    with pytest.raises(ValueError, match="sh: expected 1, 4, 9 or 16 coefficients"):
+    with pytest.raises(ValueError, match=tells("sh:", "expected 1, 4, 9 or 16", "got 5")):
         rotate_sh(torch.zeros(2, 5, 3), torch.eye(3))

@@ -6,6 +6,7 @@ import oracles_splat as oracle
 import pytest
 import torch
 from cases_splat import a_camera, gaussians_before
+from messages import tells
 
 from kfgs.cameras.camera import Camera, Distortion
 from kfgs.cameras.projection import camera_to_pixel, world_to_camera
@@ -263,27 +264,27 @@ def test_camera_pose_has_a_gradient(project):
 
 def test_camera_with_distortion_is_refused(project):
     camera = replace(a_camera(), distortion=Distortion("brown_conrady", (0.1, 0.0, 0.0, 0.0)))
-    with pytest.raises(ValueError, match=r"camera: expected a camera without distortion, got brown_conrady.*undistort"):
+    with pytest.raises(ValueError, match=tells("camera:", "got brown_conrady")):
         project(_balls([[0.0, 0, 2]]), camera)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"near": 0.0}, r"near: expected a number in \(0"), ({"low_pass": -0.1}, r"low_pass: expected a number in \[0")],
+    [({"near": 0.0}, ("near:", "got 0.0")), ({"low_pass": -0.1}, ("low_pass:", "got -0.1"))],
 )
 def test_options_out_of_range(project, options, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         project(_balls([[0.0, 0, 2]]), _straight(), **options)
 
 
 def test_unknown_engine_is_refused():
-    with pytest.raises(ValueError, match=r"engine: expected one of 'auto', .*'numba'.*, got 'opengl'"):
+    with pytest.raises(ValueError, match=tells("engine:", "'auto'", "'numba'", "got 'opengl'")):
         project_by(_balls([[0.0, 0, 2]]), _straight(), engine="opengl")
 
 
 def test_compiled_engine_refuses_other_dtypes():
     half = _balls([[0.0, 0, 2]], dtype=torch.float16)
-    with pytest.raises(ValueError, match=r"gaussians: expected all in float32 or all in float64 .*, got torch.float16"):
+    with pytest.raises(ValueError, match=tells("gaussians:", "float32", "float64", "got torch.float16")):
         project_by(half, _straight(), engine="numba")
 
 

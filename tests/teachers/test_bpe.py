@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from oracles_bpe import hugging_face, read_merges, vocabulary
 
 import kfgs
@@ -132,20 +133,20 @@ def test_ties_merge_from_the_left() -> None:
 
 def test_too_long_a_prompt_is_named_not_cut(tokenizer: Tokenizer) -> None:
     assert (tokenizer(["cat " * 75])[0] > 0).all()  # 75 tokens fit
-    with pytest.raises(ValueError, match=r"at most 75 tokens each, got 76 in 'cat cat .*'\.\.\.; shorten it"):
+    with pytest.raises(ValueError, match=tells("prompts:", "75", "got 76", "'cat cat ")):
         tokenizer(["dog", "cat " * 76])
 
 
 @pytest.mark.parametrize(
     ("prompts", "error", "match"),
     [
-        ("a cat", TypeError, "expected a list of texts, got the text 'a cat'; put it into a list"),
-        (["a", 3], TypeError, "expected texts, got int 3"),
-        (["a\ud800"], ValueError, "half of a surrogate pair in 'a.ud800'; read the text as UTF-8"),
+        ("a cat", TypeError, ("prompts:", "list", "'a cat'")),
+        (["a", 3], TypeError, ("prompts:", "got int 3")),
+        (["a\ud800"], ValueError, ("prompts:", "'a\\ud800'", "UTF-8")),
     ],
 )
 def test_wrong_prompts(tokenizer: Tokenizer, prompts, error, match: str) -> None:
-    with pytest.raises(error, match=match):
+    with pytest.raises(error, match=tells(*match)):
         tokenizer(prompts)
 
 
@@ -166,21 +167,21 @@ def test_other_sources_give_the_same_ids(tokenizer: Tokenizer, oracle, tmp_path:
 
 
 def test_wrong_sources(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"expected CLIP's vocabulary .* got no such file"):
+    with pytest.raises(FileNotFoundError, match=tells("none.txt.gz:", "vocabulary", "no such file")):
         load_tokenizer(tmp_path / "none.txt.gz")
-    with pytest.raises(FileNotFoundError, match=r"got one without tokenizer\.json and merges\.txt"):
+    with pytest.raises(FileNotFoundError, match=tells("tokenizer.json", "merges.txt")):
         load_tokenizer(tmp_path)
     (tmp_path / "short.txt").write_text("#version: 0.2\na b\nc d\n")
-    with pytest.raises(ValueError, match="expected CLIP's 48,894 merges, two symbols in a line, got 2"):
+    with pytest.raises(ValueError, match=tells("short.txt:", "48,894", "got 2")):
         load_tokenizer(tmp_path / "short.txt")
     (tmp_path / "cut.txt.gz").write_bytes(SHIPPED.read_bytes()[:5000])
-    with pytest.raises(ValueError, match=r"cut\.txt\.gz: expected CLIP's vocabulary, but it cannot be read as text"):
+    with pytest.raises(ValueError, match=tells("cut.txt.gz:", "vocabulary", "read")):
         load_tokenizer(tmp_path / "cut.txt.gz")
     (tmp_path / "noise.txt").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ValueError, match=r"noise\.txt: expected CLIP's vocabulary, but it cannot be read as text"):
+    with pytest.raises(ValueError, match=tells("noise.txt:", "vocabulary", "read")):
         load_tokenizer(tmp_path / "noise.txt")
     (tmp_path / "tokenizer.json").write_text("{not json")
-    with pytest.raises(ValueError, match=r"tokenizer\.json: expected JSON of a tokenizer"):
+    with pytest.raises(ValueError, match=tells("tokenizer.json:", "JSON")):
         load_tokenizer(tmp_path)
 
 
@@ -190,5 +191,5 @@ def test_another_models_tokenizer_is_refused(tmp_path: Path) -> None:
     ids["<|endoftext|>"], ids["!"] = 0, 49407
     model = {"vocab": ids, "merges": [merge.split(" ") for merge in merges]}
     (tmp_path / "tokenizer.json").write_text(json.dumps({"model": model}))
-    with pytest.raises(ValueError, match=r"expected the ids of CLIP's tokenizer \(49,408\), got others"):
+    with pytest.raises(ValueError, match=tells("(49,408)", "got others")):
         load_tokenizer(tmp_path)

@@ -155,7 +155,7 @@ def test_every_truncation_and_many_flips_give_one_line(tmp_path: Path) -> None:
         whole, path = buffer.getvalue(), tmp_path / f"{zipped}.pt"
         for size in range(0, len(whole), 7):
             path.write_bytes(whole[:size])
-            with pytest.raises(ValueError, match="expected a checkpoint"):
+            with pytest.raises(ValueError, match=tells("checkpoint")):
                 read_checkpoint(path)
         for _ in range(400):
             changed = bytearray(whole)
@@ -172,35 +172,38 @@ def test_every_truncation_and_many_flips_give_one_line(tmp_path: Path) -> None:
 
 
 KINDS = {
-    "empty": (b"", "an empty file: the download failed"),
-    "html": (b"\n<!DOCTYPE html>\n<html><head>Quota exceeded</head></html>", "an HTML page: the download failed"),
-    "xml": (b"<?xml version='1.0'?><Error>AccessDenied</Error>", "an XML document"),
-    "lfs": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 3\n", "a Git LFS pointer, .*git lfs pull"),
-    "png": (b"\x89PNG\r\n\x1a\n123", "a PNG picture"),
-    "jpeg": (b"\xff\xd8\xff\xe0" + b"x" * 50, "a JPEG picture"),
-    "gzip": (b"\x1f\x8b\x08" + b"x" * 50, "a gzip file: unpack"),
-    "keras": (b"\x89HDF\r\n\x1a\n", "an HDF5 file"),
-    "npy": (b"\x93NUMPY\x01\x00", "a numpy array"),
-    "zeros": (bytes(5000), "a file of zeros"),
-    "tar": (b"x" * 257 + b"ustar" + bytes(250), "a tar archive"),
-    "text": (b"cat, dog\nhouse\n", "a text file that begins 'cat, dog'"),
-    "umlaut": ("Tür\n".encode() * 500, "a text file that begins 'T"),
-    "json": (b'{"weight_map": {}}', "a JSON file .*index"),
-    "blank": (b"  \n ", "a blank text file"),
-    "random": (b"\x07\x00\xfe\x13" * 40, "a file of an unknown kind"),
-    "pickle": (pickle.dumps({"a": [1, 2]}), "a plain pickle"),
-    "zip": (zip_of({"photo.txt": b"hello"}), r"a zip archive that torch.save did not write \(it holds photo.txt"),
-    "no records": (zip_of({}), "an empty zip archive"),
+    "empty": (b"", ("empty file", "download")),
+    "html": (b"\n<!DOCTYPE html>\n<html><head>Quota exceeded</head></html>", ("HTML", "download")),
+    "xml": (b"<?xml version='1.0'?><Error>AccessDenied</Error>", ("XML",)),
+    "lfs": (
+        b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 3\n",
+        ("Git LFS pointer", "`git lfs pull`"),
+    ),
+    "png": (b"\x89PNG\r\n\x1a\n123", ("PNG",)),
+    "jpeg": (b"\xff\xd8\xff\xe0" + b"x" * 50, ("JPEG",)),
+    "gzip": (b"\x1f\x8b\x08" + b"x" * 50, ("gzip", "unpack")),
+    "keras": (b"\x89HDF\r\n\x1a\n", ("HDF5",)),
+    "npy": (b"\x93NUMPY\x01\x00", ("numpy", ".npy")),
+    "zeros": (bytes(5000), ("zeros",)),
+    "tar": (b"x" * 257 + b"ustar" + bytes(250), ("tar archive",)),
+    "text": (b"cat, dog\nhouse\n", ("text", "'cat, dog'")),
+    "umlaut": ("Tür\n".encode() * 500, ("text", "'T")),
+    "json": (b'{"weight_map": {}}', ("JSON", "index")),
+    "blank": (b"  \n ", ("blank", "text")),
+    "random": (b"\x07\x00\xfe\x13" * 40, ("unknown kind",)),
+    "pickle": (pickle.dumps({"a": [1, 2]}), ("pickle", "torch.save")),
+    "zip": (zip_of({"photo.txt": b"hello"}), ("torch.save", "photo.txt")),
+    "no records": (zip_of({}), ("empty zip",)),
     "compressed": (
         zip_of({"a/data.pkl": bytes(10**6)}, zipfile.ZIP_DEFLATED),
-        "an archive that is compressed or encrypted",
+        ("compressed", "encrypted"),
     ),
     "cut safetensors": (
         struct.pack("<Q", 80) + b'{"a":{"dtype":"F32","shape":[2],',
-        "a .safetensors file that is damaged",
+        ("a .safetensors file", "damaged"),
     ),
-    "empty safetensors": (struct.pack("<Q", 2) + b"{}", "a .safetensors file without tensors"),
-    "no storage": (archive(pickled({"a": tensor()})), "one whose pickle cannot be read: .* data/0"),
+    "empty safetensors": (struct.pack("<Q", 2) + b"{}", ("a .safetensors file", "without tensors")),
+    "no storage": (archive(pickled({"a": tensor()})), ("pickle", "data/0")),
 }
 
 
@@ -208,7 +211,7 @@ KINDS = {
 def test_other_files_are_named(tmp_path: Path, kind: str) -> None:
     content, match = KINDS[kind]
     (tmp_path / "a.ckpt").write_bytes(content)
-    with pytest.raises(ValueError, match=rf"expected a checkpoint .*, got {match}") as caught:
+    with pytest.raises(ValueError, match=tells("a.ckpt:", "a checkpoint", *match)) as caught:
         read_checkpoint(tmp_path / "a.ckpt")
     assert "\n" not in str(caught.value)
 
@@ -216,55 +219,51 @@ def test_other_files_are_named(tmp_path: Path, kind: str) -> None:
 @pytest.mark.parametrize(
     ("value", "match"),
     [
-        (torch.ones(3), "a file of one tensor, without a state dict"),
-        ({"epoch": 3, "loss": [1.0]}, "a file of a dict with keys epoch, loss, without a state dict"),
-        ({}, "an empty dict"),
-        ([torch.ones(3)], "one list"),
-        (argparse.Namespace(a=1), "one object, argparse.Namespace"),
-        (torch.nn.Linear(2, 2), r"one object, torch.nn.modules.linear.Linear \(save its state_dict\(\)"),
+        (torch.ones(3), ("a.pt:", "one tensor", "state dict")),
+        ({"epoch": 3, "loss": [1.0]}, ("a.pt:", "epoch, loss", "state dict")),
+        ({}, ("a.pt:", "empty dict")),
+        ([torch.ones(3)], ("a.pt:", "one list")),
+        (argparse.Namespace(a=1), ("a.pt:", "argparse.Namespace", "state_dict()")),
+        (torch.nn.Linear(2, 2), ("torch.nn.modules.linear.Linear", "state_dict()")),
         (
             {"a": torch.eye(2).to_sparse(), "b": torch.ones(1)},
-            "else than dense tensors .*_rebuild_sparse_tensor",
+            ("a.pt:", "dense", "_rebuild_sparse_tensor"),
         ),
         (
             {"a": torch.ones(1).expand(1000)},
-            "tensor a is of size .1000., .* 1 values: .*save it contiguous$",
+            ("tensor a", "[1000]", "1 values", "contiguous"),
         ),
-        ({"a": torch.complex(torch.ones(2), torch.ones(2)).conj()}, "tensor a is not a plain dense tensor"),
+        ({"a": torch.complex(torch.ones(2), torch.ones(2)).conj()}, ("tensor a", "dense")),
     ],
 )
 def test_what_torch_saves_beside_state_dicts_is_named(tmp_path: Path, value: object, match: str) -> None:
     torch.save(value, tmp_path / "a.pt")
-    with pytest.raises(ValueError, match=match):
+    with pytest.raises(ValueError, match=tells(*match)):
         read_checkpoint(tmp_path / "a.pt")
 
 
 def test_torchscript_is_refused(tmp_path: Path) -> None:
     source = zip_of({"net/data.pkl": b"N.", "net/constants.pkl": b").", "net/code/__torch__.py": b"import os"})
     (tmp_path / "a.pt").write_bytes(source)
-    with pytest.raises(ValueError, match=r"got a TorchScript archive, which is a program; save its state_dict\(\)"):
+    with pytest.raises(ValueError, match=tells("a.pt:", "TorchScript", "state_dict()")):
         read_checkpoint(tmp_path / "a.pt")
 
 
 def test_no_file_and_folder(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"a\.ckpt: expected a checkpoint .* got no such file"):
+    with pytest.raises(FileNotFoundError, match=tells("a.ckpt:", "checkpoint", "no such file")):
         read_checkpoint(tmp_path / "a.ckpt")
-    with pytest.raises(FileNotFoundError, match=r"a\.ckpt: expected a checkpoint .* got no such file"):
+    with pytest.raises(FileNotFoundError, match=tells("a.ckpt:", "checkpoint", "no such file")):
         weights_digest(tmp_path / "a.ckpt")
     for read in (read_checkpoint, weights_digest):
-        with pytest.raises(ValueError, match="got a folder; name the file of weights in it"):
+        with pytest.raises(ValueError, match=tells("checkpoint", "got a folder", "weights")):
             read(tmp_path)
 
 
 @pytest.mark.parametrize("read", [read_checkpoint, weights_digest])
 def test_what_the_system_refuses_is_one_line(tmp_path: Path, read) -> None:
-    with pytest.raises(
-        FileNotFoundError, match=r"x: expected a checkpoint .* got a name too long for a file; check it"
-    ):
+    with pytest.raises(FileNotFoundError, match=tells("x:", "checkpoint", "too long")):
         read(tmp_path / ("x" * 256))
-    with pytest.raises(
-        ValueError, match=r"^/proc/self/mem: expected .* got one that cannot be read \(.+\); check the file"
-    ):
+    with pytest.raises(ValueError, match=tells("/proc/self/mem:", "read (")):
         read("/proc/self/mem")
 
 
@@ -272,13 +271,13 @@ def test_a_dict_in_itself_many_times_is_looked_into_once(tmp_path: Path) -> None
     value: dict = {"epoch": 3}
     value |= dict.fromkeys(("state_dict", "model_state_dict", "model", "module", "net", "network", "params"), value)
     torch.save(value, tmp_path / "a.pt")
-    with pytest.raises(ValueError, match="without a state dict"):
+    with pytest.raises(ValueError, match=tells("a.pt:", "state dict")):
         read_checkpoint(tmp_path / "a.pt")
 
 
 def test_names_from_the_file_cannot_write_to_the_terminal(tmp_path: Path) -> None:
     (tmp_path / "a.pt").write_bytes(archive(b"cevil\x1b[2J\nabc\n)R."))
-    with pytest.raises(ValueError, match=r"one object, evil\\x1b\[2J\.abc") as caught:
+    with pytest.raises(ValueError, match=tells("a.pt:", "evil\\x1b[2J.abc")) as caught:
         read_checkpoint(tmp_path / "a.pt")
     assert str(caught.value).isprintable()
 
@@ -288,5 +287,5 @@ def test_keys_that_are_no_text_are_left_out_or_named_by_their_kind(tmp_path: Pat
     torch.save({key: torch.ones(1), "a": torch.ones(2)}, tmp_path / "a.pt")
     assert_same(read_checkpoint(tmp_path / "a.pt"), {"a": torch.ones(2)})
     torch.save({key: 1}, tmp_path / "a.pt")
-    with pytest.raises(ValueError, match="a dict with keys (1|tuple), without"):
+    with pytest.raises(ValueError, match=tells("a.pt:", "dict", "keys", "state dict")):
         read_checkpoint(tmp_path / "a.pt")

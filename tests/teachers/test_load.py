@@ -6,6 +6,7 @@ import sys
 
 import pytest
 import torch
+from messages import tells
 
 from kfgs.teachers import Teacher, embed_labels, identify
 from kfgs.teachers.load import load_teacher, teacher_names
@@ -119,7 +120,7 @@ def test_a_teacher_with_an_identity_stays_what_it_is(write):
     assert embed_labels(teacher, ["wall"]).shape == (1, 3)
     assert teacher.templates == "siglip"
     assert copy.copy(teacher).factor == 2.0
-    with pytest.raises(AttributeError, match="absent"):
+    with pytest.raises(AttributeError, match=tells("'absent'")):
         _ = teacher.absent
     write(CLASS)
     still = load_teacher("mine:Scaled")
@@ -132,7 +133,7 @@ def test_modules_are_found_beside_the_command_but_the_path_stays(write):
     load_teacher("mine:Scaled")
     assert sys.path == [*before, "/mine"]
     write("raise KeyError('x')")
-    with pytest.raises(ValueError, match="KeyError"):
+    with pytest.raises(ValueError, match=tells("teacher:", "KeyError", "got 'mine:Scaled'")):
         load_teacher("mine:Scaled")
     assert sys.path == [*before, "/mine"]
 
@@ -140,19 +141,19 @@ def test_modules_are_found_beside_the_command_but_the_path_stays(write):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("def f(:\n", r"got 'mine:f' \(SyntaxError: .*mine.py, line 1"),
-        ("raise RuntimeError('no GPU\\nat all')\n", r"\(RuntimeError: no GPU\); check both names, and that"),
-        ("import sys\nsys.exit(3)\n", r"\(SystemExit: 3\)"),
-        ("import absent_package\n", r"No module named 'absent_package'"),
+        ("def f(:\n", ("teacher:", "got 'mine:f'", "(SyntaxError: ", "mine.py, line 1")),
+        ("raise RuntimeError('no GPU\\nat all')\n", ("teacher:", "got 'mine:f'", "(RuntimeError: no GPU)")),
+        ("import sys\nsys.exit(3)\n", ("teacher:", "got 'mine:f'", "(SystemExit: 3)")),
+        ("import absent_package\n", ("teacher:", "got 'mine:f'", "'absent_package'")),
         (
             "f = 3\n",
-            r"got int behind 'mine:f', which lacks name, encode_image or encode_text; see kfgs.teachers.Teacher",
+            ("got int", "'mine:f'", "encode_image", "encode_text", "kfgs.teachers.Teacher"),
         ),
     ],
 )
 def test_a_module_that_does_not_work_is_named_in_one_line(write, text, words):
     write(text)
-    with pytest.raises(ValueError, match=words) as error:
+    with pytest.raises(ValueError, match=tells(*words)) as error:
         load_teacher("mine:f")
     assert "\n" not in str(error.value)
 
@@ -160,34 +161,34 @@ def test_a_module_that_does_not_work_is_named_in_one_line(write, text, words):
 def test_a_class_that_does_not_take_the_options_is_named(write):
     write(CLASS.replace("weights=None, factor=1.0", "factor"))
     with pytest.raises(
-        ValueError, match=r"weights, options: expected what 'mine:Scaled' takes, \(factor\), got nothing \(miss"
+        ValueError, match=tells("weights, options:", "'mine:Scaled'", "(factor)", "got nothing (missing")
     ):
         load_teacher("mine:Scaled")
-    words = r"takes, \(factor\), got weights, factor \(multiple values for argument 'factor'\); pass just those"
-    with pytest.raises(ValueError, match=words):
+    words = ("weights, options:", "'factor'", "got weights, factor")
+    with pytest.raises(ValueError, match=tells(*words)):
         load_teacher("mine:Scaled", "w.pt", factor=2)
-    with pytest.raises(ValueError, match=r"got size \("):
+    with pytest.raises(ValueError, match=tells("weights, options:", "got size (")):
         load_teacher("mine:Scaled", size=2)
 
 
 def test_what_cannot_be_imported_is_refused(own):
     for name in ("nowhere:x", ":x", ".own_teachers:thumbnail", "own_teachers:", "own_teachers:a:b"):
-        with pytest.raises(ValueError, match=f"expected package.module:name that can be imported, got '{name}'"):
+        with pytest.raises(ValueError, match=tells("teacher:", "package.module:name", f"got '{name}'")):
             load_teacher(name)
-    with pytest.raises(ValueError, match="own_teachers:absent"):
+    with pytest.raises(ValueError, match=tells("teacher:", "got 'own_teachers:absent'")):
         load_teacher("own_teachers:absent")
-    with pytest.raises(ValueError, match="which is made already, got w.pt"):
+    with pytest.raises(ValueError, match=tells("weights:", "got w.pt")):
         load_teacher("own_teachers:thumbnail", "w.pt")
 
 
 def test_an_unknown_name_is_answered_with_the_nearest():
-    with pytest.raises(ValueError, match="did you mean 'lseg'"):
+    with pytest.raises(ValueError, match=tells("teacher:", "'lseg'", "got 'LSeg2'")):
         load_teacher("LSeg2")
     assert {"lseg", "clip", "siglip", "dinov2", "sam"} <= set(teacher_names())
 
 
 def test_weights_are_asked_for():
-    with pytest.raises(ValueError, match="weights: expected a checkpoint file for teacher 'lseg', got none"):
+    with pytest.raises(ValueError, match=tells("weights:", "'lseg'", "got none")):
         load_teacher("lseg")
-    with pytest.raises(ValueError, match="a folder of save_pretrained, or a hub id for teacher 'clip'"):
+    with pytest.raises(ValueError, match=tells("weights:", "save_pretrained", "'clip'", "got none")):
         load_teacher("clip")

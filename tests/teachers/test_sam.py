@@ -3,6 +3,7 @@
 import pytest
 import torch
 from kornia.models.sam import Sam, SamConfig
+from messages import tells
 
 from kfgs.teachers import Teacher, identify
 from kfgs.teachers.sam import load_sam
@@ -77,7 +78,7 @@ def test_it_is_a_teacher_without_text(teacher, file):
     assert identify(teacher) == identify(load_sam(file))
     assert identify(teacher)["name"] == "sam"
     assert len(identify(teacher)["weights"]) == 64
-    with pytest.raises(NotImplementedError, match="teacher 'sam': expected one with a text encoder, got one that sees"):
+    with pytest.raises(NotImplementedError, match=tells("teacher 'sam':", "text encoder", "pictures")):
         teacher.encode_text(["wall"])
 
 
@@ -89,12 +90,12 @@ def test_features_come_from_the_device_of_the_encoder(file):
 
 
 def test_pictures_of_bytes_are_refused(teacher):
-    with pytest.raises(TypeError, match=r"image: expected floats in \[0, 1\], got torch.uint8"):
+    with pytest.raises(TypeError, match=tells("image:", "[0, 1]", "got torch.uint8")):
         teacher.encode_image(torch.zeros(3, 8, 8, dtype=torch.uint8))
 
 
 def test_pictures_that_are_not_finite_are_refused(teacher):
-    with pytest.raises(ValueError, match=r"image: expected finite values in \[0, 1\], got nan to nan"):
+    with pytest.raises(ValueError, match=tells("image:", "[0, 1]", "got nan")):
         teacher.encode_image(torch.full((3, 8, 8), torch.nan))
 
 
@@ -113,22 +114,20 @@ def test_mobile_sam_is_recognised(tmp_path):
 def test_other_checkpoints_are_named(sam, tmp_path):
     path = tmp_path / "other.pth"
     torch.save({"visual.proj": torch.zeros(2)}, path)
-    with pytest.raises(
-        ValueError, match="expected a checkpoint of Segment Anything.*got 1 weights, the first 'visual.p"
-    ):
+    with pytest.raises(ValueError, match=tells("other.pth:", "Segment Anything", "got 1 weights", "'visual.p")):
         load_sam(path)
     torch.save({"image_encoder.trunk.pos_embed": torch.zeros(2)}, path)
-    with pytest.raises(ValueError, match="got one without 'patch_embed.proj.weight'; use a checkpoint of SAM 1"):
+    with pytest.raises(ValueError, match=tells("other.pth:", "'patch_embed.proj.weight'")):
         load_sam(path)
     state = {**sam.state_dict(), "image_encoder.neck.0.weight": torch.zeros(256, 17, 1, 1)}
     torch.save(state, path)
     with pytest.raises(
-        ValueError, match=r"1 missing, left over.*'neck.0.weight' \(256, 17, 1, 1\) instead of \(256, 16"
+        ValueError, match=tells("other.pth:", "1 missing", "'neck.0.weight' (256, 17, 1, 1)", "(256, 16")
     ):
         load_sam(path)
     del state["image_encoder.neck.0.weight"]
     torch.save({**state, "image_encoder.more": torch.zeros(1)}, path)
-    with pytest.raises(ValueError, match="2 missing, left over.*'neck.0.weight' missing instead of"):
+    with pytest.raises(ValueError, match=tells("other.pth:", "2 missing", "'neck.0.weight' missing")):
         load_sam(path)
-    with pytest.raises(FileNotFoundError, match="got no such file"):
+    with pytest.raises(FileNotFoundError, match=tells("none.pth:", "no such file")):
         load_sam(tmp_path / "none.pth")

@@ -113,7 +113,7 @@ def test_an_attack_runs_nothing_and_imports_nothing(tmp_path: Path, attack: str,
     load_torch_file(honest)  # torch imports some modules when it reads the first file
     modules = set(sys.modules)
     if container == "pickle":
-        with pytest.raises(TorchFileError, match="not what torch.save writes|a text file"):
+        with pytest.raises(TorchFileError, match="torch.save|text"):
             load_torch_file(path)
     elif named is None:
         found = load_torch_file(path)
@@ -471,5 +471,5 @@ def test_torch_reads_the_pickle_that_was_checked(tmp_path: Path, container) -> N
     with zipfile.ZipFile(tmp_path / "a.pt") as seen:
         assert seen.read("x/data.pkl") == good
     assert torch._C.PyTorchFileReader(str(tmp_path / "a.pt")).get_record("data.pkl") == evil
-    with pytest.raises(TorchFileError, match=tells("two readers read differently")):
+    with pytest.raises(TorchFileError, match=tells("two readers")):
         load_torch_file(tmp_path / "a.pt")

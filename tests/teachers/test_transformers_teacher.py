@@ -7,6 +7,7 @@ from torch.nn.functional import normalize
 
 transformers = pytest.importorskip("transformers")
 
+from messages import tells  # noqa: E402
 from oracles_transformers import clip_features, siglip_features  # noqa: E402
 from tiny_transformers import CHANNELS, KINDS, write_teacher  # noqa: E402
 
@@ -192,30 +193,28 @@ def test_text_rows_do_not_depend_on_company_or_capitals(load, name):
 
 @pytest.mark.parametrize("name", BLIND)
 def test_teachers_without_text_say_so(load, name):
-    with pytest.raises(NotImplementedError, match=r"expected one with a text encoder, got one that sees only pictures"):
+    with pytest.raises(NotImplementedError, match=tells("text encoder", "pictures", "clip, openclip")):
         load(name).encode_text(["wall"])
 
 
 def test_a_single_text_and_a_long_one_are_refused(load):
-    with pytest.raises(TypeError, match="prompts: expected a list of texts, got the text 'wall'"):
+    with pytest.raises(TypeError, match=tells("prompts:", "'wall'")):
         load("clip").encode_text("wall")
-    with pytest.raises(ValueError, match="prompts: expected at least one text, got none"):
+    with pytest.raises(ValueError, match=tells("prompts:", "got none")):
         load("clip").encode_text([])
-    with pytest.raises(ValueError, match="prompts: expected at most 16 tokens for teacher 'clip', got 22 .*shorten it"):
+    with pytest.raises(ValueError, match=tells("prompts:", "16", "'clip'", "got 22")):
         load("clip").encode_text(["abcdefghijklmnopqrst"])
-    with pytest.raises(ValueError, match="at most 16 tokens for teacher 'tipsv2', got 21"):
+    with pytest.raises(ValueError, match=tells("prompts:", "16", "'tipsv2'", "got 21")):
         load("tipsv2").encode_text(["a", "abcdefghijklmnopqrst"])
 
 
 def test_pictures_of_bytes_other_shapes_or_values_are_refused(load):
     teacher = load("dinov2")
-    with pytest.raises(
-        ValueError, match=r"image: expected finite values in \[0, 1\], got 0 to 255; divide bytes by 255"
-    ):
+    with pytest.raises(ValueError, match=tells("image:", "[0, 1]", "got 0 to 255")):
         teacher.encode_image(torch.tensor([0.0, 255.0, 1.0]).expand(3, 8, 3))
-    with pytest.raises(TypeError, match=r"image: expected floats in \[0, 1\], got torch.uint8; divide bytes by 255"):
+    with pytest.raises(TypeError, match=tells("image:", "[0, 1]", "got torch.uint8", "255")):
         teacher.encode_image(torch.zeros(3, 8, 8, dtype=torch.uint8))
-    with pytest.raises(ValueError, match=r"image: expected \[3, H, W\], got \(8, 8, 3\)"):
+    with pytest.raises(ValueError, match=tells("image:", "[3, H, W]", "got (8, 8, 3)")):
         teacher.encode_image(torch.zeros(8, 8, 3))
 
 
@@ -258,11 +257,9 @@ def test_hook_is_taken_away_again(load):
 
 
 def test_options_that_do_not_suit_are_refused(load, folders):
-    with pytest.raises(
-        ValueError, match="residual: expected False for teacher 'siglip', got True; only clip, openclip"
-    ):
+    with pytest.raises(ValueError, match=tells("residual:", "'siglip'", "got True", "clip, openclip")):
         load("siglip", residual=True)
-    with pytest.raises(ValueError, match="size: expected a whole number, got 1.5"):
+    with pytest.raises(ValueError, match=tells("size:", "got 1.5")):
         load("clip", size=1.5)
-    with pytest.raises(ValueError, match="kind: expected one of 'clip'.*got 'clap'"):
+    with pytest.raises(ValueError, match=tells("kind:", "'clip'", "got 'clap'")):
         load_transformers_teacher("clap", folders["clip"])

@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from messages import tells
 from skimage.io import imread
 
 from kfgs.cameras.camera import Camera
@@ -180,11 +181,11 @@ def test_an_existing_room_is_reused_or_refused(tmp_path):
     before = (path / "text.npy").stat().st_mtime_ns
     assert make_toy_room(path, TINY) == path
     assert (path / "text.npy").stat().st_mtime_ns == before
-    with pytest.raises(FileExistsError, match="expected no folder, an empty one or a toy room made with .*'seed': 1"):
+    with pytest.raises(FileExistsError, match=tells("room:", "toy room", "'seed': 1")):
         make_toy_room(path, replace(TINY, seed=1))
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("irreplaceable")
-    with pytest.raises(FileExistsError, match="got other files; choose another path or delete it"):
+    with pytest.raises(FileExistsError, match=tells("mine:", "toy room", "other files")):
         make_toy_room(tmp_path / "mine", TINY)
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "irreplaceable"
 
@@ -202,20 +203,20 @@ def test_a_failed_run_leaves_nothing(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"train_views": 1}, r"train_views: expected a number in \[2"),
-        ({"test_views": 0}, r"test_views: expected a number in \[1"),
-        ({"test_views": 5}, "test_views: expected at most train_views = 4"),
-        ({"size": (72,)}, r"size: expected \(height, width\)"),
-        ({"size": (72, 4)}, r"size \(width\): expected a number in \[8"),
-        ({"size": (72.0, 96)}, r"size \(height\): expected a whole number, got 72.0"),
-        ({"feature_size": (80, 24)}, r"feature_size: expected at most size = \(72, 96\)"),
-        ({"feature_dim": 8}, r"feature_dim: expected a number in \[16"),
-        ({"sparse_points": 1501}, "sparse_points: expected at most surface_points = 1500"),
-        ({"seed": -1}, r"seed: expected a number in \[0"),
+        ({"train_views": 1}, ("train_views:", "got 1")),
+        ({"test_views": 0}, ("test_views:", "got 0")),
+        ({"test_views": 5}, ("test_views:", "train_views", "got 5")),
+        ({"size": (72,)}, ("size:", "(height, width)", "got (72,)")),
+        ({"size": (72, 4)}, ("size (width):", "got 4")),
+        ({"size": (72.0, 96)}, ("size (height):", "got 72.0")),
+        ({"feature_size": (80, 24)}, ("feature_size:", "(72, 96)", "got (80, 24)")),
+        ({"feature_dim": 8}, ("feature_dim:", "16", "got 8")),
+        ({"sparse_points": 1501}, ("sparse_points:", "surface_points", "1500", "got 1501")),
+        ({"seed": -1}, ("seed:", "got -1")),
     ],
 )
 def test_a_bad_configuration_is_refused(change, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         replace(SMALL, **change)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from cases_viz import some_camera, some_gaussians, some_plotter
+from messages import tells
 
 from kfgs.splat.rasterize import rasterize
 from kfgs.viz import FeatureColors, add_cloud, look_through, palette
@@ -102,7 +103,7 @@ def test_new_colours_travel_with_their_gaussians():
         plotter.screenshot(return_img=True)
         cloud = actor.mapper.dataset
         np.testing.assert_array_equal(cloud["rgb"], colors[cloud["index"]])
-        with pytest.raises(ValueError, match=r"colors: expected uint8 \[60, 3\] \(from actor\), got uint8 \(59, 3\)"):
+        with pytest.raises(ValueError, match=tells("colors:", "[60, 3]", "got uint8", "(59, 3)")):
             recolor_cloud(actor, colors[1:])
 
 

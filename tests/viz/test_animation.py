@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from PIL import Image
 
 from kfgs.cameras import Camera
@@ -130,29 +131,29 @@ def test_video_without_ffmpeg_says_what_to_install_before_anything_is_drawn(tmp_
     def never(camera):
         raise AssertionError
 
-    with pytest.raises(ImportError, match="pip install imageio-ffmpeg"):
+    with pytest.raises(ImportError, match=tells("path:", ".mp4", "pip install imageio-ffmpeg")):
         save_animation(tmp_path / "a.mp4", never, cameras())
 
 
 @pytest.mark.parametrize(
     ("name", "frames", "fps", "message"),
     [
-        ("a.avi", [np.zeros((2, 2, 3))], 10, r"path: expected a name that ends in \.gif or \.mp4, got 'a\.avi'"),
-        ("a.gif", [], 10, "frames: expected at least one picture"),
-        ("a.gif", [np.zeros((2, 2))], 10, r"frames\[0\]: expected \[H, W, 3\], got \(2, 2\)"),
-        ("a.gif", [np.zeros((2, 2, 3)), np.zeros((2, 4, 3))], 10, r"frames\[1\]: expected \[2, 2, 3\]"),
-        ("a.gif", [np.zeros((2, 2, 3))], 60, r"fps: expected a number in \(0, 50\]"),
-        ("a.gif", [np.zeros((2, 2, 3))], 0, "fps: expected a number"),
+        ("a.avi", [np.zeros((2, 2, 3))], 10, ("path:", ".gif", ".mp4", "got 'a.avi'")),
+        ("a.gif", [], 10, ("frames:", "got none")),
+        ("a.gif", [np.zeros((2, 2))], 10, ("frames[0]:", "[H, W, 3]", "got (2, 2)")),
+        ("a.gif", [np.zeros((2, 2, 3)), np.zeros((2, 4, 3))], 10, ("frames[1]:", "[2, 2, 3]", "got (2, 4, 3)")),
+        ("a.gif", [np.zeros((2, 2, 3))], 60, ("fps:", "(0, 50]", "got 60")),
+        ("a.gif", [np.zeros((2, 2, 3))], 0, ("fps:", "got 0")),
     ],
 )
 def test_what_makes_no_film_is_refused(tmp_path, name, frames, fps, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         save_frames(tmp_path / name, frames, fps=fps)
     assert not list(tmp_path.iterdir())
 
 
 def test_cameras_must_be_some_and_of_one_size(tmp_path):
-    with pytest.raises(ValueError, match="cameras: expected at least one camera"):
+    with pytest.raises(ValueError, match=tells("cameras:", "got none")):
         save_animation(tmp_path / "a.gif", shade, [])
-    with pytest.raises(ValueError, match=r"cameras: expected one size .*\[\(4, 4\), \(8, 12\)\]"):
+    with pytest.raises(ValueError, match=tells("cameras:", "(4, 4)", "(8, 12)")):
         save_animation(tmp_path / "a.gif", shade, [*cameras(1), *cameras(1, 4, 4)])

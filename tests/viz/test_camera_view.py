@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 from cases_viz import some_camera, some_plotter
+from messages import tells
 
 from kfgs.viz import look_through, make_plotter
 from kfgs.viz.camera_view import camera_of
@@ -46,5 +47,5 @@ def test_camera_of_projects_as_vtk_does_whatever_turned_the_view():
 def test_parallel_rays_are_of_no_pinhole_camera():
     with some_plotter() as plotter:
         plotter.enable_parallel_projection()
-        with pytest.raises(ValueError, match="plotter: expected a perspective view, got a parallel projection"):
+        with pytest.raises(ValueError, match=tells("plotter:", "perspective")):
             camera_of(plotter)

@@ -56,15 +56,15 @@ def test_colours_by_rgb_opacity_and_feature(plotter):
 def test_what_is_missing_is_named(plotter):
     gaussians = some_gaussians()
     for field, color_by in (("labels", "label"), ("sh", "rgb"), ("features", "feature")):
-        with pytest.raises(ValueError, match=rf"gaussians\.{field}: expected .*got None"):
+        with pytest.raises(ValueError, match=tells(f"gaussians.{field}:", "got None")):
             add_cloud(plotter, gaussians.replace(**{field: None}), color_by=color_by)
-    with pytest.raises(ValueError, match="feature_colors: expected it"):
+    with pytest.raises(ValueError, match=tells("feature_colors:", "got None")):
         add_cloud(plotter, gaussians, color_by="feature")
-    with pytest.raises(ValueError, match="expected at least one Gaussian to draw"):
+    with pytest.raises(ValueError, match=tells("gaussians:", "got none")):
         add_cloud(plotter, gaussians.select(torch.zeros(60, dtype=torch.bool)))
-    with pytest.raises(ValueError, match="style: expected one of 'points', 'gaussians'"):
+    with pytest.raises(ValueError, match=tells("style:", "'points', 'gaussians'", "got 'spheres'")):
         add_cloud(plotter, gaussians, style="spheres")
-    with pytest.raises(ValueError, match="color_by: expected one of"):
+    with pytest.raises(ValueError, match=tells("color_by:", "got 'colour'")):
         add_cloud(plotter, gaussians, color_by="colour")
 
 
@@ -102,18 +102,18 @@ def test_range_of_scores_leaves_the_outermost_out(plotter):
 
 def test_wrong_values_to_colour_by_are_named(plotter):
     gaussians = some_gaussians()
-    with pytest.raises(ValueError, match=r"color_by: expected \[N\] with N = 60"):
+    with pytest.raises(ValueError, match=tells("color_by:", "[N]", "N = 60", "got (59,)")):
         add_cloud(plotter, gaussians, color_by=torch.zeros(59))
-    with pytest.raises(TypeError, match="color_by: expected labels .* or scores .*got bool"):
+    with pytest.raises(TypeError, match=tells("color_by:", "got bool")):
         add_cloud(plotter, gaussians, color_by=torch.zeros(60, dtype=torch.bool))
-    with pytest.raises(ValueError, match=r"clim\[1\]: expected a number in \(1, inf"):
+    with pytest.raises(ValueError, match=tells("clim[1]:", "got 1.0")):
         add_cloud(plotter, gaussians, color_by=torch.zeros(60), clim=(1.0, 1.0))
-    with pytest.raises(ValueError, match="color_by: expected 'rgb' for style 'points', got 'view'"):
+    with pytest.raises(ValueError, match=tells("color_by:", "'rgb'", "'points'", "got 'view'")):
         add_cloud(plotter, gaussians, color_by="view")
     for name, value in (("opacity", 0), ("faint", 1), ("deviations", 0), ("point_size", -1)):
-        with pytest.raises(ValueError, match=f"{name}: expected a number in"):
+        with pytest.raises(ValueError, match=tells(f"{name}:", f"got {value}")):
             CloudOptions(**{name: value})
-    with pytest.raises(ValueError, match="moving: expected one of"):
+    with pytest.raises(ValueError, match=tells("moving:", "got 'never'")):
         CloudOptions(moving="never")
 
 
@@ -137,10 +137,10 @@ def test_ellipsoids_are_the_gaussians_surfaces(plotter):
 
 
 def test_too_many_or_too_faint_ellipsoids_are_refused(plotter, monkeypatch):
-    with pytest.raises(ValueError, match="expected at least one of opacity above 0.95, got none; lower options.faint"):
+    with pytest.raises(ValueError, match=tells("gaussians:", "0.95", "got none", "options.faint")):
         add_cloud(plotter, some_gaussians(), style="ellipsoids", options=CloudOptions(faint=0.95))
     monkeypatch.setattr("kfgs.viz.points_and_ellipsoids.MOST", 10)
-    with pytest.raises(ValueError, match="gaussians: expected at most 10 to draw as ellipsoids, got"):
+    with pytest.raises(ValueError, match=tells("gaussians:", "10", "got 29")):
         add_cloud(plotter, some_gaussians(), style="ellipsoids")
 
 
@@ -178,7 +178,7 @@ def test_look_through_puts_points_on_their_pixels(plotter):
 def test_look_through_refuses_a_distorting_lens(plotter):
     camera = some_camera()
     bent = Camera(camera.viewmat, camera.K, 160, 120, distortion=Distortion("brown_conrady", (0.1, 0, 0, 0)))
-    with pytest.raises(ValueError, match="camera: expected a pinhole camera"):
+    with pytest.raises(ValueError, match=tells("camera:", "pinhole", "'brown_conrady'")):
         look_through(plotter, bent)
 
 
@@ -211,9 +211,9 @@ def test_opacities_are_exchanged_with_the_colours():
         assert not np.array_equal(cloud["index"], np.arange(60))
         np.testing.assert_array_equal(cloud["rgb"], colors[cloud["index"]])
         np.testing.assert_array_equal(cloud["opacity"], opacities.astype(np.float32)[cloud["index"]])
-        with pytest.raises(ValueError, match=r"opacities: expected numbers in \[0, 1\], got 0 to 2"):
+        with pytest.raises(ValueError, match=tells("opacities:", "[0, 1]", "got 0 to 2")):
             recolor_cloud(actor, colors, 2 * opacities)
-        with pytest.raises(ValueError, match=r"opacities: expected \[N\] with N = 60"):
+        with pytest.raises(ValueError, match=tells("opacities:", "[N]", "N = 60", "got (59,)")):
             recolor_cloud(actor, colors, opacities[1:])
 
 

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from messages import tells
 
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
@@ -60,15 +61,15 @@ def test_without_labels_a_cloud_is_shown_in_rgb_and_a_camera_of_any_precision_wi
 
 def test_what_is_missing_is_named():
     for field, color_by in (("labels", "label"), ("sh", "rgb"), ("features", "feature")):
-        with pytest.raises(ValueError, match=rf"gaussians\.{field}: expected .*got None"):
+        with pytest.raises(ValueError, match=tells(f"gaussians.{field}:", "got None")):
             show_cloud(wall().replace(**{field: None}), color_by=color_by)
-    with pytest.raises(ValueError, match="feature_colors: expected it"):
+    with pytest.raises(ValueError, match=tells("feature_colors:", "got None")):
         show_cloud(wall(), color_by="feature")
-    with pytest.raises(ValueError, match="color_by: expected one of 'label', 'rgb', 'feature'"):
+    with pytest.raises(ValueError, match=tells("color_by:", "'label', 'rgb', 'feature'", "got 'score'")):
         show_cloud(wall(), color_by="score")
-    with pytest.raises(ValueError, match="background: expected a colour"):
+    with pytest.raises(ValueError, match=tells("background:", "got 'paper'")):
         show_cloud(wall(), background="paper")
-    with pytest.raises(ValueError, match="expected at least one Gaussian to draw"):
+    with pytest.raises(ValueError, match=tells("gaussians:", "got none")):
         show_cloud(wall().select(torch.zeros(1, dtype=torch.bool)))
 
 
@@ -85,14 +86,14 @@ def test_pictures_lie_side_by_side_over_the_legend():
 
 
 def test_a_picture_of_another_size_is_refused():
-    with pytest.raises(ValueError, match=r"shows\['x'\]: expected pictures \[12, 20, 3\]"):
+    with pytest.raises(ValueError, match=tells("shows['x']:", "[12, 20, 3]", "got (5, 5, 3)")):
         draw_frame(as_shows({"x": lambda camera: np.zeros((5, 5, 3))}), some_camera())
 
 
 def test_what_cannot_be_shown_is_refused():
-    with pytest.raises(TypeError, match=r"shows\['a'\]: expected Gaussians or a function of a camera, got str"):
+    with pytest.raises(TypeError, match=tells("shows['a']:", "got str")):
         as_shows({"a": "cloud.ply"})
-    with pytest.raises(ValueError, match="shows: expected at least one thing"):
+    with pytest.raises(ValueError, match=tells("shows:", "got none")):
         as_shows({})
 
 
@@ -102,5 +103,5 @@ def test_the_legend_lists_every_class_of_the_clouds():
     assert strip.shape[1] == 200
     for label, there in ((3, True), (5, True), (1, False)):
         assert ((strip == palette(np.array(label))).all(-1).sum() > 20) == there
-    with pytest.raises(ValueError, match="names: expected labelled Gaussians"):
+    with pytest.raises(ValueError, match=tells("names:", "got none")):
         legend_under(wall().replace(labels=None), names, 200)

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from PIL import Image
 
 from kfgs.cameras import Camera, Orbit
@@ -41,7 +42,7 @@ def test_a_turntable_is_written_and_turns(tmp_path):
 
 
 def test_functions_alone_have_nothing_to_go_round(tmp_path):
-    with pytest.raises(ValueError, match="shows: expected Gaussians to go round"):
+    with pytest.raises(ValueError, match=tells("shows:", "Gaussians", "orbit_cameras(points)")):
         save_turntable(tmp_path / "a.gif", {"mine": lambda camera: np.zeros((*camera.size, 3))})
 
 

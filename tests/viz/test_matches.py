@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 from cases_viz import data, some_gaussians, some_plotter
+from messages import tells
 from oracles_palette import worst_distance
 
 from kfgs.labels import transfer_labels
@@ -35,11 +36,11 @@ def test_transfer_lines_join_destination_and_source(plotter):
 def test_wrong_transfers_are_named(plotter):
     src, dst = some_gaussians(80, 1), some_gaussians(50, 2)
     transfer = transfer_labels(src.means, src.labels, dst.means, 0.3)
-    with pytest.raises(ValueError, match=r"transfer.labels: expected \[N\] with N = 80"):
+    with pytest.raises(ValueError, match=tells("transfer.labels:", "[N]", "N = 80", "got (50,)")):
         add_transfer(plotter, src, src, transfer)
-    with pytest.raises(ValueError, match="transfer: expected sources below 2"):
+    with pytest.raises(ValueError, match=tells("transfer:", "got 75")):
         add_transfer(plotter, src.select(torch.arange(2)), dst, transfer)
-    with pytest.raises(ValueError, match="got none within 1e-09; raise the distance"):
+    with pytest.raises(ValueError, match=tells("transfer:", "got none", "1e-09", "distance")):
         add_transfer(plotter, src, dst, transfer_labels(src.means, src.labels, dst.means, 1e-9))
 
 

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from messages import tells
 from PIL import Image
 
 from kfgs.viz import palette, reports
@@ -87,18 +88,18 @@ def test_growth_has_a_curve_per_scene(tmp_path):
 
 def test_wrong_input_is_named(tmp_path):
     path = tmp_path / "a.png"
-    with pytest.raises(ValueError, match=r"embeddings: expected \[C, D\] with D = 3 \(from codewords\)"):
+    with pytest.raises(ValueError, match=tells("embeddings:", "[C, D]", "D = 3", "got (3, 2)")):
         plot_codebook_report(BOOK, NAMES, WORDS[:, :2], path)
-    with pytest.raises(ValueError, match=r"names: expected 3 class names \(from embeddings\), got 1"):
+    with pytest.raises(ValueError, match=tells("names:", "expected 3", "got 1")):
         plot_codebook_report(BOOK, ["wall"], WORDS, path)
-    with pytest.raises(ValueError, match=r"usage: expected \[K\] with K = 6"):
+    with pytest.raises(ValueError, match=tells("usage:", "[K]", "K = 6", "got (2,)")):
         plot_codebook_report(BOOK, NAMES, WORDS, path, usage=USAGE[:2])
-    with pytest.raises(ValueError, match="words: expected a number"):
+    with pytest.raises(ValueError, match=tells("words:", "got 0")):
         codebook_rows(BOOK, WORDS, words=0)
-    with pytest.raises(ValueError, match="histories: expected at least one scene"):
+    with pytest.raises(ValueError, match=tells("histories:", "got none")):
         plot_codebook_growth({}, path)
-    with pytest.raises(ValueError, match=r"histories\['a'\]: expected rows with epoch and size"):
+    with pytest.raises(ValueError, match=tells("histories['a']:", "epoch", "size")):
         plot_codebook_growth({"a": [{"loss": 1.0}]}, path)
-    with pytest.raises(ValueError, match="history: expected rows with epoch and size"):
+    with pytest.raises(ValueError, match=tells("history:", "epoch", "size")):
         plot_codebook_report(BOOK, NAMES, WORDS, path, history=[{"loss": 1.0}])
     assert list(tmp_path.iterdir()) == []

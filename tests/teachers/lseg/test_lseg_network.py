@@ -4,6 +4,7 @@ import oracles_lseg
 import pytest
 import torch
 from lseg_layout import random_state
+from messages import tells
 from torch import nn
 from torch.nn import functional
 
@@ -117,7 +118,7 @@ def test_a_planted_mistake_is_noticed(case, mistake, monkeypatch):
 
 def test_a_window_of_another_size_is_refused(case):
     network = network_from_state(case[0], TINY, source="tiny")
-    with pytest.raises(ValueError, match=r"x: expected \[B, 3, 64, 64\], got \(1, 3, 64, 80\)"):
+    with pytest.raises(ValueError, match=tells("x:", "[B, 3, 64, 64]", "got (1, 3, 64, 80)")):
         network(torch.zeros(1, 3, 64, 80))
 
 
@@ -129,18 +130,18 @@ def test_the_defaults_are_those_of_the_released_checkpoint():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"patch": 14}, "patch: expected 16, got 14"),
-        ({"window": 72}, "window: expected a multiple of 32 pixels, got 72"),
-        ({"hooks": (0, 1, 2)}, "hooks: expected four rising block numbers below depth = 5"),
-        ({"hooks": (0, 1, 2, 5)}, "hooks: expected four rising block numbers below depth = 5"),
-        ({"neck": (8, 8)}, "neck: expected four channel counts"),
-        ({"heads": 5}, "heads: expected a divisor of width = 32, got 5"),
-        ({"text_heads": 3}, "text_heads: expected a divisor of text_width = 16, got 3"),
-        ({"depth": 0}, r"depth: expected a number in \[1, inf\), got 0"),
+        ({"patch": 14}, ("patch:", "expected 16", "got 14")),
+        ({"window": 72}, ("window:", "32", "got 72")),
+        ({"hooks": (0, 1, 2)}, ("hooks:", "got (0, 1, 2)")),
+        ({"hooks": (0, 1, 2, 5)}, ("hooks:", "got (0, 1, 2, 5)")),
+        ({"neck": (8, 8)}, ("neck:", "got (8, 8)")),
+        ({"heads": 5}, ("heads:", "32", "got 5")),
+        ({"text_heads": 3}, ("text_heads:", "text_width", "16", "got 3")),
+        ({"depth": 0}, ("depth:", "[1, inf)", "got 0")),
     ],
 )
 def test_sizes_that_contradict_are_refused(change, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=tells(*message)):
         LSegConfig(**{**SIZES, **change})
 
 

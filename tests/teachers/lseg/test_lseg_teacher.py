@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from lseg_layout import random_state
+from messages import tells
 from torch import Tensor
 from torch.nn import functional
 
@@ -230,77 +231,77 @@ def test_load_lseg_combines_fast_with_single_settings(tmp_path: Path) -> None:
         scales=LSegOptions.fast().scales, flip=True, size=None
     )
     assert load_lseg(path, config=TINY, options=LSegOptions.paper()).options == LSegOptions.paper()
-    with pytest.raises(ValueError, match="options: expected either options or size, scales, flip, fast, got both; use"):
+    with pytest.raises(
+        ValueError, match=tells("options:", "size, scales, flip, fast", "got both", "dataclasses.replace")
+    ):
         load_lseg(path, config=TINY, options=LSegOptions(), fast=True)
 
 
 def test_file_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"demo_e200\.ckpt"):
+    with pytest.raises(FileNotFoundError, match=tells("demo_e200.ckpt:")):
         load_lseg(tmp_path / "demo_e200.ckpt")
 
 
 @pytest.mark.parametrize(
     ("image", "error", "message"),
     [
-        ([[0.0]], TypeError, r"image: expected a tensor \[3, H, W\], got list; use torch.as_tensor"),
-        (torch.zeros(8, 9, 3), ValueError, r"image: expected \[3, H, W\], got \(8, 9, 3\)"),
-        (torch.zeros(1, 3, 8, 9), ValueError, r"image: expected \[3, H, W\], got \(1, 3, 8, 9\)"),
-        (torch.zeros(3, 8, 9, dtype=torch.uint8), TypeError, "floats in .0, 1., got torch.uint8; divide bytes by 255"),
-        (torch.zeros(3, 0, 9), ValueError, r"image: expected at least one pixel, got \(3, 0, 9\); leave empty"),
-        (torch.full((3, 8, 9), 255.0), ValueError, r"finite values in \[0, 1\], got 255 to 255; divide bytes by 255"),
-        (torch.full((3, 8, 9), -0.5), ValueError, r"finite values in \[0, 1\], got -0.5 to -0.5"),
-        (torch.full((3, 8, 9), torch.nan), ValueError, r"finite values in \[0, 1\], got nan to nan"),
-        (torch.tensor([0.0, torch.nan] * 3).reshape(3, 1, 2), ValueError, r"finite values in \[0, 1\], got nan"),
-        (torch.full((3, 8, 9), torch.inf), ValueError, r"finite values in \[0, 1\], got inf to inf"),
+        ([[0.0]], TypeError, ("image:", "[3, H, W]", "got list", "torch.as_tensor")),
+        (torch.zeros(8, 9, 3), ValueError, ("image:", "[3, H, W]", "got (8, 9, 3)")),
+        (torch.zeros(1, 3, 8, 9), ValueError, ("image:", "[3, H, W]", "got (1, 3, 8, 9)")),
+        (torch.zeros(3, 8, 9, dtype=torch.uint8), TypeError, ("image:", "[0, 1]", "got torch.uint8", "255")),
+        (torch.zeros(3, 0, 9), ValueError, ("image:", "got (3, 0, 9)")),
+        (torch.full((3, 8, 9), 255.0), ValueError, ("image:", "[0, 1]", "got 255 to 255")),
+        (torch.full((3, 8, 9), -0.5), ValueError, ("image:", "[0, 1]", "got -0.5 to -0.5")),
+        (torch.full((3, 8, 9), torch.nan), ValueError, ("image:", "[0, 1]", "got nan to nan")),
+        (torch.tensor([0.0, torch.nan] * 3).reshape(3, 1, 2), ValueError, ("image:", "[0, 1]", "got nan")),
+        (torch.full((3, 8, 9), torch.inf), ValueError, ("image:", "[0, 1]", "got inf to inf")),
     ],
 )
 def test_pictures_that_are_refused(image, error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=message):
+    with pytest.raises(error, match=tells(*message)):
         tiny().encode_image(image)
 
 
 @pytest.mark.parametrize(
     ("prompts", "error", "message"),
     [
-        ([], ValueError, "prompts: expected at least one text, got none; name what to look for"),
-        ("wall", TypeError, "prompts: expected a list of texts, got the text 'wall'; put it into a list"),
-        (["wall", 3], TypeError, "prompts: expected texts, got int 3; use str"),
+        ([], ValueError, ("prompts:", "got none")),
+        ("wall", TypeError, ("prompts:", "'wall'")),
+        (["wall", 3], TypeError, ("prompts:", "got int")),
     ],
 )
 def test_prompts_that_are_refused(prompts, error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=message):
+    with pytest.raises(error, match=tells(*message)):
         with_text().encode_text(prompts)
 
 
 def test_without_text_prompts_are_refused() -> None:
-    with pytest.raises(
-        NotImplementedError, match="teacher 'lseg': expected one with a text tower, got one made without"
-    ):
+    with pytest.raises(NotImplementedError, match=tells("teacher 'lseg':", "text tower", "load_lseg")):
         tiny().encode_text(["wall"])
 
 
 @pytest.mark.parametrize(
     ("values", "error", "message"),
     [
-        ({"scales": ()}, ValueError, r"scales: expected at least one scale, got none; pass \(1.0,\)"),
-        ({"scales": (1.0, 0.0)}, ValueError, r"scales: expected a number in \(0, 16\], got 0.0"),
-        ({"scales": (float("nan"),)}, ValueError, r"scales: expected a number in \(0, 16\], got nan"),
-        ({"scales": (520.0,)}, ValueError, r"scales: expected a number in \(0, 16\], got 520.0"),
-        ({"scales": "1"}, TypeError, "scales: expected numbers, got '1'; pass"),
-        ({"scales": 1.0}, TypeError, r"scales: expected numbers, got 1.0; pass \(1.0,\) for one scale"),
+        ({"scales": ()}, ValueError, ("scales:", "got none", "(1.0,)")),
+        ({"scales": (1.0, 0.0)}, ValueError, ("scales:", "(0, 16]", "got 0.0")),
+        ({"scales": (float("nan"),)}, ValueError, ("scales:", "(0, 16]", "got nan")),
+        ({"scales": (520.0,)}, ValueError, ("scales:", "(0, 16]", "got 520.0")),
+        ({"scales": "1"}, TypeError, ("scales:", "got '1'", "(1.0,)")),
+        ({"scales": 1.0}, TypeError, ("scales:", "got 1.0", "(1.0,)")),
         (
             {"size": "full"},
             ValueError,
-            r"size: expected 'auto', \(height, width\) or None, got 'full'; pass \(360, 480\)",
+            ("size:", "'auto'", "(height, width)", "got 'full'", "(360, 480)"),
         ),
-        ({"size": 480}, ValueError, r"size: expected 'auto', \(height, width\) or None, got 480"),
-        ({"size": (480,)}, ValueError, r"size: expected 'auto', \(height, width\) or None, got \(480,\)"),
-        ({"size": (0, 480)}, ValueError, r"size: expected a number in \[1, inf\), got 0"),
-        ({"size": (3.5, 480)}, ValueError, "size: expected a whole number, got 3.5; pass an int"),
-        ({"precision": "half"}, ValueError, "precision: expected one of 'float32', 'bfloat16', got 'half'"),
-        ({"flip": "no"}, ValueError, "flip: expected one of False, True, got 'no'"),
+        ({"size": 480}, ValueError, ("size:", "'auto'", "(height, width)", "got 480")),
+        ({"size": (480,)}, ValueError, ("size:", "'auto'", "(height, width)", "got (480,)")),
+        ({"size": (0, 480)}, ValueError, ("size:", "[1, inf)", "got 0")),
+        ({"size": (3.5, 480)}, ValueError, ("size:", "got 3.5")),
+        ({"precision": "half"}, ValueError, ("precision:", "'float32', 'bfloat16'", "got 'half'")),
+        ({"flip": "no"}, ValueError, ("flip:", "False, True", "got 'no'")),
     ],
 )
 def test_options_that_are_refused(values, error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=message):
+    with pytest.raises(error, match=tells(*message)):
         LSegOptions(**values)

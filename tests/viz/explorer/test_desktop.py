@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from cases_desktop import CLOUDS, HEIGHT, changed, clouds, press, shot
 from cases_explorer import splat_file
+from messages import tells
 
 from kfgs.viz import available, headless
 from kfgs.viz.explorer import ExploreOptions, Explorer
@@ -107,12 +108,10 @@ def test_after_the_window_the_explorer_draws_off_screen_without_a_panel(desktop)
 
 def test_a_window_needs_a_display(desktop, monkeypatch):
     monkeypatch.setattr("kfgs.viz.explorer.desktop.has_display", lambda: False)
-    with pytest.raises(RuntimeError, match=r"explorer: expected a display to open a window on, got none .*; use serve"):
+    with pytest.raises(RuntimeError, match=tells("explorer:", "got none", "serve(explorer)")):
         open_window(desktop.explorer)
     monkeypatch.setattr("kfgs.viz.explorer.desktop.has_display", lambda: True)
-    with pytest.raises(
-        RuntimeError, match=r"expected one that draws into a window, got one that draws off-screen; make"
-    ):
+    with pytest.raises(RuntimeError, match=tells("explorer:", "window", "off_screen=False")):
         open_window(desktop.explorer)
 
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 from cases_explorer import LINE, MODES, cameras, cloud, field, grid, grid_clouds, line, splat_file
 from cases_explorer import classes as some_classes
+from messages import tells
 
 from kfgs.cameras import Distortion
 from kfgs.labels import transfer_labels
@@ -97,7 +98,7 @@ def test_a_question_comes_and_goes():
     assert not made.selected("color").any()
     assert made.gamma_range == (0.0, 1.0)
     made.ask("chair")
-    with pytest.raises(ValueError, match="did you mean 'chair'"):
+    with pytest.raises(ValueError, match=tells("class:", "'chair'", "got 'chiar'")):
         made.ask("chiar")
     assert made.asked.words == "chair"  # that of before stays
     assert made.ask("") is None
@@ -135,42 +136,38 @@ def test_hidden_classes_are_not_drawn():
 
 def test_numbers_out_of_range():
     made = line()
-    with pytest.raises(ValueError, match=r"gamma: expected a question that it applies to, got none \(gamma 0.5\); ask"):
+    with pytest.raises(ValueError, match=tells("gamma:", "got none", "0.5")):
         made.set_gamma(0.5)
     made.ask("chair")
     for gamma in (-0.1, 1.1, float("nan")):
-        with pytest.raises(ValueError, match=r"gamma: expected a number in \[.*\], got"):
+        with pytest.raises(ValueError, match=tells("gamma:", f"got {gamma}")):
             made.set_gamma(gamma)
     assert made.gamma == 0.0
     for distance in (0.0, -1.0, float("inf"), float("nan")):
-        with pytest.raises(ValueError, match=r"distance: expected a number in \(0, inf\), got"):
+        with pytest.raises(ValueError, match=tells("distance:", "(0, inf)", f"got {distance}")):
             made.set_distance(distance)
-    with pytest.raises(ValueError, match=r"labels: expected a number in \[-1, 3\], got 4"):
+    with pytest.raises(ValueError, match=tells("labels:", "[-1, 3]", "got 4")):
         made.set_hidden([1, 4])
     assert (made.distance, made.hidden) == (1.0, frozenset())
-    with pytest.raises(ValueError, match=r"index: expected a number in \[0, 4\], got 5"):
+    with pytest.raises(ValueError, match=tells("index:", "[0, 4]", "got 5")):
         made.pick("color", 5)
 
 
 def test_clouds_that_cannot_be_explored():
-    with pytest.raises(ValueError, match="color: expected at least one Gaussian, got none; choose another file"):
+    with pytest.raises(ValueError, match=tells("color:", "got none")):
         Exploration(SplatMeaning(splat_file(cloud(LINE, [0] * 4))), cloud(torch.zeros(0, 3)))
     bent = replace(cameras()[0], distortion=Distortion("kannala_brandt", (0.1, 0, 0, 0)))
-    with pytest.raises(
-        ValueError, match=r"cameras: expected views without distortion, got kannala_brandt \('view_0'\)"
-    ):
+    with pytest.raises(ValueError, match=tells("cameras:", "got kannala_brandt", "('view_0')")):
         line(cameras=[bent])
     hole = cloud(LINE).replace(means=torch.full((4, 3), torch.nan))
-    with pytest.raises(ValueError, match="color.means: expected finite numbers, got NaN or infinity in row 0"):
+    with pytest.raises(ValueError, match=tells("color.means:", "got NaN", "row 0")):
         Exploration(SplatMeaning(splat_file(cloud(LINE, [0] * 4))), hole)
     labelled = hole.replace(labels=torch.zeros(4, dtype=torch.int64))
-    with pytest.raises(ValueError, match="meaning.gaussians.means: expected finite numbers, got NaN or infinity in"):
+    with pytest.raises(ValueError, match=tells("meaning.gaussians.means:", "got NaN")):
         Exploration(SplatMeaning(splat_file(labelled)))
     unlabelled = SplatMeaning(splat_file(cloud(LINE, [0] * 4)))
     unlabelled.gaussians = cloud(LINE)
-    with pytest.raises(
-        ValueError, match=r"meaning.gaussians.labels: expected labels \[N\], got None; use FieldMeaning"
-    ):
+    with pytest.raises(ValueError, match=tells("meaning.gaussians.labels:", "[N]", "got None", "FieldMeaning")):
         Exploration(unlabelled)
 
 
@@ -203,9 +200,7 @@ def test_what_is_no_number_is_refused(value):
     made = line()
     made.ask("chair")
     for name, verb in (("gamma", made.set_gamma), ("distance", made.set_distance)):
-        with pytest.raises(
-            TypeError, match=rf"{name}: expected a number, got .* \({type(value).__name__}\); pass a float"
-        ):
+        with pytest.raises(TypeError, match=tells(f"{name}:", "number", f"({type(value).__name__})")):
             verb(value)
     made.set_gamma(np.float32(0.5))
     assert made.gamma == 0.5
@@ -214,7 +209,7 @@ def test_what_is_no_number_is_refused(value):
 @pytest.mark.parametrize("words", [5, b"chair", ["chair"]], ids=str)
 def test_what_is_no_text_is_refused(words):
     made = line()
-    with pytest.raises(TypeError, match=r"words: expected text, got .* \((int|bytes|list)\); ask for one"):
+    with pytest.raises(TypeError, match=tells("words:", "text", f"({type(words).__name__})")):
         made.ask(words)
     assert made.asked is None
 
@@ -224,9 +219,9 @@ def test_hidden_classes_are_a_list_of_labels_or_names():
     made.set_hidden(["table", -1])
     assert made.hidden == {2, -1}
     for labels in ("chair", 2):
-        with pytest.raises(TypeError, match=rf"labels: expected a list of labels or names, got {labels!r}; pass \["):
+        with pytest.raises(TypeError, match=tells("labels:", f"got {labels!r}")):
             made.set_hidden(labels)
-    with pytest.raises(ValueError, match="did you mean 'chair'"):
+    with pytest.raises(ValueError, match=tells("class:", "'chair'", "got 'chiar'")):
         made.set_hidden(["chiar"])
     assert made.hidden == {2, -1}
     assert made.present == {1, 2, -1}

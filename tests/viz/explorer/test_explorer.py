@@ -6,6 +6,7 @@ import pytest
 import torch
 from cases_viz import some_camera
 from cases_window import LEGEND, SMALL, TITLE, a_state, agreement, an_explorer, panes, psnr
+from messages import tells
 from PIL import Image
 
 from kfgs.cameras import Distortion
@@ -59,7 +60,7 @@ def test_listeners_hear_of_each_change(explorer):
     explorer.ask("chair")
     explorer.pick(180, 110)
     assert heard == ["score"] * 3
-    with pytest.raises(ValueError, match="chiar"):
+    with pytest.raises(ValueError, match=tells("class:", "got 'chiar'")):
         explorer.ask("chiar")
     assert len(heard) == 3
     assert explorer.state.asked.words == "chair"
@@ -72,7 +73,7 @@ def test_files_are_numbered(tmp_path):
         np.testing.assert_array_equal(
             np.asarray(Image.open(tmp_path / "view" / "picture_002.png")), explorer.screenshot()
         )
-        with pytest.raises(ValueError, match="selection: expected at least one Gaussian"):
+        with pytest.raises(ValueError, match=tells("selection:", "got none")):
             explorer.save_selection()
         explorer.ask("chair")
         assert {path.parent.name for path in explorer.save_selection()} == {"selection_001"}
@@ -128,26 +129,26 @@ def test_closing_twice_is_fine_and_errors_close(monkeypatch):
     closed = []
     monkeypatch.setattr(Explorer, "close", lambda self, close=Explorer.close: (closed.append(self), close(self)))
     lens = type(some_camera())(torch.eye(4), torch.eye(3), 4, 4, distortion=Distortion("brown_conrady", (0.1, 0, 0, 0)))
-    with pytest.raises(ValueError, match="camera: expected a pinhole camera"):
+    with pytest.raises(ValueError, match=tells("camera:", "pinhole", "'brown_conrady'")):
         an_explorer(camera=lens)
     assert len(closed) == 1
 
 
 def test_options_are_checked():
-    with pytest.raises(ValueError, match="rest: expected a number in"):
+    with pytest.raises(ValueError, match=tells("rest:", "got 1.0")):
         ExploreOptions(rest=1.0)
-    with pytest.raises(ValueError, match="style: expected one of"):
+    with pytest.raises(ValueError, match=tells("style:", "got 'ellipsoids'")):
         ExploreOptions(style="ellipsoids")
-    with pytest.raises(ValueError, match="height: expected"):
+    with pytest.raises(ValueError, match=tells("height:", "got 0")):
         ExploreOptions(height=0)
-    with pytest.raises(ValueError, match="width: expected"):
+    with pytest.raises(ValueError, match=tells("width:", "got 1")):
         ExploreOptions(width=1)
 
 
 def test_unknown_styles_and_classes_are_refused(explorer):
-    with pytest.raises(ValueError, match="style: expected one of"):
+    with pytest.raises(ValueError, match=tells("style:", "got 'cubes'")):
         explorer.set_style("cubes")
-    with pytest.raises(ValueError, match="chair"):
+    with pytest.raises(ValueError, match=tells("class:", "got 'chiar'")):
         explorer.set_hidden(["chiar"])
     assert explorer.state.hidden == frozenset()
 
@@ -173,8 +174,8 @@ def test_a_closed_explorer_refuses_all_verbs_alike(tmp_path):
         "save_selection": [],
     }
     for name, arguments in verbs.items():
-        message = rf"explorer: expected an open one for {name}, got one that is closed; make another with explore\("
-        with pytest.raises(RuntimeError, match=message):
+        message = ("explorer:", name, "explore(")
+        with pytest.raises(RuntimeError, match=tells(*message)):
             getattr(explorer, name)(*arguments)
     assert explorer.state.details() == before
     assert not (tmp_path / "view").exists()
@@ -194,7 +195,7 @@ def test_a_window_that_the_desktop_destroyed_counts_as_closed():
     with an_explorer() as explorer:
         explorer.plotter.close()
         assert explorer.closed
-        with pytest.raises(RuntimeError, match="expected an open one for ask"):
+        with pytest.raises(RuntimeError, match=tells("explorer:", "open", "ask", "closed")):
             explorer.ask("chair")
 
 
@@ -260,7 +261,7 @@ def test_two_explorers_that_save_into_one_folder_lose_nothing(tmp_path, monkeypa
 
 def test_what_cannot_be_saved_leaves_nothing(tmp_path, monkeypatch):
     with an_explorer(out=tmp_path / "a" / "view") as explorer:
-        with pytest.raises(ValueError, match="selection: expected at least one Gaussian"):
+        with pytest.raises(ValueError, match=tells("selection:", "got none")):
             explorer.save_selection()
         assert not (tmp_path / "a" / "view").exists()
         explorer.save_picture()

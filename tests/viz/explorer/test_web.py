@@ -7,6 +7,7 @@ from unittest.mock import MagicMock
 
 import cases_page
 import pytest
+from messages import tells
 
 from kfgs.viz import available
 from kfgs.viz.explorer import notebook, serve, web
@@ -26,7 +27,7 @@ def explorer(tmp_path):
 def test_without_the_extra_the_install_line_is_told(monkeypatch):
     found = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "trame_vtk" else found(name))
-    with pytest.raises(ImportError, match=r'extra \'web\' .* got no trame_vtk; pip install "kfgs\[web\]"'):
+    with pytest.raises(ImportError, match=tells("'web'", "trame_vtk", 'pip install "kfgs[web]"')):
         web.require_web()
 
 
@@ -78,16 +79,14 @@ def test_a_port_that_is_taken_is_told(explorer):
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        with pytest.raises(
-            ValueError, match=rf"host, port: expected an address .* got '127.0.0.1' and {port} \(.*choose"
-        ):
+        with pytest.raises(ValueError, match=tells("host, port:", f"got '127.0.0.1' and {port}")):
             serve(explorer, port=port, open_browser=False)
-    with pytest.raises(ValueError, match="host, port: expected an address of this machine"):
+    with pytest.raises(ValueError, match=tells("host, port:", "got '203.0.113.7'")):
         serve(explorer, host="203.0.113.7", open_browser=False)
 
 
 def test_a_port_is_a_whole_number():
-    with pytest.raises(ValueError, match="port: expected a number in"):
+    with pytest.raises(ValueError, match=tells("port:", "got 70000")):
         serve(None, port=70000)
 
 
@@ -96,7 +95,7 @@ def test_within_an_event_loop_the_notebook_way_is_told():
     async def inside():
         serve(None)
 
-    with pytest.raises(RuntimeError, match="serve: expected no running event loop, got one.*use show_in_notebook"):
+    with pytest.raises(RuntimeError, match=tells("serve:", "show_in_notebook")):
         asyncio.run(inside())
 
 
@@ -172,14 +171,14 @@ def test_what_goes_wrong_is_told_on_the_page_and_nothing_ends(explorer, monkeypa
 
 @pytest.mark.parametrize("value", ["0.5", None, True, float("nan"), float("inf"), [0.5]])
 def test_a_position_is_a_number(value):
-    with pytest.raises(ValueError, match="position: expected a number between 0 and 1, got .*; reload"):
+    with pytest.raises(ValueError, match=tells("position:", "0 and 1", "reload")):
         _share(value)
 
 
 def test_positions_and_numbers_are_read():
     assert [_share(0.5), _share(-1), _share(7)] == [0.5, 0, 1]
     assert _number("gamma", "0,25") == 0.25
-    with pytest.raises(ValueError, match="gamma: expected a number, got 'much'; write it as"):
+    with pytest.raises(ValueError, match=tells("gamma:", "got 'much'", "0.05")):
         _number("gamma", "much")
 
 

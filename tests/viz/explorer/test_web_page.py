@@ -8,6 +8,7 @@ import weakref
 
 import cases_page
 import pytest
+from messages import tells
 
 from kfgs.viz import available
 from kfgs.viz.explorer import notebook, serve, web
@@ -133,13 +134,13 @@ def test_a_closed_explorer_is_freed_with_its_page(tmp_path):
 def test_a_closed_explorer_is_not_shown(explorer):
     explorer.close()
     for show in (lambda: serve(explorer, open_browser=False), lambda: notebook.show_in_notebook(explorer)):
-        with pytest.raises(RuntimeError, match=r"explorer: expected an open one to show, got one that is closed; make"):
+        with pytest.raises(RuntimeError, match=tells("explorer:", "explore(...)")):
             show()
 
 
 @pytest.mark.parametrize("host", ["", " "])
 def test_no_address_is_not_everyone(explorer, host):
-    with pytest.raises(ValueError, match=rf"host: expected an address of this machine, got '{host}'; 127.0.0.1 is"):
+    with pytest.raises(ValueError, match=tells("host:", f"got '{host}'", "127.0.0.1")):
         serve(explorer, host=host, open_browser=False)
 
 
