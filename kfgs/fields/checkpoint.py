@@ -1,4 +1,4 @@
-"""The state of an unfinished fit in one file, so that a killed run continues: on a CPU bit for bit."""
+"""The state of an unfinished fit in one file, so that a killed run can continue (on a CPU with bit-equal results)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ KIND, VERSION = "field checkpoint", "1"
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Everything that a fit needs to go on: numbers in `state`, tensors by name."""
+    """Everything that a fit needs to continue: numbers in `state`, tensors by name."""
 
     tensors: dict[str, Tensor]
     state: dict[str, Any]
@@ -40,9 +40,9 @@ def identify_fit(
     generator: torch.Generator,
     others: dict[str, Any],
 ) -> dict[str, str]:
-    """A digest of each thing a fit depends on. For the targets these are their number and the first map.
+    """A digest of each input of a fit. Of the targets, only their number and the first map count.
 
-    Near planes count where one is not at 0.2: checkpoints from before cameras had one stay valid.
+    Near planes count only if one is not at 0.2, so that checkpoints of older versions without near planes stay valid.
     """
     options = {name: value for name, value in asdict(config).items() if name != "checkpoint_every"}
     views = [tensor for camera in cameras for tensor in (camera.viewmat, camera.K, torch.tensor(camera.size))]
@@ -75,7 +75,7 @@ def read_checkpoint(path: Path, identity: dict[str, str]) -> Checkpoint | None:
     """Read the file, or None if there is none.
 
     Raises:
-        ValueError: if the file is damaged or something else, or belongs to a fit that started otherwise.
+        ValueError: if the file is damaged or no checkpoint, or belongs to a fit with other inputs.
     """
     if not path.exists():
         return None

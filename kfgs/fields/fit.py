@@ -25,7 +25,7 @@ Callback = Callable[[dict[str, Any]], None]
 
 @dataclass(frozen=True, eq=False)
 class FieldFit:
-    """A fitted cloud and how it came about.
+    """A fitted cloud, and the history of its training.
 
     Each row of `history` holds `step`, `loss` (the mean since the row before), `count` (Gaussians) and `seconds`
     (training time so far, earlier runs of a resumed fit included).
@@ -52,29 +52,29 @@ def fit_field(
 ) -> FieldFit:
     """Train Gaussians until their renderings match the targets (Eq. 4), growing and pruning them on the way.
 
-    Each step takes one view, in random order, every view once before any comes again.
+    Each step uses one view, in random order; each view is used once before any is repeated.
 
     Args:
-        params: where to start; not changed. Dtype and device of the fit are theirs.
+        params: the start; not changed. They decide dtype and device of the fit.
         cameras: C posed cameras without distortion.
-        targets: one map per camera, of any size, NaN where nothing is known (`l1_loss`); read one at a time
-            and only by `len` and index, so they may live on disk.
-        config: the paper's values when not given.
-        extent: size of the scene in world units (`Scene.extent`); scales the means' learning rate and what counts as a
-            large Gaussian.
+        targets: one map per camera, of any size, NaN if unknown (`l1_loss`); read one at a time and only by `len` and
+            index, so they may be on disk.
+        config: None: the paper's values.
+        extent: size of the scene in world units (`Scene.extent`); scales the means' learning rate and the threshold for
+            large Gaussians.
         loss: compares a rendered map, its alpha and the target. For colours, `ColorLoss`.
-        generator: draws the views' order and the places of split Gaussians; None stands for seed 0.
+        generator: draws the views' order and the positions of split Gaussians; None: seed 0.
         progress: show a bar with loss, number of Gaussians and time left.
-        callback: called with each new row of the history. To stop early, raise from it; a checkpoint stays behind.
-        checkpoint: a file that is written every `checkpoint_every` steps and at the end. If it exists, the fit
-            continues from it, and its result is bit for bit that of an undisturbed run (on one machine's CPU; a GPU adds
-            gradients up in no fixed order).
+        callback: called with each new row of the history. To stop early, raise in it; a checkpoint stays.
+        checkpoint: a file that is written every `checkpoint_every` steps and at the end. If it exists, the fit continues
+            from it, with the same result bit for bit as an uninterrupted run (on one machine's CPU; a GPU adds gradients
+            in no fixed order).
 
     Returns:
         The fitted params, and the history.
 
     Raises:
-        TypeError: if `params` is something else.
+        TypeError: if `params` has another type.
         ValueError: if counts or shapes disagree, a camera has distortion, the checkpoint belongs to another fit, or no
             Gaussian is left.
         FloatingPointError: if the loss is no longer finite.
