@@ -1,7 +1,8 @@
-"""The fused feature of each Gaussian: the mean of what the training views show at the pixels where it is seen.
+"""The fused feature of each Gaussian: the mean of the rendered features at the pixels that show it, over the training views.
 
-Training constrains only blends of Gaussians, so the latent of a single Gaussian may mean something that no view shows. The
-mean over its pixels, weighted by w = T alpha, cannot. It is computed once, when a field is finished, and needs no camera later.
+Training constrains only blends of Gaussians, so the latent of a single Gaussian may decode to something that no view shows.
+The mean over its pixels, weighted by w = T alpha, does not have this problem. It is computed once, when a field is finished;
+later no camera is needed.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from ..labels import average_views, nearest_codeword
 from ..quant import Autoencoder, Codebook, LinearLatents, fit_linear_latents
 from ..splat import rasterize
 
-KEEP, MOST = 0.999, 64  # share of the variation between codewords that is kept, and the most latents for it
+KEEP, MOST = 0.999, 64  # share of the codewords' variation to keep, with at most so many latents
 CHUNK = 8192  # pixels quantised at once
 PIXELS = 80_000  # most pixels of a view that are rendered
 
@@ -28,8 +29,8 @@ PIXELS = 80_000  # most pixels of a view that are rendered
 class Seen(NamedTuple):
     """How well the training views show each Gaussian."""
 
-    pixels: Tensor  # [N] how many pixels it fills, in all training views together
-    agreement: Tensor  # [N] in [0, 1]: length of the mean of the unit features that it was shown with
+    pixels: Tensor  # [N] number of pixels that it fills, in all training views
+    agreement: Tensor  # [N] in [0, 1]: length of the mean of the unit features at its pixels
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -49,13 +50,13 @@ class Answers(NamedTuple):
 def fused_answers(
     gaussians: Gaussians, codebook: Codebook | None, autoencoder: Autoencoder | None, cameras: Sequence[Camera]
 ) -> Answers:
-    """Render a trained field from each camera, quantise, and average onto the Gaussians what their pixels show.
+    """Render a trained field from each camera, quantise the pixels, and average them onto the Gaussians that they show.
 
     Args:
         gaussians: with the field's latents.
-        codebook: S; None: the rendered features themselves are averaged.
+        codebook: S; None: the rendered features are averaged without quantising.
         autoencoder: E and Psi, or None.
-        cameras: at least one; those that the field was trained with.
+        cameras: at least one; the training cameras.
     """
     assert gaussians.features is not None
     with torch.no_grad():

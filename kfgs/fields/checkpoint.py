@@ -1,4 +1,4 @@
-"""The state of an unfinished fit in one file, so that a killed run continues: on a CPU bit for bit."""
+"""The state of an unfinished fit in one file, so that a killed run can continue (on a CPU with bit-equal results)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ KIND, VERSION = "field checkpoint", "1"
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Everything that a fit needs to go on: numbers in `state`, tensors by name."""
+    """Everything that a fit needs to continue: numbers in `state`, tensors by name."""
 
     tensors: dict[str, Tensor]
     state: dict[str, Any]
@@ -43,7 +43,7 @@ def identify_fit(
     generator: torch.Generator,
     others: dict[str, Any],
 ) -> dict[str, str]:
-    """A digest of each thing a fit depends on. For the targets these are their number and the first map.
+    """A digest of each input of a fit. Of the targets, only their number and the first map count.
 
     The extent of the config may be None, so the caller puts the one in use into `others`. Near planes count where one is not
     at 0.2: checkpoints from before cameras had one stay valid.
@@ -79,7 +79,7 @@ def read_checkpoint(path: Path, identity: dict[str, str]) -> Checkpoint | None:
     """Read the file, or None if there is none.
 
     Raises:
-        ValueError: if the file is damaged or something else, or belongs to a fit that started otherwise.
+        ValueError: if the file is damaged or no checkpoint, or belongs to a fit with other inputs.
     """
     if not path.exists():
         return None

@@ -26,7 +26,7 @@ class FieldConfig:
     means_lr: float = 1.6e-4
     """Learning rate of the means at step 0, in units of the scene extent."""
     means_lr_final: float = 1.6e-6
-    """The same at the last step; exponential in between."""
+    """Learning rate of the means at the last step; exponential in between."""
     quats_lr: float = 0.001
     scales_lr: float = 0.005
     """Learning rate of the log-scales."""
@@ -38,14 +38,14 @@ class FieldConfig:
     sh_rest_lr: float = 0.0025 / 20
     """Learning rate of the higher harmonics."""
     sh_degree_every: int = 1_000
-    """Colours gain one degree each so many steps, from the highest one that the start makes use of: 0 for a cloud of points,
-    its own for a loaded splat, which training must not first strip of what it holds. 0 = all from the start."""
+    """Raise the SH degree by one every so many steps, starting at the degree that the input uses: 0 for points, its degree for
+    a loaded splat. 0 = all degrees from the start."""
     coarse: tuple[tuple[int, int], ...] = ()
-    """Pairs (last step, divisor): up to that step pictures are compared at size // divisor, each pixel the mean of divisor
-    x divisor ones; the last steps, and all when empty, at full size. A divisor beyond a picture's smaller side counts as that
-    side. For targets of the cameras' own size."""
+    """Pairs (last step, divisor): up to this step pictures are compared at size // divisor, where a pixel is the mean of
+    divisor x divisor ones. After the last pair (or if empty) they have full size. A divisor is at most a picture's smaller
+    side. Only for targets of the cameras' size."""
     adam_eps: float = 1e-15
-    """Adam's epsilon: tiny, since gradients of a mean over all pixels are tiny."""
+    """Adam's epsilon: tiny, because gradients of a mean over all pixels are tiny."""
     render_scale: float | None = None
     """None renders at the camera's size (the paper). A number renders at this multiple of the target map's size, never
     larger than the camera's; the resize of Eq. 4 follows either way."""
@@ -53,10 +53,10 @@ class FieldConfig:
     densify_until: int = 15_000
     densify_every: int = 100
     densify_gradient: float = 2e-4
-    """Mean norm of the screen-space gradient, in NDC units, from which a Gaussian is cloned or split."""
+    """A Gaussian is cloned or split if the mean norm of its screen-space gradient, in NDC units, is at least this."""
     densify_gradient_size: Literal["render", "target"] = "render"
-    """Whose half-size turns pixel gradients into NDC ones: the rendered map's (right), or the target map's, as the
-    released script does (a stricter threshold: 1.33 times at 639x479 against 480x360)."""
+    """The map whose half-size converts pixel gradients to NDC: the rendered map (correct), or the target map as in the
+    released script (a stricter threshold: 1.33 times at 639x479 against 480x360)."""
     percent_dense: float = 0.01
     """Gaussians up to this fraction of the scene extent are cloned, larger ones are split."""
     prune_opacity: float = 0.005
@@ -66,9 +66,9 @@ class FieldConfig:
     reset_every: int = 3_000
     """Steps between opacity resets; 0 = never (nor is anything pruned by size then)."""
     reset_opacity: float = 0.01
-    """Opacities are lowered to at most this value by a reset."""
+    """A reset lowers opacities to at most this value."""
     max_gaussians: int | None = None
-    """Densifying never grows the field beyond this many; the strongest gradients go first. None = no limit."""
+    """The most Gaussians after densifying; those with the strongest gradients grow first. None = no limit."""
     engine: str = "auto"
     """Compositing engine, as `kfgs.splat.rasterize` takes it."""
     report_every: int = 50
@@ -104,28 +104,27 @@ class FieldConfig:
             )
 
     def divisor(self, step: int) -> int:
-        """By how much pictures are shrunk at a step (`coarse`)."""
+        """The divisor of picture sizes at a step (`coarse`)."""
         return next((divisor for last, divisor in self.coarse if step <= last), 1)
 
     def sh_degree(self, step: int, start: int = 0) -> int:
-        """Up to which degree colours are used at a step, if they have it; `start` is the degree in use at the start."""
+        """The highest SH degree used at a step; `start` is the degree used at the start."""
         return start + step // self.sh_degree_every if self.sh_degree_every else 3
 
     @classmethod
     def paper(cls, **changes: Any) -> FieldConfig:
-        """The published values (the same as `FieldConfig()`), perhaps with some exchanged."""
+        """The published values (the same as `FieldConfig()`), with changes."""
         return cls(**changes)
 
     @classmethod
     def cpu(cls, **changes: Any) -> FieldConfig:
         """A short run for a CPU: a fifteenth of the steps, a schedule compressed to match, and faster learning rates.
 
-        Few steps must still carry features from 0 to their values and Gaussians to their places, hence the higher rates.
-        Maps are rendered at twice the target's size: a field trained at the target's own size looks worse when it is
-        rendered larger. Growing takes a higher threshold than the paper's: few views of few pixels are soon fitted to
-        the last pixel, which costs time and shows from new viewpoints. Opacities are not reset: there are too few steps
-        to recover. (Toy room, 24 views of 48x64, ideal labels, 1,000 steps: test mIoU 0.77 at scale 1 and 2e-4, 0.79 at
-        1 and 6e-4, 0.89 at 2 and 6e-4.)
+        The rates are higher because few steps must bring features from 0 to their values and Gaussians to their places.
+        Maps are rendered at twice the target's size: a field trained at the target's size looks worse if rendered larger.
+        The threshold for growing is higher than the paper's, because few small views are overfitted soon. Opacities are
+        not reset: there are too few steps to recover. (Toy room, 24 views of 48x64, ideal labels, 1,000 steps: test mIoU
+        0.77 at scale 1 and 2e-4, 0.79 at 1 and 6e-4, 0.89 at 2 and 6e-4.)
         """
         preset = cls(
             steps=2_000,
@@ -149,7 +148,7 @@ class FieldConfig:
     def with_steps(self, steps: int) -> FieldConfig:
         """The same schedule stretched or compressed to another number of steps; `densify_every` stays.
 
-        Where pairs of `coarse` come to end at the same step, the last of them is kept.
+        If pairs of `coarse` then end at the same step, the last one is kept.
         """
         ratio = steps / self.steps
         names = ("densify_from", "densify_until", "reset_every", "sh_degree_every")

@@ -18,17 +18,17 @@ SPLIT_SHRINK = 1.6  # 0.8 times the number of children (3DGS)
 
 
 class GradientStatistics(NamedTuple):
-    """Running sum of screen-space gradient norms per Gaussian, and over how many views."""
+    """Running sum of screen-space gradient norms per Gaussian, and its number of views."""
 
     total: Tensor  # [N]
-    views: Tensor  # [N], how many saw it
+    views: Tensor  # [N], number of views that saw it
 
     def __repr__(self) -> str:
         return short_repr(self)
 
     @staticmethod
     def zeros(params: GaussianParams) -> GradientStatistics:
-        """Nothing seen yet."""
+        """Statistics of no view."""
         return GradientStatistics(*(params.means.new_zeros(len(params), requires_grad=False) for _ in range(2)))
 
     def add_(
@@ -37,14 +37,14 @@ class GradientStatistics(NamedTuple):
         gradient: Tensor,  # [M, 2] of the loss by means2d, in pixels
         size: tuple[int, int],  # (height, width)
     ) -> None:
-        """Add one view. NDC spans 2 over the picture, so a gradient by NDC is half the size times one by pixels."""
+        """Add one view. NDC spans 2 over the picture, so a gradient in NDC is half the size times one in pixels."""
         height, width = size
         norm = torch.hypot(gradient[:, 0] * (width / 2), gradient[:, 1] * (height / 2))
         self.total[index] += norm
         self.views[index] += 1
 
     def mean(self) -> Tensor:  # [N]
-        """Mean norm over the views that saw the Gaussian; 0 where none did."""
+        """Mean norm over the views that saw the Gaussian; 0 if none did."""
         return self.total / self.views.clamp(min=1)
 
 
@@ -53,7 +53,7 @@ class Densified(NamedTuple):
 
     params: GaussianParams
     source: Tensor  # [N'] int64: row of the old cloud
-    fresh: Tensor  # [N'] bool: a new Gaussian, not the old one itself
+    fresh: Tensor  # [N'] bool: a new Gaussian
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -70,23 +70,23 @@ def densify(
 ) -> Densified:
     """One round of adaptive density control.
 
-    A Gaussian whose gradient reaches `config.densify_gradient` is cloned (an exact copy is added) when its largest scale
-    is at most `percent_dense * extent`; otherwise two Gaussians of 1/1.6 its scales, drawn from its own distribution,
-    take its place. Then Gaussians below `prune_opacity`, and with `prune_large` those larger than `prune_extent * extent`,
-    are dropped. Order of the result: what stays, clones, children. With `max_gaussians` the strongest gradients grow
-    first (equal ones in order of index).
+    A Gaussian with a gradient of at least `config.densify_gradient` is cloned (an exact copy is added) if its largest scale
+    is at most `percent_dense * extent`; otherwise two Gaussians of 1/1.6 its scales, drawn from its distribution, replace
+    it. Then Gaussians below `prune_opacity`, and with `prune_large` those larger than `prune_extent * extent`, are dropped.
+    Order of the result: old ones, clones, children. With `max_gaussians` the strongest gradients grow first (ties in order
+    of index).
 
     Args:
         params: the cloud; not changed.
         gradient: `GradientStatistics.mean()`.
         config: thresholds.
         extent: size of the scene, world units.
-        prune_large: 3DGS does so only once opacities were reset for the first time.
-        generator: draws the children's places (on its own device); None draws the same ones each time.
+        prune_large: in 3DGS true only after the first reset of opacities.
+        generator: draws the children's positions (on its own device); None draws the same ones each time.
 
     Note:
-        3DGS also means to prune what is larger than 20 pixels on screen, but its radii are zeroed just before
-        they are looked at; so nothing of the kind is done here either.
+        3DGS intends to prune Gaussians larger than 20 pixels on screen, but sets their radii to zero before the test, so
+        it never does. Neither does this function.
     """
     values = params.map(torch.Tensor.detach)
     scales = values.log_scales.exp().amax(dim=1)
@@ -114,7 +114,7 @@ def lowered_opacities(
     logit_opacities: Tensor,  # [N]
     opacity: float,
 ) -> Tensor:  # [N]
-    """The same logits, none above that of `opacity`: the opacity reset of 3DGS."""
+    """The opacity reset of 3DGS: logits lowered to at most that of `opacity`."""
     return logit_opacities.detach().clamp(max=math.log(opacity / (1 - opacity)))
 
 

@@ -1,4 +1,4 @@
-"""Classes without text: examples in views, or Gaussians of the field, show what a class looks like."""
+"""Define classes by examples instead of text: pixels of views, or Gaussians of the field."""
 
 from __future__ import annotations
 
@@ -62,18 +62,18 @@ Example = Clicks | Box | Mask | Picked
 
 
 def label_set_from_examples(field: SemanticField, examples: Mapping[str, Example | Sequence[Example]]) -> LabelSet:
-    """Make classes out of examples, for a teacher that has no text (DINOv2, SAM) or words that it does not know.
+    """Make classes from examples, for a teacher without text (DINOv2, SAM) or for words that it does not know.
 
-    A class's row is the mean direction of the features that its examples show: of the field rendered at the pixels, or of the
-    Gaussians themselves. Every example counts alike, however many pixels it has.
+    A class's row is the mean direction of the features of its examples: of the field rendered at the pixels, or of the
+    Gaussians. Every example has the same weight, whatever its number of pixels.
 
     Args:
         field: a finished field.
         examples: one or more examples of each class, by its name.
 
     Raises:
-        ValueError: if there is no class or no example of one, a view is unknown, a place lies outside its view, or the field
-            shows nothing there.
+        ValueError: if there is no class, or one has no example, a view is unknown, a point lies outside its view, or the
+            field shows nothing there.
     """
     if not examples:
         raise ValueError("examples: expected at least one class, got none; name one and show it")
@@ -96,7 +96,7 @@ def read_examples(path: str | Path) -> dict[str, list[Example]]:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is something else.
+        ValueError: if it has another content.
     """
     content = read_json(path)
     if not isinstance(content, dict) or not all(isinstance(shown, list) for shown in content.values()):
@@ -124,7 +124,7 @@ def _read(where: str, one: Any) -> Example:
 
 
 def _feature(field: SemanticField, example: Example, name: str) -> Tensor:  # [D] unit
-    """The mean direction of what one example shows."""
+    """The mean direction of the features of one example."""
     where = _of_gaussians if isinstance(example, Picked) else _of_pixels
     features = where(field, example, name)
     known = features[row_norms(features) > EPS]

@@ -24,7 +24,7 @@ from .trainer import Trainer
 
 @dataclass(frozen=True, eq=False)
 class FieldFit:
-    """A fitted cloud and how it came about.
+    """A fitted cloud, and the history of its training.
 
     Each row of `history` holds `step`, `loss` (the mean since the row before), `count` (Gaussians) and `seconds`
     (training time so far, earlier runs of a resumed fit included).
@@ -49,10 +49,10 @@ def fit_field(
 ) -> FieldFit:
     """Train Gaussians until their renderings match the targets (Eq. 4), growing and pruning them on the way.
 
-    Each step takes one view, in random order, every view once before any comes again.
+    Each step uses one view, in random order; each view is used once before any is repeated.
 
     Args:
-        params: where to start; not changed. Dtype and device of the fit are theirs.
+        params: the start; not changed. They decide dtype and device of the fit.
         cameras: C posed cameras without distortion.
         targets: one map per camera, of any size, NaN where nothing is known (`l1_loss`); read one at a time
             and only by `len` and index, so they may live on disk.
@@ -70,7 +70,7 @@ def fit_field(
         The fitted params, and the history.
 
     Raises:
-        TypeError: if `params` is something else.
+        TypeError: if `params` has another type.
         ValueError: if counts or shapes disagree, a camera has distortion, the checkpoint belongs to another fit, or no
             Gaussian is left.
         FloatingPointError: if the loss is no longer finite.

@@ -1,4 +1,4 @@
-"""What a rendered map is compared by."""
+"""Losses that compare a rendered map with its target."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def l1_loss(
 ) -> Tensor:  # []
     """Eq. 4: the rendered map F_r, resized bilinearly to the target's size, against the latent map F_l.
 
-    The mean of the absolute differences over pixels and channels: the paper writes a norm, its released script takes
-    the mean, and the learning rates and the densification threshold of 3DGS are made for a mean. Pixels whose target is
-    NaN in any channel are not known and count nowhere.
+    The mean of the absolute differences over pixels and channels. The paper writes a norm, but its released script takes
+    the mean, and learning rates and densification threshold of 3DGS are made for a mean. Pixels with NaN in any channel of
+    the target are unknown and do not count.
     """
     height, width, channels = target.shape
     known = _known(target)
@@ -44,13 +44,13 @@ def l1_loss(
 
 @dataclass(frozen=True)
 class ColorLoss:
-    """What 3DGS trains colours with: (1 - ssim_weight) L1 + ssim_weight (1 - SSIM).
+    """The loss of 3DGS for colours: (1 - ssim_weight) L1 + ssim_weight (1 - SSIM).
 
-    Pixels whose target is NaN in any channel are not known: they count neither in L1, nor does any SSIM window that holds one.
+    Pixels with NaN in any channel of the target are unknown: they and the SSIM windows that contain them do not count.
 
     Note:
-        3DGS pads pictures with zeros for SSIM; here only windows that lie inside the picture count, as in
-        `kfgs.metrics.ssim`. A picture smaller than a window is compared by L1 alone.
+        3DGS pads pictures with zeros for SSIM; here only windows inside the picture count, as in `kfgs.metrics.ssim`. A
+        picture smaller than a window is compared by L1 only.
     """
 
     ssim_weight: float = 0.2
@@ -67,7 +67,7 @@ class ColorLoss:
         alpha: Tensor,  # [H, W], not used
         target: Tensor,  # [h, w, D]
     ) -> Tensor:  # []
-        """Compare a rendered picture with the one that was taken."""
+        """Compare a rendered picture with the photograph."""
         absolute = l1_loss(rendered, alpha, target)
         if self.ssim_weight == 0 or min(target.shape[:2]) < SSIM_WINDOW:
             return absolute
@@ -103,11 +103,11 @@ def mean_similarity(
 
 
 def _known(target: Tensor) -> Tensor:  # [H, W, D] -> [H, W] bool
-    return ~target.amax(dim=2).isnan()  # a NaN is above all; 9 times faster than isnan().any(dim=2) of 64 channels
+    return ~target.amax(dim=2).isnan()  # amax returns NaN; 9 times faster than isnan().any(dim=2) of 64 channels
 
 
 class _CompiledSimilarity(torch.autograd.Function):
-    """Returns the gradient together with the value."""
+    """Computes value and gradient together."""
 
     @staticmethod
     def forward(ctx: Any, picture: Tensor, target: Tensor, counted: Tensor | None, engine: str) -> Tensor:

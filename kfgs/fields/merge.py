@@ -1,4 +1,4 @@
-"""Fewer Gaussians that show nearly the same: those of one voxel with like features become one, moments matched."""
+"""Merge Gaussians with similar features in one voxel to a single Gaussian with the same moments."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ OPACITY = 0.05, 0.99  # of merged Gaussians: fainter ones would be pruned by the
 
 
 class Merged(NamedTuple):
-    """A smaller cloud, and the source of its Gaussians."""
+    """The merged cloud, and the members of its Gaussians."""
 
     gaussians: Gaussians  # M, with features
     weights: Tensor  # [M] sums of their members' weights
@@ -45,22 +45,22 @@ def merge_gaussians(
     clusters: int = CLUSTERS,
     generator: torch.Generator | None = None,
 ) -> Merged:
-    """Prune and merge Gaussians with features until at most `maximum` are left. It uses no classes.
+    """Prune and merge Gaussians with features until at most `maximum` are left. Classes are not used.
 
-    If there are more, the faintest are dropped, those that together hold the share `faint` of all weight: many, since a splat
-    has many Gaussians that hardly show, and their features are noise. The others merge where they lie in one cube of a grid
-    and their features fall into one of `clusters` groups (spherical k-means). The edge of the cubes is the smallest that
-    leaves at most `maximum`. A merged Gaussian has the mean, the covariance (that of the mixture: within plus between its
-    members) and the mean feature of its members, by weight. Its opacity keeps the area that they covered: the sum of o_i A_i
-    over its own A, where A is the product of the two larger standard deviations.
+    If there are more, the faintest Gaussians are dropped, which together have the share `faint` of all weight. These are
+    many, because a splat has many Gaussians that are hardly visible; their features are noise. The others are merged if
+    they lie in one cube of a grid and their features are in one of `clusters` groups (spherical k-means). The cubes are as
+    small as possible with at most `maximum` Gaussians left. A merged Gaussian has the weighted mean, covariance (of the
+    mixture: within plus between its members) and mean feature of its members. Its opacity keeps the area that they covered:
+    the sum of o_i A_i divided by its A, where A is the product of the two larger standard deviations.
 
     Args:
         gaussians: N Gaussians with features.
-        weights: what each is worth, usually the pixels that it fills in the training views.
+        weights: of the Gaussians, usually the pixels that each fills in the training views.
         maximum: most Gaussians of the result.
-        faint: share of all weight that is dropped, in [0, 1). Gaussians without weight always are.
+        faint: share of all weight that is dropped, in [0, 1). Gaussians without weight are always dropped.
         clusters: groups of features.
-        generator: draws the first centres of k-means; None stands for seed 0.
+        generator: draws the first centres of k-means; None: seed 0.
 
     Raises:
         ValueError: if there are no features, shapes disagree, or no Gaussian has enough weight.
@@ -91,7 +91,7 @@ def merge_gaussians(
 
 
 def _above(weights: Tensor, faint: float) -> Tensor:  # [n] -> [n] bool
-    """All but the smallest weights, which together hold at most a share of their sum; at least one is left."""
+    """All but the smallest weights, which sum to at most the share `faint` of all; at least one is left."""
     order = weights.argsort(stable=True)
     below = weights[order].double().cumsum(0) <= faint * weights.double().sum()
     kept = torch.ones_like(below)
@@ -104,7 +104,7 @@ def _smallest_voxels(means: Tensor, kinds: Tensor, worth: Tensor, maximum: int) 
     low, span = means.amin(0), float((means.amax(0) - means.amin(0)).max())
     fine, coarse = 0.0, 1.001 * span + torch.finfo(means.dtype).tiny
     best = _groups(means, low, coarse, kinds, worth)
-    while best[1] > maximum:  # even one cube holds more kinds than are allowed: merge these too
+    while best[1] > maximum:  # a single cube has more kinds than `maximum`: merge kinds too
         kinds = kinds // 2
         best = _groups(means, low, coarse, kinds, worth)
     for _ in range(TRIES):
@@ -120,7 +120,7 @@ def _smallest_voxels(means: Tensor, kinds: Tensor, worth: Tensor, maximum: int) 
 
 
 def _groups(means: Tensor, low: Tensor, edge: float, kinds: Tensor, worth: Tensor) -> tuple[Tensor, int]:
-    """Number the pairs of cube and kind; a kind with little weight in its cube joins the cube's heaviest one."""
+    """Number the pairs of cube and kind; a kind with little weight in a cube joins the heaviest kind there."""
     cells = ((means - low).double() / edge).floor().to(torch.int64)
     sides = cells.amax(0) + 1
     column = torch.unique(cells[:, 0] * sides[1] + cells[:, 1], return_inverse=True)[1]
@@ -169,6 +169,6 @@ def _match_moments(cloud: Gaussians, worth: Tensor, group: Tensor, count: int) -
 
 
 def _area(scales: Tensor) -> Tensor:  # [n, 3] -> [n]
-    """Product of the two larger standard deviations: what a flat Gaussian covers of a view, up to a constant."""
+    """Product of the two larger standard deviations: the visible area of a flat Gaussian, up to a constant."""
     ordered = scales.sort(dim=1).values
     return ordered[:, 1] * ordered[:, 2]

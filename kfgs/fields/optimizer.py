@@ -1,4 +1,4 @@
-"""Adam over the raw values of a cloud whose number of Gaussians changes while it is trained."""
+"""Adam for the raw values of a cloud; the number of Gaussians may change during training."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class FieldOptimizer:
-    """Adam with one learning rate per kind of parameter, and moments that follow the Gaussians they belong to.
+    """Adam with one learning rate per kind of parameter, and moments that stay with their Gaussians.
 
     `params` holds the leaf tensors that are being trained. Growing or pruning keeps the moments of every Gaussian that
     stays; new ones start at 0 (as in 3DGS). torch's Adam does the arithmetic, fused.
@@ -85,7 +85,7 @@ class FieldOptimizer:
         return found
 
     def load_state_(self, state: dict[str, Tensor]) -> None:
-        """Continue from what `state_tensors` gave."""
+        """Continue from the result of `state_tensors`."""
         for key, entry in state.items():
             name, moment = key.split(".")
             self._adam.state[self.params.to_tensors()[name]][moment] = entry.clone()

@@ -1,4 +1,4 @@
-"""A fused field in few bytes: whole numbers of a stated precision, compressed losslessly."""
+"""Pack a fused field into few bytes: round to whole numbers of a fixed precision, and compress these losslessly."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .semantic_field import SemanticField
 
 STEP = 1 / 48
 """Of the latents, as a share of a unit feature: rounding then turns a feature of 20 latents by about 1.5 degrees."""
-LEVEL = 19  # of zstd: the smallest that it makes in seconds
+LEVEL = 19  # of zstd: the best compression that takes only seconds
 LIMIT = 1 << 30  # bytes that a packed field may unpack to
 
 
@@ -50,17 +50,13 @@ def pack_field(field: SemanticField) -> bytes:
         "ranges": torch.stack([*mean_range, *scale_range]).float(),
         "step": torch.tensor(step),
     }
-    # one value after another of the same kind compresses better than Gaussian after Gaussian
+    # column by column compresses better than Gaussian by Gaussian
     planes = {name: value.T.contiguous() if value.ndim == 2 else value for name, value in columns.items()}
     return zstandard.ZstdCompressor(level=LEVEL).compress(save(planes))
 
 
 def unpack_field(data: bytes) -> SemanticField:
-    """The field that `pack_field` made smaller, without its cameras and reliability.
-
-    Raises:
-        ValueError: if the bytes are something else.
-    """
+    """Unpack the result of `pack_field`: a field without cameras and reliability. A ValueError for other bytes."""
     try:
         if zstandard.get_frame_parameters(data).content_size > LIMIT:
             raise ValueError(f"it would unpack to more than {LIMIT} bytes")
@@ -85,7 +81,7 @@ def unpack_field(data: bytes) -> SemanticField:
 
 
 def rounded(field: SemanticField) -> SemanticField:
-    """A fused field with the values that packing and unpacking give; its other parts stay."""
+    """A fused field with its values rounded as by packing and unpacking; its other parts stay."""
     back = unpack_field(pack_field(field))
     return replace(field, gaussians=back.gaussians, linear=back.linear)
 

@@ -1,4 +1,4 @@
-"""The raw, trainable values behind a cloud of Gaussians, and how they start from a point cloud."""
+"""The raw, trainable values of a cloud of Gaussians, and their start from a point cloud or from Gaussians."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from .._check import check_range, check_shapes, check_whole
 from ..gaussians import Gaussians
 from ..splat.sh import rgb_to_sh0
 
-# Spacing of a point is held within these bounds: near-duplicates would give specks, a loner a giant Gaussian.
+# Bounds of a point's spacing: near-duplicates would give specks, and a lonely point a giant Gaussian.
 SMALLEST_SPACING = 0.01  # times the median spacing
 LARGEST_SPACING_QUANTILE = 0.99
 
 
 @dataclass(frozen=True, eq=False)
 class GaussianParams:
-    """N Gaussians as the optimiser sees them: unbounded numbers. `activated()` returns the `Gaussians` they stand for.
+    """N Gaussians as unbounded numbers for the optimiser. `activated()` returns them as `Gaussians`.
 
     **Convention**: scales are logarithms of world units, opacities are logits, quaternions are (w, x, y, z) of any
-    length; features and spherical harmonics are linear, without activation. A semantic field carries `features`, a colour
-    field `sh0` and, above degree 0, `sh_rest`: two tensors, since they learn at different rates.
+    length; features and spherical harmonics are linear, without activation. A semantic field has `features`, a colour
+    field `sh0` and, above degree 0, `sh_rest`: two tensors, because their learning rates differ.
     """
 
     means: Tensor  # [N, 3]
@@ -66,33 +66,29 @@ class GaussianParams:
 
     @property
     def channels(self) -> int:
-        """D, how many channels a rendered map has: the number of features per Gaussian, or 3 for colours."""
+        """D, the channels of a rendered map: the number of features per Gaussian, or 3 for colours."""
         return 3 if self.features is None else int(self.features.shape[1])
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the spherical harmonics; 0 where there are none."""
+        """Degree of the spherical harmonics; 0 if there are none."""
         return 0 if self.sh_rest is None else isqrt(self.sh_rest.shape[1] + 1) - 1
 
     def used_sh_degree(self) -> int:
-        """Highest degree with a coefficient other than 0; 0 where only `sh0` is used."""
+        """Highest degree with a coefficient other than 0; 0 if only `sh0` is used."""
         if self.sh_rest is None:
             return 0
         filled = self.sh_rest.detach().ne(0).any(dim=2).any(dim=0)  # [K - 1]
         return isqrt(int(filled.nonzero().max()) + 1) if bool(filled.any()) else 0
 
     def to_tensors(self) -> dict[str, Tensor]:
-        """The raw tensors that there are, by name, in a fixed order."""
+        """The raw tensors (without None) by name, in a fixed order."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if value is not None}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> GaussianParams:
-        """The params that `to_tensors` took apart; other names are ignored.
-
-        Raises:
-            ValueError: if a name is missing.
-        """
+        """The inverse of `to_tensors`; other names are ignored, and a missing one is a ValueError."""
         names = [field.name for field in fields(cls)]
         needed = [*names[:4], "sh0" if "features" not in tensors and "sh0" in tensors else "features"]
         missing = [name for name in needed if name not in tensors]
@@ -108,7 +104,7 @@ class GaussianParams:
         return GaussianParams(**{name: function(value) for name, value in self.to_tensors().items()})
 
     def activated(self, sh_degree: int | None = None) -> Gaussians:
-        """The Gaussians these values stand for; differentiable.
+        """The Gaussians with these values; differentiable.
 
         Args:
             sh_degree: of colours, use the harmonics up to this degree only; None: all.
@@ -123,11 +119,11 @@ class GaussianParams:
 
     @classmethod
     def from_gaussians(cls, gaussians: Gaussians) -> GaussianParams:
-        """The raw values of a cloud with features or colours: the inverse of `activated`, to train on from there.
+        """The raw values of a cloud with features or colours, to continue training: the inverse of `activated`.
 
-        Features are taken where a cloud has both. Scales of 0 become the smallest normal number and opacities keep eps away
-        from 0 and 1, since logarithm and logit must be finite. `fit_field` goes on with the harmonics that the cloud makes
-        use of (`used_sh_degree`), not from degree 0 as for points; `FieldConfig` says how further ones come.
+        If a cloud has both, features are taken. Scales of 0 become the smallest normal number, and opacities keep eps away
+        from 0 and 1, because logarithm and logit must be finite. `fit_field` starts with the SH degree that the cloud uses
+        (`used_sh_degree`), not with degree 0 as for points.
 
         Raises:
             ValueError: if the Gaussians carry neither.
@@ -162,19 +158,19 @@ class GaussianParams:
         outlier_range: float = 4.0,
         generator: torch.Generator | None = None,
     ) -> GaussianParams:
-        """Put one round Gaussian on each point, as wide as its three nearest neighbours are away (3DGS).
+        """Put one round Gaussian on each point, with the distance of its three nearest neighbours as its width (3DGS).
 
-        The standard deviation is the root mean square of the three distances, held between `SMALLEST_SPACING` times its
-        median and its 0.99 quantile, so that near-duplicates and lonely points are harmless. Features start at 0 and
-        rotations at the identity. With `colors` it is a colour field that starts: each Gaussian shows its point's colour
-        from everywhere.
+        The standard deviation is the root mean square of the three distances, clamped between `SMALLEST_SPACING` times its
+        median and its 0.99 quantile, so that near-duplicates and lonely points do no harm. Features start at 0 and
+        rotations at the identity. With `colors` it becomes a colour field: each Gaussian has its point's colour from all
+        directions.
 
-        Structure from motion leaves points far outside a scene (30 times its size is common). A point is dropped when
-        its distance from the coordinate-wise median exceeds `outlier_range` times the 0.95 quantile of these distances.
+        Structure from motion leaves points far outside a scene (30 times its size is common). A point is dropped if its
+        distance from the coordinate-wise median exceeds `outlier_range` times the 0.95 quantile of these distances.
 
         Args:
             points: the cloud, usually `Scene.points`.
-            channels: D, the number of features per Gaussian; leave it out where `colors` are given.
+            channels: D, the number of features per Gaussian; leave it out with `colors`.
             colors: of the points, usually `Scene.colors`; None starts a field of features.
             sh_degree: highest degree of the spherical harmonics of a colour field, 0 to 3.
             initial_opacity: in (0, 1).
@@ -244,9 +240,9 @@ def _inliers(points: Tensor, outlier_range: float) -> Tensor:  # [P, 3] -> [P] b
 
 
 def point_spacing(points: Tensor) -> Tensor:  # [P, 3] -> [P] world units
-    """Root mean square distance to the three nearest other places (fewer if there are fewer), held within bounds.
+    """Root mean square distance to the three nearest other positions (or fewer), clamped to bounds.
 
-    Equal points count as one place and share its spacing.
+    Equal points are one position and share its spacing.
 
     Raises:
         ValueError: if there are not at least two different points.

@@ -1,4 +1,4 @@
-"""The parts of a semantic field: whether they fit together, and how some of them label a view."""
+"""Helpers of `SemanticField`: check that its parts fit together, and label views."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def check_parts(
     linear: LinearLatents | None,
     answers: Tensor | None,  # [N, e]
 ) -> None:
-    """Raise a ValueError unless these are the parts of one field; `SemanticField` says what each is."""
+    """Raise a ValueError unless these parts fit together; they are those of `SemanticField`."""
     features = gaussians.features
     if features is None:
         raise ValueError("gaussians: expected features [N, d], got None; fit them with fit_field")
@@ -56,7 +56,7 @@ def check_parts(
 
 
 def checked_classes(classes: Classes) -> Classes:
-    """Classes as they are, an array as a tensor; a name alone is an error that says what to call."""
+    """Return classes unchanged, an array as a tensor; a single name is an error."""
     if isinstance(classes, str):
         raise TypeError(
             f"classes: expected a LabelSet or embeddings [C, D], got the name {classes!r}; query({classes!r}) finds the "
@@ -66,13 +66,13 @@ def checked_classes(classes: Classes) -> Classes:
 
 
 def teacher_name(info: dict[str, Any]) -> str | None:
-    """The name of the teacher in a field's `info`; None where it is not known."""
+    """The name of the teacher in a field's `info`; None if unknown."""
     teacher = info.get("teacher")
     return str(teacher.get("name")) if isinstance(teacher, dict) else None
 
 
 def info_lines(info: dict[str, Any]) -> list[str]:
-    """What a person wants to know of a field's `info`, a line each; lists and dictionaries are left out."""
+    """A field's `info` for people, a line per entry; lists and dictionaries are left out."""
     teacher = teacher_name(info)
     lines = [] if teacher is None else [f"  teacher: {teacher}"]
     return [*lines, *(f"  {name}: {value}" for name, value in info.items() if not isinstance(value, list | dict))]
@@ -84,7 +84,7 @@ def blend_votes(
     cosines: Tensor,  # [N, C]
     known: Tensor,  # [N] bool
 ) -> Tensor:  # [H, W] int64
-    """The class with most votes at each pixel: each Gaussian shares one vote, and votes are blended as colours are."""
+    """The class with most votes at each pixel: each Gaussian divides one vote, and votes are blended like colours."""
     with torch.no_grad():
         winners = cosines.argmax(dim=1)[known].unique()  # a class that no Gaussian prefers wins no pixel
         if len(winners) == 0:
@@ -100,7 +100,7 @@ def label_rendered(
     decode: Callable[[Tensor], Tensor],
     unit: Tensor,  # [C, D] unit rows
 ) -> Tensor:  # [H, W] int64
-    """The class that is most similar to each pixel's decoded feature; -1 where nothing was drawn."""
+    """The class that is most similar to each pixel's decoded feature; -1 for empty pixels."""
     pixels = [decode(part) for part in rendering.map.flatten(0, 1).split(CHUNK)]
     found = torch.cat([(part @ unit.T).max(dim=1).indices.masked_fill(~part.any(dim=1), -1) for part in pixels])
     return found.view(rendering.alpha.shape).masked_fill(rendering.alpha <= 0, -1)

@@ -1,4 +1,4 @@
-"""What a field remembers of its scene: where classes and text table lay, relative to the field, and their digests."""
+"""A field's notes about its scene: relative paths and digests of classes and text table, so that it finds them again."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from .._files import digest_file
 from ..labels import LabelSet, load_label_set
 
 CLASSES = ("classes.json", "text.npy"), ("classes.json", "text.safetensors"), ("text.safetensors",)
-"""Files of a scene folder that make a label set, the first pair that is there."""
+"""Files of a scene folder that make a label set; the first pair that exists is used."""
 
 
 def remember(scene: Path, field: Path) -> dict[str, Any]:
-    """What a field at `field` notes of the scene folder `scene`: paths relative to the field, and digests; JSON."""
+    """Make a field's notes about a scene folder, as JSON: paths relative to the field, and digests."""
     found: dict[str, Any] = {"scene": _relative(scene, field)}
     for names in CLASSES:
         files = [scene / name for name in names]
@@ -25,7 +25,7 @@ def remember(scene: Path, field: Path) -> dict[str, Any]:
 
 
 def rebased(info: dict[str, Any], old: Path | None, new: Path) -> dict[str, Any]:
-    """The same notes for a field that moves from one folder to another."""
+    """The notes of a field that moves to another folder."""
     if old is None or old.resolve() == new.resolve():
         return info
     moved = dict(info)
@@ -37,12 +37,7 @@ def rebased(info: dict[str, Any], old: Path | None, new: Path) -> dict[str, Any]
 
 
 def recall_scene(info: dict[str, Any], folder: Path | None) -> Path:
-    """The scene folder that a field remembers.
-
-    Raises:
-        ValueError: if it remembers none.
-        FileNotFoundError: if there is none any more.
-    """
+    """The scene folder in a field's notes; a ValueError if there is no note, a FileNotFoundError if no folder."""
     noted = info.get("scene")
     if not isinstance(noted, str) or folder is None:
         raise ValueError("scene: expected a field that remembers its scene, got one that does not; pass the scene")
@@ -57,7 +52,7 @@ def recall_classes(info: dict[str, Any], folder: Path | None) -> LabelSet:
 
     Raises:
         ValueError: if it remembers none, or a file has changed.
-        FileNotFoundError: if a file is gone.
+        FileNotFoundError: if a file is missing.
     """
     noted = info.get("classes")
     if not noted or folder is None:
@@ -81,5 +76,5 @@ def _relative(path: Path, field: Path) -> str:
 
 
 def _absolute(field: Path, noted: str) -> Path:
-    """Where a noted path leads. The field's folder may be a link, and paths were noted from where it really lies."""
+    """The absolute form of a noted path. Links are resolved first: notes are relative to the field's real folder."""
     return Path(os.path.normpath(field.resolve() / noted))

@@ -1,4 +1,4 @@
-"""The finished semantic field: Gaussians with latents, the decoder of latents, and the rule that gives each its class."""
+"""The finished semantic field: Gaussians with latents, their decoder, and the rule that gives each Gaussian a class."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ Rule = Literal["fused", "paper"]
 
 @dataclass(frozen=True, eq=False)
 class SemanticField:
-    """A scene's semantics in 3-D, with all that is needed to classify, query and segment.
+    """A scene's semantics in 3-D, with everything needed to classify, query and segment.
 
     Latents are linear in the teacher's features (`linear`, made by `uplift`), or one of the three rows of Table 1: with
-    codebook and autoencoder d latents ("decouple+ADC+SC"), with the codebook alone features near codewords
-    ("decouple+ADC"), with neither the teacher's features as they are ("just decouple").
+    codebook and autoencoder, d latents ("decouple+ADC+SC"); with the codebook only, features near codewords
+    ("decouple+ADC"); with neither, the teacher's features ("just decouple").
 
-    **The rule.** Each Gaussian has a class, or a score, of its own: that of its *fused* feature, the mean of what the
-    training views show where it is seen. Selections, labels of other clouds, and the views of a fused field follow from it.
-    `rule="paper"` is Sec. 3.4 as printed: a Gaussian's own latent, or a pixel's rendered one, is decoded and quantised.
+    **The rule.** The class or score of a Gaussian is that of its *fused* feature: the mean over the pixels of the training
+    views that show it. Selections, labels of other clouds, and the views of a fused field follow from it. `rule="paper"` is
+    Sec. 3.4 as printed: decode and quantise a Gaussian's own latent, or a pixel's rendered one.
     `field.gaussians[field.query("chair")]` are the Gaussians of the chair.
     """
 
@@ -47,17 +47,17 @@ class SemanticField:
     codebook: Codebook | None = None
     autoencoder: Autoencoder | None = None
     info: dict[str, Any] = default(default_factory=dict)
-    """Where it comes from; anything that JSON can hold."""
+    """The origin of the field, as JSON."""
     linear: LinearLatents | None = None
-    """What linear latents stand for: `answers` where there are some, else the Gaussians' features."""
+    """Decodes linear latents: `answers` if there are any, else the Gaussians' features."""
     answers: Tensor | None = None  # [N, e]
-    """Each Gaussian's fused feature, as linear latents; None where the Gaussians' features are just that."""
+    """Each Gaussian's fused feature, as linear latents; None if the Gaussians' features are already fused."""
     seen: Seen | None = None
     """How well the training views show each Gaussian."""
     cameras: tuple[Camera, ...] = ()
     """The training views, undistorted."""
     folder: Path | None = None
-    """Where it was loaded from."""
+    """The folder it was loaded from."""
 
     def __post_init__(self) -> None:
         parts.check_parts(self.gaussians, self.codebook, self.autoencoder, self.linear, self.answers)
@@ -89,7 +89,7 @@ class SemanticField:
 
     @property
     def known(self) -> Tensor:  # [N] bool
-        """Which Gaussians a training view has shown: the others have learnt nothing, and belong to no class."""
+        """Which Gaussians a training view has shown; nothing is known about the others, so they have no class."""
         return self._own.any(dim=1)
 
     def __len__(self) -> int:
@@ -116,7 +116,7 @@ class SemanticField:
             return rasterize(self.gaussians, camera, engine=engine)
 
     def decode(self, latents: Tensor) -> Tensor:  # [..., d] -> [..., D]
-        """Bring latents back to the teacher's space (Psi of Sec. 3.3.2, or B z); features are returned as they are."""
+        """Decode latents to the teacher's space (Psi of Sec. 3.3.2, or B z); features are returned unchanged."""
         latents = as_tensor("latents", latents, floating=True)
         if latents.shape[-1] != self.channels:
             raise ValueError(
@@ -129,18 +129,18 @@ class SemanticField:
             return latents if self.autoencoder is None else self.autoencoder.decode(latents, chunk=parts.CHUNK)
 
     def feature_map(self, camera: Camera) -> Tensor:  # [H, W, D]
-        """The teacher's features as seen from a viewpoint. 512 channels at 640x480 take 630 MB."""
+        """Render the teacher's features from a viewpoint. 512 channels at 640x480 take 630 MB."""
         return self.decode(self.render(camera).map)
 
     # The rule
 
     def cosines(self, rows: Tensor, *, rule: Rule = "fused") -> Tensor:  # [M, D] -> [N, M]
-        """The cosine of each Gaussian's feature with some rows; 0 where nothing is known of the Gaussian.
+        """The cosine of each Gaussian's feature with some rows; 0 if nothing is known about the Gaussian.
 
         Args:
             rows: embeddings in the teacher's space, of any length.
             rule: `fused`: its fused feature. `paper`: the codeword nearest to its own decoded latent (Sec. 3.4). A field
-                that was made without its training views has no fused features, and follows the paper either way.
+                made without its training views has no fused features, and always follows the paper.
 
         Raises:
             ValueError: if there is no row, shapes disagree, or a row is all-zero.
@@ -159,7 +159,7 @@ class SemanticField:
             return per_codeword[torch.cat(index)] * self.features.any(dim=1)[:, None]
 
     def own_features(self, rows: Tensor) -> Tensor:  # [n] int64 -> [n, D]
-        """The features that some Gaussians answer with, in the teacher's space; all-zero where nothing is known."""
+        """The features of some Gaussians by the rule, in the teacher's space; all-zero if unknown."""
         if self.linear is not None:
             return self.linear.decode(self._own[rows])
         return self.decode(self.features[rows]) * self.known[rows, None]
@@ -172,7 +172,7 @@ class SemanticField:
             rule: see `cosines`.
 
         Returns:
-            Labels [N], -1 where nothing is known of the Gaussian, and scores [N]. A tie goes to the lowest class.
+            Labels [N], -1 if nothing is known about the Gaussian, and scores [N]. A tie goes to the lowest class.
         """
         scores, labels = self.cosines(self._rows(classes), rule=rule).max(dim=1)
         nothing = ~(self.known if rule == "fused" else self.features.any(dim=1))
@@ -193,19 +193,18 @@ class SemanticField:
         logit_scale: float | str = "clip",
         rule: Rule = "fused",
     ) -> Selection:
-        """The Gaussians of one thing: those that are more like it than a threshold (gamma of Sec. 3.4).
+        """The Gaussians of one thing: those with a score above a threshold (gamma of Sec. 3.4).
 
-        By default they are those that are more like the target than like anything that it is compared with: the other classes
-        for a class, the canonical words for anything else. The score is then a relevancy (`labels.relevancy`), gamma 0.5.
+        By default a Gaussian is selected if it is more similar to the target than to all negatives: the other classes for a
+        class, the canonical words for any other target. The score is then a relevancy (`labels.relevancy`), gamma 0.5.
 
         Args:
             target: the name of a class, or an embedding [D].
-            classes: where the name is looked up, and what it is compared with; None: the field's own (`label_set`).
-            threshold: gamma. None: 0.5 for a relevancy, else read off the scores; the result says how.
-            negatives: what the target is compared with: "classes", "canonical" (words of the classes' table), "none", rows
-                [M, D], or "auto" as above.
+            classes: to look up the name and for the negatives; None: the field's own (`label_set`).
+            threshold: gamma. None: 0.5 for a relevancy, else derived from the scores; `how` of the result explains it.
+            negatives: "classes", "canonical" (words of the classes' table), "none", rows [M, D], or "auto" as above.
             score: "relevancy", "softmax" over target and negatives, or "cosine". None: relevancy if there are negatives.
-            logit_scale: of the softmax: "raw", "lseg", "clip", or a number that multiplies the cosines.
+            logit_scale: for the softmax: "raw", "lseg", "clip", or a number that multiplies the cosines.
             rule: see `cosines`.
 
         Raises:
@@ -215,7 +214,7 @@ class SemanticField:
             target = as_tensor("target", target, floating=True)
         if score == "cosine" and isinstance(negatives, str) and negatives == "auto":
             negatives = "none"
-        compared = isinstance(negatives, str) and negatives != "none"  # from something that the classes' files hold
+        compared = isinstance(negatives, str) and negatives != "none"  # needs classes or their canonical words
         if classes is None and (isinstance(target, str) or (compared and "classes" in self.info)):
             try:
                 classes = self.label_set()
@@ -233,16 +232,16 @@ class SemanticField:
     def segment(
         self, camera: Camera, classes: Classes | None = None, *, rule: Rule = "fused"
     ) -> Tensor:  # [H, W] int64
-        """The class of each pixel from a viewpoint; -1 where nothing was drawn.
+        """The class of each pixel from a viewpoint; -1 for empty pixels.
 
         Args:
             camera: any viewpoint.
             classes: a label set, or embeddings [C, D]; None: the field's own (`label_set`).
-            rule: `fused`: each Gaussian of a fused field shares one vote among the classes (the softmax of 100 cosines,
-                CLIP's scale), and a pixel takes the class with most blended votes. A trained field learnt blends of latents,
-                so it takes the codeword whose latent is nearest to the rendered one. `paper`: render the latent map, decode
-                every pixel, quantise, look up (Sec. 3.4). Without an autoencoder, the class most similar to the rendered
-                feature wins; only `paper` quantises it first.
+            rule: `fused`: in a fused field each Gaussian divides one vote among the classes (the softmax of 100 times the
+                cosines, CLIP's scale), and a pixel takes the class with most blended votes. A trained field has learnt
+                blends of latents, so a pixel takes the codeword with the latent nearest to the rendered one. `paper`: render
+                the latent map, decode every pixel, quantise, look up (Sec. 3.4). Without an autoencoder, the class most
+                similar to the rendered feature wins; only `paper` quantises it first.
 
         Raises:
             ValueError: if shapes disagree or `rule` is unknown.
@@ -271,11 +270,11 @@ class SemanticField:
         return label_codewords(self.codebook.codewords, embeddings)
 
     def with_answers(self, cameras: Sequence[Camera], found: Answers | None = None) -> SemanticField:
-        """This field with the fused features that some views show, and with these views. A fused field keeps its own features.
+        """Add fused features computed from views, and these views. A fused field keeps its features.
 
         Args:
-            cameras: the views that the field was trained with.
-            found: what `fused_answers` returned; None calls it.
+            cameras: the training views.
+            found: the result of `fused_answers`; None calls it.
 
         Raises:
             ValueError: if there is no camera.
@@ -292,16 +291,17 @@ class SemanticField:
 
         Raises:
             ValueError: if it remembers none, or they have changed.
-            FileNotFoundError: if they are no longer where they were.
+            FileNotFoundError: if their files are missing.
         """
         return recall_classes(self.info, self.folder)
 
     # Size and files
 
     def storage(self) -> int:
-        """Bytes as Table 1 counts them: every attribute of the Gaussians, and what decodes them, in float32.
+        """Bytes as in Table 1: every attribute of the Gaussians, and their decoder, in float32.
 
-        Without an autoencoder, the table counts no codebook; we do: labelling needs it. Fused answers are not counted.
+        Without an autoencoder, the table counts no codebook; here it counts, because labelling needs it. Fused answers do
+        not count.
         """
         decoder = 0 if self.autoencoder is None else self.autoencoder.decoder_parameters
         codebook = 0 if self.codebook is None else self.codebook.codewords.numel()
@@ -309,7 +309,7 @@ class SemanticField:
         return semantic_storage_bytes(len(self), self.channels, decoder, codebook + basis)
 
     def summary(self) -> str:
-        """A few lines for a person: counts, channels, codewords, size."""
+        """A few lines of text: counts, channels, codewords, size."""
         codewords = "no codebook" if self.codebook is None else f"{self.codebook.size} codewords"
         lines = [
             f"semantic field ({self.method}): {len(self)} Gaussians, {self.channels} channels for {self.dim}, {codewords}",
@@ -322,7 +322,7 @@ class SemanticField:
         """Write a folder with `field.safetensors` and `field.json`, whole or not at all; an older field is replaced.
 
         Raises:
-            FileExistsError: if something else than a field lies at `path`.
+            FileExistsError: if there is something other than a field at `path`.
             ValueError: if `info` is not JSON.
         """
         save_field(path, vars(self))
@@ -333,7 +333,7 @@ class SemanticField:
 
         Raises:
             FileNotFoundError: if there is no field at `path`.
-            ValueError: if it is damaged, from another version, or something else.
+            ValueError: if it is damaged, from another version, or no field.
         """
         return cls(**load_field(path), folder=Path(path))
 

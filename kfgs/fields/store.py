@@ -25,7 +25,7 @@ TENSORS, DESCRIPTION = "field.safetensors", "field.json"
 
 
 def save_field(path: str | Path, parts: Mapping[str, Any]) -> None:
-    """Write the parts of a field, as `load_field` gives them, into a folder; see `SemanticField.save`."""
+    """Write the parts of a field, as returned by `load_field`, into a folder; see `SemanticField.save`."""
     path = Path(path)
     if path.exists() and not (path / DESCRIPTION).is_file() and not (path.is_dir() and not any(path.iterdir())):
         raise FileExistsError(

@@ -22,7 +22,7 @@ from .working_maps import shrink_camera, shrink_map
 
 
 class Trainer:
-    """Gaussians under training, with all that the next step depends on."""
+    """Gaussians in training, with everything that the next step depends on."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class Trainer:
         self._losses, self._seconds = 0.0, 0.0
 
     def advance_(self) -> dict[str, Any] | None:
-        """One step of the optimisation; the new row of the history if there is one."""
+        """One step of the optimisation; returns the new row of the history, if there is one."""
         started = time.perf_counter()
         config = self._config
         self.step += 1
@@ -139,7 +139,7 @@ class Trainer:
         return min(self._config.divisor(self.step), *self._cameras[view].size)
 
     def _camera(self, view: int, target: Tensor) -> Camera:
-        """The camera to render with; each is made once, since checking a camera takes longer than using it."""
+        """The camera to render with; cached, because checking a new camera takes longer than using it."""
         divisor = self._divisor(view)
         if (view, divisor) not in self._render_cameras:
             camera = self._cameras[view].to(self.optimizer.params.means)
@@ -150,7 +150,7 @@ class Trainer:
         return self._render_cameras[view, divisor]
 
     def snapshot(self) -> Checkpoint:
-        """All that `restore_` needs."""
+        """Everything that `restore_` needs."""
         tensors = {f"params.{name}": value for name, value in self.optimizer.params.to_tensors().items()}
         tensors |= {f"adam.{name}": value for name, value in self.optimizer.state_tensors().items()}
         tensors |= {f"statistics.{name}": value for name, value in self.statistics._asdict().items()}
@@ -165,7 +165,7 @@ class Trainer:
         return Checkpoint(tensors, state)
 
     def restore_(self, checkpoint: Checkpoint) -> None:
-        """Continue from a snapshot; the generator given to the fit is set to its state then."""
+        """Continue from a snapshot; also restores the state of the fit's generator."""
         device = self.optimizer.params.means.device
         parts: dict[str, dict[str, Tensor]] = {"params": {}, "adam": {}, "statistics": {}}
         for name, value in checkpoint.tensors.items():

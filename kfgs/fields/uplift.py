@@ -1,8 +1,8 @@
-"""Features of 2-D maps carried to Gaussians without training: averaged in 3-D first, corrected, compressed after.
+"""Carry features of 2-D maps to Gaussians without training: average in 3-D, correct, then compress.
 
 Each Gaussian takes the mean of the pixels that show it, weighted by its rendering weight w = T alpha. Every rendered pixel
-is a blend of Gaussians, so the mean of a Gaussian near a border holds some of its neighbours. A few passes of the simultaneous
-iterative reconstruction technique (SIRT, Gilbert 1972) take that out: render, compare with the maps, carry the difference back.
+is a blend of Gaussians, so near a border the mean contains some of the neighbours. A few passes of the simultaneous iterative
+reconstruction technique (SIRT, Gilbert 1972) remove that: render, compare with the maps, carry the difference back.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ from ..splat import rasterize
 from .merge import FAINT, Merged, merge_gaussians
 from .working_maps import WorkingMaps, shrink_map, working_directions
 
-NEIGHBOURS = 17  # a Gaussian and 16 around it, whose corrections are judged together
-SPARSE = 0.3  # of the views: a splat of the scene fills nearly all of them
+NEIGHBOURS = 17  # a Gaussian and its 16 nearest, whose corrections are judged together
+SPARSE = 0.3  # share of the views' pixels: a splat of the scene fills nearly all of them
 
 
 @dataclass(frozen=True)
 class UpliftConfig:
-    """How maps become features of Gaussians. The defaults change no Gaussian; `UpliftConfig.field()` makes a small field."""
+    """Options of `uplift_maps`. The defaults keep every Gaussian; `UpliftConfig.field()` makes a small field."""
 
     max_gaussians: int | None = None
-    """Prune and merge down to at most this many (`merge_gaussians`). None keeps every Gaussian as it is."""
+    """Prune and merge to at most this many (`merge_gaussians`). None keeps every Gaussian unchanged."""
     keep: float = 0.995
-    """Share of the fused features' variation beside their main direction that the latents must hold: decides their number."""
+    """Share of the fused features' variation around their main direction that latents keep; it decides their number."""
     max_latents: int = 32
     """Most latents of a Gaussian."""
     corrections: int = 1
-    """Passes of SIRT over all views, and one more after merging if there is any. A second one wins a little where maps are
-    blurred, and costs as much where they are sharp and noisy."""
+    """Passes of SIRT over all views; if there is any, one more follows after merging. A second pass helps a little for blurred
+    maps, and harms as much for sharp and noisy ones."""
     pixels: int = 80_000
-    """Most pixels of a working view. Maps are rendered at the largest whole multiple of their size within it, and larger maps are
-    shrunk to a whole fraction of theirs."""
+    """Most pixels of a working view. Views are rendered at the largest whole multiple of the map's size within it; larger maps
+    are shrunk by a whole factor."""
     faint: float = FAINT
-    """Before merging, the faintest Gaussians are dropped that together fill this share of all pixels (`merge_gaussians`)."""
+    """Before merging, the faintest Gaussians, which together fill this share of all pixels, are dropped (`merge_gaussians`)."""
 
     def __post_init__(self) -> None:
         if self.max_gaussians is not None:
@@ -64,23 +64,23 @@ class UpliftConfig:
 
     @staticmethod
     def field(**changes: Any) -> UpliftConfig:
-        """At most 30,000 Gaussians, as the paper's semantic fields have; other values as given."""
+        """At most 30,000 Gaussians, as in the paper's semantic fields, with changes."""
         return UpliftConfig(**({"max_gaussians": 30_000} | changes))
 
 
 @dataclass(frozen=True, eq=False)
 class Uplifted:
-    """Gaussians with fused features, and how sure these are."""
+    """Gaussians with fused features, and measures of their reliability."""
 
     gaussians: Gaussians
     """With latents as features; all-zero where no view shows the Gaussian."""
     latents: LinearLatents
-    """What the latents stand for."""
+    """The decoder of the latents."""
     pixels: Tensor  # [N]
-    """How many pixels the Gaussian fills, in all views together."""
+    """Number of pixels that the Gaussian fills, in all views."""
     agreement: Tensor  # [N] in [0, 1]
-    """Length of the mean of the unit features that it was shown with: 1 where all pixels said the same, 0 = never shown. Of
-    merged Gaussians the mean of their members'."""
+    """Length of the mean of the unit features at its pixels: 1 if all are equal, 0 = never shown. For merged Gaussians the mean
+    over their members."""
 
     __repr__ = short_repr
 
@@ -98,26 +98,26 @@ def uplift_maps(
 ) -> Uplifted:
     """Average feature maps onto Gaussians by rendering weight, correct for blending, and keep few linear latents.
 
-    Features count by direction. No class is used anywhere, so the result answers any words. Each map is read once for the
-    average and, for at most 32 views, once before to find the working directions. In memory are 2 x [N, 65] numbers; the maps in
-    the working directions, at most 10 MB each, lie in files.
+    Only the directions of features matter. No classes are used, so the result answers any text. Each map is read once for
+    the average and, for at most 32 views, once before to find the working directions. Memory holds 2 x [N, 65] numbers; the
+    maps in the working directions, at most 10 MB each, are in files.
 
     Args:
-        gaussians: any cloud in the cameras' frame; colours and features that it has are not used.
+        gaussians: any cloud in the cameras' frame; its colours and features are not used.
         cameras: C posed cameras without distortion.
-        maps: one per camera, covering its picture at any size; all-zero features say nothing about their pixel.
+        maps: one per camera, covering its picture at any size; all-zero features mean "unknown".
         config: see `UpliftConfig`.
-        generator: draws the first centres of merging; None stands for seed 0.
-        scratch: a folder of these maps alone for these files: those that a killed process left there are not made again. The
-            caller deletes it. None: a temporary folder.
+        generator: draws the first centres of merging; None: seed 0.
+        scratch: a folder for these files, used for these maps only; files of a killed process are used again. The caller
+            deletes it. None: a temporary folder.
         progress: show a bar.
-        report: receives a line per step.
+        report: called with a line per step.
 
     Raises:
         ValueError: if counts or shapes disagree, a map is not finite, or no view shows any Gaussian.
 
     Note:
-        To train on from here, start `fit_field` with `GaussianParams.from_gaussians(found.gaussians)` and give it the maps
+        To continue by training, start `fit_field` with `GaussianParams.from_gaussians(found.gaussians)` and the maps
         `found.latents.encode(unit features)`.
     """
     config, say = config or UpliftConfig(), report or (lambda text: None)
@@ -178,7 +178,7 @@ def _add(cloud: Gaussians, camera: Camera, signal: Tensor, sums: Tensor) -> None
 
 
 def _average(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, Tensor]:  # [2, N, d' + 1], [N]
-    """Sums of features and of weights over the even and over the odd views, and the pixels that each Gaussian fills."""
+    """Sums of features and weights, over the even and the odd views, and the number of pixels that each Gaussian fills."""
     sums, shown = cloud.means.new_zeros(2, len(cloud), views.channels + 1), torch.zeros_like(cloud.opacities)
     for i in range(len(views)):
         camera, features, _, scale = views[i]
@@ -190,10 +190,10 @@ def _average(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, Te
 
 
 def _correct(cloud: Gaussians, sums: Tensor, views: WorkingMaps, bar: Any) -> Tensor:  # [2, N, d + 1]
-    """One pass of SIRT: add to each Gaussian's feature the mean, by weight, of the difference at its pixels, without the noise.
+    """One pass of SIRT: correct each Gaussian's feature by the weighted mean of the difference at its pixels, without noise.
 
-    The even and the odd views make a reconstruction each, from their own maps alone. How well the two corrections agree
-    among neighbours tells signal from noise (`_reliability`), and both take the reliable share.
+    The even and the odd views make one reconstruction each. Signal is the part of the two corrections that agrees among
+    neighbours (`_reliability`); both take the reliable share.
     """
     weights = sums[..., -1:]
     halves = sums[..., :-1] / _some(weights)
@@ -212,8 +212,8 @@ def _correct(cloud: Gaussians, sums: Tensor, views: WorkingMaps, bar: Any) -> Te
 def _reliability(one: Tensor, other: Tensor, near: Tensor) -> Tensor:  # [N, d] x 2, [N, k] -> [N] in [0, 1]
     """The share of signal in the mean of two independent estimates: 2 r / (1 + r), the Spearman-Brown formula.
 
-    r is the common part of the estimates, sum of products over mean sum of squares, among a Gaussian and its neighbours. Below 0
-    it counts as 0, and so does that of Gaussians that one half of the views does not show.
+    r is the common part of the estimates, sum of products over mean sum of squares, over a Gaussian and its neighbours.
+    Negative values become 0; so do those of Gaussians that one half of the views does not show.
     """
     products = (one * other).sum(1)[near].sum(1)
     squares = (one.square().sum(1) + other.square().sum(1))[near].sum(1) / 2
@@ -230,7 +230,7 @@ def _neighbours(means: Tensor) -> Tensor:  # [N, 3] -> [N, k] int64
 
 
 def _mean(sums: Tensor) -> Tensor:  # [2, N, d + 1] -> [N, d]
-    """The mean feature over both halves of the views; 0 where none shows the Gaussian."""
+    """The mean feature over both halves of the views; 0 if no view shows the Gaussian."""
     whole = sums.sum(0)
     return whole[:, :-1] / _some(whole[:, -1:])
 
@@ -243,7 +243,7 @@ def _pooled(values: Tensor, merged: Merged) -> Tensor:  # [N, ...] -> [M, ...]
 
 
 def _capped(weights: Tensor) -> Tensor:
-    """Weights held to their 0.99 quantile: a few wall-sized Gaussians must not choose all latents."""
+    """Weights capped at their 0.99 quantile, so that a few wall-sized Gaussians do not decide all latents."""
     sample = weights[weights > 0]
     sample = sample[:: max(1, len(sample) // 100_000)]
     return weights.clamp_max(torch.quantile(sample, 0.99))

@@ -1,4 +1,4 @@
-"""Maps at a working size: whole blocks of pixels averaged, in a few directions, kept in files while they are fused."""
+"""Feature maps at a working size: blocks of pixels averaged, in a few directions, stored in files during fusion."""
 
 from __future__ import annotations
 
@@ -21,32 +21,32 @@ from ..quant.linear import principal_directions
 from ..quant.sampling import sample_grid
 
 WORKING = 64
-"""Directions in which maps are averaged at first. Those of room_0's maps hold 98.8 % of their energy, and what they leave out is
-noise of single pixels. The latents found among them keep a cosine above 0.99 with the average of all 512 channels."""
-LOOKED_AT = 32, 2_000  # views, and features of each, that the working directions are found in
+"""Number of working directions. For room_0's maps they keep 98.8 % of the energy; the rest is noise of single pixels. The
+latents found in them keep a cosine above 0.99 with the average of all 512 channels."""
+LOOKED_AT = 32, 2_000  # the working directions are found in so many views, and so many features of each
 
 
 def shrink_map(
     map: Tensor,  # [H, W, D]
     divisor: int,
 ) -> Tensor:  # [H // divisor, W // divisor, D]
-    """The mean of every block of divisor x divisor pixels; a block with a NaN is NaN. Rows and columns that are left over at
-    the bottom and right are dropped, so that blocks stay whole.
+    """The mean of each block of divisor x divisor pixels; NaN if one is NaN. Incomplete blocks at the bottom and right are
+    dropped.
     """
     return from_bchw(torch.nn.functional.avg_pool2d(to_bchw(map), divisor))
 
 
 def shrink_camera(camera: Camera, divisor: int) -> Camera:
-    """The camera that sees the picture of `shrink_map`. Its pixels are exactly divisor times as wide.
+    """The camera of a picture shrunk by `shrink_map`: its pixels are exactly `divisor` times as wide.
 
-    `Camera.resized` would squeeze the dropped pixels in instead, which moves everything by a fraction of a pixel.
+    `Camera.resized` would include the dropped pixels, and move everything by a fraction of a pixel.
     """
     factors = camera.K.new_tensor([1 / divisor, 1 / divisor, 1.0])[:, None]
     return replace(camera, K=camera.K * factors, width=camera.width // divisor, height=camera.height // divisor)
 
 
 class WorkingMaps:
-    """The maps at their working size, in few directions, each kept in a file."""
+    """The maps at their working size, in few directions, each in a file."""
 
     def __init__(
         self, cameras: Sequence[Camera], maps: FeatureMaps, directions: Tensor, pixels: int, scratch: Path | None
@@ -68,16 +68,16 @@ class WorkingMaps:
 
     @property
     def channels(self) -> int:
-        """Of the maps as they are given now."""
+        """Number of current directions."""
         return int((self._directions if self._basis is None else self._basis).shape[1])
 
     def project(self, basis: Tensor) -> None:  # [d', d]
-        """From now on give maps in these directions of the working ones."""
+        """From now on return maps in these directions, given in the working directions."""
         self._basis = basis
 
     def __getitem__(self, i: int) -> tuple[Camera, Tensor, int, float]:
-        """The working camera, the map [h, w, d] (NaN where nothing is known), the divisor that brings a rendering to the map's
-        size, and how many of the camera's original pixels a working pixel covers.
+        """The working camera, the map [h, w, d] (NaN if unknown), the divisor from a rendering to the map's size, and the
+        number of original pixels that a working pixel covers.
         """
         kept, shape = self._keep(i)
         h, w, _ = kept.shape
@@ -92,7 +92,7 @@ class WorkingMaps:
         return working, features, factor, 1 / float(span.prod())
 
     def _keep(self, i: int) -> tuple[Tensor, Tensor]:  # [h, w, d'], [2]
-        """The map in the working directions, and the (height, width) that it had; made once, then read."""
+        """The map in the working directions, and its original (height, width); made once, then read from its file."""
         file = self._folder / f"{i}.npz"
         if not file.is_file():
             rows, shape = self._make(i)
@@ -124,7 +124,7 @@ class WorkingMaps:
 
 
 def working_directions(maps: FeatureMaps) -> Tensor:  # [D, d']
-    """The main directions of unit features, found in samples of some evenly spread maps."""
+    """The main directions of unit features, from samples of some evenly spread maps."""
     most, samples = LOOKED_AT
     views = sorted({round(i) for i in np.linspace(0, len(maps) - 1, min(most, len(maps)))})
     moment: Tensor | float = 0.0

@@ -1,4 +1,4 @@
-"""The paper's Figure 2 as a few named, resumable calls, and what a finished field is used for."""
+"""The whole job (the paper's Figure 2) as a few resumable calls, and the uses of a finished field."""
 
 from ..viz.field_colors import feature_colors
 from .apply import (

@@ -1,4 +1,4 @@
-"""Use a finished field: segment views, score them, label Gaussians and clouds, draw pictures of how the run went."""
+"""Use a finished field: segment views, score them, label Gaussians and clouds, plot the training."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def segment_scene(
             f"classes: expected at most {VOID} (label pictures hold a byte per pixel, {VOID} = none), got {len(classes)}; "
             "segment with fewer classes, or call SemanticField.segment, which has no such limit"
         )
-    class_rows(classes, field.dim, field.info)  # refuses words of another teacher before any file is written
+    class_rows(classes, field.dim, field.info)  # checks the classes before any file is written
     views = scene.views(split)
     shown = {views[i] for i in np.linspace(0, len(views) - 1, min(pictures, len(views))).round().astype(int)}
     colors = feature_colors(field)
@@ -92,7 +92,7 @@ def segment_scene(
 def true_labels(scene: Scene, folder: Path, split: str) -> dict[str, Tensor]:
     """The label pictures of a split's views by stem, as [H, W] with -1 = void; views without one are left out.
 
-    Where the scene's lens was removed, it is removed from the label pictures too, which are of the pictures as taken.
+    If the scene is undistorted, the label pictures are undistorted too.
     """
     truth = {}
     for i in scene.views(split):
@@ -118,10 +118,10 @@ def score_teacher(
     """Score the teacher itself: each pixel's best class by cosine, under the protocol of `score_scene`.
 
     Args:
-        maps: gives a view's teacher map [h, w, D] by its stem, undistorted as the views are.
-        truth: what `true_labels` gives.
+        maps: returns a view's teacher map [h, w, D] by its stem, undistorted like the views.
+        truth: the result of `true_labels`.
         classes: names and embeddings.
-        size: (height, width) to which the teacher's labels are brought before they are compared.
+        size: (height, width); the teacher's labels are resized to it before the comparison.
     """
 
     def predict(stem: str) -> Tensor:
@@ -133,12 +133,12 @@ def score_teacher(
 
 
 def select_labelled(splats: SplatFile, name: str, threshold: float | None = None) -> Selection:
-    """The Gaussians of a labelled splat that carry one class.
+    """The Gaussians of a labelled splat that have one class.
 
     Args:
         splats: with labels and class names.
-        name: the class asked for.
-        threshold: take only those whose `score` is above it.
+        name: the class.
+        threshold: take only Gaussians with a `score` above it.
 
     Raises:
         ValueError: if the splat has no labels or no such class, or there are no scores to compare with a threshold.
@@ -157,14 +157,14 @@ def select_labelled(splats: SplatFile, name: str, threshold: float | None = None
 def save_labelled(
     path: str | Path, gaussians: Gaussians, scores: Tensor, classes: LabelSet, *, rule: str
 ) -> list[Path]:
-    """Write labelled Gaussians as PLY (`class_id`, `score`, label colours) with a JSON file beside it.
+    """Write labelled Gaussians as PLY (`class_id`, `score`, label colours), with a JSON file next to it.
 
     Args:
         path: the PLY file to write.
         gaussians: with labels.
         scores: one per Gaussian.
         classes: names for the JSON file.
-        rule: how labels and scores came about, for the JSON file.
+        rule: how labels and scores were found, for the JSON file.
     """
     path = Path(path)
     assert gaussians.labels is not None
@@ -174,7 +174,7 @@ def save_labelled(
 
 
 def label_columns(labels: Tensor, scores: Tensor | None = None) -> Columns:  # labels [N], scores [N]
-    """PLY columns of labels: class_id (int, -1 = none), label colours, and scores when given."""
+    """PLY columns of labels: class_id (int, -1 = none), label colours, and scores if given."""
     rgb = palette(labels)
     columns: Columns = {"class_id": labels.to(torch.int32).numpy()}
     columns |= {name: np.ascontiguousarray(rgb[:, i]) for i, name in enumerate(("red", "green", "blue"))}
@@ -208,14 +208,14 @@ def label_cloud(
 ) -> tuple[Transfer, list[Path]]:
     """Carry labels to points or Gaussians by distance (Sec. 3.4), keeping all their other columns.
 
-    Label colours are added where the cloud has no colours of its own; `class_id` is replaced.
+    Label colours are added if the cloud has no colours; `class_id` is replaced.
 
     Args:
         gaussians: labelled Gaussians of the semantic field.
-        cloud: what `read_cloud` gives, in the same frame.
+        cloud: the result of `read_cloud`, in the same frame.
         out: the PLY file to write.
-        classes: names for the JSON file beside it.
-        distance: the paper's lambda, in world units; from the clouds' spacing when not given.
+        classes: names for the JSON file next to it.
+        distance: lambda of Sec. 3.4, in world units; None: from the clouds' spacing.
     """
     assert gaussians.labels is not None
     moved = transfer_labels(gaussians.means, gaussians.labels, points_from_columns(cloud), distance)
@@ -230,12 +230,12 @@ def label_cloud(
 
 
 def write_report(path: Path, **parts: Any) -> None:
-    """Write scores and facts of a run as one JSON file; reports are turned into plain numbers."""
+    """Write scores and details of a run as one JSON file; reports become plain numbers."""
     write_json(path, {name: part.to_json() if hasattr(part, "to_json") else part for name, part in parts.items()})
 
 
 def write_training_pictures(result: FitResult) -> list[Path]:
-    """Draw the histories of a run's codebook and field into its folder; return the pictures written."""
+    """Plot the histories of a run's codebook and field into its folder; return the pictures written."""
     draw = {"codebook": plot_codebook_history, "field": plot_training}
     written = []
     for stage in result.stages:

@@ -1,4 +1,4 @@
-"""A semantic field meets any splat: check or find the common frame, carry the classes over, say how it went."""
+"""Give any splat the classes of a semantic field: check or find the common frame, and carry the classes over."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ from ..splat.transform import transform_gaussians
 
 By = Literal["distance", "views"]
 WAYS: tuple[By, ...] = ("distance", "views")
-SOLID = 0.05  # opacity from which a Gaussian takes part in finding the frame: fainter ones float anywhere
-STAYS = 0.005  # of the scene's size: an alignment that moves half of the points by less moves nothing
+SOLID = 0.05  # fainter Gaussians are not used to find the frame: they can be anywhere
+STAYS = 0.005  # of the scene's size: an alignment that moves half of the points by less is ignored
 
 
 @dataclass(frozen=True, eq=False)
 class Attached:
-    """A splat with classes, and how it came to them."""
+    """A splat with classes, and how they were found."""
 
     splats: SplatFile
     """The splat in its own frame, with `labels`, the extra column `score`, class names and `info["labels"]`."""
     transfer: Transfer
-    """What distance decided: every Gaussian (`by="distance"`), or those that the views left open (`by="views"`)."""
+    """The labels decided by distance: of every Gaussian (`by="distance"`), or of those without a label by views."""
     similarity: Similarity
     """From the semantic field's frame to the splat's."""
     alignment: Alignment | None
-    """How the similarity was found; None where the frames agreed or it was given."""
+    """How the similarity was found; None if the frames agreed or it was given."""
     words: tuple[str, ...]
-    """What was done and found, a sentence each."""
+    """Sentences for people: what was done, and the results."""
 
     __repr__ = short_repr
 
@@ -69,27 +69,27 @@ def attach(
     by: By | None = None,
     method: Method = "nearest",
 ) -> Attached:
-    """Give every Gaussian of a splat the class that the semantic field has at its place.
+    """Give every Gaussian of a splat the class that the semantic field has at its position.
 
-    Frames: a similarity is taken as it is given; to cameras of the splat's own, one is fitted by their names; without
-    either, both share one frame where `frames_agree` says so, and else the clouds themselves are aligned.
+    Frames: a given similarity is used. If cameras of the splat are given, a similarity is fitted to those with the same
+    names. Otherwise `frames_agree` checks whether both share one frame, and if not, the clouds are aligned.
 
     Classes, `by="views"`: the field segments its training views, and each Gaussian of the splat takes the class of most of
-    the pixels that it fills in them (the score is the winner's share of its votes); on one that no view shows, those of the
-    splat that have a class decide, within lambda (the distance within which a label is carried over). `by="distance"`, the
-    paper's Sec. 3.4: the field's own Gaussians are classified, and those within lambda decide. How distance decides is
-    `method`'s: "nearest" gives a score of 1 - d / lambda, "vote" and "mahalanobis" the winner's share of the weights.
+    the pixels that it fills in them (the score is the winner's share of its votes). A Gaussian that no view shows takes the
+    label of labelled ones of the splat within lambda (the distance within which a label is carried over). `by="distance"`,
+    the paper's Sec. 3.4: the field's own Gaussians are classified, and those within lambda decide. With distances, the
+    score is 1 - d / lambda for `method` "nearest", and the winner's share of the weights for "vote" and "mahalanobis".
 
     Args:
         field: a finished field.
-        splats: any splat of the same scene, its Gaussians alone, or the path of a splat file; labels that it has are replaced.
+        splats: any splat of the same scene, its Gaussians, or the path of a splat file; old labels are replaced.
         classes: names and embeddings in the teacher's space.
-        cameras: undistorted views in the field's frame, usually those it was trained on.
-        frame: what tells the splat's frame: the similarity from the field's to it (`Similarity.identity()` says that they
-            are one), or views in it, some of which share their names with `cameras`. None compares the clouds.
-        distance: lambda in the splat's world units; None takes `default_distance`.
+        cameras: undistorted views in the field's frame, usually the training views.
+        frame: the similarity from the field's frame to the splat's (`Similarity.identity()` if they are the same), or views
+            in the splat's frame, some with the same names as `cameras`. None compares the clouds.
+        distance: lambda in the splat's world units; None: `default_distance`.
         by: None: "views", which follows the borders of objects much better, or "distance" for a field without cameras.
-        method: which label wins where distance decides, see `transfer_labels`; "nearest" is the paper's.
+        method: which label wins by distance, see `transfer_labels`; "nearest" is the paper's.
 
     Raises:
         ValueError: if `by` or `method` is unknown, cameras are missing, the splat is empty, the words have another D than
@@ -98,10 +98,9 @@ def attach(
 
     Note:
         Toy room, colour field of 40,000 Gaussians, protocol `kfgs-removal/1`, the chairs: by distance 0.979 of their
-        pixels are gone and 0.969 of the others untouched, by views 0.995 and 0.970 (true label maps instead of
-        segmented ones give the same). Gaussians across a border cost the rest: with a score of at least 0.6 alone,
-        0.969 are gone and 0.976 untouched. A vote of neighbours for such Gaussians, or the class of the nearest
-        rendered surface, made it worse.
+        pixels are removed and 0.969 of the others unchanged; by views 0.995 and 0.970 (the same with true label maps).
+        Gaussians across a border cause the rest: with only those of score 0.6 or more, 0.969 are removed and 0.976
+        unchanged. A vote of neighbours for border Gaussians, or the class of the nearest rendered surface, was worse.
     """
     if isinstance(splats, str | Path):
         splats = read_splats(splats)
@@ -122,7 +121,7 @@ def attach(
     for name, needed in (('by="views"', by == "views"), ("frame", not isinstance(frame, Similarity | None))):
         if needed and not cameras:
             raise ValueError(f"cameras: expected views in the field's frame (for {name}), got none; pass them as well")
-    semantic = field.label(classes)  # refuses words of another teacher before the frames are compared
+    semantic = field.label(classes)  # checks the classes before the frames are compared
     similarity, alignment, said = _common_frame(field, splats, cameras, frame)
     carry = partial(transfer_labels, distance=distance, method=method)
     if by == "distance":
@@ -168,7 +167,7 @@ def _common_frame(
     cameras: Sequence[Camera] | None,
     frame: Similarity | Sequence[Camera] | None,
 ) -> tuple[Similarity, Alignment | None, str]:
-    """From the field's frame to the splat's, how it was found, and that in words."""
+    """The similarity from the field's frame to the splat's, the alignment behind it, and a sentence about it."""
     if isinstance(frame, Similarity):
         return frame, None, "the similarity between the frames was given"
     if frame is not None:
@@ -192,14 +191,14 @@ def _common_frame(
 
 
 def _stays(means: Tensor, alignment: Alignment) -> bool:  # [N, 3]
-    """Whether an alignment leaves the points where they are, but for what sparse clouds are uncertain about."""
+    """Whether an alignment moves the points by no more than the uncertainty of sparse clouds."""
     places = means.detach().double().cpu()
     shifts = (alignment.similarity.apply(places) - places).norm(dim=1)
     return float(shifts.median()) < STAYS * alignment.size
 
 
 def _solid(means: Tensor, opacities: Tensor) -> Tensor:  # [N, 3], [N] -> [n, 3]
-    """The places of Gaussians that are there to see; all of them where hardly any is."""
+    """The positions of Gaussians that are not faint; all positions if nearly all are faint."""
     seen = (opacities > SOLID) & means.isfinite().all(1)
     return means[seen] if int(seen.sum()) >= 100 else means
 
@@ -210,7 +209,7 @@ def _by_distance(
     similarity: Similarity,
     carry: Callable[[Gaussians, Tensor, Gaussians], Transfer],
 ) -> tuple[Tensor, Tensor, Transfer, dict[str, Any]]:
-    """Labels [N], scores [N], the transfer and facts: the rule of Sec. 3.4."""
+    """Labels [N], scores [N], the transfer and details, by the rule of Sec. 3.4."""
     assert semantic.labels is not None
     transfer = carry(transform_gaussians(semantic, similarity), semantic.labels, splats.gaussians)
     facts = {
@@ -230,7 +229,7 @@ def _by_views(
     similarity: Similarity,
     carry: Callable[[Gaussians, Tensor, Gaussians], Transfer],
 ) -> tuple[Tensor, Tensor, Transfer, dict[str, Any]]:
-    """Labels [N], scores [N], the transfer and facts: each Gaussian asks the pixels that it fills."""
+    """Labels [N], scores [N], the transfer and details: each Gaussian takes the class of most pixels that it fills."""
 
     def segmented() -> Iterator[tuple[Camera, Tensor]]:
         for camera in cameras:
@@ -253,7 +252,7 @@ def _by_views(
 
 
 def _about(transfer: Transfer, by: By) -> str:
-    """What distance decided, in words."""
+    """A sentence about the labels decided by distance."""
     if by == "distance":
         return repr(transfer)
     count = len(transfer.labels)

@@ -1,4 +1,4 @@
-"""Train an ordinary 3DGS colour field of a scene, as a stage of a run folder. Labels are carried to it, and it is edited."""
+"""Train an ordinary 3DGS colour field of a scene, as a stage of a run folder, to carry labels to and to edit."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from .train import check_scene, field_stage, training_device, with_extent
 
 @dataclass(frozen=True)
 class ColorConfig:
-    """How a colour field is trained; the defaults are those of 3DGS."""
+    """Options of `fit_color`; the defaults are those of 3DGS."""
 
     seed: int = 0
     """Every random choice follows from it."""
     split: str = "train"
-    """Which views of the scene are learnt from."""
+    """The split of training views."""
     sh_degree: int = 3
     """Highest degree of the spherical harmonics, 0 to 3: how colour changes with the direction of sight."""
     picture_scale: float = 1.0
-    """Pictures are learnt at this fraction of their size, at most 1."""
+    """Train with pictures at this fraction of their size, at most 1."""
     ssim_weight: float = 0.2
     """Lambda of 3DGS: the share of 1 - SSIM in the loss, the rest being L1."""
     max_points: int | None = None
@@ -60,21 +60,19 @@ class ColorConfig:
     def cpu() -> ColorConfig:
         """A schedule for two CPU cores, minutes for a room: the method of 3DGS, a tenth of its steps at twice its rates.
 
-        Most steps compare pictures of half the size, which takes a quarter of the time; the last ones bring the detail.
-        Growing is over early, bounded, and asks for a higher threshold; opacities are not reset, since there are too few
-        steps to recover. (Replica's room_0, 90 views of 639x479: PSNR 34.4 dB on unseen views, 149,000 Gaussians; 57 ms for
-        a step at half size, 87 at full size.)
+        Most steps compare pictures of half the size, which takes a quarter of the time; the last steps add the detail.
+        Growing ends early, is limited, and has a higher threshold. Opacities are not reset: there are too few steps to
+        recover. (Replica's room_0, 90 views of 639x479: PSNR 34.4 dB on unseen views, 149,000 Gaussians; 57 ms for a step
+        at half size, 87 at full size.)
         """
         return ColorConfig(sh_degree=2, field=_CPU_FIELD)
 
     @staticmethod
     def geometry() -> ColorConfig:
-        """Where a scene's surfaces are, in two minutes on two CPU cores: what features are fused onto.
+        """A schedule for Gaussians to fuse features onto: two minutes on two CPU cores.
 
-        Pictures stay at half size.
-
-        Colours stay soft, but a Gaussian's place and size are right to a few pixels of a teacher's map. (room_0: 100,000
-        Gaussians; `docs/results.md` has the mIoU beside that of the `cpu` schedule.)
+        Pictures stay at half size, so colours are soft, but positions and sizes of Gaussians are right within a few pixels
+        of a teacher's map. (room_0: 100,000 Gaussians; `docs/results.md` compares the mIoU with the `cpu` schedule.)
         """
         schedule: dict[str, Any] = {
             "densify_from": 100,
@@ -87,9 +85,9 @@ class ColorConfig:
 
     @staticmethod
     def quick() -> ColorConfig:
-        """A minute on two CPU cores for a small scene, such as the toy room (48 views of 192x256).
+        """A schedule for a small scene: a minute on two CPU cores for the toy room (48 views of 192x256).
 
-        Many Gaussians for its few pixels: what is removed later takes its border along, and small ones straddle less of it.
+        It has many Gaussians for its few pixels, because small Gaussians reach less across the border of a removed object.
         """
         schedule: dict[str, Any] = {
             "densify_from": 80,
@@ -135,20 +133,20 @@ class ColorResult:
 
     @property
     def seconds(self) -> float:
-        """Time spent on it, also by earlier processes."""
+        """Training time, including earlier processes."""
         return sum(stage.seconds for stage in self.stages)
 
 
 class Photos(Sequence[Tensor]):
-    """The training pictures at their training size: read when first asked for, then kept as bytes.
+    """The training pictures at their training size: read at the first access, then kept as bytes.
 
-    A picture is [h, w, 3] float32 in [0, 1]. A pixel is NaN if nothing was recorded in it or in a part of it (the border of an
-    undistorted picture). Bytes take a quarter of the memory: 0.9 MB for 639x479.
+    A picture is [h, w, 3] float32 in [0, 1]. A pixel is NaN if it was not fully recorded (the border of an undistorted
+    picture). Bytes take a quarter of the memory: 0.9 MB for 639x479.
 
     Args:
-        scene: whose pictures.
-        views: which of its views.
-        cameras: one per view, of the size that the picture is to have.
+        scene: the scene.
+        views: indices of its views.
+        cameras: one per view, with the training size.
     """
 
     def __init__(self, scene: Scene, views: Sequence[int], cameras: Sequence[Camera]) -> None:
@@ -184,9 +182,9 @@ def fit_color(
     progress: Progress = False,
     device: str | torch.device = "auto",
 ) -> ColorResult:
-    """Fit an ordinary 3DGS colour field to a scene's pictures, resuming what a run folder already holds.
+    """Fit an ordinary 3DGS colour field to a scene's pictures, or resume it in a run folder.
 
-    Spherical harmonics up to `config.sh_degree`, L1 + D-SSIM, cloning, splitting and pruning as 3DGS does, on black.
+    Spherical harmonics up to `config.sh_degree`, L1 + D-SSIM, cloning, splitting and pruning as in 3DGS, on black.
 
     Args:
         scene: posed, undistorted views with their sparse points.
@@ -198,11 +196,11 @@ def fit_color(
         device: where to train, see `training_device`; the result lies on the CPU.
 
     Raises:
-        ValueError: if a camera has distortion, there is no such device, the scene has no points to start from, or no
-            view is in the split.
+        ValueError: if a camera has distortion, there is no such device, the scene has no points to start from, or the
+            split has no views.
     """
     config = config or ColorConfig.paper()
-    scene.views(config.split)  # refuses a split without views
+    scene.views(config.split)  # raises for a split without views
     check_scene(scene)
     return make_color(Run(Path(folder), report), scene, config, training_device(device), progress, overwrite=True)
 
@@ -226,9 +224,9 @@ def make_color(
 
 
 def find_color(run: Run, scene: Scene, config: ColorConfig) -> Gaussians | None:
-    """The Gaussians of the longest colour stage in the run, if it is of this scene and longer than `config` asks for.
+    """The Gaussians of the longest colour stage in the run, if it has this scene and more steps than `config`; else None.
 
-    `kfgs color` makes it in the same run. None if there is none.
+    `kfgs color` makes such a stage in the same run folder.
     """
     views = scene.views(config.split)
     wanted = json.loads(json.dumps(_inputs(run, scene, views, config) | {"config": None}))
@@ -295,7 +293,7 @@ def _color_stage(
 
 
 def _is_saved(result: ColorResult) -> bool:
-    """Whether this very cloud lies there already; a file that has since been given labels is left as it is."""
+    """Whether the file has this cloud already; then it is not written again, because it may have labels now."""
     try:
         saved = read_splats(result.path).gaussians
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""A colour scene before and after an edit: which viewpoints show the change, and pictures from them."""
+"""Compare a colour scene before and after an edit: choose viewpoints that show the change, and draw pictures."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from ..viz import save_picture
 from ..viz.pictures import picture_grid
 
 PREVIEW = 96  # pixels: width of the renderings that choose the viewpoints
-VISIBLE = 8 / 255  # a pixel has changed when some channel did by more than this
-MOST = 0.5  # a picture of which more has changed is taken from inside the change: it comes after all others
-SHOWN = 0.5  # an edit is shown where a view shows this share of what its best view shows
+VISIBLE = 8 / 255  # a pixel has changed if a channel changed by more than this
+MOST = 0.5  # if more of a picture changed, its camera is inside the change: such views come last
+SHOWN = 0.5  # a view shows an edit if it shows this share of what the best view shows
 APART = 30.0  # degrees between the viewing directions of chosen viewpoints, if enough viewpoints are that far apart
 
 
 def render_color(gaussians: Gaussians, camera: Camera) -> Tensor:  # [H, W, 3] in [0, 1]
-    """What a camera sees of a colour field, on black."""
+    """Render a colour field on black."""
     with torch.no_grad():
         return rasterize(gaussians.replace(features=None), camera).map.clamp(0, 1)
 
@@ -36,21 +36,21 @@ def views_of_change(before: Gaussians, after: Gaussians, cameras: Sequence[Camer
         before: the scene.
         after: the edited scene.
         cameras: viewpoints to choose from.
-        count: how many to choose at most; those in which nothing changes are never chosen, those of which more than half
-            changes only when there are too few others.
+        count: the most to choose. Views without a change are never chosen; views of which more than half changes only if
+            there are too few others.
     """
     return views_of_edits((before, after), cameras, count)
 
 
 def views_of_edits(states: Iterable[Gaussians], cameras: Sequence[Camera], count: int = 2) -> list[int]:
-    """The viewpoints that show several edits: for each in turn its best, then those that show most of all together.
+    """The viewpoints that show several edits: the best one for each edit, then those that show most of all edits.
 
-    An edit gets no view of its own if a chosen view shows it half as well as its best view does, or if it is undone later.
+    An edit gets no extra view if a chosen view shows it half as well as its best view, or if it is undone later.
 
     Args:
         states: the scene before the first edit, and after each of them.
         cameras: viewpoints to choose from.
-        count: how many to choose at most, by the rules of `views_of_change`.
+        count: the most to choose, by the rules of `views_of_change`.
     """
     check_whole("count", count, 0)
     if count == 0:
@@ -72,7 +72,7 @@ def views_of_edits(states: Iterable[Gaussians], cameras: Sequence[Camera], count
 
 
 def _filled_up(chosen: list[int], shares: list[float], cameras: Sequence[Camera], count: int) -> list[int]:
-    """What is chosen and the best of the others: first those that look another way, then any."""
+    """Add the best other views to those chosen: first those with another direction, then any."""
     ranked = _ranked(shares)
     forward = {i: cameras[i].viewmat[2, :3].double() for i in ranked}
     limit = torch.cos(torch.deg2rad(torch.tensor(APART, dtype=torch.float64)))
@@ -120,7 +120,7 @@ def _padded(picture: Tensor, height: int, width: int) -> Tensor:  # [h, w, 3] ->
 
 
 class PhotoPictures:
-    """What `score_views` calls for each view: some of the renderings are drawn beside their photographs."""
+    """A callback for `score_views` that draws some renderings side by side with their photographs."""
 
     def __init__(self, folder: Path, stems: Sequence[str], count: int) -> None:
         """Draw `count` of the views, evenly spread, into `folder/<stem>.png`."""

@@ -1,4 +1,4 @@
-"""What a run of `fit_scene` does: its method, and the options of every stage."""
+"""Options of `fit_scene`: the method, and the options of every stage."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ MODES: tuple[Mode, ...] = ("decouple", "adc", "adc+sc")
 
 @dataclass(frozen=True)
 class FitConfig:
-    """What a run does."""
+    """Options of `fit_scene`."""
 
     method: Method = "fuse"
-    """`fuse`: features are averaged onto sharp Gaussians in 3-D, merged and compressed after (`fields.uplift_maps`).
+    """`fuse`: features are averaged onto sharp Gaussians in 3-D, then merged and compressed (`fields.uplift_maps`).
     `paper`: maps are compressed per pixel, and Gaussians are trained on them (Sec. 3)."""
     mode: Mode = "adc+sc"
-    """Of method `paper`, rows of Table 1: `decouple` (raw features), `adc` (+ codebook), `adc+sc` (+ codebook + autoencoder)."""
+    """For method `paper`, rows of Table 1: `decouple` (raw features), `adc` (+ codebook), `adc+sc` (+ codebook + autoencoder)."""
     seed: int = 0
     """Every random choice of the run follows from it."""
     split: str = "train"
-    """Which views of the scene are learnt from."""
+    """The split of training views."""
     device: str = "auto"
-    """Where a field is trained, see `training_device`; the other stages and the result stay on the CPU."""
+    """Where to train a field, see `training_device`; the other stages and the result stay on the CPU."""
     undistorted_features: bool = False
-    """Whether the teacher saw undistorted pictures; otherwise the lens is removed from its maps as from the pictures."""
+    """Whether the teacher saw undistorted pictures; if not, its maps are undistorted like the pictures."""
     uplift: UpliftConfig = default(default_factory=UpliftConfig.field)
     """Of method `fuse`."""
     color: ColorConfig = default(default_factory=ColorConfig.geometry)
-    """Of method `fuse`: how Gaussians are trained to fuse onto, where there is no splat."""
+    """For method `fuse` without a splat: how to train Gaussians to fuse onto."""
     codebook: CodebookConfig = default(default_factory=CodebookConfig)
     """This and the rest: of method `paper`."""
     autoencoder: AutoencoderConfig = default(default_factory=AutoencoderConfig)
@@ -49,7 +49,7 @@ class FitConfig:
 
     @property
     def needs_maps(self) -> bool:
-        """Whether the field learns from the dense maps themselves, so that they must be stored and stay."""
+        """Whether the field is trained on the dense maps, so that they must be stored."""
         return self.method == "paper" and self.mode == "decouple"
 
     @staticmethod
@@ -60,5 +60,5 @@ class FitConfig:
 
     @staticmethod
     def cpu(**changes: Any) -> FitConfig:
-        """For two CPU cores: the same as `FitConfig()`, and 2,000 field steps where the method is the paper's."""
+        """For two CPU cores: `FitConfig()`, with 2,000 field steps for the paper's method."""
         return FitConfig(**{"field": FieldConfig.cpu(), **changes})

@@ -1,4 +1,4 @@
-"""Every step on a room that the package makes itself, with colours and edits, scored against exact ground truth."""
+"""The demo: every step on the toy room, with colours and edits, scored against exact ground truth."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ def run(
     """Make the room, fit it, segment its unseen views, label its surface, edit its colours; return the files written.
 
     Args:
-        out: receives `scene/`, `run/`, `segmentation/`, labelled and edited clouds, pictures and `scores.json`.
-        config: how to fit; the CPU preset when not given.
-        room: what to build; the default room when not given.
-        report: receives one line per step.
+        out: the folder for `scene/`, `run/`, `segmentation/`, labelled and edited clouds, pictures and `scores.json`.
+        config: how to fit; None: the CPU preset.
+        room: the room to build; None: the default room.
+        report: called with one line per step.
         progress: show progress bars.
     """
     out, say = Path(out), report or (lambda text: None)
@@ -121,7 +121,7 @@ def _edit_colors(
     classes: LabelSet,
     say: Callable[[str], None],
 ) -> tuple[list[Path], dict[str, Any]]:
-    """Attach the classes to the colours, remove the chairs and recolour the plants; the files and the scores."""
+    """Attach the classes to the colours, remove the chairs and recolour the plants; returns files and scores."""
     splats = attach(fitted.field, SplatFile(colors), classes).splats
     written = write_splats(out / "color.ply", splats).paths
     for part in connected_parts(splats.gaussians, OfClass(REMOVED).select(splats), fitted.field.cameras):

@@ -1,4 +1,4 @@
-"""Describe what is at a path: a field, a run, a scene, feature maps, a splat file or a point cloud."""
+"""Describe a path: a field, a run, a scene, feature maps, a splat file or a point cloud."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def describe(path: str | Path) -> str:
     """Describe a field, run or scene folder, a folder of feature maps that kfgs made, a splat file, or a PLY of points.
 
     Raises:
-        FileNotFoundError: if there is nothing there.
+        FileNotFoundError: if the path does not exist.
         ValueError: if it is none of these.
     """
     path = Path(path)

@@ -1,4 +1,4 @@
-"""Disk, memory and time of each stage of a run: bytes from shapes, seconds from small runs (`trial`) times counts."""
+"""Estimate disk, memory and time of each stage of a run: bytes from shapes, seconds from small runs (`trial`)."""
 
 from __future__ import annotations
 
@@ -19,49 +19,48 @@ Dense = Literal["keep", "discard", "recompute"]
 DENSE: tuple[Dense, ...] = ("keep", "discard", "recompute")
 HALF, FLOAT = 2, 4  # bytes
 GROWTH = {"low": 6.0, "high": 1.15}
-"""How many times more Gaussians than points training is taken to end with, by the gradient from which it densifies: below 4e-4
-as in the paper (110.5k in Table 2, of the 18.5k points of room_0), above it as room_0 and the toy room with the CPU preset. How
-many there will be depends on the scene; `max_gaussians` is never exceeded."""
+"""Assumed ratio of Gaussians at the end of training to points, by the densification threshold: below 4e-4 as in the paper
+(110.5k in Table 2, of the 18.5k points of room_0), above it as room_0 and the toy room with the CPU preset. The true ratio
+depends on the scene; `max_gaussians` is never exceeded."""
 MARGIN = 1.25
-"""By how much more memory is planned than a small run took: a long one fragments it (toy room, 100,000 Gaussians: 1.11 GB, small
-runs 1.00)."""
+"""Factor on the memory of a small run: a long run fragments memory (toy room, 100,000 Gaussians: 1.11 GB, small runs
+1.00)."""
 TRAINING = 8
-"""Copies of the Gaussians that are in memory while they are trained: values, gradients, Adam's two moments, and what a step makes
-of them."""
+"""Copies of the Gaussians in memory during training: values, gradients, Adam's two moments, and temporaries of a step."""
 
 
 @dataclass(frozen=True)
 class StagePlan:
-    """One stage. None: not known."""
+    """The estimate for one stage. None: unknown."""
 
     name: str
     what: str
-    """What it does, in words with its sizes."""
+    """A description with sizes."""
     seconds: float | None
     peak_bytes: int | None
     """Memory of the whole process while it runs."""
     disk_bytes: int | None
-    """What it writes. It lies on the disk together with what the other stages write."""
+    """Bytes that it writes to disk."""
     kept_bytes: int | None
-    """What of it is left in the end."""
+    """Bytes on disk that stay at the end."""
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """Everything that the stages' disk and memory follow from."""
+    """The sizes from which disk and memory of the stages follow."""
 
     config: FitConfig
     dense: Dense
-    """What becomes of the maps."""
+    """Whether maps are kept, discarded or recomputed."""
     points: int
     pictures: tuple[tuple[int, int], ...]
     """(height, width) of each view."""
     shapes: tuple[tuple[int, int, int] | None, ...]
-    """(h, w, D) of each view's map; None where it is not known."""
+    """(h, w, D) of each view's map; None if unknown."""
     made: tuple[bool, ...]
     """For each view, whether its map exists."""
     done: frozenset[str] = frozenset()
-    """Stages that the run folder holds already."""
+    """Finished stages in the run folder."""
     picture_seconds: float | None = None
     """The teacher's, of all pictures; None if it was not run."""
     teacher_peak: int | None = None
@@ -69,7 +68,7 @@ class Sizes:
     teacher_bytes: int = 0
     """Memory that the teacher takes."""
     timings: dict[str, Timing] = field(default_factory=dict)
-    """What the small runs took, by stage."""
+    """Times of the small runs, by stage."""
     base: int = 0
     """Memory of this process before any stage."""
 
@@ -80,12 +79,12 @@ class Sizes:
 
     @property
     def shape(self) -> tuple[int, int, int] | None:
-        """(h, w, D) of a map, None if some map's is not known."""
+        """(h, w, D) of a map; None if that of a map is unknown."""
         return None if None in self.shapes else self.shapes[0]
 
     @property
     def pixels(self) -> int:
-        """Of all maps."""
+        """Pixels of all maps."""
         return sum(shape[0] * shape[1] for shape in self.shapes if shape)
 
     @property
@@ -95,7 +94,7 @@ class Sizes:
 
     @property
     def samples(self) -> int:
-        """Features of one map that the codebook looks at."""
+        """Features of one map that the codebook samples."""
         if self.shape is None:
             return 0
         (h, w, _), options = self.shape, self.config.codebook
@@ -105,13 +104,13 @@ class Sizes:
         return min(found, most) if options.adaptive else found
 
     def map_bytes(self, views: Iterable[int]) -> int | None:
-        """Of some views' maps on disk, in half precision; None if the shape of one is not known."""
+        """Bytes of some views' maps on disk, in half precision; None if a shape is unknown."""
         shapes = [self.shapes[i] for i in views]
         return None if None in shapes else sum(HALF * h * w * D for h, w, D in filter(None, shapes))
 
     @property
     def missing(self) -> list[int]:
-        """Views whose maps the teacher has to make."""
+        """Views without a map, which the teacher must make."""
         return [i for i, made in enumerate(self.made) if self.dense == "recompute" or not made]
 
 
@@ -133,10 +132,10 @@ def _stage(sizes: Sizes, name: str, what: str, count: int, disk: tuple[int, int]
     Args:
         sizes: of the run.
         name: of the stage.
-        what: it does.
+        what: its description.
         count: views or steps.
-        disk: bytes that it writes, and what of them it keeps; None if the shape of the maps is not known.
-        more: bytes of memory that a small run does not show, because it has fewer views or Gaussians.
+        disk: bytes that it writes, and those that stay; None if the shape of the maps is unknown.
+        more: bytes of memory in addition to a small run, which has fewer views or Gaussians.
     """
     title = name.replace("_", " ")
     if name in sizes.done:
@@ -151,7 +150,7 @@ def _stage(sizes: Sizes, name: str, what: str, count: int, disk: tuple[int, int]
 
 
 def _features(sizes: Sizes) -> StagePlan:
-    """The teacher over all pictures without a map; its maps (or the samples that the codebook looks at) on disk."""
+    """The teacher on all pictures without a map; its maps, or the samples for the codebook, on disk."""
     missing, seconds = sizes.missing, sizes.picture_seconds
     peak = None if sizes.teacher_peak is None else round(MARGIN * sizes.teacher_peak)
     what = f"{len(missing)} pictures"
@@ -166,7 +165,7 @@ def _features(sizes: Sizes) -> StagePlan:
 
 
 def _again(sizes: Sizes, stage: StagePlan) -> StagePlan:
-    """A stage that looks at every map once: the teacher runs meanwhile where maps are not stored."""
+    """A stage that reads every map once; if maps are not stored, the teacher runs again in it."""
     if sizes.dense != "recompute" or stage.what == "done already":
         return stage
     peak = None if stage.peak_bytes is None else stage.peak_bytes + sizes.teacher_bytes
@@ -205,7 +204,7 @@ def _autoencoder(sizes: Sizes) -> StagePlan:
 
 
 def _autoencoder_bytes(sizes: Sizes) -> int:
-    """Weights and biases of encoder and decoder; none where there is no autoencoder."""
+    """Bytes of the weights of encoder and decoder; 0 without an autoencoder."""
     if sizes.shape is None or sizes.config.method != "paper" or sizes.config.mode != "adc+sc":
         return 0
     options, D = sizes.config.autoencoder, sizes.shape[2]
@@ -214,13 +213,13 @@ def _autoencoder_bytes(sizes: Sizes) -> int:
 
 
 def _channels(sizes: Sizes) -> int:
-    """That the paper's field is trained with."""
+    """Channels per Gaussian of the paper's field."""
     compressed = sizes.config.mode == "adc+sc"
     return sizes.config.autoencoder.latent if compressed else sizes.shape[2] if sizes.shape else 0
 
 
 def _field(sizes: Sizes) -> StagePlan:
-    """Training; parameters of the stage and of the finished field are kept, a checkpoint goes."""
+    """Training; the stage and the finished field stay on disk, the checkpoint does not."""
     options, channels = sizes.config.field, _channels(sizes)
     mean, last = gaussian_counts(options, sizes.points)
     what = f"{options.steps:,} steps, {sizes.points / 1e3:.1f}k points, perhaps {last / 1e3:.1f}k Gaussians"
@@ -236,7 +235,7 @@ def _field(sizes: Sizes) -> StagePlan:
 
 
 def _color(sizes: Sizes) -> StagePlan:
-    """Gaussians trained on the pictures, to fuse onto; a splat of the user's takes their place."""
+    """Training of Gaussians on the pictures, to fuse onto; not needed with the user's splat."""
     options, colors = sizes.config.color.field, color_channels(sizes.config)
     mean, last = gaussian_counts(options, sizes.points, full=True)
     what = f"{options.steps:,} steps on the pictures, at most {last / 1e3:.1f}k Gaussians; none with --splat"
@@ -249,7 +248,7 @@ def _color(sizes: Sizes) -> StagePlan:
 
 
 def _uplift(sizes: Sizes) -> StagePlan:
-    """Maps averaged onto the Gaussians and corrected."""
+    """Averaging maps onto the Gaussians, and correction."""
     options = sizes.config.uplift
     what = f"{sizes.count} maps onto the Gaussians, at most {options.max_gaussians or 'all'} left"
     if sizes.shape is None:
@@ -266,7 +265,7 @@ def _uplift(sizes: Sizes) -> StagePlan:
 
 
 def _answers(sizes: Sizes) -> StagePlan:
-    """What each Gaussian of the trained field answers with: every view rendered once and averaged onto the Gaussians."""
+    """Fused features of a trained field: every view is rendered once and averaged onto the Gaussians."""
     what = f"{sizes.count} views averaged onto the Gaussians"
     if sizes.shape is None:
         return _stage(sizes, "answers", what, sizes.count, None)
@@ -278,14 +277,14 @@ def _answers(sizes: Sizes) -> StagePlan:
 
 
 def color_channels(config: FitConfig) -> int:
-    """Numbers of a Gaussian's colour."""
+    """Number of colour coefficients per Gaussian."""
     return 3 * (config.color.sh_degree + 1) ** 2
 
 
 def gaussian_counts(config: FieldConfig, points: int, *, full: bool = False) -> tuple[float, int]:
-    """Mean number of Gaussians over the steps, and the last one: a guess (`GROWTH`), growing evenly while it densifies.
+    """Guess the mean and the final number of Gaussians (`GROWTH`), with even growth while it densifies.
 
-    With `full`, as many as `config.max_gaussians` allows, if it has a limit.
+    With `full`, the final number is `config.max_gaussians`, if there is a limit.
     """
     until = min(config.densify_until, config.steps)
     if until <= config.densify_from:
@@ -298,12 +297,12 @@ def gaussian_counts(config: FieldConfig, points: int, *, full: bool = False) -> 
 
 
 def gaussian_bytes(gaussians: int, channels: int) -> int:
-    """Mean, rotation, scale, opacity and features of so many Gaussians, in float32."""
+    """Bytes of mean, rotation, scale, opacity and features of some Gaussians, in float32."""
     return FLOAT * gaussians * (11 + channels)
 
 
 def training_bytes(sizes: Sizes) -> int:
-    """The least memory that training takes beside the process itself: Gaussians, and three maps of the rendered size."""
+    """The least memory of training, in addition to the process: Gaussians, and three maps of the rendered size."""
     fuse = sizes.config.method == "fuse"
     config, channels = sizes.config, color_channels(sizes.config) if fuse else _channels(sizes)
     _, last = gaussian_counts(config.color.field if fuse else config.field, sizes.points, full=fuse)
@@ -311,7 +310,7 @@ def training_bytes(sizes: Sizes) -> int:
 
 
 def notes_on(sizes: Sizes) -> list[str]:
-    """What a reader should know besides the numbers."""
+    """Notes for the reader of the numbers."""
     found = [
         "times are those of small runs on this machine as busy as it is now, scaled up: within a factor of two or so"
     ]
@@ -337,5 +336,5 @@ def _say(sizes: Sizes) -> str:
 
 
 def add(values: list[Any]) -> Any:
-    """Their sum, or None if one is not known."""
+    """The sum, or None if a value is unknown."""
     return None if any(value is None for value in values) else sum(values)

@@ -1,7 +1,7 @@
-"""From teacher maps and posed images to a saved semantic field: fused in 3-D and then compressed, or as the paper's Figure 2.
+"""Make a semantic field from teacher maps and posed images: fuse in 3-D, then compress; or the paper's Figure 2.
 
-Each step is a stage in the run folder. A finished stage is found again by the hash of its inputs; the long one (the field) also
-resumes from its last checkpoint.
+Each step is a stage in the run folder. A finished stage is found again by the hash of its inputs. The longest one (the field)
+also resumes from its last checkpoint.
 """
 
 from __future__ import annotations
@@ -61,32 +61,32 @@ class FitResult:
 
     @property
     def field_path(self) -> Path:
-        """Where the field was saved."""
+        """The folder of the saved field."""
         return self.folder / "field"
 
     @property
     def seconds(self) -> float:
-        """Time spent making the stages, reused ones counted with what they took when they were made."""
+        """Total time of the stages; reused ones count with their original time."""
         return sum(stage.seconds for stage in self.stages)
 
 
 @dataclass(frozen=True)
 class _Job:
-    """One call of `fit_scene`: what all of its stages need."""
+    """One call of `fit_scene`: the values that all of its stages need."""
 
     run: Run
     scene: Scene
     views: list[int]
     maps: Maps
     features: dict[str, Any]
-    """What decides the maps, as JSON."""
+    """Identity of the maps, as JSON."""
     config: FitConfig
     device: torch.device
     progress: Progress
 
     @property
     def cameras(self) -> list[Camera]:
-        """Of the views."""
+        """The cameras of the views."""
         return [self.scene.cameras[i] for i in self.views]
 
     def generator(self, stage: str) -> torch.Generator:
@@ -112,7 +112,7 @@ def _codebook_stage(job: _Job) -> tuple[Codebook, Stage]:
 
 
 def _index_stage(job: _Job, codebook: Codebook, upstream: Stage) -> tuple[IndexMaps, Stage]:
-    """Quantisation, Eq. 5: the index map M of every view; a killed one goes on with the view it was at."""
+    """Quantisation, Eq. 5: the index map M of every view; after a kill it continues with the next view."""
     inputs = {"features": job.features, "codebook": upstream.key}
     scratch, progress = job.run.scratch("index_maps", inputs), job.progress is True
 
@@ -166,7 +166,7 @@ def _field_stage(job: _Job, targets: Sequence[Tensor], inputs: dict[str, Any]) -
 
 
 def _check_inputs(scene: Scene, views: Sequence[int], maps: Maps, config: FitConfig) -> None:
-    """Refuse what would fail only after the first stages are done."""
+    """Check inputs that would otherwise fail only after the first stages."""
     split = config.split
     if config.needs_maps:
         if getattr(maps, "recomputed", False):
@@ -199,13 +199,13 @@ def fit_scene(
     report: Callable[[str], None] | None = None,
     progress: Progress = False,
 ) -> FitResult:
-    """Make a semantic field of a scene, resuming whatever a run folder already holds.
+    """Make a semantic field of a scene; finished stages in the run folder are reused.
 
     Args:
         scene: posed, undistorted views with their sparse points.
-        maps: one teacher map [h, w, D] per training view; read one at a time. Once the stages made of them are in the run
-            folder the maps may be gone (`discard_maps`), except for the paper's mode `decouple`.
-        folder: the run folder; `folder/field` receives the finished field.
+        maps: one teacher map [h, w, D] per training view; read one at a time. When the stages that read them are finished,
+            the maps may be deleted (`discard_maps`), except for the paper's mode `decouple`.
+        folder: the run folder; the finished field goes to `folder/field`.
         config: the method and its options.
         splat: of method `fuse`, the Gaussians to fuse onto, in the scene's frame: a splat file or its content. None trains them
             on the pictures with `config.color` and writes them to `folder/color.ply`, unless that file exists. If `fit_color`
@@ -215,8 +215,8 @@ def fit_scene(
 
     Raises:
         ValueError: if the counts of views and maps differ, a camera has distortion, there is no such device, a splat is given
-            to the paper's method, or its mode `decouple` gets maps that run the teacher at each look (`RecomputedMaps`).
-        FileNotFoundError: if a stage is to be made of maps that were discarded, or a picture is missing.
+            to the paper's method, or its mode `decouple` gets `RecomputedMaps`.
+        FileNotFoundError: if a stage needs maps that were discarded, or a picture is missing.
     """
     config = config or FitConfig()
     target_device = training_device(config.device)
@@ -245,7 +245,7 @@ def fit_scene(
 
 
 def _make_field(job: _Job, splat: Gaussians | SplatFile | str | Path | None) -> tuple[SemanticField, dict[str, Any]]:
-    """All stages of a method: the field, and what `field.json` tells about how it was made."""
+    """All stages of a method: the field, and its origin for `field.json`."""
     config = job.config
     if config.method == "paper":
         return answers_stage(job.run, _paper_stages(job), job.cameras), {"mode": config.mode}
@@ -256,7 +256,7 @@ def _make_field(job: _Job, splat: Gaussians | SplatFile | str | Path | None) -> 
 
 
 def _paper_stages(job: _Job) -> SemanticField:
-    """Figure 2: codebook, index maps, autoencoder, and Gaussians trained on what they make of the maps."""
+    """Figure 2: codebook, index maps, autoencoder, and Gaussians trained on the latent maps."""
     codebook, autoencoder, mode = None, None, job.config.mode
     targets: Sequence[Tensor] = KnownFeatures(job.maps)
     if mode == "decouple":
@@ -284,12 +284,12 @@ def _job(run: Run, scene: Scene, maps: Maps, config: FitConfig, device: torch.de
 
 
 def finished_stages(scene: Scene, maps: Maps | None, folder: str | Path, config: FitConfig) -> set[str]:
-    """The names of the stages that `fit_scene` would find in a run folder and not make again; nothing is written.
+    """The names of the stages in a run folder that `fit_scene` would reuse; nothing is written.
 
     Args:
         scene: as for `fit_scene`.
-        maps: as for `fit_scene`; None if there are none yet: then only a stage without maps can be found.
-        folder: the run folder, which need not exist.
+        maps: as for `fit_scene`; None if there are none yet: then only stages without maps are found.
+        folder: the run folder; it may be missing.
         config: as for `fit_scene`.
     """
     run, device = Run(Path(folder), look_only=True), torch.device("cpu")
@@ -308,7 +308,7 @@ def _color_config(config: FitConfig) -> ColorConfig:
 
 
 def _is_saved(field: SemanticField, path: Path) -> bool:
-    """Whether this very field lies at `path` already, so that nothing there need be touched."""
+    """Whether the same field is at `path` already."""
     try:
         saved = SemanticField.load(path)
     except (OSError, ValueError):
@@ -320,6 +320,6 @@ def _is_saved(field: SemanticField, path: Path) -> bool:
 
 
 def load_history(stage: Stage) -> list[dict[str, Any]]:
-    """The history rows of a finished stage; none if it keeps no history."""
+    """The history rows of a finished stage; empty if it has none."""
     path = stage.folder / "history.json"
     return list(read_json(path)) if path.is_file() else []

@@ -1,4 +1,4 @@
-"""The stages of the default method: Gaussians that are sharp, features fused onto them, and answers of trained fields."""
+"""The stages of the default method: find sharp Gaussians and fuse features onto them. Also fused features of trained fields."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def find_geometry(
     device: torch.device,
     progress: Progress,
 ) -> tuple[Gaussians, str]:
-    """The Gaussians to fuse onto, and where they come from.
+    """The Gaussians to fuse onto, and their origin.
 
     Without a splat they are the colour field of the run. Its stage is found again if it is there. A longer colour field of the
     same scene, as `kfgs color` makes it in the same run folder, is taken instead. A shorter one is not, but its
@@ -64,7 +64,7 @@ def uplift_stage(
 ) -> SemanticField:
     """Fuse the maps onto the Gaussians, merge and compress, as a stage of a run.
 
-    `inputs` says what decides the result beside Gaussians and cameras: `features` (the maps), `config` and `seed`.
+    `inputs` are those in addition to Gaussians and cameras: `features` (the maps), `config` and `seed`.
     """
     inputs = {
         "geometry": digest_tensors(*(getattr(geometry, name) for name in SHAPE)),
@@ -97,7 +97,7 @@ def uplift_stage(
 
 
 def without_lens(scene: Scene, maps: Maps, config: FitConfig) -> Maps:
-    """The maps of a run's views as its undistorted cameras see them."""
+    """The maps of a run's views, undistorted."""
     if scene.lenses is None or config.undistorted_features:
         return maps
     return UndistortedMaps(maps, [scene.lenses[i] for i in scene.views(config.split)])
@@ -117,13 +117,13 @@ def uplift(
 
     Args:
         scene: posed, undistorted views in the splat's frame.
-        maps: one teacher map per view, of the pictures as they were taken; read one at a time.
+        maps: one teacher map per view, of the original pictures; read one at a time.
         splat: the Gaussians, a splat file or its content, or a field.
-        config: its `uplift`, `split`, `undistorted_features` and `seed` count. None takes the training views and keeps every
-            Gaussian as it is.
-        folder: where the field will be saved: what it remembers of the scene is relative to it.
+        config: only `uplift`, `split`, `undistorted_features` and `seed` are used. None: the training views, and every
+            Gaussian stays unchanged.
+        folder: where the field will be saved; its notes about the scene are relative to it.
         progress: show a bar.
-        report: receives a line per step.
+        report: called with a line per step.
 
     Raises:
         ValueError: if counts disagree, a camera has distortion, or no view shows any Gaussian.
@@ -152,7 +152,7 @@ def uplift(
 
 
 def answers_stage(run: Run, field: SemanticField, cameras: Sequence[Camera]) -> SemanticField:
-    """Find what each Gaussian of a trained field answers with, as a stage of a run."""
+    """Compute the fused features of a trained field, as a stage of a run."""
     field_stage = next(stage for stage in reversed(run.stages) if stage.name == "field")
     inputs = {"field": field_stage.key}
 

@@ -1,4 +1,4 @@
-"""Teacher maps as a run uses them: lens distortion removed if it was removed from the scene, unknown pixels marked."""
+"""Prepare teacher maps for a run: undistort them if the scene is undistorted, and mark unknown pixels."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from .stages import Run, describe_lens
 
 
 class Maps(Protocol):
-    """Teacher maps, one per view, read when they are asked for; an all-zero feature means "unknown".
+    """Teacher maps, one per view, read at each access; an all-zero feature means "unknown".
 
-    Four more members are used if they exist: `identity`, JSON that says which teacher made them; `digests() ->
-    list[list[str]] | None`, what decides each map, if that is known without reading the files; `shape`, (h, w, D) without
-    reading values; and `grid(i, step, samples)`, see `fit_codebook`.
+    Four more members are used if they exist: `identity`, JSON of the teacher; `digests() -> list[list[str]] | None`, a digest
+    of each map if known without reading the files; `shape`, (h, w, D) without reading values; and `grid(i, step, samples)`,
+    see `fit_codebook`.
     """
 
     @property
@@ -36,9 +36,9 @@ class Maps(Protocol):
 
 
 class UndistortedMaps:
-    """Maps of the pictures as they were taken, changed into maps of the undistorted views of a scene.
+    """Turns maps of the original pictures into maps of undistorted views.
 
-    Where the lens saw nothing, the feature is all-zero.
+    Outside the original picture the feature is all-zero.
 
     Args:
         maps: one per view, of the distorted pictures.
@@ -57,7 +57,7 @@ class UndistortedMaps:
 
     @property
     def files(self) -> Sequence[Path]:
-        """The files of the maps as they are on disk."""
+        """The files of the original maps."""
         return self.maps.files
 
     def __len__(self) -> int:
@@ -65,11 +65,11 @@ class UndistortedMaps:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(h, w, D) of every map; removing distortion changes no size."""
+        """(h, w, D) of every map; undistorting does not change it."""
         return map_shape(self.maps)
 
     def digests(self) -> list[list[str]] | None:
-        """What decides each map before its distortion is removed; None if the maps do not know."""
+        """The digests of the original maps; None if unknown."""
         return _own_digests(self.maps)
 
     def __getitem__(self, i: int, /) -> Tensor:  # [h, w, D]
@@ -94,7 +94,7 @@ class UndistortedMaps:
 
 
 class KnownFeatures(Sequence[Tensor]):
-    """Raw maps as targets of a field (`decouple`): unknown pixels are NaN, which the loss leaves out."""
+    """Raw maps as targets of a field (`decouple`): unknown pixels are NaN, which the loss ignores."""
 
     def __init__(self, maps: Maps) -> None:
         self.maps = maps
@@ -120,11 +120,7 @@ def map_shape(maps: Maps) -> tuple[int, int, int]:
 
 
 def check_readable(maps: Maps, stage: str) -> None:
-    """Refuse to begin a stage that reads maps if some of them have been discarded.
-
-    Raises:
-        FileNotFoundError: if a file is gone.
-    """
+    """Raise a FileNotFoundError before a stage that reads maps, if some of them were discarded."""
     gone = [file for file in maps.files if not file.is_file()]
     if gone:
         raise FileNotFoundError(

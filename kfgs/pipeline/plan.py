@@ -1,4 +1,4 @@
-"""What a run will cost, before it starts: disk, memory and minutes of each stage, and whether this machine has them."""
+"""Predict the costs of a run: disk, memory and minutes of each stage, and whether this machine has enough."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from .plan_maps import NamedTeacher, find_stored, run_teacher
 from .train import training_device
 from .trial import Timing, disk_free, memory_free, memory_now, time_color, time_fit
 
-FEATURES = "features"  # the folder of maps in a scene's, where `kfgs features` writes and `kfgs fit` reads
+FEATURES = "features"  # the folder of maps in a scene folder, written by `kfgs features` and read by `kfgs fit`
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run will take; `str` gives a table."""
+    """The predicted costs of a run; `str` gives a table."""
 
     title: str
     stages: tuple[StagePlan, ...]
@@ -36,23 +36,23 @@ class Plan:
     dense: Dense
     disk_free: int
     memory_free: int | None
-    """Bytes that processes can still have; None where the system does not say."""
+    """Free memory in bytes; None if unknown."""
     disk_recomputed: int | None = None
-    """Disk that the same run needs if maps are made again instead of stored."""
+    """Disk that the same run needs if maps are recomputed instead of stored."""
 
     @property
     def seconds(self) -> float | None:
-        """Of all stages."""
+        """Time of all stages."""
         return add([stage.seconds for stage in self.stages])
 
     @property
     def disk_bytes(self) -> int | None:
-        """The most that lies on the disk at a time."""
+        """The largest use of disk at any time."""
         return add([stage.disk_bytes for stage in self.stages])
 
     @property
     def kept_bytes(self) -> int | None:
-        """What lies on the disk in the end."""
+        """Bytes on disk at the end."""
         return add([stage.kept_bytes for stage in self.stages])
 
     @property
@@ -68,7 +68,7 @@ class Plan:
 
     @property
     def verdict(self) -> str:
-        """Whether it fits, in a sentence, and what to do if not."""
+        """A sentence: whether it fits, and what to do if not."""
         if self._lacks is None:
             return (
                 "unknown whether it fits: the maps' size is not known; name a teacher that can be loaded, or --features"
@@ -77,7 +77,7 @@ class Plan:
 
     @property
     def _lacks(self) -> list[str] | None:
-        """What the machine has too little of; None if it lacks nothing that is known, and something is not known."""
+        """The resources of which the machine has too little; None if unknown."""
         found = []
         disk = sum(stage.disk_bytes or 0 for stage in self.stages)
         if disk > self.disk_free:
@@ -135,9 +135,9 @@ def plan_scene(
 ) -> Plan:
     """Predict disk, memory and minutes of `extract_features` and `fit_scene` on this machine.
 
-    Disk and memory follow from shapes. Times are measured: the teacher sees one picture, and each stage is run with a few
-    views and twenty steps, with as many Gaussians and as large maps as planned; then counts scale them up. That takes
-    seconds, or a minute where a teacher is slow. Times are orders of magnitude, within about a factor of two.
+    Disk and memory follow from shapes. Times are measured: the teacher sees one picture, and each stage runs with a few
+    views and twenty steps, with the planned number of Gaussians and size of maps; then times are scaled by counts. This
+    takes seconds, or a minute with a slow teacher. Times are right within about a factor of two.
 
     Args:
         scene: whose views of `config.split` are learnt from.
@@ -152,9 +152,9 @@ def plan_scene(
         run: the folder of `fit_scene`; stages that are finished there count as done.
 
     Raises:
-        ValueError: if there is no such teacher, split or device; if `dense` is not `keep` although the field learns from the
-            dense maps themselves (mode `decouple`); or if the weights are of another model.
-        FileNotFoundError: if the weights or a picture are not there.
+        ValueError: if there is no such teacher, split or device; if `dense` is not `keep` in mode `decouple`, which trains on
+            the dense maps; or if the weights belong to another model.
+        FileNotFoundError: if the weights or a picture are missing.
     """
     check_choice("dense", dense, DENSE)
     config = config or FitConfig()
@@ -202,7 +202,7 @@ def plan_scene(
 
 
 def _run_stages(scene: Scene, sizes: Sizes, maps: FeatureFolder | None) -> Sizes:
-    """Try the stages that are not done and fit into memory; sizes with what they took."""
+    """Time the stages that are not finished and fit into memory; returns the sizes with the timings."""
     config, free, now = sizes.config, memory_free(), memory_now() or 0
     sizes = replace(sizes, base=now)
     if sizes.points < 2 or (free is not None and training_bytes(sizes) > free):

@@ -1,4 +1,4 @@
-"""What a plan knows of the maps: which are stored already, and what the teacher makes of one picture."""
+"""The maps in a plan: find those that are stored, and run the teacher on one picture."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from .estimate import Sizes
 from .trial import EncodedPicture, memory_now, time_picture
 
 MOST_SIZES = 3  # sizes of pictures that the teacher is run on
-RANK = 8  # directions of the noise that stands for maps of a network with meaningless weights
+RANK = 8  # directions of the noise that replaces the maps of a network with random weights
 
 
 @dataclass(frozen=True)
 class NamedTeacher:
-    """A teacher by its name, which is loaded only if the plan has to run it. Nothing is downloaded for that.
+    """A teacher by its name, loaded only if the plan must run it. Nothing is downloaded.
 
     Args:
-        name: as `load_teacher` takes it.
-        weights: likewise. Without weights, `lseg` is timed with a network of the right size and meaningless weights.
-        options: likewise.
+        name: as in `load_teacher`.
+        weights: as in `load_teacher`. Without weights, `lseg` is timed with random weights.
+        options: as in `load_teacher`.
     """
 
     name: str
@@ -35,11 +35,7 @@ class NamedTeacher:
     options: dict[str, Any] = field(default_factory=dict)
 
     def load(self) -> tuple[Teacher | None, str | None]:
-        """The teacher, or None if its weights are not on this machine; and a note on that.
-
-        Raises:
-            ValueError, FileNotFoundError, ImportError: as `load_teacher` does.
-        """
+        """The teacher, or None if its weights are not on this machine, with a note; raises as `load_teacher`."""
         if self.without_weights:
             return _lseg_without_weights(
                 self.options
@@ -57,13 +53,13 @@ class NamedTeacher:
 
     @property
     def without_weights(self) -> bool:
-        """Whether it is LSeg, of which the time and the size of its maps are known without weights."""
+        """Whether it is LSeg without weights; its time and the size of its maps do not depend on them."""
         return self.name == "lseg" and self.weights is None
 
 
 @dataclass(frozen=True)
 class StoredMaps:
-    """The maps that a folder has already."""
+    """The maps that a folder has."""
 
     there: tuple[bool, ...]
     """For each view, whether its map can be read."""
@@ -77,7 +73,7 @@ class StoredMaps:
 
 
 def find_stored(scene: Scene, split: str, folder: Path, teacher: Any) -> StoredMaps:
-    """Look for the views' maps: all of any program, or some that kfgs made with the teacher."""
+    """Find the views' maps: a complete set of any program, or some made by kfgs with this teacher."""
     views = scene.views(split)
     stems, sizes = [scene.stem(i) for i in views], [scene.cameras[i].size for i in views]
     nothing = StoredMaps(tuple(False for _ in views))
@@ -103,7 +99,7 @@ def find_stored(scene: Scene, split: str, folder: Path, teacher: Any) -> StoredM
             return replace(nothing, maps=maps, shape=None if maps is None else maps.shape)
         sample = FeatureFolder(folder, [stems[i] for i in kept], sizes=[sizes[i] for i in kept])
         for i in range(len(kept)):
-            sample.grid(i, sample.shape[:2], 1)  # one feature: whether it is there, of this size and finite
+            sample.grid(i, sample.shape[:2], 1)  # reads one feature: checks existence, size and finite values
     except (ValueError, TypeError, OSError) as error:
         return replace(nothing, note=f"maps that exist are not counted: {error}")
     return StoredMaps(there, sample.shape, maps, sample, str(made_by.get("name", "maps of another program")))
@@ -157,7 +153,7 @@ def run_teacher(
 
 
 def _lseg_without_weights(options: dict[str, Any]) -> LSeg:
-    """LSeg as large and as slow as it is, with weights that mean nothing: there is one size of it only."""
+    """LSeg with random weights, to measure its time; it exists in one size only."""
     given = dict(options)
     chosen = LSegOptions.fast() if given.pop("fast", False) else LSegOptions()
     with torch.device("meta"):

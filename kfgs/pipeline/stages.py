@@ -1,8 +1,8 @@
-"""A run folder of finished stages, each under the hash of what it was made from.
+"""A run folder of finished stages, each named by the hash of its inputs.
 
-A stage is a function that fills a folder. Its name and the JSON description of its inputs give a key; a folder with
-that key that is complete is used as it is, otherwise the stage is made in a temporary folder and moved into place in
-one step. So a killed run leaves only finished stages, and the same command continues where it stopped.
+A stage is a function that fills a folder. Its name and the JSON of its inputs give a key. A complete folder with that key is
+reused. Otherwise the stage is made in a temporary folder and moved into place in one step. So a killed run leaves only
+finished stages, and the same command continues where it stopped.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from ..scenes import Scene
 
 STAGE_FILE = "stage.json"
 STAGE_VERSION = 2
-"""Part of every key: raised when the same inputs would give another result, so that old stages are not used again."""
+"""Part of every key: raised if the same inputs give another result in a new version, so that old stages are not reused."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One finished stage: where its files lie, and how it came about."""
+    """One finished stage: its files, and how it was made."""
 
     name: str
     key: str
@@ -41,12 +41,12 @@ class Stage:
 
 
 class UnfinishedError(Exception):
-    """A stage is not in the run folder, and `Run.look_only` says not to make it."""
+    """A stage is not in the run folder, and `Run.look_only` forbids to make it."""
 
 
 @dataclass
 class Run:
-    """The stages of one run folder, in the order they were asked for.
+    """The stages of one run folder, in the order of use.
 
     Example:
         >>> import tempfile, pathlib
@@ -64,16 +64,16 @@ class Run:
     """Make and write nothing: a stage that is not finished raises `UnfinishedError`, and files are not digested."""
 
     def stage(self, name: str, inputs: dict[str, Any], make: Callable[[Path], float | None]) -> Stage:
-        """Return the finished stage of these inputs, making it if it is not there.
+        """Return the finished stage of these inputs; make it if it does not exist.
 
         Args:
             name: a word for the folder's name.
-            inputs: everything that decides the result, as JSON; keys of earlier stages stand for their content.
-            make: fills the folder it is given; may return the seconds of work that an earlier, killed process did for it.
+            inputs: everything that decides the result, as JSON; for earlier stages, their keys.
+            make: fills the given folder; may return the seconds of work by an earlier, killed process.
 
         Raises:
             ValueError: if a folder of that key is damaged.
-            UnfinishedError: if the stage is not there, and `look_only` is True.
+            UnfinishedError: if the stage does not exist, and `look_only` is True.
         """
         key = _key(name, inputs)
         target = self.folder / "stages" / f"{name}-{key}"
@@ -112,9 +112,9 @@ class Run:
         return self.folder / "unfinished" / f"{name}-{_key(name, inputs)}"
 
     def digests(self, paths: Sequence[Path]) -> list[list[str]]:
-        """[file name, SHA-256] of each file, in the order given; a file that has not changed is not read again.
+        """[file name, SHA-256] of each file; unchanged files are not read again.
 
-        With `look_only`, a file that would have to be read gets "unknown", which is the digest of no finished stage.
+        With `look_only`, a file that would have to be read gets "unknown", which matches no finished stage.
         """
         cache_path = self.folder / "digests.json"
         cache: dict[str, Any] = read_json(cache_path) if cache_path.is_file() else {}
@@ -150,7 +150,7 @@ def _sizes(folder: Path) -> dict[str, int]:
 
 
 def stage_generator(seed: int, purpose: str) -> torch.Generator:
-    """A generator of its own for each stage, so that skipping a finished stage changes nothing downstream."""
+    """A separate generator for each stage, so that reusing a stage does not change later ones."""
     digest = hashlib.sha256(f"{purpose}:{seed}".encode()).digest()
     return torch.Generator().manual_seed(int.from_bytes(digest[:7], "little"))
 
@@ -167,7 +167,7 @@ def digest_tensors(*tensors: Tensor) -> str:
 def digest_scene(scene: Scene, views: Sequence[int]) -> str:
     """SHA-256 of some views' poses, intrinsics, sizes and near planes, and of the sparse points.
 
-    Where all near planes are at 0.2 they are left out: runs from before cameras had one stay valid.
+    Near planes count only if one is not at 0.2, so that runs of older versions without near planes stay valid.
     """
     cameras = [scene.cameras[i] for i in views]
     poses = torch.stack([camera.viewmat for camera in cameras])
@@ -178,5 +178,5 @@ def digest_scene(scene: Scene, views: Sequence[int]) -> str:
 
 
 def describe_lens(lens: Camera) -> list[Any]:
-    """What decides how a lens is removed, as plain values."""
+    """The values that decide how a picture is undistorted."""
     return [lens.K.tolist(), lens.size, asdict(lens.distortion) if lens.distortion else None]

@@ -1,4 +1,4 @@
-"""What the semantic and the colour field share: where they are trained, on what scene, and a fit that can be resumed."""
+"""Helpers for training semantic and colour fields: the device, checks of the scene, and a fit that can be resumed."""
 
 from __future__ import annotations
 
@@ -19,13 +19,10 @@ from .stages import Run, Stage
 
 
 def training_device(device: str | torch.device = "auto") -> torch.device:
-    """The device that a name stands for.
+    """The device of a name; a ValueError if it is no device, or there is no such GPU.
 
     Args:
         device: `auto` takes CUDA if torch sees it and an engine runs on it, else the CPU; `cpu`, `cuda`, `cuda:1`.
-
-    Raises:
-        ValueError: if it is no device, or a GPU that is not there.
     """
     if device == "auto":
         return torch.device("cuda" if torch.cuda.is_available() and available_engines("cuda") else "cpu")
@@ -65,13 +62,13 @@ def field_stage(
     inputs: dict[str, Any],
     train: Callable[[Path], FieldFit],
 ) -> tuple[GaussianParams, Stage]:
-    """Train a field as a stage of a run: found again when finished, resumed when it was killed.
+    """Train a field as a stage of a run; after a kill it resumes from its checkpoint.
 
     Args:
         run: the run folder.
-        name: the stage's.
+        name: of the stage.
         inputs: everything that decides the result.
-        train: fits the field, given the file for its checkpoint.
+        train: fits the field, with the given file for its checkpoint.
     """
     scratch = run.scratch(name, inputs)
 

@@ -1,4 +1,4 @@
-"""Small runs that are timed, so that a plan needs no table of how fast things are: one picture, a few views, twenty steps."""
+"""Time small runs for a plan: one picture, a few views, twenty steps."""
 
 from __future__ import annotations
 
@@ -25,42 +25,42 @@ from .config import FitConfig
 from .fit import fit_scene
 from .stages import Stage
 
-STEPS = 20  # of training, in the longer of the two runs that are compared
-VIEWS = 4  # likewise
-DENSER = 8  # times more samples of a map
-SHORT = 2  # steps and views of the shorter one
-PATIENCE = 5.0  # seconds: what takes longer is not run a second time, nor for all of the steps
-NOISE = 0.1  # the least share of its mean time that one step or view more is taken to cost
+STEPS = 20  # steps of the longer of two runs
+VIEWS = 4  # views of the longer run
+DENSER = 8  # factor on the samples of a map
+SHORT = 2  # steps and views of the shorter run
+PATIENCE = 5.0  # seconds: slower runs are not repeated, and have fewer steps
+NOISE = 0.1  # one more step or view costs at least this share of the mean time
 
 
 @dataclass(frozen=True)
 class Timing:
-    """What a stage took in the small runs, as a line: so many seconds at all, and so many for each view or step."""
+    """The time of a stage as a straight line: constant seconds, plus seconds for each view or step."""
 
     fixed: float
     each: float
     peak: int | None = None
-    """Memory of the whole process meanwhile, bytes; None where the system does not say."""
+    """Peak memory of the process, bytes; None if unknown."""
 
     def seconds(self, count: int) -> float:
-        """Of so many views or steps."""
+        """The time of `count` views or steps."""
         return self.fixed + self.each * count
 
 
 @dataclass(frozen=True)
 class EncodedPicture:
-    """What a teacher made of one picture."""
+    """Costs of running a teacher on one picture."""
 
     shape: tuple[int, int, int]
     """(h, w, D) of its map."""
     seconds: float
     """For one picture, from its file to the file of its map."""
     peak: int | None
-    """Memory of the whole process meanwhile, bytes."""
+    """Peak memory of the process, bytes."""
 
 
 def time_picture(teacher: Teacher | Callable[[Tensor], Tensor], picture: Picture, folder: Path) -> EncodedPicture:
-    """Let a teacher see one picture, and write its map to a folder as `extract_features` would.
+    """Run a teacher on one picture, and write its map to a folder like `extract_features`.
 
     LSeg's network runs once, not for every scale and window; its time is multiplied.
     """
@@ -75,7 +75,7 @@ def time_picture(teacher: Teacher | Callable[[Tensor], Tensor], picture: Picture
 
     seconds = 0.0
     with PeakMemory() as memory:
-        while len(spent) < 2 and seconds < PATIENCE:  # a second time, since the first reads weights and compiles
+        while len(spent) < 2 and seconds < PATIENCE:  # twice, because the first run reads weights and compiles
             shutil.rmtree(folder, ignore_errors=True)
             start = time.perf_counter()
             made = extract_features(CallableTeacher(encode, name=teacher.name, identity={}), [picture], folder)
@@ -84,7 +84,7 @@ def time_picture(teacher: Teacher | Callable[[Tensor], Tensor], picture: Picture
 
 
 def _one_run(teacher: Teacher, picture: Picture) -> tuple[Teacher, int]:
-    """The teacher, or LSeg with one window at one scale; and how many of these runs a picture takes."""
+    """The teacher, or LSeg with one window at one scale, and the number of such runs per picture."""
     if not isinstance(teacher, LSeg):
         return teacher, 1
     height, width = map(int, picture.read().shape[:2])
@@ -94,7 +94,7 @@ def _one_run(teacher: Teacher, picture: Picture) -> tuple[Teacher, int]:
 
 
 def time_color(scene: Scene, config: FitConfig, gaussians: int) -> dict[str, Timing]:
-    """Time the stage `color`, with so many Gaussians from the start."""
+    """Time the stage `color`, with this number of Gaussians from the start."""
 
     def make(views: int, steps: int, folder: Path, report: Callable[[str], None]) -> list[Stage]:
         few = few_views(scene, config.split, views, gaussians)
@@ -105,16 +105,16 @@ def time_color(scene: Scene, config: FitConfig, gaussians: int) -> dict[str, Tim
 
 
 def time_fit(scene: Scene, maps: FeatureFolder, config: FitConfig, gaussians: int) -> dict[str, Timing]:
-    """Time the stages that are made of maps.
+    """Time the stages that read maps.
 
     Args:
         scene: as for `fit_scene`.
-        maps: of some views; they stand for those of all.
+        maps: of some views, used for all.
         config: as for `fit_scene`.
-        gaussians: so many are trained from the start (method `paper`) or fused onto (`fuse`).
+        gaussians: their number from the start (method `paper`), or to fuse onto (`fuse`).
     """
     count = len(scene.views(config.split))
-    # The adaptive codebook grows with all samples together, of which four views have too few to show it.
+    # The adaptive codebook grows with all samples together; four views have too few to show it.
     denser = max(1, min(DENSER, count // VIEWS)) if config.codebook.adaptive else 1
     codebook = replace(config.codebook, samples=denser * config.codebook.samples_of(count))
 
@@ -134,7 +134,7 @@ def time_fit(scene: Scene, maps: FeatureFolder, config: FitConfig, gaussians: in
 
 
 def few_views(scene: Scene, split: str, count: int, points: int) -> Scene:
-    """Some views of a split, evenly spread, and the scene's points repeated until there are as many as asked for."""
+    """Some evenly spread views of a split, with the scene's points repeated to a given number."""
     views = scene.views(split)
     chosen = scene.select([views[i * len(views) // count] for i in range(count)])
     generator = torch.Generator().manual_seed(0)
@@ -153,12 +153,12 @@ def _shortened(config: FieldConfig, steps: int) -> FieldConfig:
 def _time_twice(
     make: Callable[[int, int, Path, Callable[[str], None]], list[Stage]], views: int, stepwise: set[str]
 ) -> dict[str, Timing]:
-    """Time two runs of different length, and draw a line through both.
+    """Time two runs of different length, and put a straight line through both.
 
     Args:
-        make: makes the stages of so many views and steps in a folder, and reports them.
-        views: there are no more.
-        stepwise: the stages whose time follows the steps; that of the others follows the views.
+        make: makes the stages with a number of views and steps in a folder, and reports them.
+        views: the most views available.
+        stepwise: stages whose time depends on the steps; the others depend on the views.
     """
     short, long = min(SHORT, views), min(VIEWS, views)
     with TemporaryDirectory(prefix="kfgs-plan-") as place:
@@ -180,7 +180,7 @@ def _time_twice(
 
 
 class _Peaks:
-    """The most memory of each stage, by what a run reports of it."""
+    """The peak memory of each stage, from the lines that a run reports."""
 
     def __init__(self) -> None:
         self.found: dict[str, int | None] = {}
@@ -196,7 +196,7 @@ class _Peaks:
 
 
 class _FewMaps(Sequence[Tensor]):
-    """So many views' maps, evenly spread over those that are stored; one stands for several if there are too few."""
+    """The maps of a number of views, evenly spread over the stored ones; repeated if there are too few."""
 
     def __init__(self, maps: FeatureFolder, count: int) -> None:
         self._maps, self._chosen = maps, [i * len(maps) // count for i in range(count)]
@@ -216,9 +216,9 @@ class _FewMaps(Sequence[Tensor]):
 
 
 class PeakMemory:
-    """In `with`: `bytes` is the most memory that the process had meanwhile; None where the system does not say.
+    """A context: `bytes` is the peak memory of the process inside it; None if unknown.
 
-    Where the system cannot forget an earlier peak (other than Linux), it is the most so far.
+    On systems other than Linux an earlier peak cannot be reset, so it is the peak since the start.
     """
 
     bytes: int | None = None
@@ -237,7 +237,7 @@ class PeakMemory:
 
 
 def memory_now() -> int | None:
-    """Bytes of this process, or the most so far where the system does not tell."""
+    """Bytes of this process; if unknown, its peak so far."""
     with PeakMemory() as memory:
         pass
     return memory.bytes
@@ -252,7 +252,7 @@ def _largest_so_far() -> int | None:
 
 
 def disk_free(folder: str | Path) -> int:
-    """Bytes free where a folder is, or will be made."""
+    """Free bytes on the disk of a folder, which may not exist yet."""
     path = Path(folder).resolve()
     while not path.exists():
         path = path.parent
@@ -260,7 +260,7 @@ def disk_free(folder: str | Path) -> int:
 
 
 def memory_free() -> int | None:
-    """Bytes of memory that processes can still have, a container's limit counted; None where the system does not say."""
+    """Free memory in bytes, within a container's limit; None if unknown."""
     found: list[int] = []
     meminfo, limit, used = (
         Path(name) for name in ("/proc/meminfo", "/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current")

@@ -1,8 +1,8 @@
-"""CLIP's byte-pair tokenizer, with the standard library alone.
+"""CLIP's byte-pair tokenizer, with the standard library only.
 
-Text is cut into words, each word into the symbols of its UTF-8 bytes, and neighbouring symbols are merged, the earliest
-merge of a ranked list first (Sennrich et al. 2016; byte symbols as in GPT-2). What the 49,408 ids mean: 256 byte
-symbols, the same with `</w>` at a word's end, one per merge, `<|startoftext|>`, `<|endoftext|>`.
+Text is cut into words, each word into the symbols of its UTF-8 bytes, and neighbouring symbols are merged in the order of a
+ranked list of merges (Sennrich et al. 2016; byte symbols as in GPT-2). The 49,408 ids are 256 byte symbols, the same with
+`</w>` at the end of a word, one per merge, `<|startoftext|>`, `<|endoftext|>`.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ from typing import Any
 import torch
 from torch import Tensor
 
-MERGES = 48_894  # that CLIP uses of the 262,144 in OpenAI's file
+MERGES = 48_894  # CLIP uses so many of the 262,144 in OpenAI's file
 _END = "</w>"
 _SPECIAL = ("<|startoftext|>", "<|endoftext|>")
 _FIXED = re.compile(r"<\|startoftext\|>|<\|endoftext\|>|'(?:s|t|re|ve|m|ll|d)", re.IGNORECASE)
-_RUN = re.compile(r"L+|N|O+")  # over kinds of characters: letters together, each number alone, others together
+_RUN = re.compile(r"L+|N|O+")  # on character kinds: runs of letters, single numbers, runs of others
 _SPACES = "\t\n\v\f\r \x85\xa0\u1680\u2028\u2029\u202f\u205f\u3000" + "".join(map(chr, range(0x2000, 0x200B)))
 _SPACE = re.compile(f"[{_SPACES}]+")  # Unicode's White_Space; Python's \s has four control characters more
 _LIMIT = 1 << 24  # bytes of a vocabulary; OpenAI's has 3.2 million
 
 
 class Tokenizer:
-    """Prompts to the token ids of CLIP's text tower.
+    """Turns prompts into the token ids of CLIP's text tower.
 
-    Prompts are unescaped twice as HTML, composed (Unicode NFC), put into lower case, and their white space is made single
-    blanks. OpenAI's own also repairs text with `ftfy`, which changes only text that went through a wrong encoding,
+    Prompts are unescaped twice as HTML, composed (Unicode NFC) and put into lower case, and runs of white space become
+    single blanks. OpenAI's tokenizer also repairs text with `ftfy`, which only changes text with encoding errors,
     typographic quotes, ligatures and full-width letters.
 
     Args:
-        merges: pairs of symbols, the first merged first.
-        context: tokens per prompt; shorter ones are filled with 0 behind `<|endoftext|>`.
+        merges: pairs of symbols, in the order of merging.
+        context: tokens per prompt; shorter prompts are filled with 0 after `<|endoftext|>`.
 
     Example:
         >>> load_tokenizer()(["a photo of a cat"])[0, :8].tolist()
@@ -113,7 +113,7 @@ class Tokenizer:
 
 
 def load_tokenizer(path: str | Path | None = None) -> Tokenizer:
-    """CLIP's tokenizer, with the merges that come with kfgs or those of a file.
+    """CLIP's tokenizer, with the merges that kfgs ships or those of a file.
 
     Args:
         path: OpenAI's `bpe_simple_vocab_16e6.txt.gz`, the same unpacked, or the folder of a Hugging Face CLIP tokenizer
@@ -121,7 +121,7 @@ def load_tokenizer(path: str | Path | None = None) -> Tokenizer:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it does not hold CLIP's 48,894 merges, or its ids are others than CLIP's.
+        ValueError: if it does not hold CLIP's 48,894 merges, or its ids differ from CLIP's.
     """
     if path is None:
         packed = files("kfgs.teachers").joinpath("data", "clip_bpe_merges.txt.gz").read_bytes()
@@ -133,7 +133,7 @@ def load_tokenizer(path: str | Path | None = None) -> Tokenizer:
 
 
 def _from_folder(folder: Path) -> Tokenizer:
-    """The tokenizer of a Hugging Face folder, if its ids are those that its merges give."""
+    """The tokenizer of a Hugging Face folder, if its ids follow from its merges."""
     if (folder / "tokenizer.json").is_file():
         model: Any = _read_json(folder / "tokenizer.json").get("model")
         model = model if isinstance(model, dict) else {}
@@ -199,10 +199,10 @@ def _clean(text: str) -> str:
 
 
 def _words(text: str) -> Iterator[str]:
-    """Cut as OpenAI's expression does: special tokens and contractions, runs of letters, single numbers, runs of others.
+    """Split like OpenAI's expression: special tokens and contractions, runs of letters, single numbers, runs of others.
 
-    Letters and numbers are Unicode's categories L* and N*, which `re` has no names for: its digits leave out the
-    superscript two.
+    Letters and numbers are Unicode's categories L* and N*. `re` has no names for these: its digits lack the superscript
+    two.
     """
     kinds = "".join(" " if char in _SPACES else _KINDS.get(unicodedata.category(char)[0], "O") for char in text)
     start = 0
@@ -219,7 +219,7 @@ _KINDS = {"L": "L", "N": "N"}
 
 
 def _byte_symbols() -> dict[int, str]:
-    """A printable character for each byte, in the order of their ids: printable ones are themselves, others from 256 on."""
+    """A printable character for each byte, in the order of ids: printable bytes stay, others become 256 and following."""
     printable = [*range(ord("!"), ord("~") + 1), *range(ord("¡"), ord("¬") + 1), *range(ord("®"), ord("ÿ") + 1)]
     others = [byte for byte in range(256) if byte not in printable]
     return {byte: chr(byte) for byte in printable} | {byte: chr(256 + index) for index, byte in enumerate(others)}

@@ -15,19 +15,19 @@ from .._files import digest_file
 from .torch_files import Placeholder, TorchFileError, check_plain, load_torch_file
 
 _EXPECTED = "expected a checkpoint (.ckpt, .pt, .pth or .safetensors)"
-_STATES = ("state_dict", "model_state_dict", "model", "module", "net", "network", "params")  # where people put it
+_STATES = ("state_dict", "model_state_dict", "model", "module", "net", "network", "params")  # usual keys
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Tensor]:
     """Read the tensors of a checkpoint by name, on the CPU. Nothing in the file is run, and values are not read yet.
 
-    Files of `torch.save` and safetensors are read, told apart by content. The state dict is the file itself, or lies under
-    `state_dict` (Lightning), `model_state_dict`, `model`, `module`, `net`, `network` or `params`, in this order. What is
-    not a tensor is left out.
+    Files of `torch.save` and safetensors are read; the content shows which it is. The state dict is the whole file, or is
+    under `state_dict` (Lightning), `model_state_dict`, `model`, `module`, `net`, `network` or `params`, in this order.
+    Anything that is not a tensor is left out.
 
-    **Memory**: tensors are views of the file, mapped privately: pages are read when they are looked at, and writing to a
-    tensor does not change the file. Files of torch before 1.6 are the exception: they are read whole. While the tensors
-    are in use, the file may be deleted or replaced by another one, but not written over.
+    **Memory**: tensors are views of the file, mapped privately: pages are read at first use, and writing to a tensor does
+    not change the file. Only files of torch before 1.6 are read whole. While the tensors are in use, the file may be
+    deleted or replaced, but not overwritten.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -42,7 +42,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Tensor]:
 
 
 def weights_digest(path: str | Path) -> str:
-    """SHA-256 of a checkpoint's file, in hexadecimal: what identifies the weights.
+    """SHA-256 of a checkpoint's file, in hexadecimal, to identify the weights.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -92,7 +92,7 @@ def _read_torch(path: Path) -> dict[str, Tensor]:
 
 
 def _find_state(found: Any, seen: set[int], depth: int = 0) -> dict[Any, Any] | None:
-    """The dict that holds tensors, itself or under one of the usual keys; each is looked into once."""
+    """The dict that holds tensors, or the one under one of the usual keys; each is visited once."""
     if not isinstance(found, dict) or depth > 3 or id(found) in seen:
         return None
     seen.add(id(found))
@@ -102,7 +102,7 @@ def _find_state(found: Any, seen: set[int], depth: int = 0) -> dict[Any, Any] | 
 
 
 def _describe_object(found: Any) -> str:
-    """What an object is, in words."""
+    """Describe an object in a few words."""
     if isinstance(found, Placeholder):
         return f"one object, {one_line(found.__name__)} (save its state_dict() where it was made)"
     if isinstance(found, dict):
@@ -127,5 +127,5 @@ def _read_safetensors(path: Path) -> dict[str, Tensor]:
 
 
 def _is_safetensors(head: bytes) -> bool:
-    """Whether a JSON header follows its length: 8 bytes, of which the upper ones are zero (at most 100 MB)."""
+    """Whether the file begins with a length of 8 bytes, the upper ones zero (at most 100 MB), and a JSON header."""
     return head[8:9] == b"{" and int.from_bytes(head[:8], "little") < 2**27

@@ -1,4 +1,4 @@
-"""The identity of a user's own teacher as JSON (code, weights, options), so that a cache notices a change."""
+"""The identity of a user's teacher as JSON (code, weights, options), so that a cache notices changes."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _NESTED = (tuple, list, slice, set, frozenset, dict, torch.dtype, torch.device)
 
 
 def code_identity(source: Any) -> dict[str, str]:
-    """Find where a function (or a class, or an object's class) is defined, and take a digest of its code.
+    """The place where a function (or a class, or an object's class) is defined, and a digest of its code.
 
-    The digest is of the compiled code: instructions with their names and constants, and plain default arguments; of a
-    class, of all methods and plain attributes (also in tuples, lists, dicts) that it and its bases in the same module
-    have. Comments, line numbers and docstrings do not count. **Not noticed** are the values of globals and closures, the
-    attributes of an object, nested classes, and changes in the functions that are called: a teacher that relies on those needs
-    an `identity`. Another minor version of Python compiles to other code, and counts as a change.
+    The digest covers the compiled code: instructions with their names and constants, and plain default arguments. For a
+    class it covers all methods and plain attributes (also in tuples, lists, dicts) of the class and of its bases in the
+    same module. Comments, line numbers and docstrings do not count. **Not noticed** are the values of globals and
+    closures, the attributes of an object, nested classes, and changes in called functions: a teacher that relies on those
+    needs an `identity`. Another minor version of Python compiles to other code, so it counts as a change.
 
     Returns:
         `source`, "package.module:name", and `code`, hexadecimal digits.
@@ -58,7 +58,7 @@ def weights_identity(weights: str | Path | None) -> str | None:
 
 
 def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options as JSON holds them: lists for tuples, text for what JSON does not know (an object's address left out)."""
+    """Options as JSON: tuples become lists, and unknown types text (without an object's address)."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, Mapping):
@@ -75,13 +75,13 @@ def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _describe(source: Any) -> Any:
-    """JSON of what decides what a callable does, as far as it can be looked at."""
+    """JSON of everything visible that decides what a callable does."""
     if isinstance(source, functools.partial):
         named = {name: _constant(value) for name, value in source.keywords.items()}
         return ["partial", _describe(source.func), [_constant(value) for value in source.args], named]
     if inspect.isclass(source):
         return _describe_class(source)
-    source = inspect.unwrap(getattr(source, "__func__", source))  # from under decorators such as torch.no_grad()
+    source = inspect.unwrap(getattr(source, "__func__", source))  # removes decorators, for instance torch.no_grad()
     code = getattr(source, "__code__", None)
     if isinstance(code, types.CodeType):
         defaults = [
@@ -115,13 +115,13 @@ def _describe_class(source: type) -> list[Any]:
 
 
 def _describe_code(code: types.CodeType) -> list[Any]:
-    """Instructions with the names and constants they use: their numbers would change when a docstring is added."""
+    """Instructions with names and constants instead of their numbers, which change when a docstring is added."""
     return [[step.opname, _constant(step.argval)] for step in dis.get_instructions(code)]
 
 
 def _constant(value: Any) -> Any:
-    """A constant as JSON; of what is not plain, the kind alone."""
-    if isinstance(value, types.CodeType):  # a function within the function
+    """A constant as JSON; only the type of a constant that is not plain."""
+    if isinstance(value, types.CodeType):  # a nested function
         return _describe_code(value)
     if isinstance(value, tuple | list):
         return [_constant(one) for one in value]

@@ -22,7 +22,7 @@ from .transformers_table import TRANSFORMERS
 
 
 def _loader(name: str) -> Callable[..., Teacher]:
-    """What makes the teacher of a name from weights and options."""
+    """The function that makes the teacher of this name from weights and options."""
     if name == "lseg":
         from .lseg import load_lseg
 
@@ -45,18 +45,17 @@ def load_teacher(name: str, weights: str | Path | None = None, **options: Any) -
     """Load a teacher.
 
     Args:
-        name: one of `teacher_names()`, or `package.module:name` of your own: a teacher, a function from [3, H, W] to
+        name: one of `teacher_names()`, or your own `package.module:name`: a teacher, a function from [3, H, W] to
             [D, h, w], or a class, which is called with `weights` (if given) and the options. The current folder is
             searched for the module too. A teacher without `identity` gets one from source, code, weights and options, so
-            that a cache notices when they change; `identity.code_identity` says what is not noticed.
-        weights: a checkpoint file (lseg, sam), or a folder as `save_pretrained` writes it or a hub id (all others).
-        options: of the kind: see `load_lseg`, `load_sam`, `load_transformers_teacher`.
+            that a cache notices changes (not all: see `identity.code_identity`).
+        weights: a checkpoint file (lseg, sam), or a folder from `save_pretrained` or a hub id (all others).
+        options: of the teacher: see `load_lseg`, `load_sam`, `load_transformers_teacher`.
 
     Raises:
-        ValueError: if there is no such teacher or option, or the weights are of another network; the message says
-            which.
-        FileNotFoundError: if the weights are not there.
-        ImportError: if a package is missing, or there but broken.
+        ValueError: if there is no such teacher or option, or the weights belong to another network; the message names it.
+        FileNotFoundError: if the weights do not exist.
+        ImportError: if a package is missing or broken.
     """
     if ":" in name:
         return _imported(name, weights, options)
@@ -84,7 +83,7 @@ def _check_options(name: str, loader: Callable[..., Teacher], options: dict[str,
 
 
 def _imported(name: str, weights: str | Path | None, options: dict[str, Any]) -> Teacher:
-    """The teacher that `package.module:name` stands for; the folder in which the command runs counts."""
+    """The teacher `package.module:name`; the module may be in the folder where the command runs."""
     with _working_folder():
         found = _find(name)
         if inspect.isclass(found):
@@ -108,7 +107,7 @@ def _imported(name: str, weights: str | Path | None, options: dict[str, Any]) ->
 
 
 def _find(name: str) -> Any:
-    """What lies behind `package.module:name`."""
+    """Import the object `package.module:name`."""
     module_name, _, attribute = name.partition(":")
     try:
         importlib.invalidate_caches()
@@ -121,7 +120,7 @@ def _find(name: str) -> Any:
 
 
 def _check_signature(name: str, made: Callable[..., Any], given: list[Any], options: dict[str, Any]) -> None:
-    """Raise a ValueError if a class does not take weights and options; what it raises itself is its own matter."""
+    """Raise a ValueError if a class does not take these weights and options."""
     try:
         signature = inspect.signature(made)
     except (TypeError, ValueError):  # a class of C has none
@@ -137,7 +136,7 @@ def _check_signature(name: str, made: Callable[..., Any], given: list[Any], opti
 
 @contextmanager
 def _working_folder() -> Iterator[None]:
-    """While open, modules are also looked for in the folder in which the command runs."""
+    """Inside the `with` block, modules are also searched for in the folder where the command runs."""
     if "" in sys.path:
         yield
         return
@@ -145,19 +144,19 @@ def _working_folder() -> Iterator[None]:
     try:
         yield
     finally:
-        if "" in sys.path:  # what the module itself added stays
+        if "" in sys.path:  # entries that the module added stay
             sys.path.remove("")
 
 
 class OwnTeacher:
-    """A user's teacher that has no `identity`, with one made from what is known; made by `load_teacher`.
+    """Adds an `identity` to a user's teacher that has none; made by `load_teacher`.
 
     Args:
-        teacher: does the work; its other attributes are attributes of this object too.
+        teacher: the user's teacher; its other attributes are available here too.
         source: "package.module:name".
-        code: digest of its code; see `code_identity` for what that does not notice.
-        weights: what it was made with; the digest of the file or folder is taken when `identity` is first read.
-        options: what it was made with.
+        code: digest of its code, from `code_identity`.
+        weights: that it was made with; their digest is computed when `identity` is first read.
+        options: that it was made with.
     """
 
     def __init__(
@@ -172,12 +171,12 @@ class OwnTeacher:
 
     @property
     def name(self) -> str:
-        """The teacher's own name."""
+        """The teacher's name."""
         return self._teacher.name
 
     @property
     def identity(self) -> dict[str, Any]:
-        """JSON: name, source, a digest of the code, options, and weights as SHA-256 (None: it was made without)."""
+        """JSON: name, source, a digest of the code, options, and SHA-256 of the weights (None: no weights)."""
         if self._digest is None:
             self._digest = weights_identity(self._weights)
         return {"name": str(self.name), **self._known, "weights": self._digest}
@@ -191,14 +190,14 @@ class OwnTeacher:
         return self
 
     def encode_image(self, image: Tensor) -> Tensor:  # [3, H, W] -> [D, h, w]
-        """What the teacher returns."""
+        """The result of the user's teacher."""
         return self._teacher.encode_image(image)
 
     def encode_text(self, prompts: Sequence[str]) -> Tensor:  # -> [n, D]
-        """What the teacher returns."""
+        """The result of the user's teacher."""
         return self._teacher.encode_text(prompts)
 
-    def __getattr__(self, name: str) -> Any:  # only what is not found here
-        if name.startswith("_"):  # while it is copied or unpickled there is no teacher yet
+    def __getattr__(self, name: str) -> Any:  # called only for attributes not found here
+        if name.startswith("_"):  # during copying or unpickling there is no teacher yet
             raise AttributeError(name)
         return getattr(self._teacher, name)

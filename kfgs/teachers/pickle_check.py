@@ -20,7 +20,7 @@ def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
-_OPCODES = _words(  # what torch.load(weights_only=True) reads
+_OPCODES = _words(  # the opcodes of torch.load(weights_only=True)
     "GLOBAL NEWOBJ REDUCE BUILD APPEND APPENDS SETITEM SETITEMS MARK TUPLE TUPLE1 TUPLE2 TUPLE3 NONE NEWFALSE NEWTRUE "
     "EMPTY_TUPLE EMPTY_LIST EMPTY_DICT EMPTY_SET BININT BININT1 BININT2 BINFLOAT BINUNICODE SHORT_BINSTRING BINPERSID "
     "BINGET LONG_BINGET BINPUT LONG_BINPUT LONG1 PROTO STOP"
@@ -33,8 +33,8 @@ _DEPTH = 1000  # of tuples in tuples: their hash recurses in C
 _NAMES = 500  # classes: each call of one looks through all of them
 _ARGUMENTS = 64  # of a call; torch's have 7
 
-# What torch itself calls. Other functions that it would call (sparse, nested, quantised tensors, bytearray) can be made to
-# fill the memory, and no state dict of plain tensors needs them.
+# Functions that torch calls for plain tensors. Others (sparse, nested, quantised tensors, bytearray) could fill the memory,
+# and no state dict of plain tensors needs them.
 _REBUILDS = _words(
     "torch._utils._rebuild_tensor torch._utils._rebuild_tensor_v2 torch._utils._rebuild_tensor_v3 "
     "torch._utils._rebuild_parameter torch._utils._rebuild_parameter_with_state torch.nn.parameter.Parameter"
@@ -61,7 +61,7 @@ class OtherProtocolError(BrokenPickleError):
 
 
 class ByteSource(Protocol):
-    """What is read from: `io.BytesIO` or `mmap.mmap`, whose `read(n)` reserves no more memory than there are bytes."""
+    """`io.BytesIO` or `mmap.mmap`: their `read(n)` never allocates more memory than there are bytes."""
 
     def read(self, n: int, /) -> bytes:
         """At most `n` bytes."""
@@ -74,7 +74,7 @@ class ByteSource(Protocol):
 
 @dataclass(slots=True, eq=False)
 class _Value:
-    """What is known of an object that the pickle would make."""
+    """An object that the pickle would make, as far as the dry run knows it."""
 
     kind: str  # its opcode
     literal: Any = None  # a text or number; of GLOBAL the name, of REDUCE and NEWOBJ the name that was called
@@ -100,12 +100,12 @@ class PickleNames:
 
 
 def check_pickle(source: ByteSource) -> PickleNames:
-    """Raise unless torch can read the pickle at the position of `source` with work in proportion to its length.
+    """Raise unless torch can read the pickle at the position of `source` in time and memory proportional to its length.
 
-    Afterwards `source` is at the first byte after the pickle.
+    Moves `source` to the first byte after the pickle.
 
     Raises:
-        UnsafePickleError: if it names what runs commands, code or files, called or not.
+        UnsafePickleError: if it names something that runs commands or code or opens files, called or not.
         BrokenPickleError: if it is damaged, of another protocol, or would take too much time or memory.
     """
     run = _DryRun()

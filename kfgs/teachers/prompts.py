@@ -1,4 +1,4 @@
-"""From class names to embeddings: synonyms and templates around a teacher's text encoder."""
+"""Turn class names into embeddings with a teacher's text encoder, synonyms and templates."""
 
 from __future__ import annotations
 
@@ -38,22 +38,22 @@ def embed_labels(
     templates: str | Sequence[str] | None = None,
     synonyms: Mapping[str, Sequence[str]] | None = None,
 ) -> Tensor:  # [C, D] float32, unit rows, on the teacher's device
-    """One embedding per class: each of its words in each template, as unit rows; their mean; the mean's direction.
+    """One embedding per class: encode each word in each template as unit rows, average, and normalise.
 
-    A name may carry synonyms as ADE20K's do, "chair;armchair;seat": the first is the class's name. Underscores become
-    spaces in prompts. A word that comes twice counts once.
+    A name may contain synonyms as in ADE20K, "chair;armchair;seat": the first is the class's name. Underscores become
+    spaces in prompts. Repeated words count once.
 
     Args:
-        teacher: with a text encoder; what `as_teacher` takes, but a mere function of pictures knows no text.
+        teacher: a teacher with a text encoder.
         names: C class names.
-        templates: a name of `TEMPLATES`, one template, or several; `{}` stands for the word. When not given what suits the
-            teacher, if it says so (its `templates`); else bare words, as LSeg takes them.
+        templates: a name of `TEMPLATES`, one template, or several; `{}` is replaced by the word. None: the teacher's
+            `templates` if it has any, else bare words, as for LSeg.
         synonyms: further words of a class, by its name.
 
     Raises:
-        ValueError: if there is no name, one is empty or comes twice, synonyms are of no class, a template has no `{}`, or
+        ValueError: if there is no name, one is empty or repeated, synonyms belong to no class, a template has no `{}`, or
             the encoder's rows are not finite.
-        TypeError: if `teacher` is none, or `names` is one text.
+        TypeError: if `teacher` is no teacher, or `names` is one text.
         NotImplementedError: if the teacher has no text encoder.
     """
     teacher = as_teacher(teacher)
@@ -81,19 +81,16 @@ def make_label_set(
     synonyms: Mapping[str, Sequence[str]] | None = None,
     negatives: Sequence[str] | None = CANONICAL,
 ) -> LabelSet:
-    """Class names with their embeddings (`embed_labels`), on the CPU, and what made them in `info`.
+    """Class names with their embeddings (`embed_labels`), on the CPU; `info` records teacher and templates.
+
+    Arguments and errors are those of `embed_labels`; a class is named by its first word.
 
     Args:
-        teacher: with a text encoder.
-        names: as in `embed_labels`; each class is called by its first word.
-        templates: as in `embed_labels`; negatives take the same ones.
-        synonyms: as in `embed_labels`.
+        teacher: a teacher with a text encoder.
+        names: C class names.
+        templates: also used for the negatives.
+        synonyms: further words of a class, by its name.
         negatives: words that a query is compared with if there is no other class (LERF's canonical words), or None.
-
-    Raises:
-        ValueError: as `embed_labels`.
-        TypeError: as `embed_labels`.
-        NotImplementedError: if the teacher has no text encoder.
     """
     teacher = as_teacher(teacher)
     words = _words(names, synonyms)
@@ -109,11 +106,7 @@ def make_label_set(
 
 
 def template_set(templates: str | Sequence[str]) -> tuple[str, ...]:
-    """Templates by the name of their set, or one, or several as they are.
-
-    Raises:
-        ValueError: if there is none, or one has no `{}`; the message offers the names of sets.
-    """
+    """The templates of a named set, or the given ones; a ValueError if there is none, or one has no `{}`."""
     found = TEMPLATES.get(templates, (templates,)) if isinstance(templates, str) else tuple(templates)
     if not found or any("{}" not in one for one in found):
         wrong = next((one for one in found if "{}" not in one), "none")
@@ -126,12 +119,12 @@ def template_set(templates: str | Sequence[str]) -> tuple[str, ...]:
 
 
 def _templates_of(teacher: Teacher, templates: str | Sequence[str] | None) -> tuple[str, ...]:
-    """The templates that are given, or those that suit the teacher."""
+    """The given templates, or the teacher's."""
     return template_set(getattr(teacher, "templates", "bare") if templates is None else templates)
 
 
 def _words(names: Sequence[str], synonyms: Mapping[str, Sequence[str]] | None) -> dict[str, list[str]]:
-    """The words of each class by its name, which is the first; all as they are written in prompts but for the keys."""
+    """The words of each class, as written in prompts, by the class's name, which is its first word."""
     if isinstance(names, str):
         raise TypeError(f"names: expected a list of class names, got the text {names!r}; put it into a list")
     split = [[part.strip() for part in name.split(";")] for name in names]

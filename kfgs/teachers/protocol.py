@@ -1,4 +1,4 @@
-"""What kfgs asks of a 2-D encoder that is distilled into a field, and how anything callable becomes one."""
+"""The interface of a teacher, a 2-D encoder that is distilled into a field; any function can become one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from .._check import check_shapes
 from .identity import code_identity
 
-_ROUNDING = 1e-4  # by which a resampled picture may leave [0, 1]
+_ROUNDING = 1e-4  # a resampled picture may exceed [0, 1] by this much
 
 PROMPTS_AT_ONCE = 64  # 60 MB of activations in CLIP ViT-L's text tower
 
@@ -21,13 +21,13 @@ PROMPTS_AT_ONCE = 64  # 60 MB of activations in CLIP ViT-L's text tower
 class Teacher(Protocol):
     """An image encoder, usually with a text encoder into the same space: LSeg, or a dense CLIP.
 
-    Any object with these three members is a teacher; nothing needs to be inherited. `isinstance` checks that the
-    members exist, not their signatures. Two more are used if they exist: `to(device)` and `identity`, JSON of everything
-    that the features depend on (see `identify`). Without it a cache does not notice other weights; a teacher that
-    `load_teacher` made always has one.
+    Any object with these three members is a teacher; there is no base class. `isinstance` checks that the members exist,
+    not their signatures. Two more are used if they exist: `to(device)` and `identity`, JSON of everything that the features
+    depend on (see `identify`). Without `identity` a cache does not notice other weights; teachers from `load_teacher`
+    always have one.
 
-    **Convention**: pictures and features have the channels first here, as encoders have them; kfgs's own maps, and those
-    on disk, have them last ([h, w, D]).
+    **Convention**: here, pictures and features have the channels first, as in encoders; kfgs's maps, in memory and on disk,
+    have them last ([h, w, D]).
 
     Example:
         >>> import torch
@@ -45,11 +45,11 @@ class Teacher(Protocol):
 
     @property
     def name(self) -> str:
-        """A short name that goes into file names and reports."""
+        """A short name for file names and reports."""
         ...
 
     def encode_image(self, image: Tensor) -> Tensor:  # image: [3, H, W] RGB in [0, 1] -> [D, h, w]
-        """One feature per cell of a grid over the image; features need not be unit, and h, w may be smaller than H, W."""
+        """One feature per cell of a grid over the image, of any length; h, w may be smaller than H, W."""
         ...
 
     def encode_text(self, prompts: Sequence[str]) -> Tensor:  # -> [n, D]
@@ -66,11 +66,11 @@ class CallableTeacher:
 
     Args:
         images: [3, H, W] RGB in [0, 1] -> [D, h, w].
-        text: n prompts -> [n, D]; rows are brought to unit length. None: the teacher knows no text.
-        name: a short name; the function's own when not given.
-        identity: JSON of what the features depend on besides the name, for example a digest of the weights: a cache is
-            made again when it changes. If None, where `images` lies and a digest of its code, which notices
-            neither globals and closures nor a model's weights; see `identity.code_identity`.
+        text: n prompts -> [n, D]; rows are normalised. None: the teacher has no text encoder.
+        name: a short name; None: the function's name.
+        identity: JSON of everything except the name that the features depend on, for example a digest of the weights: if
+            it changes, a cache is made again. None: the place of `images` and a digest of its code, which notices neither
+            globals and closures nor a model's weights; see `identity.code_identity`.
 
     Example:
         >>> import torch
@@ -100,16 +100,11 @@ class CallableTeacher:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What decides the features, as far as it is known."""
+        """JSON of what the features depend on, as far as it is known."""
         return {"name": self.name, **self._identity}
 
     def encode_image(self, image: Tensor) -> Tensor:  # [3, H, W] -> [D, h, w]
-        """Call the function, and check what it returns.
-
-        Raises:
-            TypeError: if that is no tensor.
-            ValueError: if it is not a map [D, h, w] of floats.
-        """
+        """Call the function, and check the result with `check_features`."""
         return check_features(self.name, self._images(image))
 
     def encode_text(self, prompts: Sequence[str]) -> Tensor:  # [n, D]
@@ -132,10 +127,10 @@ class CallableTeacher:
 
 
 def as_teacher(source: Teacher | Callable[[Tensor], Tensor]) -> Teacher:
-    """A teacher as it is, or a function from [3, H, W] to [D, h, w] as a teacher without text.
+    """Return a teacher unchanged; wrap a function from [3, H, W] to [D, h, w] as a teacher without text.
 
     Raises:
-        TypeError: if it is neither, or a class of which nothing was made yet.
+        TypeError: if it is neither, or a class instead of an object.
     """
     if inspect.isclass(source):
         raise TypeError(
@@ -158,7 +153,7 @@ def identify(teacher: Teacher) -> dict[str, Any]:
 
 
 def check_features(name: str, features: Any) -> Tensor:  # -> [D, h, w]
-    """What a teacher returned for one picture, if it is a map of floats.
+    """Check that a teacher returned a map of floats for a picture, and return it.
 
     Raises:
         TypeError: if it is no tensor, or one without values in memory (sparse, nested, on the meta device).
@@ -179,11 +174,11 @@ def check_features(name: str, features: Any) -> Tensor:  # -> [D, h, w]
 
 
 def check_picture(image: Any) -> None:
-    """Raise unless `image` is a picture: [3, H, W], at least one pixel, finite floats in [0, 1]; it reads the values.
+    """Raise unless `image` is a picture: [3, H, W], at least one pixel, finite floats in [0, 1]; reads the values.
 
     Raises:
         TypeError: if it is no tensor with values in memory, or holds no floats.
-        ValueError: if it has another shape, or a value is not finite or not in [0, 1] (but for rounding, 1e-4).
+        ValueError: if it has another shape, or a value is not finite or not in [0, 1] (1e-4 of rounding is allowed).
     """
     if not isinstance(image, Tensor):
         hint = "torch.from_numpy" if hasattr(image, "__array__") else "torch.as_tensor"
@@ -221,7 +216,7 @@ def check_prompts(prompts: Any) -> None:
 
 
 def _check_dense(name: str, tensor: Tensor, shape: str) -> None:
-    """Raise a TypeError if a tensor's values do not lie in memory, each at its place."""
+    """Raise a TypeError for sparse and nested tensors, and for those without values in memory."""
     nested, meta = tensor.is_nested, tensor.device.type == "meta"
     if nested or meta or tensor.layout != torch.strided:
         kind = "nested tensor" if nested else "tensor on the meta device" if meta else f"tensor of {tensor.layout}"

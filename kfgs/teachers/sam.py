@@ -24,17 +24,17 @@ _PREFIX = "image_encoder."
 
 
 def load_sam(source: str | Path) -> SamTeacher:
-    """Load the image encoder out of a checkpoint of Segment Anything (vit_b, vit_l, vit_h, or MobileSAM).
+    """Load the image encoder from a checkpoint of Segment Anything (vit_b, vit_l, vit_h, or MobileSAM).
 
-    Which one it is follows from the shapes of its weights.
+    The shapes of the weights show which one it is.
 
     Args:
-        source: `sam_vit_b_01ec64.pth`, `sam_vit_l_0b3195.pth`, `sam_vit_h_4b8939.pth` or `mobile_sam.pt` as Meta and
-            MobileSAM publish them; read without running what a pickle may carry.
+        source: `sam_vit_b_01ec64.pth`, `sam_vit_l_0b3195.pth`, `sam_vit_h_4b8939.pth` or `mobile_sam.pt` as published by
+            Meta and MobileSAM; no code in it is run.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is damaged, or no checkpoint of SAM; the message says what is missing.
+        ValueError: if it is damaged, or no checkpoint of SAM; the message names missing weights.
     """
     path = Path(source).expanduser()
     state = read_checkpoint(path)
@@ -57,10 +57,10 @@ def load_sam(source: str | Path) -> SamTeacher:
 
 
 class SamTeacher:
-    """SAM's image encoder; made by `load_sam`. It knows no text.
+    """SAM's image encoder, without a text encoder; made by `load_sam`.
 
-    The longer side of a picture is resized to 1024, the rest of the square is padded at the bottom or right, and the
-    padding is cut from the map again, as Feature 3DGS does: [256, int(64 H / W + 0.5), 64] of a picture wider than high.
+    The longer side of a picture is resized to 1024, the picture is padded to a square at the bottom or right, and the
+    padding is cut from the map, as in Feature 3DGS: a picture wider than high gives [256, int(64 H / W + 0.5), 64].
 
     Attributes:
         encoder: kornia's image encoder, in evaluation mode.
@@ -99,11 +99,7 @@ class SamTeacher:
         return self.encoder(pixels)[0, :, :rows, :columns].float().contiguous()
 
     def encode_text(self, prompts: Sequence[str]) -> Tensor:
-        """Always raises: SAM has no text encoder.
-
-        Raises:
-            NotImplementedError: always.
-        """
+        """Always raises a NotImplementedError: SAM has no text encoder."""
         raise NotImplementedError(
             "teacher 'sam': expected one with a text encoder, got one that sees only pictures; use clip, siglip, tipsv2 or "
             "lseg for words, or query it by examples"
@@ -141,7 +137,7 @@ def _config_of(path: Path, state: dict[str, Tensor]) -> SamConfig:
 
 
 def _build(config: SamConfig) -> nn.Module:
-    """The encoder; on no device where all its tensors come from a checkpoint, since drawing 637 M weights takes long."""
+    """The encoder. If a checkpoint fills all tensors, they have no storage: initialising 637 M weights takes long."""
     if config.model_type is not None:  # TinyViT computes a table of indices that no checkpoint holds
         return Sam.from_config(config).image_encoder
     with torch.device("meta"):

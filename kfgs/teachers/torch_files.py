@@ -1,8 +1,8 @@
-"""The one way to open torch files that other people wrote. Nothing that they name is run or imported.
+"""Open torch files that other people wrote, without running or importing anything that they name.
 
-`torch.load(weights_only=True)` refuses the files of Lightning, whose settings name its classes; `weights_only=False` runs
-whatever they say. Here torch reads with `weights_only=True`, and each class that a file names is replaced by one that does
-nothing. `pickle_check` looks at the pickle first.
+`torch.load(weights_only=True)` refuses Lightning's files, because their settings name classes; `weights_only=False` runs any
+code in them. Here torch reads with `weights_only=True`, and each class that a file names is replaced by a placeholder that
+does nothing. `pickle_check` checks the pickle first.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from torch.serialization import (
 from .._check import one_line
 from .pickle_check import BrokenPickleError, OtherProtocolError, PickleNames, UnsafePickleError, check_pickle
 
-_ZIP = b"PK\x03\x04"  # what torch >= 1.6 writes starts so; older files are pickles in a row
+_ZIP = b"PK\x03\x04"  # first bytes of files of torch >= 1.6; older files are a sequence of pickles
 _LEGACY_MAGIC = b"\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19."  # 0x1950A86A20F9469CFC6C as a pickle
 _AGAIN = "download it again or name another file"
 _CONVERT = "save it again with torch.save and its default pickle_protocol, or as .safetensors, where you trust it"
@@ -60,7 +60,7 @@ _SIGNATURES: tuple[tuple[bytes, str], ...] = (
 
 
 class TorchFileError(ValueError):
-    """A file that is not read: what it is, and what to do. Its text is one line without the file's name."""
+    """A file that cannot be read; one line that says what it is and what to do, without the file's name."""
 
     def __init__(self, got: str, todo: str = _AGAIN) -> None:
         super().__init__(f"{got}; {todo}")
@@ -70,21 +70,21 @@ class TorchFileError(ValueError):
 class Placeholder(type):
     """Stands for a class that a file names, which is not imported, and for its objects; `__name__` is the name.
 
-    It is a metaclass: torch makes objects, and gives them a state, only of classes on its list, and here the placeholder
-    of a class is its own object.
+    It is a metaclass, so that the placeholder of a class can also be its object: torch makes objects, and sets their state,
+    only for classes on its list.
     """
 
     def __setstate__(cls, state: Any) -> None:
-        """Ignore what an object would hold."""
+        """Ignore an object's state."""
 
 
 def load_torch_file(path: Path) -> Any:
-    """Read the object in a file of `torch.save`, on the CPU. Where the file names a class, there is a `Placeholder`.
+    """Read the object in a file of `torch.save`, on the CPU. Classes that the file names become a `Placeholder`.
 
-    Objects that get items (`defaultdict`, settings that derive from dict or list) become dicts and lists.
+    Objects with items (`defaultdict`, settings that derive from dict or list) become dicts and lists.
 
-    **Memory**: tensors in a zip archive (torch >= 1.6) are views of the file, mapped privately: pages are read when looked
-    at, and writing to a tensor does not change the file. Older files are read whole.
+    **Memory**: tensors in a zip archive (torch >= 1.6) are views of the file, mapped privately: pages are read at first
+    use, and writing to a tensor does not change the file. Older files are read whole.
 
     Raises:
         TorchFileError: if it is damaged, not of `torch.save`, or asks for something dangerous.
@@ -95,7 +95,7 @@ def load_torch_file(path: Path) -> Any:
         kind = _describe_kind(head, path.stat().st_size)
         if kind is not None:
             raise TorchFileError(kind)
-        if str(path).endswith(".safetensors"):  # torch goes by the name
+        if str(path).endswith(".safetensors"):  # torch decides by the name
             raise TorchFileError("a file that is named .safetensors, but is none", "rename it to .pt")
         if not head.startswith(_ZIP):
             found = _load(path, *_pickle_in_legacy(file, head), mapped=False)
@@ -127,7 +127,7 @@ def check_plain(tensor: Tensor) -> None:
 
 @contextmanager
 def _pickle_errors() -> Iterator[None]:
-    """Say in one line what is wrong with a pickle."""
+    """Turn errors of a pickle into a one-line TorchFileError."""
     try:
         yield
     except UnsafePickleError as error:
@@ -167,7 +167,7 @@ def _load(path: Path, data: bytes, names: PickleNames, *, mapped: bool) -> Any:
 
 
 def _placeholder(name: str, like: type | None) -> Placeholder:
-    """What stands for the class `name`. A call returns the placeholder itself, or a dict or list if the file fills it."""
+    """The placeholder for class `name`. A call returns the placeholder itself, or a dict or list if the file fills it."""
 
     def make(cls: Placeholder, *_: Any) -> Any:
         if like is None:
@@ -191,7 +191,7 @@ def _unknown_names(data: bytes) -> set[str]:
 
 
 def _pickle_in_zip(file: BinaryIO) -> tuple[bytes, set[int]]:
-    """The pickle of a zip archive NAME/{data.pkl, data/0, data/1, ...}, and the sizes of the records beside it."""
+    """The pickle of a zip archive NAME/{data.pkl, data/0, data/1, ...}, and the sizes of its other records."""
     try:
         with zipfile.ZipFile(file) as archive:
             records = {info.filename: info for info in archive.infolist()}
@@ -217,10 +217,10 @@ def _pickle_in_zip(file: BinaryIO) -> tuple[bytes, set[int]]:
 
 
 def _reads_otherwise(file: BinaryIO, archive: zipfile.ZipFile, data: bytes) -> bool:
-    """Whether torch finds another pickle in the archive than zipfile, so that the wrong one would be checked.
+    """Whether torch finds another pickle in the archive than zipfile; then the wrong one would be checked.
 
-    torch's reader ignores the case of names, and takes the place of the directory literally, where zipfile allows for
-    bytes before the archive.
+    torch's reader ignores the case of names, and takes the directory's offset literally; zipfile allows for bytes before
+    the archive.
     """
     names = [name.lower() for name in archive.namelist()]
     end = zipfile._EndRecData(file)  # type: ignore[attr-defined]
@@ -263,14 +263,14 @@ def _bare_tensors(found: Any) -> list[Tensor]:
 
 
 def _reason(error: Exception) -> str:
-    """What torch says in one line; about `weights_only` it writes a page, with the reason inside."""
+    """Torch's error in one line; for `weights_only` it writes a page, with the reason inside."""
     text = str(error)
     lines = (text.partition("WeightsUnpickler error:")[2] or text).strip().splitlines()
     return one_line(lines[0] if lines else type(error).__name__, 120)
 
 
 def _describe_kind(head: bytes, size: int) -> str | None:
-    """What a file of `size` bytes is whose first kilobyte is `head`; None if it may be a checkpoint."""
+    """The kind of a file, from its size and its first kilobyte `head`; None if it may be a checkpoint."""
     if size == 0:
         return "an empty file: the download failed"
     for signature, words in _SIGNATURES:

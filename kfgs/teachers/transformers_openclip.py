@@ -1,4 +1,4 @@
-"""CLIP in OpenCLIP's layout (LERF's and LangSplat's ViT-B-16 of LAION, for instance) as a CLIPModel of transformers."""
+"""Read CLIP in OpenCLIP's layout (for instance LAION's ViT-B-16 of LERF and LangSplat) as a CLIPModel of transformers."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _TOWER = [  # OpenCLIP's names within a tower -> those of transformers; attentio
 
 
 def find_openclip(kind: str, source: Path | str, *, local_only: bool) -> Path | None:
-    """The weights in OpenCLIP's layout that `source` holds, or is; None if it has none, or is complete without them.
+    """The file with weights in OpenCLIP's layout in `source`; None if there is none, or `source` does not need it.
 
     Raises:
         ImportError: if it is a hub id, and transformers is missing or broken.
@@ -52,7 +52,7 @@ def find_openclip(kind: str, source: Path | str, *, local_only: bool) -> Path | 
 
 
 def _fetch(kind: str, source: str, *, local_only: bool) -> Path | None:
-    """The weights out of a repository of the hub in OpenCLIP's layout; None if it has another."""
+    """Download the weights of a hub repository in OpenCLIP's layout; None if it has another layout."""
     require_transformers()
     from huggingface_hub import hf_hub_download
     from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
@@ -74,13 +74,13 @@ def _fetch(kind: str, source: str, *, local_only: bool) -> Path | None:
 def load_openclip(file: Path, *, activation: str) -> Any:
     """A CLIPModel with the weights of an OpenCLIP file.
 
-    Sizes come from the weights' shapes, heads and the activation from `open_clip_config.json` beside them; without one,
-    64 channels per head (more in ViT-H, g and bigG) and the `activation` given: gelu, or quick_gelu as OpenAI trained.
+    Sizes come from the weights' shapes, heads and activation from `open_clip_config.json` in the same folder. Without that
+    file, a head has 64 channels (more in ViT-H, g and bigG), and `activation` is used: gelu, or OpenAI's quick_gelu.
 
     Raises:
         ImportError: if transformers is missing or broken.
         ValueError: if the file is no CLIP of plain vision and text transformers, is OpenAI's TorchScript archive, or is
-            damaged; the message says what.
+            damaged.
     """
     from .checkpoint import read_checkpoint
 
@@ -109,7 +109,7 @@ def load_openclip(file: Path, *, activation: str) -> Any:
 
 
 def _unwrapped(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Without the prefix that training on several devices leaves, in single precision."""
+    """Remove the prefix of training on several devices, and convert to single precision."""
     floats = {
         name: tensor.float() for name, tensor in state.items() if tensor.is_floating_point()
     }  # not the text's mask
@@ -117,7 +117,7 @@ def _unwrapped(state: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _refuse_torchscript(file: Path) -> None:
-    """Raise a ValueError that says what to use instead, if the file is as OpenAI publishes CLIP."""
+    """Raise a ValueError with an alternative if the file is OpenAI's TorchScript archive of CLIP."""
     if not zipfile.is_zipfile(file):
         return
     try:
@@ -183,7 +183,7 @@ def _config_of(config_class: Any, state: dict[str, Tensor], settings: dict[str, 
             "hidden_act": act,
             "projection_dim": state["text_projection"].shape[1],
             "bos_token_id": vocabulary - 2,
-            "eos_token_id": vocabulary - 1,  # where the text is pooled
+            "eos_token_id": vocabulary - 1,  # the text is pooled here
             "pad_token_id": 0,
         },
     )

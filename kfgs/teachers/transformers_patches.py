@@ -1,4 +1,4 @@
-"""How the patch tokens of a vision transformer become features that compare with text, one function per kind of head.
+"""Turn the patch tokens of a vision transformer into features comparable with text, one function per kind of head.
 
 Every function takes a model of transformers and one picture, and returns its patch tokens [1, h*w, D], row by row,
 without class and register tokens.
@@ -29,10 +29,10 @@ def patch_size(model: Any) -> tuple[int, int]:
 
 @contextmanager
 def values_only(attention: nn.Module, projection: nn.Module) -> Iterator[list[Tensor]]:
-    """While open, `attention` returns each token's own projected value, out(v(x)): no token sees another.
+    """Inside the `with` block, `attention` returns the projected value of each token, out(v(x)): no token sees another.
 
-    The values are also put into the list that is given, in the order of the calls. This is what MaskCLIP does in the
-    last block of CLIP (Zhou et al. 2022), since the pooled token is a mean of just these values.
+    The values are also added to the yielded list, in the order of the calls. MaskCLIP does this in the last block of CLIP
+    (Zhou et al. 2022), because the pooled token is a mean of these values.
     """
     values: list[Tensor] = []
 
@@ -62,13 +62,13 @@ def clip_patches(model: Any, pixels: Tensor, residual: bool) -> Tensor:
 
 
 def siglip_patches(model: Any, pixels: Tensor, residual: bool) -> Tensor:
-    """SigLIP: every patch through the pooling head by itself."""
+    """SigLIP: each patch alone through the pooling head."""
     vision = vision_of(model)
     return _pool_each(vision, vision(pixels, interpolate_pos_encoding=True).last_hidden_state)
 
 
 def naflex_patches(model: Any, pixels: Tensor, residual: bool) -> Tensor:
-    """SigLIP 2 with pictures of any shape (NaFlex), which takes its patches flattened: [h*w, rows * columns * RGB]."""
+    """SigLIP 2 for pictures of any shape (NaFlex), with flattened patches: [h*w, rows * columns * RGB]."""
     vision = vision_of(model)
     ph, pw = patch_size(model)
     _, C, H, W = pixels.shape  # one picture
@@ -81,9 +81,9 @@ def naflex_patches(model: Any, pixels: Tensor, residual: bool) -> Tensor:
 
 
 def tips_patches(model: Any, pixels: Tensor, residual: bool) -> Tensor:
-    """TIPS: the last hidden state as it is; `residual`: with the values of the last block, its residual and MLP kept.
+    """TIPS: the last hidden state; `residual`: the values of the last block, with its residual and MLP.
 
-    The second is how its authors segment without training.
+    The authors use `residual` to segment without training.
     """
     vision = vision_of(model)
     if not residual:
@@ -101,12 +101,12 @@ def last_patches(model: Any, pixels: Tensor, residual: bool) -> Tensor:
 
 
 def radio_patches(model: Any, pixels: Tensor, residual: bool) -> Tensor:
-    """RADIO: its own spatial features."""
+    """RADIO: its spatial features."""
     return model(pixels).features
 
 
 def _pool_each(vision: Any, hidden: Tensor) -> Tensor:  # [1, T, D] -> [1, T, D]
-    """The pooling head's path of one token that gets all of its attention: v = out(W_v h + b_v); v + MLP(LN(v))."""
+    """The pooling head for each token alone, with all attention on it: v = out(W_v h + b_v); v + MLP(LN(v))."""
     head = vision.head
     D = hidden.shape[-1]
     weight, bias = head.attention.in_proj_weight[2 * D :], head.attention.in_proj_bias[2 * D :]

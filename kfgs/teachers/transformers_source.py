@@ -1,4 +1,4 @@
-"""Where a model of transformers comes from: a package that works, a folder or a hub id, and weights that fit."""
+"""Load a model of transformers: check the package, find the folder or hub id, and check that the weights fit."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 
 
 def require_transformers() -> Any:
-    """The package transformers.
+    """Import the package transformers.
 
-    A torchvision that is installed but does not import (the build of another torch) makes every model class of
-    transformers fail with a message about something else, so it is looked at first.
+    If torchvision is installed but does not import (built for another torch), every model class of transformers fails with
+    a misleading message, so torchvision is checked first.
 
     Raises:
-        ImportError: if transformers is missing, or it or torchvision is there but broken.
+        ImportError: if transformers is missing or broken, or torchvision is broken.
     """
     try:
         if importlib.util.find_spec("torchvision") is not None:
@@ -52,11 +52,7 @@ def require_transformers() -> Any:
 
 
 def find_class(transformers: Any, name: str, kind: str) -> Any:
-    """A class of transformers, which imports what it needs at this moment.
-
-    Raises:
-        ImportError: if this version has none of that name, or it does not import.
-    """
+    """A class of transformers; an ImportError if this version lacks it, or its imports fail."""
     try:
         return getattr(transformers, name)
     except AttributeError as error:
@@ -73,11 +69,7 @@ def find_class(transformers: Any, name: str, kind: str) -> Any:
 
 
 def find_source(kind: str, source: str | Path) -> Path | str:
-    """A folder or file that exists, or else the hub id that `source` can only be.
-
-    Raises:
-        FileNotFoundError: if there is no such path and it is no hub id either.
-    """
+    """The path if it exists, else `source` as a hub id; a FileNotFoundError if it cannot be one."""
     path = Path(source).expanduser()
     if path.exists():
         return path
@@ -125,7 +117,7 @@ def read_config(kind: str, source: Path | str, *, local_only: bool) -> tuple[str
 
 
 def load_model(kind: str, source: Path | str, model_type: str, commit: str | None, *, local_only: bool) -> Any:
-    """The model in float32, with every weight out of the files and none left as it was drawn.
+    """The model in float32; every weight must come from the files, none from random initialisation.
 
     Raises:
         ImportError: if transformers is missing, broken, or too old for this model.
@@ -147,7 +139,7 @@ def load_model(kind: str, source: Path | str, model_type: str, commit: str | Non
 
 
 def load_tokenizer_of(kind: str, source: Path | str, commit: str | None, *, local_only: bool) -> Any:
-    """The tokenizer beside the weights.
+    """The tokenizer in the folder of the weights.
 
     Raises:
         ImportError: if transformers, or a package that the tokenizer needs, is missing or broken.
@@ -184,7 +176,7 @@ def weights_of(source: Path | str, commit: str | None = None) -> str:
 
 @contextmanager
 def quiet(transformers: Any) -> Iterator[None]:
-    """Keep transformers from drawing progress bars and from reporting what `refuse_gaps` says better."""
+    """Turn off progress bars and warnings of transformers; `refuse_gaps` reports missing weights better."""
     log = transformers.utils.logging
     level, bars = log.get_verbosity(), log.is_progress_bar_enabled()
     log.set_verbosity_error()
@@ -199,7 +191,7 @@ def quiet(transformers: Any) -> Iterator[None]:
 
 @contextmanager
 def explained(kind: str, source: Path | str, what: str = "weights") -> Iterator[None]:
-    """Turn what transformers raises while it reads into one line that names the source."""
+    """Turn transformers' errors while reading into one line that names the source."""
     try:
         yield
     except ImportError as error:  # sentencepiece, for instance

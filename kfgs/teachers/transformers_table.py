@@ -27,11 +27,11 @@ _NONE = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))  # pictures as they are, in [0, 1]
 
 @dataclass(frozen=True)
 class TextRule:
-    """How prompts become the ids that a text tower was trained with."""
+    """How prompts become ids, as in the training of the text tower."""
 
     lower: bool = False  # write prompts in small letters first
-    pad: bool = False  # fill up to the tower's whole length: some pool at the last token, or over all of them
-    mask: bool = False  # tell the tower which ids are padding
+    pad: bool = False  # fill up to the tower's length: some towers pool at the last token, or over all tokens
+    mask: bool = False  # pass a mask of the padding to the tower
 
 
 @dataclass(frozen=True)

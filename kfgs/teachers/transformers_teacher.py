@@ -36,19 +36,17 @@ def load_transformers_teacher(
 
     Args:
         kind: a name of the table: clip, openclip, siglip, siglip2, tipsv2, dinov2, dinov3, radio.
-        source: a folder as `save_pretrained` writes it, or a hub id `owner/name`, which is downloaded since it was asked
-            for by name. clip and openclip also take a file or a folder in OpenCLIP's own layout, but not the .pt files
-            of OpenAI (ViT-B-16.pt), which are TorchScript, that is programs: the same weights are
-            `openai/clip-vit-base-patch16` on the hub.
-        size: longer side, in pixels, that pictures are resized to before they are cut into patches; None: their own. A
-            map has one cell per patch, so that a larger picture gives a finer map.
+        source: a folder from `save_pretrained`, or a hub id `owner/name`, which is downloaded. clip and openclip also take
+            a file or a folder in OpenCLIP's layout, but not OpenAI's .pt files (ViT-B-16.pt), which are TorchScript
+            programs: use `openai/clip-vit-base-patch16` on the hub, which has the same weights.
+        size: resize the longer side of pictures to so many pixels; None: do not resize. A map has one cell per patch, so
+            larger pictures give finer maps.
         residual: clip, openclip: keep the residual connection and the MLP of the last block in addition to its values (as in
             MaskCLIP's code). tipsv2: the values of the last block instead of its attention, residual and MLP kept.
-        local_only: take a hub id from the local cache alone.
+        local_only: use only the local cache for a hub id.
 
     Raises:
-        ImportError: if transformers is missing (`pip install "kfgs[hf]"`), broken or too old, or a broken torchvision is in
-            its way.
+        ImportError: if transformers is missing (`pip install "kfgs[hf]"`), broken or too old, or torchvision is broken.
         FileNotFoundError: if there are no weights.
         ValueError: if the options do not suit the kind, or the weights are of another model, damaged or incomplete.
     """
@@ -78,7 +76,7 @@ def load_transformers_teacher(
 
 
 def _tokenize_of(kind: str, source: Path | str, commit: str | None, model: Any, *, local_only: bool) -> _Tokenize:
-    """The tokenizer beside the weights; CLIP's own vocabulary where none lies there and the kind has that one."""
+    """The tokenizer in the folder of the weights; if there is none and the kind uses CLIP's vocabulary, kfgs's copy."""
     row = TRANSFORMERS[kind]
     folder = source.parent if isinstance(source, Path) and source.is_file() else source
     words = model.config.text_config
@@ -101,8 +99,8 @@ class TransformersTeacher:
     Attributes:
         model: the model of transformers, in evaluation mode.
         name: the kind, a name of the table.
-        identity: what decides the features: name, options, and a digest of the weights or the hub's commit.
-        templates: the name of the prompt templates that suit it.
+        identity: name, options, and a digest of the weights or the hub's commit.
+        templates: the name of its prompt templates.
     """
 
     def __init__(
@@ -151,7 +149,7 @@ class TransformersTeacher:
         Raises:
             NotImplementedError: if the model has no text tower in the space of its patches.
             TypeError: if `prompts` is one text, or holds something else than texts.
-            ValueError: if there are none, one is too long, or there is no tokenizer beside the weights.
+            ValueError: if there are none, one is too long, or there is no tokenizer.
             ImportError: if a package that the tokenizer needs is missing.
         """
         rule = self.row.text
@@ -198,13 +196,13 @@ def _has_tokenizer(folder: Path) -> bool:
 
 
 def _hub_tokenize(kind: str, source: Path | str, rule: TextRule, longest: int, load: Callable[[], Any]) -> _Tokenize:
-    """A tokenizer of transformers that `load` reads at the first prompt, so that pictures alone need none.
+    """A tokenizer of transformers that `load` reads at the first prompt; without prompts it is not needed.
 
     Args:
         kind: the teacher's name, for messages.
-        source: the folder or hub id that `load` reads from.
-        rule: what the text tower was trained with.
-        longest: tokens that the text tower takes; a longer prompt is refused, not cut.
+        source: the folder or hub id, for messages.
+        rule: how the text tower was trained.
+        longest: tokens of the text tower; a longer prompt is refused, not cut.
         load: reads the tokenizer.
     """
     loaded: list[Any] = []

@@ -1,4 +1,4 @@
-"""From the names of LSeg's checkpoint to those of `LSegNetwork` and `ClipText`, or an error that says what the file is."""
+"""Map the tensor names of LSeg's checkpoint to `LSegNetwork` and `ClipText`; errors say which network a wrong file has."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _UNUSED = re.compile(
     r"|scratch\.head_block\.|logit_scale$|.*\.num_batches_tracked$"
 )
 
-# Other networks by how the names of their tensors begin. The first rule that fits counts; LSeg's prefixes are asked before.
+# Other networks by prefixes of their tensor names. The first rule that fits counts; LSeg's prefixes are checked before.
 _BY_PREFIX = (
     (("student.", "teacher."), "a self-supervised training checkpoint (DINO, iBOT)"),
     (("image_encoder.", "mask_decoder.", "prompt_encoder.", "vision_encoder."), "a SAM checkpoint"),
@@ -78,8 +78,7 @@ def network_from_state(state: Mapping[str, Tensor], config: LSegConfig, *, sourc
         source: the file's name, for messages.
 
     Raises:
-        ValueError: if tensors are missing, unknown, of another shape or no floats; it says of what other network
-            the file seems to be.
+        ValueError: if tensors are missing, unknown, of another shape or no floats; the message guesses the network.
     """
     state = _stripped(state)
     with torch.device("meta"):
@@ -95,7 +94,7 @@ def network_from_state(state: Mapping[str, Tensor], config: LSegConfig, *, sourc
 
 
 def text_from_state(state: Mapping[str, Tensor], config: LSegConfig, *, source: str) -> ClipText:
-    """Build the text tower on the tensors of a checkpoint, as `network_from_state` does the image network.
+    """Build the text tower on the tensors of a checkpoint, like `network_from_state`.
 
     Raises:
         ValueError: if the file holds no text tower, or one of other sizes.
@@ -171,7 +170,7 @@ def _first(names: list[str]) -> str:
 
 
 def _as_float(state: Mapping[str, Tensor], names: Mapping[str, str]) -> dict[str, Tensor]:
-    """Tensors by our names as float32: the very ones where they are already."""
+    """Tensors by our names as float32, without a copy if they are float32 already."""
     return {own: state[theirs].detach().to(torch.float32) for own, theirs in names.items()}
 
 
@@ -193,7 +192,7 @@ def _fill(module: nn.Module, tensors: dict[str, Tensor]) -> None:
 
 
 def _recognise(state: Mapping[str, Tensor]) -> str | None:  # names without "net."
-    """What another network a state is of, as far as names tell; None if it looks like LSeg's expected backbone, or unknown."""
+    """Name the other network that a state belongs to, by its tensor names; None if it is LSeg's, or unknown."""
     names = list(state)
     if not names:
         return "no tensors of its image network"

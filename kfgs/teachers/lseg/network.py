@@ -29,8 +29,8 @@ class LSegConfig:
     depth: int = 24  # blocks of the ViT
     heads: int = 16
     patch: int = 16  # pixels; the decoder works with no other
-    position_grid: int = 24  # the checkpoint's position embeddings lie on a square of so many (384 pixels)
-    window: int = 480  # pixels; side S of the only picture the network takes
+    position_grid: int = 24  # side of the checkpoint's square of position embeddings (384 pixels)
+    window: int = 480  # pixels; side S of the network's input
     hooks: tuple[int, ...] = (5, 11, 17, 23)  # blocks whose outputs are decoded, from 0
     neck: tuple[int, ...] = (256, 512, 1024, 1024)  # channels each hook is brought to, fine to coarse
     fusion: int = 256  # channels within the decoder
@@ -93,7 +93,7 @@ class LSegNetwork(nn.Module):
         super().__init__()
         self.config = config
         self.vit = VisionTransformer(config.window, config.patch, 3, config.width, config.depth, config.heads)
-        self.vit.norm = nn.Identity()  # LSeg decodes what the blocks return; the last norm is unused
+        self.vit.norm = nn.Identity()  # LSeg decodes the outputs of blocks; the last norm is unused
         for block in self.vit.encoder.blocks:
             block[0].fn[1] = _Attention(config.width, config.heads, 0.0, 0.0)
         self.reassemble = nn.ModuleList(_Reassemble(config, level) for level in range(4))
@@ -122,7 +122,7 @@ class LSegNetwork(nn.Module):
 
 
 class _Attention(MultiHeadAttention):
-    """kornia's attention with torch's fused kernel in place of its einsum: the same sum without its N x N matrix."""
+    """kornia's attention with torch's fused kernel instead of its einsum: the same sum without the N x N matrix."""
 
     def forward(self, x: Tensor) -> Tensor:  # [B, N, width]
         B, N, width = x.shape

@@ -1,4 +1,4 @@
-"""How LSeg looks at a picture: the size it is brought to, scales, mirroring, arithmetic."""
+"""Options of LSeg: the size that pictures are resized to, scales, mirroring, arithmetic."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PAPER_SCALES = (0.75, 1.0, 1.25, 1.75)
 
 @dataclass(frozen=True)
 class LSegOptions:
-    """How a picture is evaluated. The defaults are the paper's, but for the aspect of pictures that are not 4:3.
+    """Options of LSeg. The defaults are the paper's, except that pictures that are not 4:3 keep their aspect.
 
     Raises:
         ValueError: if a value is out of its range.
@@ -27,9 +27,9 @@ class LSegOptions:
     flip: bool = True
     """Average with the features of the mirrored picture."""
     size: Literal["auto"] | tuple[int, int] | None = "auto"
-    """Size of the map, to which the picture is resized first. "auto": long side 480 pixels (or its own if that is less),
-    aspect kept, rounded half up. (height, width): that size where the picture is wider than `width`, its own otherwise, as
-    the paper's script does, whatever the aspect. None: the picture's own."""
+    """Size of the map, and of the resized picture. "auto": long side 480 pixels, or the picture's if that is smaller, aspect
+    kept, rounded half up. (height, width): this size if the picture is wider than `width`, else the picture's, as in the
+    paper's script, with any aspect. None: the picture's size."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """Arithmetic of the network; the features are float32 in any case."""
 
@@ -55,10 +55,10 @@ class LSegOptions:
 
     @staticmethod
     def paper() -> LSegOptions:
-        """As the paper's script: 26 runs of the network for a picture, brought to 360 x 480 if it is wider than 480.
+        """The paper's script: 26 runs of the network per picture, resized to 360 x 480 if it is wider than 480.
 
-        The script does so whatever the aspect and the orientation, and leaves pictures of 480 columns or fewer as they are.
-        For 4:3 pictures, such as 640 x 480, this is what the defaults do.
+        The script does so for any aspect and orientation, and does not resize pictures of 480 columns or fewer. For 4:3
+        pictures, for instance 640 x 480, the defaults do the same.
         """
         return LSegOptions(size=(360, 480))
 
