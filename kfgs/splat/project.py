@@ -18,8 +18,8 @@ from .engines.contract import ALPHA_MIN
 from .engines.table import choose_compiled
 
 FIELD_OF_VIEW_MARGIN = 1.3
-"""The projection is linearised no further out than 1.3 times the half field of view (3DGS): beyond it the linear
-footprint of a Gaussian beside the camera grows without bound and would cover the picture."""
+"""Limit of the linearisation, in half fields of view (3DGS). Beyond it, the linear footprint of a Gaussian beside the
+camera grows without bound and would cover the picture."""
 
 
 class Projected(NamedTuple):
@@ -47,8 +47,8 @@ def project(
     """Project Gaussians through a pinhole camera and cull those that cannot touch a pixel.
 
     The 2-D covariance is J W Sigma W^T J^T + low_pass * I (Zwicker et al. 2001, eq. 31), with W the camera's rotation
-    and J the Jacobian of the projection at the mean. J is taken no further from the picture than
-    `FIELD_OF_VIEW_MARGIN` times its half-size from its middle, in tangents, wherever the principal point is.
+    and J the Jacobian of the projection at the mean. Beyond `FIELD_OF_VIEW_MARGIN` times the picture's half-size from its
+    middle (in tangents), J is that of this limit.
     Culled are: depth <= near, opacity <= 1/255, and footprints {alpha >= 1/255} whose bounding box holds no pixel centre.
 
     Args:
@@ -56,8 +56,8 @@ def project(
         camera: without distortion; cast to the Gaussians' dtype and device.
         near: smallest depth that is drawn, world units; None: the camera's.
         low_pass: variance in pixels^2 added on both axes, so that nothing is smaller than a pixel.
-        engine: as in `composite`. "numba", which "auto" takes on the CPU, computes the same with compiled code; all
-            others are kornia's functions under autograd.
+        engine: as in `composite`. "numba", which "auto" takes on the CPU, is compiled; all others use kornia's functions
+            under autograd.
 
     Returns:
         The M visible Gaussians; M = 0 is possible.
@@ -68,11 +68,10 @@ def project(
         ImportError: if the named engine's package is missing.
 
     Note:
-        A Gaussian with NaN or infinite parameters, or so large that its footprint overflows, is culled, and its gradients
-        are zero.
+        A Gaussian with NaN or infinite parameters, or whose footprint overflows, is culled. Its gradients are zero.
 
-        The compiled code has no gradients of gradients. Nor has it any in the camera: where `camera.viewmat` or
-        `camera.K` requires one, kornia's functions are used whatever the engine.
+        The compiled code has no gradients of gradients, and none in the camera: if `camera.viewmat` or `camera.K`
+        requires one, kornia's functions are used.
     """
     near = camera.near if near is None else near
     check_range("near", near, 0, closed=(False, False))
@@ -96,9 +95,9 @@ def project(
 
 
 def _project(gaussians: Gaussians, camera: Camera, near: float, low_pass: float) -> Projected:
-    """The projection as kornia and autograd have it, on any device."""
+    """The projection by kornia and autograd, on any device."""
     index = _candidates(gaussians, camera, near, low_pass)
-    points = world_to_camera(camera, gaussians.means[index])  # [m, 3]: what is culled takes no part in any gradient
+    points = world_to_camera(camera, gaussians.means[index])  # [m, 3]: without the culled ones, which have no gradient
     opacities = gaussians.opacities[index]
     means2d = camera_to_pixel(camera, points)
     variances, covariances, det = _covariance_2d(

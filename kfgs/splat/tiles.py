@@ -18,9 +18,9 @@ __all__ = ["Tiles", "bin_tiles"]
 def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16, *, engine: str = "auto") -> Tiles:
     """List the Gaussians of every tile.
 
-    A Gaussian is listed where alpha reaches 1/255 somewhere in the rectangle spanned by the tile's pixel centres: the
-    smallest value of its quadratic form there is compared with 2 ln(255 opacity), and in doubt of rounding it is kept.
-    So no pair that an engine would composite is missing, and few are listed for nothing.
+    A Gaussian is listed if alpha reaches 1/255 somewhere in the rectangle spanned by the tile's pixel centres: the smallest
+    value of its quadratic form there is compared with 2 ln(255 opacity), with room for rounding. So no pair is missing
+    that an engine would composite, and few are superfluous.
 
     Args:
         projected: M projected Gaussians in increasing order of index, as `project` returns them.
@@ -28,7 +28,7 @@ def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16
         height: of the image, pixels.
         tile_size: side of a tile, pixels.
         engine: as in `composite`. "numba", which "auto" takes on the CPU, finds the same lists with compiled code; all
-            others are functions of torch.
+            others use torch.
 
     Returns:
         The P (tile, Gaussian) pairs, grouped by tile; equally deep Gaussians are in order of their index.
@@ -99,10 +99,8 @@ def _touches_tile(
     a, b, c = (column[rows] for column in projected.conics.unbind(1))
     left, top = left + 0.5 - x[rows], top + 0.5 - y[rows]  # relative to the mean from here on
     right, bottom = left + (tile_size - 1), top + (tile_size - 1)
-    near_x, near_y = (
-        left.clamp(min=0) + right.clamp(max=0),
-        top.clamp(min=0) + bottom.clamp(max=0),
-    )  # closest to the mean
+    near_x = left.clamp(min=0) + right.clamp(max=0)  # closest to the mean
+    near_y = top.clamp(min=0) + bottom.clamp(max=0)
     along_y = torch.minimum(torch.maximum(-b / c * near_x, top), bottom)  # on the side x = near_x
     along_x = torch.minimum(torch.maximum(-b / a * near_y, left), right)  # on the side y = near_y
     smallest = torch.minimum(

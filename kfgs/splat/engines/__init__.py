@@ -36,7 +36,7 @@ def composite(
 ) -> tuple[Tensor, Tensor]:  # maps [H, W, D], alphas [H, W]
     """Composite the projected Gaussians of each tile front to back (Eq. 1-2 of 3DGS, for any number of channels).
 
-    What every engine promises is written in `kfgs.splat.engines.contract`.
+    `kfgs.splat.engines.contract` says exactly what is computed.
 
     Args:
         means2d: centres; the centre of the first pixel is (0.5, 0.5).
@@ -45,22 +45,21 @@ def composite(
         features: what is composited; any number of channels from 1.
         tiles: from `bin_tiles` on the same Gaussians.
         background: what shows through, zeros if None.
-        index: which row of `features` each Gaussian shows, as `Projected.index`; None: row m for Gaussian m, N = M.
-            It saves a copy of the visible rows, and another one of their gradients.
+        index: the row of `features` that each Gaussian shows, as `Projected.index`; None: row m for Gaussian m, N = M.
+            It saves copies of the visible rows and of their gradients.
         engine: a name of `available_engines()`, or "auto": the fastest one for the tensors' device.
 
     Returns:
         The composited features and the opacity of every pixel, differentiable in all tensors but `tiles`.
 
     Raises:
-        ValueError: if shapes, dtypes or devices disagree, `tiles` or `index` are of other Gaussians, or the engine is
-            unknown or does not run on the device or in the dtype.
+        ValueError: if shapes, dtypes or devices disagree, `tiles` or `index` belong to other Gaussians, or the engine is
+            unknown or does not know the device or the dtype.
         ImportError: if the named engine's package is missing.
-        NotImplementedError: if a gradient of a gradient is asked of a compiled engine.
+        NotImplementedError: at the gradient of a gradient of a compiled engine.
 
     Note:
-        On the CPU, the largest arrays of the last frames are kept for the next ones, up to 1 GiB per thread;
-        `free_memory` hands them back.
+        On the CPU, large arrays are kept for the next frames, up to 1 GiB per thread; `free_memory` frees them.
     """
     check_shapes(
         ("means2d", means2d, "M 2"),
@@ -97,8 +96,8 @@ def accumulate_pixels(
 ) -> tuple[Tensor, Tensor]:  # sums [M, D], weights [M]
     """Sum per-pixel values into the Gaussians, each weighted by how much the Gaussian shows at the pixel.
 
-    The sums are weights^T · pixels, the adjoint of `composite` in `features`: what uplifting features without training,
-    visibility and pruning by importance need. Both results come from one walk over the view, and carry no gradient.
+    The sums are weights^T · pixels, the adjoint of `composite` in `features`. Uplifting, visibility and pruning by
+    importance need them. Both results come from one walk over the view, and carry no gradient.
 
     Args:
         means2d: as in `composite`.
@@ -109,7 +108,7 @@ def accumulate_pixels(
         engine: as in `composite`.
 
     Returns:
-        The sums, and each Gaussian's own sum of weights, by which to divide for a mean.
+        The sums, and the sum of each Gaussian's weights: divide by it for a mean.
 
     Raises:
         ValueError: as `composite`, and if `pixels` is not as large as the image of `tiles`.

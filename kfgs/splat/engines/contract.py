@@ -16,8 +16,8 @@ and, if it can do better than kornia and torch,
     bin(means2d, conics, depths, opacities, extents, width, height, tile_size) -> rows, offsets of `Tiles`
 
 `ops` makes operators of these. The reference engine is plain torch under autograd: it has `composite(splats, tiles)`
-instead of forward and backward. No function takes more than eight parameters, except the Triton kernels: a launch takes flat
-pointers. The schemas of operators are flat, too.
+instead of forward and backward. No function takes more than eight parameters, except compiled kernels: a launch of Triton
+takes flat pointers, and numba's kernels take flat arrays. The schemas of operators are flat, too.
 
 The tensors an engine receives are contiguous, of one dtype and on one device.
 

@@ -1,8 +1,7 @@
 """The engines as operators of torch: what autograd, `torch.compile` and `torch.export` see of them.
 
-An engine works on plain tensors and has no gradients. Here its functions become opaque operators, `kfgs::composite`,
-`kfgs::project`, `kfgs::bin_tiles` and `kfgs::accumulate`, with backward passes and with fake kernels that give the shapes.
-Importing `kfgs.splat` registers them, which an exported program needs.
+An engine's functions become opaque operators with backward passes, and with fake kernels that give the shapes. Importing
+`kfgs.splat` registers them; an exported program needs that. torch demands flat schemas.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ SPLATS = "Tensor means2d, Tensor conics, Tensor opacities, Tensor features, Tens
 TILES = "Tensor rows, Tensor offsets, SymInt width, SymInt height, SymInt tile_size"
 CLOUD = "Tensor means, Tensor quats, Tensor scales, Tensor opacities"
 PINHOLE = "Tensor viewmat, Tensor K, SymInt width, SymInt height, float near, float low_pass"
-"""The fields of the contract's tuples in the words of a schema. The functions below get them flat, in this order."""
+"""The fields of the contract's tuples, as schemas name them. The functions below get them flat, in this order."""
 
 
 def _operator(schema: str) -> Callable[[Callable[..., Any]], Any]:
@@ -46,7 +45,7 @@ def _refuse(ctx: Any, *grads: Tensor) -> None:
 
 
 def check_values(count: int, sources: int, index: Tensor | None, tiles: Tiles) -> None:
-    """Refuse what a compiled engine would read from foreign memory. Not asked of a GPU, where it would cost a wait.
+    """Refuse numbers with which a compiled engine would read foreign memory; on a GPU the check would cost a wait.
 
     Raises:
         ValueError: if `index` or `rows` point beyond what there is, or `offsets` do not rise from 0 to P.

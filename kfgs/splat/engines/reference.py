@@ -1,9 +1,8 @@
 """The reference engine: compositing in plain torch, many tiles at a time, with gradients by autograd.
 
-It states the contract as directly as tensors allow, runs on any device torch runs on, and is what faster engines are
-compared with. Tiles with similarly many Gaussians are stacked (B tiles), and walked front to back in chunks of C
-Gaussians at P pixels. Autograd over a whole picture would keep every alpha alive, so the backward pass replays one chunk
-after another, last to first, from the transmittance that each started with.
+It states the contract as directly as tensors allow, and faster engines are compared with it. B tiles with similarly many
+Gaussians are stacked, and walked front to back in chunks of C Gaussians at P pixels. Autograd over a whole picture would
+keep every alpha. So the backward pass replays the chunks, last to first, from the transmittance that each started with.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ CHUNK = 64
 """Gaussians of a tile composited at once; pixels that stop are noticed between chunks."""
 
 BATCH = 1 << 20
-"""Largest B * P * C: elements of one intermediate tensor, a few megabytes, as large as caches and memory like."""
+"""Largest B * P * C: elements of one intermediate tensor, a few megabytes."""
 
 
 class _Chunk(NamedTuple):
@@ -170,7 +169,7 @@ def _pixel_centers(tile: Tensor, tiles: Tiles, dtype: torch.dtype) -> Tensor:  #
 
 
 def _batches(tiles: Tiles) -> Iterator[Tensor]:
-    """Tiles that have Gaussians, stacked with their likes in number: [B] int64 each."""
+    """Tiles that have Gaussians, stacked with those that have about as many: [B] int64 each."""
     counts = tiles.offsets.diff()
     order = torch.argsort(counts, descending=True, stable=True)[: int((counts > 0).sum())]
     if len(order):
@@ -178,7 +177,7 @@ def _batches(tiles: Tiles) -> Iterator[Tensor]:
 
 
 def _front_to_back(tiles: Tiles, batch: Tensor, stopped: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Chunks (tile [B], rows [B, C], present [B, C]) of a batch, leaving out the tiles that are done."""
+    """Chunks (tile [B], rows [B, C], present [B, C]) of a batch, without the tiles that are done."""
     counts = tiles.offsets.diff()[batch]
     for start in range(0, int(counts.max()), CHUNK):
         going = (counts > start) & ~stopped[batch].all(dim=1)

@@ -45,7 +45,7 @@ def available_engines(device: str | None = None) -> list[str]:
     return names if device is None else [name for name in names if _serves(name, device)]
 
 
-_FLAGS = RLock()  # who holds it may change the flags of dlopen; an engine may load another
+_FLAGS = RLock()  # guards the flags of dlopen; an engine may load another
 
 
 @cache
@@ -68,14 +68,13 @@ def load(name: str) -> ModuleType:
 
 @contextmanager
 def _own_symbols() -> Iterator[None]:
-    """Import compiled modules so that they find their own functions before those of others with the same names.
+    """Import compiled modules so that their own functions come before those of others with the same names.
 
-    triton brings an LLVM. Where a picture was drawn before (pyvista on Mesa's software driver) and pycolmap is loaded,
-    Mesa's LLVM is what the dynamic linker offers first, and Python ends with a segfault in it. Only then: with this flag a
-    module does not see an allocator that was loaded before all others (LD_PRELOAD), either. It changes nothing for numba,
-    whose LLVM is loaded by ctypes, past this flag, and keeps to itself.
+    triton brings an LLVM. If a picture was drawn before (pyvista on Mesa's software driver) and pycolmap is loaded, the
+    linker offers Mesa's LLVM first, and Python ends with a segfault. The flag is set only then, because with it a module
+    also ignores an allocator of LD_PRELOAD. numba is not affected: ctypes loads its LLVM.
 
-    The flag holds for the whole process. So only one import at a time sets it, and imports of other threads get it too.
+    The flag holds for the whole process. So one import at a time sets it, and imports of other threads get it too.
     """
     flag = getattr(os, "RTLD_DEEPBIND", 0)  # glibc's
     maps = Path("/proc/self/maps")
@@ -127,13 +126,12 @@ def choose_compiled(engine: str, function: str, name: str, *tensors: Tensor) -> 
 
     Args:
         engine: a name, or "auto".
-        function: what the engine should offer besides compositing, "project" or "bin".
-        name: what a message calls the tensors.
-        tensors: what it works on.
+        function: "project" or "bin".
+        name: of the tensors in a message.
+        tensors: the data.
 
     Raises:
-        ValueError: if the engine is unknown or does not run on the device, or it is named for tensors that are not
-            all of one dtype it knows.
+        ValueError: as `choose`, and if a named engine gets tensors that are not all float32 or all float64.
         ImportError: if the named engine's package is missing.
     """
     dtype = tensors[0].dtype if engine == "auto" else torch.float32  # a named engine's errors are raised below
@@ -155,13 +153,13 @@ def offers(name: str, function: str) -> bool:
     return hasattr(load(name), function)
 
 
-# What torch.compiler.assume_constant_result does, which would import the compiler: the answers are asked for once.
+# torch.compiler.assume_constant_result sets the same attribute, but imports the compiler.
 choose._dynamo_marked_constant = True  # type: ignore[attr-defined]
 offers._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 def _serves(name: str, device: str) -> bool:
-    """Whether an engine is meant for a device. An engine that runs there only for tests must be named."""
+    """Whether "auto" may take an engine for a device: not if it runs there only for tests."""
     try:
         engine = load(name)
         return device in engine.devices() and device not in getattr(engine, "PROOFS", ())

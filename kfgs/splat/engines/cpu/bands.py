@@ -74,7 +74,7 @@ def composite_narrow(
         rows: packed Gaussians with their features.
         length: of a packed row.
         passes: from `plan_passes`.
-        background: as many numbers as the passes have channels.
+        background: D numbers, and zeros up to a whole vector.
         images: maps [H * W * D], alphas [H * W] and transmittances [H * W], written.
         trace: written: per tile and square how many Gaussians were looked at, then the blocks that each was drawn in.
     """
@@ -115,18 +115,9 @@ def composite_narrow(
 def composite_wide(
     band: int, view: View, rows: Any, length: int, features: Any, begins: Any, background: Any, images: Any, trace: Any
 ) -> None:
-    """Composite the tiles of one band, with many channels.
+    """As `composite_narrow`, with many channels: the Gaussians are packed without features.
 
-    Args:
-        band: which.
-        view: the tiles.
-        rows: packed Gaussians without features.
-        length: of a packed row.
-        features: flat.
-        begins: [M], where each Gaussian's row of features begins.
-        background: D numbers and zeros up to a whole vector.
-        images: maps [H * W * D], alphas [H * W] and transmittances [H * W], written.
-        trace: see `composite_narrow`.
+    The features are flat; the row that Gaussian m shows begins at `begins[m]`.
     """
     maps, alphas, finals = images
     channels = len(maps) // len(alphas)
@@ -155,16 +146,8 @@ def composite_wide(
                     block = y // BLOCK_SIDE * BLOCK_SIDE + x // BLOCK_SIDE
                     p = block * LANES + y % BLOCK_SIDE * BLOCK_SIDE + x % BLOCK_SIDE
                     at = ((box[1] + y) * view.width + box[0] + x) * channels
-                    _write_pixel(
-                        maps,
-                        at,
-                        channels,
-                        sums,
-                        p * stride,
-                        (filled >> np.uint32(block)) & 1,
-                        background,
-                        state[FINAL + p],
-                    )
+                    summed = (filled >> np.uint32(block)) & 1
+                    _write_pixel(maps, at, channels, sums, p * stride, summed, background, state[FINAL + p])
 
 
 @njit(**INLINE)

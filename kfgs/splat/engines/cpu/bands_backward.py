@@ -141,21 +141,10 @@ def differentiate_wide(
     out: Any,
     geometry: bool,
 ) -> None:
-    """Sum the gradients of one band's tiles into its own rows of `out`, with many channels.
+    """As `differentiate_narrow`, with many channels: the Gaussians are packed without features.
 
-    Args:
-        band: which.
-        view: the tiles.
-        rows: packed Gaussians without features.
-        length: of a packed row.
-        source: features (flat), where each Gaussian's row begins, and D.
-        background: D numbers, and zeros up to a whole vector.
-        images: as for `differentiate_narrow`.
-        trace: of the forward pass.
-        slots: [P] from `number_slots`.
-        firsts: [B + 1], where the bands' rows begin.
-        out: [R * (LANES + padded D)], written.
-        geometry: whether the moments are wanted.
+    `source` is the features (flat), where each Gaussian's row begins, and D. Rows of `out` have LANES + padded D numbers,
+    of which the first are the moments, if `geometry` asks for them.
     """
     maps, grad_maps, finals, grad_alphas = images
     channels, width = source[2], view.width

@@ -1,8 +1,4 @@
-"""The CPU engine: compositing compiled by numba, with its own backward pass.
-
-The data alone decide how the tiles are cut into bands. Each band writes its own pixels and its own gradient rows, and the
-rows are summed in the order of the bands. So reruns are equal to the bit, on any number of threads.
-"""
+"""The CPU engine: compositing compiled by numba, with its own backward pass. README.md explains its parts."""
 
 from __future__ import annotations
 
@@ -26,16 +22,13 @@ from .square import SQUARE_SIDE, View, pack_rows
 from .threads import run_bands
 from .tiles import bin
 
-row_length, padded_length = (
-    square.row_length.py_func,
-    wide.padded_length.py_func,
-)  # in Python: one call is not worth compiling
+row_length, padded_length = square.row_length.py_func, wide.padded_length.py_func  # one call is not worth compiling
 
 __all__ = ["accumulate", "backward", "bin", "devices", "forward", "project", "project_backward"]
 
 MOST_BANDS, PAIRS_PER_BAND = 32, 2048
-"""The most bands, and the fewest pairs of a band. More bands keep more threads busy, but more Gaussians then have a gradient
-row in several bands. The number of bands depends on the data alone."""
+"""The most bands, and the fewest pairs of a band. More bands keep more threads busy, but give more Gaussians a gradient row
+in several bands."""
 
 NARROW_CHANNELS = len(FIRST) + LANES
 """The most channels that are summed in registers, one vector each; more are multiplied as small matrices."""

@@ -1,8 +1,7 @@
-"""Large arrays that a frame needs and the next frame needs again.
+"""Large arrays, kept from one frame for the next.
 
 Linux clears every page of new memory, which costs as much as compositing (at 480x360x512 on two threads: 180 ms per frame
-with new memory, 89 ms with memory that is kept). So the largest arrays of the last calls are kept, and given out again
-when nothing else refers to them.
+with new memory, 89 ms with kept memory). So the largest arrays are kept, and given out again when nothing refers to them.
 """
 
 from __future__ import annotations
@@ -55,9 +54,7 @@ def take_memory(like: Tensor, *shape: int) -> Tensor:
         return like.new_empty(shape)
     buffer = _find(size)
     if buffer is None:
-        buffer = np.empty(
-            size + CACHE_LINE, np.uint8
-        )  # of so much, numpy asks Linux for large pages, and torch does not
+        buffer = np.empty(size + CACHE_LINE, np.uint8)  # numpy asks Linux for large pages, and torch does not
         if size <= MOST_KEPT:
             _kept.buffers.append(buffer)
             while sum(kept.nbytes for kept in _kept.buffers) > MOST_KEPT:

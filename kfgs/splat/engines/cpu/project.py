@@ -1,8 +1,8 @@
 """The fused projection on the CPU: `project`'s equations for one Gaussian after another, compiled by numba.
 
-With kornia's functions torch would write some forty arrays. Here a Gaussian's numbers stay in registers, forward and
-backward, and the backward pass recomputes what it needs. Each band writes its own rows, and a Gaussian's numbers depend on
-no other Gaussian, so results are equal to the bit on any number of threads.
+With kornia's functions torch would write some forty arrays. Here a Gaussian's numbers stay in registers, and the backward
+pass recomputes what it needs. A Gaussian's numbers depend on no other Gaussian, so results are equal to the bit on any
+number of threads.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .threads import run_bands
 __all__ = ["project", "project_backward"]
 
 _SHARE = 16384
-"""Gaussians of a band: few enough that all threads end at about the same time, and many compared with the cost of a call."""
+"""Gaussians of a band: few, so that all threads end together, but many compared with the cost of a call."""
 
 
 @torch.no_grad()

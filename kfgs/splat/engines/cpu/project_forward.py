@@ -41,11 +41,11 @@ def project_band(
     out: tuple[Any, Any, Any, Any, Any, Any],
     counts: Any,
 ) -> None:
-    """Project one share of the Gaussians and write the visible ones one after another from the share's beginning.
+    """Project one of `bands` equal shares of the N Gaussians; write the visible ones from the share's beginning on.
 
     Args:
-        band: which.
-        bands: into how many equal shares the N Gaussians are cut.
+        band: which share.
+        bands: how many.
         lens: the camera and the options.
         gaussians: means [3 N], quats [4 N], scales [3 N], opacities [N].
         reach: [N], 2 ln(opacity / ALPHA_MIN).

@@ -1,11 +1,10 @@
 """What the compiled projection and its gradient share: the lens as numbers, planes of scratch memory, the footprint.
 
-Gaussians are worked on in batches of BATCH, gathered into planes: entry i of plane p is `state[p + i]`. The inner loop
-over a batch has no branches, always the same length, and planes at constant distances, so that LLVM computes 8 or 16
-Gaussians per instruction; and since it has no remainder, what comes out does not depend on a Gaussian's neighbours.
+Gaussians are gathered into planes, BATCH at a time: entry i of plane p is `state[p + i]`. The inner loop over a batch has no
+branches, a constant length, and planes at constant distances. So LLVM computes 8 or 16 Gaussians per instruction, and
+results do not depend on a Gaussian's neighbours.
 
-Arrays with several numbers per Gaussian are passed flat, so that these numbers' distance is known to the compiler, too;
-`max(row, 0)` tells it that an index does not wrap around.
+Arrays are passed flat, so that the compiler knows all distances; `max(row, 0)` tells it that an index does not wrap around.
 """
 
 from __future__ import annotations
@@ -90,12 +89,8 @@ def to_camera(state: Any, i: int, lens: Lens) -> tuple[Any, Any, Any]:
 @njit(fastmath=PLAIN, **OPTIONS)
 def normalize(state: Any, i: int) -> tuple[Any, Any, Any, Any, Any]:
     """Quaternion (w, x, y, z) of the batch's Gaussian i divided by its norm, and the norm."""
-    w, x, y, z = (
-        state[QUAT + i],
-        state[QUAT + BATCH + i],
-        state[QUAT + 2 * BATCH + i],
-        state[QUAT + 3 * BATCH + i],
-    )
+    w, x = state[QUAT + i], state[QUAT + BATCH + i]
+    y, z = state[QUAT + 2 * BATCH + i], state[QUAT + 3 * BATCH + i]
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     scale = state.dtype.type(1) / max(norm, state.dtype.type(QUAT_FLOOR))
     return w * scale, x * scale, y * scale, z * scale, norm

@@ -1,7 +1,6 @@
-"""Slots: each band sums gradients into rows of its own, one for each Gaussian that it meets. Later each Gaussian's are summed.
+"""Slots: each band sums gradients into its own rows, one per Gaussian that it meets. Later each Gaussian's rows are summed.
 
-So no two threads write the same row, and the sums always run in the order of the bands. There are few more rows than
-visible Gaussians, because a band is a strip of neighbouring tiles.
+A band is a strip of neighbouring tiles, so there are few more rows than visible Gaussians.
 """
 
 from __future__ import annotations

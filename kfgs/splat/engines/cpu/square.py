@@ -1,8 +1,7 @@
 """What the compiled kernels share: packed Gaussians, and squares of pixels cut into blocks of one vector each.
 
-The kernels work on a tile in squares of 16 x 16 pixels. A square is 16 blocks of 4 x 4 pixels, and a block's pixels are the
-lanes of one vector. Block b of a square is in row b // 4 and column b % 4; pixel p of a square is lane p % 16 of block
-p // 16. A *plane* is 256 numbers, one for each pixel of a square, in that order.
+Block b of a square is in row b // 4 and column b % 4; pixel p of a square is lane p % 16 of block p // 16. README.md
+explains square, block, plane and packed row.
 
 A Gaussian is packed into one row, so that it arrives in one cache line: its mean, the three numbers of its quadratic
 form, the logarithm of its opacity, then its features. The form a dx^2 + 2 b dx dy + c dy^2 is kept as
@@ -293,7 +292,7 @@ def read_block(picture: Picture, box: Any, block: int, channel: int, into: Any, 
 
 @njit(**INLINE)
 def write_block(picture: Picture, box: Any, block: int, channel: int, source: Any, place: int, stride: int) -> None:
-    """The inverse of `read_block`: nothing is written outside of the box and beyond the last channel."""
+    """The inverse of `read_block`: writes nothing outside of the box or beyond the last channel."""
     values, width, channels = picture
     lanes = lanes_below(values, channels - channel)
     left, top = box[0] + block % BLOCK_SIDE * BLOCK_SIDE, box[1] + block // BLOCK_SIDE * BLOCK_SIDE

@@ -1,8 +1,7 @@
 """Run a compiled kernel over numbered bands of work on a few threads.
 
-Numba's own parallel loops are not used: its default back end aborts when two Python threads enter it, another one does
-not survive a fork, and both split the work by the number of threads. Here the data fix the bands, and no two bands write
-the same memory. So results depend neither on the number of threads nor on which thread runs which band.
+Numba's parallel loops are not used: one back end aborts when two Python threads enter it, another does not survive a fork,
+and both split the work by the number of threads. Here the data fix the bands, so results do not depend on the threads.
 """
 
 from __future__ import annotations

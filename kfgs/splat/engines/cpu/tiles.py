@@ -1,9 +1,8 @@
 """Find which Gaussians touch which tile, compiled by numba. It sorts the Gaussians by depth, and never the pairs.
 
-Gaussians are taken front to back in bands. A band lists the (tile, Gaussian) pairs that touch, and counts them by tile;
-then every band knows where its part of each tile's list begins, and copies its pairs there. The work is proportional to
-the pairs found. The lists are those of the torch code in `kfgs.splat.tiles`, to the bit: the tests are the same
-arithmetic in the same order, without fused multiply-adds.
+Gaussians are taken front to back in bands. A band lists the (tile, Gaussian) pairs that touch, and counts them by tile.
+Then every band knows where its part of each tile's list begins, and copies its pairs there. The lists equal those of the
+torch code in `kfgs.splat.tiles`: the arithmetic is the same, in the same order, without fused multiply-adds.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from .tiles_kernels import find_pairs, list_rows
 __all__ = ["bin", "depth_order"]
 
 _SHARE = 8192
-"""Gaussians of a band: few enough that all threads end at about the same time, and many compared with the tiles' counters."""
+"""Gaussians of a band: few, so that all threads end together, but many compared with the tiles' counters."""
 
 
 @torch.no_grad()
@@ -34,21 +33,7 @@ def bin(
     height: int,
     tile_size: int,
 ) -> tuple[Tensor, Tensor]:  # rows [P] int32, offsets [T + 1] int64
-    """List the Gaussians of every tile, as `kfgs.splat.bin_tiles` says.
-
-    Args:
-        means2d: contiguous, like all that follow, float32 or float64, on the CPU.
-        conics: as `project` returns them.
-        depths: as `project` returns them.
-        opacities: as `project` returns them.
-        extents: as `project` returns them.
-        width: of the picture, pixels.
-        height: of the picture, pixels.
-        tile_size: side of a tile, pixels.
-
-    Returns:
-        Tile t owns rows[offsets[t]:offsets[t + 1]], by depth, then by row.
-    """
+    """List the Gaussians of every tile, as `kfgs.splat.bin_tiles` says."""
     M, tiles = len(depths), -(-width // tile_size) * -(-height // tile_size)
     bands = max(1, -(-M // _SHARE))
     values = (value.detach().view(-1).numpy() for value in (means2d, conics, extents))

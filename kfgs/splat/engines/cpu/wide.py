@@ -175,14 +175,8 @@ def composite_square(
 ) -> tuple[int, Any]:
     """Composite a square's Gaussians; returns where in the list it was done, and bits of the blocks that have sums.
 
-    Args:
-        packed: rows, their length, and the list of the Gaussians' numbers.
-        span: where the square's list begins and ends, and where its trace begins.
-        state: the square's planes, see `start_square`.
-        dark: bits of blocks without pixels.
-        wide: features (flat), where each Gaussian's row begins, and D.
-        scratch: corners; sums [PIXELS, padded D] in the order of blocks; kept, see `weigh_block`; hits; counts.
-        trace: written: the blocks that each Gaussian may be drawn in, as bits.
+    The arguments are those of `narrow.composite_square`, but `wide` is features (flat), where each Gaussian's row begins,
+    and D; `scratch` is corners, sums [PIXELS, padded D] in the order of blocks, kept (see `weigh_block`), hits and counts.
     """
     rows, length, order = packed
     features, sources, channels = wide

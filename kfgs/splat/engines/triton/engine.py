@@ -1,8 +1,8 @@
 """The GPU engine: compositing by Triton kernels, float32, any number of channels.
 
-Nothing here waits for the GPU: sizes come from shapes, and where each pixel stopped is handed from the forward to the
-backward pass as a tensor. Programs add their gradients to a Gaussian's by atomics, in the order in which they happen to
-finish: two runs of the backward pass, and of `accumulate`, agree to rounding, not to the bit. The forward pass does.
+Nothing here waits for the GPU: sizes come from shapes, and where each pixel stopped is a tensor. Programs add to a
+Gaussian's gradients by atomics, in any order. So two runs of the backward pass, and of `accumulate`, agree to rounding;
+two runs of the forward pass agree to the bit. Kernels have more than eight parameters, because a launch takes flat pointers.
 
 With TRITON_INTERPRET=1 in the environment before triton is imported, the same kernels run on CPU tensors, slowly.
 """
