@@ -117,7 +117,7 @@ def composite_wide(
 ) -> None:
     """As `composite_narrow`, with many channels: the Gaussians are packed without features.
 
-    Row m of the features, which are flat, begins at `begins[m]`.
+    The features are flat; the row that Gaussian m shows begins at `begins[m]`.
     """
     maps, alphas, finals = images
     channels = len(maps) // len(alphas)
