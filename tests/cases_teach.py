@@ -20,7 +20,7 @@ SCALE = 8  # by which the door's photographs, 1296 x 1936, are made smaller
 class TinyLSeg:
     """LSeg's own code with a tiny network, one window per picture; `package.module:TinyLSeg` on the command line.
 
-    In a command started with TEACH_LOG each picture adds a line to that file; TEACH_SLEEP seconds are slept before.
+    In a command started with TEACH_LOG each picture adds a line to that file; at line TEACH_STOP it waits to be ended.
     """
 
     name = "lseg"
@@ -33,10 +33,11 @@ class TinyLSeg:
         return self.lseg.identity
 
     def encode_image(self, image):
-        time.sleep(float(os.environ.get("TEACH_SLEEP", "0")))
         if "TEACH_LOG" in os.environ:
             with Path(os.environ["TEACH_LOG"]).open("a") as log:
                 log.write(f"{image.sum():.3f}\n")
+            if Path(os.environ["TEACH_LOG"]).read_text().count("\n") == int(os.environ.get("TEACH_STOP", "0")):
+                time.sleep(3600)
         return self.lseg.encode_image(image)
 
     def encode_text(self, prompts):

@@ -32,6 +32,23 @@ def pytest_unconfigure():
     gc.unfreeze()
 
 
+COMPILING = ("tests/splat/cpu/", "tests/splat/test_engine", "tests/splat/test_ops", "tests/splat/test_splat_project")
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """With `--dist loadfile`, what compiles the most kernels is one worker's: two at a time would compile each twice."""
+    if config.getvalue("dist") != "loadfile":
+        return None
+    from xdist.scheduler import LoadFileScheduling
+
+    class ByFile(LoadFileScheduling):
+        def _split_scope(self, nodeid):
+            return "kernels" if nodeid.startswith(COMPILING) else super()._split_scope(nodeid)
+
+    return ByFile(config, log)
+
+
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 

@@ -1,9 +1,10 @@
-"""LSeg's network by transformers' DPT and CLIP, out of a checkpoint's tensors; none of kfgs's code."""
+"""LSeg's network by transformers' DPT and CLIP, out of a checkpoint's tensors; none of kfgs's code.
+
+Transformers is imported where it is used: it takes seconds, and every worker imports this file.
+"""
 
 import torch
 from torch import nn
-from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection, DPTConfig, DPTModel
-from transformers.models.dpt.modeling_dpt import DPTNeck
 
 
 def plain(state, prefix, dtype):
@@ -71,6 +72,9 @@ def features(state, config, x, attention="sdpa"):
 
 def network(state, config, dtype, attention="sdpa"):
     """What `features` computes, as a function of x, for many pictures."""
+    from transformers import DPTConfig, DPTModel
+    from transformers.models.dpt.modeling_dpt import DPTNeck
+
     settings = DPTConfig(
         hidden_size=config.width,
         num_hidden_layers=config.depth,
@@ -125,6 +129,8 @@ def text_tensors(found, layers):
 
 
 def text_settings(config, attention):
+    from transformers import CLIPTextConfig
+
     return CLIPTextConfig(
         vocab_size=config.vocabulary,
         hidden_size=config.text_width,
@@ -141,6 +147,8 @@ def text_settings(config, attention):
 
 def text(state, config, ids, dtype=torch.float64, attention="sdpa"):
     """[n, context] -> [n, D]."""
+    from transformers import CLIPTextModel
+
     tower = CLIPTextModel(text_settings(config, attention)).to(dtype).eval()
     found = plain(state, "clip_pretrained.", dtype)
     ours = text_tensors(found, config.text_layers)
@@ -155,6 +163,8 @@ def text(state, config, ids, dtype=torch.float64, attention="sdpa"):
 
 def prompt_embeddings(state, config, prompts, tokenizer):
     """Unit rows [n, D] float64 by transformers from the text on: its tokenizer, pooling and projection, a prompt at a time."""
+    from transformers import CLIPTextModelWithProjection
+
     tower = CLIPTextModelWithProjection(text_settings(config, "sdpa")).double().eval()
     found = plain(state, "clip_pretrained.", torch.float64)
     ours = {f"text_model.{name}": value for name, value in text_tensors(found, config.text_layers).items()}

@@ -182,8 +182,11 @@ def _can_compile():
 
 @pytest.mark.skipif(not _can_compile(), reason="inductor needs a C++ compiler and Python's headers")
 def test_compositing_goes_through_inductor():
+    import torch._inductor.config as inductor
+
     loss, values = _compositing_loss()
-    with warnings.catch_warnings():
+    known = {"cpp.vec_isa_ok": True}  # else it compiles trials for each vector unit that the processor says it has
+    with warnings.catch_warnings(), inductor.patch(known):
         warnings.simplefilter("ignore", DeprecationWarning)  # inductor imports torch.jit's
         _assert_same_loss_and_gradients(torch.compile(loss, fullgraph=True), loss, values)
 

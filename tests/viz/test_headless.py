@@ -127,22 +127,6 @@ def test_plotter_has_the_asked_size_and_subplots():
         plotter.close()
 
 
-def test_rasterising_after_a_picture_does_not_crash():
-    """With pycolmap loaded, an LLVM (numba's) loaded after that of Mesa's driver ended Python with a segfault."""
-    if not available():
-        pytest.skip(headless.probe().reason)
-    program = """
-import pycolmap
-from kfgs.viz import make_plotter
-plotter = make_plotter(8, 8, off_screen=True)
-plotter.screenshot(return_img=True)
-import llvmlite.binding
-plotter.close()
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-
-
 BARE = {key: value for key, value in os.environ.items() if key not in VARIABLES}
 CLOUD = """
 import torch
@@ -160,19 +144,29 @@ def run_bare(program, **environment):
     )  # fmt: skip
 
 
-def test_without_a_display_nothing_is_printed_and_show_returns():
+@pytest.fixture(scope="module")
+def looked():
+    """With pycolmap loaded, an LLVM (numba's) loaded after that of Mesa's driver ended Python with a segfault."""
     if not available():
         pytest.skip(headless.probe().reason)
-    program = f"""
+    return run_bare(f"""
+import pycolmap
 from kfgs.viz import linked_clouds
 {CLOUD}
 plotter = linked_clouds(gaussians, gaussians, color_by=("label", "opacity"), height=60)
 assert plotter.screenshot(return_img=True).std() > 0
+import llvmlite.binding
 plotter.show()
 print("shown")
-"""
-    done = run_bare(program)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "shown\n", "")
+""")
+
+
+def test_rasterising_after_a_picture_does_not_crash(looked):
+    assert looked.returncode == 0, looked.stderr
+
+
+def test_without_a_display_nothing_is_printed_and_show_returns(looked):
+    assert (looked.returncode, looked.stdout, looked.stderr) == (0, "shown\n", "")
 
 
 def test_a_plotter_of_the_users_own_is_silent_and_does_not_keep_one_from_rasterising():
