@@ -1,0 +1,34 @@
+"""Ground truth of published data sets, and of any folder of labels. Poses and pictures come from `kfgs.scenes.load_scene`."""
+
+from .coco import load_coco_labels, load_coco_masks
+from .label_folder import load_labels
+from .legaussians import LEGAUSSIANS_SCENES, LEGaussiansScene, load_legaussians
+from .lerf_ovs import LERF_OVS_FRAMES, LERF_OVS_TEXTS, load_lerf_ovs
+from .ovs3d import OVS3D_REPORTED, OVS3D_SCENES, load_3dovs
+from .polygons import decode_rle, fill_polygon, fill_region
+from .replica import load_replica_points, load_semantic_nerf_labels
+from .scannet import NYU40, SCANNET_CLASSES, SCANNET_SCENES, load_scannet_points
+
+__all__ = [
+    "LEGAUSSIANS_SCENES",
+    "LERF_OVS_FRAMES",
+    "LERF_OVS_TEXTS",
+    "NYU40",
+    "OVS3D_REPORTED",
+    "OVS3D_SCENES",
+    "SCANNET_CLASSES",
+    "SCANNET_SCENES",
+    "LEGaussiansScene",
+    "decode_rle",
+    "fill_polygon",
+    "fill_region",
+    "load_3dovs",
+    "load_coco_labels",
+    "load_coco_masks",
+    "load_labels",
+    "load_legaussians",
+    "load_lerf_ovs",
+    "load_replica_points",
+    "load_scannet_points",
+    "load_semantic_nerf_labels",
+]
