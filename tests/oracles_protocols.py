@@ -1,0 +1,79 @@
+"""Protocols written a second time, in the dullest way: loops over pixels, points and classes in NumPy float64.
+
+From ../shared/reference/protocols.md alone; nothing here calls kfgs.
+"""
+
+import math
+
+import numpy as np
+
+
+def relevancy(positive, negatives, scale=10.0):
+    worst = 2.0
+    for n in negatives:
+        a, b = math.exp(scale * positive), math.exp(scale * n)
+        worst = min(worst, a / (a + b))
+    return worst
+
+
+def reflect_101(i, n):
+    while n > 1 and not 0 <= i < n:
+        i = -i if i < 0 else 2 * (n - 1) - i
+    return i if n > 1 else 0
+
+
+def box_mean(image, size=30):
+    h, w = image.shape
+    out = np.zeros((h, w))
+    for y in range(h):
+        for x in range(w):
+            total = 0.0
+            for dy in range(-(size // 2), size - size // 2):
+                for dx in range(-(size // 2), size - size // 2):
+                    total += image[reflect_101(y + dy, h), reflect_101(x + dx, w)]
+            out[y, x] = total / size**2
+    return out
+
+
+def pool_mean(image, size=29):
+    h, w = image.shape
+    reach = size // 2
+    out = np.zeros((h, w))
+    for y in range(h):
+        for x in range(w):
+            out[y, x] = image[max(0, y - reach) : y + reach + 1, max(0, x - reach) : x + reach + 1].mean()
+    return out
+
+
+def majority(mask, size=7, skip_last=True):
+    h, w = mask.shape
+    reach, cut = size // 2, 1 if skip_last else 0
+    out = np.zeros((h, w), bool)
+    for y in range(h):
+        for x in range(w):
+            window = mask[
+                max(0, y - reach) : min(y + reach + 1, h - cut), max(0, x - reach) : min(x + reach + 1, w - cut)
+            ]
+            ones = int(window.sum())
+            out[y, x] = ones > window.size - ones
+    return out
+
+
+def pool_majority(mask, size=7):
+    h, w = mask.shape
+    reach = size // 2
+    out = np.zeros((h, w), bool)
+    for y in range(h):
+        for x in range(w):
+            out[y, x] = mask[max(0, y - reach) : y + reach + 1, max(0, x - reach) : x + reach + 1].sum() / size**2 > 0.5
+    return out
+
+
+def stretch(values):
+    low, high = values.min(), values.max()
+    return np.clip(2 * (values - low) / (high - low + 1e-9) - 1, 0, 1)
+
+
+def iou(a, b):
+    union = np.logical_or(a, b).sum()
+    return np.logical_and(a, b).sum() / union if union else 0.0
