@@ -77,3 +77,25 @@ def stretch(values):
 def iou(a, b):
     union = np.logical_or(a, b).sum()
     return np.logical_and(a, b).sum() / union if union else 0.0
+
+
+def teacher_agreement(teacher, student, most=7):
+    equal, known, counts = 0, 0, {}
+    for t, s in zip(teacher.ravel(), student.ravel(), strict=True):
+        if t < 0:
+            continue
+        known += 1
+        equal += t == s
+        for label in (t, s):
+            if label >= 0:
+                counts[int(label)] = counts.get(int(label), 0) + 1
+    frequent = sorted(counts, key=lambda label: (-counts[label], label))[:most]
+    ious = []
+    for label in frequent:
+        both = either = 0
+        for t, s in zip(teacher.ravel(), student.ravel(), strict=True):
+            if t >= 0:
+                both += t == label and s == label
+                either += t == label or s == label
+        ious.append(both / either)
+    return equal / known, float(np.mean(ious))
