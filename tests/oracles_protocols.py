@@ -16,22 +16,14 @@ def relevancy(positive, negatives, scale=10.0):
     return worst
 
 
-def reflect_101(i, n):
-    while n > 1 and not 0 <= i < n:
-        i = -i if i < 0 else 2 * (n - 1) - i
-    return i if n > 1 else 0
-
-
 def box_mean(image, size=30):
     h, w = image.shape
+    before, after = size // 2, size - 1 - size // 2
+    padded = np.pad(image, ((before, after), (before, after)), mode="reflect")  # BORDER_REFLECT_101
     out = np.zeros((h, w))
     for y in range(h):
         for x in range(w):
-            total = 0.0
-            for dy in range(-(size // 2), size - size // 2):
-                for dx in range(-(size // 2), size - size // 2):
-                    total += image[reflect_101(y + dy, h), reflect_101(x + dx, w)]
-            out[y, x] = total / size**2
+            out[y, x] = padded[y : y + size, x : x + size].mean()
     return out
 
 
@@ -99,3 +91,37 @@ def teacher_agreement(teacher, student, most=7):
                 either += t == label or s == label
         ious.append(both / either)
     return equal / known, float(np.mean(ious))
+
+
+def fill_unknown(image):
+    known = image[~np.isnan(image)]
+    return np.where(np.isnan(image), known.min() if known.size else 0.0, image)
+
+
+def relevancy_maps(cosines, text, negatives, scale=10.0):
+    """From cosines {text: [L, H, W]} to a relevancy [L, H, W]."""
+    found = np.zeros(cosines[text].shape)
+    for i in np.ndindex(found.shape):
+        found[i] = np.nan
+        if not np.isnan(cosines[text][i]):
+            found[i] = relevancy(cosines[text][i], [cosines[n][i] for n in negatives], scale)
+    return np.stack([fill_unknown(level) for level in found])
+
+
+def lerf_2d(found, mask, boxes, threshold=0.4, filter="langsplat"):
+    """IoU of each level, the chosen level, and whether the maximum lies in a box."""
+    mean, clean = (box_mean, majority) if filter == "langsplat" else (pool_mean, pool_majority)
+    ious, tops, peaks = [], [], []
+    for level in found:
+        smooth = mean(level)
+        blended = 0.5 * (smooth + level)
+        ious.append(iou(clean(stretch(blended) > threshold), mask))
+        tops.append(blended.max())
+        peaks.append(smooth)
+    best = peaks[int(np.argmax([peak.max() for peak in peaks]))]
+    hit = False
+    for y in range(best.shape[0]):
+        for x in range(best.shape[1]):
+            if best[y, x] == best.max():
+                hit = hit or any(x1 <= x <= x2 and y1 <= y <= y2 for x1, y1, x2, y2 in boxes)
+    return ious, int(np.argmax(tops)), hit
