@@ -125,3 +125,39 @@ def lerf_2d(found, mask, boxes, threshold=0.4, filter="langsplat"):
             if best[y, x] == best.max():
                 hit = hit or any(x1 <= x <= x2 and y1 <= y <= y2 for x1, y1, x2, y2 in boxes)
     return ious, int(np.argmax(tops)), hit
+
+
+def nearest(points, query, count):
+    """Indices of the nearest points, the closest first."""
+    distances = [math.dist(point, query) for point in points]
+    return sorted(range(len(points)), key=lambda i: distances[i])[:count]
+
+
+def select_argmax(cosines, texts, text):
+    """From cosines {text: [L, N]}: the Gaussians whose best text it is, in the level with the largest cosine of these."""
+    levels, count = cosines[text].shape
+    found, tops = [], []
+    for level in range(levels):
+        mine, top = [], -math.inf
+        for n in range(count):
+            row = [cosines[t][level, n] for t in texts]
+            mine.append(not math.isnan(row[0]) and texts[int(np.argmax(row))] == text)
+            top = max(top, cosines[text][level, n]) if mine[-1] else top
+        found.append(np.array(mine))
+        tops.append(top)
+    return found[int(np.argmax(tops))]
+
+
+def select_by_relevancy(cosines, text, negatives, means, *, threshold, smoothed, neighbours=10):
+    levels, count = cosines[text].shape
+    known = [n for n in range(count) if not np.isnan(cosines[text][:, n]).any()]
+    found, tops = [], []
+    for level in range(levels):
+        r = np.array([relevancy(cosines[text][level, n], [cosines[m][level, n] for m in negatives]) for n in known])
+        if smoothed:
+            around = [nearest([means[m] for m in known], means[n], neighbours) for n in known]
+            r = np.array([0.5 * (r[i] + np.mean([r[j] for j in near])) for i, near in enumerate(around)])
+        tops.append(r.max())
+        chosen = stretch(r) > threshold if smoothed else r >= threshold
+        found.append(np.isin(np.arange(count), [known[i] for i in np.flatnonzero(chosen)]))
+    return found[int(np.argmax(tops))]
