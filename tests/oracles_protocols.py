@@ -161,3 +161,64 @@ def select_by_relevancy(cosines, text, negatives, means, *, threshold, smoothed,
         chosen = stretch(r) > threshold if smoothed else r >= threshold
         found.append(np.isin(np.arange(count), [known[i] for i in np.flatnonzero(chosen)]))
     return found[int(np.argmax(tops))]
+
+
+def legaussians(found, mask, threshold=0.5):
+    """IoU, accuracy, precision, and the sum of 101 interpolated precisions, of one relevancy map."""
+    seen = found >= threshold
+    tp, fp = int((seen & mask).sum()), int((seen & ~mask).sum())
+    points = []
+    for i in range(101):
+        above = found > i / 100
+        both = int((above & mask).sum())
+        points.append((both / above.sum() if above.any() else 0.0, both / mask.sum() if mask.any() else 0.0))
+    area = 0.0
+    for i in range(101):
+        area += max((p for p, r in points if r >= i / 100), default=0.0)
+    return tp / ((seen | mask).sum() + 1e-6), float((seen == mask).mean()), tp / (tp + fp + 1e-6), area
+
+
+def scannet(pred, gt, weights=None):
+    """mIoU, mAcc and accuracy; gt 0 is not scored, classes count from 1."""
+    weights = np.ones(len(gt)) if weights is None else weights
+    pred = np.where(gt == 0, 0, pred)
+    ious, recalls, right, total = [], [], 0.0, 0.0
+    for c in sorted(set(gt.tolist()) - {0}):
+        both = either = true = 0.0
+        for p, g, w in zip(pred, gt, weights, strict=True):
+            both += w * (p == c and g == c)
+            either += w * (p == c or g == c)
+            true += w * (g == c)
+        ious.append(both / either)
+        recalls.append(both / true)
+        right, total = right + both, total + true
+    return float(np.mean(ious)), float(np.mean(recalls)), right / total
+
+
+def rotation(q):
+    w, x, y, z = np.asarray(q) / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def gaussian_truth(means, quats, scales, points, labels, nearest_count=1000, radius=5.0, balanced=True):
+    """Labels count from 1, 0 = none."""
+    out = []
+    known = [i for i in range(len(points)) if labels[i] > 0]
+    for mean, q, s in zip(means, quats, scales, strict=True):
+        order = sorted(known, key=lambda i: math.dist(points[i], mean))[:nearest_count]
+        near = [i for i in order if math.dist(points[i], mean) <= radius * max(s)]
+        inverse = np.linalg.inv(rotation(q) @ np.diag(np.square(s)) @ rotation(q).T)
+        sums, counts = {}, {}
+        for i in near:
+            d = points[i] - mean
+            sums[labels[i]] = sums.get(labels[i], 0.0) + math.exp(-0.5 * d @ inverse @ d)
+            counts[labels[i]] = counts.get(labels[i], 0) + 1
+        best = [(-sums[c] / (counts[c] if balanced else 1), c) for c in sums]
+        out.append(min(best)[1] if best else 0)
+    return np.array(out)

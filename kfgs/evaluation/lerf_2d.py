@@ -23,7 +23,7 @@ from .relevancy import (
     smooth_relevancy,
     stretch,
 )
-from .report import Report, Row, make_report
+from .report import Report, Row, make_report, mean
 from .truth import MaskTruth
 
 
@@ -116,11 +116,8 @@ class LerfOvs2D:
             found = relevancies(method, view, tuple(truth.frames[view.stem]), encode, self.negatives, self.scale)
             for text, (mask, boxes) in truth.frames[view.stem].items():
                 rows.append({"view": view.stem, "text": text, **self._pair(found[text], mask, boxes)})
-        hits = [row["hit"] for row in rows if row["hit"] is not None]
-        scores = {
-            "mIoU": sum(row["IoU"] for row in rows) / len(rows) if rows else float("nan"),
-            "localisation": sum(hits) / len(hits) if hits else float("nan"),
-        }
+        hits = (row["hit"] for row in rows if row["hit"] is not None)
+        scores = {"mIoU": mean(row["IoU"] for row in rows), "localisation": mean(hits)}
         return make_report(self, method.name, scores, rows)
 
     def _pair(self, relevancy: Tensor, mask: Tensor, boxes: Tensor | None) -> Row:

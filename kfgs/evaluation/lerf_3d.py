@@ -17,7 +17,7 @@ from ..labels.scores import CANONICAL, TEMPERATURE
 from ..splat import rasterize
 from .method import Method, View, annotated, best_labels
 from .relevancy import Encode, encode_unit, lerf_relevancy, mask_iou, stretch
-from .report import Report, Row, make_report
+from .report import Report, Row, make_report, mean
 from .truth import MaskTruth
 
 RULES = ("argmax", "smoothed", "relevancy")
@@ -52,7 +52,7 @@ def share_above(ious: Sequence[float], threshold: float) -> float:
         >>> share_above([0.25, 0.26], 0.25)
         0.5
     """
-    return sum(value > threshold for value in ious) / len(ious) if ious else float("nan")
+    return mean(value > threshold for value in ious)
 
 
 @dataclass(frozen=True)
@@ -122,11 +122,7 @@ class LerfOvs3D:
                 count = int(selected[text].sum())
                 rows.append({"view": view.stem, "text": text, "IoU": mask_iou(seen, mask), "Gaussians": count})
         ious = [row["IoU"] for row in rows]
-        scores = {
-            "mIoU": sum(ious) / len(ious) if ious else float("nan"),
-            "Acc@0.25": share_above(ious, 0.25),
-            "Acc@0.5": share_above(ious, 0.5),
-        }
+        scores = {"mIoU": mean(ious), "Acc@0.25": share_above(ious, 0.25), "Acc@0.5": share_above(ious, 0.5)}
         return make_report(self, method.name, scores, rows)
 
     def select(self, method: Method, texts: Sequence[str], encode: Encode) -> dict[str, Tensor]:  # [N] bool each

@@ -14,7 +14,7 @@ from .._check import check_choice
 from .class_lists import load_classes
 from .method import Method, View, label_view
 from .relevancy import Encode, encode_unit
-from .report import Report, Row, make_report
+from .report import Report, Row, make_report, mean
 
 
 class Agreement(NamedTuple):
@@ -127,7 +127,7 @@ class TeacherAgreement:
             taught, found = (resize_by_corners(merge_labels(labels.cpu(), merged), self.size) for labels in maps)
             accuracy, iou = teacher_agreement(taught, found, self.most)
             rows.append({"view": view.stem, "mIoU": iou, "accuracy": accuracy})
-        scores = {name: sum(row[name] for row in rows) / len(rows) for name in ("mIoU", "accuracy")}
+        scores = {name: mean(row[name] for row in rows) for name in ("mIoU", "accuracy")}
         return make_report(self, method.name, scores, rows)
 
     def chosen(self, views: Sequence[View]) -> list[View]:
