@@ -222,3 +222,58 @@ def gaussian_truth(means, quats, scales, points, labels, nearest_count=1000, rad
         best = [(-sums[c] / (counts[c] if balanced else 1), c) for c in sums]
         out.append(min(best)[1] if best else 0)
     return np.array(out)
+
+
+def median5(values):
+    """Median of five; beyond the ends values are mirrored with the edge repeated."""
+    n = len(values)
+    out = []
+    for i in range(n):
+        window = []
+        for j in range(i - 2, i + 3):
+            j = -j - 1 if j < 0 else j
+            window.append(values[2 * n - 1 - j if j >= n else j])
+        out.append(sorted(window)[2])
+    return out
+
+
+def stable_threshold(level, steepest=0.4, fractions=(0.005, 0.9), run=5):
+    """(slope, threshold) of a level's last stable run, or None."""
+    score = (level - level.min()) / max(level.max() - level.min(), 1e-9)
+    ts = [i / 100 for i in range(1, 100)]
+    means = [float(score[score > t].mean()) if (score > t).any() else 0.0 for t in ts]
+    shares = [float((score > t).mean()) for t in ts]
+
+    def steps(values):
+        out = []
+        for i in range(99):
+            a, b = max(i - 1, 0), min(i + 1, 98)
+            out.append(abs((values[b] - values[a]) / (ts[b] - ts[a])))
+        return median5(out)
+
+    mean_steps, share_steps = steps(means), steps(shares)
+    runs, current = [], []
+    for i in range(99):
+        inside = fractions[0] < shares[i] < fractions[1]
+        if mean_steps[i] < steepest and share_steps[i] < steepest and inside:
+            current.append(i)
+        else:
+            runs, current = [*runs, current], []
+    runs = [one for one in [*runs, current] if len(one) >= run]
+    if not runs:
+        return None
+    last = runs[-1]
+    return float(np.mean([mean_steps[i] for i in last])), ts[last[(len(last) - 1) // 2]]
+
+
+def stable_mask(found, **options):
+    best, level = None, 0
+    for i, one in enumerate(found):
+        run = stable_threshold(one, **options)
+        if run is not None and (best is None or run[0] < best[0]):
+            best, level = run, i
+    if best is None:
+        level = int(np.argmax([one.max() for one in found]))
+    threshold = 0.5 if best is None else best[1]
+    score = (found[level] - found[level].min()) / max(found[level].max() - found[level].min(), 1e-9)
+    return score > threshold, level, threshold
