@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -81,6 +81,23 @@ def label_view(method: Method, view: View, text: Tensor, level: int = 0) -> Tens
     if isinstance(method, Labeller):
         return method.labels(view, text)
     return best_labels(method.cosines(view, text)[level])
+
+
+def annotated(views: Sequence[View], stems: Iterable[str]) -> list[View]:
+    """The views that have ground truth, in their order.
+
+    Raises:
+        ValueError: if a picture with ground truth has no view.
+    """
+    wanted = set(stems)
+    found = [view for view in views if view.stem in wanted]
+    missing = sorted(wanted - {view.stem for view in found})
+    if missing or not found:
+        raise ValueError(
+            f"views: expected one for each of {len(wanted)} pictures with ground truth, got none for "
+            f"{', '.join(missing[:3]) or 'any'}{' ...' if len(missing) > 3 else ''}; pass views with these stems"
+        )
+    return found
 
 
 class FieldMethod:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -111,6 +111,12 @@ def make_report(protocol: Any, method: str, scores: Mapping[str, float], rows: l
         options=options,
         changed=changed,
     )
+
+
+def mean(values: Iterable[float]) -> float:
+    """The plain mean; NaN of nothing."""
+    listed = list(values)
+    return sum(listed) / len(listed) if listed else math.nan
 
 
 def plain(value: Any) -> Any:
