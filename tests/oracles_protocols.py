@@ -277,3 +277,33 @@ def stable_mask(found, **options):
     threshold = 0.5 if best is None else best[1]
     score = (found[level] - found[level].min()) / max(found[level].max() - found[level].min(), 1e-9)
     return score > threshold, level, threshold
+
+
+def vote_nearest(points, means, labels, count=25):
+    out = []
+    for point in points:
+        votes = {}
+        for i in nearest(means, point, count):
+            votes[labels[i]] = votes.get(labels[i], 0) + 1
+        out.append(min(votes, key=lambda c: (-votes[c], c == -1, c)))
+    return np.array(out)
+
+
+def scenesplat(pred, gt, classes, dropped):
+    """f-mIoU, f-mAcc, mIoU, mAcc and accuracy; gt -1 is not scored."""
+    ious, recalls = {}, {}
+    for c, name in enumerate(classes):
+        both = sum(p == c and g == c for p, g in zip(pred, gt, strict=True))
+        either = sum((p == c or g == c) and g >= 0 for p, g in zip(pred, gt, strict=True))
+        true = sum(g == c for g in gt)
+        if true:
+            ious[name], recalls[name] = both / either, both / true
+    front = [name for name in ious if name not in dropped]
+    scored = [(p, g) for p, g in zip(pred, gt, strict=True) if g >= 0]
+    return (
+        np.mean([ious[n] for n in front]),
+        np.mean([recalls[n] for n in front]),
+        np.mean(list(ious.values())),
+        np.mean(list(recalls.values())),
+        np.mean([p == g for p, g in scored]),
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -111,6 +111,30 @@ def make_report(protocol: Any, method: str, scores: Mapping[str, float], rows: l
         options=options,
         changed=changed,
     )
+
+
+def average(reports: Sequence[Report]) -> Report:
+    """The plain mean of a protocol's scores over several scenes, as published tables have it; one row for each scene.
+
+    Args:
+        reports: of one method, protocol and options. The row of a report is named by its digest "scene", or counted.
+
+    Raises:
+        ValueError: if there is none, or protocols, options or methods differ.
+    """
+    if not reports:
+        raise ValueError("reports: expected at least one, got none; score some scenes")
+    first = reports[0]
+    for i, report in enumerate(reports):
+        for name in ("protocol", "options", "method"):
+            if getattr(report, name) != getattr(first, name):
+                raise ValueError(
+                    f"reports[{i}]: expected the {name} of the first, {getattr(first, name)!r}, got "
+                    f"{getattr(report, name)!r}; score all scenes alike"
+                )
+    rows = [{"scene": report.digests.get("scene", i), **report.scores} for i, report in enumerate(reports)]
+    scores = {name: mean(report.scores[name] for report in reports) for name in first.scores}
+    return replace(first, scores=scores, rows=tuple(rows), digests={}, command="")
 
 
 def mean(values: Iterable[float]) -> float:

@@ -6,7 +6,7 @@ from typing import ClassVar
 import pytest
 import torch
 
-from kfgs.evaluation import LabelTruth, MaskAndBoxes, MaskTruth, PointTruth, Report
+from kfgs.evaluation import LabelTruth, MaskAndBoxes, MaskTruth, PointTruth, Report, average
 from kfgs.evaluation.report import make_report, plain
 
 
@@ -73,3 +73,14 @@ def test_truths_check_their_shapes():
         PointTruth(torch.zeros(3, 3), torch.zeros(2).long(), {1: "wall"})
     frames = {s: {t: MaskAndBoxes(torch.ones(2, 3).bool()) for t in ts} for s, ts in {"a": "yx", "b": "xz"}.items()}
     assert MaskTruth(frames).texts == ("y", "x", "z")
+
+
+def test_scenes_are_averaged_alike():
+    one, two = (make_report(Example(), "kfgs", {"mIoU": v, "acc": v / 2}, []) for v in (0.2, 0.6))
+    both = average([one.of(digests={"scene": "ramen"}), two])
+    assert both.scores == pytest.approx({"mIoU": 0.4, "acc": 0.2})
+    assert [row["scene"] for row in both.rows] == ["ramen", 1]
+    with pytest.raises(ValueError, match="expected the options of the first"):
+        average([one, make_report(Example(threshold=0.1), "kfgs", {"mIoU": 0.2}, [])])
+    with pytest.raises(ValueError, match="expected at least one, got none"):
+        average([])
