@@ -9,7 +9,7 @@ from typing import Any
 
 from .._check import check_choice
 
-FILES = ("ade20k", "legaussians", "lerf_ovs", "scannet", "scenesplat")
+FILES = ("ade20k", "legaussians", "legaussians_views", "lerf_ovs", "scannet", "scenesplat")
 
 
 @cache

@@ -10,16 +10,15 @@ import torch
 from messages import tells
 from PIL import Image
 
-from kfgs.evaluation import MaskTruth
+from kfgs.evaluation import MaskTruth, load_classes
 from kfgs.evaluation.datasets import (
-    LEGAUSSIANS_SCENES,
-    LERF_OVS_FRAMES,
-    LERF_OVS_TEXTS,
     load_3dovs,
     load_legaussians,
     load_lerf_ovs,
 )
 
+FRAMES = load_classes("lerf_ovs")["frames"]
+LEGAUSSIANS = load_classes("legaussians") | load_classes("legaussians_views")
 SQUARE = [[2, 1], [5, 1], [5, 3], [2, 3]]
 
 
@@ -31,7 +30,7 @@ def _lerf(folder: Path, scene: str = "ramen", objects: list[dict] | None = None)
     labels = folder / "label" / scene
     labels.mkdir(parents=True, exist_ok=True)
     objects = [_object("egg", SQUARE), _object("sake cup", [[7, 7], [9, 7], [9, 9]])] if objects is None else objects
-    for number in LERF_OVS_FRAMES[scene]:
+    for number in FRAMES[scene]:
         info = {"name": f"frame_{number:05d}.jpg", "width": 12, "height": 10}
         (labels / f"frame_{number:05d}.json").write_text(json.dumps({"info": info, "objects": objects}))
     return labels
@@ -93,10 +92,10 @@ def test_lerf_ovs_that_is_not_whole(tmp_path: Path) -> None:
 
 
 def test_lerf_ovs_tables() -> None:
-    assert {scene: len(frames) for scene, frames in LERF_OVS_FRAMES.items()} == {
+    assert {scene: len(frames) for scene, frames in FRAMES.items()} == {
         "figurines": 4, "ramen": 7, "teatime": 6, "waldo_kitchen": 5,
     }  # fmt: skip
-    assert {scene: len(texts) for scene, texts in LERF_OVS_TEXTS.items()} == {
+    assert {scene: len(texts) for scene, texts in load_classes("lerf_ovs")["texts"].items()} == {
         "figurines": 21, "ramen": 14, "teatime": 14, "waldo_kitchen": 18,
     }  # fmt: skip
 
@@ -160,9 +159,9 @@ def test_3dovs_that_is_not_whole(tmp_path: Path) -> None:
 
 
 def _legaussians(folder: Path, scene: str = "kitchen") -> Path:
-    entry = LEGAUSSIANS_SCENES[scene]
-    for i, view in enumerate(entry.views):
-        _mask(folder / scene / "segmentations" / view / f"{entry.texts[i % len(entry.texts)]}.png", (1, 2, 3, 4))
+    texts = LEGAUSSIANS[scene]
+    for i, view in enumerate(LEGAUSSIANS["views"][scene]):
+        _mask(folder / scene / "segmentations" / view / f"{texts[i % len(texts)]}.png", (1, 2, 3, 4))
     return folder / scene
 
 
@@ -171,7 +170,7 @@ def test_legaussians(tmp_path: Path) -> None:
     _mask(folder / "segmentations/DSCF0660/Wood plat.png", (0, 0, 12, 10))
     _mask(folder / "segmentations/DSCF9999/Wood plat.png", (0, 0, 12, 10))
     truth = load_legaussians(folder)
-    assert tuple(truth.frames) == LEGAUSSIANS_SCENES["kitchen"].views
+    assert list(truth.frames) == LEGAUSSIANS["views"]["kitchen"]
     assert list(truth.frames["DSCF0660"]) == ["LEGO Technic 856 Bulldozer", "Wood plat"]
     assert bool(truth.frames["DSCF0660"]["Wood plat"].mask.all())
     assert len(load_legaussians(tmp_path, "kitchen").frames) == 28
@@ -192,9 +191,17 @@ def test_legaussians_that_is_not_whole(tmp_path: Path) -> None:
 
 
 def test_the_numbers_of_legaussians_views() -> None:
-    assert {scene: len(entry.views) for scene, entry in LEGAUSSIANS_SCENES.items()} == {
+    assert {scene: len(views) for scene, views in LEGAUSSIANS["views"].items()} == {
         "bicycle": 19, "bonsai": 29, "counter": 24, "garden": 18, "kitchen": 28, "room": 19,
     }  # fmt: skip
-    for entry in LEGAUSSIANS_SCENES.values():
-        assert len(set(entry.views)) == len(entry.views)
-        assert all(re.fullmatch(r"(_DSC|DSCF)\d{4}|DSC\d{5}", view) for view in entry.views)
+    for views in LEGAUSSIANS["views"].values():
+        assert len(set(views)) == len(views)
+        assert all(re.fullmatch(r"(_DSC|DSCF)\d{4}|DSC\d{5}", view) for view in views)
+    assert LEGAUSSIANS["codes"] == {
+        "bicycle": 128,
+        "bonsai": 64,
+        "counter": 128,
+        "garden": 128,
+        "kitchen": 32,
+        "room": 128,
+    }

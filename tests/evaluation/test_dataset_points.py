@@ -9,10 +9,8 @@ from meshes import QUADS, XYZ, write_mesh
 from messages import tells
 from PIL import Image
 
+from kfgs.evaluation import load_classes
 from kfgs.evaluation.datasets import (
-    NYU40,
-    SCANNET_CLASSES,
-    SCANNET_SCENES,
     load_replica_points,
     load_scannet_points,
     load_semantic_nerf_labels,
@@ -65,18 +63,12 @@ def test_scannet_points_that_are_not_whole(tmp_path: Path) -> None:
 
 
 def test_scannet_tables() -> None:
-    assert [len(SCANNET_CLASSES[count]) for count in (19, 15, 10)] == [19, 15, 10]
-    assert set(SCANNET_CLASSES[10]) < set(SCANNET_CLASSES[15]) < set(SCANNET_CLASSES[19])
-    assert [NYU40[i] for i in SCANNET_CLASSES[10]] == [
+    lists = load_classes("scannet")
+    assert set(lists["10"]) < set(lists["15"]) < set(lists["19"])
+    assert [lists["names"][str(i)] for i in lists["10"]] == [
         "wall", "floor", "bed", "chair", "sofa", "table", "door", "window", "bookshelf", "toilet",
     ]  # fmt: skip
-    assert (len(NYU40), len(SCANNET_SCENES), NYU40[24], NYU40[36], NYU40[40]) == (
-        40,
-        10,
-        "refrigerator",
-        "bathtub",
-        "otherprop",
-    )
+    assert (len(lists["names"]), len(set(lists["scenes"]))) == (40, 10)
 
 
 INFO = {

@@ -2,23 +2,16 @@
 
 from .coco import load_coco_labels, load_coco_masks
 from .label_folder import load_labels
-from .legaussians import LEGAUSSIANS_SCENES, LEGaussiansScene, load_legaussians
-from .lerf_ovs import LERF_OVS_FRAMES, LERF_OVS_TEXTS, load_lerf_ovs
+from .legaussians import load_legaussians
+from .lerf_ovs import load_lerf_ovs
 from .ovs3d import OVS3D_REPORTED, OVS3D_SCENES, load_3dovs
 from .polygons import decode_rle, fill_polygon, fill_region
 from .replica import load_replica_points, load_semantic_nerf_labels
-from .scannet import NYU40, SCANNET_CLASSES, SCANNET_SCENES, load_scannet_points
+from .scannet import load_scannet_points
 
 __all__ = [
-    "LEGAUSSIANS_SCENES",
-    "LERF_OVS_FRAMES",
-    "LERF_OVS_TEXTS",
-    "NYU40",
     "OVS3D_REPORTED",
     "OVS3D_SCENES",
-    "SCANNET_CLASSES",
-    "SCANNET_SCENES",
-    "LEGaussiansScene",
     "decode_rle",
     "fill_polygon",
     "fill_region",

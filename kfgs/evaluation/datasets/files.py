@@ -18,13 +18,17 @@ T = TypeVar("T")
 
 
 class ReadWhenAsked(Mapping[str, T]):
-    """Values by name that are read from disk every time they are asked for, so that few are in memory at once."""
+    """Values by name that are read from disk when they are asked for. Only the last one stays in memory."""
 
     def __init__(self, readers: Mapping[str, Callable[[], T]]) -> None:
         self._readers = dict(readers)
+        self._last: tuple[str, T] | None = None
 
     def __getitem__(self, key: str) -> T:
-        return self._readers[key]()
+        last = self._last  # one read: another thread may change it
+        if last is None or last[0] != key:
+            last = self._last = (key, self._readers[key]())
+        return last[1]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._readers)

@@ -3,6 +3,7 @@
 **Quirks**: a text is whatever the annotators wrote ("dall-e brand", upper and lower case mixed). Several objects of one
 category in a picture are one mask, their union, with a box each. Only texts that a picture's file has are asked there. The
 numbers of the published pictures count from 1. LangSplat, LangSplatV2 and GAGS train on these pictures too.
+`load_classes("lerf_ovs")` has the numbers, and the texts of OpenGaussian's 3-D protocol.
 """
 
 from __future__ import annotations
@@ -15,38 +16,10 @@ import torch
 
 from ..._files import read_json
 from ...scenes.files import natural_key, some
+from ..class_lists import load_classes
 from ..truth import MaskAndBoxes, MaskTruth
 from .files import ReadWhenAsked, find_folder, open_picture
 from .polygons import MOST, fill_polygon, union
-
-LERF_OVS_FRAMES: dict[str, tuple[int, ...]] = {
-    "figurines": (41, 105, 152, 195),
-    "ramen": (6, 24, 60, 65, 81, 119, 128),
-    "teatime": (2, 25, 43, 107, 129, 140),
-    "waldo_kitchen": (53, 66, 89, 140, 154),
-}
-"""The annotated pictures of each scene, `frame_00041` and so on."""
-
-LERF_OVS_TEXTS: dict[str, tuple[str, ...]] = {
-    "figurines": (
-        "jake", "pirate hat", "pikachu", "rubber duck with hat", "porcelain hand", "red apple", "tesla door handle", "waldo",
-        "bag", "toy cat statue", "miffy", "green apple", "pumpkin", "rubics cube", "old camera", "rubber duck with buoy",
-        "red toy chair", "pink ice cream", "spatula", "green toy chair", "toy elephant",
-    ),
-    "ramen": (
-        "nori", "sake cup", "kamaboko", "corn", "spoon", "egg", "onion segments", "plate", "napkin", "bowl", "glass of water",
-        "hand", "chopsticks", "wavy noodles",
-    ),
-    "teatime": (
-        "sheep", "yellow pouf", "stuffed bear", "coffee mug", "tea in a glass", "apple", "coffee", "hooves", "bear nose",
-        "dall-e brand", "plate", "paper napkin", "three cookies", "bag of cookies",
-    ),
-    "waldo_kitchen": (
-        "Stainless steel pots", "dark cup", "refrigerator", "frog cup", "pot", "spatula", "plate", "spoon", "toaster",
-        "ottolenghi", "plastic ladle", "sink", "ketchup", "cabinet", "red cup", "pour-over vessel", "knife", "yellow desk",
-    ),
-}  # fmt: skip
-"""The texts of the 3-D protocol of OpenGaussian (`lerf-ovs-3d/1`): the scene's list, whatever a picture shows."""
 
 
 def load_lerf_ovs(path: str | Path, scene: str | None = None) -> MaskTruth:
@@ -72,7 +45,11 @@ def load_lerf_ovs(path: str | Path, scene: str | None = None) -> MaskTruth:
     folder = find_folder(places, "*.json") if scene or not (path / "label").is_dir() else _one_scene(path)
     files = sorted(folder.glob("*.json"), key=lambda file: natural_key(file.name))
     stems = {file.stem for file in files}
-    missing = [f"frame_{n:05d}" for n in LERF_OVS_FRAMES.get(folder.name, ()) if f"frame_{n:05d}" not in stems]
+    missing = [
+        f"frame_{n:05d}"
+        for n in load_classes("lerf_ovs")["frames"].get(folder.name, ())
+        if f"frame_{n:05d}" not in stems
+    ]
     if missing:
         raise FileNotFoundError(
             f"{folder}: expected labels of all published pictures of {folder.name}, {some(missing)} missing; download the "

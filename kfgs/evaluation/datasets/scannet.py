@@ -1,4 +1,4 @@
-"""ScanNet's labelled vertices, and the scenes and classes of OpenGaussian's protocol."""
+"""ScanNet's labelled vertices. The scenes and classes of OpenGaussian's protocol are data: `load_classes("scannet")`."""
 
 from __future__ import annotations
 
@@ -11,33 +11,8 @@ from torch import Tensor
 
 from ..._files import read_json
 from ...formats.ply import points_from_columns, read_ply
+from ..class_lists import load_classes
 from ..truth import PointTruth
-
-NYU40 = dict(
-    enumerate(
-        (
-            "wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "bookshelf", "picture", "counter",
-            "blinds", "desk", "shelves", "curtain", "dresser", "pillow", "mirror", "floormat", "clothes", "ceiling", "books",
-            "refrigerator", "television", "paper", "towel", "showercurtain", "box", "whiteboard", "person", "nightstand",
-            "toilet", "sink", "lamp", "bathtub", "bag", "otherstructure", "otherfurniture", "otherprop",
-        ),
-        start=1,
-    )
-)  # fmt: skip
-"""Names of the ids; 0 is unlabelled."""
-
-SCANNET_SCENES = (
-    "scene0000_00", "scene0062_00", "scene0070_00", "scene0097_00", "scene0140_00", "scene0200_00", "scene0347_00",
-    "scene0400_00", "scene0590_00", "scene0645_00",
-)  # fmt: skip
-"""The ten scenes of OpenGaussian's protocol. Several papers use eight or nine of them."""
-
-SCANNET_CLASSES = {
-    19: (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16, 24, 28, 33, 34, 36),
-    15: (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 33, 34),
-    10: (1, 2, 4, 5, 6, 7, 8, 9, 10, 33),
-}
-"""The ids of the three class sets; their texts are those of `NYU40` without a template ("showercurtain" is one word)."""
 
 LABELS = "_vh_clean_2.labels.ply"
 
@@ -68,7 +43,8 @@ def load_scannet_points(path: str | Path) -> PointTruth:
     if not bool(((labels >= 1) & (labels <= 40)).any()):
         got = labels.unique()[:5].tolist()
         raise ValueError(f"{file}: expected NYU40 ids of 1 to 40, got only {got}; are these labels of another table?")
-    return PointTruth(points_from_columns(columns), labels, NYU40, _instances(file, len(labels)))
+    names = {int(number): name for number, name in load_classes("scannet")["names"].items()}
+    return PointTruth(points_from_columns(columns), labels, names, _instances(file, len(labels)))
 
 
 def _find(path: Path) -> Path:
