@@ -8,6 +8,7 @@ from .ovs3d import OVS3D_REPORTED, OVS3D_SCENES, load_3dovs
 from .polygons import decode_rle, fill_polygon, fill_region
 from .replica import load_replica_points, load_semantic_nerf_labels
 from .scannet import load_scannet_points
+from .views import truth_views
 
 __all__ = [
     "OVS3D_REPORTED",
@@ -24,4 +25,5 @@ __all__ = [
     "load_replica_points",
     "load_scannet_points",
     "load_semantic_nerf_labels",
+    "truth_views",
 ]
