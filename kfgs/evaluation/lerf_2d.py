@@ -38,32 +38,31 @@ def activate(
     relevancy: Tensor,  # [levels, H, W]
     threshold: float = 0.4,
     filter: Filter = "langsplat",
+    smoothed: Tensor | None = None,  # [levels, H, W]
 ) -> Activated:
     """Masks of a text as LangSplat makes them (`activate_stream`), and the level that it chooses.
 
     The relevancy is blended half and half with its box mean. It is stretched by its minimum and maximum in each level, cut
     at `threshold`, and cleaned by a 7 x 7 majority. The level is chosen by the maximum before stretching; a tie goes to
-    the first.
+    the first. `smoothed` is the box mean, if it is known already.
     """
-    blended = 0.5 * (smooth_relevancy(relevancy, filter) + relevancy)
+    blended = 0.5 * ((smooth_relevancy(relevancy, filter) if smoothed is None else smoothed) + relevancy)
     masks = clean_mask(stretch(blended) > threshold, filter)
     return Activated(masks, int(blended.amax((-2, -1)).argmax()))
 
 
 def localise(
-    relevancy: Tensor,  # [levels, H, W]
+    smoothed: Tensor,  # [levels, H, W] `smooth_relevancy` of a text
     boxes: Tensor,  # [B, 4] x1, y1, x2, y2 in pixels
-    filter: Filter = "langsplat",
 ) -> bool:
     """Whether the largest smoothed relevancy lies in one of the boxes (`lerf_localization`).
 
     Of all levels the one with the largest smoothed value counts, and all pixels that attain it; one inside a box (its edges
     included) is enough.
     """
-    smoothed = smooth_relevancy(relevancy, filter)
     level = smoothed[int(smoothed.amax((-2, -1)).argmax())]
     y, x = (level == level.max()).nonzero().T[:, :, None]  # [n, 1] each
-    x1, y1, x2, y2 = boxes.to(relevancy).T  # [B] each
+    x1, y1, x2, y2 = boxes.to(smoothed).T  # [B] each
     return bool(((x >= x1) & (x <= x2) & (y >= y1) & (y <= y2)).any())
 
 
@@ -123,11 +122,12 @@ class LerfOvs2D:
     def _pair(self, relevancy: Tensor, mask: Tensor, boxes: Tensor | None) -> Row:
         fixed = isinstance(self.level, int)
         seen = relevancy[[self.level]] if fixed else relevancy
-        masks, level = activate(seen, self.threshold, self.filter)
+        smoothed = smooth_relevancy(seen, self.filter)
+        masks, level = activate(seen, self.threshold, self.filter, smoothed)
         ious = [mask_iou(one, mask) for one in masks]
         if self.level == "oracle":
             level = ious.index(max(ious))
-        hit = None if boxes is None or len(boxes) == 0 else localise(seen, boxes, self.filter)
+        hit = None if boxes is None or len(boxes) == 0 else localise(smoothed, boxes)
         return {"level": self.level if fixed else level, "IoU": ious[level], "hit": hit}
 
 

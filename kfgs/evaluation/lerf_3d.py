@@ -70,6 +70,8 @@ class LerfOvs3D:
         "mask; mean over (frame, text) pairs; Acc@t = share of the pairs with an IoU above t, strictly"
     )
 
+    always: ClassVar[tuple[str, ...]] = ("selection", "threshold", "silhouette")
+
     selection: Literal["argmax", "smoothed", "relevancy"] = "argmax"
     """"argmax": each Gaussian belongs to the most similar text of the scene. "smoothed" (VALA): relevancy, averaged half and half
     with its 10 nearest Gaussians, stretched by minimum and maximum, above `threshold`. "relevancy" (Dr.Splat's demo):

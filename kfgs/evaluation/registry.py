@@ -33,7 +33,7 @@ _TYPES: tuple[Any, ...] = (
     OVS3DStability,
     SceneSplatBench,
 )
-PROTOCOLS: dict[str, Any] = {protocol.name: protocol for protocol in _TYPES}
+PROTOCOLS: dict[str, type] = {protocol.name: protocol for protocol in _TYPES}
 """Frozen dataclasses by `name`; their fields are options, with the published behaviour as default. `docs/protocols.md`."""
 
 
@@ -52,7 +52,8 @@ def get_protocol(name: str, **options: Any) -> Any:
         >>> get_protocol("lerf-ovs-2d", threshold=0.5).threshold
         0.5
     """
-    found = PROTOCOLS.get(name) or next((one for key, one in PROTOCOLS.items() if key.partition("/")[0] == name), None)
+    named = (one for key, one in PROTOCOLS.items() if name in (key, key.partition("/")[0]))
+    found: Any = next(named, None)
     if found is None:
         near = difflib.get_close_matches(name, PROTOCOLS, n=3, cutoff=0.4)
         hint = f"; did you mean {' or '.join(near)}?" if near else ""

@@ -33,6 +33,8 @@ class Report:
     """The protocol's options, plain values."""
     changed: tuple[str, ...] = ()
     """Options that are not as published."""
+    always: tuple[str, ...] = ()
+    """Options that are printed even if they are: they move the score so much."""
     digests: Mapping[str, str] = field(default_factory=dict)
     """Of the data and of the field, by name."""
     command: str = ""
@@ -54,10 +56,10 @@ class Report:
         return next(iter(self.scores.values()))
 
     def __str__(self) -> str:
-        """All scores, the protocol, and what differs from it as published."""
+        """All scores, the protocol, and the options that differ from it as published or are always named."""
         numbers = ", ".join(f"{name} {value:.3f}" for name, value in self.scores.items())
-        differs = "".join(f", {name}={self.options[name]}" for name in self.changed)
-        return f"{numbers} ({self.protocol}{differs})"
+        named = [name for name in self.options if name in self.changed or name in self.always]
+        return f"{numbers} ({', '.join([self.protocol, *(f'{name}={_short(self.options[name])}' for name in named)])})"
 
     def __repr__(self) -> str:
         return f"Report({self}, {len(self.rows)} rows)"
@@ -110,6 +112,7 @@ def make_report(protocol: Any, method: str, scores: Mapping[str, float], rows: l
         about=protocol.about,
         options=options,
         changed=changed,
+        always=getattr(protocol, "always", ()),
     )
 
 
@@ -141,6 +144,10 @@ def mean(values: Iterable[float]) -> float:
     """The plain mean; NaN of nothing."""
     listed = list(values)
     return sum(listed) / len(listed) if listed else math.nan
+
+
+def _short(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def plain(value: Any) -> Any:

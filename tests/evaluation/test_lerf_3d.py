@@ -74,6 +74,14 @@ def test_the_whole_protocol_against_loops(name, seed):
     assert report["Acc@0.5"] == np.mean(np.array(ious) > 0.5)
 
 
+def test_both_thresholds_are_printed():
+    method, truth, views = _scene()
+    said = str(LerfOvs3D.vala().score(method, truth, views, method.encode))
+    assert said.endswith("(lerf-ovs-3d/1, selection=smoothed, threshold=0.6, silhouette=0.0392)")
+    said = str(LerfOvs3D().score(method, truth, views, method.encode))
+    assert said.endswith("(lerf-ovs-3d/1, selection=argmax, threshold=0.6, silhouette=0.7)")
+
+
 def test_accuracy_is_strict_by_hand():
     assert share_above([0.25, 0.26], 0.25) == 0.5
     assert np.isnan(share_above([], 0.5))

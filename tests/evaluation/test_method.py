@@ -4,9 +4,22 @@ import torch
 import torch.nn.functional as F
 
 from kfgs import Camera, Gaussians
-from kfgs.evaluation import FieldMethod, Labeller, Method, TeacherMethod, View, best_labels, label_view
+from kfgs.evaluation import (
+    FieldMethod,
+    Labeller,
+    LabelTruth,
+    MaskAndBoxes,
+    MaskTruth,
+    Method,
+    TeacherMethod,
+    View,
+    best_labels,
+    get_protocol,
+    label_view,
+)
 from kfgs.features import FeatureFolder, save_feature_map
 from kfgs.fields import SemanticField
+from kfgs.labels.scores import CANONICAL
 from kfgs.quant import Autoencoder, Codebook, LinearLatents
 
 DIM = 6
@@ -95,3 +108,21 @@ def test_ties_and_unknown_places():
     nan = float("nan")
     cosines = torch.tensor([[[0.5, 0.5, 0.1]], [[nan, nan, nan]], [[nan, -0.2, nan]]])
     assert best_labels(cosines).tolist() == [[0], [-1], [1]]
+
+
+@pytest.mark.parametrize("name", ["kfgs-pooled", "lerf-ovs-2d", "lerf-ovs-3d", "3dovs-closed", "legaussians-mip360"])
+def test_a_field_goes_through_a_whole_protocol(name):
+    """The truth is what the field shows of three classes, so argmax scores are perfect and the others are near it."""
+    field = _field("fused")
+    rows = torch.eye(DIM)[:3]
+    negatives = -torch.ones(4, DIM)
+    table = dict(zip(["a", "b", "c", *CANONICAL], [*rows, *negatives], strict=True))
+    labels = field.segment(VIEW.camera, rows)
+    masks = {text: MaskAndBoxes(labels == i, torch.tensor([[0.0, 0, 39, 15]])) for i, text in enumerate("abc")}
+    truth = LabelTruth(("a", "b", "c"), {"a": labels}) if name == "kfgs-pooled" else MaskTruth({"a": masks})
+    options = {"silhouette": 0.04} if name == "lerf-ovs-3d" else {}  # small balls are nowhere opaque
+    report = get_protocol(name, **options).score(
+        FieldMethod(field), truth, [VIEW], lambda texts: torch.stack([table[text] for text in texts])
+    )
+    assert report.value == 1 if name in ("kfgs-pooled", "3dovs-closed") else 0 < report.value <= 1
+    assert report.method == "kfgs fused"
