@@ -119,6 +119,8 @@ def _advice(path: Path) -> str:
     inside = [folder.name for folder in folders[:100] if _is_scene(folder)]
     if inside:
         return f"it holds scenes ({some(inside)}): give one of them, as in {path / inside[0]}"
+    if _is_scene(path.resolve().parent):
+        return f"the folder above is a scene: give {path.resolve().parent}"
     return "estimate the cameras first: `kfgs sfm <images> <scene>` or kfgs.scenes.run_sfm"
 
 

@@ -74,6 +74,8 @@ def test_replica_that_is_not_whole(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=tells("it holds scenes (room0)", "room0")):
         load_scene(_nice_slam(tmp_path).parent)
     folder = tmp_path / "room0"
+    with pytest.raises(SceneError, match=tells("results", "the folder above is a scene", folder)):
+        load_scene(folder / "results")
     lines = (folder / "traj.txt").read_text().splitlines()
     (folder / "traj.txt").write_text("\n".join(lines[:2]))
     with pytest.raises(SceneError, match=tells("traj.txt", "2 lines", "numbers up to 2", "copy the whole folder")):

@@ -74,8 +74,8 @@ def read_mask(path: Path) -> Tensor:  # [H, W] bool
     return torch.from_numpy(grey >= 1 if grey.max(initial=0) == 1 else grey >= 128)
 
 
-def find_folder(places: Sequence[Path], holds: str) -> Path:
-    """The first place that has a file of this pattern.
+def find_folder(places: Sequence[Path], holds: str, what: str) -> Path:
+    """The first place that has a file of this pattern; `what` is for the message.
 
     Raises:
         FileNotFoundError: if none has; the message names them.
@@ -85,7 +85,7 @@ def find_folder(places: Sequence[Path], holds: str) -> Path:
             return place
     tried = some([str(place) for place in dict.fromkeys(places)])
     raise FileNotFoundError(
-        f"{places[0]}: expected {holds} there, found none (looked in {tried}); give the right folder"
+        f"{places[0]}: expected {what} ({holds}) there, found none (looked in {tried}); give the right folder"
     )
 
 

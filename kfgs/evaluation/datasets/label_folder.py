@@ -16,7 +16,7 @@ from ...scenes.files import file_stem, list_images, some
 from ..truth import LabelTruth
 from .coco import load_coco_labels
 from .files import ReadWhenAsked, read_pixels
-from .replica import relabel
+from .replica import ids_in, relabel
 
 VOID_NAMES = ("void", "unlabeled", "unlabelled", "unknown", "ignore")
 """Names in a table whose pixels are void: they are not scored."""
@@ -149,14 +149,15 @@ def _read_ids(file: Path, index: Mapping[int, int], table: Path) -> Tensor:  # [
             f"{file}: expected class ids in one channel, as {table} has ids, got {ids.shape[-1]} channels; give a table of "
             "colours, or write ids"
         )
-    _check_known(file, [(int(i),) for i in np.unique(ids)], [(i,) for i in index], table, "id")
-    return relabel(ids.astype(np.int64), index)
+    whole = ids.astype(np.int64)
+    _check_known(file, [(i,) for i in ids_in(whole)], [(i,) for i in index], table, "id")
+    return relabel(whole, index)
 
 
 def _read_colors(file: Path, index: Mapping[tuple[int, int, int], int], table: Path) -> Tensor:  # [H, W] int64
     packed = _packed(read_pixels(file, "a coloured label picture", "RGB").astype(np.int64))
     by_number = {(r << 16) | (g << 8) | b: label for (r, g, b), label in index.items()}
-    colors = [(int(i) >> 16, int(i) >> 8 & 255, int(i) & 255) for i in np.unique(packed)]
+    colors = [(i >> 16, i >> 8 & 255, i & 255) for i in ids_in(packed)]
     _check_known(file, colors, list(index), table, "colour")
     return relabel(packed, by_number)
 

@@ -35,7 +35,7 @@ def load_legaussians(path: str | Path, scene: str | None = None) -> MaskTruth:
     path = Path(path)
     base = path.parent if path.name == "segmentations" else path
     base = base / scene if scene and base.name != scene else base
-    folder = find_folder([base / "segmentations", base], "*/*.png")
+    folder = find_folder([base / "segmentations", base], "*/*.png", "masks of LEGaussians")
     views = {f.name: f for f in sorted(folder.iterdir(), key=lambda f: natural_key(f.name)) if f.is_dir()}
     known: list[str] = load_classes("legaussians_views")["views"].get(base.name, [])
     if known:

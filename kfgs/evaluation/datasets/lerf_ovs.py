@@ -42,7 +42,11 @@ def load_lerf_ovs(path: str | Path, scene: str | None = None) -> MaskTruth:
     path = Path(path)
     root = path / scene if scene else path
     places = [root, root.parent / "label" / root.name, root / "label"]
-    folder = find_folder(places, "*.json") if scene or not (path / "label").is_dir() else _one_scene(path)
+    folder = (
+        find_folder(places, "*.json", "labels of LERF-OVS")
+        if scene or not (path / "label").is_dir()
+        else _one_scene(path)
+    )
     files = sorted(folder.glob("*.json"), key=lambda file: natural_key(file.name))
     stems = {file.stem for file in files}
     missing = [

@@ -18,6 +18,7 @@ from ..truth import LabelTruth, PointTruth
 from .files import ReadWhenAsked, read_pixels
 
 INFO = "info_semantic.json"
+TABLE = 1 << 16  # ids below it are looked up in a table, as those of pictures with one channel are
 
 
 def load_replica_points(path: str | Path) -> PointTruth:
@@ -85,7 +86,7 @@ def load_semantic_nerf_labels(path: str | Path, info: str | Path | None = None) 
             f"{places[0]}: no such file; expected Replica's {INFO} of the scene, which names the classes; pass info=PATH"
         )
     named, _ = read_replica_info(found)
-    seen = sorted({int(i) for file in files for i in np.unique(_ids(file))} & {i for i in named if i > 0})
+    seen = sorted({i for file in files for i in ids_in(_ids(file))} & {i for i in named if i > 0})
     if not seen:
         raise ValueError(
             f"{folder}: expected class ids of {found}, none of {len(files)} pictures shows one; is it this scene's?"
@@ -123,9 +124,22 @@ def read_replica_info(path: Path) -> tuple[dict[int, str], dict[int, int]]:
 
 def relabel(ids: np.ndarray[tuple[int, ...], np.dtype[np.int64]], index: Mapping[int, int]) -> Tensor:  # [H, W] int64
     """Indices for ids; -1 for ids that have none."""
+    if 0 <= int(ids.min(initial=0)) <= int(ids.max(initial=0)) < TABLE:  # five times faster than sorting the pixels
+        table = np.full(int(ids.max(initial=0)) + 1, -1, np.int64)
+        for i in index:
+            if i < len(table):
+                table[i] = index[i]
+        return torch.from_numpy(table[ids])
     unique, inverse = np.unique(ids, return_inverse=True)
-    table = np.array([index.get(int(i), -1) for i in unique], dtype=np.int64)
-    return torch.from_numpy(table[inverse.reshape(ids.shape)])
+    labels = np.array([index.get(int(i), -1) for i in unique], dtype=np.int64)
+    return torch.from_numpy(labels[inverse.reshape(ids.shape)])
+
+
+def ids_in(ids: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> list[int]:
+    """The ids that occur, ascending."""
+    if 0 <= int(ids.min(initial=0)) <= int(ids.max(initial=0)) < TABLE:
+        return [int(i) for i in np.bincount(ids.reshape(-1)).nonzero()[0]]
+    return [int(i) for i in np.unique(ids)]
 
 
 def _read_ids(file: Path, index: Mapping[int, int]) -> Tensor:  # [H, W] int64

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..._files import read_json
 from ...formats.ply import points_from_columns, read_ply
+from ...scenes.files import some
 from ..class_lists import load_classes
 from ..truth import PointTruth
 
@@ -36,7 +37,7 @@ def load_scannet_points(path: str | Path) -> PointTruth:
     columns = read_ply(file)
     if "label" not in columns:
         raise ValueError(
-            f"{file}: expected a vertex property 'label' (NYU40 ids), got {', '.join(columns)}; give the mesh whose name ends "
+            f"{file}: expected a vertex property 'label' (NYU40 ids), got {some(list(columns))}; give the mesh whose name ends "
             f"in {LABELS}, not the one with colours only"
         )
     labels = torch.from_numpy(columns["label"].astype(np.int64))
