@@ -21,6 +21,7 @@ from kfgs.evaluation.foreign import (
     load_occam,
     load_splat_features,
 )
+from kfgs.formats import read_splats
 from kfgs.formats.ply import write_ply
 from kfgs.gaussians import Gaussians
 from kfgs.splat import rasterize
@@ -313,6 +314,19 @@ def test_files_that_are_missing_or_of_another_program(tmp_path: Path) -> None:
     _ply(tmp_path / "leg/point_cloud/iteration_30000/point_cloud.ply", _semantic(_random(N, 8), "clip_f_indices_"))
     with pytest.raises(ValueError, match=tells("codebook.pt", "[5, 512 or more]", "[5, 14]")):
         load_legaussians_field(tmp_path / "leg", tmp_path / "leg/codebook.pt")
+
+
+def test_a_real_splat_without_and_with_features(tmp_path: Path, shared_data: Path) -> None:
+    ply = shared_data / "splats/inria_9080.ply"
+    with pytest.raises(ValueError, match=tells("inria_9080.ply", "semantic_0", "trained with features")):
+        load_feature3dgs(ply)
+    count = len(read_splats(ply).gaussians)
+    values = _random(count, 6)
+    np.save(tmp_path / "lang.npy", values.numpy())
+    method = load_splat_features(ply, tmp_path / "lang.npy")
+    text = _random(K, 6, seed=5)
+    expected = _cosine(values.numpy(), text.double().numpy())
+    np.testing.assert_allclose(method.gaussian_cosines(text)[0].numpy(), expected, atol=2e-5)
 
 
 def test_nothing_in_a_checkpoint_is_run(tmp_path: Path) -> None:

@@ -59,6 +59,28 @@ def test_replica_of_nice_slam(tmp_path: Path) -> None:
     assert scene.colors.shape == (3 * 48 * 64, 3)
 
 
+def test_a_real_room_in_the_layout_of_nice_slam(tmp_path: Path, shared_data: Path) -> None:
+    room = load_scene(shared_data / "room_0")
+    chosen = list(range(0, 180, 45))
+    (tmp_path / "results").mkdir()
+    lines = []
+    for number, i in enumerate(chosen):
+        with Image.open(room.image_paths[i]) as picture:
+            picture.convert("RGB").save(tmp_path / f"results/frame{number:06d}.jpg")
+        lines.append(_line(torch.linalg.inv(room.cameras[i].viewmat.double()).numpy()))
+    (tmp_path / "traj.txt").write_text("\n".join(lines))
+    K, (height, width) = room.cameras[0].K, room.cameras[0].size
+    camera = {"w": width, "h": height, "fx": float(K[0, 0]), "fy": float(K[1, 1])}
+    camera |= {"cx": float(K[0, 2]) - 0.5, "cy": float(K[1, 2]) - 0.5, "scale": 6553.5}
+    (tmp_path / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    scene = load_scene(tmp_path)
+    for number, i in enumerate(chosen):
+        torch.testing.assert_close(scene.cameras[number].viewmat, room.cameras[i].viewmat, atol=1e-5, rtol=0)
+        torch.testing.assert_close(scene.cameras[number].K, room.cameras[i].K)
+    assert len(scene.points) == 0
+    assert any("no points" in note for note in scene.notes)
+
+
 def test_a_subset_of_the_frames_keeps_its_poses(tmp_path: Path) -> None:
     folder = _nice_slam(tmp_path)
     far = POSE.copy()

@@ -14,7 +14,7 @@ from .splatted import Level, SplattedMethod
 
 
 def load_feature3dgs(run: str | Path, step: int | None = None, *, decoder: str | Path | None = None) -> SplattedMethod:
-    """Read a run of Feature 3DGS, or of DF-3DGS's fork of it that keeps features as they are.
+    """Read a run of Feature 3DGS. The 512-channel PLY of DF-3DGS has the same columns, without colours.
 
     `RUN/point_cloud/iteration_30000/point_cloud.ply`, and `RUN/decoder_chkpnt30000.pth` if there is one. A PLY alone will
     do, too. The convolution has a bias, so a Gaussian's feature is that of its value alone, decoded.
