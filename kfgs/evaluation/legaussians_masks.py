@@ -13,7 +13,7 @@ from .._check import check_range
 from ..cameras import resize_labels
 from ..labels.scores import CANONICAL, TEMPERATURE
 from .lerf_2d import relevancies
-from .method import Method, View, annotated
+from .method import Method, View, annotated, check_level
 from .relevancy import Encode
 from .report import Report, Row, make_report, mean
 from .truth import MaskTruth
@@ -91,16 +91,16 @@ class LEGaussiansMasks:
         Raises:
             ValueError: if a picture has no view.
         """
+        check_level(method, self.level)
         rows: list[Row] = []
         for view in annotated(views, truth.frames):
             asked = truth.frames[view.stem]
             if not asked:
                 continue
-            found = relevancies(method, view, tuple(asked), encode, self.negatives, self.scale)
             each = []
-            for text, (mask, _) in asked.items():
-                seen = found[text][self.level].cpu()
-                known = resize_labels(mask.long().cpu(), view.camera.size).bool()
+            for text, found in relevancies(method, view, tuple(asked), encode, self.negatives, self.scale):
+                seen = found[self.level].cpu()
+                known = resize_labels(asked[text].mask.long().cpu(), view.camera.size).bool()
                 area = average_precision(seen, known)
                 each.append(mask_scores(seen >= self.threshold, known) | {"AP/100": area / 100, "AP/101": area / 101})
             rows.append({"view": view.stem} | {name: sum(one[name] for one in each) / len(each) for name in each[0]})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from .._check import check_choice
 from ..labels.scores import CANONICAL, TEMPERATURE
-from .method import Method, View, annotated
+from .method import Method, View, annotated, check_level
 from .relevancy import (
     FILTERS,
     Encode,
@@ -110,11 +110,12 @@ class LerfOvs2D:
         Raises:
             ValueError: if a frame has no view, or a mask has another size than its view.
         """
+        check_level(method, self.level)
         rows: list[Row] = []
         for view in annotated(views, truth.frames):
-            found = relevancies(method, view, tuple(truth.frames[view.stem]), encode, self.negatives, self.scale)
-            for text, (mask, boxes) in truth.frames[view.stem].items():
-                rows.append({"view": view.stem, "text": text, **self._pair(found[text], mask, boxes)})
+            asked = truth.frames[view.stem]
+            for text, found in relevancies(method, view, tuple(asked), encode, self.negatives, self.scale):
+                rows.append({"view": view.stem, "text": text, **self._pair(found, *asked[text])})
         hits = (row["hit"] for row in rows if row["hit"] is not None)
         scores = {"mIoU": mean(row["IoU"] for row in rows), "localisation": mean(hits)}
         return make_report(self, method.name, scores, rows)
@@ -133,9 +134,9 @@ class LerfOvs2D:
 
 def relevancies(
     method: Method, view: View, texts: Sequence[str], encode: Encode, negatives: Sequence[str], scale: float
-) -> Mapping[str, Tensor]:
-    """LERF's relevancy of some texts in a view, [levels, H, W] each; unknown pixels have the least value of their map."""
-    both = encode_unit(encode, [*texts, *negatives])
-    cosines = method.cosines(view, both)
-    found = lerf_relevancy(cosines[..., : len(texts)], cosines[..., len(texts) :], scale)
-    return {text: fill_unknown(found[..., i].contiguous()) for i, text in enumerate(texts)}
+) -> Iterator[tuple[str, Tensor]]:
+    """LERF's relevancy of some texts in a view, [levels, H, W], one by one; unknown pixels have the least value of their map."""
+    cosines = method.cosines(view, encode_unit(encode, [*texts, *negatives]))
+    worst = cosines[..., len(texts) :].amax(-1, keepdim=True)
+    for i, text in enumerate(texts):
+        yield text, fill_unknown(lerf_relevancy(cosines[..., i : i + 1], worst, scale)[..., 0])

@@ -15,7 +15,7 @@ from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels.scores import CANONICAL, TEMPERATURE
 from ..splat import rasterize
-from .method import Method, View, annotated, best_labels
+from .method import Method, View, annotated, best_labels, check_level
 from .relevancy import Encode, encode_unit, lerf_relevancy, mask_iou, stretch
 from .report import Report, Row, make_report, mean
 from .truth import MaskTruth
@@ -136,6 +136,7 @@ class LerfOvs3D:
         """
         if method.gaussians is None:
             raise TypeError(f"method: expected one with Gaussians, got {method.name!r} without; use lerf-ovs-2d/1")
+        check_level(method, self.level)
         if self.selection == "argmax":
             return self._best(method, texts, encode)
         cosines = method.gaussian_cosines(encode_unit(encode, [*texts, *self.negatives]))

@@ -69,6 +69,14 @@ def best_labels(cosines: Tensor) -> Tensor:  # [..., K] -> [...] int64
     return cosines.masked_fill(unknown, -torch.inf).argmax(-1).masked_fill(unknown.all(-1), -1)
 
 
+def check_level(method: Method, level: int | str) -> None:
+    """Raise a ValueError unless the method has a map of that level; the name of a rule is no level."""
+    if not isinstance(level, str) and not 0 <= level < method.levels:
+        raise ValueError(
+            f"level: expected 0 to {method.levels - 1} (the levels of {method.name!r}), got {level}; choose one of them"
+        )
+
+
 def label_view(method: Method, view: View, text: Tensor, level: int = 0) -> Tensor:  # [H, W] int64
     """The class of each pixel: the method's own answer if it has a rule (`Labeller`), else the largest cosine.
 
@@ -77,7 +85,11 @@ def label_view(method: Method, view: View, text: Tensor, level: int = 0) -> Tens
         view: the picture.
         text: one unit row per class, [K, D].
         level: of a method with several.
+
+    Raises:
+        ValueError: if the method has no such level.
     """
+    check_level(method, level)
     if isinstance(method, Labeller):
         return method.labels(view, text)
     return best_labels(method.cosines(view, text)[level])
@@ -197,16 +209,17 @@ class TeacherMethod:
             KeyError: if the view has no map.
         """
         features = self.feature_map(view.stem)
-        unit = unit_embeddings(text, "text").to(features)
+        wide = torch.promote_types(features.dtype, torch.float32)  # half precision is computed in float32
+        unit = unit_embeddings(text, "text").to(features.device, wide)
         height, width = view.camera.size
         upper, lower, down = _taps(height, int(features.shape[0]), self.align_corners)
         left, right, across = _taps(width, int(features.shape[1]), self.align_corners)
-        down, across = down.to(features)[:, None, None], across.to(features)[:, None]
-        found = torch.empty(height, width, len(unit), dtype=features.dtype, device=features.device)
+        down, across = down.to(unit)[:, None, None], across.to(unit)[:, None]
+        found = torch.empty(height, width, len(unit)).to(unit)
         rows = max(1, CHUNK // width)
         for start in range(0, height, rows):
             some = slice(start, start + rows)
-            band = torch.lerp(features[upper[some]], features[lower[some]], down[some])
+            band = torch.lerp(features[upper[some]].to(wide), features[lower[some]].to(wide), down[some])
             band = torch.lerp(band[:, left], band[:, right], across)
             unknown = row_norms(band) <= EPS
             found[some] = (unit_rows(band) @ unit.T).masked_fill(unknown[..., None], torch.nan)

@@ -13,7 +13,7 @@ from .._check import check_choice, check_range
 from ..cameras import resize_labels
 from ..labels.scores import CANONICAL, TEMPERATURE
 from .lerf_2d import activate, relevancies
-from .method import Method, View, annotated, label_view
+from .method import Method, View, annotated, check_level, label_view
 from .relevancy import FILTERS, Encode, Filter, clean_mask, encode_unit, mask_iou
 from .report import Report, Row, make_report, mean
 from .stable_threshold import stable_mask
@@ -47,7 +47,8 @@ def one_hot_accuracy(
 class OVS3DClosed:
     """3D-OVS's own `renderer.py`: a closed set, the scene's list of texts; each pixel takes its most similar one.
 
-    A class without a pixel in truth and prediction has IoU 0, as in scikit-learn's Jaccard score.
+    IoU counts for the texts that have a mask in a view. A class without a pixel in truth and prediction has IoU 0, as in
+    scikit-learn's Jaccard score.
     """
 
     name: ClassVar[str] = "3dovs-closed/1"
@@ -123,16 +124,23 @@ class OVS3DThreshold:
         Raises:
             ValueError: if a picture has no view.
         """
+        check_level(method, self.level)
         rows: list[Row] = []
         for view in annotated(views, truth.frames):
-            found = relevancies(method, view, tuple(truth.frames[view.stem]), encode, self.negatives, self.scale)
-            for text, (mask, _) in truth.frames[view.stem].items():
-                seen = found[text] if isinstance(self.level, str) else found[text][[self.level]]
+            asked = truth.frames[view.stem]
+            for text, found in relevancies(method, view, tuple(asked), encode, self.negatives, self.scale):
+                seen = found if isinstance(self.level, str) else found[[self.level]]
                 if self.stretched:
                     masks, level = activate(seen, self.threshold, self.filter)
                 else:
                     masks, level = seen > self.threshold, int(seen.amax((-2, -1)).argmax())
-                rows.append({"view": view.stem, "text": text, "IoU": mask_iou(masks[level].cpu(), mask_at(mask, view))})
+                rows.append(
+                    {
+                        "view": view.stem,
+                        "text": text,
+                        "IoU": mask_iou(masks[level].cpu(), mask_at(asked[text].mask, view)),
+                    }
+                )
         return make_report(self, method.name, {"mIoU": mean(row["IoU"] for row in rows)}, rows)
 
 
@@ -168,10 +176,10 @@ class OVS3DStability:
         """
         rows: list[Row] = []
         for view in annotated(views, truth.frames):
-            found = relevancies(method, view, tuple(truth.frames[view.stem]), encode, self.negatives, self.scale)
-            for text, (mask, _) in truth.frames[view.stem].items():
-                stable = stable_mask(found[text], steepest=self.steepest, fractions=self.fractions, run=self.run)
-                iou = mask_iou(clean_mask(stable.mask, "langsplat").cpu(), mask_at(mask, view))
+            asked = truth.frames[view.stem]
+            for text, found in relevancies(method, view, tuple(asked), encode, self.negatives, self.scale):
+                stable = stable_mask(found, steepest=self.steepest, fractions=self.fractions, run=self.run)
+                iou = mask_iou(clean_mask(stable.mask, "langsplat").cpu(), mask_at(asked[text].mask, view))
                 row = {
                     "view": view.stem,
                     "text": text,

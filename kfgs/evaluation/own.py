@@ -13,7 +13,7 @@ from ..gaussians import Gaussians
 from ..scenes import Scene
 from .color import COLOR_PROTOCOL, score_views
 from .editing import RECOLOR, REMOVAL, RecolorReport, RemovalReport, score_recolor, score_removal
-from .method import Method, View, annotated, best_labels, label_view
+from .method import Method, View, annotated, best_labels, check_level, label_view
 from .relevancy import Encode, encode_unit
 from .report import Report, Row, make_report
 from .scannet_points import needed
@@ -76,6 +76,7 @@ class KfgsSurface:
             raise TypeError(
                 f"method: expected one with Gaussians, got {method.name!r} without; use a protocol of views"
             )
+        check_level(method, self.level)
         names = tuple(dict.fromkeys(truth.names.values()))
         cosines = method.gaussian_cosines(encode_unit(needed(encode), names))[self.level]
         points = truth.points.to(method.gaussians.means)

@@ -13,7 +13,7 @@ from torch import Tensor
 from .._check import check_choice, check_range
 from ..gaussians import Gaussians
 from .class_lists import load_classes
-from .method import Method, View, best_labels
+from .method import Method, View, best_labels, check_level
 from .relevancy import Encode, encode_unit
 from .report import Report, Row, make_report, mean
 from .truth import PointTruth
@@ -82,6 +82,7 @@ def predict_classes(
     """
     if method.gaussians is None:
         raise TypeError(f"method: expected one with Gaussians, got {method.name!r} without; use a protocol of views")
+    check_level(method, level)
     labels = best_labels(method.gaussian_cosines(encode_unit(encode, names))[level])
     return method.gaussians, labels.clamp_min(0) if unknown == "first class" else labels
 
@@ -159,8 +160,7 @@ class ScanNetPoints:
                 "freeze the positions, or use scannet-volume/1"
             )
         target[opacities < self.least_opacity] = -1
-        scored = target >= 0
-        accuracy = mean((predicted == target)[scored].tolist())
+        accuracy = float((predicted == target)[target >= 0].double().mean())
         return report_classes(self, method, names, class_scores(predicted, target, self.classes), accuracy)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from .._check import check_choice, check_whole
 from ..metrics import ConfusionMatrix
 from .class_lists import load_classes
-from .method import Method, View, best_labels
+from .method import Method, View, best_labels, check_level
 from .relevancy import Encode, encode_unit
 from .report import Report, Row, make_report, mean
 from .scannet_points import needed
@@ -128,6 +128,7 @@ class SceneSplatBench:
             raise TypeError(
                 f"method: expected one with Gaussians, got {method.name!r} without; use a protocol of views"
             )
+        check_level(method, self.level)
         cosines = method.gaussian_cosines(text)[self.level].cpu()
         labels = best_labels(cosines)
         if self.least_cosine is not None:

@@ -104,6 +104,21 @@ def test_a_teacher_has_no_gaussians():
         TeacherMethod({}).gaussian_cosines(ROWS)
 
 
+def test_a_level_that_a_method_does_not_have_is_named():
+    with pytest.raises(ValueError, match="expected 0 to 0 .the levels of 'kfgs fused'., got 1; choose one"):
+        label_view(FieldMethod(_field("fused")), VIEW, ROWS, 1)
+    truth = MaskTruth({"a": {"x": MaskAndBoxes(torch.zeros(16, 40).bool())}})
+    for name in ("lerf-ovs-2d", "lerf-ovs-3d", "3dovs-threshold", "legaussians-mip360"):
+        with pytest.raises(ValueError, match="level: expected 0 to 0"):
+            get_protocol(name, level=3).score(FieldMethod(_field("fused")), truth, [VIEW], lambda texts: ROWS)
+
+
+def test_half_precision_is_computed_in_single():
+    features = torch.randn(5, 7, DIM, generator=torch.Generator().manual_seed(1)).half()
+    found = TeacherMethod({"a": features}).cosines(VIEW, ROWS)
+    torch.testing.assert_close(found, TeacherMethod({"a": features.float()}).cosines(VIEW, ROWS))
+
+
 def test_ties_and_unknown_places():
     nan = float("nan")
     cosines = torch.tensor([[[0.5, 0.5, 0.1]], [[nan, nan, nan]], [[nan, -0.2, nan]]])
