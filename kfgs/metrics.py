@@ -6,6 +6,7 @@ that do not occur, and which SSIM.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -37,11 +38,17 @@ class Score:
     Example:
         >>> print(Score("mIoU", 0.7661, "10 classes, one confusion matrix over 90 views"))
         mIoU 0.7661 (10 classes, one confusion matrix over 90 views)
+        >>> named = Score("mIoU", 0.7661, "kfgs-pooled/1: one confusion matrix over all views")
+        >>> print(named)
+        mIoU 0.766 (kfgs-pooled/1)
+        >>> print(named.text)
+        mIoU 0.7661 (kfgs-pooled/1: one confusion matrix over all views)
     """
 
     name: str
     value: float
     protocol: str
+    """What was measured and how. Of "name/version: long text" only the name and the version are printed."""
 
     def __post_init__(self) -> None:
         for field, text in (("name", self.name), ("protocol", self.protocol)):
@@ -49,6 +56,12 @@ class Score:
                 raise ValueError(f"{field}: expected a text, got {text!r}; say what was measured and how")
 
     def __str__(self) -> str:
+        named = re.match(r"[\w.-]+/\d+(?=:)", self.protocol)
+        return f"{self.name} {self.value:.3f} ({named[0]})" if named else self.text
+
+    @property
+    def text(self) -> str:
+        """The long form, with all that the protocol says."""
         return f"{self.name} {self.value:.4f} ({self.protocol})"
 
 

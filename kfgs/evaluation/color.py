@@ -45,8 +45,13 @@ class ColorReport:
         worst = min(self.views, key=lambda view: view.psnr)
         return (
             f"PSNR {self.psnr.value:.2f} dB, SSIM {self.ssim.value:.4f} over {len(self.views)} views, worst "
-            f"{worst.psnr:.2f} dB ({worst.name}) ({self.psnr.protocol})"
+            f"{worst.psnr:.2f} dB ({worst.name}) ({self.psnr.protocol.split(':')[0]})"
         )
+
+    @property
+    def text(self) -> str:
+        """The same, and what the protocol says."""
+        return f"{self}\n{self.psnr.protocol}"
 
     def to_json(self) -> dict[str, Any]:
         """The scores as plain numbers; an infinite PSNR (equal pictures) is null."""

@@ -97,6 +97,11 @@ class RemovalReport:
             f"border), {self.kept_points:.4f} of the surface ({self.protocol.split(':')[0]}, {self.views} views)"
         )
 
+    @property
+    def text(self) -> str:
+        """The same, and what the protocol says."""
+        return f"{self}\n{self.protocol}"
+
     def to_json(self) -> dict[str, Any]:
         """The report as plain values; what could not be measured is null."""
         return _plain(self)
@@ -136,6 +141,11 @@ class RecolorReport:
             f"border), {self.hue_inside:.4f} of its coloured pixels have the hue ({self.hue_before:.4f} before) "
             f"({self.protocol.split(':')[0]}, {self.views} views)"
         )
+
+    @property
+    def text(self) -> str:
+        """The same, and what the protocol says."""
+        return f"{self}\n{self.protocol}"
 
     def to_json(self) -> dict[str, Any]:
         """The report as plain values; what could not be measured, and an infinite PSNR, is null."""

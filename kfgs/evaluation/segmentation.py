@@ -63,6 +63,11 @@ class SegmentationReport:
         rows += [f"  {name:<16s} {float(value):.3f}" for name, value in zip(self.names, self.iou, strict=True)]
         return "\n".join(rows)
 
+    @property
+    def text(self) -> str:
+        """The same, and what the protocol says."""
+        return f"{self}\n{PROTOCOL}"
+
     def to_json(self) -> dict[str, Any]:
         """The scores as plain numbers; classes that occur in neither truth nor prediction are null."""
         iou = [None if value != value else value for value in self.iou.tolist()]

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..evaluation import LabelSet, load_label_set, score_recolor, score_removal, score_views
+from ..evaluation import LabelSet, load_label_set, score_recolor, score_removal, score_surface, score_views
+from ..evaluation.surface import SurfaceReport
 from ..features import FeatureFolder
 from ..formats import SplatFile, write_splats
 from ..formats.ply import write_ply
 from ..gaussians import Gaussians
-from ..labels import EditList, OfClass, Recolor, Remove, connected_parts, parse_color, transfer_labels
+from ..labels import EditList, OfClass, Recolor, Remove, connected_parts, parse_color
 from ..scenes import Scene, load_scene
 from ..toy.room_folder import ToyConfig, make_toy_room
 from .apply import (
@@ -36,10 +37,6 @@ from .fit import FitResult, fit_scene
 
 REMOVED, PAINTED, PAINT = "chair", "plant", "#c04040"  # the edits of the paper's Figures 5 and 4
 TITLES = ("before", "after")
-SURFACE_PROTOCOL = (
-    "kfgs-surface/1: share of the ground-truth surface points, each seen by some training view, that receive their true "
-    "class from the nearest labelled Gaussian within lambda; points out of reach count as wrong"
-)
 
 
 def run(
@@ -87,7 +84,7 @@ def run(
     gaussians = fitted.field.gaussians.replace(labels=labels)
     written = save_labelled(out / "gaussians.ply", gaussians, cosines, classes, rule="fused features; score = cosine")
     surface = _label_surface(gaussians, folder, out / "surface.ply")
-    say(f"surface points: {surface['agreement']:.4f} agree ({SURFACE_PROTOCOL})")
+    say(f"surface points: {surface}")
     edited, edit_scores = _edit_colors(out, scene, folder, fitted, colored.gaussians, classes, say)
     write_report(
         out / "scores.json",
@@ -143,20 +140,12 @@ def _edit_colors(
     return written, {"removal": removal, "recolor": recolored}
 
 
-def _label_surface(gaussians: Gaussians, folder: Path, out: Path | None) -> dict[str, Any]:
+def _label_surface(gaussians: Gaussians, folder: Path, out: Path) -> SurfaceReport:
     """Carry the Gaussians' labels to the room's true surface points and score them (protocol `kfgs-surface/1`)."""
     assert gaussians.labels is not None
     with np.load(folder / "surface.npz") as surface:
         points, true = torch.from_numpy(surface["points"]).float(), torch.from_numpy(surface["labels"]).long()
-    moved = transfer_labels(gaussians.means, gaussians.labels, points)
-    if out is not None:
-        columns = {name: points[:, i].contiguous().numpy() for i, name in enumerate("xyz")}
-        write_ply(out, columns | label_columns(moved.labels), comments=("labels carried by kfgs",))
-    return {
-        "protocol": SURFACE_PROTOCOL,
-        "agreement": float((moved.labels == true).float().mean()),
-        "distance": moved.distance,
-        "distance from": moved.how,
-        "labelled": moved.labelled,
-        "points": len(points),
-    }
+    report = score_surface(gaussians.means, gaussians.labels, points, true)
+    columns = {name: points[:, i].contiguous().numpy() for i, name in enumerate("xyz")}
+    write_ply(out, columns | label_columns(report.transfer.labels), comments=("labels carried by kfgs",))
+    return report

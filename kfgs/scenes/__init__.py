@@ -1,4 +1,4 @@
-"""Scenes: posed images and points, read from files of COLMAP, nerfstudio, instant-ngp and Blender, or estimated."""
+"""Scenes: posed images and points, read from files of COLMAP, nerfstudio, instant-ngp, Blender and data sets, or estimated."""
 
 from ..cameras.bounds import Bounds, robust_bounds
 from .colmap_model import ColmapModel, read_model

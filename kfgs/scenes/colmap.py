@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from ..cameras.camera import Camera, Distortion
 from .colmap_files import CAMERA_MODELS
 from .colmap_model import ColmapImage, ColmapModel, read_model
 from .files import SceneError, is_file, list_images, natural_key, some
+from .posed import picture_size
 from .scene import Scene
 
 # COLMAP's model: (our lens, its number of coefficients). COLMAP's own order after the intrinsics is ours in each case:
@@ -65,7 +67,8 @@ def load_colmap(path: str | Path, images: str | Path) -> Scene:
 
     Args:
         path: the model's folder (cameras, images, points3D; binary or text; with or without rigs and frames).
-        images: the folder that the model's image names are relative to.
+        images: the folder that the model's image names are relative to. In a folder `images_2`, `images_4` or the like,
+            as in Mip-NeRF 360, pictures are smaller than the model says: the cameras are resized to them.
 
     Returns:
         The scene in natural order of names, points in order of their COLMAP ids, every view in the `train` split.
@@ -82,7 +85,7 @@ def load_colmap(path: str | Path, images: str | Path) -> Scene:
     views = sorted(model.images.values(), key=lambda image: natural_key(image.name))
     posed = [image for image in views if image.pose is not None]
     found = [image for image in posed if is_file(folder / image.name)]
-    cameras = _cameras(path, model, found)
+    cameras, shrunk = _resized(_cameras(path, model, found), folder)
     lost = [image.name for image in views if image.pose is None]
     missing = [image.name for image in posed if not is_file(folder / image.name)]
     if not found:
@@ -91,6 +94,7 @@ def load_colmap(path: str | Path, images: str | Path) -> Scene:
             "is there; give the right image folder"
         )
     notes = [f"{len(lost)} images of the model have no pose and were left out: {some(lost)}"] if lost else []
+    notes += shrunk
     if missing:
         notes.append(f"{len(missing)} of {len(posed)} posed images have no file in {folder}: {some(missing)}")
     names = {image.name for image in views}
@@ -103,6 +107,29 @@ def load_colmap(path: str | Path, images: str | Path) -> Scene:
     splits = {"train": list(range(len(found))), "test": []}
     paths = [folder / image.name for image in found]
     return Scene(cameras, paths, points, colors, splits, tuple(notes)).with_near()
+
+
+def _resized(cameras: list[Camera], folder: Path) -> tuple[list[Camera], list[str]]:
+    """Cameras for the pictures of a folder `images_N`, which are N times smaller; and a note that says so."""
+    match = re.fullmatch(r"images_(\d+)", folder.name)
+    if match is None or not cameras:
+        return cameras, []
+    factor, sizes = int(match[1]), {}
+    for camera in cameras:  # pictures of one size are resized to one size: only the first is looked at
+        if camera.size in sizes:
+            continue
+        width, height = picture_size(folder / camera.name)
+        odd = max(abs(camera.width - factor * width), abs(camera.height - factor * height)) > factor
+        if odd and (height, width) != camera.size:
+            raise SceneError(
+                f"{folder / camera.name}: expected a picture of 1/{factor} of {camera.width}x{camera.height} pixels, as "
+                f"the name of its folder says, got {width}x{height}; rename the folder, or resize the pictures"
+            )
+        sizes[camera.size] = (height, width)
+    if all(size == small for size, small in sizes.items()):
+        return cameras, []  # the model was made from these pictures
+    note = f"{folder.name}: pictures are {factor} times smaller than the model says; cameras were resized to them"
+    return [camera.resized(*sizes[camera.size]) for camera in cameras], [note]
 
 
 def _cameras(path: Path, model: ColmapModel, images: list[ColmapImage]) -> list[Camera]:

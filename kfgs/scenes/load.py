@@ -2,36 +2,64 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from .._check import check_choice
 from .colmap import load_colmap
 from .colmap_model import has_model
-from .files import SceneError, some
+from .files import SceneError, natural_key, some
+from .llff import POSES, is_llff, load_llff
+from .replica import is_nice_slam, is_semantic_nerf, load_nice_slam, load_semantic_nerf
+from .scannet import is_scannet, load_scannet
 from .scene import Scene
-from .splits import choose_split, make_split, read_split
+from .splits import RULES, choose_split, make_split, read_split, read_test_list
 from .transforms import load_transforms
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap_ground_truth", ".")
 _TRANSFORMS = ("transforms.json", "transforms_train.json")
 
-SplitChoice = Literal["auto", "file", "df3dgs", "holdout8", "all"]
+SplitChoice = Literal["auto", "file", "df3dgs", "feature3dgs", "holdout8", "all"]
+
+
+class _Layout(NamedTuple):
+    """A data set's layout of a scene folder."""
+
+    name: str
+    files: str  # what it is recognised by
+    matches: Callable[[Path], bool]
+    load: Callable[[Path, str | Path | None], Scene]
+
+
+_LAYOUTS = (
+    _Layout("Replica (NICE-SLAM)", "results/ and traj.txt", is_nice_slam, lambda path, _: load_nice_slam(path)),
+    _Layout(
+        "Replica (Semantic-NeRF)", "rgb/ and traj_w_c.txt", is_semantic_nerf, lambda path, _: load_semantic_nerf(path)
+    ),
+    _Layout("ScanNet", "color/ and pose/", is_scannet, lambda path, _: load_scannet(path)),
+    _Layout("LLFF (3D-OVS)", POSES, is_llff, load_llff),
+)
+"""Asked in this order, after COLMAP models and transforms.json: 3D-OVS and Mip-NeRF 360 have both a model and LLFF's poses."""
 
 
 def load_scene(path: str | Path, *, images: str | Path | None = None, split: SplitChoice = "auto") -> Scene:
-    """Open a folder with images and a COLMAP model, or with a transforms.json.
+    """Open a folder with pictures and their poses, in the layout of COLMAP, nerfstudio, or a data set.
 
     The first of these is read: a COLMAP model in `sparse/0`, `sparse`, `colmap/sparse/0`, `colmap_ground_truth` or the
-    folder itself (binary before text); `transforms.json`; Blender's `transforms_train.json`.
+    folder itself (binary before text); `transforms.json`; Blender's `transforms_train.json`; Replica as NICE-SLAM
+    (`results/`, `traj.txt`) or Semantic-NeRF (`rgb/`, `traj_w_c.txt`) rendered it; ScanNet (`color/`, `pose/`); LLFF and
+    3D-OVS (`poses_bounds.npy`). `docs/datasets.md` has them all.
 
     Args:
         path: the scene folder, a model folder, or a .json file.
-        images: the image folder; None: `images/` next to the model or up to two folders above it, else the scene folder.
-        split: `"auto"`: split.json if there is one, else the split of the transforms.json if it has one, else by number
-            of images: from 200 the paper's (which trains on every 10th image only), from 8 `"holdout8"`, below 8 all;
-            `"file"`: split.json; or a rule of `make_split`.
+        images: the image folder, also by its name in the scene folder, as in `"images_4"` of Mip-NeRF 360, whose cameras are
+            then resized; None: `images/` beside the model or up to two folders above it, else the first of `images_2`,
+            `images_4`, ..., else the scene folder. Replica and ScanNet know one place only.
+        split: `"auto"`: split.json if there is one, else the model's test.txt, else the split of the transforms.json if it
+            has one, else by number of images: from 200 the paper's (which trains on every 10th image only), from 8
+            `"holdout8"`, below 8 all; `"file"`: split.json; or a rule of `make_split`.
 
     Returns:
         The scene, with views in natural order of names, and cameras with a `near` for the size of the scene
@@ -43,10 +71,12 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
         ValueError: if `split` is unknown.
     """
     path = Path(path)
-    check_choice("split", split, ("auto", "file", "df3dgs", "holdout8", "all"))
+    check_choice("split", split, ("auto", "file", *RULES))
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such folder; expected a scene there")
     root = path if path.is_dir() else path.parent
+    if images is not None and not Path(images).is_dir() and (root / images).is_dir():
+        images = root / images
     scene = replace(_load_views(path, root, images), folder=root)
     return _with_split(scene, root, split)
 
@@ -64,16 +94,45 @@ def _load_views(path: Path, root: Path, images: str | Path | None) -> Scene:
                 return scene
     if path.suffix == ".json" or any((path / name).is_file() for name in _TRANSFORMS):
         return load_transforms(path, images)
+    for layout in _LAYOUTS:
+        if path.is_dir() and layout.matches(path):
+            return layout.load(path, images)
+    others = [
+        name for name in ("results", "color", "pose", "rgb", "traj.txt", "traj_w_c.txt") if (path / name).exists()
+    ]
+    half = f" (there is {' and '.join(others)}, but not what belongs to it)" if others else ""
     raise SceneError(
-        f"{path}: expected a COLMAP model (in {', '.join(MODEL_FOLDERS)}) or a transforms.json, found neither; "
-        "estimate the cameras first: `kfgs sfm <images> <scene>` or kfgs.scenes.run_sfm"
+        f"{path}: expected a COLMAP model (in {', '.join(MODEL_FOLDERS)}) or a transforms.json, found neither; nor "
+        f"{'; '.join(f'{layout.files} of {layout.name}' for layout in _LAYOUTS)}{half}; {_advice(path)}"
     )
 
 
+def _is_scene(path: Path) -> bool:
+    model = any(has_model(path / name) for name in MODEL_FOLDERS)
+    return model or any((path / name).is_file() for name in _TRANSFORMS) or any(a.matches(path) for a in _LAYOUTS)
+
+
+def _advice(path: Path) -> str:
+    folders = (
+        sorted((f for f in path.iterdir() if f.is_dir()), key=lambda f: natural_key(f.name)) if path.is_dir() else []
+    )
+    inside = [folder.name for folder in folders[:100] if _is_scene(folder)]
+    if inside:
+        return f"it holds scenes ({some(inside)}): give one of them, as in {path / inside[0]}"
+    if _is_scene(path.resolve().parent):
+        return f"the folder above is a scene: give {path.resolve().parent}"
+    return "estimate the cameras first: `kfgs sfm <images> <scene>` or kfgs.scenes.run_sfm"
+
+
 def _image_folder(root: Path, model: Path) -> Path:
-    for above in dict.fromkeys((root, model.resolve().parent, model.resolve().parent.parent)):
+    places = list(dict.fromkeys((root, model.resolve().parent, model.resolve().parent.parent)))
+    for above in places:
         if (above / "images").is_dir():
             return above / "images"
+    for above in places:
+        smaller = [folder for folder in above.glob("images_*") if folder.is_dir() and folder.name[7:].isdecimal()]
+        if smaller:
+            return min(smaller, key=lambda folder: natural_key(folder.name))
     return root
 
 
@@ -83,6 +142,9 @@ def _with_split(scene: Scene, root: Path, split: SplitChoice) -> Scene:
         splits, unknown = read_split(file, [scene.stem(i) for i in range(len(scene))])
         notes = [f"{len(unknown)} names in {file} are not in the scene: {some(unknown)}"] if unknown else []
         return replace(scene, splits=splits, notes=(*scene.notes, *notes))
+    listed = [root / name / "test.txt" for name in MODEL_FOLDERS if (root / name / "test.txt").is_file()]
+    if split == "auto" and listed and has_model(listed[0].parent):
+        return replace(scene, splits=read_test_list(listed[0], [scene.stem(i) for i in range(len(scene))]))
     if split == "auto" and scene.splits.get("test"):
         return scene
     rule = choose_split(len(scene)) if split == "auto" else split

@@ -9,7 +9,8 @@ from typing import Any, Literal
 from .._check import check_choice
 from .files import SceneError, file_stem, read_scene_json
 
-SplitRule = Literal["df3dgs", "holdout8", "all"]
+SplitRule = Literal["df3dgs", "feature3dgs", "holdout8", "all"]
+RULES: tuple[SplitRule, ...] = ("df3dgs", "feature3dgs", "holdout8", "all")
 
 DF3DGS_FEWEST = 200  # the paper's rule leaves out 4 of 5 views: fine for a video, too many of a few dozen photos
 
@@ -53,14 +54,17 @@ def make_split(count: int, rule: SplitRule) -> dict[str, list[int]]:
     Args:
         count: number of views.
         rule: `"df3dgs"`: the paper's, every 10th view from the 1st tests, every 10th from the 6th trains, the others
-            are unused (Sec. 4.1); `"holdout8"`: every 8th from the 1st tests, the rest trains; `"all"`: all train.
+            are unused (Sec. 4.1); `"feature3dgs"`: Feature 3DGS's of Replica, every 8th from the 3rd tests, the rest trains;
+            `"holdout8"`: every 8th from the 1st tests, the rest trains; `"all"`: all train.
 
     Raises:
         ValueError: if the rule is unknown.
     """
-    check_choice("split", rule, ("df3dgs", "holdout8", "all"))
+    check_choice("split", rule, RULES)
     if rule == "df3dgs":
         return split_every(count, step=10, train_start=5)
+    if rule == "feature3dgs":
+        return split_every(count, step=8, test_start=2)
     if rule == "holdout8":
         return split_every(count, step=8)
     return {"train": list(range(count)), "test": []}
@@ -112,6 +116,26 @@ def read_split(path: str | Path, stems: Sequence[str]) -> tuple[dict[str, list[i
             "both; scores on training views mean nothing: remove them from one"
         )
     return splits, unknown
+
+
+def read_test_list(path: Path, stems: Sequence[str]) -> dict[str, list[int]]:
+    """Read a `test.txt` beside a COLMAP model, as 3DGS and Occam's LGS do: a held-out picture per line; the others train.
+
+    Raises:
+        SceneError: if a name is not in the scene, or none is left to train.
+    """
+    names = [line.strip() for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    index = {stem: i for i, stem in enumerate(stems)}
+    found = [index.get(name, index.get(file_stem(name))) for name in names]
+    unknown = [name for name, i in zip(names, found, strict=True) if i is None]
+    test = {i for i in found if i is not None}
+    if unknown or not 0 < len(test) < len(stems):
+        got = f"{unknown[0]!r:.80}" if unknown else f"{len(test)} of them"
+        raise SceneError(
+            f"{path}: expected names of some of the scene's {len(stems)} pictures ({', '.join(stems[:3])}, ...), got {got}; "
+            "correct the list, or choose another split"
+        )
+    return {"train": [i for i in range(len(stems)) if i not in test], "test": sorted(test)}
 
 
 def _is_split(value: Any) -> bool:

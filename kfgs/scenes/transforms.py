@@ -36,6 +36,7 @@ from .scene import Scene
 _PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 _COEFFICIENTS = {"PINHOLE": (), "SIMPLE_PINHOLE": (), **dict.fromkeys(_FISHEYE, ("k1", "k2", "k3", "k4"))}
+_UNNAMED_POINTS = "points3d.ply"
 _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # OpenGL axes to COLMAP's
 
 
@@ -61,7 +62,8 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
 
     A frame whose file is missing is left out and named in `notes`. Frames outside the scene folder (an absolute path, or
     `..`) are read if they are image files, and counted in `notes`. `ply_file_path` gives the points if it is inside the
-    folder; else the scene has no points (P = 0), and a note says so. `mask_path` and `depth_file_path` are not read.
+    folder, without it the `points3d.ply` of 3DGS and OpenGaussian; else the scene has no points (P = 0), and a
+    note says so. `mask_path` and `depth_file_path` are not read.
 
     Args:
         path: the file, or a folder with `transforms.json` or `transforms_train.json`.
@@ -286,7 +288,12 @@ class _Frame:
 def _points(reader: _Reader, top: dict[str, Any]) -> tuple[Tensor, Tensor, list[str]]:
     """The points of `ply_file_path`, in the frame of the poses."""
     nothing = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)
-    listed = top.get("ply_file_path")
+    listed, notes = top.get("ply_file_path"), []
+    if listed is None and is_file(reader.root / _UNNAMED_POINTS):
+        listed = _UNNAMED_POINTS
+        notes = [
+            f"points of {listed}, which no file names: 3DGS and OpenGaussian write it; 3DGS's are random for Blender scenes"
+        ]
     if listed is None:
         return *nothing, [
             "no points: this transforms.json has no ply_file_path; a field needs points to start from (`kfgs sfm` finds them)"
@@ -298,6 +305,8 @@ def _points(reader: _Reader, top: dict[str, Any]) -> tuple[Tensor, Tensor, list[
         columns = read_ply(file)
         points = points_from_columns(columns)
     except ValueError as error:
+        if notes:
+            raise SceneError(f"{error}; write the points again, or remove the file to load without points") from error
         raise SceneError(
             f"{error} (named by ply_file_path in {reader.path}; remove the entry to load without points)"
         ) from error
@@ -307,7 +316,7 @@ def _points(reader: _Reader, top: dict[str, Any]) -> tuple[Tensor, Tensor, list[
     for i, name in enumerate(("red", "green", "blue")):
         if name in columns and columns[name].dtype.kind in "iu":
             colors[:, i] = torch.from_numpy(columns[name].clip(0, 255).astype("uint8"))
-    return points, colors, []
+    return points, colors, notes
 
 
 def _splits(views: list[tuple[Camera, Path, str]], root: Path, top: dict[str, Any]) -> dict[str, list[int]]:

@@ -38,7 +38,7 @@ def test_split_every_checks_its_numbers() -> None:
         split_every(10, step=10, test_start=-1)
     with pytest.raises(ValueError, match=tells("train_start:", "test_start", "got 0")):
         split_every(10, step=10, train_start=0)
-    with pytest.raises(ValueError, match=tells("split:", "'df3dgs', 'holdout8', 'all'", "got 'llff'")):
+    with pytest.raises(ValueError, match=tells("split:", "'df3dgs', 'feature3dgs', 'holdout8', 'all'", "got 'llff'")):
         make_split(10, "llff")  # type: ignore[arg-type]
 
 

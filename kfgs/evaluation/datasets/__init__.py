@@ -1,0 +1,29 @@
+"""Ground truth of published data sets, and of any folder of labels. Poses and pictures come from `kfgs.scenes.load_scene`."""
+
+from .coco import load_coco_labels, load_coco_masks
+from .label_folder import load_labels
+from .legaussians import load_legaussians
+from .lerf_ovs import load_lerf_ovs
+from .ovs3d import OVS3D_REPORTED, OVS3D_SCENES, load_3dovs
+from .polygons import decode_rle, fill_polygon, fill_region
+from .replica import load_replica_points, load_semantic_nerf_labels
+from .scannet import load_scannet_points
+from .views import truth_views
+
+__all__ = [
+    "OVS3D_REPORTED",
+    "OVS3D_SCENES",
+    "decode_rle",
+    "fill_polygon",
+    "fill_region",
+    "load_3dovs",
+    "load_coco_labels",
+    "load_coco_masks",
+    "load_labels",
+    "load_legaussians",
+    "load_lerf_ovs",
+    "load_replica_points",
+    "load_scannet_points",
+    "load_semantic_nerf_labels",
+    "truth_views",
+]

@@ -1,0 +1,138 @@
+"""COCO's JSON: polygons or run lengths of objects, as annotation programs export them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..._files import read_json
+from ...scenes.files import file_stem
+from ..truth import LabelTruth, MaskAndBoxes, MaskTruth
+from .files import ReadWhenAsked
+from .polygons import MOST, decode_rle, fill_region, union
+
+
+@dataclass(frozen=True)
+class _Picture:
+    size: tuple[int, int]  # (height, width)
+    objects: list[tuple[int, dict[str, Any]]]  # (place in the file, annotation)
+
+
+def load_coco_masks(path: str | Path) -> MaskTruth:
+    """Read a COCO JSON as masks of texts: the categories that each picture has, several objects as one mask with a box each.
+
+    Polygons are filled by the centres of pixels (`fill_region`); run lengths may be a list or COCO's compressed text.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is damaged; the message names the annotation.
+    """
+    path = Path(path)
+    names, pictures = _read(path)
+    return MaskTruth(
+        ReadWhenAsked({stem: partial(_masks, path, names, p) for stem, p in pictures.items() if p.objects})
+    )
+
+
+def load_coco_labels(path: str | Path) -> LabelTruth:
+    """Read a COCO JSON as labels: one class per pixel, -1 where no object is; a later object covers an earlier one.
+
+    Classes are all categories of the file, in its order.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is damaged; the message names the annotation.
+    """
+    path = Path(path)
+    names, pictures = _read(path)
+    index = {category: i for i, category in enumerate(names)}
+    readers = {stem: partial(_labels, path, index, p) for stem, p in pictures.items()}
+    return LabelTruth(tuple(names.values()), ReadWhenAsked(readers))
+
+
+def _read(path: Path) -> tuple[dict[int, str], dict[str, _Picture]]:
+    """The categories by id, and the pictures by stem."""
+    top = read_json(path)
+    try:
+        names = {int(entry["id"]): str(entry["name"]) for entry in top["categories"]}
+        images = {int(entry["id"]): entry for entry in top["images"]}
+        stems = {number: file_stem(str(entry["file_name"])) for number, entry in images.items()}
+        pictures = {n: _Picture((int(e["height"]), int(e["width"])), []) for n, e in images.items()}
+        for place, annotation in enumerate(top["annotations"]):
+            pictures[int(annotation["image_id"])].objects.append((place, annotation))
+    except (TypeError, KeyError, ValueError, OverflowError) as error:
+        raise ValueError(
+            f"{path}: expected COCO's 'categories', 'images' and 'annotations', each annotation with the id of an image; got "
+            f"something else ({type(error).__name__}: {error}); export it again"
+        ) from error
+    if len(set(stems.values())) != len(stems) or len(set(names.values())) != len(names) or not names or not pictures:
+        raise ValueError(f"{path}: expected some images and categories, each name once; export it again")
+    for number, picture in pictures.items():
+        if min(picture.size) < 1 or picture.size[0] * picture.size[1] > MOST:
+            raise ValueError(f"{path}: expected a size of image {stems[number]!r}, got {picture.size}; export it again")
+    return names, {stems[number]: picture for number, picture in pictures.items()}
+
+
+def _masks(path: Path, names: dict[int, str], picture: _Picture) -> dict[str, MaskAndBoxes]:
+    found: dict[int, list[tuple[Tensor, Tensor]]] = {}
+    for place, annotation in picture.objects:
+        category, mask = _object(path, place, annotation, names, picture.size)
+        found.setdefault(category, []).append((mask, _box(path, place, annotation)))
+    return {
+        names[category]: MaskAndBoxes(union([mask for mask, _ in parts]), torch.stack([box for _, box in parts]))
+        for category, parts in found.items()
+    }
+
+
+def _labels(path: Path, index: dict[int, int], picture: _Picture) -> Tensor:  # [H, W] int64
+    labels = torch.full(picture.size, -1, dtype=torch.int64)
+    for place, annotation in picture.objects:
+        category, mask = _object(path, place, annotation, index, picture.size)
+        labels[mask] = index[category]
+    return labels
+
+
+def _object(
+    path: Path, place: int, annotation: dict[str, Any], known: Any, size: tuple[int, int]
+) -> tuple[int, Tensor]:  # category, [H, W] bool
+    where = f"{path}, annotation {annotation.get('id', place)}"
+    category: Any = annotation.get("category_id")
+    segmentation: Any = annotation.get("segmentation")
+    if category not in known:
+        raise ValueError(f"{where}: expected a category of the file ({len(known)} ids), got {category!r:.40}")
+    try:
+        if isinstance(segmentation, dict):
+            mask = decode_rle(segmentation)
+            if tuple(mask.shape) != size:
+                raise ValueError(f"size: expected {size} as its image, got {tuple(mask.shape)}")
+            return int(category), mask
+        if not isinstance(segmentation, list) or not segmentation:
+            raise ValueError(f"segmentation: expected polygons or run lengths, got {segmentation!r:.60}")
+        return int(category), union([fill_region(_corners(polygon), size) for polygon in segmentation])
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}; export the annotations again") from error
+
+
+def _corners(polygon: Any) -> list[list[float]]:
+    numbers = polygon if isinstance(polygon, list) else []
+    plain = all(type(n) in (int, float) and math.isfinite(n) for n in numbers)
+    if len(numbers) < 6 or len(numbers) % 2 or not plain:
+        raise ValueError(f"segmentation: expected polygons [x1, y1, x2, y2, x3, y3, ...], got {polygon!r:.60}")
+    return [[numbers[i], numbers[i + 1]] for i in range(0, len(numbers), 2)]
+
+
+def _box(path: Path, place: int, annotation: dict[str, Any]) -> Tensor:  # [4] x1, y1, x2, y2
+    box = annotation.get("bbox")
+    if not isinstance(box, list) or len(box) != 4 or not all(type(n) in (int, float) and math.isfinite(n) for n in box):
+        where = f"{path}, annotation {annotation.get('id', place)}"
+        raise ValueError(
+            f"{where}: expected a bbox [x, y, width, height], got {box!r:.60}; export the annotations again"
+        )
+    x, y, width, height = box
+    return torch.tensor([x, y, x + width, y + height], dtype=torch.float32)

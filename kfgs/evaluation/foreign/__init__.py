@@ -1,0 +1,18 @@
+"""Fields of other programs, read as data and scored by the same protocols. Nothing in their files is run."""
+
+from .feature3dgs import load_feature3dgs
+from .langsplat import load_langsplat, load_langsplat_v2, load_occam
+from .legaussians import load_legaussians_field
+from .splat_features import load_splat_features
+from .splatted import Level, SplattedMethod
+
+__all__ = [
+    "Level",
+    "SplattedMethod",
+    "load_feature3dgs",
+    "load_langsplat",
+    "load_langsplat_v2",
+    "load_legaussians_field",
+    "load_occam",
+    "load_splat_features",
+]

@@ -1,0 +1,181 @@
+"""SceneSplat-Bench: points of a scene take the majority of their nearest Gaussians, in one confusion matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from .._check import check_choice, check_whole
+from ..metrics import ConfusionMatrix
+from .class_lists import load_classes
+from .method import Method, View, best_labels, check_level
+from .relevancy import Encode, encode_unit
+from .report import Report, Row, make_report, mean
+from .scannet_points import needed
+from .truth import PointTruth
+
+BENCHMARKS = ("scannet20", "scannet200", "scannetpp100", "matterport21", "holicity4")
+CHUNK = 16_384  # points looked up at once: with 200 classes their counts take 26 MB
+
+
+def vote_nearest(
+    points: Tensor,  # [P, 3]
+    means: Tensor,  # [N, 3]
+    labels: Tensor,  # [N] int64, -1 = none
+    neighbours: int = 25,
+) -> Tensor:  # [P] int64, -1 = none
+    """The most frequent label among the nearest Gaussians of each point. "None" votes too; a tie goes to the lowest label."""
+    places, centres = (x.detach().cpu().double().numpy() for x in (points, means))
+    found = torch.full((len(places),), -1, dtype=torch.int64)
+    if len(centres) == 0:
+        return found
+    tree, labels = cKDTree(centres), labels.cpu()
+    C = int(labels.max()) + 1
+    voting = labels.where(labels >= 0, C)  # "none" comes last, so that it loses a tie
+    count = range(1, min(neighbours, len(centres)) + 1)
+    for start in range(0, len(places), CHUNK):
+        index = torch.from_numpy(tree.query(places[start : start + CHUNK], k=count, workers=-1)[1])
+        votes = torch.zeros(len(index), C + 1, dtype=torch.int32)
+        votes.scatter_add_(1, voting[index], torch.ones_like(index, dtype=torch.int32))
+        best = votes.argmax(1)
+        found[start : start + CHUNK] = best.masked_fill(best == C, -1)
+    return found
+
+
+def vote_instances(labels: Tensor, instances: Tensor) -> Tensor:  # [P], [P] int64 -> [P] int64
+    """Give all points of an instance their most frequent label (the lowest of a tie); points of no instance (-1) keep theirs."""
+    labels = labels.clone()
+    for instance in instances[instances >= 0].unique():
+        inside = instances == instance
+        values, counts = labels[inside].unique(return_counts=True)
+        labels[inside] = values[counts == counts.max()].min()
+    return labels
+
+
+@dataclass(frozen=True)
+class SceneSplatBench:
+    """SceneSplat-Bench's `open_vocab_seg_*.py`: foreground mIoU over the points of many scenes.
+
+    `score` takes one scene, `score_scenes` those of a table, which are pooled in one confusion matrix. A scene's labels are
+    matched with the benchmark's classes by name. ScanNet++'s several labels of a point are not supported: the first counts.
+    """
+
+    name: ClassVar[str] = "scenesplat-fmiou/1"
+    about: ClassVar[str] = (
+        "SceneSplat-Bench: a Gaussian takes its most similar class, a point the majority of its 25 nearest Gaussians; one "
+        "confusion matrix over all scenes, no prediction is a miss; f-mIoU and f-mAcc leave out wall, floor and ceiling; means "
+        "over the classes that the truth has"
+    )
+
+    benchmark: Literal["scannet20", "scannet200", "scannetpp100", "matterport21", "holicity4"] = "scannet20"
+    """Which classes, prompts, and classes that are no foreground (`load_classes("scenesplat")`)."""
+    template: str = "this is a {}"
+    """What is asked for a class; HoliCity has six prompts of its own."""
+    neighbours: int = 25
+    """Gaussians that vote for a point."""
+    drop_unknown: bool = False
+    """Whether Gaussians without a feature are left out of the vote, as for ScanNet++; else they vote for "none"."""
+    within_instances: bool = False
+    """Take the majority inside each *true* instance, as `enable_clustering` in the script for Occam's LGS. It inflates."""
+    least_cosine: float | None = None
+    """A Gaussian whose best cosine is lower has no label. For SigLIP's sigmoid pass the cosine where its logit is 0."""
+    level: int = 0
+    """Of a method with several."""
+
+    def __post_init__(self) -> None:
+        check_choice("benchmark", self.benchmark, BENCHMARKS)
+        check_whole("neighbours", self.neighbours, 1)
+        if "{}" not in self.template:
+            raise ValueError(f"template: expected a text with {{}} where the class goes, got {self.template!r}")
+
+    def score(
+        self, method: Method, truth: PointTruth, views: Sequence[View] = (), encode: Encode | None = None
+    ) -> Report:
+        """Score one scene; see `score_scenes`. `views` are not used."""
+        return self.score_scenes([(method, truth)], needed(encode))
+
+    def score_scenes(self, scenes: Iterable[tuple[Method, PointTruth]], encode: Encode) -> Report:
+        """Score a method on several scenes, in one confusion matrix.
+
+        Args:
+            scenes: a method with Gaussians and the labelled points of its scene, one scene at a time.
+            encode: the teacher's text encoder.
+
+        Raises:
+            TypeError: if a method has no Gaussians.
+            ValueError: if there is no scene, none of its names is a class of the benchmark, or instances are missing.
+        """
+        lists = load_classes("scenesplat")[self.benchmark]
+        classes: list[str] = lists["classes"]
+        prompts = lists.get("prompts") or [[self.template.format(name), i] for i, name in enumerate(classes)]
+        text = encode_unit(encode, [prompt for prompt, _ in prompts])
+        meant = torch.tensor([index for _, index in prompts])
+        pooled, name, count = ConfusionMatrix(len(classes)), "", 0
+        for method, truth in scenes:
+            pooled.update(self._predict(method, truth, text, meant), matched(truth, classes))
+            name, count = method.name, count + 1
+        if count == 0:
+            raise ValueError("scenes: expected at least one, got none; pass pairs of a method and its truth")
+        return self._report(pooled, classes, lists["dropped"], name)
+
+    def _predict(self, method: Method, truth: PointTruth, text: Tensor, meant: Tensor) -> Tensor:  # [P] int64
+        if method.gaussians is None:
+            raise TypeError(
+                f"method: expected one with Gaussians, got {method.name!r} without; use a protocol of views"
+            )
+        check_level(method, self.level)
+        cosines = method.gaussian_cosines(text)[self.level].cpu()
+        labels = best_labels(cosines)
+        if self.least_cosine is not None:
+            labels = labels.masked_fill(cosines.nan_to_num(-2.0).amax(-1) < self.least_cosine, -1)
+        labels = meant[labels.clamp_min(0)].where(labels >= 0, -1)
+        means = method.gaussians.means.cpu()
+        if self.drop_unknown:
+            means, labels = means[labels >= 0], labels[labels >= 0]
+        found = vote_nearest(truth.points, means, labels, self.neighbours)
+        if not self.within_instances:
+            return found
+        if truth.instances is None:
+            raise ValueError("truth: expected instances for within_instances, got None; leave the option out")
+        return vote_instances(found, truth.instances.cpu())
+
+    def _report(self, pooled: ConfusionMatrix, classes: Sequence[str], dropped: Sequence[str], method: str) -> Report:
+        counts = pooled.matrix.double()
+        true, hits = counts.sum(1) + pooled.misses, counts.diagonal()
+        iou, recall = hits / (true + counts.sum(0) - hits), hits / true
+        rows: list[Row] = [
+            {"class": name, "IoU": float(iou[i]), "recall": float(recall[i]), "foreground": name not in dropped}
+            for i, name in enumerate(classes)
+            if true[i] > 0
+        ]
+        front = [row for row in rows if row["foreground"]]
+        means: dict[str, Any] = {
+            f"{prefix}{score}": mean(row[key] for row in some)
+            for prefix, some in (("f-", front), ("", rows))
+            for score, key in (("mIoU", "IoU"), ("mAcc", "recall"))
+        }
+        return make_report(self, method, means | {"accuracy": pooled.accuracy()}, rows)
+
+
+def matched(truth: PointTruth, classes: Sequence[str]) -> Tensor:  # [P] int64
+    """The labels of points as indices into some classes, by name; -1 for all others.
+
+    Raises:
+        ValueError: if no name of the truth is a class.
+    """
+    ids = {label: classes.index(name) for label, name in truth.names.items() if name in classes}
+    if not ids:
+        some = ", ".join(list(truth.names.values())[:3])
+        raise ValueError(
+            f"truth: expected names such as {', '.join(classes[:3])} (of the benchmark), got {some or 'none'}"
+        )
+    labels = truth.labels.cpu()
+    found = torch.full_like(labels, -1)
+    for label, index in ids.items():
+        found[labels == label] = index
+    return found

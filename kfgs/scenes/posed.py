@@ -1,0 +1,210 @@
+"""From files with one pose per picture to a scene: what the readers of such folders share."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
+
+from ..cameras.camera import Camera
+from .files import MAX_NUMBER, SceneError, is_file, list_images, natural_key, read_image, some
+from .scene import Scene
+
+DEPTH_VIEWS = 25  # depth pictures that are read for points: enough to see a room from all sides, a second to decode
+DEPTH_POINTS = 100_000  # points from all of them: what structure from motion gives for a room, and more
+
+Matrix = NDArray[np.float64]
+
+
+class PosedPicture(NamedTuple):
+    """A picture, and where it was taken from."""
+
+    name: str  # of the view, with suffix
+    path: Path
+    pose: Matrix  # [4, 4] camera to world, x right, y down, z forward
+    origin: str  # the file, and the line, that the pose is from; for messages
+
+
+def picture_size(path: Path) -> tuple[int, int]:
+    """(width, height) of a picture, from its header.
+
+    Raises:
+        SceneError: if it is no picture.
+    """
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except (UnidentifiedImageError, OSError, ValueError) as error:
+        raise SceneError(
+            f"{path}: expected a picture, but its header cannot be read ({error}); copy it again"
+        ) from error
+
+
+def read_numbers(path: Path, expected: str) -> Matrix:  # [rows, columns]
+    """The numbers of a text file, row by row.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        SceneError: if it holds something else, or rows of several lengths.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected {expected} there")
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        rows = [[float(word) for word in line.replace(",", " ").split()] for line in lines if line.strip()]
+        if not rows or len({len(row) for row in rows}) != 1:
+            raise ValueError(f"{len(rows)} rows of {sorted({len(row) for row in rows})} numbers")
+    except ValueError as error:
+        raise SceneError(f"{path}: expected {expected}, got something else ({error}); write the file again") from error
+    return np.array(rows, dtype=np.float64)
+
+
+def read_poses(path: Path) -> Matrix:  # [V, 4, 4]
+    """Camera-to-world matrices, one of 16 numbers (or 12) per line.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        SceneError: if it holds something else.
+    """
+    rows = read_numbers(path, "lines of 16 numbers, one camera-to-world matrix per picture")
+    if rows.shape[1] == 12:
+        rows = np.concatenate([rows, np.tile([[0.0, 0, 0, 1]], (len(rows), 1))], 1)
+    if rows.shape[1] != 16:
+        raise SceneError(
+            f"{path}: expected lines of 16 numbers, one camera-to-world matrix per picture, got lines of {rows.shape[1]}; "
+            "copy the file again"
+        )
+    return rows.reshape(-1, 4, 4)
+
+
+def numbered_pictures(folder: Path, pattern: str, poses: Path) -> tuple[list[PosedPicture], list[str]]:
+    """The pictures of a folder whose number says which line of a file is their pose, counted from 0.
+
+    Args:
+        folder: the pictures.
+        pattern: a regular expression of their names; its first group is the number.
+        poses: the file of poses.
+
+    Returns:
+        The pictures in order, and notes about poses without a picture.
+
+    Raises:
+        FileNotFoundError: if there is no file of poses.
+        SceneError: if it is damaged, there is no picture, or a picture has no line.
+    """
+    matrices = read_poses(poses)
+    matches = [match for name in list_images(folder) if (match := re.fullmatch(pattern, name))]
+    if not matches:
+        example = pattern.replace(r"(\d+)", "NUMBER").split("\\")[0]
+        raise SceneError(
+            f"{folder}: expected pictures named {example}..., got none; copy the pictures of {poses} there"
+        )
+    numbers = [int(match[1]) for match in matches]
+    if max(numbers) >= len(matrices):
+        raise SceneError(
+            f"{poses}: expected a line for each picture of {folder}, got {len(matrices)} lines for numbers up to "
+            f"{max(numbers)} (the first line is for number 0); copy the whole folder again"
+        )
+    views = [
+        PosedPicture(match[0], folder / match[0], matrices[number], f"{poses}, line {number + 1}")
+        for match, number in zip(matches, numbers, strict=True)
+    ]
+    missing = len(matrices) - len(set(numbers))
+    return views, [f"{missing} of {len(matrices)} poses in {poses} have no picture"] if missing else []
+
+
+def scene_of_poses(
+    folder: Path,
+    views: Sequence[PosedPicture],
+    K: Matrix,  # [3, 3]
+    size: tuple[int, int],  # (width, height)
+    points: tuple[Tensor, Tensor] | None = None,  # [P, 3], [P, 3] uint8
+    notes: Sequence[str] = (),
+) -> Scene:
+    """A scene of pictures that one camera took; views without a pose (not finite) are left out and noted.
+
+    Raises:
+        SceneError: if no view has a pose, or a pose is no rigid motion.
+    """
+    views = sorted(views, key=lambda view: natural_key(view.name))
+    known = [bool(np.isfinite(view.pose).all() and np.abs(view.pose).max() < MAX_NUMBER) for view in views]
+    posed = [view for view, has_pose in zip(views, known, strict=True) if has_pose]
+    lost = [view.name for view, has_pose in zip(views, known, strict=True) if not has_pose]
+    if not posed:
+        raise SceneError(f"{folder}: expected poses of finite numbers, none of {len(views)} is; copy the poses again")
+    cameras = []
+    for view in posed:
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = view.pose[:3, :3].T  # Camera refuses what is not a rotation
+        viewmat[:3, 3] = -view.pose[:3, :3].T @ view.pose[:3, 3]
+        try:
+            if view.pose[3].tolist() != [0, 0, 0, 1]:
+                raise ValueError(f"pose: expected 0 0 0 1 as its last row, got {view.pose[3].tolist()}")
+            cameras.append(Camera(torch.from_numpy(viewmat).float(), torch.from_numpy(K).float(), *size, view.name))
+        except ValueError as error:
+            raise SceneError(f"{view.origin}: {error}; copy the poses again") from error
+    said = [f"{len(lost)} views have no pose (not finite) and were left out: {some(lost)}"] if lost else []
+    if points is None:
+        points = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)
+        said.append("no points: a field needs points to start from (`kfgs sfm` finds them)")
+    splits = {"train": list(range(len(cameras))), "test": []}
+    return Scene(cameras, [view.path for view in posed], *points, splits, (*notes, *said)).with_near()
+
+
+def read_depth(path: Path) -> NDArray[Any]:  # [H, W]
+    """The whole numbers of a depth PNG; 0 is unknown.
+
+    Raises:
+        SceneError: if it is no picture with one channel.
+    """
+    try:
+        with Image.open(path) as image:
+            depth = np.asarray(image)
+    except (UnidentifiedImageError, OSError, ValueError) as error:
+        raise SceneError(f"{path}: expected a depth PNG, but it cannot be read ({error}); copy it again") from error
+    if depth.ndim != 2:
+        raise SceneError(f"{path}: expected a depth PNG with one channel, got {depth.shape}; is this a colour picture?")
+    return depth
+
+
+def points_from_depth(
+    views: Sequence[PosedPicture],
+    depths: Sequence[Path],
+    K: Matrix,  # [3, 3] of the depth pictures
+    scale: float,
+) -> tuple[Tensor, Tensor] | None:  # [P, 3] float32, [P, 3] uint8
+    """About `DEPTH_POINTS` points of surfaces with their colours, from `DEPTH_VIEWS` evenly chosen depth pictures.
+
+    Args:
+        views: the pictures; those without a pose are left out.
+        depths: their depth pictures; a missing file is left out.
+        K: intrinsics of the depth pictures. A colour is that of the same place in the colour picture.
+        scale: numbers in the file per world unit.
+
+    Returns:
+        The points, or None if there is no depth.
+    """
+    found = [(v, d) for v, d in zip(views, depths, strict=True) if np.isfinite(v.pose).all() and is_file(d)]
+    if not found:
+        return None
+    chosen = [found[i] for i in np.unique(np.linspace(0, len(found) - 1, DEPTH_VIEWS).round().astype(int))]
+    points, colors = [], []
+    for view, file in chosen:
+        depth, image = read_depth(file).astype(np.float64) / scale, read_image(view.path).numpy()
+        height, width = depth.shape
+        step = max(int(np.sqrt(height * width * len(chosen) / DEPTH_POINTS)), 1)
+        y, x = (axis.reshape(-1) for axis in np.mgrid[step // 2 : height : step, step // 2 : width : step])
+        z = depth[y, x]
+        x, y, z = x[z > 0], y[z > 0], z[z > 0]
+        local = np.stack([(x + 0.5 - K[0, 2]) / K[0, 0] * z, (y + 0.5 - K[1, 2]) / K[1, 1] * z, z], 1)
+        points.append(local @ view.pose[:3, :3].T + view.pose[:3, 3])
+        colors.append(image[y * image.shape[0] // height, x * image.shape[1] // width])
+    places, shades = np.concatenate(points), np.concatenate(colors)
+    return torch.from_numpy(places).float(), torch.from_numpy((shades * 255).round().astype(np.uint8))

@@ -1,0 +1,88 @@
+"""ScanNet scenes as its SensReader exports them: colour pictures with a pose file each.
+
+**Convention**: `pose/N.txt` is camera to world, x right, y down, z forward, in metres, in the frame of the scene's mesh.
+The intrinsics are used as they are: ScanNet does not say whether they count pixel centres from 0 or from 0.5.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..formats.ply import points_from_columns, read_ply
+from .files import SceneError, file_stem, list_images, some
+from .posed import Matrix, PosedPicture, picture_size, points_from_depth, read_numbers, scene_of_poses
+from .scene import Scene
+
+_MILLIMETRES = 1000.0  # of ScanNet's depth pictures
+MESH = "_vh_clean_2.ply"
+
+
+def is_scannet(folder: Path) -> bool:
+    """Whether this is a scene that ScanNet's SensReader exported."""
+    return (folder / "color").is_dir() and (folder / "pose").is_dir()
+
+
+def load_scannet(folder: str | Path) -> Scene:
+    """Read a ScanNet scene: `color/0.jpg`, `pose/0.txt`, `intrinsic/intrinsic_color.txt`.
+
+    Views whose pose is not finite (tracking was lost) are left out and noted. Points are all vertices of
+    `<scene>_vh_clean_2.ply` if there is one, in its order; else they come from `depth/` and `intrinsic/intrinsic_depth.txt`.
+
+    Raises:
+        FileNotFoundError: if a file is missing.
+        SceneError: if one is damaged, or no view has a pose.
+    """
+    folder = Path(folder)
+    names = list_images(folder / "color")
+    with_pose = [name for name in names if (folder / "pose" / f"{file_stem(name)}.txt").is_file()]
+    if not with_pose:
+        raise SceneError(
+            f"{folder / 'pose'}: expected N.txt for the pictures N.jpg of {folder / 'color'} ({some(names, 3) or 'none'}), "
+            "got none that fits; export the scene again with ScanNet's SensReader"
+        )
+    views = []
+    for name in with_pose:
+        file = folder / "pose" / f"{file_stem(name)}.txt"
+        views.append(PosedPicture(name, folder / "color" / name, _matrix(file), str(file)))
+    K, size = _matrix(folder / "intrinsic" / "intrinsic_color.txt")[:3, :3], picture_size(views[0].path)
+    if not (0 < K[0, 2] < size[0] and 0 < K[1, 2] < size[1]):
+        raise SceneError(
+            f"{folder / 'intrinsic/intrinsic_color.txt'}: expected a principal point inside {views[0].path} "
+            f"({size[0]}x{size[1]} pixels), got ({K[0, 2]:g}, {K[1, 2]:g}); give pictures of the size that was exported"
+        )
+    notes = []
+    if len(with_pose) < len(names):
+        lost = [name for name in names if name not in set(with_pose)]
+        notes.append(f"{len(lost)} pictures have no file in pose/ and were left out: {some(lost)}")
+    return scene_of_poses(folder, views, K, size, _points(folder, views), notes)
+
+
+def _matrix(path: Path) -> Matrix:  # [4, 4]
+    matrix = read_numbers(path, "4 rows of 4 numbers")
+    if matrix.shape != (4, 4):
+        raise SceneError(f"{path}: expected 4 rows of 4 numbers, got {matrix.shape}; export the scene again")
+    return matrix
+
+
+def _points(folder: Path, views: list[PosedPicture]) -> tuple[Tensor, Tensor] | None:
+    meshes = sorted(folder.glob(f"*{MESH}"))
+    if meshes:
+        try:
+            columns = read_ply(meshes[0])
+            points = points_from_columns(columns)
+        except ValueError as error:
+            raise SceneError(f"{error}; copy the mesh again, or remove it to take points from the depth") from error
+        colors = torch.full((len(points), 3), 128, dtype=torch.uint8)
+        for i, name in enumerate(("red", "green", "blue")):
+            if name in columns and columns[name].dtype == np.uint8:
+                colors[:, i] = torch.from_numpy(columns[name])
+        return points, colors
+    intrinsic = folder / "intrinsic" / "intrinsic_depth.txt"
+    if not intrinsic.is_file():
+        return None
+    depths = [folder / "depth" / f"{file_stem(view.name)}.png" for view in views]
+    return points_from_depth(views, depths, _matrix(intrinsic)[:3, :3], _MILLIMETRES)

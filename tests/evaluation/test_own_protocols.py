@@ -1,0 +1,138 @@
+import cases_methods as cases
+import numpy as np
+import pytest
+import torch
+from small_room import make_room
+
+from kfgs.evaluation import (
+    KfgsColor,
+    KfgsPooled,
+    KfgsRecolor,
+    KfgsRemoval,
+    KfgsSurface,
+    LabelTruth,
+    PointTruth,
+    TeacherMethod,
+    View,
+    evaluate_segmentation,
+    score_recolor,
+    score_removal,
+    score_surface,
+    score_views,
+)
+from kfgs.features import FeatureFolder
+from kfgs.labels import load_label_set, transfer_labels
+from kfgs.pipeline.apply import score_teacher, true_labels
+from kfgs.scenes import load_scene
+from kfgs.splat import rgb_to_sh0
+
+NAMES = ("a", "b", "c")
+
+
+def test_pooled_is_evaluate_segmentation():
+    rng = np.random.default_rng(0)
+    method = cases.Numbers(NAMES, cases.random_maps(rng, ["x", "y"], NAMES, 2, 9, 12))
+    truth = LabelTruth(NAMES, {stem: torch.from_numpy(rng.integers(-1, 3, (18, 24))) for stem in ("x", "y")})
+    views = [cases.view(stem, 9, 12) for stem in ("z", "y", "x")]
+    report = KfgsPooled(level=1).score(method, truth, views, method.encode)
+    labels = {stem: np.argmax([maps[n][1] for n in NAMES], 0) for stem, maps in method.maps.items()}
+    hits, either, right, total = np.zeros(3), np.zeros(3), 0, 0
+    for stem, target in truth.maps.items():
+        large = labels[stem].repeat(2, 0).repeat(2, 1)
+        for p, t in zip(large.ravel(), target.numpy().ravel(), strict=True):
+            if t >= 0:
+                right, total = right + (p == t), total + 1
+                for c in range(3):
+                    hits[c] += p == c and t == c
+                    either[c] += p == c or t == c
+    assert report["mIoU"] == pytest.approx((hits / either).mean())
+    assert report["accuracy"] == pytest.approx(right / total)
+    assert str(report) == f"mIoU {report['mIoU']:.3f}, accuracy {report['accuracy']:.3f} (kfgs-pooled/1, level=1)"
+    assert "one confusion matrix over all views" in report.text
+    with pytest.raises(ValueError, match="got none for y; pass views with these stems"):
+        KfgsPooled().score(method, truth, views[:1] + views[2:], method.encode)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    return make_room(tmp_path_factory.mktemp("own") / "room")
+
+
+def test_the_teacher_scores_as_the_demo_says(room):
+    scene, classes = load_scene(room), load_label_set(room / "classes.json", room / "text.npy")
+    truth = true_labels(scene, room / "labels", "test")
+    folder = FeatureFolder(room / "features", list(truth))
+    views = [View(scene.stem(i), scene.cameras[i].resized(*folder.shape[:2])) for i in scene.views("test")]
+    method = TeacherMethod(folder)
+    rows = {name: row for name, row in zip(classes.names, classes.embeddings, strict=True)}
+    report = KfgsPooled().score(
+        method, LabelTruth(tuple(classes.names), truth), views, lambda texts: torch.stack([rows[t] for t in texts])
+    )
+    want = score_teacher(lambda stem: folder[folder.stems.index(stem)], truth, classes, (30, 40))
+    assert report["mIoU"] == pytest.approx(want.miou.value)
+    assert report["accuracy"] == pytest.approx(want.accuracy.value)
+
+
+def test_surface_carries_labels_to_points():
+    rng = np.random.default_rng(1)
+    own = {name: rng.uniform(size=(1, 50)) for name in NAMES}
+    for values in own.values():
+        values[:, :5] = np.nan
+    method = cases.Numbers(NAMES, own=own, gaussians=cases.spread_gaussians(rng, 50))
+    points = method.gaussians.means[rng.integers(0, 50, 80)] + 0.05 * torch.randn(80, 3)
+    ids = torch.from_numpy(rng.choice([0, 2, 5, 9], 80))
+    report = KfgsSurface().score(method, PointTruth(points, ids, {2: "a", 5: "b", 9: "c"}), (), method.encode)
+    labels = np.argmax([own[n][0] for n in NAMES], 0)
+    labels[:5] = -1
+    moved = transfer_labels(method.gaussians.means, torch.from_numpy(labels), points)
+    right = [moved.labels[i] == {2: 0, 5: 1, 9: 2}[int(t)] for i, t in enumerate(ids) if t > 0]
+    assert report["agreement"] == pytest.approx(np.mean(right))
+    assert str(report).endswith("(kfgs-surface/1)")
+    with pytest.raises(TypeError, match="expected one with Gaussians"):
+        KfgsSurface().score(TeacherMethod({}), PointTruth(points, ids, {2: "a"}), (), method.encode)
+    found = score_surface(method.gaussians.means, torch.from_numpy(labels), points, torch.zeros(80).long())
+    assert "kfgs-surface/1, 80 points" in str(found)
+    assert "within lambda" in found.text
+    assert found.to_json()["points"] == 80
+    with pytest.raises(ValueError, match="expected some point with a class"):
+        score_surface(method.gaussians.means, torch.from_numpy(labels), points, torch.full((80,), -1))
+
+
+def test_pictures_and_edits_are_scored_as_their_functions_do(room):
+    scene = load_scene(room)
+    with np.load(room / "surface.npz") as surface:
+        points, labels = torch.from_numpy(surface["points"]).float(), torch.from_numpy(surface["labels"].astype(int))
+    count = len(points)
+    cloud = cases.spread_gaussians(np.random.default_rng(2), count)
+    colors = torch.rand(count, 3, generator=torch.Generator().manual_seed(0))
+    before = cloud.replace(means=points, scales=torch.full((count, 3), 0.05), sh=rgb_to_sh0(colors)[:, None])
+    names = load_label_set(room / "classes.json", room / "text.npy").names
+    index = int(labels.bincount().argmax())
+    after = before.select(labels != index)
+
+    color = KfgsColor().score(before, scene)
+    want = score_views(before, scene)
+    assert color.scores == {"PSNR": want.psnr.value, "SSIM": want.ssim.value}
+    assert "(kfgs-color/1)" in str(want)
+    assert "11x11" in want.text
+    removal, found = (
+        KfgsRemoval().score(before, after, room, names[index]),
+        score_removal(before, after, room, names[index]),
+    )
+    assert removal["gone pixels"] == found.gone_pixels
+    assert removal.rows[0]["kept_points"] == found.kept_points
+    assert "held-out views" in found.text
+    assert "held-out views" in removal.to_json()["about"]
+    recolor = KfgsRecolor().score(before, before, room, names[index], (1, 0, 0))
+    found = score_recolor(before, before, room, names[index], (1, 0, 0))
+    assert recolor["hue inside"] == found.hue_inside
+    assert recolor.to_json()["scores"]["psnr outside"] is None  # infinite: nothing changed
+    assert "kfgs-recolor/1" in found.text
+
+
+def test_a_named_score_is_short_and_its_text_long():
+    report = evaluate_segmentation(lambda stem: torch.tensor([[0, 1]]), {"a": torch.tensor([[0, 0]])}, ["x", "y"])
+    assert str(report.miou) == "mIoU 0.250 (kfgs-pooled/1)"
+    assert report.miou.text.startswith("mIoU 0.2500 (kfgs-pooled/1: one confusion matrix")
+    assert "void (255) ignored" in report.text
+    assert "void" not in str(report)

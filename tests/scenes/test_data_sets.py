@@ -1,0 +1,291 @@
+"""Scenes in the layouts of data sets, written here as those data sets have them."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from colmap_models import write_model, write_picture
+from messages import tells
+from PIL import Image
+
+from kfgs.cameras.projection import project_points
+from kfgs.formats.ply import write_ply
+from kfgs.scenes import SceneError, load_scene
+
+# Camera at (1, 2, 3), looking along world +x, world +z up: right = -y, down = -z, forward = +x
+POSE = np.array([[0.0, 0, 1, 1], [-1, 0, 0, 2], [0, -1, 0, 3], [0, 0, 0, 1]])
+CAMERA = {"w": 64, "h": 48, "fx": 50.0, "fy": 55.0, "cx": 31.5, "cy": 23.5, "scale": 6553.5}
+
+
+def _line(pose: np.ndarray) -> str:
+    return " ".join(f"{value:.8e}" for value in pose.reshape(-1))
+
+
+def _depth(path: Path, value: int, size: tuple[int, int] = (48, 64)) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.full(size, value, np.uint16)).save(path)
+
+
+def _nice_slam(folder: Path, count: int = 3) -> Path:
+    scene = folder / "room0"
+    (scene / "results").mkdir(parents=True)
+    for i in range(count):
+        write_picture(scene / f"results/frame{i:06d}.jpg")
+        _depth(scene / f"results/depth{i:06d}.png", 13107)  # 2 metres
+    (scene / "traj.txt").write_text("".join(_line(POSE) + "\n" for _ in range(count)))
+    (folder / "cam_params.json").write_text(json.dumps({"camera": CAMERA}))
+    return scene
+
+
+def _looks_along_x(scene, K: tuple[float, float, float, float]) -> None:
+    fx, fy, cx, cy = K
+    points = torch.tensor([[6.0, 2.0, 3.0], [6.0, 1.0, 3.0], [6.0, 2.0, 4.0]])  # ahead; to the right; above
+    xy, depth, _ = project_points(scene.cameras[0], points)
+    torch.testing.assert_close(xy, torch.tensor([[cx, cy], [cx + fx / 5, cy], [cx, cy - fy / 5]]))
+    torch.testing.assert_close(depth, torch.tensor([5.0, 5.0, 5.0]))
+
+
+def test_replica_of_nice_slam(tmp_path: Path) -> None:
+    scene = load_scene(_nice_slam(tmp_path))
+    _looks_along_x(scene, (50, 55, 32, 24))  # their centres of pixels are whole numbers, ours are halves
+    assert [camera.name for camera in scene.cameras] == ["frame000000.jpg", "frame000001.jpg", "frame000002.jpg"]
+    assert scene.image(1).shape == (48, 64, 3)
+    assert scene.cameras[0].size == (48, 64)
+    torch.testing.assert_close(scene.points[:, 0], torch.full((len(scene.points),), 3.0), atol=1e-4, rtol=0)
+    xy, _, _ = project_points(scene.cameras[0], scene.points[:1])
+    torch.testing.assert_close(xy, torch.tensor([[0.5, 0.5]]), atol=1e-3, rtol=0)
+    assert scene.colors.shape == (3 * 48 * 64, 3)
+
+
+def test_a_real_room_in_the_layout_of_nice_slam(tmp_path: Path, shared_data: Path) -> None:
+    room = load_scene(shared_data / "room_0")
+    chosen = list(range(0, 180, 45))
+    (tmp_path / "results").mkdir()
+    lines = []
+    for number, i in enumerate(chosen):
+        with Image.open(room.image_paths[i]) as picture:
+            picture.convert("RGB").save(tmp_path / f"results/frame{number:06d}.jpg")
+        lines.append(_line(torch.linalg.inv(room.cameras[i].viewmat.double()).numpy()))
+    (tmp_path / "traj.txt").write_text("\n".join(lines))
+    K, (height, width) = room.cameras[0].K, room.cameras[0].size
+    camera = {"w": width, "h": height, "fx": float(K[0, 0]), "fy": float(K[1, 1])}
+    camera |= {"cx": float(K[0, 2]) - 0.5, "cy": float(K[1, 2]) - 0.5, "scale": 6553.5}
+    (tmp_path / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    scene = load_scene(tmp_path)
+    for number, i in enumerate(chosen):
+        torch.testing.assert_close(scene.cameras[number].viewmat, room.cameras[i].viewmat, atol=1e-5, rtol=0)
+        torch.testing.assert_close(scene.cameras[number].K, room.cameras[i].K)
+    assert len(scene.points) == 0
+    assert any("no points" in note for note in scene.notes)
+
+
+def test_a_subset_of_the_frames_keeps_its_poses(tmp_path: Path) -> None:
+    folder = _nice_slam(tmp_path)
+    far = POSE.copy()
+    far[0, 3] = 9
+    (folder / "traj.txt").write_text("".join(_line(pose) + "\n" for pose in (POSE, POSE, far, POSE)))
+    (folder / "results/frame000001.jpg").unlink()
+    scene = load_scene(folder)
+    assert [float(camera.center[0]) for camera in scene.cameras] == pytest.approx([1, 9])
+    assert any("2 of 4 poses" in note for note in scene.notes)
+
+
+def test_replica_that_is_not_whole(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match=tells("it holds scenes (room0)", "room0")):
+        load_scene(_nice_slam(tmp_path).parent)
+    folder = tmp_path / "room0"
+    with pytest.raises(SceneError, match=tells("results", "the folder above is a scene", folder)):
+        load_scene(folder / "results")
+    lines = (folder / "traj.txt").read_text().splitlines()
+    (folder / "traj.txt").write_text("\n".join(lines[:2]))
+    with pytest.raises(SceneError, match=tells("traj.txt", "2 lines", "numbers up to 2", "copy the whole folder")):
+        load_scene(folder)
+    (folder / "traj.txt").write_text("1 2 3\n")
+    with pytest.raises(SceneError, match=tells("traj.txt", "16 numbers", "lines of 3")):
+        load_scene(folder)
+    (folder / "traj.txt").write_text("1 2 3\n1 2\n")
+    with pytest.raises(SceneError, match=tells("traj.txt", "2 rows of [2, 3] numbers")):
+        load_scene(folder)
+    (folder / "traj.txt").write_text("\n".join([_line(2 * POSE), *lines[1:]]))
+    with pytest.raises(SceneError, match=tells("traj.txt, line 1", "0 0 0 1", "copy the poses again")):
+        load_scene(folder)
+    (folder / "traj.txt").write_text("\n".join(lines))
+    (tmp_path / "cam_params.json").write_text(json.dumps({"camera": CAMERA | {"w": 65}}))
+    with pytest.raises(SceneError, match=tells("frame000000.jpg", "65x48", "64x48")):
+        load_scene(folder)
+    (tmp_path / "cam_params.json").write_text(json.dumps({"camera": CAMERA | {"fx": "fifty"}}))
+    with pytest.raises(SceneError, match=tells("cam_params.json", "fx", "copy it again")):
+        load_scene(folder)
+    (tmp_path / "cam_params.json").unlink()
+    with pytest.raises(FileNotFoundError, match=tells("cam_params.json", '"scale": 6553.5')):
+        load_scene(folder)
+    (folder / "traj.txt").unlink()
+    with pytest.raises(
+        SceneError, match=tells("there is results, but not what belongs to it", "results/ and traj.txt")
+    ):
+        load_scene(folder)
+
+
+def test_replica_of_semantic_nerf(tmp_path: Path) -> None:
+    for i in (0, 2):
+        write_picture(tmp_path / f"rgb/rgb_{i}.png")
+        _depth(tmp_path / f"depth/depth_{i}.png", 2000)
+    (tmp_path / "traj_w_c.txt").write_text("".join(_line(POSE) + "\n" for _ in range(3)))
+    scene = load_scene(tmp_path)
+    _looks_along_x(scene, (32, 32, 32, 24))  # 90 degrees across 64 pixels
+    assert [scene.stem(i) for i in range(2)] == ["rgb_0", "rgb_2"]
+    assert any("90 degrees" in note for note in scene.notes)
+    assert float(scene.points[:, 0].mean()) == pytest.approx(3.0)
+    (tmp_path / "rgb/rgb_0.png").rename(tmp_path / "rgb/a.png")
+    (tmp_path / "rgb/rgb_2.png").unlink()
+    with pytest.raises(SceneError, match=tells("rgb", "pictures named rgb_NUMBER", "none")):
+        load_scene(tmp_path)
+
+
+def _scannet(folder: Path) -> Path:
+    for i in range(3):
+        write_picture(folder / f"color/{i}.jpg")
+        _depth(folder / f"depth/{i}.png", 2000, (24, 32))
+        (folder / "pose").mkdir(exist_ok=True)
+        (folder / f"pose/{i}.txt").write_text("\n".join(" ".join(map(str, row)) for row in POSE))
+    (folder / "intrinsic").mkdir()
+    for name, K in (("color", (50, 55, 32, 24)), ("depth", (25, 27.5, 16, 12))):
+        rows = [[K[0], 0, K[2], 0], [0, K[1], K[3], 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+        (folder / f"intrinsic/intrinsic_{name}.txt").write_text("\n".join(" ".join(map(str, row)) for row in rows))
+    return folder
+
+
+def test_scannet(tmp_path: Path) -> None:
+    folder = _scannet(tmp_path)
+    (folder / "pose/1.txt").write_text("\n".join(["-inf -inf -inf -inf"] * 4))
+    write_picture(folder / "color/7.jpg")
+    scene = load_scene(folder)
+    _looks_along_x(scene, (50, 55, 32, 24))
+    assert [camera.name for camera in scene.cameras] == ["0.jpg", "2.jpg"]
+    assert any("1 views have no pose" in note and "1.jpg" in note for note in scene.notes)
+    assert any("no file in pose/" in note and "7.jpg" in note for note in scene.notes)
+    assert float(scene.points[:, 0].mean()) == pytest.approx(3.0)
+    xyz = {name: np.array([1.0, 2.0], np.float32) for name in "xyz"}
+    write_ply(folder / "scene0000_00_vh_clean_2.ply", xyz | {"red": np.array([5, 6], np.uint8)})
+    scene = load_scene(folder)
+    assert scene.points.tolist() == [[1, 1, 1], [2, 2, 2]]  # every vertex, in the order of the mesh
+    assert scene.colors.tolist() == [[5, 128, 128], [6, 128, 128]]
+
+
+def test_scannet_that_is_not_whole(tmp_path: Path) -> None:
+    folder = _scannet(tmp_path)
+    (folder / "pose/0.txt").write_text("1 2 3\n")
+    with pytest.raises(SceneError, match=tells("0.txt", "4 rows of 4 numbers", "(1, 3)")):
+        load_scene(folder)
+    (folder / "pose/0.txt").write_text("one two")
+    with pytest.raises(SceneError, match=tells("0.txt", "4 rows of 4 numbers", "'one'")):
+        load_scene(folder)
+    (folder / "pose/0.txt").unlink()
+    (folder / "scene_vh_clean_2.ply").write_text("no mesh")
+    with pytest.raises(SceneError, match=tells("scene_vh_clean_2.ply", "PLY", "copy the mesh again")):
+        load_scene(folder)
+    (folder / "intrinsic/intrinsic_color.txt").write_text("1170 0 647 0\n0 1170 483 0\n0 0 1 0\n0 0 0 1")
+    with pytest.raises(SceneError, match=tells("intrinsic_color.txt", "64x48", "(647, 483)")):
+        load_scene(folder)
+    (folder / "intrinsic/intrinsic_color.txt").unlink()
+    with pytest.raises(FileNotFoundError, match=tells("intrinsic_color.txt", "no such file")):
+        load_scene(folder)
+    for name in "12":
+        (folder / f"pose/{name}.txt").unlink()
+    with pytest.raises(SceneError, match=tells("pose", "0.jpg", "SensReader")):
+        load_scene(folder)
+
+
+def _llff(folder: Path, count: int = 3, size: tuple[float, float, float] = (96, 128, 100)) -> Path:
+    matrix = np.zeros((3, 5))
+    matrix[:, 0], matrix[:, 1], matrix[:, 2] = -POSE[:3, 1] * -1, POSE[:3, 0], -POSE[:3, 2]
+    matrix[:, 3], matrix[:, 4] = POSE[:3, 3], size
+    for i in range(count):
+        write_picture(folder / f"images_2/{i:02d}.jpg")
+    np.save(folder / "poses_bounds.npy", np.tile(np.concatenate([matrix.reshape(-1), [1, 9]]), (count, 1)))
+    return folder
+
+
+def test_llff_and_its_smaller_pictures(tmp_path: Path) -> None:
+    scene = load_scene(_llff(tmp_path))
+    _looks_along_x(scene, (50, 50, 32, 24))  # f = 100 at 128x96
+    assert (len(scene), len(scene.points)) == (3, 0)
+    assert any("no points" in note for note in scene.notes)
+
+
+def test_llff_that_is_not_whole(tmp_path: Path) -> None:
+    folder = _llff(tmp_path)
+    write_picture(folder / "images_2/99.jpg")
+    with pytest.raises(SceneError, match=tells("poses_bounds.npy", "images_2 (4)", "got 3")):
+        load_scene(folder)
+    (folder / "images_2/99.jpg").unlink()
+    _llff(folder, size=(128, 96, 100))
+    with pytest.raises(SceneError, match=tells("00.jpg", "96x128", "64x48", "turned")):
+        load_scene(folder)
+    np.save(folder / "poses_bounds.npy", np.zeros((3, 17)))
+    with pytest.raises(SceneError, match=tells("poses_bounds.npy", "above 0")):
+        load_scene(folder)
+    np.save(folder / "poses_bounds.npy", np.zeros((3, 16)))
+    with pytest.raises(SceneError, match=tells("poses_bounds.npy", "[V, 17]", "(3, 16)")):
+        load_scene(folder)
+    (folder / "poses_bounds.npy").write_bytes(b"nothing")
+    with pytest.raises(SceneError, match=tells("poses_bounds.npy", "cannot be read")):
+        load_scene(folder)
+    (folder / "images_2").rename(folder / "photos")
+    _llff(folder)
+    (folder / "images_2").rename(folder / "others")
+    with pytest.raises(FileNotFoundError, match=tells("images", "poses_bounds.npy")):
+        load_scene(folder)
+
+
+def test_mip_nerf_360_with_smaller_pictures(tmp_path: Path) -> None:
+    write_model(tmp_path / "sparse/0", ["a.png", "b.png"])  # 64x48, f = 50, 55, c = 31, 25
+    for name in ("a.png", "b.png"):
+        write_picture(tmp_path / "images" / name)
+        write_picture(tmp_path / "images_4" / name, 12, 16)
+    assert load_scene(tmp_path).cameras[0].size == (48, 64)
+    scene = load_scene(tmp_path, images="images_4")
+    assert scene.image(0).shape == (12, 16, 3)
+    torch.testing.assert_close(scene.cameras[0].K, torch.tensor([[12.5, 0, 7.75], [0, 13.75, 6.25], [0, 0, 1]]))
+    assert any("4 times smaller" in note for note in scene.notes)
+    (tmp_path / "images").rename(tmp_path / "originals")
+    assert load_scene(tmp_path).cameras[0].size == (12, 16)  # what there is
+    (tmp_path / "images_4").rename(tmp_path / "images_8")
+    with pytest.raises(SceneError, match=tells("images_8", "1/8 of 64x48", "16x12")):
+        load_scene(tmp_path)
+
+
+def test_feature_3dgs_and_lists_of_test_views(tmp_path: Path) -> None:
+    names = [f"rgb_{i}.png" for i in range(12)]
+    write_model(tmp_path / "sparse/0", names)
+    for name in names:
+        write_picture(tmp_path / "images" / name)
+    assert load_scene(tmp_path, split="feature3dgs").splits["test"] == [2, 10]
+    (tmp_path / "sparse/0/test.txt").write_text("rgb_3.png\nrgb_7\n\n")
+    scene = load_scene(tmp_path)
+    assert scene.splits["test"] == [3, 7]
+    assert len(scene.splits["train"]) == 10
+    (tmp_path / "sparse/0/test.txt").write_text("frame_1.png\n")
+    with pytest.raises(SceneError, match=tells("test.txt", "12 pictures", "frame_1.png")):
+        load_scene(tmp_path)
+    assert load_scene(tmp_path, split="holdout8").splits["test"] == [0, 8]
+
+
+def test_scannet_as_opengaussian_has_it(tmp_path: Path) -> None:
+    opengl = (POSE @ np.diag([1.0, -1, -1, 1])).tolist()
+    lens = {"w": 64, "h": 48, "fl_x": 50, "fl_y": 55, "cx": 32, "cy": 24}
+    for split, numbers in (("train", (0, 20)), ("test", (10,))):
+        frames = []
+        for i in numbers:
+            write_picture(tmp_path / f"color/{i}.jpg")
+            frames.append({"file_path": f"color/{i}", "transform_matrix": opengl})
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps({**lens, "frames": frames}))
+    write_ply(tmp_path / "points3d.ply", {name: np.array([1.0, 2.0], np.float32) for name in "xyz"})
+    scene = load_scene(tmp_path)
+    _looks_along_x(scene, (50, 55, 32, 24))
+    assert [camera.name for camera in scene.cameras] == ["color/0.jpg", "color/10.jpg", "color/20.jpg"]
+    assert scene.splits == {"train": [0, 2], "test": [1]}
+    assert len(scene.points) == 2
+    assert any("points3d.ply" in note for note in scene.notes)
