@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-import numpy as np
 import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from scipy.spatial import cKDTree
@@ -28,7 +27,7 @@ from .scannet_points import (
 )
 from .truth import PointTruth
 
-CHUNK = 512  # Gaussians whose vertices are looked up at once: at most 512,000 pairs, 80 MB
+PAIRS = 500_000  # of a Gaussian and a vertex at once: 80 MB
 
 
 def significance(gaussians: Gaussians) -> Tensor:  # [N] float64
@@ -68,17 +67,13 @@ def gaussian_truth(
         return found
     C, tree = int(classes.max()) + 1, cKDTree(places.numpy())
     reach = radius * cloud.scales.amax(1)
+    around = tree.query_ball_point(cloud.means.numpy(), reach.numpy(), return_length=True, workers=-1)
+    count = torch.from_numpy(around).clamp_max(nearest)
     whitening = quaternion_to_rotation_matrix(cloud.quats) / cloud.scales.clamp_min(1e-12)[:, None]  # R S^-1
-    count = min(nearest, len(places))
-    for rows in reach.argsort().split(CHUNK):  # of like radius, so that one bound suits all
-        limit = float(reach[rows].max())
-        distance, index = tree.query(
-            cloud.means[rows].numpy(),
-            k=range(1, count + 1),
-            distance_upper_bound=np.nextafter(limit, np.inf),
-            workers=-1,
-        )
-        inside = torch.from_numpy(distance) <= reach[rows, None]  # [n, k]
+    for rows in _alike(count):
+        k = range(1, int(count[rows[-1]]) + 1)
+        _, index = tree.query(cloud.means[rows].numpy(), k=k, workers=-1)
+        inside = torch.arange(len(k)) < count[rows, None]  # [n, k]: the nearest come first
         owner, column = inside.nonzero().T
         which = torch.from_numpy(index)[owner, column]
         offsets = (places[which] - cloud.means[rows][owner])[:, None] @ whitening[rows][owner]  # [m, 1, 3]
@@ -87,8 +82,19 @@ def gaussian_truth(
         sums = torch.zeros(len(rows) * C, dtype=torch.float64).index_add_(0, cell, votes)
         members = torch.bincount(cell, minlength=len(rows) * C)
         score = (sums / members.clamp_min(1) if balanced else sums).masked_fill(members == 0, -1).view(-1, C)
-        found[rows] = score.argmax(1).masked_fill(~inside.any(1), -1)
+        found[rows] = score.argmax(1)
     return found
+
+
+def _alike(count: Tensor) -> Iterator[Tensor]:  # [N] -> [n] int64 each
+    """The Gaussians with candidates, those of like number together, in parts of at most `PAIRS` pairs."""
+    order = count.argsort()
+    order = order[count[order] > 0]
+    while len(order):
+        most = count[order[: max(1, PAIRS // int(count[order[0]]))]]
+        fit = max(1, int((torch.arange(1, len(most) + 1) * most <= PAIRS).sum()))  # pairs grow along the order
+        yield order[:fit]
+        order = order[fit:]
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from .ply import _TYPES, Columns, _check_scalars, _check_vertex, _Element, _existing, _parse_header, _read_element
 
 _CORNERS = ("vertex_indices", "vertex_index")
+_STEP = 64  # faces looked at after one of another size: a mesh that mixes sizes is not read over and over
 
 
 class Mesh(NamedTuple):
@@ -86,12 +87,12 @@ def _rows(
     before: list[tuple[str, str]],
     after: list[tuple[str, str]],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Columns]:
-    """Runs of faces with the same number of corners are read at once."""
+    """Runs of faces with the same number of corners are read at once, in steps that grow while the run goes on."""
     count_code, corner_code = (order + _TYPES[name] for name in types)
     columns: dict[str, list[NDArray[Any]]] = {name: [] for name, _ in face.properties}
     corners, counts, place, done = [], [], 0, 0
     head = sum(np.dtype(code).itemsize for _, code in before)
-    count_size = np.dtype(count_code).itemsize
+    count_size, step = np.dtype(count_code).itemsize, _STEP
     while done < face.rows:
         if place + head + count_size > len(data):
             raise ValueError(
@@ -104,14 +105,14 @@ def _rows(
         fields += [("count", count_code), ("corners", corner_code, (n,))]
         fields += [(f"a{i}", order + code) for i, (_, code) in enumerate(after)]
         dtype = np.dtype(fields)
-        fit = min((len(data) - place) // dtype.itemsize, face.rows - done)
+        fit = min((len(data) - place) // dtype.itemsize, face.rows - done, step)
         if fit == 0:
             raise ValueError(
                 f"{path}: the header promises {face.rows} faces, but only {done} follow; the file is truncated"
             )
         rows = np.frombuffer(data, dtype, fit, place)
         other = (rows["count"] != n).nonzero()[0]
-        rows = rows[: int(other[0])] if len(other) else rows
+        rows, step = (rows[: int(other[0])], _STEP) if len(other) else (rows, 2 * step)
         corners.append(rows["corners"].astype(np.int64).reshape(-1))
         counts.append(np.full(len(rows), n, np.int64))
         for letter, some in (("b", before), ("a", after)):
