@@ -209,7 +209,7 @@ Image.fromarray(picture)
 
 # %%
 attached = {by: kfgs.attach(field, colors, classes, by=by) for by in ("distance", "views")}
-print(*attached["views"].words[1:], sep="\n")  # the first says how the frames were found to agree
+print(*attached["views"].notes[1:], sep="\n")  # the first says how the frames were found to agree
 row = [viz.show_cloud(one.splats.gaussians)(camera) for one in attached.values()]
 Image.fromarray(viz.picture_grid([row], ("by distance", "by views"), width=width))
 

@@ -457,16 +457,16 @@ def test_discarding_spares_the_maps_of_other_views(scene, weights, tmp_path, cap
         (["--teacher", "cases_teach:TinyLSeg", "--weights", "w", "--discard-features"], "stores no dense maps"),
         (
             ["--teacher", "cases_teach:TinyLSeg", "--weights", "w", "--undistorted-features"],
-            "sees the pictures as taken",
+            "sees the original pictures",
         ),
         (
             ["--teacher", "cases_teach:TinyLSeg", "--weights", "w", "--level", "s"],
-            "level: expected none beside --teacher",
+            "level: expected none with --teacher",
         ),
         (["--fast"], "fast: expected none without --teacher"),
         (["--size", "4", "5"], "size: expected none without --teacher"),
         (["--weights", "w"], "weights: expected none without --teacher"),
-        (["--level", "s"], "level: expected none beside"),
+        (["--level", "s"], "level: expected none with"),
     ],
 )
 def test_options_without_effect_are_refused(scene, maps, given, words, tmp_path, capsys):

@@ -130,7 +130,7 @@ def test_no_driver_is_told_before_anything_is_read(files, monkeypatch, capsys):
         (["FIELD", "--where", "picture", "--images", "x"], "--images: expected none without --scene"),
         (["FIELD", "--text", "TABLE", "--where", "picture", "--weights", "x"], "--weights: expected none without --teacher"),
         (["FIELD", "--text", "TABLE", "--where", "picture", "--ask", "wal"], "wal"),
-        (["SPLAT", "--text", "TABLE", "--where", "picture"], "--text: expected none beside a splat"),
+        (["SPLAT", "--text", "TABLE", "--where", "picture"], "--text: expected none with a splat"),
         (["COLOR", "--where", "picture"], "SOURCE: expected a splat with classes"),
         (["nowhere", "--where", "picture"], "SOURCE: expected the folder that `kfgs fit` wrote"),
         (["FIELD", "--text", "TABLE", "--color", "FIELD", "--where", "picture"], "--color: expected a splat file"),

@@ -34,22 +34,22 @@ class Alignment:
     rms: float
     """Root mean square distance of the inliers, world units of the destination."""
     size: float
-    """Extent of what was compared in the destination, world units."""
+    """Extent of the compared cameras (or points) in the destination, world units."""
     inliers: int
     """Cameras (or points) that fit."""
     count: int
     """Cameras (or points) that were compared."""
     how: str
-    """What was done, in words."""
+    """How it was found, in words."""
     details: dict[str, Any] = field(default_factory=dict)
-    """More numbers, such as the worst cameras by name; JSON can hold all of them."""
+    """More numbers as JSON, for instance the worst cameras by name."""
 
     def __repr__(self) -> str:
         return f"Alignment({self.summary})"
 
     @property
     def summary(self) -> str:
-        """One sentence: what was done, the scale, how many fit and how closely."""
+        """One sentence: how it was found, the scale, how many fit and how closely."""
         return (
             f"{self.how}: scale {self.similarity.scale:.6g}, {self.inliers} of {self.count} fit, rms {self.rms:.3g} "
             f"({self.rms / self.size:.2%} of the extent {self.size:.3g})"

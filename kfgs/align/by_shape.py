@@ -24,7 +24,7 @@ SIZES = (0.75, 0.87, 1.0, 1.15, 1.33)  # around the ratio of the clouds' radii, 
 BASINS, FINALISTS = 8, 3  # starts that are refined, and starts that are refined on more points
 COARSE, FINE, FULL = 300, 3_000, 10_000  # points of each cloud
 MIN_FIT = 0.6  # of the points, both ways (harmonic mean)
-MARGIN = 0.6  # of what the best leaves unfit, the runner-up must leave more than 1 / MARGIN times as much
+MARGIN = 0.6  # the second best fit must leave more than 1 / MARGIN times as many points unfit as the best
 
 
 def align_clouds(

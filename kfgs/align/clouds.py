@@ -1,4 +1,4 @@
-"""What the alignments share: the bulk of a cloud, its spacing, nearest points, rotations and robust weights."""
+"""Helpers of all alignments: the bulk of a cloud, its spacing, nearest points, rotations and robust weights."""
 
 from __future__ import annotations
 

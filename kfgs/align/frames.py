@@ -43,7 +43,7 @@ class FrameCheck(NamedTuple):
     summary: str  # one sentence with the numbers
     near: tuple[float, float]  # share of src's points near dst, and of dst's near src
     distance: float  # median distance to the other cloud, of the nearer one, world units
-    reach: tuple[float, float]  # what counted as near dst, and near src, world units
+    reach: tuple[float, float]  # the distances that count as near dst, and near src, world units
     drift: float  # how far the best fit nearby moves the surface of src, along its normals, world units
 
 

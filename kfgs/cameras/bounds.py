@@ -43,7 +43,7 @@ def robust_bounds(
     Args:
         points: the cloud, P >= 1, finite.
         coverage: share of the points between the two quantiles of one axis, in (0, 1].
-        margin: what to add on each side, as a fraction of the box.
+        margin: added on each side, as a fraction of the box.
 
     Raises:
         ValueError: if there are no points, or a number is out of range.

@@ -142,7 +142,7 @@ class Camera:
         if float(right.norm()) < 1e-6:
             raise ValueError(
                 f"up: expected another direction than that of the view, got {zenith.tolist()} for a view along "
-                f"{forward.tolist()}; give the direction that shall be up in the picture, such as (0, 1, 0)"
+                f"{forward.tolist()}; pass a direction that is up in the picture, for instance (0, 1, 0)"
             )
         right = right / right.norm()
         R = torch.stack([right, torch.linalg.cross(forward, right), forward])  # x right, y down, z forward

@@ -1,4 +1,4 @@
-"""From the z = 1 plane to pixels, through the lens if there is one; and the angle beyond which a lens model is wrong."""
+"""Project the z = 1 plane to pixels, with or without a lens; find the angle beyond which a lens model is wrong."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def plane_to_pixel(
 
     Note:
         D is kornia's `distort_points` or `distort_points_kannala_brandt`, which agree with COLMAP's camera models.
-        With a lens, slopes are clamped at 1e4, so that a point beside the camera gives a large number instead of NaN.
+        With a lens, slopes are clamped at 1e4, so that a point at the camera's side gives a large number instead of NaN.
     """
     intrinsics = torch.stack([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
     if distortion is None:

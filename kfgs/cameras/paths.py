@@ -15,7 +15,7 @@ from .._check import check_size, check_whole
 from .camera import Camera
 
 Array = np.ndarray[Any, Any]
-SAME = 1e-9  # two successive views that are closer than this, in place and direction, count as one
+SAME = 1e-9  # successive views closer than this, in position and direction, are one
 STANDING = 1e-6  # of the coordinates: cameras on one tripod differ by the rounding of float32
 AROUND = 3  # a closed path is continued by this many keys at both ends: keys farther away hardly change a spline
 

@@ -159,7 +159,7 @@ def fit_similarity(
         if spread[1] <= STRAIGHT * spread[0]:
             raise ValueError(
                 f"{name}: expected points that span a plane, got points on a line (spreads {spread.tolist()}); "
-                "add pairs beside it"
+                "add pairs next to it"
             )
     U, d, Vh = torch.linalg.svd(y.T @ x)
     signs = torch.ones(3).double()

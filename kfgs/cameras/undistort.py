@@ -19,7 +19,7 @@ def undistort(
     image: Tensor,  # [H, W, C]
     camera: Camera,
 ) -> tuple[Tensor, Camera, Tensor]:  # [H, W, C], camera, [H, W] bool
-    """Remove the lens from a picture or a feature map: K, pose and size stay, the distortion goes.
+    """Undistort a picture or a feature map; K, pose and size stay.
 
     Each pixel of the result looks up, bilinearly, where its ray fell in the distorted picture.
 
@@ -28,14 +28,14 @@ def undistort(
         camera: the camera that took it. Without distortion the picture is returned unchanged.
 
     Returns:
-        The picture, 0 where nothing was recorded; the camera without distortion; and the mask of recorded pixels.
+        The picture, 0 at unrecorded pixels; the camera without distortion; and the mask of recorded pixels.
 
     Raises:
         TypeError: if `image` is not floating point.
         ValueError: if `image` is not of the camera's size.
 
     Note:
-        kornia's `undistort_image` does the same two steps (distort the grid, remap), but knows no fisheye and gives no mask.
+        kornia's `undistort_image` does the same two steps (distort the grid, remap), but has no fisheye model and no mask.
         Pixels beyond the border of the picture, or beyond the `fold_radius` of the lens model, do not count as recorded.
         Within half a pixel of the border the outermost pixel is repeated.
     """
@@ -62,7 +62,7 @@ def undistort_labels(
     Args:
         labels: as large as the camera says.
         camera: the camera that took it; without distortion the labels are returned unchanged.
-        fill: what to write where nothing was recorded.
+        fill: label of unrecorded pixels.
 
     Raises:
         TypeError: if `labels` are not integers.

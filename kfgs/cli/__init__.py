@@ -2,7 +2,7 @@
 
 Every command names the files it wrote, shows progress on long work, and ends with 0 (done), 1 (bad input, with one
 message that says what to do), 2 (wrong usage), 130 (interrupted; demo, features, fit and color continue where they stopped)
-or 141 (nobody reads its lines any more).
+or 141 (its output was closed).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ GROUPS: dict[str, tuple[Any, ...]] = {
     "Colour splats": (color, attach, edit, convert),
 }
 COMMANDS = {command.__name__: command for group in GROUPS.values() for command in group}
-RESUMED = {"demo", "features", "fit", "color"}  # commands that find what they did before
+RESUMED = {"demo", "features", "fit", "color"}  # commands that reuse their earlier work
 STYLE = (
     tyro.conf.DisallowNone,
     tyro.conf.FlagCreatePairsOff,
@@ -46,8 +46,8 @@ STYLE = (
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; return the exit code."""
-    # Read when torch is first imported: waiting threads sleep instead of spinning, which beside other busy programs is
-    # the difference between 25 training steps a second and one (measured on two cores).
+    # Read when torch is first imported: waiting threads sleep instead of spinning. With other busy programs this makes 25
+    # training steps a second instead of one (measured on two cores).
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if not sys.stderr.isatty():  # read when tqdm is imported: a log gets two lines a minute, not ten a second
         os.environ.setdefault("TQDM_MININTERVAL", "30")
@@ -78,7 +78,7 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         _fail("interrupted" + ("; the same command goes on where it stopped" if name in RESUMED else ""))
         return 130
-    except BrokenPipeError:  # whoever read our lines has gone, as `head` does
+    except BrokenPipeError:  # the reader of the output has ended, for instance `head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter complains when it ends
         return 141
     except (ValueError, TypeError, OSError, ImportError, ArithmeticError) as error:
@@ -100,7 +100,7 @@ def _expand_home(word: str) -> str:
 
 
 def _overview() -> str:
-    """What `kfgs --help` prints: a line for each command."""
+    """The text of `kfgs --help`: a line for each command."""
     lines = [
         "usage: kfgs COMMAND ...",
         "",
@@ -123,7 +123,7 @@ def _unknown(name: str) -> str:
 
 
 def _description(command: Callable[..., None]) -> str:
-    """A command's docstring without the options: what it does, and examples. The indent keeps tyro from joining lines."""
+    """A command's docstring without the options. The indent keeps tyro from joining lines."""
     first, *more = (inspect.getdoc(command) or "").split("\n\nArgs:")[0].split("\n\n")
     lines = [_wrap(first, "  ")]
     for part in more:
@@ -136,7 +136,7 @@ def _wrap(text: str, indent: str = "") -> str:
 
 
 def _shown_names(kind: Any) -> dict[str, str]:
-    """How the command line writes the parameters of a command, or the fields of its options: SCENE, --splat-scene."""
+    """The command-line names of a command's parameters, or of the fields of its options: SCENE, --splat-scene."""
     found: dict[str, str] = {}
     for name, hint in get_type_hints(kind, include_extras=True).items():
         if dataclasses.is_dataclass(hint):
@@ -154,6 +154,6 @@ def _in_options(message: str, names: dict[str, str]) -> str:
     arguments = about.replace("-", "_").split(", ")
     if colon and all(argument in names for argument in arguments):
         about = ", ".join(names[argument] for argument in arguments)
-    for name in (name for name in names if "_" in name):  # in the text only names that are no English words
+    for name in (name for name in names if "_" in name):  # in the text, replace only names that are no English words
         rest = re.sub(rf"\b{name}(=\w+)?\b", names[name], rest)
     return about + colon + rest

@@ -1,4 +1,4 @@
-"""Edits as they are written on a command line: `plant:#c04040`, `lamp:0.3`, `table:0.5,0,0`, `chair/2:z,90`."""
+"""Parse edits written on a command line: `plant:#c04040`, `lamp:0.3`, `table:0.5,0,0`, `chair/2:z,90`."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ class Edits:
 
 
 def parse_edits(asked: Edits) -> Iterator[Any]:
-    """The edits that the options ask for, in the order of `Edits`: what is removed last could be recoloured before.
+    """The edits of the options, in the order of `Edits`, so that a class can be recoloured before it is removed.
 
-    Each edit counts the parts of a class (`chair/1`) in what the edits before left; all parts of one class that are
-    removed are counted together. A class whose own name ends in `/1` can only be edited in Python.
+    Parts of a class (`chair/1`) are counted after the earlier edits; removed parts of one class are counted together. A class
+    with a name that ends in `/1` can only be edited in Python.
 
     Raises:
         ValueError: if an option lacks its value, or the value is of another kind; the message quotes the option's text.
@@ -104,8 +104,8 @@ def check_parts(splats: Any, edits: Iterable[Any]) -> None:
     """Raise a ValueError if an edit names a part of a class (`chair/6`) that `kfgs select` does not list.
 
     Args:
-        splats: what the edits begin with.
-        edits: edits that `parse_edits` made.
+        splats: the cloud before the edits.
+        edits: from `parse_edits`.
     """
     import torch
 
@@ -150,7 +150,7 @@ def _where(option: str, words: str) -> Any:
 
 
 def _together(remove: Sequence[str]) -> dict[str, list[Any]]:
-    """What is removed of each class, whatever the case of its name: removing one part changes the numbers of the others."""
+    """The removed parts by class (ignoring case), because removing one part changes the numbers of the others."""
     found: dict[str, list[Any]] = {}
     for words in dict.fromkeys(remove):
         where = _where("remove", words)

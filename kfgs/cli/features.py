@@ -1,4 +1,4 @@
-"""Commands of the teachers: plan what it will cost, and make feature maps or look them over."""
+"""The commands plan (predict costs) and features (make or check feature maps)."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def features(
     teacher: MapTeacher,
     views: Views,
 ) -> None:
-    """Run a teacher over a scene's pictures and keep its feature maps; or check maps that exist.
+    """Run a teacher over a scene's pictures and store its feature maps; or check existing maps.
 
-    Pictures are done one at a time. A killed run goes on with the same command: finished pictures are not done again.
+    Pictures are processed one at a time. After a kill, the same command continues with the next picture.
 
     Examples:
         kfgs features scene/ --teacher lseg --weights demo_e200.ckpt
@@ -37,7 +37,7 @@ def features(
         kfgs features scene/ --check maps/    # by Feature 3DGS, LangSplat, or in .npy or .safetensors
 
     Args:
-        out: Folder for the maps; SCENE/features when not given.
+        out: Folder for the maps; by default SCENE/features.
         overwrite: Replace maps of another teacher, other weights or other options; without it they are an error.
         check: Check this folder of maps instead, and report every file that does not fit.
         level: For --check: which masks of LangSplat's maps, default, subparts (s), parts (m) or wholes (l).
@@ -47,7 +47,7 @@ def features(
 
     if check is not None:
         for name, given in (("teacher", teacher.teacher), ("weights", teacher.weights), ("out", out)):
-            check_alone(name, given, "beside --check, which encodes nothing")
+            check_alone(name, given, "with --check, which encodes nothing")
     else:
         check_alone("level", level, "without --check; it is of LangSplat's maps")
     loaded = views.load(scene)
@@ -79,21 +79,21 @@ def plan(
     teacher: MapTeacher,
     views: Views,
 ) -> None:
-    """Predict disk, memory and minutes of `kfgs features` and `kfgs fit`, before either starts.
+    """Predict disk, memory and minutes of `kfgs features` and `kfgs fit`.
 
-    Times are measured: the teacher sees one picture, and a few views and steps are tried. Maps that exist, and stages that
-    are finished, are counted. Nothing is downloaded. Without --teacher it is lseg, which needs no weights here.
+    Times are measured: the teacher sees one picture, and a few views and steps are tried. Existing maps and finished stages
+    take no time. Nothing is downloaded. The default teacher is lseg, which needs no weights here.
 
     Examples:
         kfgs plan scene/
         kfgs plan scene/ --teacher clip --weights openai/clip-vit-base-patch16 --store discard
 
     Args:
-        features: Folder of maps that exist, in any layout that `kfgs fit` reads; SCENE/features when not given.
-        run: Run folder of `kfgs fit` (its --out), whose finished stages count as done.
-        store: What becomes of the feature maps: keep them; discard them when the field is made (kfgs fit
-            --discard-features); recompute instead of storing (kfgs fit --teacher).
-        steps: Training steps; the preset's when not given.
+        features: Folder of existing maps, in any layout that `kfgs fit` reads; by default SCENE/features.
+        run: Run folder of `kfgs fit` (its --out), to find finished stages.
+        store: keep the feature maps; discard them when the field is made (kfgs fit --discard-features); or recompute them
+            instead of storing (kfgs fit --teacher).
+        steps: Training steps; by default the preset's.
         device: auto (a GPU if there is one), cpu or cuda.
         out: Also write the plan to this .json file.
     """
@@ -125,18 +125,14 @@ def plan(
 
 
 def choose_teacher(name: str | None, weights: str | None, fast: bool, size: tuple[int, ...], device: str) -> Any:
-    """The teacher that a command asks for, on its device.
-
-    Raises:
-        ValueError: if none is named, or an option does not fit the teacher.
-    """
+    """Load the teacher of a command on its device; a ValueError if none is named, or an option does not fit."""
     from ..pipeline.train import training_device
     from ..teachers.load import load_teacher, teacher_names
 
     if name is None:
         raise ValueError(
             f"teacher: expected one of {', '.join(teacher_names())}, or package.module:name, got none; pass --teacher "
-            "(and --weights), or --check FOLDER to look over maps that exist"
+            "(and --weights), or --check FOLDER to check existing maps"
         )
     target = training_device(device)
     teacher = load_teacher(name, weights, **teacher_options(name, fast, size))
@@ -144,7 +140,7 @@ def choose_teacher(name: str | None, weights: str | None, fast: bool, size: tupl
 
 
 def teacher_options(name: str, fast: bool, size: tuple[int, ...]) -> dict[str, Any]:
-    """The options of a teacher that --fast and --size stand for.
+    """The teacher's options for --fast and --size.
 
     Raises:
         ValueError: if the teacher has no such option, or takes another number of numbers.
@@ -152,7 +148,7 @@ def teacher_options(name: str, fast: bool, size: tuple[int, ...]) -> dict[str, A
     options: dict[str, Any] = {}
     if fast:
         if name != "lseg":
-            raise ValueError(f"fast: expected none beside teacher {name!r}, which has one pass only; leave it out")
+            raise ValueError(f"fast: expected none with teacher {name!r}, which has one pass only; leave it out")
         options["fast"] = True
     if size:
         wanted = 2 if name == "lseg" else 1
@@ -171,7 +167,7 @@ def stored_maps(scene: Any, views: list[int], folder: Path, level: Level | None)
 
     maps = FeatureFolder(folder, level=level or "default").of(scene, views)
     if not maps.has_masks:
-        check_alone("level", level, f"beside {folder}, whose maps are not LangSplat's")
+        check_alone("level", level, f"with {folder}, whose maps are not LangSplat's")
     problems = maps.check(values=False).problems
     for name, texts in list(problems.items())[:MISFITS]:
         say(f"note: {name}: {'; '.join(texts)}")
@@ -182,10 +178,10 @@ def stored_maps(scene: Any, views: list[int], folder: Path, level: Level | None)
 
 
 def check_discard(maps: Any, config: Any) -> None:
-    """Refuse to delete dense maps that nothing could replace, before the work rather than after it.
+    """Check before the work that dense maps can be deleted after it.
 
     Raises:
-        ValueError: if the mode makes no index maps, or kfgs did not make these maps and so could not make them again.
+        ValueError: if the mode makes no index maps, or kfgs did not make these maps and cannot make them again.
     """
     from ..features import discard_maps
 
@@ -198,7 +194,7 @@ def check_discard(maps: Any, config: Any) -> None:
 
 
 def scene_folder(scene: Path) -> Path:
-    """The folder that a scene given as a folder or as a transforms.json lies in."""
+    """The folder of a scene that is given as a folder or as a transforms.json."""
     return scene if scene.is_dir() else scene.parent
 
 

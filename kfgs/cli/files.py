@@ -1,4 +1,4 @@
-"""Files that commands read and write: checked before the work, so that nothing is found out after minutes."""
+"""Check the files that commands read and write before the work begins."""
 
 from __future__ import annotations
 
@@ -48,11 +48,7 @@ def is_field(path: Path) -> bool:
 
 
 def open_field(name: str, field: Path) -> Any:
-    """Load a semantic field.
-
-    Raises:
-        ValueError: if the path is something else; a run folder gets a hint of its own.
-    """
+    """Load a semantic field. Raises a ValueError if the path is no field."""
     from ..fields import SemanticField
 
     if not (field / "field.json").is_file():

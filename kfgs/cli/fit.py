@@ -120,19 +120,19 @@ def fit(
     config = dataclasses.replace(config, undistorted_features=maps.undistorted_features, device=training.device)
     check_folder("out", out)
     if method.method == "paper":
-        check_alone("splat", splat, "beside --method paper, which trains its own Gaussians")
+        check_alone("splat", splat, "with --method paper, which trains its own Gaussians")
     elif splat is not None:
-        check_alone("steps", training.steps, "beside --splat, which needs no training")
+        check_alone("steps", training.steps, "with --splat, which needs no training")
     as_taken = views.load(scene)
     loaded = as_taken.undistorted()
     check_scene(loaded)  # before hours of features
     chosen = loaded.views(views.split)
     if teacher.teacher is not None:
         for name, given in (("features", maps.features), ("level", maps.level)):
-            check_alone(name, given, "beside --teacher, whose maps are not stored")
-        check_alone("discard_features", discard_features, "beside --teacher, which stores no dense maps")
+            check_alone(name, given, "with --teacher, whose maps are not stored")
+        check_alone("discard_features", discard_features, "with --teacher, which stores no dense maps")
         check_alone(
-            "undistorted_features", maps.undistorted_features, "beside --teacher, which sees the pictures as taken"
+            "undistorted_features", maps.undistorted_features, "with --teacher, which sees the original pictures"
         )
         network = choose_teacher(teacher.teacher, teacher.weights, teacher.fast, teacher.size, training.device)
         found: Any = RecomputedMaps(network, as_taken, views.split, out / "teacher")
@@ -216,7 +216,7 @@ def color(
         out: Run folder; OUT/color.ply receives the splat. Running again continues where it stopped.
         preset: quick (a minute, for small scenes), cpu (minutes on two cores) or paper (30,000 steps, full size, degree 3:
             for a GPU).
-        pictures: How many of the views held out are drawn beside their photographs.
+        pictures: Number of held-out views to draw next to their photographs.
     """
     from .._check import check_whole
     from ..evaluation.color import score_views

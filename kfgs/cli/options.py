@@ -59,7 +59,7 @@ class Views:
     """Which views: train, test, or another split that SCENE/split.json names; `kfgs features` also takes all."""
 
     def load(self, scene: Path) -> Any:
-        """The scene as its pictures were taken; its notes are printed."""
+        """Load the scene (not undistorted), and print its notes."""
         from ..scenes import load_scene
 
         loaded = load_scene(scene, images=self.images)
@@ -143,7 +143,7 @@ class Training:
 
 @dataclass(frozen=True)
 class SceneOption:
-    """The scene, where its cameras and pictures are needed."""
+    """The scene, if its cameras and pictures are needed."""
 
     scene: Given[Path] = None
     """Scene folder in the same frame: cameras, pictures and classes."""
@@ -173,10 +173,10 @@ class Classes(SceneOption):
     """Text embeddings: a table of `kfgs text` (.safetensors) or a row for each class (.npy); SCENE/text.* when not given."""
 
     def files(self) -> tuple[Path, ...] | None:
-        """What `load_label_set` takes: a table alone, or names and rows; None if nothing says where they are."""
+        """The arguments of `load_label_set`: a table, or names and rows; None if neither is given."""
         scene, classes, text = self.scene, self.classes, self.text
         if classes is not None and classes.suffix == ".safetensors":
-            check_alone("text", text, f"beside the table {classes}")
+            check_alone("text", text, f"with the table {classes}")
             return (classes,)
         if text is not None and classes is None and text.suffix == ".safetensors":
             return (text,)
@@ -217,12 +217,12 @@ class Classes(SceneOption):
         return label_set
 
     def of_field(self, field: Any) -> Any:
-        """The label set that these options name, or the one that the field remembers."""
+        """The label set of these options; without options, that of the field."""
         given = any(path is not None for path in (self.scene, self.classes, self.text))
         return self.load_classes() if given or "classes" not in field.info else field.label_set()
 
     def open_field(self, name: str, path: Path) -> Any:
-        """Open a field. One that lacks what its views show of each Gaussian gets it from the views of --scene."""
+        """Open a field with fused features; an old field computes them from the views of --scene, if given."""
         field = open_field(name, path)
         if field.linear is not None and (field.cameras or self.scene is None):
             return field
@@ -251,7 +251,7 @@ def fit_config(
     max_gaussians: int | None = None,
     split: str = "train",
 ) -> Any:
-    """The options of a fit, from a preset and what was given beside it."""
+    """The options of a fit, from a preset and the given options."""
     from ..pipeline import FitConfig
     from ..pipeline.color import ColorConfig
 

@@ -1,4 +1,4 @@
-"""What commands print: lines, the files they wrote, counts of Gaussians, and warnings as notes."""
+"""The output of commands: lines, files written, counts of Gaussians, and warnings as notes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def wrote(paths: list[Path]) -> None:
 
 
 def say_counts(labels: Any, names: Sequence[str]) -> None:
-    """Print how many Gaussians each class has, and how many have none if there are any."""
+    """Print the number of Gaussians of each class, and of those without a class."""
     for i, name in enumerate(names):
         say(f"  {name:<16s} {int((labels == i).sum()):8d} Gaussians")
     if bool((labels < 0).any()):
@@ -30,7 +30,7 @@ def say_counts(labels: Any, names: Sequence[str]) -> None:
 
 
 def say_lost(written: Any) -> None:
-    """Say what the format of a splat file (`Written`) could not hold, and whether it reordered the Gaussians."""
+    """Report what the format of a splat file (`Written`) could not store, and whether it reordered the Gaussians."""
     for words in written.lost:
         say(f"note: {words}")
     if written.order is not None:

@@ -1,4 +1,4 @@
-"""Commands that ask a field or a labelled splat: select, segment, label, info."""
+"""Commands that query a field or a labelled splat: select, segment, label, info."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ def select(
         query: A class name, "chair"; with --teacher any phrase.
         source: A field folder (RUN/field), or a splat with classes.
         out: Folder for selection.json (with the indices) and selection.ply (the Gaussians).
-        threshold: Scores must be above it. For a field it is the paper's gamma; when not given it is 0.5 for a relevancy,
-            else read off the scores. For a splat every Gaussian of the class is taken when not given.
-        negatives: What the query is compared with (field only): all other classes, LERF's canonical words (object, things,
-            stuff, texture), or nothing. auto: the other classes for a class, the canonical words for another phrase.
+        threshold: Scores must be above it. For a field it is the paper's gamma; by default 0.5 for a relevancy, else derived
+            from the scores. For a splat the default takes every Gaussian of the class.
+        negatives: Compare the query with all other classes, LERF's canonical words (object, things, stuff, texture), or
+            nothing (field only). auto: the other classes for a class, the canonical words for another phrase.
         score: relevancy (against the most similar negative), softmax (over query and negatives) or cosine (field only).
             auto: relevancy, or cosine with --negatives none.
     """
@@ -74,11 +74,11 @@ def select(
     else:
         given = {"classes": classes.classes, "text": classes.text, "negatives": negatives, "score": score}
         for name, value in (given | dataclasses.asdict(teacher)).items():
-            check_alone(name, None if value == "auto" else value, "beside a splat, which has its own classes")
+            check_alone(name, None if value == "auto" else value, "with a splat, which has its own classes")
         cloud = open_splats("source", source, labelled=True)
         found = select_labelled(cloud, query, threshold)
         cameras = None if classes.scene is None else classes.load_scene().undistorted().cameras
-    say(f"{query}: {len(found)} of {len(cloud)} Gaussians, {found.words}")
+    say(f"{query}: {len(found)} of {len(cloud)} Gaussians, {found.summary}")
     things = connected_parts(cloud.gaussians, found, cameras)
     for number, thing in enumerate(things, start=1):
         say(f"  {query}/{number}: {thing!r}" if counted else f"  {thing!r}")
@@ -176,9 +176,9 @@ def label(
         query: Label only the Gaussians of this class, as `kfgs select` finds them.
         threshold: The paper's gamma for --query: scores must be above it; see `kfgs select`.
         cloud: PLY of points in the field's frame that receive the labels. For a splat `kfgs attach` does better.
-        distance: The paper's lambda: the distance within which a label is carried over, in world units; from the clouds'
-            spacing when not given.
-        rule: fused: what the training views show of a Gaussian decides; paper: its own latent (Sec. 3.4).
+        distance: The paper's lambda: the distance within which a label is carried over, in world units; by default from the
+            clouds' spacing.
+        rule: fused: the training views decide the class of a Gaussian; paper: its own latent (Sec. 3.4).
     """
     import torch
 
@@ -189,7 +189,7 @@ def label(
         ("distance", distance, "cloud", cloud),
     ):
         if value is not None and needed is None:
-            raise ValueError(f"{name}: expected --{other} beside it, got none; it would have no effect")
+            raise ValueError(f"{name}: expected --{other} with it, got none; it would have no effect")
     loaded = classes.open_field("field", field)
     label_set = classes.of_field(loaded)
     carried = None if cloud is None else read_cloud(cloud)
@@ -217,7 +217,7 @@ def label(
 
 
 def info(path: Positional[Path]) -> None:
-    """Say what a field, a run, a scene, a folder of feature maps or a PLY file holds.
+    """Describe a field, a run, a scene, a folder of feature maps or a PLY file.
 
     Examples:
         kfgs info run/field
@@ -243,9 +243,9 @@ def _save(out: Path, query: str, cloud: Any, found: Any, things: list[Any]) -> l
 
 
 def _negatives(negatives: Negatives, score: Score) -> Negatives:
-    """As asked; a ValueError if the score cannot use them."""
+    """Return the negatives; a ValueError if the score cannot use them."""
     if score == "cosine" and negatives not in ("auto", "none"):
-        raise ValueError(f"negatives: expected none beside --score cosine, got {negatives}; leave one of both out")
+        raise ValueError(f"negatives: expected none with --score cosine, got {negatives}; leave one of the two out")
     if score in ("softmax", "relevancy") and negatives == "none":
         raise ValueError(f"negatives: expected classes or canonical for --score {score}, got none; leave it out")
     return negatives

@@ -30,7 +30,7 @@ def attach(
     same_frame: Flag = False,
     classes: Classes,
 ) -> None:
-    """Give every Gaussian of a splat file the class that a semantic field has at its place.
+    """Give every Gaussian of a splat file the class that a semantic field has at its position.
 
     The frames of field and splat are compared first, and aligned if they differ.
 
@@ -47,8 +47,8 @@ def attach(
             it fills. distance: labelled Gaussians of the field within lambda decide, as in the paper (Sec. 3.4).
         method: For --by distance: the nearest labelled Gaussian (as in the paper), a vote of those around, or their overlap
             (mahalanobis), which is the best of the three for a field with noisy labels.
-        distance: The paper's lambda: the distance within which a label is carried over, in the splat's world units; from
-            the clouds' spacing when not given.
+        distance: The paper's lambda: the distance within which a label is carried over, in the splat's world units; by
+            default from the clouds' spacing.
         splat_scene: Scene folder of the splat's own cameras, if its frame differs: cameras of the same names align the two.
             Without it the shapes of the clouds do.
         same_frame: Do not compare the frames; they are the same.
@@ -66,7 +66,7 @@ def attach(
     for name, asked in (("by", by == "views"), ("splat_scene", splat_scene is not None)):
         if asked and not loaded.cameras:
             raise ValueError(
-                f"{name}: expected --scene beside it for a field that remembers no cameras, got none; pass --scene"
+                f"{name}: expected --scene with it for a field that remembers no cameras, got none; pass --scene"
             )
     label_set = classes.of_field(loaded)
     same = Similarity.identity() if same_frame else None
@@ -78,8 +78,8 @@ def attach(
             f"splats: no frame found in which field and splat agree: {error} (--splat-scene gives the splat's cameras, "
             "--same-frame says that there is nothing to find)"
         ) from error
-    for words in found.words:
-        say(words)
+    for note in found.notes:
+        say(note)
     say_counts(found.labels, label_set.names)
     written = write_splats(out, found.splats)
     say_lost(written)
@@ -96,9 +96,9 @@ def edit(
     edits: Edits,
     scene: SceneOption,
 ) -> None:
-    """Edit a labelled splat by class. The edits are saved beside the result and can be replayed.
+    """Edit a labelled splat by class. The edits are saved next to the result and can be replayed.
 
-    The input stays as it is. For another order of edits run the command several times, or use --replay.
+    The input does not change. For another order of edits run the command several times, or use --replay.
 
     Examples:
         kfgs edit labelled.ply --out edited.ply --remove chair --recolor "plant:#c04040" --scene scene/
@@ -106,12 +106,11 @@ def edit(
         kfgs edit other.ply --out edited.ply --replay edited.edits.json
 
     Args:
-        splats: A splat with classes, as `kfgs attach` writes it.
-        out: The edited splat; its ending chooses the format. The edits go to a file beside it (edited.edits.json for
+        splats: A splat with classes, for instance from `kfgs attach`.
+        out: The edited splat; its ending chooses the format. The edits go to a file next to it (edited.edits.json for
             edited.ply), and with --scene the views before and after to a picture (edited.png).
-        replay: Edits that were saved before; they come first.
-        views: Name of a view to show (with --scene). When none is given, one for each edit in turn, then those in which most
-            changes.
+        replay: Saved edits; they come first.
+        views: Name of a view to show (with --scene). By default one for each edit, then those in which most changes.
         pictures: How many views to show if none is named.
     """
     from .._check import check_whole
@@ -153,7 +152,7 @@ def edit(
 
 
 def convert(source: Positional[Path], target: Positional[Path]) -> None:
-    """Convert a splat file to another format. Classes are kept; whatever the new format cannot hold is named.
+    """Convert a splat file to another format. Classes are kept; losses of the new format are reported.
 
     Examples:
         kfgs convert edited.ply edited.spz
@@ -175,7 +174,7 @@ def convert(source: Positional[Path], target: Positional[Path]) -> None:
 
 
 def _edits_beside(out: Path, replay: Path | None) -> Path:
-    """Where the edits behind a splat file are saved; a ValueError if that is the file to replay, or no file can be there."""
+    """The file for the edits of a splat file; a ValueError if it is the file to replay, or cannot be written."""
     saved = out.with_suffix(".edits.json")
     check_file("out", saved)
     if replay is not None and replay.resolve() == saved.resolve():

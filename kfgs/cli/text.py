@@ -1,4 +1,4 @@
-"""The command text: a table of classes from words or examples; and any phrase as a query."""
+"""The command text, which makes a table of classes from words or examples; and helpers to query any phrase."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ def text(
             "chair;armchair;seat" is called chair.
         out: The table to write (.safetensors).
         templates: Sentences around each word: bare (none, as LSeg and the paper), clip7, tcl9, siglip, or your own with {}
-            for the word; when not given, what suits the teacher.
+            for the word; by default those of the teacher.
         no_negatives: Leave out LERF's canonical words (object, things, stuff, texture), which `kfgs select --negatives
             canonical` needs.
         examples: A .json file of examples instead of words.
-        field: The field folder in which the examples are shown.
+        field: The field folder of the examples.
     """
     from ..labels import CANONICAL
     from ..labels.label_set import SUFFIX
@@ -56,11 +56,9 @@ def text(
         raise ValueError(f"out: expected a file whose name ends in {SUFFIX}, got {out}; give another name")
     if examples is not None:
         for name, given in ({"names": names, "templates": templates} | dataclasses.asdict(teacher)).items():
-            check_alone(name, given, "beside --examples, which take the place of words")
+            check_alone(name, given, "with --examples, which replace words")
         if field is None:
-            raise ValueError(
-                "field: expected --field beside --examples, got none; pass the field that they are shown in"
-            )
+            raise ValueError("field: expected --field with --examples, got none; pass the field of the examples")
         from ..fields import label_set_from_examples, read_examples
 
         shown = label_set_from_examples(open_field("field", field), read_examples(examples))
@@ -90,8 +88,8 @@ def read_words(names: str) -> list[str]:
     Text with neither ending is words, even if a folder has the same name; a file with another ending is an error.
 
     Raises:
-        FileNotFoundError: if the file is not there.
-        ValueError: if it is of another kind, or holds no words.
+        FileNotFoundError: if the file does not exist.
+        ValueError: if it is no list of words, or empty.
     """
     found: Any
     kind = Path(names).suffix.lower()
@@ -114,7 +112,7 @@ def read_words(names: str) -> list[str]:
 
 
 def _words_of_file(name: str, kind: str) -> Any:
-    """What a .json file holds, or the lines of a .txt file."""
+    """The content of a .json file, or the lines of a .txt file."""
     from .._files import read_json
 
     if not os.path.isfile(name):
@@ -133,7 +131,7 @@ def _words_of_file(name: str, kind: str) -> Any:
 
 
 def text_encoder(teacher: Teacher) -> Callable[..., Any]:
-    """A function that makes label sets of words (`teachers.prompts.make_label_set`) with a teacher that is loaded now.
+    """Load a teacher now, and return a function that makes label sets of words (`teachers.prompts.make_label_set`).
 
     The function raises a ValueError if the teacher has no text encoder.
     """
@@ -153,10 +151,10 @@ def text_encoder(teacher: Teacher) -> Callable[..., Any]:
 
 
 def ask(query: str, classes: Classes, teacher: Teacher, field: Any) -> tuple[Any, Any]:
-    """The label set to look a query up in, and what to ask for: the name of a class, or the embedding of a phrase.
+    """The label set and the target of a query: the name of a class, or the embedding of a phrase.
 
-    Without a teacher the query is a class of the table. With one it may be any phrase, embedded in the table's templates;
-    canonical negatives then come from the teacher. If the options name no table, the field's own classes count.
+    Without a teacher the query must be a class of the table. With a teacher it may be any phrase, embedded in the table's
+    templates; canonical negatives then come from the teacher. If the options name no table, the field's classes are used.
     """
     if teacher.teacher is None:
         teacher.check_weights()
@@ -178,7 +176,7 @@ def ask(query: str, classes: Classes, teacher: Teacher, field: Any) -> tuple[Any
     note_other_teacher(asked, label_set)
     name = asked.names[0]
     known = label_set.knows(name)
-    if asked.dim == label_set.dim:  # else the query says what does not fit
+    if asked.dim == label_set.dim:  # otherwise the query raises an error
         label_set = dataclasses.replace(
             label_set, negatives=asked.negatives, negative_names=asked.negative_names, info=asked.info
         )
@@ -186,9 +184,9 @@ def ask(query: str, classes: Classes, teacher: Teacher, field: Any) -> tuple[Any
 
 
 def note_other_teacher(asked: Any, table: Any) -> None:
-    """Say so if a query and the table that it is compared with were embedded by different teachers.
+    """Print a note if a query and its table were embedded by different teachers.
 
-    `SemanticField.query` says whether the query fits the field.
+    `SemanticField.query` checks whether the query fits the field.
     """
     from ..labels.label_set import teacher_difference
 

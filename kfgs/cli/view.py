@@ -1,4 +1,4 @@
-"""The command view: look at a field or a labelled splat, and ask it."""
+"""The command view: explore a field or a labelled splat."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ FEW = 0.05  # of a colour cloud within lambda, under which the frames probably d
 
 @dataclass(frozen=True)
 class Display:
-    """How it looks, and where the page listens."""
+    """Options of the display and of the page."""
 
     show: Literal["labels", "rgb", "score", "latents"] = "labels"
-    """What the colours stand for at first."""
+    """The meaning of the colours at the start."""
     style: Literal["auto", "gaussians", "points"] = "auto"
     """gaussians as they are rasterised, points (quick); auto: Gaussians if a frame of them is quick."""
     host: str = "127.0.0.1"
@@ -46,25 +46,25 @@ def view(
     classes: Classes,
     display: Display,
 ) -> None:
-    """Look at a field: type "chair", move gamma and lambda, click a Gaussian, save what was found.
+    """Explore a field: type "chair", change gamma and lambda, click a Gaussian, save the selection.
 
     The semantic cloud and the colour cloud stand side by side, in a window or in a browser page that only this machine can
-    open. What is selected in the semantic cloud lights up in the colour cloud. Gamma is the score that a Gaussian must
+    open. A selection in the semantic cloud lights up in the colour cloud. Gamma is the score that a Gaussian must
     exceed; lambda is the distance within which the colour cloud lights up too.
 
     Examples:
         kfgs view run/field --color run/color.ply
         kfgs view labelled.ply --ask chair --where picture --out pictures/
-        kfgs view run/field --teacher lseg --weights demo_e200.ckpt    # asked in any words
+        kfgs view run/field --teacher lseg --weights demo_e200.ckpt    # any text
 
     Args:
         source: A field folder (RUN/field), asked by text; or a splat with classes (`kfgs attach`), asked by class.
         color: Colour splat in the same frame, any splat file; without it the source is shown alone.
         ask: A first question.
-        distance: The paper's lambda at first, in world units; from the clouds' spacing when not given.
+        distance: Lambda at the start, in world units; by default from the clouds' spacing.
         where: window, browser, or picture (writes OUT/view.png and ends). auto: a window if there is a display, else the
             browser.
-        out: Folder for the pictures and selections that are saved while looking.
+        out: Folder for saved pictures and selections.
     """
     from .._check import check_range, check_whole
     from ..viz.explorer import Exploration, ExploreOptions, Explorer
@@ -90,7 +90,7 @@ def view(
     cloud = None if color is None else open_splats("color", color).gaussians
     state = Exploration(meaning, cloud, cameras=cameras, distance=distance)
     _note(state)
-    height, width = (680, 980) if place == "window" else (600, 1200)  # beside the clouds a window has a panel
+    height, width = (680, 980) if place == "window" else (600, 1200)  # a window has a panel next to the clouds
     options = ExploreOptions(height=height, width=width, style=display.style, out=out)
     with Explorer(state, options, off_screen=place != "window") as explorer:
         explorer.set_show(display.show)
@@ -115,7 +115,7 @@ def _open(explorer: Any, place: Where, host: str, port: int) -> None:
 
 
 def _meaning(source: Path, classes: Classes, teacher: Teacher) -> tuple[Any, list[Any]]:
-    """What can be asked, and the cameras of the scene (those that a field was trained on)."""
+    """The answers to questions, and the cameras of the scene (those that a field was trained on)."""
     from ..viz.explorer import FieldMeaning, SplatMeaning
 
     if is_field(source) or not source.exists():
@@ -124,7 +124,7 @@ def _meaning(source: Path, classes: Classes, teacher: Teacher) -> tuple[Any, lis
         return FieldMeaning(field, label_set, embed=embed), list(field.cameras)
     given = {"classes": classes.classes, "text": classes.text} | dataclasses.asdict(teacher)
     for name, value in given.items():
-        check_alone(name, value, "beside a splat, which has its own classes")
+        check_alone(name, value, "with a splat, which has its own classes")
     cameras = [] if classes.scene is None else classes.load_scene().undistorted().cameras
     return SplatMeaning(open_splats("source", source, labelled=True)), cameras
 
@@ -154,7 +154,7 @@ def _words_of(label_set: Any, teacher: Teacher) -> tuple[Any, Callable[[str], An
 
 
 def _note(state: Any) -> None:
-    """Say so if the clouds are probably in different frames."""
+    """Print a note if the clouds are probably in different frames."""
     color = state.details().get("color")
     if color and color["total"] - color["orphaned"] < FEW * color["total"]:
         say(

@@ -1,4 +1,4 @@
-"""How well a colour field shows views that it has not learnt: PSNR and SSIM under a named protocol."""
+"""Score a colour field on unseen views: PSNR and SSIM under a named protocol."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Does an edit do what was asked, and nothing else? Measured in pictures and on surfaces whose truth is known.
+"""Score edits: does an edit change its object, and nothing else? In pictures and on surfaces with known classes.
 
-The toy room knows at every pixel what is seen there, and on every surface what it is (`make_toy_room`).
-So an edited cloud is compared with the cloud before the edit where the truth says "this is the object", and elsewhere.
+The toy room knows the class of every pixel and every surface (`make_toy_room`). So an edited cloud is compared with the cloud
+before the edit, separately on the object and elsewhere.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ RECOLOR = (
     "kfgs-recolor/1: test views of a scene with exact labels. Outside = PSNR of after against before over all pixels of "
     "other classes and channels; inside = share of the class's coloured pixels whose hue is within 20 degrees of the target"
 )
-# What `passed` asks for: shares, and decibels.
+# Thresholds of `passed`: shares, and decibels.
 GONE, UNTOUCHED, OUTSIDE = 0.95, 0.98, 35.0
 CHANGED = (
     0.8  # a class that looks as before is not gone, wherever its Gaussians went; but some things match their background
 )
 HUE_INSIDE = 0.8
-MEASURED = 0.5  # so that an edit that does nothing does not pass, nor a report that could measure nothing
+MEASURED = 0.5  # a report that measured less does not pass
 
 STEP = 8 / 255  # a channel that moves less is untouched: twice what 8-bit rounding and a JPEG would do
 HUE = 20.0  # degrees
@@ -51,7 +51,7 @@ LEAST_CHROMA = 0.04  # ten 8-bit steps between the largest and the smallest chan
 
 @dataclass(frozen=True)
 class RemovalReport:
-    """Shares in [0, 1] (NaN where nothing could be measured), and how much they were measured on."""
+    """Shares in [0, 1] (NaN if nothing could be measured), and how much was measured."""
 
     name: str
     """The class that was to be removed."""
@@ -78,10 +78,10 @@ class RemovalReport:
 
     @property
     def passed(self) -> bool:
-        """Whether at least 0.95 of the class is gone and 0.98 of the rest is untouched, in pictures and on surfaces.
+        """Whether at least 0.95 of the class is removed and 0.98 of the rest is unchanged, in pictures and on surfaces.
 
-        And whether it can be seen (0.8 of the class's pixels changed) and says something: at least half of the class's
-        pixels and of its surface could be measured.
+        Also, 0.8 of the class's pixels must have changed, and at least half of its pixels and of its surface must have
+        been measured.
         """
         gone = (
             self.gone_pixels >= GONE and self.gone_points >= GONE and self.changed_pixels >= CHANGED
@@ -103,7 +103,7 @@ class RemovalReport:
         return f"{self}\n{self.protocol}"
 
     def to_json(self) -> dict[str, Any]:
-        """The report as plain values; what could not be measured is null."""
+        """The report as plain values; NaN becomes null."""
         return _plain(self)
 
 

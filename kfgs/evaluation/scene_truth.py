@@ -1,4 +1,4 @@
-"""What a scene with ground truth knows of its views and surfaces: where a class is seen, and where it is."""
+"""Ground truth of a class in a scene: the pixels that show it in each view, and its surface."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BORDER = 2  # pixels around the class whose light is mixed: pictures are sampled
 
 
 class TrueView(NamedTuple):
-    """A view, and where the class is in it."""
+    """A view, and the pixels that show the class."""
 
     camera: Camera
     inside: Tensor  # [H, W] bool: the class is seen here
@@ -41,9 +41,9 @@ class SceneTruth:
     scene: Scene
     label: int
     indices: tuple[int, ...]
-    """The views that are looked at."""
+    """The views of the split."""
     pixels: int
-    """How many of their pixels show the class."""
+    """Number of their pixels that show the class."""
 
     __repr__ = short_repr
 

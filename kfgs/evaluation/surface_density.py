@@ -1,4 +1,4 @@
-"""How much of a cloud lies at given points of space: the sum of its Gaussians' densities there."""
+"""The density of a cloud at given points: the sum of its Gaussians' densities there."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ class MaskFeatures:
         if index.ndim != 3 or 0 in index.shape or index.dtype.kind not in "iuf":
             raise ValueError(f"expected mask numbers [4, H, W], got {index.dtype} {index.shape}")
         if not partner.is_file():
-            raise FileNotFoundError(f"expected {partner.name} with the masks' features beside it, got none")
+            raise FileNotFoundError(f"expected {partner.name} with the masks' features in the same folder, got none")
         rows = np.load(partner, allow_pickle=False)
         if rows.ndim != 2 or rows.shape[1] == 0 or rows.dtype.kind != "f":
             raise ValueError(f"expected floats [M, D] in {partner.name}, got {rows.dtype} {rows.shape}")

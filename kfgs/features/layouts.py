@@ -30,7 +30,7 @@ ROW_BLOCK = 32  # rows of a map converted at a time: 30 MB in single precision a
 
 @dataclass(frozen=True)
 class Reading:
-    """How to read a map whose file does not say it alone."""
+    """How to read a map, as far as its file does not say it."""
 
     channels: int | None = None
     """D, if it is known: distinguishes [h, w, D] from [D, h, w]."""
@@ -55,7 +55,7 @@ class Layout(NamedTuple):
 def _open_torch(file: Path, _: Reading) -> Any:
     found = load_torch_file(file)
     if isinstance(found, Placeholder):
-        raise ValueError("it holds objects beside tensors, which are not run")
+        raise ValueError("it holds objects other than tensors, which are not run")
     if not isinstance(found, Tensor):
         return found
     check_plain(found)

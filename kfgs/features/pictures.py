@@ -64,7 +64,7 @@ def as_pictures(pictures: Scene | Sequence[Picture], split: Split, *, exist: boo
             f"pictures: expected a Scene or a list of Picture, got {type(pictures).__name__}; pass load_scene(folder)"
         )
     elif split != "train":
-        raise ValueError(f"split: expected none beside a list of pictures, got {split!r}; leave it out")
+        raise ValueError(f"split: expected none with a list of pictures, got {split!r}; leave it out")
     check_stems("pictures", [picture.stem for picture in pictures])
     for picture in pictures:
         parts = PurePosixPath(picture.stem)

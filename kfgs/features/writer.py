@@ -94,7 +94,7 @@ class MapWriter:
         if record.image_digest != image_digest:
             return "the picture has changed"
         if stem in self._missing:
-            return "its map was discarded" if self.manifest.discarded else "its map is gone"
+            return "its map was discarded" if self.manifest.discarded else "its map is missing"
         file = self.folder / record.file
         if (doubt := record.doubt(file)) is not None:
             return f"its map {doubt}"

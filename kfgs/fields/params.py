@@ -53,7 +53,7 @@ class GaussianParams:
             raise ValueError(f"features, sh0: expected one of them, got {got}; a field has features or colours")
         if self.sh_rest is not None and (self.sh0 is None or self.sh_rest.shape[1] not in (3, 8, 15)):
             raise ValueError(
-                f"sh_rest: expected 3, 8 or 15 coefficients (degree 1 to 3) beside sh0, got {self.sh_rest.shape[1]}"
+                f"sh_rest: expected 3, 8 or 15 coefficients (degree 1 to 3) with sh0, got {self.sh_rest.shape[1]}"
                 f"{' without sh0' if self.sh0 is None else ''}; leave it None at degree 0"
             )
 

@@ -32,7 +32,7 @@ class Document:
         self._binary = binary
         self._buffers: dict[int, memoryview] = {}
         self.fetched = 0
-        """Bytes of files beside the document that were read."""
+        """Bytes read from other files."""
 
     def wrong(self, where: str, expected: str, got: object) -> ValueError:
         """Make the error for a place in the document."""
@@ -115,7 +115,7 @@ class Document:
         file = self._beside(uri, where)
         if not file.is_file():
             raise ValueError(
-                f"{self.path}: {where}: expected the file {file.name!r} beside it, got none; copy it there"
+                f"{self.path}: {where}: expected the file {file.name!r} in the same folder, got none; copy it there"
             )
         with file.open("rb") as handle:
             content = handle.read(min(length, file.stat().st_size))
@@ -128,22 +128,20 @@ class Document:
         odd = urlsplit(uri).scheme or "\0" in name or PureWindowsPath(name).drive or name.startswith(("/", "\\"))
         if odd or ".." in PurePosixPath(name.replace("\\", "/")).parts:
             raise ValueError(
-                f"{self.path}: {where}: expected a file beside it, got the uri {uri!r:.80}; kfgs opens nothing elsewhere, "
-                "pack the scene as .glb"
+                f"{self.path}: {where}: expected a file in the same folder, got the uri {uri!r:.80}; "
+                "kfgs opens nothing elsewhere, pack the scene as .glb"
             )
         folder = self.path.resolve().parent
         file = (folder / name).resolve()
         if not file.is_relative_to(folder):
-            raise ValueError(f"{self.path}: {where}: expected a file beside it, got a link to {file}; copy it there")
+            raise ValueError(
+                f"{self.path}: {where}: expected a file in the same folder, got a link to {file}; copy it there"
+            )
         return file
 
 
 def open_document(path: Path) -> Document:
-    """Read a `.glb` or `.gltf` file.
-
-    Raises:
-        ValueError: if it is neither, truncated, or of another version than 2.
-    """
+    """Read a `.glb` or `.gltf` file. Raises a ValueError if it is neither, truncated, or of another version than 2."""
     with path.open("rb") as file:
         head = file.read(_HEAD.size)
         if head.startswith(MAGIC):

@@ -81,7 +81,7 @@ def _numbered(columns: Columns, group: str) -> list[str]:
     if missing:
         odd = sorted(set(found) - set(names))
         raise ValueError(
-            f"columns: expected {missing[0]} beside {odd[0]}, got none; number {group}* from 0 to the last"
+            f"columns: expected {missing[0]} as well as {odd[0]}, got none; number {group}* from 0 to the last"
         )
     return names
 

@@ -59,7 +59,7 @@ class SogFiles:
         """
         if not isinstance(name, str) or not name or name in (".", "..") or set(name) & set("/\\:\0"):
             raise ValueError(
-                f"{self.path}: expected the name of a file beside {META}, got {name!r:.80}; paths are refused"
+                f"{self.path}: expected the name of a file next to {META}, got {name!r:.80}; paths are refused"
             )
         data = self._read_zip(name, limit) if self._zip is not None else self._read_folder(name, limit)
         if len(data) > limit:

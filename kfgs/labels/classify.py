@@ -229,7 +229,7 @@ def select_near(
     check_shapes(("means", means, "N 3"), ("labels", labels, "N"), ("features", features, "N D"))
     if (labels is None) == (features is None):
         raise ValueError(
-            "labels, features: expected one of them, got none or both; labels say which Gaussians are alike"
+            "labels, features: expected one of them, got none or both; labels define which Gaussians are similar"
         )
     nearest = _nearest(means, point)
     if labels is not None:
@@ -244,7 +244,7 @@ def select_near(
         assert features is not None
         alike = select_like(features, nearest, threshold)
         if not bool(alike.mask[nearest]):  # at a threshold of 1 nothing is above it, not even itself
-            alike = Selection(alike.mask | (alike.scores >= alike.scores[nearest]), alike.scores, None, alike.words)
+            alike = Selection(alike.mask | (alike.scores >= alike.scores[nearest]), alike.scores, None, alike.summary)
     numbers = component_numbers(means, alike.mask, distance)
     return alike.within(numbers == numbers[nearest], f"connected with Gaussian {nearest}, the nearest to the point")
 

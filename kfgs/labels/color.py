@@ -40,7 +40,7 @@ def parse_color(color: str | Sequence[float] | Tensor, name: str = "rgb") -> tup
             channels = ImageColor.getrgb(color.strip())
         except ValueError as error:
             raise ValueError(
-                f"{name}: expected a colour such as '#c04040', 'teal' or 'rgb(192, 64, 64)', got {color!r:.80}; "
+                f"{name}: expected a colour like '#c04040', 'teal' or 'rgb(192, 64, 64)', got {color!r:.80}; "
                 "write one of these"
             ) from error
         if len(channels) != 3:

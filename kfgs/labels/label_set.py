@@ -163,7 +163,7 @@ def load_label_set(classes: str | Path, embeddings: str | Path | None = None) ->
     """
     if Path(classes).suffix == SUFFIX:
         if embeddings is not None:
-            raise ValueError(f"embeddings: expected none beside the table {classes}, got {embeddings}; leave it out")
+            raise ValueError(f"embeddings: expected none with the table {classes}, got {embeddings}; leave it out")
         return _read_table(Path(classes))
     names = read_json(classes)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or not names:
@@ -173,7 +173,7 @@ def load_label_set(classes: str | Path, embeddings: str | Path | None = None) ->
     if embeddings is None:
         raise ValueError(
             f"embeddings: expected an .npy file of one row per name in {classes}, got none; pass it, or pass a table that "
-            "`kfgs text` made in place of both"
+            "`kfgs text` made, instead of both"
         )
     if Path(embeddings).suffix == SUFFIX:
         return _read_table(Path(embeddings)).select(names)

@@ -114,7 +114,7 @@ def describe_selection(
     check_shapes(("gaussians.means", gaussians.means, "N 3"), ("selection.mask", selection.mask, "N"))
     if not bool(selection.mask.any()):
         raise ValueError(
-            f"selection: expected at least one Gaussian, got none ({selection.words}); lower the threshold, or ask for "
+            f"selection: expected at least one Gaussian, got none ({selection.summary}); lower the threshold, or ask for "
             "something else"
         )
     return _described(gaussians, selection, [selection.indices], [selection.how], cameras, engine)[0]

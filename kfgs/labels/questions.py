@@ -133,7 +133,7 @@ def _unlike(rows: Tensor, row: Tensor) -> Tensor:  # [M, D], [D] -> [M] bool
 def _check_words(classes: LabelSet, dim: int, info: dict[str, Any]) -> None:
     if classes.dim != dim:
         words = teacher_difference(info, classes.info)
-        difference = "" if words is None else f" ({words[0]} {words[2]!r:.40} in place of {words[1]!r:.40})"
+        difference = "" if words is None else f" ({words[0]} {words[2]!r:.40} instead of {words[1]!r:.40})"
         raise ValueError(
             f"classes: expected embeddings [C, {dim}] (from the field), got {tuple(classes.embeddings.shape)}: text of "
             f"another teacher?{difference} Embed the words with the teacher whose features this field was fitted to"

@@ -59,14 +59,14 @@ class Selection:
         return int(self.mask.sum())
 
     def __repr__(self) -> str:
-        words = self.words if len(self.words) <= 160 else self.words[:157] + "..."
-        return f"Selection({len(self)} of {len(self.mask)} Gaussians: {words})"
+        summary = self.summary if len(self.summary) <= 160 else self.summary[:157] + "..."
+        return f"Selection({len(self)} of {len(self.mask)} Gaussians: {summary})"
 
     def _repr_html_(self) -> str:
         chosen = self.scores[self.mask]
         scores = f"{float(chosen.min()):.3g} to {float(chosen.max()):.3g}" if len(chosen) else None
         count = f"{len(self):,} of {len(self.mask):,} Gaussians"
-        return html_card("Selection", {"selected": count, "scores": scores, "how": self.words})
+        return html_card("Selection", {"selected": count, "scores": scores, "how": self.summary})
 
     @property
     def indices(self) -> Tensor:  # [n] int64
@@ -74,7 +74,7 @@ class Selection:
         return self.mask.nonzero()[:, 0]
 
     @property
-    def words(self) -> str:
+    def summary(self) -> str:
         """How it was made and its threshold, in words."""
         return self.how if self.threshold is None else f"score > {self.threshold:.4g} ({self.how})"
 
@@ -101,20 +101,22 @@ class Selection:
         return OrientedBox.around(torch.from_numpy(self.points(cloud)))
 
     def within(self, mask: Tensor, how: str) -> Selection:  # mask: [N] bool
-        """The part of this selection under a mask, with the same scores and threshold; `how` is added to the words."""
+        """The part of this selection under a mask, with the same scores and threshold; `how` is added to the summary."""
         check_shapes(("selection.mask", self.mask, "N"), ("mask", mask, "N"))
         return Selection(self.mask & mask, self.scores, self.threshold, f"{self.how}; {how}" if self.how else how)
 
     def __and__(self, other: Selection) -> Selection:
         scores = self._beside(other)
-        return Selection(self.mask & other.mask, torch.minimum(*scores), None, f"({self.words}) and ({other.words})")
+        return Selection(
+            self.mask & other.mask, torch.minimum(*scores), None, f"({self.summary}) and ({other.summary})"
+        )
 
     def __or__(self, other: Selection) -> Selection:
         scores = self._beside(other)
-        return Selection(self.mask | other.mask, torch.maximum(*scores), None, f"({self.words}) or ({other.words})")
+        return Selection(self.mask | other.mask, torch.maximum(*scores), None, f"({self.summary}) or ({other.summary})")
 
     def __invert__(self) -> Selection:
-        return Selection(~self.mask, 1 - self.scores, None, f"not ({self.words})")
+        return Selection(~self.mask, 1 - self.scores, None, f"not ({self.summary})")
 
     def __sub__(self, other: Selection) -> Selection:
         self._beside(other)

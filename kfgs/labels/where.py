@@ -315,7 +315,7 @@ KINDS: dict[str, type[Where]] = {
 
 def _check_where(name: str, value: Any) -> None:
     if not isinstance(value, Where):
-        raise TypeError(f"{name}: expected a Where, such as OfClass('chair'), got {value!r:.80}; build one")
+        raise TypeError(f"{name}: expected a Where like OfClass('chair'), got {value!r:.80}; build one")
 
 
 def _parts(kind: type[Both] | type[Either], where: Where) -> tuple[Where, ...]:

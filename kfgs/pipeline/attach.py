@@ -46,7 +46,7 @@ class Attached:
     """From the semantic field's frame to the splat's."""
     alignment: Alignment | None
     """How the similarity was found; None if the frames agreed or it was given."""
-    words: tuple[str, ...]
+    notes: tuple[str, ...]
     """Sentences for people: what was done, and the results."""
 
     __repr__ = short_repr
@@ -122,7 +122,7 @@ def attach(
         if needed and not cameras:
             raise ValueError(f"cameras: expected views in the field's frame (for {name}), got none; pass them as well")
     semantic = field.label(classes)  # checks the classes before the frames are compared
-    similarity, alignment, said = _common_frame(field, splats, cameras, frame)
+    similarity, alignment, frame_note = _common_frame(field, splats, cameras, frame)
     carry = partial(transfer_labels, distance=distance, method=method)
     if by == "distance":
         labels, scores, transfer, found = _by_distance(semantic, splats, similarity, carry)
@@ -131,11 +131,11 @@ def attach(
         labels, scores, transfer, found = _by_views(field, splats, classes, cameras, similarity, carry)
     nothing_open = len(transfer.labels) == 0
     counts = torch.bincount(labels + 1, minlength=len(classes) + 1).tolist()
-    facts = {
+    details = {
         **found,
         "lambda": None if nothing_open else transfer.distance,
         "lambda from": None if nothing_open else transfer.how,
-        "frame": said,
+        "frame": frame_note,
         "alignment": alignment.to_json() if alignment is not None else None,
         "similarity": similarity.matrix().tolist(),
         "counts": {"none": counts[0], **dict(zip(classes.names, counts[1:], strict=True))},
@@ -144,11 +144,11 @@ def attach(
         gaussians=splats.gaussians.replace(labels=labels),
         extra=splats.extra | {SCORE: scores.to(torch.float32).cpu().numpy()},
         classes=classes.names,
-        info=splats.info | {"labels": facts},
+        info=splats.info | {"labels": details},
     )
-    labelled_by = f"{facts['labelled by']}: {len(splats) - counts[0]} of {len(splats)} Gaussians have a class"
-    words = said, labelled_by, _about(transfer, by)
-    return Attached(labelled, transfer, similarity, alignment, words)
+    labelled_by = f"{details['labelled by']}: {len(splats) - counts[0]} of {len(splats)} Gaussians have a class"
+    notes = frame_note, labelled_by, _about(transfer, by)
+    return Attached(labelled, transfer, similarity, alignment, notes)
 
 
 def _check_frame(frame: Any) -> None:
@@ -183,10 +183,8 @@ def _common_frame(
     except SceneError as error:
         raise SceneError(f"{error} (frame=Similarity.identity() says that both share one frame)") from error
     if _stays(clouds[0], alignment):
-        words = (
-            f"at first {check.summary}; but of all frames their own fits best, by the {alignment.how}: they share it"
-        )
-        return Similarity.identity(), None, words
+        note = f"at first {check.summary}; but of all frames their own fits best, by the {alignment.how}: they share it"
+        return Similarity.identity(), None, note
     return alignment.similarity, alignment, f"{check.summary}; aligned by {alignment.summary}"
 
 
@@ -212,13 +210,13 @@ def _by_distance(
     """Labels [N], scores [N], the transfer and details, by the rule of Sec. 3.4."""
     assert semantic.labels is not None
     transfer = carry(transform_gaussians(semantic, similarity), semantic.labels, splats.gaussians)
-    facts = {
+    details = {
         "labelled by": "distance to the field's Gaussians",
         "method": transfer.method,
         "score": transfer.score_meaning,
         "ambiguous": transfer.ambiguous,
     }
-    return transfer.labels, transfer.scores, transfer, facts
+    return transfer.labels, transfer.scores, transfer, details
 
 
 def _by_views(
@@ -241,14 +239,14 @@ def _by_views(
     carried = carry(colour, votes.labels, colour.select(open_))
     labels, scores = votes.labels.clone(), votes.shares.clone()
     labels[open_], scores[open_] = carried.labels, carried.scores.to(scores)
-    facts = {
+    details = {
         "labelled by": f"votes of {len(cameras)} segmented views",
         "method": carried.method,
         "score": f"share of the votes; where no view shows a Gaussian, {carried.score_meaning}, to those that have a class",
         "shown": int((~open_).sum()),
         "not shown": int(open_.sum()),
     }
-    return labels, scores, carried, facts
+    return labels, scores, carried, details
 
 
 def _about(transfer: Transfer, by: By) -> str:

@@ -124,7 +124,7 @@ def check_readable(maps: Maps, stage: str) -> None:
     gone = [file for file in maps.files if not file.is_file()]
     if gone:
         raise FileNotFoundError(
-            f"maps: expected the maps of all views, which {stage} looks at, got {len(gone)} of {len(maps)} that are gone "
+            f"maps: expected the maps of all views, which {stage} reads, got {len(gone)} of {len(maps)} missing "
             f"({gone[0]}, ...); make them again with `kfgs features` (extract_features)"
         )
 

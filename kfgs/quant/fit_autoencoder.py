@@ -1,4 +1,4 @@
-"""Training the autoencoder on the codewords of one scene (Sec. 3.3.2, Eq. 10)."""
+"""Train the autoencoder on the codewords of one scene (Sec. 3.3.2, Eq. 10)."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ NORM_EPS = 1e-5  # added to the variance in batch normalisation, torch's default
 
 @dataclass(frozen=True)
 class AutoencoderConfig:
-    """How the autoencoder is built and trained.
+    """Options of the autoencoder and its training.
 
-    The networks are the paper's, or its script's where the paper is silent. The paper trains them on the codewords alone
-    (`AutoencoderConfig.paper()`); by default blends of codewords are learnt as well, because a field renders blends.
+    The networks are the paper's, or its script's if the paper gives none. The paper trains on the codewords only
+    (`AutoencoderConfig.paper()`); by default blends of codewords are learnt too, because a field renders blends.
     """
 
     latent: int = 9
@@ -159,7 +159,7 @@ def _quick_on_a_cpu() -> Iterator[None]:
     """One torch thread, and denormal numbers taken as zero, for a while.
 
     The weights of dead units shrink to denormal numbers, which a CPU multiplies some ten times slower. And at most some hundred
-    rows leave a second thread little to do, while beside other busy programs its waiting slows every step (measured).
+    rows leave a second thread little to do, and with other busy programs its waiting slows every step (measured).
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # the denormal mode is a property of this thread alone

@@ -1,4 +1,4 @@
-"""Fitting the codebook of a scene: quantisation, optimisation and evolution at once (Sec. 3.3.1)."""
+"""Fit the codebook of a scene: quantisation, optimisation and evolution together (Sec. 3.3.1)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CODEWORD_RMS = 0.5  # of a codeword's channels: in mode adc the field learns the
 
 @dataclass(frozen=True)
 class CodebookConfig:
-    """How a codebook is fitted: from the data alone by default, or as the paper does (`CodebookConfig.paper()`)."""
+    """Options of `fit_codebook`. By default the data decide; `CodebookConfig.paper()` follows the paper."""
 
     adaptive: bool = True
     """Grow by splitting cells and let the data decide (`grow`); False follows Eq. 6-9 to the letter."""
@@ -40,10 +40,10 @@ class CodebookConfig:
     prune_above: float = 0.99
     """The later of two codewords is dropped when their similarity is above this (beta, Eq. 9)."""
     grid_step: tuple[int, int] | None = None
-    """Every how many rows and columns of a map are looked at; None: the finest grid within `samples_of`."""
+    """Sample every so many rows and columns of a map; None: the finest grid within `samples_of`."""
     samples: int = SAMPLES
-    """Most features of a map that are looked at when `grid_step` is None: (2, 3) on 360 x 480, all of 90 x 120. Unless
-    as in the paper, at most `POOL` of all maps together, whatever the grid."""
+    """Most features sampled per map if `grid_step` is None: (2, 3) on 360 x 480, all of 90 x 120. If adaptive, at most `POOL`
+    of all maps together, for any grid."""
     initial: int = 8
     """Paper only: codewords from farthest-point sampling on the first image (rho)."""
     joins_per_image: int | None = None
@@ -59,7 +59,7 @@ class CodebookConfig:
     eager_epochs: int = 2
     """Paper only: epochs at the start with a step after every image (script)."""
     step_every: int = 8
-    """Paper only: images per step afterwards, their gradients averaged; an epoch's last step takes what is left."""
+    """Paper only: images per step afterwards, their gradients averaged; an epoch's last step uses the rest."""
 
     def __post_init__(self) -> None:
         for name in ("initial", "epochs", "step_every", "samples", "maximum"):
@@ -77,7 +77,7 @@ class CodebookConfig:
                 raise ValueError(
                     "expand_below: expected a similarity with adaptive = False, got None; the paper has 0.9"
                 )
-        # Otherwise what joins is pruned at once, and joins again.
+        # Otherwise a new codeword is pruned at once, and joins again.
         check_range("prune_above", self.prune_above, -1 if self.expand_below is None else self.expand_below, 1)
         check_range("coverage", self.coverage, 0, 1, closed=(False, True))
         check_range("learning_rate", self.learning_rate, 0, closed=(False, True))
@@ -94,7 +94,7 @@ class CodebookConfig:
 
     @staticmethod
     def paper(**changes: Any) -> CodebookConfig:
-        """The paper's method and values, or its released script's where the paper is silent."""
+        """The paper's method and values; those of its released script if the paper gives none."""
         return CodebookConfig(**({"adaptive": False, "maximum": 100, "expand_below": 0.9} | changes))
 
     @staticmethod
@@ -118,9 +118,9 @@ class CodebookFit:
     mean_similarity: float
     """Mean similarity of the sampled features to their codeword."""
     alpha: float
-    """The similarity that `coverage` counts: `expand_below`, or what the data reached."""
+    """The similarity for `coverage`: `expand_below`, or the one that the data reached."""
     note: str | None
-    """One line that says what to do when the book is full or covers too little; None if all is well."""
+    """One line of advice if the book is full or covers too little; None if all is well."""
 
     __repr__ = short_repr
 
@@ -145,9 +145,9 @@ def fit_codebook(
 
     Args:
         maps: one map per image; only `len(maps)` and `maps[i]` are used, and one map is in memory at a time. Sizes may
-            differ, D may not. All-zero features are left out everywhere; half precision is computed in float32. Maps
-            that offer `grid(i, step, samples)`, equal to `sample_grid(maps[i], step, samples=samples)`, are asked for
-            that instead: maps on disk then read only what is looked at.
+            differ, D may not. All-zero features are left out everywhere; half precision is computed in float32. If maps
+            have `grid(i, step, samples)`, equal to `sample_grid(maps[i], step, samples=samples)`, it is called instead, so
+            that maps on disk read only the samples.
         config: see `CodebookConfig`.
         generator: draws the first directions of splits (paper: the order of the images); None stands for a fresh one
             with seed 0. On a CPU the same generator state gives the same bits.

@@ -29,7 +29,7 @@ class Cells(NamedTuple):
 
 
 class Grown(NamedTuple):
-    """What `grow` made."""
+    """The result of `grow`."""
 
     cells: Cells
     history: list[dict[str, Any]]  # per round: size, added, mean_similarity before it grew

@@ -13,7 +13,7 @@ from .._card import short_repr
 from .._check import as_tensor, check_range, check_shapes, check_whole
 from .._rows import unit_rows
 
-NOISE = 1e-10  # of the first eigenvalue: what float32 rounding puts into a direction that the data do not have
+NOISE = 1e-10  # of the first eigenvalue: rounding in float32 gives so much to directions that are not in the data
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,11 +112,11 @@ def fit_linear_latents(
     """The fewest latents that keep a stated share of the features' variation about their mean direction.
 
     Args:
-        features: their length counts as a weight; normalise rows that should count alike.
+        features: longer rows have more weight; normalise rows for equal weights.
         weights: of the rows; 1 if None.
         keep: share in (0, 1] of the energy beyond the first direction that the other latents must hold.
         minimum: fewest latents.
-        maximum: most latents, whatever `minimum` says; D if None.
+        maximum: most latents, even if `minimum` is larger; None: D.
 
     Raises:
         ValueError: if shapes disagree, an option is out of range, a number is not finite, or there is nothing but zeros.

@@ -104,7 +104,7 @@ class LatentMaps(Sequence[Tensor]):
 
     Args:
         index_maps: M, per image.
-        latents: what each codeword stands for: latents S', or the codewords themselves.
+        latents: of the codewords: latents S', or the codewords themselves.
 
     Raises:
         ValueError: if `latents` does not have a row per codeword.
@@ -152,10 +152,10 @@ def quantize_maps(
 
     Args:
         maps: see `fit_codebook`.
-        codebook: what the maps are quantised with.
+        codebook: S.
         progress: show a progress bar.
-        scratch: a folder for these maps and this codebook only. Each index map is written there at once, so a run that was
-            killed goes on where it stopped. The caller deletes the folder.
+        scratch: a folder for these maps and this codebook only. Each finished index map is written there, so a killed run
+            can continue. The caller deletes the folder.
 
     Raises:
         ValueError: if a map is not [h, w, D] with the codebook's D, or holds NaN or infinity.

@@ -8,7 +8,7 @@ from torch import Tensor
 from .._check import check_range, check_shapes
 from .._rows import EPS, row_norms, unit_rows
 
-SAMPLES = 28_800  # what rows 1::2 and columns 1::3 leave of a 360 x 480 map, as the paper's experiments used
+SAMPLES = 28_800  # rows 1::2 and columns 1::3 of a 360 x 480 map, as in the paper's experiments
 
 
 def choose_grid_step(height: int, width: int, samples: int = SAMPLES) -> tuple[int, int]:
@@ -30,7 +30,7 @@ def choose_grid_step(height: int, width: int, samples: int = SAMPLES) -> tuple[i
 def grid_slices(
     height: int, width: int, step: tuple[int, int] | None = None, *, samples: int = SAMPLES
 ) -> tuple[slice, slice]:
-    """The rows and the columns of a map that `sample_grid` looks at, so that a map on disk need not be read whole.
+    """The rows and columns of a map that `sample_grid` uses, so that only these are read from disk.
 
     Raises:
         ValueError: if a step is not positive.

@@ -25,11 +25,7 @@ _FATAL = 3  # glog's levels: 0 info, 1 warning, 2 error, 3 fatal
 
 
 def import_pycolmap() -> Any:
-    """The module, loaded at the first call.
-
-    Raises:
-        ImportError: if it is not installed, with the install line.
-    """
+    """The module, loaded at the first call. Raises an ImportError if it is not installed, with the install line."""
     before = signal.getsignal(signal.SIGTERM)
     try:
         import pycolmap

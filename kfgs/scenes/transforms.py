@@ -89,7 +89,7 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
     if not views:
         raise SceneError(
             f"{path}: expected frames with image files, none of {len(missing)} has one ({some(missing, 3)}); "
-            "copy the images beside the file or give their folder"
+            "copy the images next to the file or pass their folder"
         )
     views.sort(key=lambda view: natural_key(view[0].name))
     first, top = next(iter(readers.values()))
@@ -261,7 +261,7 @@ class _Frame:
         if model != "FULL_OPENCV":
             raise self.fail(
                 "", "at most k1 k2 k3 p1 p2", {"k4": k[3], "k5": k[4], "k6": k[5]},
-                'undistort the images first, or say "camera_model": "FULL_OPENCV" if these are OpenCV\'s k4 k5 k6',
+                'undistort the images first, or set "camera_model": "FULL_OPENCV" if these are OpenCV\'s k4 k5 k6',
             )  # fmt: skip
         return Distortion("brown_conrady", (k[0], k[1], *p, *k[2:]))
 

@@ -91,7 +91,7 @@ class _Value:
 
 @dataclass
 class PickleNames:
-    """What a pickle calls besides the few functions of torch it needs: `module.name`, in Python 3's spelling."""
+    """Names in a pickle (`module.name`, in Python 3's spelling), without the few functions of torch it needs."""
 
     called: set[str] = field(default_factory=set)
     """Must be replaced by something that ignores arguments, state and further calls."""

@@ -149,7 +149,7 @@ def _refuse_others(file: Path, state: dict[str, Tensor], settings: dict[str, Any
         what = "weights in the layout of transformers (pass their folder, with config.json)"
     raise ValueError(
         f"{file}: expected a CLIP of two plain transformers in OpenCLIP's layout, got {what} (no {missing[0]!r}); use a "
-        "ViT model such as ViT-B-16, or a folder of save_pretrained"
+        "ViT model like ViT-B-16, or a folder of save_pretrained"
     )
 
 

@@ -210,7 +210,7 @@ def _hub_tokenize(kind: str, source: Path | str, rule: TextRule, longest: int, l
     def tokenize(prompts: list[str]) -> tuple[Tensor, Tensor]:
         if isinstance(source, Path) and not _has_tokenizer(source):
             raise ValueError(
-                f"{source}: expected a tokenizer beside the weights of teacher {kind!r} ({', '.join(_TOKENIZER_FILES[:2])}, "
+                f"{source}: expected a tokenizer next to the weights of teacher {kind!r} ({', '.join(_TOKENIZER_FILES[:2])}, "
                 "...), got none; download those files too, or use a text table made elsewhere"
             )
         if not loaded:

@@ -49,7 +49,7 @@ class Solid:
 
 
 def intersect(solid: Solid, origin: Array, directions: Array) -> Array:  # [3], [..., 3] -> [...]
-    """The parameter t at which `origin + t * directions` enters the solid; infinity where it misses."""
+    """The parameter t at which `origin + t * directions` enters the solid; infinity if it misses."""
     o = solid.to_local(origin)
     d = directions @ solid.rotation()
     if solid.shape == "ellipsoid":

@@ -83,7 +83,7 @@ def surface_color(
     points: Array,  # [N, 3]
     which: NDArray[np.int64],  # [N]
     footprint: Array,  # [N] metres a pixel covers
-    lit: Array,  # [N, L] 1 where a light reaches, 0 in its shadow
+    lit: Array,  # [N, L] 1 if lit, 0 in shadow
 ) -> Array:  # [N, 3] in [0, 1]
     """Texture times a matte shading by the lights of the room; it does not depend on the camera."""
     color = np.zeros((len(points), 3))
@@ -104,7 +104,7 @@ def surface_color(
 
 
 def light_reaches(solids: Sequence[Solid], points: Array) -> Array:  # [N, 3] -> [N, L]
-    """1 where nothing stands between a point and each light, else 0; walls, floor and ceiling cast no shadow."""
+    """1 if nothing is between a point and a light, else 0; walls, floor and ceiling cast no shadow."""
     casters = [s for s in solids if s.label not in ("wall", "floor", "ceiling", "rug", "picture")]
     return np.stack([~occluded(casters, np.array(p), points) for p, _ in _LIGHTS], axis=-1).astype(float)
 

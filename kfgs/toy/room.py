@@ -1,4 +1,4 @@
-"""The furnished room: which solids stand where, and what they are made of."""
+"""The furnished room: its solids, their positions and materials."""
 
 from __future__ import annotations
 

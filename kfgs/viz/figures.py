@@ -64,11 +64,7 @@ def finish(axes: Axes, path: str | Path | None) -> Figure:
 
 
 def save_figure(figure: Figure, path: str | Path) -> None:
-    """Write a PNG file, whole or not at all.
-
-    Raises:
-        ValueError: if the name does not end in .png.
-    """
+    """Write a PNG file, whole or not at all. Raises a ValueError if the name does not end in .png."""
     if Path(path).suffix.lower() != ".png":
         raise ValueError(f"path: expected a name that ends in .png, got {Path(path).name!r}; rename it")
     with atomic_path(path) as temporary:

@@ -188,7 +188,7 @@ def picture_grid(
         if shown.shape[:2] != (height, width):
             raise ValueError(
                 f"{name}: expected [H, W, 3] with H = {height}, W = {width} (from rows[0][0]), got {tuple(picture.shape)}; "
-                f"say picture_grid(..., width={width}) to resize"
+                f"call picture_grid(..., width={width}) to resize"
             )
     letters = max(12, width // 28)  # pixels
     head = (letters * 3 // 2 if titles else 0) + GAP
@@ -231,7 +231,7 @@ def _resize_alike(pictures: list[list[Array]], width: int) -> list[list[Array]]:
     """All pictures `width` pixels wide and in the proportions of the first."""
     if not isinstance(width, numbers.Integral) or width < 1:
         raise ValueError(
-            f"width: expected a positive whole number of pixels, got {width!r}; pass an integer such as 320"
+            f"width: expected a positive whole number of pixels, got {width!r}; pass an integer, for instance 320"
         )
     if not all(picture.size for row in pictures for picture in row):
         raise ValueError("rows: expected pictures of at least one pixel, got an empty one; leave it out")

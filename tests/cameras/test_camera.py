@@ -156,7 +156,7 @@ def test_look_at_sees_the_field_of_view_that_was_asked_for():
     ("arguments", "options", "parts"),
     [
         (((1, 2, 3), (1, 2, 3)), {}, ("target - eye", "direction", "[0.0, 0.0, 0.0]")),
-        (((0, 0, 0), (0, 0, -5)), {}, ("up", "direction", "[0.0, 0.0, 1.0]", "such as (0, 1, 0)")),
+        (((0, 0, 0), (0, 0, -5)), {}, ("up", "direction", "[0.0, 0.0, 1.0]", "(0, 1, 0)")),
         (((0, 0, 0), (1, 0, 0)), {"up": (0, 0, 0)}, ("up", "direction", "[0.0, 0.0, 0.0]")),
         (((0, 0), (1, 0, 0)), {}, ("eye", "[3]", "(2,)")),
         (((0, 0, 0), (1, 0, 0)), {"fov_degrees": 180}, ("fov_degrees", "180")),

@@ -106,7 +106,7 @@ def test_a_changed_picture_a_damaged_and_a_missing_map_are_made_again_and_named(
     assert len(again.calls) == 3
     assert "a: the picture has changed; making it again" in lines[1]
     assert f"b: its map has changed ({len(whole['b.npy']) - 7} bytes instead of {len(whole['b.npy'])})" in lines[2]
-    assert "sub/c: its map is gone" in lines[3]
+    assert "sub/c: its map is missing" in lines[3]
     found = contents(folder)
     assert found["a.npy"] != whole["a.npy"]
     assert {**found, "a.npy": b""} == {**whole, "a.npy": b""}

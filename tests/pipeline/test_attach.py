@@ -100,7 +100,7 @@ def test_distance_in_one_frame():
     attached = attach(a_field(), splats, CLASSES)
     assert accuracy(attached.labels, splats) > 0.97
     assert attached.alignment is None
-    assert "the frames agree" in attached.words[0]
+    assert "the frames agree" in attached.notes[0]
     labelled = attached.labels >= 0
     score = torch.from_numpy(attached.splats.extra["score"])
     expected = 1 - attached.transfer.distances / attached.transfer.distance
@@ -187,8 +187,8 @@ def test_the_clouds_find_the_frame(monkeypatch):
     monkeypatch.setattr(register, "ROTATIONS", 200)
     splats = moved(a_splat(), a_similarity())
     attached = attach(a_field(), splats, CLASSES)
-    assert "disagree" in attached.words[0]
-    assert "shape of the clouds" in attached.words[0]
+    assert "disagree" in attached.notes[0]
+    assert "shape of the clouds" in attached.notes[0]
     assert accuracy(attached.labels, a_splat()) > 0.95
     assert attached.alignment.details["quality"] > 0.7
 
@@ -229,8 +229,8 @@ def test_clouds_that_fit_best_where_they_are_share_a_frame(monkeypatch):
     spread = field.gaussians.means.clone()
     spread[::3] += 0.7 * torch.randn(spread[::3].shape, generator=generator)
     attached = attach(SemanticField(field.gaussians.replace(means=spread)), noisy, CLASSES)
-    assert "the frames disagree" in attached.words[0]
-    assert "of all frames their own fits best" in attached.words[0]
+    assert "the frames disagree" in attached.notes[0]
+    assert "of all frames their own fits best" in attached.notes[0]
     assert torch.equal(attached.similarity.matrix(), Similarity.identity().matrix())
     assert attached.alignment is None
 
@@ -245,7 +245,7 @@ def test_where_the_views_show_everything_distance_has_no_lambda():
     assert facts["not shown"] == 0
     assert facts["lambda"] is None
     assert facts["lambda from"] is None
-    assert attached.words[2] == "there is none that no view shows"
+    assert attached.notes[2] == "there is none that no view shows"
 
 
 def test_a_given_similarity_is_taken_as_it_is():

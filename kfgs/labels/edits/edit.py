@@ -64,7 +64,7 @@ class OnSelection(Edit):
             where = OfIndex(tuple(where.indices.tolist()))
         elif not isinstance(where, Where):
             raise TypeError(
-                f"where: expected a Where, such as OfClass('chair'), a Selection or a class name, got {where!r:.80}; "
+                f"where: expected a Where like OfClass('chair'), a Selection or a class name, got {where!r:.80}; "
                 "build one"
             )
         set_fields(self, where=where)

@@ -86,11 +86,7 @@ class Insert(Edit):
 
 
 def read_similarity(value: Any, name: str) -> Similarity | None:
-    """Read what `Insert.to_json` wrote.
-
-    Raises:
-        ValueError: if it is something else, or not a similarity.
-    """
+    """Read what `Insert.to_json` wrote. Raises a ValueError if it is something else, or not a similarity."""
     if value is None:
         return None
     needed = {"scale", "rotation", "translation"}

@@ -101,11 +101,7 @@ class LSegNetwork(nn.Module):
         self.head = nn.Conv2d(config.fusion, config.dim, 1)
 
     def forward(self, x: Tensor) -> Tensor:  # x: [B, 3, S, S] -> [B, D, S / 2, S / 2]
-        """Encode windows.
-
-        Raises:
-            ValueError: if a window is not S x S.
-        """
+        """Encode windows. Raises a ValueError if a window is not S x S."""
         check_shapes(("x", x, ("B", 3, self.config.window, self.config.window)))
         # Block by block: the ViT's own forward would keep the outputs of all blocks, 88 MB a window, until the next call.
         tokens = self.vit.patch_embedding(x)  # [B, 1 + grid * grid, width]

@@ -28,11 +28,7 @@ class ClipText(nn.Module):
         self.projection = nn.Parameter(torch.zeros(width, config.dim))
 
     def forward(self, ids: Tensor) -> Tensor:  # ids: [n, context] int64 -> [n, D]
-        """Embed prompts.
-
-        Raises:
-            ValueError: if rows are not `context` tokens long, or no integers.
-        """
+        """Embed prompts. Raises a ValueError if rows are not `context` tokens long, or no integers."""
         check_shapes(("ids", ids, ("n", self.config.context)))
         if ids.dtype != torch.int64:
             raise ValueError(f"ids: expected int64 token numbers, got {ids.dtype}; pass what the tokenizer returns")

@@ -97,7 +97,7 @@ def meaning_of(
         for name, given in (("classes", classes), ("embed", embed)):
             if given is not None:
                 raise ValueError(
-                    f"{name}: expected none beside a splat, which has its own classes, got one; leave it out"
+                    f"{name}: expected none with a splat, which has its own classes, got one; leave it out"
                 )
         return SplatMeaning(source)
     return FieldMeaning(source, classes, cameras=cameras, embed=embed)

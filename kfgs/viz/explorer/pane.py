@@ -1,4 +1,4 @@
-"""Show the panel beside a plotter's subplots: its width is fixed, and it can be redrawn without the clouds."""
+"""Show the panel next to a plotter's subplots: its width is fixed, and it can be redrawn without the clouds."""
 
 from __future__ import annotations
 
