@@ -229,4 +229,4 @@ def test_every_object_with_tensors_shows_itself_in_a_short_line():
             if len(line) >= 200 or "\n" in line:
                 long.append(f"{kind.__module__}.{kind.__name__}: {line[:80]}")
     assert seen > 60
-    assert long == []
+    assert long == [], "\n".join(long)

@@ -8,6 +8,7 @@ from typing import ClassVar, Literal, NamedTuple
 
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import check_choice
 from ..labels.scores import CANONICAL, TEMPERATURE
 from .method import Method, View, annotated, check_level
@@ -32,6 +33,9 @@ class Activated(NamedTuple):
 
     masks: Tensor  # [levels, H, W] bool
     chosen: int  # the level with the largest blended relevancy
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def activate(

@@ -8,6 +8,8 @@ import numpy as np
 from scipy.ndimage import median_filter
 from torch import Tensor
 
+from .._card import short_repr
+
 THRESHOLDS = np.arange(1, 100) / 100
 FALLBACK = 0.5  # where no threshold is stable
 MEDIAN = 5  # thresholds of the median filter
@@ -21,6 +23,9 @@ class Stable(NamedTuple):
     mask: Tensor  # [H, W] bool
     level: int
     threshold: float
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 class _Run(NamedTuple):

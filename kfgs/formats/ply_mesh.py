@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .._card import short_repr
 from .ply import _TYPES, Columns, _check_scalars, _check_vertex, _Element, _existing, _parse_header, _read_element
 
 _CORNERS = ("vertex_indices", "vertex_index")
@@ -22,6 +23,9 @@ class Mesh(NamedTuple):
     corners: NDArray[np.int64]  # [C] vertices of all faces, one face after another
     counts: NDArray[np.int64]  # [F] corners of each face
     faces: Columns  # F values each, such as object_id
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def read_mesh(path: str | Path) -> Mesh:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
+from .._card import short_repr
 from ..cameras.camera import Camera
 from .files import MAX_NUMBER, SceneError, is_file, list_images, natural_key, read_image, some
 from .scene import Scene
@@ -30,6 +31,9 @@ class PosedPicture(NamedTuple):
     path: Path
     pose: Matrix  # [4, 4] camera to world, x right, y down, z forward
     origin: str  # the file, and the line, that the pose is from; for messages
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def picture_size(path: Path) -> tuple[int, int]:
