@@ -23,7 +23,7 @@ def a_similarity(seed):
 @pytest.mark.parametrize("seed", range(2))
 def test_finds_rotation_scale_and_place(seed):
     true = a_similarity(seed)
-    found = align_clouds(room(6_000, seed), true.apply(room(9_000, seed + 50, thinning=0.6, floaters=0.05)))
+    found = align_clouds(room(3_000, seed), true.apply(room(4_500, seed + 50, thinning=0.6, floaters=0.05)))
     left = true.inverse() @ found.similarity
     angle = np.degrees(Rotation.from_matrix(left.rotation.numpy()).magnitude())
     assert angle < 0.5

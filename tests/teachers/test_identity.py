@@ -95,7 +95,7 @@ def test_digest_is_the_same_in_every_process():
     )
     found = {
         subprocess.run(
-            [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60,
+            [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=600,
             env={"PYTHONHASHSEED": seed, "PYTHONPATH": str(Path(kfgs.__file__).parents[1]), "OMP_NUM_THREADS": "1"},
         ).stdout
         for seed in ("1", "2")

@@ -139,7 +139,7 @@ gaussians = Gaussians(torch.rand(9, 3), torch.ones(9, 4), torch.full((9, 3), 0.1
 def run_bare(program, **environment):
     """In a Python of its own, as on a machine without a display that nobody has prepared."""
     return subprocess.run(
-        [sys.executable, "-W", "error", "-c", program], capture_output=True, text=True, check=False, timeout=120,
+        [sys.executable, "-W", "error", "-c", program], capture_output=True, text=True, check=False, timeout=600,
         env=BARE | environment,
     )  # fmt: skip
 
