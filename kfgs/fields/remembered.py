@@ -13,12 +13,17 @@ CLASSES = ("classes.json", "text.npy"), ("classes.json", "text.safetensors"), ("
 """Files of a scene folder that make a label set; the first pair that exists is used."""
 
 
-def remember(scene: Path, field: Path) -> dict[str, Any]:
-    """Make a field's notes about a scene folder, as JSON: paths relative to the field, and digests."""
+def remember(scene: Path, field: Path, channels: int | None = None) -> dict[str, Any]:
+    """Make a field's notes about a scene folder, as JSON: paths relative to the field, and digests.
+
+    Classes are left out if their embeddings cannot be read, or do not have the `channels` of the teacher's features.
+    """
     found: dict[str, Any] = {"scene": _relative(scene, field)}
     for names in CLASSES:
         files = [scene / name for name in names]
         if all(file.is_file() for file in files):
+            if channels is not None and not _is_of(files, channels):
+                break
             found["classes"] = [{"path": _relative(file, field), "sha256": digest_file(file)} for file in files]
             break
     return found
@@ -69,6 +74,13 @@ def recall_classes(info: dict[str, Any], folder: Path | None) -> LabelSet:
                 f"classes: expected {file} as it was when the field was fitted, got another; pass the classes that you mean"
             )
     return load_label_set(*files)
+
+
+def _is_of(files: list[Path], channels: int) -> bool:
+    try:
+        return load_label_set(*files).embeddings.shape[1] == channels
+    except (ValueError, OSError):  # said when classes are asked for; a long fit does not fail at its end
+        return False
 
 
 def _relative(path: Path, field: Path) -> str:

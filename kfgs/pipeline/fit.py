@@ -234,7 +234,7 @@ def fit_scene(
         "views": [camera.name for camera in job.cameras],
         "teacher_map": list(map_shape(job.maps)),
         **({"teacher": teacher} if teacher else {}),
-        **({} if scene.folder is None else remember(scene.folder, done.field_path)),
+        **({} if scene.folder is None else remember(scene.folder, done.field_path, found.dim)),
         "seconds": {stage.name: round(stage.seconds, 3) for stage in run.stages},
         "kfgs": version("kfgs"),
     }

@@ -143,7 +143,7 @@ def uplift(
         "method": "uplift",
         "views": [camera.name for camera in cameras],
         **({"teacher": teacher} if teacher else {}),
-        **({} if folder is None or scene.folder is None else remember(scene.folder, Path(folder))),
+        **({} if folder is None or scene.folder is None else remember(scene.folder, Path(folder), found.latents.dim)),
         "kfgs": version("kfgs"),
     }
     seen = Seen(found.pixels, found.agreement)

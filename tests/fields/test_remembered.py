@@ -54,6 +54,14 @@ def test_paths_are_relative_to_the_field(tmp_path):
     assert json.loads(json.dumps(noted)) == noted
 
 
+def test_classes_of_another_teacher_or_damaged_ones_are_not_remembered(tmp_path):
+    scene, place = tree(tmp_path)
+    assert "classes" in remember(scene, place, channels=ROWS.shape[1])
+    assert "classes" not in remember(scene, place, channels=ROWS.shape[1] + 1)
+    (scene / "text.npy").write_bytes(b"damaged")
+    assert "classes" not in remember(scene, place, channels=ROWS.shape[1])
+
+
 def test_the_whole_tree_may_move(tmp_path):
     tree(tmp_path / "before")
     shutil.move(tmp_path / "before", tmp_path / "after")
