@@ -180,7 +180,8 @@ print("closed")
 
 @pytest.mark.skipif(shutil.which("Xvfb") is None, reason="a real window needs Xvfb")
 def test_a_real_window_opens_answers_and_closes():
-    command = ["Xvfb", "-displayfd", "1", "-screen", "0", "1280x800x24"]
+    # Without -noreset the server starts anew whenever its last client leaves, and refuses a client that comes meanwhile.
+    command = ["Xvfb", "-displayfd", "1", "-noreset", "-screen", "0", "1280x800x24"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as server:
         try:
             environment = {name: value for name, value in os.environ.items() if name not in headless.WITHOUT_DISPLAY}
@@ -192,4 +193,4 @@ def test_a_real_window_opens_answers_and_closes():
             )  # fmt: skip
         finally:
             server.terminate()
-    assert (done.returncode, done.stdout, done.stderr) == (0, "closed\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "closed\n", ""), done.stderr
