@@ -1,0 +1,144 @@
+"""LangSplat's scores on LERF-OVS in 2-D: masks from relevancy, and whether its maximum lies in a box."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal, NamedTuple
+
+from torch import Tensor
+
+from .._check import check_choice
+from ..labels.scores import CANONICAL, TEMPERATURE
+from .method import Method, View, annotated
+from .relevancy import (
+    FILTERS,
+    Encode,
+    Filter,
+    clean_mask,
+    encode_unit,
+    fill_unknown,
+    lerf_relevancy,
+    mask_iou,
+    smooth_relevancy,
+    stretch,
+)
+from .report import Report, Row, make_report
+from .truth import MaskTruth
+
+
+class Activated(NamedTuple):
+    """A text's masks in one view, one for each level."""
+
+    masks: Tensor  # [levels, H, W] bool
+    chosen: int  # the level with the largest blended relevancy
+
+
+def activate(
+    relevancy: Tensor,  # [levels, H, W]
+    threshold: float = 0.4,
+    filter: Filter = "langsplat",
+) -> Activated:
+    """Masks of a text as LangSplat makes them (`activate_stream`), and the level that it chooses.
+
+    The relevancy is blended half and half with its box mean. It is stretched by its minimum and maximum in each level, cut
+    at `threshold`, and cleaned by a 7 x 7 majority. The level is chosen by the maximum before stretching; a tie goes to
+    the first.
+    """
+    blended = 0.5 * (smooth_relevancy(relevancy, filter) + relevancy)
+    masks = clean_mask(stretch(blended) > threshold, filter)
+    return Activated(masks, int(blended.amax((-2, -1)).argmax()))
+
+
+def localise(
+    relevancy: Tensor,  # [levels, H, W]
+    boxes: Tensor,  # [B, 4] x1, y1, x2, y2 in pixels
+    filter: Filter = "langsplat",
+) -> bool:
+    """Whether the largest smoothed relevancy lies in one of the boxes (`lerf_localization`).
+
+    Of all levels the one with the largest smoothed value counts, and all pixels that attain it; one inside a box (its edges
+    included) is enough.
+    """
+    smoothed = smooth_relevancy(relevancy, filter)
+    level = smoothed[int(smoothed.amax((-2, -1)).argmax())]
+    y, x = (level == level.max()).nonzero().T[:, :, None]  # [n, 1] each
+    x1, y1, x2, y2 = boxes.to(relevancy).T  # [B] each
+    return bool(((x >= x1) & (x <= x2) & (y >= y1) & (y <= y2)).any())
+
+
+@dataclass(frozen=True)
+class LerfOvs2D:
+    """LangSplat's `eval/evaluate_iou_loc.py`: each text that is annotated in a frame is looked for in that frame.
+
+    The evaluated frames are training views in LangSplat, LangSplatV2 and GAGS; Occam's LGS and VALA hold them out. Say which.
+    Pixels of which a method knows nothing count as the least relevant ones of their map.
+    """
+
+    name: ClassVar[str] = "lerf-ovs-2d/1"
+    about: ClassVar[str] = (
+        "LERF-OVS in 2-D as LangSplat scores it: mean IoU of masks of relevancy over all (frame, text) pairs of the scene; "
+        "localisation = share of the pairs whose most relevant pixel lies in a box"
+    )
+
+    level: Literal["chosen", "oracle"] | int = "chosen"
+    """Of a method with several maps. "chosen": the one with the most relevant pixel, as published. "oracle": the best IoU of
+    any level, which nobody can know; do not report it as the result. A number: always this one."""
+    threshold: float = 0.4
+    """A pixel belongs to a text above it (`--mask_thresh`), after stretching. VALA's paper says 0.5."""
+    filter: Filter = "langsplat"
+    """"langsplat": 30 x 30 mean with OpenCV's offsets, majority that leaves out the last row and column. "langsplatv2": average
+    pooling of 29 and 7."""
+    scale: float = TEMPERATURE
+    """Of the cosines in the relevancy."""
+    negatives: tuple[str, ...] = CANONICAL
+    """What texts are compared with."""
+
+    def __post_init__(self) -> None:
+        check_choice("filter", self.filter, FILTERS)
+        if isinstance(self.level, str):
+            check_choice("level", self.level, ("chosen", "oracle"))
+
+    def score(self, method: Method, truth: MaskTruth, views: Sequence[View], encode: Encode) -> Report:
+        """Look for the texts of each annotated frame.
+
+        Args:
+            method: what is scored.
+            truth: masks, and boxes for the localisation; a text without boxes is not localised.
+            views: of the annotated frames (others are ignored), of the size of the masks.
+            encode: the teacher's text encoder.
+
+        Raises:
+            ValueError: if a frame has no view, or a mask has another size than its view.
+        """
+        rows: list[Row] = []
+        for view in annotated(views, truth.frames):
+            found = relevancies(method, view, tuple(truth.frames[view.stem]), encode, self.negatives, self.scale)
+            for text, (mask, boxes) in truth.frames[view.stem].items():
+                rows.append({"view": view.stem, "text": text, **self._pair(found[text], mask, boxes)})
+        hits = [row["hit"] for row in rows if row["hit"] is not None]
+        scores = {
+            "mIoU": sum(row["IoU"] for row in rows) / len(rows) if rows else float("nan"),
+            "localisation": sum(hits) / len(hits) if hits else float("nan"),
+        }
+        return make_report(self, method.name, scores, rows)
+
+    def _pair(self, relevancy: Tensor, mask: Tensor, boxes: Tensor | None) -> Row:
+        fixed = isinstance(self.level, int)
+        seen = relevancy[[self.level]] if fixed else relevancy
+        masks, level = activate(seen, self.threshold, self.filter)
+        ious = [mask_iou(one, mask) for one in masks]
+        if self.level == "oracle":
+            level = ious.index(max(ious))
+        hit = None if boxes is None or len(boxes) == 0 else localise(seen, boxes, self.filter)
+        return {"level": self.level if fixed else level, "IoU": ious[level], "hit": hit}
+
+
+def relevancies(
+    method: Method, view: View, texts: Sequence[str], encode: Encode, negatives: Sequence[str], scale: float
+) -> Mapping[str, Tensor]:
+    """LERF's relevancy of some texts in a view, [levels, H, W] each; unknown pixels have the least value of their map."""
+    both = encode_unit(encode, [*texts, *negatives])
+    cosines = method.cosines(view, both)
+    found = lerf_relevancy(cosines[..., : len(texts)], cosines[..., len(texts) :], scale)
+    return {text: fill_unknown(found[..., i].contiguous()) for i, text in enumerate(texts)}

@@ -1,0 +1,232 @@
+"""Whatever can be scored: kfgs's field, a baseline, a checkpoint of another program, or the teacher itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from .._rows import EPS, row_norms, unit_embeddings, unit_rows
+from ..cameras import Camera
+from ..features import FeatureFolder
+from ..fields import SemanticField
+from ..gaussians import Gaussians
+from ..labels import nearest_codeword
+
+CHUNK = 8192  # pixels decoded at once
+
+
+class View(NamedTuple):
+    """One picture of a scene."""
+
+    stem: str
+    """The picture's name without its ending."""
+    camera: Camera
+    """Without distortion; its size is that of the picture that is scored."""
+
+
+@runtime_checkable
+class Method(Protocol):
+    """What a protocol needs of a method: cosines with texts, for pixels and for Gaussians, in the teacher's text space."""
+
+    @property
+    def name(self) -> str:
+        """For tables: "LangSplat"."""
+
+    @property
+    def levels(self) -> int:
+        """How many maps it has of a view: 1, or 3 for LangSplat (small, medium and large parts)."""
+
+    @property
+    def gaussians(self) -> Gaussians | None:
+        """Its geometry; None for a teacher."""
+
+    def cosines(self, view: View, text: Tensor) -> Tensor:  # [K, D] unit rows -> [levels, H, W, K]
+        """The cosine of each pixel's feature with each text; NaN where nothing is known."""
+
+    def gaussian_cosines(self, text: Tensor) -> Tensor:  # [K, D] unit rows -> [levels, N, K]
+        """The cosine of each Gaussian's feature with each text; NaN rows for Gaussians without a feature."""
+
+
+@runtime_checkable
+class Labeller(Protocol):
+    """A method with a rule of its own for the classes of pixels; of the others, the class with the largest cosine wins."""
+
+    def labels(self, view: View, text: Tensor) -> Tensor:  # [K, D] unit rows -> [H, W] int64
+        """The class of each pixel, -1 where nothing is known."""
+
+
+def best_labels(cosines: Tensor) -> Tensor:  # [..., K] -> [...] int64
+    """The text with the largest cosine; -1 where the cosines are NaN. A tie goes to the lowest.
+
+    Example:
+        >>> best_labels(torch.tensor([[0.1, 0.3], [0.2, 0.2], [float("nan")] * 2])).tolist()
+        [1, 0, -1]
+    """
+    unknown = cosines.isnan()
+    return cosines.masked_fill(unknown, -torch.inf).argmax(-1).masked_fill(unknown.all(-1), -1)
+
+
+def label_view(method: Method, view: View, text: Tensor, level: int = 0) -> Tensor:  # [H, W] int64
+    """The class of each pixel: the method's own answer if it has a rule (`Labeller`), else the largest cosine.
+
+    Args:
+        method: what is scored.
+        view: the picture.
+        text: one unit row per class, [K, D].
+        level: of a method with several.
+    """
+    if isinstance(method, Labeller):
+        return method.labels(view, text)
+    return best_labels(method.cosines(view, text)[level])
+
+
+def annotated(views: Sequence[View], stems: Iterable[str]) -> list[View]:
+    """The views that have ground truth, in their order.
+
+    Raises:
+        ValueError: if a picture with ground truth has no view.
+    """
+    wanted = set(stems)
+    found = [view for view in views if view.stem in wanted]
+    missing = sorted(wanted - {view.stem for view in found})
+    if missing or not found:
+        raise ValueError(
+            f"views: expected one for each of {len(wanted)} pictures with ground truth, got none for "
+            f"{', '.join(missing[:3]) or 'any'}{' ...' if len(missing) > 3 else ''}; pass views with these stems"
+        )
+    return found
+
+
+class FieldMethod:
+    """A `SemanticField` as a method: one level.
+
+    The cosine of a pixel is that of the feature that is rendered there; of a field with an autoencoder, that of the
+    codeword with the nearest latent. Classes of pixels are those of `SemanticField.segment`, unless `own_labels` is False.
+
+    Args:
+        field: any field.
+        name: for tables; None: "kfgs" and the field's method.
+        own_labels: False takes the class with the largest cosine, as for the other methods.
+    """
+
+    levels = 1
+
+    def __init__(self, field: SemanticField, name: str | None = None, *, own_labels: bool = True) -> None:
+        self.field = field
+        self.name = f"kfgs {field.method}" if name is None else name
+        self.own_labels = own_labels
+
+    def __repr__(self) -> str:
+        return f"FieldMethod({self.name!r}, {self.field!r})"
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The field's Gaussians."""
+        return self.field.gaussians
+
+    def cosines(self, view: View, text: Tensor) -> Tensor:  # [K, D] -> [1, H, W, K]
+        """The cosine of each pixel's rendered feature with each text; NaN where nothing was drawn."""
+        field = self.field
+        unit = unit_embeddings(text, "text").to(field.features)
+        with torch.no_grad():
+            rendering = field.render(view.camera)
+            parts = rendering.map.flatten(0, 1).split(CHUNK)
+            if field.linear is not None and field.method == "fused":
+                found = torch.cat([field.linear.cosines(part, unit) for part in parts])
+                known = row_norms(rendering.map) > EPS
+            elif field.codebook is not None and field.autoencoder is not None:
+                centres = field.autoencoder.encode(field.codebook.codewords).to(unit)
+                per_codeword = field.codebook.unit.to(unit) @ unit.T  # [codewords, K]
+                found = torch.cat([per_codeword[nearest_codeword(part, centres)] for part in parts])
+                known = rendering.alpha > 0
+            else:
+                found = torch.cat([unit_rows(field.decode(part)) @ unit.T for part in parts])
+                known = row_norms(rendering.map) > EPS
+        known = known & (rendering.alpha > 0)
+        return found.view(*view.camera.size, -1).masked_fill(~known[..., None], torch.nan)[None]
+
+    def labels(self, view: View, text: Tensor) -> Tensor:  # [K, D] -> [H, W] int64
+        """The class of each pixel: what `SemanticField.segment` says, or the largest cosine."""
+        return self.field.segment(view.camera, text) if self.own_labels else best_labels(self.cosines(view, text)[0])
+
+    def gaussian_cosines(self, text: Tensor) -> Tensor:  # [K, D] -> [1, N, K]
+        """The cosine of each Gaussian's fused feature with each text (`SemanticField.cosines`)."""
+        return self.field.cosines(text).masked_fill(~self.field.known[:, None], torch.nan)[None]
+
+
+class TeacherMethod:
+    """A teacher's maps as a method: one level and no Gaussians. Scores of it are what a field of these maps can reach.
+
+    A map of another size than the picture is resized bilinearly, a few rows at a time, before cosines are taken.
+
+    Args:
+        maps: a `FeatureFolder`, or maps [h, w, D] by the stem of their picture. An all-zero feature means "unknown".
+        name: for tables.
+        align_corners: how maps are resized, see `resize_map`; True is Feature 3DGS's way.
+    """
+
+    levels = 1
+    gaussians: Gaussians | None = None
+
+    def __init__(
+        self, maps: FeatureFolder | Mapping[str, Tensor], name: str = "teacher", *, align_corners: bool = False
+    ) -> None:
+        self.maps, self.name, self.align_corners = maps, name, align_corners
+
+    def __repr__(self) -> str:
+        return f"TeacherMethod({self.name!r}, {len(self.maps)} maps)"
+
+    def feature_map(self, stem: str) -> Tensor:  # [h, w, D]
+        """The map of one picture, as large as it is.
+
+        Raises:
+            KeyError: if there is no map of that name.
+        """
+        maps = self.maps
+        if stem not in (maps.stems if isinstance(maps, FeatureFolder) else maps):
+            raise KeyError(f"view: expected a picture that has a map, got {stem!r}; choose views of the maps' folder")
+        return maps[maps.stems.index(stem)] if isinstance(maps, FeatureFolder) else maps[stem]
+
+    def cosines(self, view: View, text: Tensor) -> Tensor:  # [K, D] -> [1, H, W, K]
+        """The cosine of each pixel's feature with each text; NaN where the map says nothing.
+
+        Raises:
+            KeyError: if the view has no map.
+        """
+        features = self.feature_map(view.stem)
+        unit = unit_embeddings(text, "text").to(features)
+        height, width = view.camera.size
+        upper, lower, down = _taps(height, int(features.shape[0]), self.align_corners)
+        left, right, across = _taps(width, int(features.shape[1]), self.align_corners)
+        down, across = down.to(features)[:, None, None], across.to(features)[:, None]
+        found = torch.empty(height, width, len(unit), dtype=features.dtype, device=features.device)
+        rows = max(1, CHUNK // width)
+        for start in range(0, height, rows):
+            some = slice(start, start + rows)
+            band = torch.lerp(features[upper[some]], features[lower[some]], down[some])
+            band = torch.lerp(band[:, left], band[:, right], across)
+            unknown = row_norms(band) <= EPS
+            found[some] = (unit_rows(band) @ unit.T).masked_fill(unknown[..., None], torch.nan)
+        return found[None]
+
+    def gaussian_cosines(self, text: Tensor) -> Tensor:
+        """A teacher has no Gaussians.
+
+        Raises:
+            TypeError: always.
+        """
+        raise TypeError(f"method: expected one with Gaussians, got the teacher {self.name!r}; use a protocol of views")
+
+
+def _taps(size: int, source: int, align_corners: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """For each of `size` places the two of `source` that are blended, and the share of the second."""
+    places = torch.arange(size, dtype=torch.float64)
+    if align_corners:
+        places = places * ((source - 1) / max(size - 1, 1))
+    else:
+        places = ((places + 0.5) * (source / size) - 0.5).clamp_min(0)
+    first = places.floor().long().clamp_max(source - 1)
+    return first, (first + 1).clamp_max(source - 1), places - first

@@ -1,0 +1,132 @@
+"""What a protocol says about a method: scores that carry the protocol's name, and all that is needed to get them again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+Row = Mapping[str, Any]
+"""One line of a report's table: "view", "text" or "class", and numbers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """Scores under a named protocol.
+
+    `str(report)` is the short form, `mIoU 0.831 (kfgs-pooled/1)`; `report.text` says how it was measured.
+    """
+
+    protocol: str
+    """Name and version: "lerf-ovs-2d/1"."""
+    scores: Mapping[str, float]
+    """By name; the first is the headline. NaN where nothing could be measured."""
+    rows: tuple[Row, ...] = ()
+    """What the scores are made of, for each view or class."""
+    method: str = ""
+    """What was scored."""
+    about: str = ""
+    """What the protocol measures, in words."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """The protocol's options, plain values."""
+    changed: tuple[str, ...] = ()
+    """Options that are not as published."""
+    digests: Mapping[str, str] = field(default_factory=dict)
+    """Of the data and of the field, by name."""
+    command: str = ""
+    """What was run."""
+
+    def __post_init__(self) -> None:
+        if not self.scores:
+            raise ValueError("scores: expected at least one, got none; name what was measured")
+
+    def __getitem__(self, name: str) -> float:
+        """A score by its name."""
+        if name not in self.scores:
+            raise KeyError(f"no score {name!r}; expected one of {', '.join(self.scores)}")
+        return self.scores[name]
+
+    @property
+    def value(self) -> float:
+        """The headline score."""
+        return next(iter(self.scores.values()))
+
+    def __str__(self) -> str:
+        """All scores, the protocol, and what differs from it as published."""
+        numbers = ", ".join(f"{name} {value:.3f}" for name, value in self.scores.items())
+        differs = "".join(f", {name}={self.options[name]}" for name in self.changed)
+        return f"{numbers} ({self.protocol}{differs})"
+
+    def __repr__(self) -> str:
+        return f"Report({self}, {len(self.rows)} rows)"
+
+    @property
+    def text(self) -> str:
+        """The long form: the scores, the protocol in words, every option, and the table."""
+        lines = [f"{self.method}: {self}" if self.method else str(self)]
+        lines += [f"  {self.about}"] if self.about else []
+        lines += [f"  {name} = {value}" for name, value in self.options.items()]
+        lines += [f"  {name}: {value}" for name, value in self.digests.items()]
+        lines += [f"  command: {self.command}"] if self.command else []
+        for row in self.rows:
+            parts = (f"{k} {v:.3f}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items())
+            lines.append("    " + ", ".join(parts))
+        return "\n".join(lines)
+
+    def of(self, *, command: str = "", digests: Mapping[str, str] | None = None) -> Report:
+        """The same report with the command that made it, and digests of data and field."""
+        return replace(self, command=command or self.command, digests={**self.digests, **(digests or {})})
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values: protocol, version, options, scores, rows, digests, command. A number that is not finite is null."""
+        name, _, version = self.protocol.partition("/")
+        return {
+            "protocol": self.protocol,
+            "name": name,
+            "version": int(version) if version.isdigit() else version,
+            "about": self.about,
+            "method": self.method,
+            "options": plain(self.options),
+            "changed": list(self.changed),
+            "scores": plain(self.scores),
+            "rows": plain(self.rows),
+            "digests": plain(self.digests),
+            "command": self.command,
+        }
+
+
+def make_report(protocol: Any, method: str, scores: Mapping[str, float], rows: list[Row] | tuple[Row, ...]) -> Report:
+    """The report of a protocol: a frozen dataclass with `name` and `about`, whose fields are its options."""
+    options = {option.name: plain(getattr(protocol, option.name)) for option in fields(protocol)}
+    usual = type(protocol)()
+    changed = tuple(name for name in options if getattr(protocol, name) != getattr(usual, name))
+    return Report(
+        protocol=protocol.name,
+        scores=dict(scores),
+        rows=tuple(rows),
+        method=method,
+        about=protocol.about,
+        options=options,
+        changed=changed,
+    )
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON holds it: numbers that are not finite become None, tuples lists, tensors nested lists."""
+    if isinstance(value, bool | str | int) or value is None:
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset | range):
+        return [plain(item) for item in value]
+    if is_dataclass(value) and not isinstance(value, type):
+        return {entry.name: plain(getattr(value, entry.name)) for entry in fields(value)}
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"value: expected something that JSON can hold, got {type(value).__name__}; convert it first")

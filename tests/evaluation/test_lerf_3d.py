@@ -1,0 +1,129 @@
+import cases_methods as cases
+import numpy as np
+import oracles_protocols as dull
+import oracles_uplift
+import pytest
+import torch
+
+from kfgs.evaluation import MaskAndBoxes, MaskTruth, TeacherMethod
+from kfgs.evaluation.class_lists import load_classes
+from kfgs.evaluation.lerf_3d import LerfOvs3D, nearest_gaussians, share_above, silhouette
+from kfgs.labels.scores import CANONICAL
+
+SIZE = (18, 24)
+TEXTS = ("mug", "spoon", "plate")
+
+
+def _scene(levels=3, seed=0):
+    rng = np.random.default_rng(seed)
+    cloud = cases.spread_gaussians(rng, 40, scale=0.25)
+    own = {text: rng.uniform(0.1, 0.4, (levels, 40)) for text in (*TEXTS, *CANONICAL)}
+    for values in own.values():
+        values[:, 5] = np.nan  # nothing is known of one Gaussian
+    frames = {}
+    for stem, texts in (("frame_1", TEXTS[:2]), ("frame_2", TEXTS)):
+        frames[stem] = {t: MaskAndBoxes(torch.from_numpy(rng.uniform(size=SIZE) < 0.6)) for t in texts}
+    method = cases.Numbers([*TEXTS, *CANONICAL], own=own, gaussians=cloud)
+    return method, MaskTruth(frames), [cases.view(stem, *SIZE) for stem in frames]
+
+
+def _silhouette(cloud, selected, threshold):
+    parts = [x.double().numpy()[selected] for x in (cloud.means, cloud.quats, cloud.scales, cloud.opacities)]
+    camera = cases.camera(*SIZE)
+    viewmat, k = camera.viewmat.double().numpy(), camera.K.double().numpy()
+    weights = oracles_uplift.blend_weights(*parts, viewmat, k, camera.width, camera.height)
+    return weights.sum(-1) > threshold
+
+
+PROTOCOLS = {
+    "argmax": LerfOvs3D(),
+    "vala": LerfOvs3D.vala(),
+    "dr_splat": LerfOvs3D.dr_splat(),
+    "level": LerfOvs3D(selection="smoothed", threshold=0.3, level=1, neighbours=4),
+}
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_whole_protocol_against_loops(name, seed):
+    method, truth, views = _scene(seed=seed)
+    protocol = PROTOCOLS[name]
+    report = protocol.score(method, truth, views, method.encode)
+    own = {t: v[[1]] for t, v in method.own.items()} if name == "level" else method.own
+    selected = {}
+    for text in TEXTS:
+        if name == "argmax":
+            selected[text] = dull.select_argmax(own, TEXTS, text)
+        else:
+            options = {"threshold": protocol.threshold, "smoothed": protocol.selection == "smoothed"}
+            means = method.gaussians.means.double().tolist()
+            selected[text] = dull.select_by_relevancy(
+                own, text, CANONICAL, means, neighbours=protocol.neighbours, **options
+            )
+        found = protocol.select(method, TEXTS, method.encode)[text].numpy()
+        assert np.array_equal(found, selected[text])
+        assert not found[5]
+        assert found.any()
+    ious = [
+        dull.iou(_silhouette(method.gaussians, selected[text], protocol.silhouette), mask.numpy())
+        for texts in truth.frames.values()
+        for text, (mask, _) in texts.items()
+    ]
+    assert report["mIoU"] == pytest.approx(np.mean(ious), abs=2e-3)  # float32 at the silhouette's threshold
+    assert report["Acc@0.25"] == np.mean(np.array(ious) > 0.25)
+    assert report["Acc@0.5"] == np.mean(np.array(ious) > 0.5)
+
+
+def test_accuracy_is_strict_by_hand():
+    assert share_above([0.25, 0.26], 0.25) == 0.5
+    assert np.isnan(share_above([], 0.5))
+
+
+def test_the_silhouette_is_that_of_the_selection_alone():
+    method, _, views = _scene()
+    nothing = torch.zeros(40, dtype=torch.bool)
+    assert not silhouette(method.gaussians, nothing, views[0].camera).any()
+    wide = silhouette(method.gaussians, ~nothing, views[0].camera, 10 / 255)
+    assert wide.sum() > silhouette(method.gaussians, ~nothing, views[0].camera, 0.7).sum() > 0
+
+
+def test_a_method_that_knows_nothing_scores_zero():
+    method, truth, views = _scene()
+    for values in method.own.values():
+        values[:] = np.nan
+    for protocol in PROTOCOLS.values():
+        assert protocol.score(method, truth, views, method.encode)["mIoU"] == 0
+
+
+def test_the_nearest_include_the_gaussian_itself():
+    means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
+    assert nearest_gaussians(means, 2).tolist() == [[0, 1], [1, 0], [2, 1]]
+    assert nearest_gaussians(means, 9).shape == (3, 3)
+
+
+def test_the_scenes_texts_are_the_published_ones():
+    texts = load_classes("lerf_ovs")["texts"]
+    assert {scene: len(names) for scene, names in texts.items()} == {
+        "waldo_kitchen": 18,
+        "ramen": 14,
+        "figurines": 21,
+        "teatime": 14,
+    }
+
+
+def test_other_texts_of_the_scene_compete():
+    method, truth, views = _scene(levels=1)
+    few = LerfOvs3D().select(method, ["mug"], method.encode)["mug"]
+    assert few.sum() == 39  # no other text
+    some = LerfOvs3D(texts=TEXTS).select(method, ["mug"], method.encode)["mug"]
+    assert 0 < some.sum() < 39
+    with pytest.raises(ValueError, match="expected all annotated texts, got none of plate; add them"):
+        LerfOvs3D(texts=TEXTS[:2]).score(method, truth, views, method.encode)
+
+
+def test_bad_input_is_named():
+    method, truth, views = _scene()
+    with pytest.raises(TypeError, match="expected one with Gaussians, got 'teacher' without"):
+        LerfOvs3D().score(TeacherMethod({}), truth, views, method.encode)
+    with pytest.raises(ValueError, match="selection: expected one of 'argmax'"):
+        LerfOvs3D(selection="leaf")
