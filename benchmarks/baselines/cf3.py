@@ -1,8 +1,8 @@
 """CF3 (ICCV 2025): features lifted to a colour cloud, squeezed to 3 numbers, and the cloud merged to a twentieth.
 
 From the paper's description; its code was not seen, and the rounds of merging are ours. Lift; drop the 0.01 % of the Gaussians
-whose views disagree most; an autoencoder of the Gaussians' features to 3 latents; then rounds of pruning what shows little, merging
-neighbours with like features by moments, and training against renderings of the latents before merging.
+whose views disagree most; fit an autoencoder of the Gaussians' features to 3 latents. Then, in rounds: prune what shows little,
+merge neighbours with like features by moments, and train against renderings of the latents before merging.
 """
 
 from __future__ import annotations

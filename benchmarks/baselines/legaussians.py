@@ -62,7 +62,7 @@ class LEGaussiansConfig:
         """For two cores: 40 epochs on 512 features a map, 10 times the rate; 600 steps on small views, 5 times the rates."""
         return LEGaussiansConfig(
             epochs=40, images=16, rows=512, code_rate=1e-3, steps=600, feature_rate=5e-3, network_rate=5e-3,
-            smooth_sample=10_000, pixels=20_000,
+            smooth_sample=10_000, pixels=8_000,
         )  # fmt: skip
 
 

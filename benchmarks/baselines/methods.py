@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from kfgs._rows import unit_rows
 from kfgs.cameras import Camera
+from kfgs.evaluation import View
 from kfgs.gaussians import Gaussians
 from kfgs.splat import Rendering, rasterize
 
@@ -49,7 +50,7 @@ class LinearDecoder:
 
 @dataclass(frozen=True, eq=False)
 class RenderedMethod:
-    """A `kfgs.evaluation.method.Method` that renders latents and decodes each pixel."""
+    """A `kfgs.evaluation.Method` that renders latents and decodes each pixel; also a `Labeller`."""
 
     name: str
     gaussians: Gaussians
@@ -64,7 +65,7 @@ class RenderedMethod:
         return rasterize(self.gaussians, camera)
 
     @torch.no_grad()
-    def cosines(self, view: Any, text: Tensor) -> Tensor:  # View, [K, D] unit rows -> [1, H, W, K]
+    def cosines(self, view: View, text: Tensor) -> Tensor:  # [K, D] unit rows -> [1, H, W, K]
         """The cosine of each pixel's decoded feature with the rows; NaN where nothing was drawn."""
         rendering = self.render(view.camera)
         parts = rendering.map.flatten(0, 1).split(CHUNK)
@@ -82,11 +83,11 @@ class RenderedMethod:
         return found.masked_fill(~known[:, None], torch.nan)[None]
 
     @torch.no_grad()
-    def labels(self, camera: Camera, text: Tensor) -> Tensor:  # [K, D] unit rows -> [H, W] int64
+    def labels(self, view: View, text: Tensor) -> Tensor:  # [K, D] unit rows -> [H, W] int64
         """The row of largest cosine at each pixel, -1 where nothing was drawn: the arg-max of `cosines`, found faster."""
         if isinstance(self.decoder, LinearDecoder):
-            return self._linear_labels(self.decoder, camera, text)
-        rendering = self.render(camera)
+            return self._linear_labels(self.decoder, view.camera, text)
+        rendering = self.render(view.camera)
         parts = rendering.map.flatten(0, 1).split(CHUNK)
         found = torch.cat([self.decoder.scores(part, text).argmax(dim=1) for part in parts])
         return found.view(rendering.alpha.shape).masked_fill(rendering.alpha <= 0, -1)

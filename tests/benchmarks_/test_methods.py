@@ -3,12 +3,8 @@ import torch
 from baselines.methods import LinearDecoder, RenderedMethod
 from small_task import cameras, cloud
 
+from kfgs.evaluation import Labeller, Method, View
 from kfgs.splat import rasterize
-
-
-class Seen:
-    def __init__(self, camera):
-        self.stem, self.camera = "view", camera
 
 
 def method(matrix=None, bias=None, channels=3):
@@ -31,19 +27,24 @@ def test_fast_labels_are_the_largest_cosines(matrix, bias):
     b = torch.randn(5, generator=generator) if bias else None
     one, rows = method(A, b), text(5 if matrix else 3)
     for camera in cameras():
-        cosines = one.cosines(Seen(camera), rows)[0]
+        cosines = one.cosines(View("view", camera), rows)[0]
         drawn = ~cosines[..., 0].isnan()
-        labels = one.labels(camera, rows)
+        labels = one.labels(View("view", camera), rows)
         assert torch.equal(labels >= 0, drawn)
         best = cosines.gather(2, labels.clamp_min(0)[..., None])[..., 0]
         assert torch.allclose(best[drawn], cosines.amax(2)[drawn], atol=1e-5)
         assert 0 < int(drawn.sum()) < drawn.numel()
 
 
+def test_it_is_a_method():
+    assert isinstance(method(), Method)
+    assert isinstance(method(), Labeller)
+
+
 def test_cosines_are_those_of_the_rendered_feature():
     one, rows, camera = method(), text(3), cameras()[0]
     map = rasterize(one.gaussians, camera).map[10, 12]
-    found = one.cosines(Seen(camera), rows)
+    found = one.cosines(View("view", camera), rows)
     assert found.shape == (1, 20, 24, 4)
     assert torch.allclose(found[0, 10, 12], rows @ map / map.norm(), atol=1e-5)
 
