@@ -6,6 +6,7 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
+import numpy as np
 from table1_rows import ROWS
 
 from kfgs._files import atomic_path, write_json
@@ -14,8 +15,9 @@ from kfgs.metrics import MIB
 from kfgs.scenes import load_scene
 from kfgs.viz import overlay_labels, plot_quality_storage, save_picture
 from kfgs.viz.figures import new_figure, save_figure
-from kfgs.viz.pictures import picture_grid
+from kfgs.viz.pictures import legend_strip, picture_grid
 
+COLUMNS = 5  # of the picture of labels
 HEAD = (
     "row", "dim", "mIoU", "accuracy", "agrees with teacher: accuracy, IoU7", "minutes (stages, s)", "Gaussians",
     "storage, MiB", "on disk, MiB", "FPS maps", "FPS labels", "peak, GB", "paper: mIoU, min, Gaussians, MB, FPS",
@@ -101,7 +103,7 @@ def draw_plots(out: Path, scene: Path, truth: str, results: list[dict[str, Any]]
             title, miou = row.title.strip("*"), mean(one["miou"] for one in found)
             sizes[title] = mean(one["storage"] for one in found) / MIB, miou
             times[title] = max(mean(sum(one["stages"].values()) for one in found) / 60, 1e-3), miou
-    paper = {f"{row.title} (paper)": row.paper for row in ROWS.values() if row.paper is not None}
+    paper = {f"{row.title.split(' (')[0]} (paper)": row.paper for row in ROWS.values() if row.paper is not None}
     plot_quality_storage(
         sizes, out / "quality_storage.png", reference={name: (p["mib"], p["miou"] / 100) for name, p in paper.items()}
     )
@@ -119,25 +121,24 @@ def draw_labels(out: Path, folder: Path, truth: str, results: list[dict[str, Any
         load_scene(folder).undistorted(),
         list(load_label_set(folder / "classes.json", folder / "text.npy").names),
     )
-    stem = results[0]["picture"]
+    stem, seed = results[0]["picture"], results[0]["request"]["seed"]
     (view,) = [i for i in scene.views("test") if scene.stem(i) == stem]
     photo = scene.image(view)
-    pictures, titles = [photo], [f"photo {stem}"]
-    true = folder / truth / f"{stem}.png"
-    if true.is_file():
-        pictures.append(overlay_labels(photo, load_label_map(true), names))
-        titles.append("truth")
+    maps = {}
+    if (folder / truth / f"{stem}.png").is_file():
+        maps["truth"] = load_label_map(folder / truth / f"{stem}.png")
     for result in results:
         request = result["request"]
         labels = out / "rows" / f"{request['row']}-{request['preset']}-{request['seed']}" / "labels.png"
-        if result["picture"] == stem and labels.is_file() and request["seed"] == results[0]["request"]["seed"]:
-            pictures.append(overlay_labels(photo, load_label_map(labels), names))
-            titles.append(ROWS[request["row"]].title.strip("*"))
-    sheets = []
-    for first in range(0, len(pictures), 5):
-        part = pictures[first : first + 5]
-        blank = [photo * 0 + 1] * (5 - len(part))
-        sheets.append(picture_grid([[*part, *blank]], [*titles[first : first + 5], *[""] * len(blank)], width=320))
-    import numpy as np
-
-    save_picture(out / "labels.png", np.concatenate(sheets))
+        if result["picture"] == stem and request["seed"] == seed and labels.is_file():
+            maps[ROWS[request["row"]].title.strip("*")] = load_label_map(labels)
+    pictures = [photo, *(overlay_labels(photo, labels) for labels in maps.values())]
+    titles = [f"photo {stem}", *maps]
+    pictures += [photo * 0 + 1] * (-len(pictures) % COLUMNS)
+    titles += [""] * (len(pictures) - len(titles))
+    sheets = [
+        picture_grid([pictures[i : i + COLUMNS]], titles[i : i + COLUMNS], width=320)
+        for i in range(0, len(pictures), COLUMNS)
+    ]
+    present = np.concatenate([labels.numpy().ravel() for labels in maps.values()])
+    save_picture(out / "labels.png", np.concatenate([*sheets, legend_strip(present, names, sheets[0].shape[1])]))

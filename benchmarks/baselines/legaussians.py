@@ -59,9 +59,9 @@ class LEGaussiansConfig:
 
     @staticmethod
     def short() -> LEGaussiansConfig:
-        """For two cores: 40 epochs on 512 features a map, 10 times the rate; 600 steps on small views, 5 times the rates."""
+        """For two cores: 40 epochs on 512 features a map, 10 times the rate; 600 steps on small views at higher rates."""
         return LEGaussiansConfig(
-            epochs=40, images=16, rows=512, code_rate=1e-3, steps=600, feature_rate=5e-3, network_rate=5e-3,
+            epochs=40, images=16, rows=512, code_rate=1e-3, steps=600, feature_rate=2e-2, network_rate=5e-3,
             smooth_sample=10_000, pixels=8_000,
         )  # fmt: skip
 

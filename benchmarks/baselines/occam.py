@@ -6,6 +6,7 @@ feature is that at floor(m), so the two may be a pixel apart. Gaussians that nev
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numba
@@ -13,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kfgs._rows import unit_rows
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
 from kfgs.splat import bin_tiles, project
@@ -93,31 +93,44 @@ def _walk(means, conics, opacities, pixels, inside, rows, offsets, columns, side
     return weights
 
 
-def centre_average(geometry: Gaussians, cameras: list[Camera], maps: KeptMaps) -> tuple[Tensor, Tensor]:  # [N, D], [N]
+def centre_average(
+    geometry: Gaussians, cameras: Sequence[Camera], maps: KeptMaps
+) -> tuple[Tensor, Tensor]:  # [N, D], [N]
     """The weighted mean of the unit features at the centres, and the sum of the weights."""
     sums, weights = torch.zeros(len(geometry), int(maps[0].shape[2])), torch.zeros(len(geometry))
     for i, camera in enumerate(cameras):
         index, weight, pixel = centre_weights(geometry, camera)
-        features = unit_rows(sample_map(maps[i], pixel, camera.size))
-        weight = weight * features.any(dim=1)
-        weights.index_add_(0, index, weight)
-        sums.index_add_(0, index, weight[:, None] * features)
+        places = map_places(pixel, camera.size, (maps[i].shape[0], maps[i].shape[1]))
+        _add(maps[i].contiguous().numpy(), places.numpy(), index.numpy(), weight.numpy(), sums.numpy(), weights.numpy())
     return sums.div_(weights[:, None] + WEIGHT_EPS), weights
 
 
-def sample_map(map: Tensor, pixel: Tensor, size: tuple[int, int]) -> Tensor:  # [h, w, D], [M, 2], (H, W) -> [M, D]
-    """A map at the size of the picture, bilinearly, at some of its pixels (row, column): no large map is made."""
+def map_places(pixel: Tensor, size: tuple[int, int], cells: tuple[int, int]) -> Tensor:  # [M, 2] int64 -> [M, 2]
+    """Where the centres of pixels (row, column) of a picture lie among the cells of a map, as `resize_map` has it."""
+    scale = torch.tensor(cells) / torch.tensor(size)
+    return torch.minimum(((pixel + 0.5) * scale - 0.5).clamp_min(0), torch.tensor(cells) - 1.0)
+
+
+@numba.njit(cache=True, parallel=True)
+def _add(map, places, index, weight, sums, weights):  # type: ignore[no-untyped-def]
+    """Add a map's unit features at some places, bilinearly, to the sums of some Gaussians; no index comes twice."""
     h, w, D = map.shape
-    flat, found = map.reshape(h * w, D), 0
-    rows, columns = ((pixel[:, axis] + 0.5) * (map.shape[axis] / size[axis]) - 0.5 for axis in (0, 1))
-    rows, columns = rows.clamp(0, h - 1), columns.clamp(0, w - 1)
-    top, left = rows.floor().long(), columns.floor().long()
-    for down in (0, 1):
-        for right in (0, 1):
-            r, c = (top + down).clamp_max(h - 1), (left + right).clamp_max(w - 1)
-            share = (1 - (rows - top - down).abs()) * (1 - (columns - left - right).abs())
-            found = found + share.clamp_min(0).to(map)[:, None] * flat[r * w + c]
-    return found
+    for m in numba.prange(len(index)):
+        top, left = int(places[m, 0]), int(places[m, 1])
+        below, right = min(top + 1, h - 1), min(left + 1, w - 1)
+        down, across = places[m, 0] - top, places[m, 1] - left
+        feature = np.empty(D, np.float32)
+        squares = 0.0
+        for c in range(D):
+            upper = (1 - across) * map[top, left, c] + across * map[top, right, c]
+            lower = (1 - across) * map[below, left, c] + across * map[below, right, c]
+            feature[c] = (1 - down) * upper + down * lower
+            squares += feature[c] * feature[c]
+        if squares > 0:
+            weights[index[m]] += weight[m]
+            share = weight[m] / np.sqrt(squares)
+            for c in range(D):
+                sums[index[m], c] += share * feature[c]
 
 
 def storage_bytes(gaussians: int, channels: int) -> int:

@@ -3,7 +3,7 @@ import torch
 from baselines import occam
 from small_task import cameras, cloud, task
 
-from kfgs.cameras import Camera
+from kfgs.cameras import Camera, resize_map
 from kfgs.gaussians import Gaussians
 from kfgs.splat import rasterize
 
@@ -54,12 +54,18 @@ def test_weights_are_those_of_the_renderer():
                 assert found.get(row, 0.0) == pytest.approx(float(rendered.map[y, x, row]), abs=1e-5)
 
 
-def test_sampling_a_map_is_bilinear():
-    map = torch.arange(6.0).view(2, 3, 1).expand(2, 3, 2)
-    pixel = torch.tensor([[0, 0], [3, 5], [1, 2], [2, 3]])
-    large = torch.nn.functional.interpolate(map.permute(2, 0, 1)[None], (4, 6), mode="bilinear")[0].permute(1, 2, 0)
-    found = occam.sample_map(map, pixel, (4, 6))
-    assert torch.allclose(found, large[pixel[:, 0], pixel[:, 1]])
+def test_average_is_that_of_unit_features_at_the_centres():
+    one = task()
+    found, weights = occam.centre_average(one.geometry, one.cameras, one.maps)
+    sums, total = torch.zeros(12, 8), torch.zeros(12)
+    for camera, map in zip(one.cameras, one.maps, strict=True):
+        large = resize_map(map, camera.size)
+        for i, weight, (row, column) in zip(*occam.centre_weights(one.geometry, camera), strict=True):
+            sums[i] += weight * large[row, column] / large[row, column].norm()
+            total[i] += weight
+    assert torch.allclose(weights, total, atol=1e-5)
+    assert torch.allclose(found[total > 0], (sums / total[:, None])[total > 0], atol=1e-5)
+    assert not found[total == 0].any()
 
 
 def test_average_and_pruning():
