@@ -1,13 +1,13 @@
 """CLIP's tokenizer as Hugging Face's `tokenizers` computes it, over a vocabulary that is put together here."""
 
-import gzip
+import bz2
 from pathlib import Path
 from typing import Any
 
 
 def read_merges(path: Path) -> list[str]:
     """The lines "a b" of a packed list of merges, without its header."""
-    lines = gzip.decompress(path.read_bytes()).decode("utf-8").split("\n")
+    lines = bz2.decompress(path.read_bytes()).decode("utf-8").split("\n")
     return [line for line in lines[1:] if line]
 
 

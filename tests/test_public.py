@@ -4,6 +4,7 @@ import importlib
 import inspect
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import pytest
@@ -56,3 +57,13 @@ def test_ci_runs_the_readmes_commands_as_written():
     for command in commands:
         assert f"```bash\n{command}\n```" in readme
         assert f"\n{command}" in ci
+
+
+def test_the_package_stays_small():
+    root = Path(kfgs.__file__).parent
+    files = [path for path in root.rglob("*") if path.is_file() and path.suffix not in (".pyc", ".nbi", ".nbc")]
+    # As a wheel packs them, with two headers and a line with the digest for each.
+    packed = {
+        path: len(zlib.compress(path.read_bytes())) + 2 * len(str(path.relative_to(root))) + 130 for path in files
+    }
+    assert sum(packed.values()) < 2**20, sorted(packed, key=packed.__getitem__)[-5:]

@@ -7,6 +7,7 @@ ranked list of merges (Sennrich et al. 2016; byte symbols as in GPT-2). The 49,4
 
 from __future__ import annotations
 
+import bz2
 import gzip
 import html
 import json
@@ -124,8 +125,8 @@ def load_tokenizer(path: str | Path | None = None) -> Tokenizer:
         ValueError: if it does not hold CLIP's 48,894 merges, or its ids differ from CLIP's.
     """
     if path is None:
-        packed = files("kfgs.teachers").joinpath("data", "clip_bpe_merges.txt.gz").read_bytes()
-        return Tokenizer(_parse(gzip.decompress(packed).decode("utf-8").split("\n"), "kfgs"))
+        packed = files("kfgs.teachers").joinpath("data", "clip_bpe_merges.txt.bz2").read_bytes()
+        return Tokenizer(_parse(bz2.decompress(packed).decode("utf-8").split("\n"), "kfgs"))
     path = Path(path)
     if path.is_dir():
         return _from_folder(path)
