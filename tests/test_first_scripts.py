@@ -1,4 +1,7 @@
-"""Five scripts that a new user writes first, each complete; they run as they stand on the toy room."""
+"""The five scripts of docs/recipes.md, which a new user writes first; they run as they stand on the toy room."""
+
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -6,8 +9,20 @@ from cases_color import make_splat
 from PIL import Image
 from small_room import make_room
 
-from kfgs import FeatureFolder, FitConfig, UpliftConfig, fit_scene, load_scene
+import kfgs
+from kfgs import FeatureFolder, FitConfig, SemanticField, UpliftConfig, attach, fit_scene, load_scene, read_splats
 from kfgs.viz import available
+
+PAGE = Path(kfgs.__file__).parents[1] / "docs" / "recipes.md"
+
+
+@pytest.fixture(scope="module")
+def scripts():
+    if not PAGE.is_file():
+        pytest.skip("kfgs is installed without its repository: no docs/recipes.md beside it")
+    found = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    assert len(found) == 5
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -27,47 +42,32 @@ def inside(room, monkeypatch):
     monkeypatch.chdir(room)
 
 
-def test_a_picture_of_the_features_from_a_new_viewpoint():
-    from kfgs import SemanticField, load_scene, viz
+def run(script):
+    known = {}
+    exec(script, known)
+    return known
 
-    field = SemanticField.load("run/field")
-    scene = load_scene("scene")
-    camera = scene.cameras[scene.views("test")[0]]
-    colors = viz.feature_colors(field)  # a PCA of the whole scene: the same colours in every view
-    viz.save_picture("features.png", colors(field.render(camera).map))
 
+def test_a_picture_of_the_features_from_a_new_viewpoint(scripts):
+    run(scripts[0])
     picture = np.asarray(Image.open("features.png"))
     assert picture.shape == (60, 80, 3)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
 
 
-def test_the_gaussians_of_a_class_in_pyvista():
-    from kfgs import SemanticField, viz
-
-    field = SemanticField.load("run/field")
-    chair = field.query("chair")
-    chairs = field.gaussians[chair]
-    points = viz.to_pyvista(chairs)  # points.plot(scalars="rgb", rgb=True) opens a window
-    assert points.n_points == len(chairs) == len(chair) > 20
-    assert points["rgb"].shape == (len(chairs), 3)
+def test_the_gaussians_of_a_class_in_pyvista(scripts):
     if not available():
         pytest.skip("nothing can be drawn here")
-
-    plotter = viz.make_plotter(240, 320)
-    viz.add_cloud(plotter, chairs, style="gaussians")  # plotter.show() opens a window
-    plotter.screenshot("chairs.png")
-    plotter.close()
+    known = run(scripts[1])
+    points, chairs = known["points"], known["chairs"]
+    assert points.n_points == len(chairs) > 20
+    assert points["rgb"].shape == (len(chairs), 3)
     assert np.asarray(Image.open("chairs.png")).std() > 5
 
 
-def test_labels_for_a_splat_of_another_program():
-    from kfgs import SemanticField, attach, read_splats, write_splats
-
-    field = SemanticField.load("run/field")
-    labelled = attach(field, "my.ply").splats
-    write_splats("labelled.ply", labelled)
-
-    again = read_splats("labelled.ply")
+def test_labels_for_a_splat_of_another_program(scripts):
+    run(scripts[2])
+    field, again = SemanticField.load("run/field"), read_splats("labelled.ply")
     assert again.classes == field.label_set().names
     true = np.load("scene/surface.npz")["labels"]
     assert (again.gaussians.labels.numpy() == true).mean() > 0.6
@@ -75,27 +75,17 @@ def test_labels_for_a_splat_of_another_program():
     assert same.equal(again.gaussians.labels)
 
 
-def test_how_the_codebook_grew():
-    from kfgs import FeatureFolder, fit_codebook, viz
-
-    fit = fit_codebook(FeatureFolder("scene/features"))
-    viz.plot_codebook_growth(fit.history, "growth.png")
-
+def test_how_the_codebook_grew(scripts):
+    fit = run(scripts[3])["fit"]
     assert fit.history[-1]["size"] == fit.codebook.size
     assert np.asarray(Image.open("growth.png")).shape[1] > 600
 
 
-def test_the_chairs_as_points_and_box_for_trimesh_or_open3d():
-    from kfgs import SemanticField
-    from kfgs.labels import OrientedBox
-
-    field = SemanticField.load("run/field")
-    chairs = field.gaussians[field.query("chair")]
-    points = chairs.to_numpy()["means"]  # trimesh.PointCloud(points), open3d.utility.Vector3dVector(points)
-    box = OrientedBox.around(points)
-    corners = box.corners.numpy()
-
+def test_the_chairs_as_points_and_box_for_trimesh_or_open3d(scripts):
+    known = run(scripts[4])
+    chairs, points, box, corners = (known[name] for name in ("chairs", "points", "box", "corners"))
     assert points.shape == (len(chairs), 3)
     assert corners.shape == (8, 3)
     assert box.contains(points).all()
     assert (corners.min(axis=0) <= points.min(axis=0) + 1e-6).all()
+    assert np.allclose(sorted(2 * box.half), sorted(np.linalg.norm(corners[[1, 2, 4]] - corners[0], axis=1)), atol=1e-5)
