@@ -1,110 +1,159 @@
-"""The paper's Table 1 on one scene: fit each row, score it on unseen views, and print the table.
+"""Table 1, side by side: every row fitted on one scene with one teacher, scored on unseen views, beside the paper's figures.
 
-    python benchmarks/table1.py SCENE FEATURES OUT [--modes decouple adc adc+sc] [--preset cpu] [--truth labels_scored]
+    python benchmarks/table1.py SCENE FEATURES OUT [--splat PLY] [--rows ROW ...] [--quick] [--seeds 0 1 2] [--preset cpu|paper]
 
-FEATURES holds a teacher map for every training view, and for every test view too if the teacher is to be scored. Times
-are of this machine; a run folder that is already there is used again and keeps the times it was made with.
+FEATURES holds a teacher map for every training view, and for every test view too if the teacher is to be scored. All methods
+that put features on coloured Gaussians share one cloud, which no semantic loss moves: --splat, or that of `kfgs color`, trained
+first. Each row runs in a process of its own; a row that is finished is read back, so a killed run goes on where it stopped.
+
+--quick: `short()` of every baseline, few steps of the paper's rows, and every third test view: under 20 minutes for room_0 on two
+idle cores. Without it baselines take five times as many steps and all views count. --preset paper: the published schedules.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import platform
+import subprocess
+import sys
 import time
-from functools import partial
 from pathlib import Path
+from typing import Any
 
-import torch
+from table1_report import draw_plots, print_table, save_report
+from table1_rows import LONGER, REQUEST, RESULT, ROWS, config_of
 
-from kfgs._files import write_json
+from kfgs._files import digest_file, read_json, write_json
 from kfgs.evaluation import load_label_set
 from kfgs.features import FeatureFolder
-from kfgs.pipeline import FitConfig, fit_scene, score_scene, score_teacher, segment_scene, true_labels
+from kfgs.pipeline import ColorConfig, fit_color, score_teacher, true_labels
 from kfgs.scenes import load_scene
 
-NAMES = {"decouple": "just decouple", "adc": "decouple + ADC", "adc+sc": "decouple + ADC + SC"}
-
-
-def frames_per_second(work, cameras) -> float:
-    """Median over the cameras of 1 / seconds, after one warm-up."""
-    work(cameras[0])
-    times = []
-    for camera in cameras:
-        start = time.perf_counter()
-        work(camera)
-        times.append(time.perf_counter() - start)
-    return 1 / sorted(times)[len(times) // 2]
-
-
-def segment(field, embeddings, rule, camera) -> None:
-    """One frame of labels."""
-    field.segment(camera, embeddings, rule=rule)
+HERE = Path(__file__).resolve().parent
 
 
 def main() -> None:
-    """Fit, score and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    """Fit, score, print and draw."""
+    args = parse_arguments()
+    start = time.perf_counter()
+    args.out.mkdir(parents=True, exist_ok=True)
+    splat, geometry_seconds = find_splat(args)
+    teacher = read_teacher(args)
+    results: list[dict[str, Any]] = []
+    failed = []
+    for key in args.rows:
+        for seed in args.seeds:
+            found = row_result(args, key, seed, splat)
+            if found is None:
+                failed.append(f"{key}, seed {seed}")
+                continue
+            results.append(found)
+            print(
+                f"{ROWS[key].title}, seed {seed}: mIoU {100 * found['miou']:.1f}, {found['wall_seconds']:.0f} s",
+                flush=True,
+            )
+    about = {
+        "machine": f"{platform.processor() or platform.machine()}, {results[0]['threads'] if results else 0} threads",
+        "command": "python benchmarks/table1.py " + " ".join(sys.argv[1:]), "preset": preset_of(args),
+        "geometry_seconds": geometry_seconds, "seconds": time.perf_counter() - start, "teacher": teacher, "longer": LONGER,
+    }  # fmt: skip
+    save_report(args.out / "table1.json", about, results)
+    print_table(args.out / "table1.md", about, results)
+    draw_plots(args.out, args.scene, args.truth, results)
+    if failed:
+        sys.exit(f"failed: {'; '.join(failed)}; see the log beside each request.json")
+
+
+def preset_of(args: argparse.Namespace) -> str:
+    """`quick`, `cpu` or `paper`."""
+    return "quick" if args.quick else str(args.preset)
+
+
+def find_splat(args: argparse.Namespace) -> tuple[Path, float | None]:
+    """The shared cloud, and the seconds that it took if it was trained here."""
+    if args.splat is not None:
+        return args.splat, None
+    if all(ROWS[key].mode for key in args.rows):  # the paper's own rows need none
+        return args.out / "none", None
+    config = (
+        ColorConfig.geometry() if args.quick else ColorConfig.paper() if args.preset == "paper" else ColorConfig.cpu()
+    )
+    result = fit_color(load_scene(args.scene).undistorted(), args.out / "color", config, report=print)
+    return result.path, result.seconds
+
+
+def read_teacher(args: argparse.Namespace) -> dict[str, Any] | None:
+    """The teacher's own score on the views that are scored; None if it has no maps of them."""
+    scene = load_scene(args.scene).undistorted()
+    classes = load_label_set(args.scene / "classes.json", args.scene / "text.npy")
+    stems = [scene.stem(i) for i in scene.views("test")]
+    truth = true_labels(scene, args.scene / args.truth, "test")
+    chosen = {stem: truth[stem] for stem in stems[:: every(args)] if stem in truth}
+    try:
+        maps = FeatureFolder(args.features).of(scene, "test")
+    except FileNotFoundError:
+        return None
+    size = scene.cameras[scene.views("test")[0]].size
+    report = score_teacher(lambda stem: maps[stems.index(stem)], chosen, classes, size)
+    print(f"teacher on the same views: {report.miou}\n{report.accuracy}", flush=True)
+    return {"miou": report.miou.value, "accuracy": report.accuracy.value, "views": len(chosen)}
+
+
+def every(args: argparse.Namespace) -> int:
+    """Every how many test views one is scored."""
+    return args.every or (3 if args.quick else 1)
+
+
+def row_result(args: argparse.Namespace, key: str, seed: int, splat: Path) -> dict[str, Any] | None:
+    """A row's result: read back if it is there and was asked for in the same way, else made in a process of its own."""
+    preset = preset_of(args)
+    uses_splat = ROWS[key].mode is None
+    request = {
+        "row": key, "seed": seed, "preset": preset, "steps": args.steps, "scene": str(args.scene), "truth": args.truth,
+        "features": str(args.features), "every": every(args), "splat": str(splat) if uses_splat else None,
+        "splat_digest": digest_file(splat) if uses_splat else None, "config": config_of(key, preset, args.steps, seed),
+    }  # fmt: skip
+    folder = args.out / "rows" / f"{key}-{preset}-{seed}"
+    if (folder / RESULT).is_file():
+        found = read_json(folder / RESULT)
+        if same(found["request"], request):
+            return dict(found)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / RESULT).unlink(missing_ok=True)
+    write_json(folder / REQUEST, request)
+    command = [sys.executable, str(HERE / "table1_rows.py"), str(folder)]
+    with (folder / "log.txt").open("w") as log:
+        code = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, check=False).returncode
+    if code:
+        print(f"{key}, seed {seed}: failed with {code}:\n" + (folder / "log.txt").read_text()[-1_500:], file=sys.stderr)
+        return None
+    return dict(read_json(folder / RESULT))
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two requests ask for the same; a tuple is a list in JSON."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(same(one[name], other[name]) for name in one)
+    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    return bool(one == other)
+
+
+def parse_arguments() -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("features", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--modes", nargs="+", choices=NAMES, default=list(NAMES))
+    parser.add_argument("--splat", type=Path, help="the coloured Gaussians that methods share")
+    parser.add_argument("--rows", "--modes", nargs="+", choices=ROWS, default=list(ROWS))
+    parser.add_argument("--quick", action="store_true", help="few steps, every third test view")
     parser.add_argument("--preset", choices=("cpu", "paper"), default="cpu")
-    parser.add_argument("--steps", type=int)
+    parser.add_argument("--steps", type=int, help="of the fields of the paper's rows")
+    parser.add_argument("--every", type=int, help="score every so many test views")
     parser.add_argument("--truth", default="labels_scored")
-    parser.add_argument("--seed", type=int, default=0)
-    args = parser.parse_args()
-
-    scene = load_scene(args.scene).undistorted()
-    classes = load_label_set(args.scene / "classes.json", args.scene / "text.npy")
-    test = scene.views("test")
-    maps = FeatureFolder(args.features).of(scene, "train")
-    stems = [scene.stem(i) for i in test]
-    truth = true_labels(scene, args.scene / args.truth, "test")
-    report: dict[str, object] = {"machine": f"{platform.processor()}, {torch.get_num_threads()} threads"}
-    rows = []
-
-    test_maps = FeatureFolder(args.features).of(scene, "test")
-    teacher = score_teacher(lambda stem: test_maps[stems.index(stem)], truth, classes, scene.cameras[test[0]].size)
-    print(f"teacher on the same views: {teacher.miou}\n{teacher.accuracy}")
-    report["teacher"] = teacher.to_json()
-
-    for mode in args.modes:
-        config = FitConfig.cpu() if args.preset == "cpu" else FitConfig.paper()
-        config = dataclasses.replace(config, method="paper", mode=mode, seed=args.seed)
-        if args.steps:
-            config = dataclasses.replace(config, field=config.field.with_steps(args.steps))
-        result = fit_scene(scene, maps, args.out / mode, config, report=print, progress=True)
-        field = result.field
-        found = segment_scene(field, scene, classes, args.out / mode / "segmentation", progress=True)
-        scores = score_scene(found, truth, classes)
-        cameras = [scene.cameras[i] for i in test[:12]]
-        with torch.no_grad():
-            fps = frames_per_second(field.render, cameras)
-            rules = ("paper", "fused")
-            label_fps = {
-                rule: frames_per_second(partial(segment, field, classes.embeddings, rule), cameras[:5])
-                for rule in rules
-            }
-        storage = field.storage() / 2**20
-        print(f"{mode}: {scores}")
-        rows.append(
-            f"| {NAMES[mode]} | {field.gaussians.features.shape[1]} | {100 * scores.miou.value:.1f} | "
-            f"{result.seconds / 60:.1f} | {len(field.gaussians) / 1000:.1f}k | {storage:.1f} | {fps:.1f} | "
-            f"{', '.join(f'{name} {value:.1f}' for name, value in label_fps.items())} |"
-        )
-        report[mode] = {
-            "scores": scores.to_json(),
-            "seconds": {stage.name: stage.seconds for stage in result.stages},
-            "gaussians": len(field.gaussians),
-            "storage_mib": storage,
-            "fps_features": fps,
-            "fps_labels": label_fps,
-        }
-        write_json(args.out / "table1.json", report)
-    print("| row | dim | mIoU | training min | Gaussians | storage MiB | FPS features | FPS labels |")
-    print("|---|---|---|---|---|---|---|---|")
-    print("\n".join(rows))
+    parser.add_argument("--seeds", "--seed", type=int, nargs="+", default=[0])
+    return parser.parse_args()
 
 
 if __name__ == "__main__":

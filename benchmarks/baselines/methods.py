@@ -1,0 +1,101 @@
+"""Gaussians with latents and a decoder of pixels: what every baseline becomes when it is finished."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from kfgs._rows import unit_rows
+from kfgs.cameras import Camera
+from kfgs.evaluation import View
+from kfgs.gaussians import Gaussians
+from kfgs.splat import Rendering, rasterize
+
+CHUNK = 16_384  # pixels decoded at once
+
+
+class Decoder(Protocol):
+    """From rendered latents to the teacher's space."""
+
+    def features(self, latents: Tensor) -> Tensor:  # [n, d] -> [n, D]
+        """The features of latents, of any length."""
+        ...
+
+    def scores(self, latents: Tensor, text: Tensor) -> Tensor:  # [n, d], [K, D] -> [n, K]
+        """Their products with unit rows: the cosines, up to a positive factor for each latent."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class LinearDecoder:
+    """f = A z + b. Rendering is linear too, so a view is labelled from K rendered scores; no feature is needed."""
+
+    matrix: Tensor | None = None  # A [D, d]; None = identity
+    bias: Tensor | None = None  # b [D]; None = 0
+
+    def features(self, latents: Tensor) -> Tensor:  # [n, d] -> [n, D]
+        """A z + b."""
+        found = latents if self.matrix is None else latents @ self.matrix.T
+        return found if self.bias is None else found + self.bias
+
+    def scores(self, latents: Tensor, text: Tensor) -> Tensor:  # [n, d], [K, D] -> [n, K]
+        """(A z + b) . t, without A z."""
+        rows = text if self.matrix is None else text @ self.matrix  # [K, d]
+        found = latents @ rows.T
+        return found if self.bias is None else found + text @ self.bias
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedMethod:
+    """A `kfgs.evaluation.Method` that renders latents and decodes each pixel; also a `Labeller`."""
+
+    name: str
+    gaussians: Gaussians
+    """What is splatted is in `features`."""
+    decoder: Decoder
+    known: Tensor | None = None  # [N] bool, which Gaussians have learnt something; None = all that are not zero
+    levels: int = 1
+
+    @torch.no_grad()
+    def render(self, camera: Camera) -> Rendering:
+        """The map of latents, with its opacity."""
+        return rasterize(self.gaussians, camera)
+
+    @torch.no_grad()
+    def cosines(self, view: View, text: Tensor) -> Tensor:  # [K, D] unit rows -> [1, H, W, K]
+        """The cosine of each pixel's decoded feature with the rows; NaN where nothing was drawn."""
+        rendering = self.render(view.camera)
+        parts = rendering.map.flatten(0, 1).split(CHUNK)
+        found = torch.cat([unit_rows(self.decoder.features(part)) @ text.T for part in parts])
+        found = found.view(*rendering.alpha.shape, len(text))
+        return found.masked_fill((rendering.alpha <= 0)[..., None], torch.nan)[None]
+
+    @torch.no_grad()
+    def gaussian_cosines(self, text: Tensor) -> Tensor:  # [K, D] unit rows -> [1, N, K]
+        """The cosine of each Gaussian's own decoded feature; NaN for those that have learnt nothing."""
+        own = self.gaussians.features
+        assert own is not None
+        found = torch.cat([unit_rows(self.decoder.features(part)) @ text.T for part in own.split(CHUNK)])
+        known = own.any(dim=1) if self.known is None else self.known
+        return found.masked_fill(~known[:, None], torch.nan)[None]
+
+    @torch.no_grad()
+    def labels(self, view: View, text: Tensor) -> Tensor:  # [K, D] unit rows -> [H, W] int64
+        """The row of largest cosine at each pixel, -1 where nothing was drawn: the arg-max of `cosines`, found faster."""
+        if isinstance(self.decoder, LinearDecoder):
+            return self._linear_labels(self.decoder, view.camera, text)
+        rendering = self.render(view.camera)
+        parts = rendering.map.flatten(0, 1).split(CHUNK)
+        found = torch.cat([self.decoder.scores(part, text).argmax(dim=1) for part in parts])
+        return found.view(rendering.alpha.shape).masked_fill(rendering.alpha <= 0, -1)
+
+    def _linear_labels(self, decoder: LinearDecoder, camera: Camera, text: Tensor) -> Tensor:
+        own = self.gaussians.features
+        assert own is not None
+        products = LinearDecoder(decoder.matrix).scores(own, text).contiguous()
+        rendering = rasterize(self.gaussians.replace(features=products), camera)
+        scores = rendering.map if decoder.bias is None else rendering.map + text @ decoder.bias
+        return scores.argmax(dim=2).masked_fill(rendering.alpha <= 0, -1)

@@ -1,0 +1,144 @@
+"""Table 1 as text and as pictures, from the results of its rows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+import numpy as np
+from table1_rows import ROWS
+
+from kfgs._files import atomic_path, write_json
+from kfgs.evaluation import load_label_map, load_label_set
+from kfgs.metrics import MIB
+from kfgs.scenes import load_scene
+from kfgs.viz import overlay_labels, plot_quality_storage, save_picture
+from kfgs.viz.figures import new_figure, save_figure
+from kfgs.viz.pictures import legend_strip, picture_grid
+
+COLUMNS = 5  # of the picture of labels
+HEAD = (
+    "row", "dim", "mIoU", "accuracy", "agrees with teacher: accuracy, IoU7", "minutes (stages, s)", "Gaussians",
+    "storage, MiB", "on disk, MiB", "FPS maps", "FPS labels", "peak, GB", "paper: mIoU, min, Gaussians, MB, FPS",
+)  # fmt: skip
+PRESETS = {
+    "quick": "baselines by their `short()`, few steps of the paper's rows, every third test view",
+    "cpu": "baselines by their `short()` with {longer} times the steps, kfgs's rows by its preset `cpu`",
+    "paper": "published schedules",
+}
+
+
+def save_report(path: Path, about: dict[str, Any], results: list[dict[str, Any]]) -> None:
+    """Write everything as JSON."""
+    write_json(path, {**about, "rows": results})
+
+
+def print_table(path: Path, about: dict[str, Any], results: list[dict[str, Any]]) -> None:
+    """Print the table, and write it as Markdown."""
+    text = table_text(about, results)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    print(text)
+
+
+def table_text(about: dict[str, Any], results: list[dict[str, Any]]) -> str:
+    """The table with what has to be said about it."""
+    lines = [f"{about['command']}", "", f"Preset {about['preset']}: {PRESETS[about['preset']].format(**about)}."]
+    lines.append(f"{about['machine']}; {about['seconds'] / 60:.1f} minutes in all (rows read back take none).")
+    if about["geometry_seconds"] is not None:
+        lines.append(
+            f"The shared coloured Gaussians took {about['geometry_seconds'] / 60:.1f} minutes, not counted below."
+        )
+    if about["teacher"] is not None:
+        teacher = about["teacher"]
+        lines.append(
+            f"Teacher: mIoU {100 * teacher['miou']:.1f}, accuracy {100 * teacher['accuracy']:.1f} over {teacher['views']} "
+            "views (kfgs-pooled/1)."
+        )
+    lines += ["", f"| {' | '.join(HEAD)} |", "|" + "---|" * len(HEAD)]
+    for key, row in ROWS.items():
+        found = [result for result in results if result["request"]["row"] == key]
+        if found:
+            lines.append(f"| {' | '.join(cells(row.title, row.paper, found))} |")
+    return "\n".join(lines) + "\n"
+
+
+def cells(title: str, paper: dict[str, Any] | None, found: list[dict[str, Any]]) -> list[str]:
+    """One row over its seeds: means, and the range of mIoU."""
+
+    def average(name: str) -> float:
+        return mean(one[name] for one in found)
+
+    spread = "" if len(found) == 1 else " ({:.1f} to {:.1f})".format(*_range([100 * one["miou"] for one in found]))
+    stages = ", ".join(f"{name} {mean(one['stages'][name] for one in found):.0f}" for name in found[0]["stages"])
+    agrees = "-"
+    if "teacher_accuracy" in found[0]:
+        agrees = f"{100 * average('teacher_accuracy'):.1f}, {100 * average('teacher_iou7'):.1f}"
+    packed = "" if "packed" not in found[0] else f" (packed {average('packed') / MIB:.2f})"
+    published = "-"
+    if paper is not None:
+        published = f"{paper['miou']}, {paper['minutes']}, {paper['gaussians'] / 1_000:.1f}k, {paper['mib']}, {paper['fps']:.1f}"
+    return [
+        title, found[0]["dim"], f"{100 * average('miou'):.1f}{spread}", f"{100 * average('accuracy'):.1f}", agrees,
+        f"{mean(sum(one['stages'].values()) for one in found) / 60:.2f} ({stages})", f"{average('gaussians') / 1_000:.1f}k",
+        f"{average('storage') / MIB:.2f}", f"{average('disk') / MIB:.2f}{packed}", f"{average('fps_maps'):.1f}",
+        f"{average('fps_labels'):.1f}", f"{average('peak') / 1e9:.2f}", published,
+    ]  # fmt: skip
+
+
+def _range(values: list[float]) -> tuple[float, float]:
+    return min(values), max(values)
+
+
+def draw_plots(out: Path, scene: Path, truth: str, results: list[dict[str, Any]]) -> None:
+    """Quality against storage and against time, and the labels of one view by every row."""
+    if not results:
+        return
+    sizes: dict[str, tuple[float, float]] = {}
+    times: dict[str, tuple[float, float]] = {}
+    for key, row in ROWS.items():
+        found = [result for result in results if result["request"]["row"] == key]
+        if found:
+            title, miou = row.title.strip("*"), mean(one["miou"] for one in found)
+            sizes[title] = mean(one["storage"] for one in found) / MIB, miou
+            times[title] = max(mean(sum(one["stages"].values()) for one in found) / 60, 1e-3), miou
+    paper = {f"{row.title.split(' (')[0]} (paper)": row.paper for row in ROWS.values() if row.paper is not None}
+    plot_quality_storage(
+        sizes, out / "quality_storage.png", reference={name: (p["mib"], p["miou"] / 100) for name, p in paper.items()}
+    )
+    figure = new_figure(7.6, 5.2)
+    axes = figure.add_subplot()
+    plot_quality_storage(times, ax=axes)
+    axes.set(xlabel="minutes beyond the shared coloured Gaussians, on this machine", title="Quality against time")
+    save_figure(figure, out / "quality_time.png")
+    draw_labels(out, scene, truth, results)
+
+
+def draw_labels(out: Path, folder: Path, truth: str, results: list[dict[str, Any]]) -> None:
+    """The photograph, the truth, and what each row makes of one view."""
+    scene, names = (
+        load_scene(folder).undistorted(),
+        list(load_label_set(folder / "classes.json", folder / "text.npy").names),
+    )
+    stem, seed = results[0]["picture"], results[0]["request"]["seed"]
+    (view,) = [i for i in scene.views("test") if scene.stem(i) == stem]
+    photo = scene.image(view)
+    maps = {}
+    if (folder / truth / f"{stem}.png").is_file():
+        maps["truth"] = load_label_map(folder / truth / f"{stem}.png")
+    for result in results:
+        request = result["request"]
+        labels = out / "rows" / f"{request['row']}-{request['preset']}-{request['seed']}" / "labels.png"
+        if result["picture"] == stem and request["seed"] == seed and labels.is_file():
+            maps[ROWS[request["row"]].title.strip("*")] = load_label_map(labels)
+    pictures = [photo, *(overlay_labels(photo, labels) for labels in maps.values())]
+    titles = [f"photo {stem}", *maps]
+    pictures += [photo * 0 + 1] * (-len(pictures) % COLUMNS)
+    titles += [""] * (len(pictures) - len(titles))
+    sheets = [
+        picture_grid([pictures[i : i + COLUMNS]], titles[i : i + COLUMNS], width=320)
+        for i in range(0, len(pictures), COLUMNS)
+    ]
+    present = np.concatenate([labels.numpy().ravel() for labels in maps.values()])
+    save_picture(out / "labels.png", np.concatenate([*sheets, legend_strip(present, names, sheets[0].shape[1])]))

@@ -1,0 +1,248 @@
+"""The rows of Table 1: how each is fitted, and what is measured. One row in one process, so that its peak of memory is its own.
+
+python benchmarks/table1_rows.py FOLDER    # reads FOLDER/request.json, writes FOLDER/row.json; `table1.py` calls it
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from baselines import cf3, feature_3dgs, langsplat, langsplatv2, legaussians, occam, plain_uplift
+from baselines.common import FLOAT, Fitted, Task
+from safetensors.torch import save_file
+
+from kfgs._files import read_json, write_json
+from kfgs.cameras import Camera
+from kfgs.evaluation import FieldMethod, LabelTruth, Method, TeacherMethod, View, label_view, load_label_set
+from kfgs.evaluation.segmentation import evaluate_segmentation
+from kfgs.evaluation.teacher_agreement import TeacherAgreement
+from kfgs.features import FeatureFolder
+from kfgs.fields import SemanticField, pack_field
+from kfgs.formats import read_splats
+from kfgs.labels import LabelSet
+from kfgs.pipeline import FitConfig, fit_scene, true_labels
+from kfgs.pipeline.apply import save_label_map
+from kfgs.pipeline.maps import Maps
+from kfgs.scenes import Scene, load_scene
+
+LONGER = 5
+"""Times the steps of `short()` when the table is not to be quick."""
+QUICK_STEPS = {"decouple": 350, "adc": 350, "adc+sc": 800}
+FPS_VIEWS = 5
+REQUEST, RESULT = "request.json", "row.json"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the table."""
+
+    title: str
+    paper: dict[str, Any] | None = None
+    """The paper's figures: dim, miou, minutes, gaussians, mib, fps."""
+    module: Any = None
+    """Of a baseline."""
+    options: tuple[Any, ...] = ()
+    """Of the presets of its configuration."""
+    mode: str | None = None
+    """Of kfgs's `--method paper`; a row with neither is kfgs's default."""
+
+
+def _paper(dim: str, miou: float, minutes: str, gaussians: float, mib: float, fps: float) -> dict[str, Any]:
+    return {"dim": dim, "miou": miou, "minutes": minutes, "gaussians": 1_000 * gaussians, "mib": mib, "fps": fps}
+
+
+ROWS = {
+    "legaussians": Row("LEGaussians (frozen)", _paper("8", 32.0, "28", 571.0, 18.1, 77.66), legaussians),
+    "langsplat": Row("LangSplat (one level)", _paper("3x3", 58.5, "10 + 5x3", 572.2, 20.7, 61.45 / 3), langsplat),
+    "feature3dgs-128": Row(
+        "Feature 3DGS, speed-up", _paper("128", 73.4, "99", 607.2, 296.5, 19.60), feature_3dgs, (128,)
+    ),
+    "feature3dgs-512": Row("Feature 3DGS", _paper("512", 73.9, "351", 602.2, 1175.2, 5.66), feature_3dgs),
+    "decouple": Row("just decouple", _paper("512", 73.5, "263", 29.6, 59.4, 6.26), mode="decouple"),
+    "adc": Row("decouple + ADC", _paper("512", 77.9, "220", 28.7, 57.6, 9.37), mode="adc"),
+    "adc+sc": Row("decouple + ADC + SC", _paper("9", 76.6, "8", 110.5, 13.0, 36.08), mode="adc+sc"),
+    "kfgs": Row("**kfgs default**"),
+    "langsplatv2": Row("LangSplatV2 (one level)", module=langsplatv2),
+    "occam": Row("Occam's LGS", module=occam),
+    "uplift": Row("plain uplift", module=plain_uplift),
+    "cf3": Row("CF3", module=cf3),
+}
+"""Those that the paper has, in its order, then kfgs's default, then newer ones."""
+
+CONFIGS = {
+    legaussians: legaussians.LEGaussiansConfig, langsplat: langsplat.LangSplatConfig,
+    feature_3dgs: feature_3dgs.Feature3DGSConfig, langsplatv2: langsplatv2.LangSplatV2Config,
+    occam: occam.OccamConfig, plain_uplift: plain_uplift.PlainUpliftConfig, cf3: cf3.CF3Config,
+}  # fmt: skip
+
+
+def baseline_config(row: Row, preset: str) -> Any:
+    """A baseline's configuration: `quick` is `short()`, `cpu` has five times its steps, `paper` is `published()`."""
+    kind = CONFIGS[row.module]
+    if preset == "paper":
+        return kind.published(*row.options)
+    config = kind.short(*row.options)
+    return replace(config, steps=LONGER * config.steps) if preset == "cpu" and hasattr(config, "steps") else config
+
+
+def kfgs_config(row: Row, key: str, preset: str, steps: int | None, seed: int) -> FitConfig:
+    """The configuration of one of kfgs's own rows."""
+    if row.mode is None:
+        return FitConfig(seed=seed)
+    config = FitConfig.paper() if preset == "paper" else FitConfig.cpu()
+    config = replace(config, method="paper", mode=row.mode, seed=seed)
+    steps = QUICK_STEPS[key] if preset == "quick" and steps is None else steps
+    return config if steps is None else replace(config, field=config.field.with_steps(steps))
+
+
+def config_of(key: str, preset: str, steps: int | None, seed: int) -> dict[str, Any]:
+    """What decides a row, as JSON."""
+    row = ROWS[key]
+    config = baseline_config(row, preset) if row.module else kfgs_config(row, key, preset, steps, seed)
+    return asdict(config)
+
+
+@dataclass(frozen=True)
+class Made:
+    """A fitted row, before it is scored."""
+
+    method: Method
+    render: Callable[[Camera], Any]
+    facts: dict[str, Any]
+
+
+class Room:
+    """A scene with its teacher and its truth."""
+
+    def __init__(self, folder: Path, features: Path, truth: str, every: int) -> None:
+        self.scene: Scene = load_scene(folder).undistorted()
+        self.classes: LabelSet = load_label_set(folder / "classes.json", folder / "text.npy")
+        self.features = features
+        self.maps: Maps = FeatureFolder(features).of(self.scene, "train")
+        views = [View(self.scene.stem(i), self.scene.cameras[i]) for i in self.scene.views("test")]
+        self.all_views, self.views = views, views[::every]
+        found = true_labels(self.scene, folder / truth, "test")
+        self.truth = LabelTruth(
+            tuple(self.classes.names), {v.stem: found[v.stem] for v in self.views if v.stem in found}
+        )
+
+    @property
+    def text(self) -> torch.Tensor:  # [K, D] unit rows
+        """The classes."""
+        return torch.nn.functional.normalize(self.classes.embeddings.float(), dim=1)
+
+    def score(self, method: Method) -> dict[str, Any]:
+        """`kfgs-pooled/1` over the views that were chosen, and, if the teacher has maps of them, the agreement with it."""
+        views = {view.stem: view for view in self.views}
+        report = evaluate_segmentation(
+            lambda stem: label_view(method, views[stem], self.text), self.truth.maps, self.truth.names
+        )
+        scores: dict[str, Any] = {
+            "pooled": report.to_json(),
+            "miou": report.miou.value,
+            "accuracy": report.accuracy.value,
+        }
+        try:
+            maps = FeatureFolder(self.features).of(self.scene, "test")
+        except FileNotFoundError:
+            return scores
+        agreement = TeacherAgreement(texts=tuple(self.classes.names))
+        found = agreement.score(method, TeacherMethod(maps, align_corners=True), self.all_views, lambda _: self.text)
+        return scores | {
+            "teacher": found.to_json(),
+            "teacher_accuracy": found["accuracy"],
+            "teacher_iou7": found["mIoU"],
+        }
+
+
+def frames_per_second(work: Callable[[Any], object], items: Sequence[Any]) -> float:
+    """Median over the items of 1 / seconds, after one warm-up."""
+    work(items[0])
+    times = []
+    for item in items:
+        start = time.perf_counter()
+        work(item)
+        times.append(time.perf_counter() - start)
+    return 1 / sorted(times)[len(times) // 2]
+
+
+def peak_memory() -> int:
+    """The highest resident memory of this process, bytes; 0 where the system does not say."""
+    try:
+        found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    except FileNotFoundError:
+        return 0
+    return 0 if found is None else 1024 * int(found[1])
+
+
+def make_baseline(row: Row, room: Room, request: dict[str, Any], folder: Path) -> Made:
+    """Fit a baseline on the frozen splat, and keep what it needs in a file."""
+    cameras = [room.scene.cameras[i] for i in room.scene.views("train")]
+    geometry = read_splats(request["splat"]).gaussians
+    task = Task(geometry, cameras, room.maps, seed=request["seed"])
+    fitted: Fitted = row.module.fit(task, baseline_config(row, request["preset"]))
+    file = folder / "semantics.safetensors"
+    save_file({name: value.contiguous() for name, value in fitted.tensors.items()}, file)
+    shape = 0 if fitted.own_geometry else FLOAT * 11 * len(fitted.method.gaussians)
+    facts = {
+        "dim": fitted.dim, "gaussians": len(fitted.method.gaussians), "storage": fitted.storage,
+        "disk": file.stat().st_size + shape, "stages": fitted.seconds, "history": fitted.history,
+    }  # fmt: skip
+    return Made(fitted.method, fitted.method.render, facts)
+
+
+def make_kfgs(row: Row, room: Room, request: dict[str, Any], folder: Path) -> Made:
+    """Fit one of kfgs's own rows."""
+    config = kfgs_config(row, request["row"], request["preset"], request["steps"], request["seed"])
+    splat = request["splat"] if row.mode is None else None
+    result = fit_scene(room.scene, room.maps, folder / "run", config, splat=splat, report=print)
+    field: SemanticField = result.field
+    stages: dict[str, float] = {}
+    for stage in result.stages:
+        stages[stage.name] = stages.get(stage.name, 0.0) + stage.seconds
+    facts = {
+        "dim": str(field.channels), "gaussians": len(field), "storage": field.storage(),
+        "disk": sum(file.stat().st_size for file in result.field_path.iterdir()), "stages": stages,
+    }  # fmt: skip
+    if row.mode is None:
+        facts["packed"] = len(pack_field(field))
+    return Made(FieldMethod(field), partial(_render, field), facts)
+
+
+def _render(field: SemanticField, camera: Camera) -> None:
+    field.render(camera)
+
+
+def run_row(folder: Path) -> dict[str, Any]:
+    """Fit, score and measure what `folder/request.json` asks for."""
+    request = read_json(folder / REQUEST)
+    row, start = ROWS[request["row"]], time.perf_counter()
+    room = Room(Path(request["scene"]), Path(request["features"]), request["truth"], request["every"])
+    made = (make_baseline if row.module else make_kfgs)(row, room, request, folder)
+    fit_peak = peak_memory()
+    shown, text = room.views[:FPS_VIEWS], room.text
+    with torch.no_grad():
+        fps = frames_per_second(lambda view: made.render(view.camera), shown)
+        label_fps = frames_per_second(lambda view: label_view(made.method, view, text), shown)
+    fitted = time.perf_counter()
+    scores = room.score(made.method)
+    middle = room.views[len(room.views) // 2]
+    save_label_map(folder / "labels.png", label_view(made.method, middle, text))
+    return {
+        "request": request, **made.facts, **scores, "fps_maps": fps, "fps_labels": label_fps, "peak_fit": fit_peak,
+        "peak": peak_memory(), "views": len(room.truth.maps), "picture": middle.stem, "threads": torch.get_num_threads(),
+        "scoring_seconds": time.perf_counter() - fitted, "wall_seconds": time.perf_counter() - start,
+    }  # fmt: skip
+
+
+if __name__ == "__main__":
+    place = Path(sys.argv[1])
+    write_json(place / RESULT, run_row(place))
