@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from .files import check_file, is_field
+from .files import check_file, check_folder, is_field
 from .options import Classes, Flag, Given, Name, Positional, Several, Teacher
 from .output import say, wrote
 
@@ -69,10 +69,145 @@ def evaluate(
     found = evaluate_result(field, question, encode=encode, with_file=with_file, command=command)
     say(found.text if long else str(found))
     if out is not None:
-        inputs = {"field": field, "with_file": with_file, "scene": classes.scene, "truth": truth}
+        inputs = {"field": field, "with_file": with_file, "truth": truth, **dataclasses.asdict(classes)}
         places = {name: None if place is None else str(place.resolve()) for name, place in inputs.items()}
-        write_json(out, {**found.to_json(), "inputs": {**places, "split": split, "set": list(set)}})
+        words = {"split": split, "set": list(set), **dataclasses.asdict(teacher)}
+        write_json(out, {**found.to_json(), "inputs": {**places, **words}})
         wrote([out])
+
+
+def compare(
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(help_behavior_hint="")],
+    *,
+    out: Given[Path] = None,
+    protocol: Name = None,
+    truth: Given[Path] = None,
+    split: Name = None,
+    set: Several = (),
+    pictures: int = 3,
+    teacher: Teacher,
+    classes: Classes,
+) -> None:
+    """Compare results under one protocol: a table, and pictures of photograph, truth, each result and its errors.
+
+    Numbers of different protocols, options or data are refused. Results that `kfgs evaluate --out` kept are not computed again,
+    and say how the others are scored.
+
+    Examples:
+        kfgs compare run_a run_b --out compared/
+        kfgs compare a.json b.json output/figurines --out compared/ --pictures 5
+
+    Args:
+        runs: Two or more: whatever `kfgs evaluate` takes, or JSON files that it wrote.
+        out: Folder for compare.txt, compare.json and a picture of each view.
+        protocol: Its name; by default that of the first JSON file, else kfgs-pooled/1.
+        truth: Folder or file of the ground truth, if it is not in the scene.
+        split: Which views, as for `kfgs evaluate`.
+        set: An option of the protocol, threshold=0.5. Can be given several times.
+        pictures: How many views are drawn.
+    """
+    from .._check import check_range
+    from ..evaluation import LabelSet
+    from ..evaluation.encoders import TableEncoder
+    from ..pipeline.evaluate import check_kind, digest_method, open_result
+    from ..pipeline.evaluate import evaluate as evaluate_result
+    from ..pipeline.question import open_question
+    from ..pipeline.side_by_side import check_comparable, rank, show_views, table_text, write_pictures
+
+    check_range("pictures", pictures, 0)
+    if out is not None:
+        check_folder("out", out)
+    kept = {path: _read_kept(path) for path in runs if path.suffix == ".json"}
+    first: dict[str, Any] = next(iter(kept.values()))[1] if kept else {}
+    plain = [path for path in runs if path not in kept]
+    protocol = protocol or (next(iter(kept.values()))[0].protocol if kept else "kfgs-pooled/1")
+    for path in plain:
+        check_kind(path, protocol)
+    reports = {path: report for path, (report, _) in kept.items()}
+    if len({*runs}) < 2 or not plain:
+        check_comparable({str(path): report for path, report in reports.items()})  # before anything is computed
+    draw = out is not None and pictures > 0
+    opened: dict[Path, Any] = {}
+    if plain or draw:
+        remembered = {
+            name: Path(place) for name in ("scene", "images", "classes", "text") if (place := first.get(name))
+        }
+        given = {name: place for name, place in dataclasses.asdict(classes).items() if place is not None}
+        classes = with_scene(Classes(**{**remembered, **given}), (plain or runs)[0])
+        teacher = teacher if teacher.teacher else Teacher(first.get("teacher"), first.get("weights"))
+        encode = find_encoder(teacher, classes, (plain or [Path(str(first.get("field")))])[0])
+        options = find_options(protocol, set or tuple(first.get("set", ())), encode)
+        place = truth if truth is not None else first.get("truth")
+        words: dict[str, Any] = {"truth": place, "split": split or first.get("split"), "images": classes.images}
+        assert classes.scene is not None
+        question = open_question(classes.scene, protocol, options=options, **words)
+        for path in runs:
+            if path in kept:
+                if draw:
+                    _reopen(path, kept[path], question, opened, open_result, digest_method)
+                continue
+            method = opened[path] = open_result(path, question)
+            reports[path] = evaluate_result(method, question, encode=encode)
+    titles = _titles({path: reports[path] for path in runs})
+    named = {titles[path]: reports[path] for path in dict.fromkeys(runs)}
+    check_comparable(named)
+    text = table_text(named)
+    say(text)
+    if out is None:
+        return
+    from .._files import atomic_path, write_json
+
+    write_json(out / "compare.json", {title: report.to_json() for title, report in rank(named).items()})
+    with atomic_path(out / "compare.txt") as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+    written = [out / "compare.txt", out / "compare.json"]
+    if draw:
+        asked = TableEncoder(encode) if isinstance(encode, LabelSet) else encode
+        shown = show_views(question, {titles[path]: opened[path] for path in runs if path in opened}, asked, pictures)
+        if not shown:
+            say(f"note: no pictures: {question.protocol.name} scores no pictures of its own")
+        written += write_pictures(out, shown)
+    wrote(written)
+
+
+def _read_kept(path: Path) -> tuple[Any, dict[str, Any]]:
+    """The report that `kfgs evaluate --out` kept, and what it was asked with."""
+    from .._files import read_json
+    from ..evaluation import Report
+
+    top = read_json(path)
+    try:
+        return Report.from_json(top), dict(top.get("inputs", {}))
+    except (ValueError, AttributeError, TypeError) as error:
+        raise ValueError(
+            f"{path}: {str(error).removeprefix('value: ')}; give what `kfgs evaluate --out` wrote"
+        ) from error
+
+
+def _reopen(
+    path: Path, kept: Any, question: Any, opened: dict[Path, Any], open_result: Any, digest_method: Any
+) -> None:
+    """Open the result that a JSON file is about, to draw it; a note says why if that is not possible."""
+    report, inputs = kept
+    try:
+        found = open_result(Path(inputs["field"]), question, inputs.get("with_file"))
+    except (KeyError, TypeError, ValueError, OSError) as error:
+        say(f"note: {path} is not drawn: {error}")
+        return
+    if digest_method(found) != report.digests.get("field"):
+        say(f"note: {path} is not drawn: {inputs['field']} has changed since it was scored")
+        return
+    opened[path] = found
+
+
+def _titles(reports: dict[Path, Any]) -> dict[Path, str]:
+    """The name of each method; with its file or folder where several have one name."""
+    names = [report.method for report in reports.values()]
+    short = {path: path.name if not report.method else report.method for path, report in reports.items()}
+    long = {path: f"{short[path]} ({path.stem if path.suffix == '.json' else path.name})" for path in reports}
+    titles = {path: long[path] if names.count(report.method) > 1 else short[path] for path, report in reports.items()}
+    repeated = [title for title in titles.values() if list(titles.values()).count(title) > 1]
+    return {path: f"{short[path]} ({path})" if title in repeated else title for path, title in titles.items()}
 
 
 def with_scene(classes: Classes, field: Path) -> Classes:
