@@ -104,9 +104,13 @@ def draw_plots(out: Path, scene: Path, truth: str, results: list[dict[str, Any]]
             sizes[title] = mean(one["storage"] for one in found) / MIB, miou
             times[title] = max(mean(sum(one["stages"].values()) for one in found) / 60, 1e-3), miou
     paper = {f"{row.title.split(' (')[0]} (paper)": row.paper for row in ROWS.values() if row.paper is not None}
+    figure = new_figure(12, 8)  # large enough for the names of both kinds of points
     plot_quality_storage(
-        sizes, out / "quality_storage.png", reference={name: (p["mib"], p["miou"] / 100) for name, p in paper.items()}
+        sizes,
+        ax=figure.add_subplot(),
+        reference={name: (p["mib"], p["miou"] / 100) for name, p in paper.items()},
     )
+    save_figure(figure, out / "quality_storage.png")
     figure = new_figure(7.6, 5.2)
     axes = figure.add_subplot()
     plot_quality_storage(times, ax=axes)

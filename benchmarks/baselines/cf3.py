@@ -24,7 +24,7 @@ from kfgs.labels.views import sum_pixels
 from kfgs.metrics import semantic_storage_bytes
 from kfgs.splat import covariance_3d, rasterize
 
-from .common import Clock, Fitted, Task, seeded, within
+from .common import Clock, Fitted, Task, one_thread, seeded, within
 from .langsplat import Autoencoder
 from .methods import RenderedMethod
 
@@ -59,8 +59,8 @@ class CF3Config:
 
     @staticmethod
     def short() -> CF3Config:
-        """For two cores: 6 epochs, 480 steps on small views."""
-        return CF3Config(epochs=6, steps=480, pixels=40_000)
+        """For two cores: 3 epochs, 480 steps on small views."""
+        return CF3Config(epochs=3, steps=480, pixels=40_000)
 
 
 def structure_loss(latents: Tensor, features: Tensor) -> Tensor:  # [n, 3], [n, D] unit rows -> []
@@ -184,7 +184,8 @@ def fit(task: Task, config: CF3Config) -> Fitted:
     with clock.stage("autoencoder"):
         assert lifted.features is not None
         rows = unit_rows(found.latents.decode(lifted.features))
-        network = fit_autoencoder(rows, config, task.seed)
+        with one_thread():
+            network = fit_autoencoder(rows, config, task.seed)
         with torch.no_grad():
             latents = torch.cat([network.encode(part) for part in rows.split(16_384)])
         cloud = lifted.replace(features=latents)
