@@ -13,7 +13,6 @@ idle cores. Without it baselines take five times as many steps and all views cou
 from __future__ import annotations
 
 import argparse
-import platform
 import subprocess
 import sys
 import time
@@ -27,6 +26,7 @@ from kfgs._files import digest_file, read_json, write_json
 from kfgs.evaluation import load_label_set
 from kfgs.features import FeatureFolder
 from kfgs.pipeline import ColorConfig, fit_color, score_teacher, true_labels
+from kfgs.pipeline.evaluate import this_machine
 from kfgs.scenes import load_scene
 
 HERE = Path(__file__).resolve().parent
@@ -53,7 +53,7 @@ def main() -> None:
                 flush=True,
             )
     about = {
-        "machine": f"{platform.processor() or platform.machine()}, {results[0]['threads'] if results else 0} threads",
+        "machine": this_machine(),
         "command": "python benchmarks/table1.py " + " ".join(sys.argv[1:]), "preset": preset_of(args),
         "geometry_seconds": geometry_seconds, "seconds": time.perf_counter() - start, "teacher": teacher, "longer": LONGER,
     }  # fmt: skip

@@ -10,7 +10,13 @@ import kfgs
 from kfgs import cli
 
 REPOSITORY = Path(kfgs.__file__).parents[1]
-SHOWN = ["README.md", "docs/results.md", "docs/architecture.md", "notebooks/6_inspect_in_pyvista.py"]
+SHOWN = [
+    "README.md",
+    "docs/results.md",
+    "docs/architecture.md",
+    "docs/protocols.md",
+    "notebooks/6_inspect_in_pyvista.py",
+]
 
 
 def help_of(command, capsys):

@@ -20,6 +20,7 @@ from typing import Any, get_type_hints
 
 import tyro
 
+from .evaluate import compare, evaluate
 from .features import features, plan
 from .fit import color, demo, fit, sfm, uplift
 from .output import say, warnings_as_notes
@@ -32,6 +33,7 @@ GROUPS: dict[str, tuple[Any, ...]] = {
     "Start here": (demo, info),
     "Make a semantic field": (sfm, plan, features, text, fit, uplift),
     "Ask it": (select, segment, label, view),
+    "Score it": (evaluate, compare),
     "Colour splats": (color, attach, edit, convert),
 }
 COMMANDS = {command.__name__: command for group in GROUPS.values() for command in group}

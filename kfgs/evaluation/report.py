@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
+SHOWN = 4
+"""An option with more values is only counted in the short form."""
 Row = Mapping[str, Any]
 """One line of a report's table: "view", "text" or "class", and numbers."""
 
@@ -39,6 +41,8 @@ class Report:
     """Of the data and of the field, by name."""
     command: str = ""
     """What was run."""
+    machine: str = ""
+    """Where it was run."""
 
     def __post_init__(self) -> None:
         if not self.scores:
@@ -72,14 +76,16 @@ class Report:
         lines += [f"  {name} = {value}" for name, value in self.options.items()]
         lines += [f"  {name}: {value}" for name, value in self.digests.items()]
         lines += [f"  command: {self.command}"] if self.command else []
+        lines += [f"  machine: {self.machine}"] if self.machine else []
         for row in self.rows:
             parts = (f"{k} {v:.3f}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items())
             lines.append("    " + ", ".join(parts))
         return "\n".join(lines)
 
-    def of(self, *, command: str = "", digests: Mapping[str, str] | None = None) -> Report:
-        """The same report with the command that made it, and digests of data and field."""
-        return replace(self, command=command or self.command, digests={**self.digests, **(digests or {})})
+    def of(self, *, command: str = "", digests: Mapping[str, str] | None = None, machine: str = "") -> Report:
+        """The same report with the command that made it, digests of data and field, and the machine."""
+        both = {**self.digests, **(digests or {})}
+        return replace(self, command=command or self.command, digests=both, machine=machine or self.machine)
 
     def to_json(self) -> dict[str, Any]:
         """Plain values: protocol, version, options, scores, rows, digests, command. A number that is not finite is null."""
@@ -92,11 +98,36 @@ class Report:
             "method": self.method,
             "options": plain(self.options),
             "changed": list(self.changed),
+            "always": list(self.always),
             "scores": plain(self.scores),
             "rows": plain(self.rows),
             "digests": plain(self.digests),
             "command": self.command,
+            "machine": self.machine,
         }
+
+    @staticmethod
+    def from_json(value: Mapping[str, Any]) -> Report:
+        """The report that `to_json` gave; a score that is null becomes NaN.
+
+        Raises:
+            ValueError: if it is something else.
+        """
+        try:
+            scores = {str(name): math.nan if score is None else float(score) for name, score in value["scores"].items()}
+            names = ("protocol", "about", "method", "options", "digests", "command", "machine")
+            parts = {name: value[name] for name in names if name in value}
+            return Report(
+                scores=scores,
+                rows=tuple(value["rows"]),
+                changed=tuple(value["changed"]),
+                always=tuple(value["always"]),
+                **parts,
+            )
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
+            raise ValueError(
+                f"value: expected a report in JSON, as `kfgs evaluate --out` writes it, got something else ({error!r})"
+            ) from error
 
 
 def make_report(protocol: Any, method: str, scores: Mapping[str, float], rows: list[Row] | tuple[Row, ...]) -> Report:
@@ -147,6 +178,8 @@ def mean(values: Iterable[float]) -> float:
 
 
 def _short(value: Any) -> str:
+    if isinstance(value, list | tuple) and len(value) > SHOWN:
+        return f"{len(value)} values"
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 

@@ -18,10 +18,12 @@ from .color import ColorConfig, fit_color
 from .compare import views_of_change, write_comparison
 from .config import FitConfig
 from .describe import describe
+from .evaluate import evaluate
 from .fit import fit_scene
 from .fuse import uplift
 from .plan import Plan, plan_scene
 from .plan_maps import NamedTeacher
+from .question import Question, open_question
 from .stages import Run
 
 __all__ = [
@@ -29,13 +31,16 @@ __all__ = [
     "FitConfig",
     "NamedTeacher",
     "Plan",
+    "Question",
     "Run",
     "attach",
     "describe",
+    "evaluate",
     "feature_colors",
     "fit_color",
     "fit_scene",
     "label_cloud",
+    "open_question",
     "plan_scene",
     "read_cloud",
     "save_labelled",

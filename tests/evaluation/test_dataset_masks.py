@@ -12,6 +12,7 @@ from PIL import Image
 
 from kfgs.evaluation import MaskTruth, load_classes
 from kfgs.evaluation.datasets import (
+    find_masks,
     load_3dovs,
     load_legaussians,
     load_lerf_ovs,
@@ -205,3 +206,22 @@ def test_the_numbers_of_legaussians_views() -> None:
         "kitchen": 32,
         "room": 128,
     }
+
+
+def test_masks_are_found_by_their_files(tmp_path: Path) -> None:
+    _lerf(tmp_path / "lerf")
+    (tmp_path / "lerf/ramen/images").mkdir(parents=True)
+    scenes = (tmp_path / "lerf/ramen", tmp_path / "lerf/label/ramen", tmp_path / "lerf")
+    for place, texts in (
+        *((place, ("egg", "sake cup")) for place in scenes),
+        (_3dovs(tmp_path / "bed"), ("banana", "black leather shoe")),
+        (tmp_path / "bed/segmentations", ("banana", "black leather shoe")),
+        (_legaussians(tmp_path), tuple(LEGAUSSIANS["kitchen"])),
+    ):
+        assert set(find_masks(place).texts) <= set(texts), place
+    with pytest.raises(FileNotFoundError, match=tells("truth", "masks", "images", "segmentations/classes.txt", "none")):
+        find_masks(tmp_path / "bed/images")
+    (tmp_path / "scene/images").mkdir(parents=True)
+    (tmp_path / "scene/classes.json").write_text("[]")  # a scene's loose JSON is no ground truth
+    with pytest.raises(FileNotFoundError, match=tells("truth", "masks", "none")):
+        find_masks(tmp_path / "scene")

@@ -11,9 +11,12 @@ from PIL import Image
 
 from kfgs.evaluation import load_classes
 from kfgs.evaluation.datasets import (
+    find_labels,
+    find_points,
     load_replica_points,
     load_scannet_points,
     load_semantic_nerf_labels,
+    load_surface_points,
 )
 from kfgs.formats.ply import write_ply
 
@@ -138,3 +141,26 @@ def test_labels_of_semantic_nerf(tmp_path: Path) -> None:
         load_semantic_nerf_labels(sequence)
     with pytest.raises(FileNotFoundError, match=tells("semantic_class_0.png")):
         load_semantic_nerf_labels(tmp_path)
+
+
+def test_points_and_labels_are_found_by_their_files(tmp_path: Path) -> None:
+    scannet = _scannet(tmp_path / "scene0000_00", [0, 1, 1, 5, 28, 40])
+    assert find_points(scannet).labels.tolist() == [0, 1, 1, 5, 28, 40]
+    np.savez(tmp_path / "surface.npz", points=np.zeros((2, 3), np.float32), labels=np.array([1, 0], np.uint8))
+    (tmp_path / "classes.json").write_text('["wall", "floor"]')
+    found = find_points(tmp_path)
+    assert (found.labels.tolist(), found.names) == ([1, 0], {0: "wall", 1: "floor"})
+    (tmp_path / "surface.npz").write_bytes(b"no arrays")
+    with pytest.raises(ValueError, match=tells("surface.npz", "'points' and 'labels'", "make the room again")):
+        load_surface_points(tmp_path)
+    with pytest.raises(
+        FileNotFoundError, match=tells("truth", "labelled points", "habitat/mesh_semantic.ply", "no such folder")
+    ):
+        find_points(tmp_path / "nowhere")
+    with pytest.raises(FileNotFoundError, match=tells("truth", "label pictures", "labels_scored/*.png", "none")):
+        find_labels(tmp_path)
+    for name, grey in (("labels", 0), ("labels_scored", 1)):
+        (tmp_path / name).mkdir()
+        Image.fromarray(np.full((2, 2), grey, np.uint8)).save(tmp_path / name / "a.png")
+    assert find_labels(tmp_path).maps["a"].unique().tolist() == [1]  # the scored ones come first
+    assert find_labels(tmp_path / "labels").maps["a"].unique().tolist() == [0]

@@ -15,6 +15,7 @@ from kfgs.cameras import Camera
 from kfgs.evaluation import Method, View
 from kfgs.evaluation.foreign import (
     load_feature3dgs,
+    load_foreign,
     load_langsplat,
     load_langsplat_v2,
     load_legaussians_field,
@@ -117,6 +118,7 @@ def test_feature_3dgs(tmp_path: Path) -> None:
     features, seen = _map(values)
     _check(method, text, 0, features, seen, values.numpy())
     assert torch.isnan(method.gaussian_cosines(text)[0, 3]).all()
+    assert load_foreign(tmp_path).name == load_foreign(ply).name.replace("point_cloud", method.name) == method.name
     assert load_feature3dgs(tmp_path, 7000).dim == 2
     assert load_feature3dgs(ply).dim == 140
 
@@ -170,6 +172,10 @@ def test_langsplat(tmp_path: Path) -> None:
         own = np.where((values == 0).all(1)[:, None], 0, decode(unit.double().numpy()))  # untrained: unknown
         seen = seen & (features != 0).any(-1)  # what is seen has learnt something
         _check(method, text, level, decode(features), seen, own)
+    found = load_foreign(tmp_path / "output/figurines", tmp_path / "best_ckpt.pth")
+    assert (found.name, found.levels) == ("LangSplat", 3)
+    with pytest.raises(ValueError, match=tells("best_ckpt.pth", "with_file")):
+        load_foreign(tmp_path / "output/figurines")
     one = load_langsplat([tmp_path / "output/figurines_2"], tmp_path / "best_ckpt.pth", 30000)
     assert one.levels == 1
     torch.testing.assert_close(one.cosines(VIEW, text)[0], method.cosines(VIEW, text)[1], equal_nan=True)
@@ -179,6 +185,7 @@ def test_langsplat_v2(tmp_path: Path) -> None:
     logits, book, text = _random(N, 16), _random(1, 16, 9), _random(K, 9, seed=5)
     path = _capture(tmp_path / "ramen_1/chkpnt10000.pth", [logits, book])
     method = load_langsplat_v2([path.parent])
+    assert load_foreign(tmp_path / "ramen_1").name == load_foreign(path).name == "LangSplatV2"
     weights = np.zeros((N, 16))
     for i, row in enumerate(logits.double().numpy()):
         share = np.exp(row) / np.exp(row).sum()
@@ -213,6 +220,10 @@ def test_occam_whose_levels_lost_other_gaussians(tmp_path: Path) -> None:
         expected = np.array([exact[i] if i in rows else [np.nan] * K for i in (0, 1, 2, 5, 7, 3, 11)])
         np.testing.assert_allclose(own[level].numpy(), expected, atol=2e-5)
     assert load_occam(tmp_path / "chkpnt30000_langfeat_2.pth").levels == 1
+    assert load_foreign(tmp_path).levels == 2
+    assert load_foreign(tmp_path / "chkpnt30000_langfeat_2.pth").levels == 1
+    with pytest.raises(ValueError, match=tells("with_file", "none with Occam")):
+        load_foreign(tmp_path, tmp_path / "x.pth")
 
 
 def _legaussians(folder: Path) -> tuple[nn.ModuleDict, torch.Tensor]:
@@ -240,6 +251,10 @@ def test_legaussians(tmp_path: Path, kind: str) -> None:
             tmp_path / "chkpnt30000.pth",
         )  # fmt: skip
     method = load_legaussians_field(tmp_path, tmp_path / "codebook.pt", channels=10)
+    with pytest.raises(FileNotFoundError, match=tells("with_file", "codebook")):
+        load_foreign(tmp_path)
+    torch.save({"embedding.weight": _random(5, 600)}, tmp_path / "wide.pt")
+    assert load_foreign(tmp_path, tmp_path / "wide.pt").name == "LEGaussians"
 
     def decode(rows: np.ndarray, hard: bool = False) -> np.ndarray:
         rows = rows / np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-8)
@@ -266,6 +281,9 @@ def test_splats_with_features(tmp_path: Path) -> None:
     torch.save(values, tmp_path / "lang.pth")
     for method in (load_splat_features(own, column="lang_"), load_splat_features(bare, tmp_path / "lang.pth")):
         _check(method, text, 0, rendered, seen, values.numpy())
+    assert load_foreign(bare, tmp_path / "lang.npy").dim == 6
+    with pytest.raises(ValueError, match=tells("bare.ply", "semantic_0", "with_file")):
+        load_foreign(bare)
     near = load_splat_features(bare, tmp_path / "lang.npy", name="SceneSplat")
     assert (near.name, near.dim) == ("SceneSplat", 6)
     np.testing.assert_allclose(near.gaussian_cosines(text), method.gaussian_cosines(text), atol=2e-3)  # half precision
@@ -286,6 +304,13 @@ def test_files_that_are_missing_or_of_another_program(tmp_path: Path) -> None:
         load_feature3dgs(tmp_path, 7)
     with pytest.raises(ValueError, match=tells("point_cloud.ply", "semantic_0", "trained with features")):
         load_feature3dgs(tmp_path)
+    with pytest.raises(ValueError, match=tells("point_cloud.ply", "semantic_0")):
+        load_foreign(tmp_path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match=tells("empty", "known program", "Feature 3DGS", "LangSplat")):
+        load_foreign(tmp_path / "empty")
+    with pytest.raises(FileNotFoundError, match=tells("nothing", "no such file")):
+        load_foreign(tmp_path / "nothing")
     network = _decoder((3, 9))
     torch.save(network.state_dict(), tmp_path / "ae.pth")
     with pytest.raises(FileNotFoundError, match=tells("room_1", "chkpnt<step>.pth", "LangSplat")):

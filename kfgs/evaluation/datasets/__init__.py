@@ -1,6 +1,7 @@
 """Ground truth of published data sets, and of any folder of labels. Poses and pictures come from `kfgs.scenes.load_scene`."""
 
 from .coco import load_coco_labels, load_coco_masks
+from .find import find_labels, find_masks, find_points
 from .label_folder import load_labels
 from .legaussians import load_legaussians
 from .lerf_ovs import load_lerf_ovs
@@ -8,6 +9,7 @@ from .ovs3d import OVS3D_REPORTED, OVS3D_SCENES, load_3dovs
 from .polygons import decode_rle, fill_polygon, fill_region
 from .replica import load_replica_points, load_semantic_nerf_labels
 from .scannet import load_scannet_points
+from .surface_points import load_surface_points
 from .views import truth_views
 
 __all__ = [
@@ -16,6 +18,9 @@ __all__ = [
     "decode_rle",
     "fill_polygon",
     "fill_region",
+    "find_labels",
+    "find_masks",
+    "find_points",
     "load_3dovs",
     "load_coco_labels",
     "load_coco_masks",
@@ -25,5 +30,6 @@ __all__ = [
     "load_replica_points",
     "load_scannet_points",
     "load_semantic_nerf_labels",
+    "load_surface_points",
     "truth_views",
 ]

@@ -1,6 +1,7 @@
 """Fields of other programs, read as data and scored by the same protocols. Nothing in their files is run."""
 
 from .feature3dgs import load_feature3dgs
+from .find import load_foreign
 from .langsplat import load_langsplat, load_langsplat_v2, load_occam
 from .legaussians import load_legaussians_field
 from .splat_features import load_splat_features
@@ -10,6 +11,7 @@ __all__ = [
     "Level",
     "SplattedMethod",
     "load_feature3dgs",
+    "load_foreign",
     "load_langsplat",
     "load_langsplat_v2",
     "load_legaussians_field",

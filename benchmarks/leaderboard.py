@@ -1,0 +1,176 @@
+"""The leaderboard page: every row that was run, with its command, seeds, machine and spread, from the JSON of the runs.
+
+    python benchmarks/leaderboard.py docs/runs docs/leaderboard.md            # write the page again
+    python benchmarks/leaderboard.py docs/runs docs/leaderboard.md --check    # fails if the page says something else
+    python benchmarks/leaderboard.py docs/runs docs/leaderboard.md --add OUT [OUT2 ...] --name room_0-quick --about "..."
+
+--add keeps what `benchmarks/table1.py SCENE FEATURES OUT` wrote, without losses, matrices and paths, as RUNS/NAME.json. Rows of
+several OUTs are joined; of a row and seed that occur twice, the last counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import re
+import sys
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+from table1_rows import ROWS
+
+from kfgs._files import atomic_path, read_json, write_json
+
+MIB = 2**20
+KEPT = (
+    "dim", "gaussians", "storage", "disk", "packed", "stages", "miou", "accuracy", "teacher_accuracy", "teacher_iou7",
+    "fps_maps", "fps_labels", "peak", "views", "threads",
+)  # fmt: skip
+PROTOCOL = "kfgs-pooled/1"
+HEAD = (
+    "",
+    "method",
+    "mIoU, %",
+    "accuracy, %",
+    "IoU7 with teacher, %",
+    "minutes",
+    "MiB",
+    "labels, FPS",
+    "seeds",
+    "machine",
+    "command",
+)
+INTRO = f"""# Leaderboard
+
+Every row was run with kfgs's own implementation of the method (`benchmarks/baselines/`), on the same scene and teacher, by the
+command beside it. mIoU and accuracy are `{PROTOCOL}`; IoU7 is `feature3dgs-teacher/1` with the scene's classes
+([protocols](protocols.md)). Where a row has several seeds, numbers are means, and the lowest and highest mIoU stand in brackets.
+Minutes are those of training, without the teacher and the Gaussians that methods share. [Results](results.md) say more about
+rows and shortened schedules. MAPS are the teacher's maps, COLOR is what `kfgs color` writes, OUT is a folder of yours.
+
+This page is made by `python benchmarks/leaderboard.py docs/runs docs/leaderboard.md`; with `--check` the command fails if a number
+in the page is not in the runs.
+"""
+
+
+def main() -> None:
+    """Add runs, then write or check the page."""
+    args = parse_arguments()
+    if args.add:
+        if args.name is None:
+            sys.exit("--name: expected the name of the runs with --add, for instance room_0-quick")
+        write_json(
+            args.runs / f"{args.name}.json", join([read_json(out / "table1.json") for out in args.add], args.about)
+        )
+    text = page(args.runs)
+    if args.check:
+        differences = compare(args.page.read_text(encoding="utf-8") if args.page.is_file() else "", text)
+        if differences:
+            sys.exit("\n".join([f"{args.page}: differs from the runs in {args.runs}:", *differences[:20]]))
+        print(f"{args.page}: every number is in the runs")
+        return
+    with atomic_path(args.page) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    print(f"wrote {args.page}")
+
+
+def join(tables: list[dict[str, Any]], about: str = "") -> dict[str, Any]:
+    """What is kept of some tables: small rows without paths, in their order."""
+    rows: dict[tuple[str, int], dict[str, Any]] = {}
+    for table in tables:
+        for row in table["rows"]:
+            request = row["request"]
+            rows[request["row"], request["seed"]] = {
+                "row": request["row"], "seed": request["seed"], "machine": table["machine"], "command": command(request),
+                **{name: row[name] for name in KEPT if name in row},
+            }  # fmt: skip
+    presets = {table["preset"] for table in tables}
+    if len(presets) != 1:
+        sys.exit(f"--add: expected runs of one preset, got {', '.join(sorted(presets))}; add them under two names")
+    first = tables[0]
+    scene = Path(first["rows"][0]["request"]["scene"]).name
+    listed = sorted(rows.values(), key=lambda row: (row["row"], row["seed"]))
+    return {"scene": scene, "preset": first["preset"], "about": about, "teacher": first["teacher"], "rows": listed}
+
+
+def command(request: dict[str, Any]) -> str:
+    """The command that makes one row again. Folders are named by what they hold, not by where they were."""
+    words = ["python benchmarks/table1.py", Path(request["scene"]).name.upper(), "MAPS OUT"]
+    words += ["--splat COLOR/color.ply"] if request.get("splat") else []
+    words += ["--quick"] if request["preset"] == "quick" else [f"--preset {request['preset']}"]
+    words += [f"--steps {request['steps']}"] if request.get("steps") is not None else []
+    usual = 3 if request["preset"] == "quick" else 1
+    words += [f"--every {request['every']}"] if request.get("every", usual) != usual else []
+    words += [f"--truth {request['truth']}"] if request.get("truth", "labels_scored") != "labels_scored" else []
+    return " ".join([*words, f"--rows {request['row']} --seeds {request['seed']}"])
+
+
+def page(folder: Path) -> str:
+    """The whole page, from all runs of a folder."""
+    files = sorted(folder.glob("*.json"))
+    if not files:
+        sys.exit(f"{folder}: expected JSON files of runs, found none; add some with --add")
+    return "\n".join([INTRO, *(section(file.stem, read_json(file)) for file in files)])
+
+
+def section(name: str, runs: dict[str, Any]) -> str:
+    """One scene and preset: what was run, and a table, the best mIoU first."""
+    lines = [f"## {runs['scene']}, {runs['preset']}", ""]
+    lines += [runs["about"], ""] if runs["about"] else []
+    if runs["teacher"] is not None:
+        teacher = runs["teacher"]
+        lines += [
+            f"The teacher itself, on the same {teacher['views']} views: mIoU {100 * teacher['miou']:.1f} %, accuracy "
+            f"{100 * teacher['accuracy']:.1f} %.", "",
+        ]  # fmt: skip
+    lines += [f"| {' | '.join(HEAD)} |", "|" + "---|" * len(HEAD)]
+    of_row: dict[str, list[dict[str, Any]]] = {}
+    for row in runs["rows"]:
+        of_row.setdefault(row["row"], []).append(row)
+    ranked = sorted(of_row.items(), key=lambda one: -mean(row["miou"] for row in one[1]))
+    lines += [f"| {' | '.join(cells(place, key, rows))} |" for place, (key, rows) in enumerate(ranked, 1)]
+    return "\n".join([*lines, "", f"Source: [runs/{name}.json](runs/{name}.json).", ""])
+
+
+def cells(place: int, key: str, rows: list[dict[str, Any]]) -> list[str]:
+    """A row of the table over its seeds."""
+
+    def average(name: str, scale: float = 100.0, digits: int = 1) -> str:
+        return f"{mean(row[name] for row in rows) * scale:.{digits}f}" if all(name in row for row in rows) else "-"
+
+    mious = [100 * row["miou"] for row in rows]
+    spread = f" ({min(mious):.1f} to {max(mious):.1f})" if len(rows) > 1 else ""
+    minutes = mean(sum(row["stages"].values()) for row in rows) / 60
+    seeds = ", ".join(str(row["seed"]) for row in rows)
+    again = rows[0]["command"].rpartition(" --seeds ")[0] + " --seeds " + seeds.replace(",", "")
+    machines = "; ".join(dict.fromkeys(row["machine"] for row in rows))
+    return [
+        str(place), ROWS[key].title, average("miou") + spread, average("accuracy"), average("teacher_iou7"),
+        f"{minutes:.2f}", average("storage", 1 / MIB, 2), average("fps_labels", 1), seeds, machines, f"`{again}`",
+    ]  # fmt: skip
+
+
+def compare(old: str, new: str) -> list[str]:
+    """The lines in which a page differs from the runs, numbers that the runs lack first."""
+    known = set(re.findall(r"\d+\.\d+|\d+", new))
+    unknown = [number for number in re.findall(r"\d+\.\d+|\d+", old) if number not in known]
+    found = [f"not in the runs: {', '.join(dict.fromkeys(unknown))}"] if unknown else []
+    changed = difflib.unified_diff(old.splitlines(), new.splitlines(), "page", "runs", lineterm="", n=0)
+    return found + [line for line in changed if line[:1] in "+-"]
+
+
+def parse_arguments() -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=Path, help="folder of small JSON files of runs")
+    parser.add_argument("page", type=Path, help="the Markdown file")
+    parser.add_argument("--check", action="store_true", help="compare the page with the runs instead of writing it")
+    parser.add_argument("--add", nargs="+", type=Path, default=[], help="OUT folders of table1.py")
+    parser.add_argument("--name", help="of the runs that are added")
+    parser.add_argument("--about", default="", help="what they are, a sentence")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()

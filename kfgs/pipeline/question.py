@@ -1,0 +1,268 @@
+"""What methods are asked: a protocol, a scene, its ground truth and the views; the same for every method that is compared."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .._card import short_repr
+from ..cameras import undistort_labels
+from ..evaluation import Encode, LabelTruth, MaskTruth, PointTruth, Report, TeacherMethod, View, get_protocol
+from ..evaluation.datasets import find_labels, find_masks, find_points, truth_views
+from ..evaluation.datasets.files import ReadWhenAsked
+from ..evaluation.digests import digest_data
+from ..evaluation.encoders import NotedEncoder
+from ..evaluation.segmentation import load_label_map
+from ..features import FeatureFolder
+from ..formats import read_splats
+from ..gaussians import Gaussians
+from ..labels.color import parse_color
+from ..scenes import Scene, load_scene
+from .maps import UndistortedMaps
+
+EDIT_INPUTS = {"kfgs-removal/1": ("before", "removed"), "kfgs-recolor/1": ("before", "painted", "rgb")}
+"""What the protocols of edits need besides the edited splat."""
+IN_SPACE = ("kfgs-surface/1", "lerf-ovs-3d/1", "scannet-points/1", "scannet-volume/1", "scenesplat-fmiou/1")
+"""Protocols that ask Gaussians, not pictures."""
+OF_COLORS = ("kfgs-color/1", *EDIT_INPUTS)
+"""Protocols that score Gaussians with colours instead of a method."""
+
+Truth = LabelTruth | MaskTruth | PointTruth | TeacherMethod
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """What each method is asked; `score` asks one."""
+
+    protocol: Any
+    folder: Path
+    """The scene's."""
+    scene: Scene
+    """Without distortion."""
+    truth: Truth | None
+    """None: of colours and edits, whose truth is in the scene folder."""
+    views: tuple[View, ...]
+    """Those that are scored; of the teacher's protocol, those that it chooses from."""
+    digests: Mapping[str, str]
+    """Of views and truth."""
+    inputs: Mapping[str, Any]
+    """Of the protocols of edits: before, and the class."""
+
+    __repr__ = short_repr
+
+    def score(self, method: Any, encode: Encode | None = None) -> Report:
+        """Ask a method; of colours and edits, Gaussians.
+
+        Raises:
+            TypeError: if the method has no Gaussians and the protocol needs some.
+            ValueError: if the protocol cannot score it, or a text has no embedding.
+        """
+        given = dict(self.inputs)
+        if self.protocol.name in EDIT_INPUTS:
+            before = read_splats(given.pop("before")).gaussians
+            return self.protocol.score(before, method, self.folder, *given.values()).of(digests=self.digests)
+        if self.protocol.name in OF_COLORS:
+            return self.protocol.score(method, self.scene).of(digests=self.digests)
+        if encode is None:
+            raise ValueError("text: expected text embeddings, got none; pass a label set or a teacher's text encoder")
+        noted = NotedEncoder(encode)
+        found: Report = self.protocol.score(method, self.truth, list(self.views), noted)
+        return found.of(digests={**self.digests, "texts": digest_data(noted.rows)})
+
+
+def open_question(
+    scene: str | Path,
+    protocol: str = "kfgs-pooled/1",
+    *,
+    truth: str | Path | None = None,
+    split: str | None = None,
+    images: str | Path | None = None,
+    options: Mapping[str, Any] | None = None,
+) -> Question:
+    """Read a scene and its ground truth for a protocol.
+
+    Args:
+        scene: its folder.
+        protocol: a name of `kfgs.evaluation.PROTOCOLS`.
+        truth: where the ground truth is, if not in the scene's folder (`find_labels`, `find_masks`, `find_points`); of
+            `feature3dgs-teacher/1`, the teacher's maps (`features/` in the scene).
+        split: which views. None: of label pictures the test views, or all if none of those has one; of masks all pictures that
+            have some; of a teacher all views.
+        images: folder of the pictures.
+        options: of the protocol, as published where left out; and the inputs of an edit's protocol: `before` (a splat file),
+            `removed` or `painted` (a class), `rgb`.
+
+    Raises:
+        FileNotFoundError: if the scene or its truth is missing.
+        ValueError: if protocol, options, split or truth do not fit.
+    """
+    given, folder = dict(options or {}), Path(scene)
+    name = get_protocol(protocol).name
+    inputs = _edit_inputs(name, given)
+    if split is not None and name in OF_COLORS:
+        given["split"] = split
+    chosen = get_protocol(name, **given)
+    loaded = load_scene(folder, images=images).undistorted()
+    if name in OF_COLORS:
+        if truth is not None:
+            raise ValueError(
+                f"truth: expected none with {name}, whose truth is in the scene, got {truth}; leave it out"
+            )
+        digests = {
+            "views": _digest_views(_views(loaded, chosen.split)),
+            "truth": _digest_scene(loaded, folder, chosen, inputs),
+        }
+        return Question(chosen, folder, loaded, None, (), digests, inputs)
+    kind = type(chosen).score.__annotations__["truth"]
+    if kind == "PointTruth":
+        points = find_points(truth or folder)
+        return Question(chosen, folder, loaded, points, (), {"truth": digest_data(points)}, inputs)
+    if kind == "Method":
+        return _ask_teacher(chosen, folder, loaded, truth, split)
+    found: LabelTruth | MaskTruth = (find_labels if kind == "LabelTruth" else find_masks)(truth or folder)
+    found = _without_lens(_of_split(found, loaded, split), loaded)
+    views = tuple(truth_views(loaded, found))
+    digests = {"views": _digest_views(views), "truth": _digest_truth(found)}
+    return Question(chosen, folder, loaded, found, views, digests, inputs)
+
+
+def _edit_inputs(name: str, given: dict[str, Any]) -> dict[str, Any]:
+    """Take the inputs of an edit's protocol out of the options."""
+    wanted = EDIT_INPUTS.get(name, ())
+    missing = [key for key in wanted if key not in given]
+    if missing:
+        words = ", ".join(
+            f"{key}={'FILE' if key == 'before' else 'COLOUR' if key == 'rgb' else 'CLASS'}" for key in missing
+        )
+        raise ValueError(
+            f"set: expected {words} with {name} (what the splat was before, and what was edited), got none; add it"
+        )
+    inputs = {key: given.pop(key) for key in wanted}
+    if "rgb" in inputs:
+        inputs["rgb"] = parse_color(inputs["rgb"], "rgb")
+    return inputs
+
+
+def _ask_teacher(protocol: Any, folder: Path, scene: Scene, truth: str | Path | None, split: str | None) -> Question:
+    maps = Path(truth) if truth is not None else folder / "features"
+    if not maps.is_dir():
+        raise FileNotFoundError(
+            f"truth: expected the teacher's feature maps, got {maps}, which is no folder; name the folder that has them"
+        )
+    views = _views(scene, split or "all")
+    chosen = protocol.chosen(views)
+    teacher = read_teacher(maps, scene, chosen)
+    files = FeatureFolder(maps, [view.stem for view in chosen]).files
+    digests = {"views": _digest_views(chosen), "truth": digest_data(list(files))}
+    return Question(protocol, folder, scene, teacher, tuple(views), digests, {})
+
+
+def read_teacher(folder: Path, scene: Scene, views: Sequence[View], align_corners: bool = True) -> TeacherMethod:
+    """The maps of some views as a method; the lens is removed from them if it was removed from the scene.
+
+    Raises:
+        FileNotFoundError: if a view has no map.
+    """
+    index = {scene.stem(i): i for i in range(len(scene))}
+    places = [index[view.stem] for view in views]
+    maps = FeatureFolder(folder).of(scene, [scene.stem(i) for i in places])
+    lenses = None if scene.lenses is None else [scene.lenses[i] for i in places]
+    read = maps if lenses is None else UndistortedMaps(maps, lenses)
+    by_stem = ReadWhenAsked({view.stem: partial(read.__getitem__, i) for i, view in enumerate(views)})
+    return TeacherMethod(by_stem, f"teacher ({folder.name})", align_corners=align_corners)
+
+
+def _views(scene: Scene, split: str) -> list[View]:
+    indices = range(len(scene)) if split == "all" and "all" not in scene.splits else scene.views(split)
+    return [View(scene.stem(i), scene.cameras[i]) for i in indices]
+
+
+def _of_split(truth: Any, scene: Scene, split: str | None) -> Any:
+    """The truth of a split's views."""
+    labels = isinstance(truth, LabelTruth)
+    known: Mapping[str, Any] = truth.maps if labels else truth.frames
+    if split is None:
+        test = {scene.stem(i) for i in scene.splits.get("test", ())} if labels else set()
+        chosen = [stem for stem in known if stem in test] or list(known)
+    else:
+        wanted = {view.stem for view in _views(scene, split)}
+        chosen = [stem for stem in known if stem in wanted]
+        if not chosen:
+            raise ValueError(
+                f"split: expected one whose views have ground truth, got {split!r}: none of its {len(wanted)} views is among "
+                f"the {len(known)} pictures with truth; choose another"
+            )
+    kept = ReadWhenAsked({stem: partial(known.__getitem__, stem) for stem in chosen})
+    return LabelTruth(truth.names, kept) if labels else MaskTruth(kept)
+
+
+def _without_lens(truth: Any, scene: Scene) -> Any:
+    """Label pictures without distortion, as the scene's pictures."""
+    if scene.lenses is None:
+        return truth
+    lenses = {scene.stem(i): lens for i, lens in enumerate(scene.lenses) if lens.distortion is not None}
+    if isinstance(truth, MaskTruth):
+        if lenses.keys() & set(truth.frames):
+            raise ValueError(
+                "truth: expected masks of pictures without lens distortion, got distorted ones; undistort pictures and masks"
+            )
+        return truth
+
+    def read(stem: str) -> Tensor:
+        labels = _labels(truth.maps[stem])
+        if stem not in lenses:
+            return labels
+        return undistort_labels(labels, lenses[stem].resized(int(labels.shape[0]), int(labels.shape[1])))
+
+    return replace(truth, maps=ReadWhenAsked({stem: partial(read, stem) for stem in truth.maps}))
+
+
+def _labels(found: Tensor | Path) -> Tensor:
+    return found if isinstance(found, Tensor) else load_label_map(found)
+
+
+def _digest_views(views: Sequence[View]) -> str:
+    return digest_data([[view.stem, view.camera.viewmat, view.camera.K, *view.camera.size] for view in views])
+
+
+def _digest_truth(truth: LabelTruth | MaskTruth) -> str:
+    """Of what is scored, as it was read; one picture in memory at a time."""
+    if isinstance(truth, LabelTruth):
+        return digest_data([list(truth.names), [[stem, digest_data(_labels(truth.maps[stem]))] for stem in truth.maps]])
+    return digest_data(
+        [[stem, digest_data({k: list(v) for k, v in truth.frames[stem].items()})] for stem in truth.frames]
+    )
+
+
+def _digest_scene(scene: Scene, folder: Path, protocol: Any, inputs: Mapping[str, Any]) -> str:
+    """Of the photographs; of an edit, of the labels, the surfaces, the splat before and the class."""
+    indices = scene.views(protocol.split)
+    if not inputs:
+        return digest_data([scene.image_paths[i] for i in indices])
+    files = [
+        folder / "classes.json",
+        folder / "surface.npz",
+        *(folder / "labels" / f"{scene.stem(i)}.png" for i in indices),
+    ]
+    there = [file for file in files if file.is_file()]
+    return digest_data([there, {key: Path(value) if key == "before" else value for key, value in inputs.items()}])
+
+
+def colors_of(found: Any, name: str) -> Gaussians:
+    """The Gaussians with colours of a method or of a splat.
+
+    Raises:
+        ValueError: if it has none.
+    """
+    cloud = found if isinstance(found, Gaussians) else found.gaussians
+    if cloud is None or cloud.sh is None:
+        raise ValueError(
+            f"field: expected Gaussians with colours for {name}, got none in it; name a colour splat, or a run with color.ply"
+        )
+    return cloud.replace(sh=cloud.sh.to(torch.float32))

@@ -1,0 +1,97 @@
+import re
+import sys
+from pathlib import Path
+
+import leaderboard
+import pytest
+
+from kfgs._files import read_json, write_json
+
+DOCS = Path(leaderboard.__file__).resolve().parents[1] / "docs"
+MIB = 2**20
+
+
+def row(key, seed, miou):
+    request = {
+        "row": key, "seed": seed, "preset": "quick", "steps": None, "scene": "/secret/room_0", "features": "/secret/maps",
+        "truth": "labels_scored", "every": 3, "splat": "/secret/color.ply",
+    }  # fmt: skip
+    scores = {"miou": miou, "accuracy": 0.9, "teacher_iou7": 0.7, "fps_maps": 30.0, "fps_labels": 12.5}
+    facts = {
+        "dim": "17",
+        "gaussians": 30_000,
+        "storage": 3 * MIB,
+        "disk": 4 * MIB,
+        "stages": {"uplift": 60.0, "merge": 30.0},
+    }
+    return {"request": request, **scores, **facts, "history": [{"loss": 1.0}], "pooled": {"confusion": [[1]]}}
+
+
+@pytest.fixture
+def out(tmp_path):
+    teacher = {"miou": 0.724, "accuracy": 0.9, "views": 30}
+    rows = [row("occam", 0, 0.816), *(row("kfgs", seed, miou) for seed, miou in enumerate((0.843, 0.842, 0.847)))]
+    table = {"machine": "a machine, 2 threads", "preset": "quick", "teacher": teacher, "rows": rows}
+    write_json(tmp_path / "out" / "table1.json", table)
+    return tmp_path / "out"
+
+
+def run(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["leaderboard.py", *map(str, words)])
+    leaderboard.main()
+
+
+def test_a_row_has_mean_spread_seeds_machine_and_command(out, tmp_path, monkeypatch):
+    runs, page = tmp_path / "runs", tmp_path / "page.md"
+    run(monkeypatch, runs, page, "--add", out, "--name", "room_0-quick", "--about", "The real teacher.")
+    text = page.read_text()
+    kfgs, occam = (line for line in text.splitlines() if re.match(r"\| \d", line))
+    assert kfgs.startswith(
+        "| 1 | **kfgs default** | 84.4 (84.2 to 84.7) | 90.0 | 70.0 | 1.50 | 3.00 | 12.5 | 0, 1, 2 | a machine"
+    )
+    assert kfgs.endswith(
+        "`python benchmarks/table1.py ROOM_0 MAPS OUT --splat COLOR/color.ply --quick --rows kfgs --seeds 0 1 2` |"
+    )
+    assert "| 2 | Occam's LGS | 81.6 | " in occam
+    assert "The real teacher." in text
+    assert "mIoU 72.4 %" in text
+    kept = (runs / "room_0-quick.json").read_text()
+    assert "secret" not in kept + text
+    assert "history" not in kept
+    assert "confusion" not in kept
+    run(monkeypatch, runs, page, "--check")
+
+
+def test_check_fails_on_a_changed_digit(out, tmp_path, monkeypatch):
+    runs, page = tmp_path / "runs", tmp_path / "page.md"
+    run(monkeypatch, runs, page, "--add", out, "--name", "room_0-quick")
+    page.write_text(page.read_text().replace("81.6", "81.9"))
+    with pytest.raises(SystemExit, match=r"(?s)differs from the runs.*not in the runs: 81.9.*\+.*81.6"):
+        run(monkeypatch, runs, page, "--check")
+    page.unlink()
+    with pytest.raises(SystemExit, match="differs from the runs"):
+        run(monkeypatch, runs, page, "--check")
+
+
+def test_rows_of_several_tables_are_joined(out, tmp_path, monkeypatch):
+    table = read_json(out / "table1.json")
+    write_json(
+        tmp_path / "more" / "table1.json",
+        table | {"machine": "other", "rows": [row("kfgs", 2, 0.9), row("cf3", 0, 0.5)]},
+    )
+    found = leaderboard.join([table, read_json(tmp_path / "more" / "table1.json")])
+    assert [(one["row"], one["seed"], one["miou"]) for one in found["rows"]] == [
+        ("cf3", 0, 0.5), ("kfgs", 0, 0.843), ("kfgs", 1, 0.842), ("kfgs", 2, 0.9), ("occam", 0, 0.816),
+    ]  # fmt: skip
+    with pytest.raises(SystemExit, match="expected runs of one preset, got cpu, quick"):
+        leaderboard.join([table, table | {"preset": "cpu"}])
+    with pytest.raises(SystemExit, match="--name"):
+        run(monkeypatch, tmp_path / "runs", tmp_path / "page.md", "--add", out)
+    with pytest.raises(SystemExit, match="expected JSON files of runs"):
+        run(monkeypatch, tmp_path / "runs", tmp_path / "page.md")
+
+
+def test_the_page_in_the_docs_is_that_of_its_runs(monkeypatch):
+    if not (DOCS / "leaderboard.md").is_file():
+        pytest.skip("kfgs is installed without its repository")
+    run(monkeypatch, DOCS / "runs", DOCS / "leaderboard.md", "--check")

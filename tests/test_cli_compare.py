@@ -1,0 +1,163 @@
+"""`kfgs compare`: its numbers are those of evaluate, its pictures show something, and numbers that differ in kind are refused."""
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from evaluated_room import save_splats
+from PIL import Image
+from small_room import make_room
+
+from kfgs.cli import main
+from kfgs.labels import load_label_set
+from kfgs.pipeline import open_question
+from kfgs.pipeline.evaluate import open_result
+from kfgs.pipeline.side_by_side import VOID, WRONG, _errors, show_views
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    return make_room(tmp_path_factory.mktemp("compare") / "scene")
+
+
+@pytest.fixture(scope="module")
+def run(room, tmp_path_factory):
+    out = tmp_path_factory.mktemp("run")
+    arguments = ["fit", str(room), "--features", str(room / "features"), "--out", str(out)]
+    assert main([*arguments, "--method", "paper", "--mode", "adc", "--steps", "60", "--max-gaussians", "2000"]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def kept(room, run, tmp_path_factory):
+    """Three evaluations in JSON: the field and the teacher's maps under one protocol, and the field under another."""
+    out = tmp_path_factory.mktemp("kept")
+    splats = save_splats(room, out)
+    features = ["--with-file", str(splats / "features.npy"), "--scene", str(room)]
+    assert main(["evaluate", str(run), "--out", str(out / "field.json")]) == 0
+    assert main(["evaluate", str(room / "features"), "--scene", str(room), "--out", str(out / "teacher.json")]) == 0
+    assert main(["evaluate", str(splats / "before.ply"), *features, "--out", str(out / "exact.json")]) == 0
+    assert main(["evaluate", str(run), "--protocol", "kfgs-surface", "--out", str(out / "surface.json")]) == 0
+    assert main(["evaluate", str(run), "--split", "train", "--out", str(out / "train.json")]) == 0
+    return out
+
+
+def pixels(path):
+    with Image.open(path) as picture:
+        return np.asarray(picture)
+
+
+def colors_in(path):
+    return len(np.unique(pixels(path).reshape(-1, 3), axis=0))
+
+
+def test_numbers_are_those_of_evaluate_and_pictures_show_something(run, room, kept, tmp_path, capsys):
+    shutil.copytree(run, tmp_path / "again")
+    names = ["field.json", "teacher.json", "exact.json"]
+    words = [*(str(kept / name) for name in names), str(tmp_path / "again"), "--scene", str(room), "--pictures", "2"]
+    capsys.readouterr()
+    assert main(["compare", *words, "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    found = json.loads((tmp_path / "out" / "compare.json").read_text())
+    assert len(found) == 4
+    scores = [one["scores"]["mIoU"] for one in found.values()]
+    assert scores == sorted(scores, reverse=True)
+    expected = {name: json.loads((kept / name).read_text())["scores"] for name in names}
+    title = {one["digests"]["field"]: name for name, one in found.items()}
+    for name in names:
+        digest = json.loads((kept / name).read_text())["digests"]["field"]
+        assert found[title[digest]]["scores"] == expected[name]
+        assert re.search(rf"^{re.escape(title[digest])} +{expected[name]['mIoU']:.3f}", said, re.MULTILINE)
+    assert scores.count(expected["field.json"]["mIoU"]) == 2  # the run that was scored now, and before
+    assert (tmp_path / "out" / "compare.txt").read_text().strip() in said
+    pictures = sorted((tmp_path / "out").glob("*.png"))
+    assert len(pictures) == 2
+    for picture in pictures:
+        assert colors_in(picture) > 200
+        assert pixels(picture).shape[1] > 6 * 320  # photograph, truth, four results
+
+
+def test_errors_are_where_labels_differ(room, run):
+    words = load_label_set(room / "classes.json", room / "text.npy")
+    question = open_question(room)
+    shown = show_views(question, {"field": open_result(run, question)}, lambda names: words.embeddings, 3)
+    assert list(shown) == [view.stem for view in question.views]
+    for one in shown.values():
+        picture, errors, share = one.answers["field"]
+        truth, labels = one.labels
+        wrong = (labels != truth) & (truth >= 0)
+        assert share == pytest.approx(float(wrong.float().mean()))
+        assert 0.01 < share < 0.9
+        vermilion = (errors[..., 0] - errors[..., 2]) > 0.3
+        assert bool((vermilion == wrong).all())
+        assert picture.shape == tuple(errors.shape)
+
+
+def test_void_is_plain_grey():
+    photo = torch.rand(4, 5, 3)
+    wrong, void = torch.zeros(4, 5), torch.zeros(4, 5, dtype=torch.bool)
+    wrong[1], void[2] = 1, True
+    found = _errors(photo, wrong, void)
+    assert bool((found[2] == VOID).all())
+    assert float((found[1] - torch.tensor(WRONG)).abs().max()) < 0.15
+
+
+def test_pictures_of_colours_and_of_a_teacher(room, run, kept, tmp_path, capsys):
+    for name in ("before", "painted"):
+        shutil.copy(kept / f"{name}.ply", tmp_path / f"{name}.ply")
+    both = [str(tmp_path / "before.ply"), str(tmp_path / "painted.ply"), "--scene", str(room)]
+    capsys.readouterr()
+    assert (
+        main(["compare", *both, "--protocol", "kfgs-color", "--pictures", "1", "--out", str(tmp_path / "color")]) == 0
+    )
+    assert "PSNR" in capsys.readouterr().out
+    (picture,) = (tmp_path / "color").glob("*.png")
+    assert colors_in(picture) > 200
+    teacher = ["--protocol", "feature3dgs-teacher", "--set", "texts=classes", "--set", "split=none", "--pictures", "1"]
+    shutil.copytree(run, tmp_path / "b")
+    assert main(["compare", str(run), str(tmp_path / "b"), *teacher, "--out", str(tmp_path / "taught")]) == 0
+    assert len(list((tmp_path / "taught").glob("*.png"))) == 1
+    surface = ["--protocol", "kfgs-surface", "--out", str(tmp_path / "points")]
+    assert main(["compare", str(run), str(tmp_path / "b"), *surface]) == 0
+    assert "note: no pictures: kfgs-surface/1" in capsys.readouterr().out
+
+
+def test_a_field_that_changed_is_not_drawn(room, run, kept, tmp_path, capsys):
+    one = json.loads((kept / "field.json").read_text())
+    one["digests"]["field"] = "0"
+    (tmp_path / "changed.json").write_text(json.dumps(one))
+    one["inputs"]["field"] = str(tmp_path / "gone")
+    (tmp_path / "gone.json").write_text(json.dumps(one))
+    capsys.readouterr()
+    words = [str(tmp_path / "changed.json"), str(tmp_path / "gone.json"), str(kept / "field.json")]
+    assert main(["compare", *words, "--out", str(tmp_path / "out"), "--pictures", "1"]) == 0
+    said = capsys.readouterr().out
+    assert re.search("changed.json is not drawn: .* has changed since it was scored", said)
+    assert "gone.json is not drawn: " in said
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("{kept}/field.json {kept}/surface.json", r"differ in protocol \(kfgs-pooled/1 and kfgs-surface/1\)"),
+        ("{kept}/field.json {kept}/train.json", r"differ in digest of the truth \(.*digest of the views"),
+        ("{kept}/field.json {kept}/options.json", r"differ in option level \(0 and 1\)"),
+        ("{kept}/field.json", "RUNS: expected at least two different results, got 1"),
+        ("{kept}/field.json {kept}/field.json", "RUNS: expected at least two different results, got 1"),
+        ("", "RUNS: expected at least two different results, got 0"),
+        ("{kept}/field.json {kept}/other.json", "other.json: expected a report in JSON"),
+        ("{kept}/field.json {kept}/nothing.json", "nothing.json: no such file"),
+        ("{kept}/field.json {run} --split train", "differ in digest of the truth"),
+    ],
+)
+def test_numbers_that_cannot_be_compared_are_refused(words, message, kept, run, capsys):
+    one = json.loads((kept / "field.json").read_text())
+    one["options"]["level"] = 1
+    (kept / "options.json").write_text(json.dumps(one))
+    (kept / "other.json").write_text("[]")
+    capsys.readouterr()
+    assert main(["compare", *words.format(kept=kept, run=run).split()]) == 1
+    assert re.search(message, capsys.readouterr().err)
