@@ -49,8 +49,8 @@ command beside it. mIoU and accuracy are `{PROTOCOL}`; IoU7 is `feature3dgs-teac
 Minutes are those of training, without the teacher and the Gaussians that methods share. [Results](results.md) say more about
 rows and shortened schedules. MAPS are the teacher's maps, COLOR is what `kfgs color` writes, OUT is a folder of yours.
 
-This page is made by `python benchmarks/leaderboard.py docs/runs docs/leaderboard.md`; with `--check` the command fails if a number
-in the page is not in the runs.
+This page is made by `python benchmarks/leaderboard.py docs/runs docs/leaderboard.md`; with `--check` the command fails if a
+number in the page is not in the runs.
 """
 
 

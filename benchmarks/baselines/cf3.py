@@ -205,8 +205,10 @@ def fit(task: Task, config: CF3Config) -> Fitted:
         with clock.stage("train"):
             fitted = fit_field(
                 GaussianParams.from_gaussians(cloud), cameras, targets,
-                FieldConfig(steps=max(1, config.steps // config.rounds), densify_until=0, reset_every=0),
-                extent=extent, generator=torch.Generator().manual_seed(task.seed + turn), progress=task.progress,
+                FieldConfig(
+                    steps=max(1, config.steps // config.rounds), densify_until=0, reset_every=0, extent=extent
+                ),
+                generator=torch.Generator().manual_seed(task.seed + turn), progress=task.progress,
             )  # fmt: skip
             cloud = fitted.params.activated().detach()
         history.append(fitted.history[-1] | {"round": turn + 1, "count": len(cloud)})
