@@ -78,13 +78,18 @@ def main() -> None:
 def join(tables: list[dict[str, Any]], about: str = "") -> dict[str, Any]:
     """What is kept of some tables: small rows without paths, in their order."""
     rows: dict[tuple[str, int], dict[str, Any]] = {}
+    configs: dict[tuple[str, int], dict[str, Any]] = {}
     for table in tables:
         for row in table["rows"]:
             request = row["request"]
+            configs[request["row"], request["seed"]] = {**request.get("config", {}), "seed": None}
             rows[request["row"], request["seed"]] = {
                 "row": request["row"], "seed": request["seed"], "machine": table["machine"], "command": command(request),
                 **{name: row[name] for name in KEPT if name in row},
             }  # fmt: skip
+    for key, seed in configs:
+        if any(other[0] == key and config != configs[key, seed] for other, config in configs.items()):
+            sys.exit(f"--add: expected one configuration of {key}, got several; run its seeds again")
     presets = {table["preset"] for table in tables}
     if len(presets) != 1:
         sys.exit(f"--add: expected runs of one preset, got {', '.join(sorted(presets))}; add them under two names")

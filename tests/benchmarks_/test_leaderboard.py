@@ -85,6 +85,10 @@ def test_rows_of_several_tables_are_joined(out, tmp_path, monkeypatch):
     ]  # fmt: skip
     with pytest.raises(SystemExit, match="expected runs of one preset, got cpu, quick"):
         leaderboard.join([table, table | {"preset": "cpu"}])
+    other = row("occam", 1, 0.8)
+    other["request"]["config"] = {"steps": 7, "seed": 1}
+    with pytest.raises(SystemExit, match="expected one configuration of occam, got several"):
+        leaderboard.join([table, table | {"rows": [other]}])
     with pytest.raises(SystemExit, match="--name"):
         run(monkeypatch, tmp_path / "runs", tmp_path / "page.md", "--add", out)
     with pytest.raises(SystemExit, match="expected JSON files of runs"):
