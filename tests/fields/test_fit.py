@@ -341,3 +341,13 @@ def test_losing_every_gaussian_says_so():
     config = replace(SHORT, prune_opacity=0.9)
     with pytest.raises(ValueError, match=tells("config:", "got none", "step 10")):
         fit_field(start(), cameras, targets, config)
+
+
+def test_targets_may_be_arrays(tmp_path):
+    cameras, targets = scene(2)
+    short = replace(SHORT, steps=5)
+    path = tmp_path / "fit.safetensors"
+    found = fit_field(start(), cameras, [target.numpy() for target in targets], short, checkpoint=path)
+    assert same(found.params, fit_field(start(), cameras, targets, short).params)
+    with pytest.raises(TypeError, match=tells("targets[", "str")):
+        fit_field(start(), cameras, ["a.npy", "b.npy"], short)
