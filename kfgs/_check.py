@@ -76,31 +76,63 @@ def as_tensor(name: str, value: Any, *, floating: bool = False) -> Tensor:
     Args:
         name: the argument, for the message.
         value: what was passed.
-        floating: also require floating-point numbers.
+        floating: also require floating-point numbers. The whole numbers of a list become such.
 
     Raises:
-        TypeError: if it is something else, or not of floating point; the message says what to pass instead.
+        TypeError: if it is something else, has a mask, or is not of floating point; the message says what to pass instead.
     """
+    advice = ".float()"
     if not isinstance(value, Tensor):
-        value = _from_numbers(name, value)
+        value, advice = _from_numbers(name, value, floating), '.astype("float32")'
     if floating and not value.is_floating_point():
-        raise TypeError(f"{name}: expected floating-point numbers, got {value.dtype}; convert them with .float()")
+        raise TypeError(f"{name}: expected floating-point numbers, got {value.dtype}; convert them with {advice}")
     return value
 
 
-def _from_numbers(name: str, value: Any) -> Tensor:
+def _from_numbers(name: str, value: Any, floating: bool) -> Tensor:
     """Lists and whatever NumPy calls an array. Our own sequences, which may read a file for each item, are not looked into."""
     is_list = isinstance(value, list | tuple | range | numbers.Real)
-    array = np.empty(0, dtype=object)
+    array, kind = np.empty(0, dtype=object), type(value).__name__
+    if isinstance(value, np.ma.MaskedArray):
+        raise TypeError(
+            f"{name}: expected numbers without a mask, got {kind}; fill the masked ones with .filled(number)"
+        )
+    if is_list and _holds_tensors(value):
+        raise TypeError(f"{name}: expected a tensor, got a {kind} of tensors; join them with torch.stack")
     if is_list or hasattr(value, "__array__"):
-        with contextlib.suppress(ValueError):  # rows of different lengths
+        with contextlib.suppress(
+            ValueError, TypeError, RuntimeError
+        ):  # rows of different lengths, another library's array
             array = np.asarray(value)
     if array.dtype.kind not in "fiub":
-        raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}; {_instead(value)}")
-    if not array.flags.writeable or min(array.strides, default=0) < 0:  # torch warns of the one and refuses the other
+        rows = isinstance(value, list | tuple) and len(value)
+        advice = "pass numbers, in rows of equal length" if rows else _instead(value)
+        raise TypeError(f"{name}: expected a tensor, got {kind}; {advice}")
+    if not array.dtype.isnative:
+        array = array.astype(array.dtype.newbyteorder("="))
+    odd = any(
+        stride < 0 or stride % array.itemsize for stride in array.strides
+    )  # torch refuses it, and warns of read-only
+    if odd or not array.flags.writeable:
         array = array.copy()
-    tensor = torch.as_tensor(array)
-    return tensor.to(torch.get_default_dtype()) if is_list and tensor.is_floating_point() else tensor
+    try:
+        tensor = torch.as_tensor(array)
+    except TypeError as error:
+        raise TypeError(
+            f'{name}: expected numbers of a type that torch has, got {array.dtype}; convert them with .astype("float64")'
+        ) from error
+    converted = is_list and (tensor.is_floating_point() or (floating and tensor.dtype != torch.bool))
+    return tensor.to(torch.get_default_dtype()) if converted else tensor
+
+
+def _holds_tensors(value: Any) -> bool:
+    """Whether the first number of nested lists is a tensor that NumPy cannot read: with gradient, bfloat16, or elsewhere."""
+    while isinstance(value, list | tuple) and len(value):
+        unread = (one for one in value if isinstance(one, Tensor))
+        if any(one.requires_grad or one.dtype == torch.bfloat16 or one.device.type != "cpu" for one in unread):
+            return True
+        value = value[0]
+    return False
 
 
 def as_array(values: Any, name: str = "values") -> np.ndarray[Any, Any]:

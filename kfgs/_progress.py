@@ -3,7 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from numbers import Real
 from typing import Any
+
+import numpy as np
 
 Progress = bool | Callable[[dict[str, Any]], None]
 """True shows a bar, a function is called with each new row, False does neither."""
+
+
+def as_progress(progress: Any) -> Progress:
+    """A function as it is; a number or NumPy's truth value as a bool, so that `is True` may be asked; None as False.
+
+    Raises:
+        TypeError: if it is something else.
+    """
+    if callable(progress):
+        return progress  # type: ignore[no-any-return]
+    if not isinstance(progress, Real | np.bool_ | None):
+        raise TypeError(
+            f"progress: expected True, False or a function, got {progress!r:.60}; True shows a bar, a function gets each row"
+        )
+    return bool(progress)
+
+
+def as_bar(progress: Any) -> bool:
+    """`as_progress` where there is no history, so no function can be called.
+
+    Raises:
+        TypeError: if it is a function, or something else.
+    """
+    found = as_progress(progress)
+    if callable(found):
+        raise TypeError(
+            "progress: expected True or False, got a function; there are no rows to call it with, so pass True for a bar"
+        )
+    return found

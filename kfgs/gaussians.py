@@ -51,7 +51,7 @@ class Gaussians:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not isinstance(value, Tensor | None):
-                object.__setattr__(self, name, as_tensor(name, value))
+                object.__setattr__(self, name, as_tensor(name, value, floating=name != "labels"))
         for name, value in self._tensors().items():
             as_tensor(name, value, floating=name != "labels")
         if self.labels is not None and self.labels.is_floating_point():

@@ -111,9 +111,14 @@ def test_arrays_become_tensors_that_share_their_memory():
     ("value", "advice"),
     [
         ("chair", ("str", "'chair'", "embedding")),
-        ([[1.0, 2.0], [3.0]], ("list", "torch.as_tensor")),
-        ([None, 1.0], ("list", "torch.as_tensor")),
-        (["chair"], ("list", "torch.as_tensor")),
+        ([[1.0, 2.0], [3.0]], ("list", "rows of equal length")),
+        ([None, 1.0], ("list", "pass numbers")),
+        (["chair"], ("list", "pass numbers")),
+        ([torch.ones(2, requires_grad=True)] * 2, ("list of tensors", "torch.stack")),
+        ([torch.ones(2, dtype=torch.bfloat16)], ("list of tensors", "torch.stack")),
+        ([[1.0], torch.ones(1, requires_grad=True)], ("list of tensors", "torch.stack")),
+        (np.ones(2, dtype=np.longdouble), (str(np.dtype(np.longdouble)), "float64")),
+        (np.ma.masked_greater(np.arange(3.0), 1), ("MaskedArray", ".filled")),
         ({"a": 1.0}, ("dict", "torch.as_tensor")),
         (SimpleNamespace(codewords=1), ("SimpleNamespace", ".codewords")),
         (np.array(["a"]), ("ndarray", "torch.as_tensor")),
@@ -131,8 +136,29 @@ def test_lists_of_numbers_become_tensors():
     assert rows.tolist() == [[0, 1.5], [2, 3]]
     assert as_tensor("labels", [2, 0]).dtype == torch.int64
     assert as_tensor("mask", [True, False]).dtype == torch.bool
+    with pytest.raises(TypeError, match=tells("rows", "bool", "floating")):
+        as_tensor("rows", [True, False], floating=True)
+
+
+def test_whole_numbers_of_a_list_are_floats_where_floats_are_meant():
+    """But not those of a tensor or an array, which say what they are: they are refused."""
+    assert as_tensor("rows", [[1, 0], [0, 1]], floating=True).dtype == torch.float32
     with pytest.raises(TypeError, match=tells("rows", "int64", ".float()")):
-        as_tensor("rows", [1, 2], floating=True)
+        as_tensor("rows", torch.tensor([1, 2]), floating=True)
+    with pytest.raises(TypeError, match=tells("rows", "int64", ".astype")):
+        as_tensor("rows", np.array([1, 2]), floating=True)
+
+
+def test_the_other_byte_order_is_converted():
+    found = as_tensor("x", np.array([1.0, 2.5], dtype=">f4"))
+    assert (found.dtype, found.tolist()) == (torch.float32, [1, 2.5])
+    assert as_tensor("x", np.array([1, 2], dtype=">i8")).tolist() == [1, 2]
+
+
+def test_a_column_of_a_record_is_copied():
+    """Its strides are no multiple of a number: torch refuses to share it."""
+    record = np.zeros(3, dtype=[("a", "u1"), ("b", "f4")])
+    assert as_tensor("x", record["b"]).tolist() == [0, 0, 0]
 
 
 def test_arrays_that_torch_cannot_share_are_copied():

@@ -159,7 +159,7 @@ def test_arrays_are_accepted_and_given():
 
 def test_values_that_cannot_be_gaussians():
     values = cloud(3, labelled=False).to_numpy()
-    with pytest.raises(TypeError, match=tells("means", "int64", ".float()")):
+    with pytest.raises(TypeError, match=tells("means", "int64", ".astype")):
         Gaussians(**values | {"means": np.zeros((3, 3), dtype=np.int64)})
     with pytest.raises(TypeError, match=tells("labels", "float32", ".long()")):
         Gaussians(**values, labels=torch.zeros(3))

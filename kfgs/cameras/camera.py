@@ -11,7 +11,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from .._check import check_choice, check_range, check_shapes
+from .._check import as_tensor, check_choice, check_range, check_shapes
 
 DistortionModel = Literal["brown_conrady", "kannala_brandt"]
 COEFFICIENTS = {"brown_conrady": (4, 5, 8), "kannala_brandt": (4,)}
@@ -52,7 +52,7 @@ class Camera:
     is (0.5, 0.5), so a centred principal point is (width / 2, height / 2). K is in pixels, without skew.
     A camera with distortion must be undistorted (`undistort`) before anything is rasterised through it.
     Only what is deeper than `near` is drawn. It is a length in world units and must suit the size of the scene: `load_scene`
-    chooses it, `Similarity.apply_to_camera` scales it.
+    chooses it, `Similarity.apply_to_camera` scales it. NumPy arrays and lists are accepted as matrices.
     """
 
     viewmat: Tensor  # [4, 4] world to camera
@@ -64,10 +64,11 @@ class Camera:
     near: float = NEAR  # > 0, world units: the smallest depth that is drawn
 
     def __post_init__(self) -> None:
+        for name, matrix in (("viewmat", self.viewmat), ("K", self.K)):  # integers would truncate the points
+            if not isinstance(matrix, Tensor):
+                object.__setattr__(self, name, as_tensor(name, matrix, floating=True))
+            as_tensor(name, getattr(self, name), floating=True)
         check_shapes(("viewmat", self.viewmat, "4 4"), ("K", self.K, "3 3"))
-        for name, matrix in (("viewmat", self.viewmat), ("K", self.K)):
-            if not matrix.is_floating_point():  # integers would truncate the points
-                raise TypeError(f"{name}: expected floating point, got {matrix.dtype}; convert it with .float()")
         for name, size in (("width", self.width), ("height", self.height)):
             if not (isinstance(size, numbers.Real) and math.isfinite(size) and size >= 1 and int(size) == size):
                 raise ValueError(f"{name}: expected a positive whole number of pixels, got {size!r}; pass an integer")

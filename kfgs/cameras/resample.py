@@ -6,7 +6,7 @@ import torch
 from kornia.geometry.transform import resize
 from torch import Tensor
 
-from .._check import check_shapes
+from .._check import as_tensor, check_shapes
 
 
 def to_bchw(map: Tensor) -> Tensor:  # [H, W, D] -> [1, D, H, W]
@@ -51,6 +51,7 @@ def resize_map(
         >>> resize_map(torch.tensor([[[0.0], [1.0], [2.0], [3.0]]]), (1, 2))[..., 0]
         tensor([[0.5000, 2.5000]])
     """
+    map = as_tensor("map", map)
     check_shapes(("map", map, "H W D"))
     if not map.is_floating_point():
         raise TypeError(f"map: expected floating point, got {map.dtype}; use resize_labels for class indices")
@@ -81,6 +82,7 @@ def resize_labels(
         >>> resize_labels(torch.tensor([[0, 1, 2, -1]]), (1, 2))  # centres 1.0 and 3.0 lie in pixels 1 and 3
         tensor([[ 1, -1]])
     """
+    labels = as_tensor("labels", labels)
     check_shapes(("labels", labels, "H W"))
     if labels.is_floating_point():
         raise TypeError(f"labels: expected integers, got {labels.dtype}; use resize_map for continuous values")

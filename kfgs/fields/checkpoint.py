@@ -15,6 +15,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from .._card import short_repr
+from .._check import as_tensor
 from .._files import atomic_path, digest_value
 from ..cameras import Camera
 from ..cameras.camera import NEAR
@@ -55,7 +56,7 @@ def identify_fit(
     return {
         "params": _digest_tensors(list(params.to_tensors().values())),
         "cameras": _digest_tensors(views),
-        "targets": _digest_tensors([torch.tensor(len(targets)), targets[0]]),
+        "targets": _digest_tensors([torch.tensor(len(targets)), as_tensor("targets[0]", targets[0], floating=True)]),
         "config": digest_value(options),
         "generator": _digest_tensors([generator.get_state()]),
         **{name: digest_value(value) for name, value in others.items()},

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import numbers
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -84,6 +86,10 @@ class FieldConfig:
         if self.max_gaussians is not None:
             _check_count("max_gaussians", self.max_gaussians, 1)
         if self.extent is not None:
+            if not isinstance(self.extent, numbers.Real) or isinstance(self.extent, bool):
+                raise TypeError(
+                    f"extent: expected a number in world units, got {self.extent!r:.60}; pass a float, or None"
+                )
             check_range("extent", self.extent, 0, closed=_POSITIVE)
         for name in ("means_lr", "means_lr_final", "adam_eps"):
             check_range(name, getattr(self, name), 0, closed=_POSITIVE)
@@ -155,6 +161,16 @@ class FieldConfig:
         coarse = tuple({max(1, round(last * ratio)): divisor for last, divisor in self.coarse}.items())
         scaled: dict[str, Any] = {name: round(getattr(self, name) * ratio) for name in names}
         return replace(self, steps=steps, coarse=coarse, **scaled)
+
+
+def check_extent(extent: float) -> float:
+    """Return the extent computed for a scene; a ValueError if it is 0 or not finite."""
+    if not (math.isfinite(extent) and extent > 0):
+        raise ValueError(
+            f"cameras: expected views that tell the size of the scene, got an extent of {extent}; pass its size with "
+            "FieldConfig(extent=...)"
+        )
+    return extent
 
 
 def _check_count(name: str, value: object, low: int) -> None:

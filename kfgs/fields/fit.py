@@ -12,11 +12,11 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from .._card import short_repr
-from .._progress import Progress
+from .._progress import Progress, as_progress
 from ..cameras import Camera
 from ..cameras.bounds import camera_extent
 from .checkpoint import identify_fit, read_checkpoint, write_checkpoint
-from .config import FieldConfig
+from .config import FieldConfig, check_extent
 from .loss import Loss, l1_loss
 from .params import GaussianParams
 from .trainer import Trainer
@@ -70,15 +70,15 @@ def fit_field(
         The fitted params, and the history.
 
     Raises:
-        TypeError: if `params` has another type.
-        ValueError: if counts or shapes disagree, a camera has distortion, the checkpoint belongs to another fit, or no
-            Gaussian is left.
+        TypeError: if `params`, a target or `progress` has another type.
+        ValueError: if the cameras' extent is 0 or not finite, counts or shapes disagree, a camera has distortion, the
+            checkpoint belongs to another fit, or no Gaussian is left.
         FloatingPointError: if the loss is no longer finite.
     """
-    config = config or FieldConfig()
+    config, progress = config or FieldConfig(), as_progress(progress)
     generator = generator or torch.Generator().manual_seed(0)
     _check_views(params, cameras, targets)
-    extent = camera_extent(cameras, params.means) if config.extent is None else config.extent
+    extent = check_extent(camera_extent(cameras, params.means)) if config.extent is None else config.extent
     trainer = Trainer(params, cameras, targets, config, extent, loss, generator)
     path, identity = (Path(checkpoint) if checkpoint is not None else None), {}
     if path is not None:

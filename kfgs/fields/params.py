@@ -12,7 +12,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from .._check import check_range, check_shapes, check_whole
+from .._check import as_tensor, check_range, check_shapes, check_whole
 from ..gaussians import Gaussians
 from ..splat.sh import rgb_to_sh0
 
@@ -39,6 +39,9 @@ class GaussianParams:
     sh_rest: Tensor | None = None  # [N, K - 1, 3], K = (degree + 1)^2; None at degree 0
 
     def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not isinstance(value, Tensor | None):
+                object.__setattr__(self, name, as_tensor(name, value, floating=True))
         check_shapes(
             ("means", self.means, "N 3"),
             ("quats", self.quats, "N 4"),
@@ -193,6 +196,8 @@ class GaussianParams:
             )
         if channels is not None:
             check_range("channels", channels, 1)
+        points = as_tensor("points", points, floating=isinstance(points, list | tuple))
+        colors = None if colors is None else as_tensor("colors", colors)
         check_shapes(("points", points, "P 3"), ("colors", colors, "P 3"))
         check_whole("sh_degree", sh_degree, 0, 3)
         check_range("initial_opacity", initial_opacity, 0, 1, closed=(False, False))

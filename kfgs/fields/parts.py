@@ -56,13 +56,16 @@ def check_parts(
 
 
 def checked_classes(classes: Classes) -> Classes:
-    """Return classes unchanged, an array as a tensor; a single name is an error."""
+    """Return classes unchanged, an array or a list of rows as a tensor; a single name is an error."""
     if isinstance(classes, str):
         raise TypeError(
             f"classes: expected a LabelSet or embeddings [C, D], got the name {classes!r}; query({classes!r}) finds the "
             "Gaussians of one class"
         )
-    return as_tensor("classes", classes, floating=True) if isinstance(classes, np.ndarray) else classes
+    rows = isinstance(classes, list | tuple) and not any(
+        isinstance(one, str) for one in classes
+    )  # names: see class_rows
+    return as_tensor("classes", classes, floating=True) if rows or isinstance(classes, np.ndarray) else classes
 
 
 def teacher_name(info: dict[str, Any]) -> str | None:

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._check import as_tensor
 from ..cameras import Camera
 from ..splat import rasterize
 from .checkpoint import Checkpoint
@@ -118,7 +119,8 @@ class Trainer:
         return self._queue.pop()
 
     def _target(self, view: int) -> Tensor:  # [h, w, D]
-        target, channels = self._targets[view], self.optimizer.params.channels
+        target = as_tensor(f"targets[{view}]", self._targets[view], floating=True)
+        channels = self.optimizer.params.channels
         if target.ndim != 3 or target.shape[2] != channels:
             raise ValueError(
                 f"targets[{view}]: expected [h, w, D] with D = {channels} (from params), got {tuple(target.shape)}; "

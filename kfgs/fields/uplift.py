@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from .._card import short_repr
 from .._check import check_range, check_whole
+from .._progress import as_bar
 from .._rows import row_norms, unit_rows
 from ..cameras import Camera, resize_map
 from ..gaussians import Gaussians
@@ -114,13 +115,14 @@ def uplift_maps(
         report: called with a line per step.
 
     Raises:
+        TypeError: if `progress` is a function: there are no rows to call it with.
         ValueError: if counts or shapes disagree, a map is not finite, or no view shows any Gaussian.
 
     Note:
         To continue by training, start `fit_field` with `GaussianParams.from_gaussians(found.gaussians)` and the maps
         `found.latents.encode(unit features)`.
     """
-    config, say = config or UpliftConfig(), report or (lambda text: None)
+    config, say, progress = config or UpliftConfig(), report or (lambda text: None), as_bar(progress)
     if len(gaussians) == 0:
         raise ValueError("gaussians: expected at least one, got none; there is nothing to carry features to")
     if len(cameras) == 0 or len(cameras) != len(maps):

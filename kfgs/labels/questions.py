@@ -35,7 +35,7 @@ def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [
     """The embeddings of some classes, checked against a field's features. Warns if another teacher embedded them.
 
     Args:
-        classes: a label set, or embeddings as a tensor or an array.
+        classes: a label set, or embeddings as a tensor, an array or a list of rows.
         dim: D of the field.
         info: of the field; it may name its teacher.
 
@@ -46,13 +46,15 @@ def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [
     if isinstance(classes, LabelSet):
         _check_words(classes, dim, info)
         return classes.embeddings
-    if not hasattr(classes, "shape"):
+    try:
+        rows = as_tensor("embeddings", classes, floating=isinstance(classes, list | tuple))
+    except TypeError as error:
         raise TypeError(
             f"classes: expected a LabelSet or embeddings [C, {dim}], got {type(classes).__name__}; load_label_set reads one, "
             "make_label_set makes one"
-        )
-    check_rows("embeddings", classes, ("C",), dim)
-    return as_tensor("embeddings", classes)
+        ) from error
+    check_rows("embeddings", rows, ("C",), dim)
+    return rows
 
 
 def make_question(

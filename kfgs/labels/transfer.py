@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -196,16 +197,23 @@ def label_splats(
     Args:
         splats: the splat to label; old labels are replaced.
         labelled: Gaussians with labels, for instance from `SemanticField.label`, or a labelled splat.
-        classes: the names of the classes; by default those of a labelled splat.
+        classes: the names of the classes; by default those of a labelled splat. Gaussians alone, as `SemanticField.label`
+            gives them, know no names: without `classes` the result has none.
         distance: lambda, the distance within which a label is carried over, in world units; None: `default_distance`.
         method: which label wins, see `transfer_labels`.
 
     Returns:
-        The splat with `labels`, the extra column `score` (`Transfer.scores`), class names, and details in `info["labels"]`.
+        The splat with `labels`, the extra column `score` (`Transfer.scores`), class names if they are known, and details in
+        `info["labels"]`.
 
     Raises:
+        TypeError: if `splats` or `labelled` is neither Gaussians nor a splat, for instance a path.
         ValueError: if `labelled` carries no labels, or as `transfer_labels`.
     """
+    for name, one in (("splats", splats), ("labelled", labelled)):
+        if not isinstance(one, SplatFile | Gaussians):
+            advice = "read_splats reads a file" if isinstance(one, str | Path) else "transfer_labels takes positions"
+            raise TypeError(f"{name}: expected Gaussians or a splat, got {type(one).__name__}; {advice}")
     splats, source = (SplatFile(one) if isinstance(one, Gaussians) else one for one in (splats, labelled))
     if source.gaussians.labels is None:
         raise ValueError(

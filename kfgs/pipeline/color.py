@@ -16,7 +16,7 @@ from torch import Tensor
 from .._card import short_repr
 from .._check import check_range, check_whole
 from .._files import read_json
-from .._progress import Progress
+from .._progress import Progress, as_progress
 from ..cameras import Camera, resize_map
 from ..fields import ColorLoss, FieldConfig, FieldFit, GaussianParams, fit_field
 from ..formats import read_splats, write_splats
@@ -199,7 +199,7 @@ def fit_color(
         ValueError: if a camera has distortion, there is no such device, the scene has no points to start from, or the
             split has no views.
     """
-    config = config or ColorConfig.paper()
+    config, progress = config or ColorConfig.paper(), as_progress(progress)
     scene.views(config.split)  # raises for a split without views
     check_scene(scene)
     return make_color(Run(Path(folder), report), scene, config, training_device(device), progress, overwrite=True)

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._files import digest_value, read_json, write_json
-from .._progress import Progress
+from .._progress import Progress, as_progress
 from ..cameras import Camera
 from ..fields import (
     FieldFit,
@@ -44,7 +44,7 @@ from ..scenes import Scene
 from .color import ColorConfig, find_color
 from .config import FitConfig
 from .fuse import answers_stage, find_geometry, uplift_stage, without_lens
-from .maps import KnownFeatures, Maps, UndistortedMaps, check_readable, map_digests, map_shape
+from .maps import KnownFeatures, Maps, UndistortedMaps, as_maps, check_readable, map_digests, map_shape
 from .stages import Run, Stage, UnfinishedError, describe_lens, digest_scene, stage_generator
 from .train import check_scene, field_stage, training_device, with_extent
 
@@ -191,7 +191,7 @@ def _check_inputs(scene: Scene, views: Sequence[int], maps: Maps, config: FitCon
 
 def fit_scene(
     scene: Scene,
-    maps: Maps,  # teacher maps of the views of config.split, in their order
+    maps: Maps | Sequence[Tensor],  # teacher maps of the views of config.split, in their order
     folder: str | Path,
     config: FitConfig | None = None,
     *,
@@ -203,8 +203,9 @@ def fit_scene(
 
     Args:
         scene: posed, undistorted views with their sparse points.
-        maps: one teacher map [h, w, D] per training view; read one at a time. When the stages that read them are finished,
-            the maps may be deleted (`discard_maps`), except for the paper's mode `decouple`.
+        maps: one teacher map [h, w, D] per training view; read one at a time; a `FeatureFolder`, or a list in memory. When
+            the stages that read them are finished, the maps may be deleted (`discard_maps`), except for the paper's mode
+            `decouple`.
         folder: the run folder; the finished field goes to `folder/field`.
         config: the method and its options.
         splat: of method `fuse`, the Gaussians to fuse onto, in the scene's frame: a splat file or its content. None trains them
@@ -214,11 +215,12 @@ def fit_scene(
         progress: True shows bars; a function receives the history rows of every trained stage as they appear.
 
     Raises:
+        TypeError: if `maps` is neither, or `progress` neither a bool nor a function.
         ValueError: if the counts of views and maps differ, a camera has distortion, there is no such device, a splat is given
             to the paper's method, or its mode `decouple` gets `RecomputedMaps`.
         FileNotFoundError: if a stage needs maps that were discarded, or a picture is missing.
     """
-    config = config or FitConfig()
+    config, progress, maps = config or FitConfig(), as_progress(progress), as_maps(maps)
     target_device = training_device(config.device)
     _check_inputs(scene, scene.views(config.split), maps, config)
     if splat is not None and config.method == "paper":

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from .._check import as_tensor
 from .._rows import EPS, row_norms
 from ..cameras import Camera, undistort
 from ..quant.sampling import SAMPLES, sample_grid
-from .stages import Run, describe_lens
+from .stages import Run, describe_lens, digest_tensors
 
 
 class Maps(Protocol):
@@ -91,6 +93,42 @@ class UndistortedMaps:
             return features
         straight, _, inside = undistort(features, lens)
         return straight * inside[..., None]
+
+
+class MapsInMemory(Sequence[Tensor]):
+    """Maps that are tensors or arrays: they have no files, and their values are digested."""
+
+    files: Sequence[Path] = ()
+
+    def __init__(self, maps: Sequence[Any]) -> None:
+        self._maps = [as_tensor(f"maps[{i}]", one, floating=True) for i, one in enumerate(maps)]
+
+    def __len__(self) -> int:
+        return len(self._maps)
+
+    def __getitem__(self, i: int) -> Tensor:  # type: ignore[override]  # [h, w, D]
+        return self._maps[i]
+
+    def digests(self) -> list[list[str]]:
+        """A number and the SHA-256 of the values of each map."""
+        numbers = (one.float() if one.dtype == torch.bfloat16 else one for one in self._maps)
+        return [[f"map {i}", digest_tensors(one)] for i, one in enumerate(numbers)]
+
+
+def as_maps(maps: Any) -> Maps:
+    """Maps as they are; a list of tensors or arrays, or one array of all maps, as `MapsInMemory`.
+
+    Raises:
+        TypeError: if it is something else.
+    """
+    if isinstance(maps, list | tuple) or (isinstance(maps, Tensor | np.ndarray) and maps.ndim == 4):
+        return MapsInMemory(maps)  # type: ignore[return-value, arg-type]
+    if not (hasattr(maps, "files") and hasattr(maps, "__getitem__")):
+        raise TypeError(
+            f"maps: expected teacher maps, got {type(maps).__name__}; read them with FeatureFolder(path).of(scene), or pass a "
+            "list of tensors [h, w, D]"
+        )
+    return maps  # type: ignore[no-any-return]
 
 
 class KnownFeatures(Sequence[Tensor]):

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._card import short_repr
 from ..evaluation import Encode, LabelTruth, MaskTruth, Method, PointTruth, Report, View, best_labels, label_view
 from ..evaluation.class_lists import load_classes
 from ..evaluation.relevancy import encode_unit
@@ -34,6 +35,9 @@ class Shown(NamedTuple):
     """By title: picture, errors, share of wrong pixels (of colours, the mean difference)."""
     labels: Any  # all labels that occur, for the legend
     names: Sequence[str]
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def check_comparable(reports: Mapping[str, Report]) -> None:

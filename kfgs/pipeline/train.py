@@ -13,6 +13,7 @@ from safetensors.torch import load_file, save_file
 
 from .._files import write_json
 from ..fields import FieldConfig, FieldFit, GaussianParams
+from ..fields.config import check_extent
 from ..scenes import Scene
 from ..splat import available_engines
 from .stages import Run, Stage
@@ -53,7 +54,7 @@ def check_scene(scene: Scene) -> None:
 
 def with_extent(config: FieldConfig, scene: Scene) -> FieldConfig:
     """The options with the scene's extent, unless they have one of their own."""
-    return replace(config, extent=float(scene.extent if config.extent is None else config.extent))
+    return replace(config, extent=float(check_extent(scene.extent) if config.extent is None else config.extent))
 
 
 def field_stage(

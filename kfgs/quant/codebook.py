@@ -90,7 +90,9 @@ class Codebook:
     codewords: Tensor  # [K, D]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "codewords", as_tensor("codewords", self.codewords))
+        object.__setattr__(
+            self, "codewords", as_tensor("codewords", self.codewords, floating=isinstance(self.codewords, list | tuple))
+        )
         check_shapes(("codewords", self.codewords, "K D"))
         if self.size < 1 or not self.codewords.is_floating_point():
             raise ValueError(

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from .._card import short_repr
 from .._check import check_range, check_whole
-from .._progress import Progress
+from .._progress import Progress, as_progress
 from .._rows import row_norms, unit_rows
 from .autoencoder import Autoencoder, Layer, mlp, unit_latents
 from .codebook import Codebook
@@ -131,6 +131,7 @@ def fit_autoencoder(
     weights = [tensor.requires_grad_() for layer in (*encoder, *norms, *decoder) for tensor in layer]
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate, weight_decay=config.weight_decay, fused=True)
     history: list[dict[str, Any]] = []
+    progress = as_progress(progress)
     with _quick_on_a_cpu():
         for step in tqdm(range(1, config.steps + 1), desc="autoencoder", disable=progress is not True):
             latents = unit_latents(_normalised_mlp(encoder, norms, target))

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from .._card import short_repr
 from .._check import as_tensor, check_range, check_shapes, check_whole
-from .._progress import Progress
+from .._progress import Progress, as_progress
 from .._rows import EPS, row_norms, unit_rows
 from .codebook import Codebook
 from .evolve import EvolvingCodebook, Tally, prune
@@ -163,7 +163,7 @@ def fit_codebook(
         raise ValueError("maps: expected at least one feature map, got none; encode the training images first")
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     fit = _fit_adaptive if config.adaptive else _fit_paper
-    return fit(maps, config, generator, progress)
+    return fit(maps, config, generator, as_progress(progress))
 
 
 def _fit_adaptive(

@@ -14,6 +14,7 @@ from .._card import short_repr
 from .._check import check_shapes, check_whole
 from .._rows import unit_rows
 from ..labels import label_codewords
+from ..quant.fit_codebook import CodebookFit
 from .figures import (
     INK,
     LINES,
@@ -139,7 +140,7 @@ def plot_codebook_report(
 
 
 def plot_codebook_growth(
-    histories: Mapping[str, Sequence[Row]] | Sequence[Row],
+    histories: Mapping[str, Sequence[Row] | CodebookFit] | Sequence[Row] | CodebookFit,
     path: str | Path | None = None,
     *,
     ax: Sequence[Axes] | np.ndarray[Any, Any] | None = None,
@@ -147,7 +148,7 @@ def plot_codebook_growth(
     """Draw how codebooks grew, a line per scene (Figure 6): size, codewords added and pruned, and coverage.
 
     Args:
-        histories: scene name to `CodebookFit.history`, or one history alone.
+        histories: scene name to a `CodebookFit` or its history, or one of them alone.
         path: a .png file to write; None writes none.
         ax: three axes to draw into; None makes a figure.
 
@@ -158,9 +159,10 @@ def plot_codebook_growth(
         histories = {"": histories}
     if not histories:
         raise ValueError("histories: expected at least one scene, got none; pass {name: CodebookFit.history}")
+    rows = {name: one.history if isinstance(one, CodebookFit) else one for name, one in histories.items()}
     axes, own = panels_for(ax, 3, 3, 12.6, 3.6)
-    _draw_growth(axes, histories)
-    if any(histories):
+    _draw_growth(axes, rows)
+    if any(rows):
         lines, names = axes[0].get_legend_handles_labels()
         if own:
             finish(axes[0], None).legend(lines, names, loc="outside right upper", frameon=False)

@@ -173,3 +173,13 @@ def test_a_camera_shows_itself_in_one_line():
     assert repr(camera) == "Camera('a.png', 64x48, fov 90.0, at (0, -4, 0.5))"
     lens = Distortion("brown_conrady", (-0.1, 0, 0, 0))
     assert repr(replace(camera, distortion=lens)).endswith("), brown_conrady)")
+
+
+def test_matrices_may_be_arrays_or_lists():
+    camera = Camera(np.eye(4), np.eye(3), 4, 4)
+    assert camera.viewmat.dtype == camera.K.dtype == torch.float64
+    assert torch.equal(Camera(np.eye(4).tolist(), [[1, 0, 2], [0, 1, 2], [0, 0, 1]], 4, 4).center, torch.zeros(3))
+    with pytest.raises(TypeError, match=tells("viewmat", "int64", "floating")):
+        Camera(np.eye(4, dtype=np.int64), np.eye(3), 4, 4)
+    with pytest.raises(TypeError, match=tells("K", "str")):
+        Camera(np.eye(4), "pinhole", 4, 4)

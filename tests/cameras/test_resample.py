@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 from messages import tells
@@ -118,3 +119,11 @@ def test_resample_refusals():
     for size in ((0, 2), (2.5, 2), (1, 2, 3)):
         with pytest.raises(ValueError, match=tells("size:", "(height, width)", f"got {size}")):
             resize_map(torch.zeros(4, 5, 1), size)
+
+
+def test_arrays_are_resized_as_tensors_are():
+    array = ramp(4, 6).numpy()
+    assert torch.equal(resize_map(array, (2, 3)), resize_map(torch.from_numpy(array), (2, 3)))
+    assert resize_labels(np.array([[0, 1, 2, -1]]), (1, 2)).tolist() == [[1, -1]]
+    with pytest.raises(TypeError, match=tells("map", "str")):
+        resize_map("a.png", (2, 3))

@@ -86,3 +86,9 @@ def test_a_very_short_schedule_keeps_one_pair_per_step():
 def test_wrong_values_of_colours(change, message):
     with pytest.raises(ValueError, match=tells(*message)):
         FieldConfig(**change)
+
+
+@pytest.mark.parametrize("extent", ["2", True, [1.0]])
+def test_an_extent_that_is_no_number_is_refused(extent):
+    with pytest.raises(TypeError, match=tells("extent", repr(extent), "float")):
+        FieldConfig(extent=extent)

@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from messages import tells
@@ -341,3 +342,33 @@ def test_losing_every_gaussian_says_so():
     config = replace(SHORT, prune_opacity=0.9)
     with pytest.raises(ValueError, match=tells("config:", "got none", "step 10")):
         fit_field(start(), cameras, targets, config)
+
+
+def test_targets_may_be_arrays(tmp_path):
+    cameras, targets = scene(2)
+    short = replace(SHORT, steps=5)
+    path = tmp_path / "fit.safetensors"
+    found = fit_field(start(), cameras, [target.numpy() for target in targets], short, checkpoint=path)
+    assert same(found.params, fit_field(start(), cameras, targets, short).params)
+    with pytest.raises(TypeError, match=tells("targets[", "str")):
+        fit_field(start(), cameras, ["a.npy", "b.npy"], short)
+
+
+def test_a_scene_without_size_needs_an_extent():
+    camera = look_at_origin(0.0)
+    params = start(2).map(lambda value: value)
+    params = replace(params, means=camera.center.repeat(len(params), 1))
+    with pytest.raises(ValueError, match=tells("cameras", "extent of 0", "FieldConfig(extent=...)")):
+        fit_field(params, [camera], [torch.zeros(4, 4, CHANNELS)], replace(SHORT, extent=None))
+
+
+def test_progress_is_a_truth_value_or_a_function(capfd):
+    cameras, targets = scene(1)
+    for shown in (1, np.True_):
+        fit_field(start(), cameras, targets, replace(SHORT, steps=2), progress=shown)
+        assert "field" in capfd.readouterr().err
+    for hidden in (0, np.False_):
+        fit_field(start(), cameras, targets, replace(SHORT, steps=2), progress=hidden)
+        assert "field" not in capfd.readouterr().err
+    with pytest.raises(TypeError, match=tells("progress", "'bar'", "function")):
+        fit_field(start(), cameras, targets, SHORT, progress="bar")

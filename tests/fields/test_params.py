@@ -252,3 +252,16 @@ def test_a_field_has_features_or_colours(change, message):
 def test_wrong_colours(change, message):
     with pytest.raises(ValueError, match=tells(*message)):
         GaussianParams.from_points(cloud(10), **({"colors": torch.zeros(10, 3)} | change))
+
+
+def test_points_and_colors_may_be_arrays_or_lists():
+    points, colors = cloud(20).double().numpy(), np.full((20, 3), 128, dtype=np.uint8)
+    found = GaussianParams.from_points(points, colors=colors)
+    assert found.means.dtype == torch.float64
+    same = GaussianParams.from_points(torch.from_numpy(points), colors=torch.from_numpy(colors))
+    assert all(torch.equal(value, same.to_tensors()[name]) for name, value in found.to_tensors().items())
+    assert GaussianParams.from_points([[0, 0, 0], [1, 0, 0]], 2).means.tolist() == [[0, 0, 0], [1, 0, 0]]
+    again = GaussianParams(**{name: value.numpy() for name, value in found.to_tensors().items()})
+    assert torch.equal(again.activated().scales, found.activated().scales)
+    with pytest.raises(TypeError, match=tells("points", "str")):
+        GaussianParams.from_points("points.ply", 2)

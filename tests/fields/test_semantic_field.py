@@ -528,3 +528,10 @@ def test_names_and_whole_numbers_in_the_place_of_embeddings():
         made.query(torch.ones(DIM, dtype=torch.int64))
     with pytest.raises(TypeError, match=tells("camera", "Gaussians", "scene.cameras")):
         made.render(made.gaussians)
+
+
+def test_classes_may_be_a_list_of_rows():
+    rows = embeddings()
+    assert torch.equal(field().classify(rows.tolist()).labels, field().classify(rows).labels)
+    with pytest.raises(TypeError, match=tells("classes", "LabelSet", "list")):
+        field().classify(["chair", "table"])

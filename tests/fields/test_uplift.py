@@ -524,3 +524,9 @@ def test_options_are_checked():
     assert UpliftConfig().max_gaussians is None
     assert UpliftConfig.field() == UpliftConfig(max_gaussians=30_000)
     assert UpliftConfig.field(max_gaussians=7, keep=0.9) == UpliftConfig(max_gaussians=7, keep=0.9)
+
+
+def test_a_function_has_no_rows_to_hear_of():
+    views = cameras()
+    with pytest.raises(TypeError, match=tells("progress", "function", "True")):
+        uplift_maps(cloud(), views, random_maps(views), PLAIN, progress=print)

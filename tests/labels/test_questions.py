@@ -1,5 +1,6 @@
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 from messages import tells
@@ -174,3 +175,11 @@ def test_arrays_are_taken_as_tensors_are():
     assert class_rows(ROWS.numpy(), 6, {}).equal(ROWS)
     with pytest.raises(TypeError, match=tells("classes", "LabelSet", "list")):
         class_rows(["chair"], 6, {})
+
+
+def test_classes_may_be_a_list_of_rows():
+    assert torch.equal(class_rows(ROWS.tolist(), 6, {}), ROWS)
+    assert torch.equal(class_rows(np.eye(3, 6, dtype=np.float32), 6, {}), ROWS)
+    for wrong in (["chair", "table"], [[1.0], [1.0, 2.0]], 5j):
+        with pytest.raises(TypeError, match=tells("classes", "LabelSet", type(wrong).__name__, "make_label_set")):
+            class_rows(wrong, 6, {})

@@ -216,3 +216,8 @@ def test_a_splat_is_labelled_in_one_call():
     assert again.extra["score"].tolist() == [1.0, 1.0, 0.0]
     with pytest.raises(ValueError, match=tells("labelled", "label")):
         label_splats(splats, gaussians(points(3, 0)))
+    assert label_splats(mine, field, distance=0.5).classes == ()
+    with pytest.raises(TypeError, match=tells("splats", "str", "read_splats")):
+        label_splats("mine.ply", field)
+    with pytest.raises(TypeError, match=tells("labelled", "ndarray", "Gaussians", "transfer_labels")):
+        label_splats(mine, np.zeros((3, 3)))

@@ -104,7 +104,8 @@ def test_without_a_splat_gaussians_are_trained_and_a_longer_colour_fit_is_taken(
     other = fit_scene(scene, maps, tmp_path, dataclasses.replace(config, seed=1))
     assert not any(stage.reused for stage in other.stages)
     longer = dataclasses.replace(quick, field=quick.field.with_steps(40))
-    fit_color(scene, tmp_path, longer)
+    explicit = dataclasses.replace(longer.field, extent=scene.extent)  # what None computes
+    fit_color(scene, tmp_path, dataclasses.replace(longer, field=explicit))
     lines = []
     taken = fit_scene(scene, maps, tmp_path, config, report=lines.append)
     assert [stage.name for stage in taken.stages] == ["uplift"]
@@ -240,3 +241,18 @@ def test_classes_by_examples_answer_like_the_words(fitted, scene, room, classes,
     assert (field.classify(made).labels == words).float().mean() > 0.85
     given = {name: Clicks(one[0]["view"], one[0]["points"]) for name, one in shown.items()}
     assert torch.equal(kfgs.label_set_from_examples(field, given).embeddings, made.embeddings)
+
+
+def test_maps_may_be_a_list_in_memory(scene, maps, splat, tmp_path):
+    given = [maps[i] for i in range(len(maps))]
+    made = fit_scene(scene, given, tmp_path, CONFIG, splat=splat)
+    stored = fit_scene(scene, maps, tmp_path / "stored", CONFIG, splat=splat)
+    assert torch.equal(made.field.features, stored.field.features)
+    again = fit_scene(scene, [one.numpy() for one in given], tmp_path, CONFIG, splat=splat)
+    assert all(stage.reused for stage in again.stages)
+    other = fit_scene(scene, [given[0] * 2, *given[1:]], tmp_path, CONFIG, splat=splat)
+    assert not any(stage.reused for stage in other.stages)
+    with pytest.raises(TypeError, match=tells("maps", "str", "FeatureFolder")):
+        fit_scene(scene, "features", tmp_path, CONFIG, splat=splat)
+    with pytest.raises(TypeError, match=tells("maps[0]", "str")):
+        fit_scene(scene, ["a.npy"], tmp_path, CONFIG, splat=splat)

@@ -161,3 +161,7 @@ def test_arrays_are_accepted_and_names_refused():
         book.quantize("chair")
     with pytest.raises(TypeError, match=tells("codebook", "Tensor", "Codebook(codewords)")):
         fit_autoencoder(rows)
+
+
+def test_codewords_may_be_a_list_of_whole_numbers():
+    assert Codebook([[1, 0], [0, 1]]).quantize(torch.tensor([[0.1, 2.0]])).tolist() == [1]

@@ -538,3 +538,14 @@ def test_malformed_tiles_are_refused(rows, offsets, message):
     elsewhere = elsewhere._replace(offsets=elsewhere.offsets.to("meta"))
     with pytest.raises(ValueError, match=tells("tiles.offsets:", "cpu", "means2d", "got meta")):
         composite(*projected[:2], projected.opacities, features, elsewhere)
+
+
+@pytest.mark.parametrize("name", ["means2d", "conics", "features"])
+def test_an_array_is_refused_by_name(name):
+    means2d, conics, opacities, tiles = _stack([0.5, 0.5], torch.float32)
+    values = {"means2d": means2d, "conics": conics, "opacities": opacities, "features": opacities[:, None]}
+    values[name] = values[name].numpy()
+    with pytest.raises(TypeError, match=tells(name, "ndarray", "torch.as_tensor")):
+        composite(**values, tiles=tiles)
+    with pytest.raises(TypeError, match=tells("tiles.rows", "ndarray", "bin")):
+        composite(means2d, conics, opacities, opacities[:, None], tiles._replace(rows=tiles.rows.numpy()))

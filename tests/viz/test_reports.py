@@ -4,6 +4,7 @@ import torch
 from messages import tells
 from PIL import Image
 
+from kfgs.quant import fit_codebook
 from kfgs.viz import palette, reports
 from kfgs.viz.reports import codebook_rows, plot_codebook_growth, plot_codebook_report
 
@@ -84,6 +85,13 @@ def test_growth_has_a_curve_per_scene(tmp_path):
     assert size.get_ylim()[0] == turnover.get_ylim()[0] == coverage.get_ylim()[0] == 0
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["room 0", "office 3"]
     assert len({tuple(line.get_color()) for line in size.lines}) == 2
+
+
+def test_growth_of_a_fit_is_that_of_its_history():
+    fit = fit_codebook([torch.eye(3)[None]])
+    drawn = [plot_codebook_growth(one).axes[0].lines[0].get_xydata() for one in (fit, {"room": fit}, fit.history)]
+    np.testing.assert_array_equal(drawn[0], drawn[2])
+    np.testing.assert_array_equal(drawn[1], drawn[2])
 
 
 def test_wrong_input_is_named(tmp_path):

@@ -135,6 +135,9 @@ def _contiguous(tiles: Tiles) -> Tiles:
 
 
 def _check_kinds(others: dict[str, Tensor | None], means2d: Tensor) -> None:
+    for name, value in ({"means2d": means2d} | others).items():
+        if not isinstance(value, Tensor | None):
+            raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}; convert it with torch.as_tensor")
     if means2d.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"means2d: expected float32 or float64, got {means2d.dtype}; convert the Gaussians with .to()")
     for name, value in others.items():
@@ -148,6 +151,8 @@ def _check_kinds(others: dict[str, Tensor | None], means2d: Tensor) -> None:
 def _check_integers(
     name: str, value: Tensor | None, means2d: Tensor, dtypes: tuple[torch.dtype, ...], advice: str
 ) -> None:
+    if not isinstance(value, Tensor | None):
+        raise TypeError(f"{name}: expected a tensor, got {type(value).__name__}; {advice}")
     if value is not None and value.device != means2d.device:
         raise ValueError(f"{name}: expected it on {means2d.device} (from means2d), got {value.device}; {advice}")
     if value is not None and value.dtype not in dtypes:
