@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from html import escape
+from pathlib import Path
 from typing import Any
 
 LONGEST = 100  # characters of one value in a line
@@ -49,11 +50,13 @@ def short_repr(thing: Any) -> str:
     names = [field.name for field in fields(thing) if field.repr] if is_dataclass(thing) else thing._fields
     values = {name: getattr(thing, name) for name in names}
     inside = ", ".join(f"{name}={short_value(value)}" for name, value in values.items() if value is not None)
-    return _cut(f"{type(thing).__name__}({inside})", LINE)
+    return cut(f"{type(thing).__name__}({inside})", LINE)
 
 
 def short_value(value: object) -> str:
     """One value in at most `LONGEST` characters: a tensor by its shape and type, a long list by its length.
+
+    Paths are shown by their names, and the rows of a table by their number and the keys of the first.
 
     Example:
         >>> short_value(range(1000)), short_value([1.5, 2.0]), short_value(list("a long list"))
@@ -67,19 +70,32 @@ def short_value(value: object) -> str:
         return (
             f"{len(value)} entries"
             if len(value) > 3
-            else _cut(", ".join(f"{k}: {short_value(v)}" for k, v in value.items()))
+            else cut(", ".join(f"{k}: {short_value(v)}" for k, v in value.items()))
         )
     if isinstance(value, list | tuple) and not hasattr(value, "_fields"):
+        if value and all(isinstance(item, Path) for item in value):
+            return cut(f"[{', '.join(item.name for item in value)}]")
+        if value and all(isinstance(item, Mapping) for item in value):
+            return cut(f"{len(value)} rows of {', '.join(map(str, value[0]))}")
         simple = len(value) <= 4 and all(isinstance(item, str | int | float) for item in value)
         kinds = sorted({type(item).__name__ for item in value})
-        return repr(value) if simple else f"{len(value)} of {' or '.join(kinds)}"
-    return _cut(repr(value))
+        return cut(repr(value) if simple else f"{len(value)} of {' or '.join(kinds)}")
+    return cut(repr(value))
 
 
 def _plain(value: object) -> str:
-    return _cut(value) if isinstance(value, str) else f"{value:,}" if type(value) is int else short_value(value)
+    return cut(value) if isinstance(value, str) else f"{value:,}" if type(value) is int else short_value(value)
 
 
-def _cut(text: str, longest: int = LONGEST) -> str:
+def cut(text: str, longest: int = LONGEST) -> str:
+    """A text in one line of at most `longest` characters; a long one ends at a word, if it has one near there, and "...".
+
+    Example:
+        >>> cut("a line of several words", 16)
+        'a line of...'
+    """
     line = " ".join(text.split())
-    return line if len(line) <= longest else line[: longest - 3] + "..."
+    if len(line) <= longest:
+        return line
+    head = line[: longest - 2].rpartition(" ")[0]  # whole words
+    return (head if len(head) >= longest // 2 else line[: longest - 3]).rstrip(",;:") + "..."

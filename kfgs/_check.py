@@ -7,6 +7,7 @@ tensor values unless its name says so, so they cost no device synchronisation.
 from __future__ import annotations
 
 import contextlib
+import difflib
 import math
 import numbers
 from collections.abc import Iterable, Sequence
@@ -164,7 +165,9 @@ def check_choice(name: str, value: object, choices: Iterable[object]) -> None:
     """Raise a ValueError unless `value` is one of `choices`."""
     options = list(choices)
     if value not in options:
-        raise ValueError(f"{name}: expected one of {', '.join(map(repr, options))}, got {value!r}")
+        near = difflib.get_close_matches(str(value).lower(), map(str, options), n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"{name}: expected one of {', '.join(map(repr, options))}, got {value!r}{hint}")
 
 
 def check_range(
@@ -175,8 +178,9 @@ def check_range(
     under = value <= high if closed[1] else value < high
     if not (over and under and -math.inf < value < math.inf):  # NaN fails every comparison
         left = "[" if closed[0] and math.isfinite(low) else "("
+        hint = "" if -math.inf < value < math.inf else "; pass a finite number"
         right = "]" if closed[1] and math.isfinite(high) else ")"
-        raise ValueError(f"{name}: expected a number in {left}{low:g}, {high:g}{right}, got {value!r}")
+        raise ValueError(f"{name}: expected a number in {left}{low:g}, {high:g}{right}, got {value!r}{hint}")
 
 
 def check_whole(name: str, value: float, low: int, high: float = float("inf")) -> None:

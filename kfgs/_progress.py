@@ -1,4 +1,4 @@
-"""What `progress` is in every function that trains: a bar, or a function that hears of each row of the history."""
+"""What `progress` is in every function that trains: a bar, or a function that is called with each row of the history."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
 import builtins
+import dataclasses
 import importlib
 import inspect
 import pkgutil
@@ -17,7 +18,11 @@ from torch import Tensor
 import kfgs
 from kfgs import Autoencoder, Camera, Codebook, Gaussians, SemanticField, rasterize
 from kfgs._card import LONGEST, html_card, short_repr, short_value
+from kfgs.formats import SplatFile
+from kfgs.labels import LabelSet, Selection
+from kfgs.labels.edits import EditList, Remove
 from kfgs.quant import CodebookFit, LinearLatents, Nearest
+from kfgs.splat.engines.contract import Cloud, Composited, Pinhole, Splats
 
 
 def test_a_card_escapes_everything_and_leaves_out_what_is_none():
@@ -68,6 +73,38 @@ def test_no_value_is_long():
         shown = short_value(value)
         assert len(shown) <= LONGEST
         assert "\n" not in shown
+
+
+def test_paths_and_rows_say_what_they_are():
+    assert short_value([Path("/a/room.ply"), Path("/a/b.json")]) == "[room.ply, b.json]"
+    assert short_value([{"step": 1, "loss": 2.0}] * 3) == "3 rows of step, loss"
+    assert short_value(["word " * 40] * 2).endswith(" word...")
+
+
+def test_long_content_makes_no_long_line():
+    long = "a long name " * 40
+    splats = SplatFile(Gaussians(torch.rand(50, 3), torch.rand(50, 4), torch.rand(50, 3), torch.rand(50)))
+    engine = [
+        Cloud(torch.rand(50, 3), torch.rand(50, 4), torch.rand(50, 3), torch.rand(50)),
+        Pinhole(torch.eye(4), torch.eye(3), 4, 3, 0.2, 0.3),
+        Splats(torch.rand(50, 2), torch.rand(50, 3), torch.rand(50), torch.rand(50, 9), torch.rand(9), None),
+        Composited(torch.rand(9, 9, 9), torch.rand(9, 9), torch.zeros(900, dtype=torch.int32)),
+    ]
+    for thing in (
+        *engine,
+        LabelSet((long, long + "2"), torch.eye(2)),
+        Camera(torch.eye(4), torch.eye(3), 4, 3, name=long + "\n"),
+        dataclasses.replace(splats, info={"format": long}),
+        EditList([Remove("chair")] * 300),
+        Selection.of(torch.tensor([True, False]), f"two\nlines {long}"),
+    ):
+        line = repr(thing)
+        assert line.startswith(type(thing).__name__)
+        assert len(line) < 200, line
+        assert "\n" not in line
+        assert "tensor(" not in line
+    assert repr(EditList([Remove("chair")] * 300)).startswith("EditList(300 edits: Remove(")
+    assert repr(EditList([Remove("chair")]).undo()) == "EditList(0 edits; 1 undone)"
 
 
 PACKAGES = ["kfgs.quant", "kfgs.fields", "kfgs.splat", "kfgs.viz", "kfgs.gaussians", "kfgs.metrics"]

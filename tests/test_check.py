@@ -192,3 +192,10 @@ def test_tensors_become_arrays():
         as_array(SimpleNamespace(map=1), "picture")
     with pytest.raises(TypeError, match=tells("picture", "str", "'a.png'")):
         as_array("a.png", "picture")
+
+
+def test_ranges_and_choices_say_what_to_do_where_it_is_not_plain():
+    with pytest.raises(ValueError, match=tells("opacity:", "got nan", "pass a finite number")):
+        check_range("opacity", math.nan, 0, 1)
+    with pytest.raises(ValueError, match=tells("engine:", "got 'Numba'", "did you mean 'numba'?")):
+        check_choice("engine", "Numba", ("auto", "numba"))

@@ -51,6 +51,7 @@ def test_maps_may_lie_in_another_folder(room, tmp_path, capsys):
             ["--out", "{tmp}/file/plan.json"],
             ("--out:", "got {tmp}/file/plan.json", "file {tmp}/file"),
         ),
+        (["--teacher", "lsge"], ("teacher:", "got 'lsge'", "did you mean 'lseg'")),
         (["--features", "{tmp}/maps"], ("--features:", "got {tmp}/maps")),
         (["--weights", "{tmp}/no.ckpt"], ("{tmp}/no.ckpt:",)),
         (["--teacher", "clip", "--weights", "{tmp}"], ("{tmp}:",)),
@@ -66,3 +67,16 @@ def test_what_cannot_end_well_is_refused_before_planning(room, given, message, t
     assert re.search(tells(*(part.format(tmp=tmp_path) for part in message)), error)
     assert error.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_typo_is_not_hidden_by_maps_that_exist(room, tmp_path, capsys):
+    assert main(["plan", str(room), "--teacher", "nix"]) == 1
+    assert re.search(tells("teacher:", "got 'nix'", "name one of them"), capsys.readouterr().err)
+    assert main(["plan", str(room), "--features", str(tmp_path), "--run", str(tmp_path / "nowhere")]) == 0
+    said = capsys.readouterr().out
+    assert f"note: no maps of these views in {tmp_path}" in said
+    assert f"note: there is no folder {tmp_path / 'nowhere'} yet" in said
+    assert not (tmp_path / "nowhere").exists()
+    assert "--splat" not in said  # which plan does not have
+    assert re.search(r"at most [\d,]+ Gaussians", said)
+    assert "at most 30,000 are kept" in said

@@ -94,7 +94,7 @@ def _check_fit(best: Fit, runner_up: float) -> None:
         )
     if 1 - best.quality > MARGIN * (1 - runner_up):
         raise SceneError(
-            f"clouds: expected one similarity to fit best, got two that fit alike (quality {best.quality:.3f} and "
+            f"clouds: expected one similarity that fits best, got two that fit equally well (quality {best.quality:.3f} and "
             f"{runner_up:.3f}): a symmetric shape, or not of the same scene. Align by cameras of the same names, or pass "
             "the similarity"
         )

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from .._card import cut
 from .._check import as_tensor, check_choice, check_range, check_shapes
 
 DistortionModel = Literal["brown_conrady", "kannala_brandt"]
@@ -157,7 +158,7 @@ class Camera:
         x, y, z = self.center.tolist()
         fov = 2 * math.degrees(math.atan(self.height / 2 / float(self.K[1, 1])))
         lens = "" if self.distortion is None else f", {self.distortion.model}"
-        return f"Camera({self.name!r}, {self.width}x{self.height}, fov {fov:.1f}, at ({x:.4g}, {y:.4g}, {z:.4g}){lens})"
+        return f"Camera({cut(self.name, 80)!r}, {self.width}x{self.height}, fov {fov:.1f}, at ({x:.4g}, {y:.4g}, {z:.4g}){lens})"
 
     @property
     def size(self) -> tuple[int, int]:
@@ -180,7 +181,7 @@ class Camera:
         """The same view with another number of pixels; the two axes scale independently.
 
         With pixel centres on halves, fx and cx scale by width / self.width, fy and cy by height / self.height, exactly.
-        kornia's `PinholeCamera.scale` knows one factor for both axes, so it is not used here.
+        kornia's `PinholeCamera.scale` scales both axes by the same factor, so it is not used here.
         """
         factors = torch.tensor(
             [width / self.width, height / self.height, 1.0], dtype=self.K.dtype, device=self.K.device

@@ -61,7 +61,7 @@ def fill_unknown(
 ) -> Tensor:  # [..., H, W]
     """Give pixels where nothing is known (NaN) the least known value of their map, or 0 if all are unknown.
 
-    The official scripts have no unknown pixels: they decode what a rendered zero means by chance. The least value is
+    The official scripts have no unknown pixels: they decode a rendered zero into an arbitrary feature. The least value is
     neutral: it is never selected, and min-max stretches the other pixels as without it.
     """
     least = maps.nan_to_num(nan=torch.inf).amin((-2, -1), keepdim=True)

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from torch import Tensor
 
-from .._card import html_card, short_repr, short_value
+from .._card import LINE, cut, html_card, short_repr, short_value
 from ..gaussians import Gaussians
 from .ply import Columns
 
@@ -35,7 +35,7 @@ class SplatFile:
     """Details of the file, as JSON: `format`, and values of the header. `antialiased` and `surfels` are the kind of rendering
     that the cloud was trained for (`render_mode`). A format that cannot store them reports them as lost."""
 
-    writer: ClassVar[Callable[..., Written]]
+    _writer: ClassVar[Callable[..., Written]]
     """What `save` calls: `table.write_splats`, which sets it. The formats import this file, and the table knows the formats."""
 
     def __post_init__(self) -> None:
@@ -52,7 +52,7 @@ class SplatFile:
     def __repr__(self) -> str:
         classes = f", {len(self.classes)} classes" if self.classes else ""
         extra = f", extra {short_value(list(self.extra))}" if self.extra else ""
-        return f"SplatFile({self.info.get('format', 'new')}: {self.gaussians!r}{classes}{extra})"
+        return cut(f"SplatFile({self.info.get('format', 'new')}: {self.gaussians!r}{classes}{extra})", LINE)
 
     def _repr_html_(self) -> str:
         facts: dict[str, object] = {"format": self.info.get("format", "new"), "gaussians": repr(self.gaussians)}
@@ -66,7 +66,7 @@ class SplatFile:
 
     def save(self, path: str | Path, *, format: str | None = None) -> Written:
         """Write the cloud in the format that the ending of `path` names; see `write_splats`, which this calls."""
-        return SplatFile.writer(path, self, format=format)
+        return SplatFile._writer(path, self, format=format)
 
     def select(self, which: Tensor) -> SplatFile:  # which: [N] bool or [n] int64
         """The Gaussians under a mask or an index, with their extra columns."""

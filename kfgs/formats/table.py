@@ -127,7 +127,7 @@ def write_splats(path: str | Path, splats: SplatFile | Gaussians, *, format: str
     return Written([path, *beside], tuple(lost), order)
 
 
-SplatFile.writer = staticmethod(write_splats)
+SplatFile._writer = staticmethod(write_splats)
 
 
 def _format_to_write(path: Path, name: str | None) -> ModuleType:

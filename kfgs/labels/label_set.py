@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from .._card import html_card
+from .._card import cut, html_card
 from .._check import as_tensor
 from .._files import atomic_path, read_json
 from .names import class_index, class_indices
@@ -70,7 +70,7 @@ class LabelSet:
         return len(self.names)
 
     def __repr__(self) -> str:
-        return f"LabelSet({len(self)} classes: {self._shown(5)}; {self.dim} channels)"
+        return f"LabelSet({len(self)} classes: {cut(self._shown(5), 140)}; {self.dim} channels)"
 
     def _repr_html_(self) -> str:
         facts = {

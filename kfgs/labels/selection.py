@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .._card import html_card
+from .._card import cut, html_card
 from .._check import as_tensor, check_shapes
 from .._rows import check_finite
 from .boxes import OrientedBox
@@ -21,7 +21,7 @@ class Selection:
     `a & b`, `a | b`, `a ^ b`, `a - b` and `~a` combine selections of the same Gaussians. Scores follow Zadeh's rules:
     `&` takes the smaller, `|` the larger, `~a` has 1 - score; `a - b` is `a & ~b`, and `a ^ b` is `(a - b) | (b - a)`.
     `len` is the number selected, so an empty selection is false in an `if`. `OfClass("chair").select(splats)`,
-    `SemanticField.query` and the functions `select_...` make selections.
+    `SemanticField.query` and `Selection.of(mask)` make selections.
 
     Example:
         >>> import torch
@@ -59,8 +59,7 @@ class Selection:
         return int(self.mask.sum())
 
     def __repr__(self) -> str:
-        summary = self.summary if len(self.summary) <= 160 else self.summary[:157] + "..."
-        return f"Selection({len(self)} of {len(self.mask)} Gaussians: {summary})"
+        return f"Selection({len(self)} of {len(self.mask)} Gaussians: {cut(self.summary, 140)})"
 
     def _repr_html_(self) -> str:
         chosen = self.scores[self.mask]

@@ -25,7 +25,7 @@ share below 0.8 had the right class, and about 95 % of the others."""
 
 
 class ViewAverage(NamedTuple):
-    """A signal carried from pixels to Gaussians."""
+    """For each Gaussian, the mean of what the pixels that show it hold."""
 
     values: Tensor  # [N, C] mean over the pixels, weighted by how much each shows the Gaussian; 0 if none does
     weights: Tensor  # [N] the number of pixels, in all views, that the Gaussian fills

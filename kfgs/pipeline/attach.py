@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from .._card import short_repr
+from .._card import LINE, cut
 from .._check import check_choice, check_range
 from ..align.by_cameras import Alignment, align_by_cameras
 from ..align.by_shape import align_clouds
@@ -49,7 +49,13 @@ class Attached:
     notes: tuple[str, ...]
     """Sentences for people: what was done, and the results."""
 
-    __repr__ = short_repr
+    def __repr__(self) -> str:
+        labelled, names = int((self.labels >= 0).sum()), len(self.splats.classes)
+        frame = "" if self.alignment is None else f"; {self.alignment!r}"
+        within = f"lambda {self.transfer.distance:.4g}"
+        return cut(
+            f"Attached({labelled:,} of {len(self.splats):,} Gaussians labelled, {names} classes, {within}{frame})", LINE
+        )
 
     @property
     def labels(self) -> Tensor:  # [N] int64

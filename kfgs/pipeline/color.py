@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from dataclasses import field as default
@@ -10,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file
 from torch import Tensor
 
 from .._card import short_repr
@@ -19,9 +19,10 @@ from .._files import read_json
 from .._progress import Progress, as_progress
 from ..cameras import Camera, resize_map
 from ..fields import ColorLoss, FieldConfig, FieldFit, GaussianParams, fit_field
-from ..formats import read_splats, write_splats
+from ..formats import write_splats
 from ..gaussians import Gaussians
 from ..scenes import Scene
+from .color_file import is_saved, may_replace, stage_gaussians, what_is
 from .stages import Run, Stage, describe_lens, digest_scene, digest_tensors, stage_generator
 from .train import check_scene, field_stage, training_device, with_extent
 
@@ -189,15 +190,16 @@ def fit_color(
     Args:
         scene: posed, undistorted views with their sparse points.
         folder: the run folder; `folder/color.ply` receives the Gaussians, in place of those of an earlier fit with other
-            options. Its stage stays in the folder, so the earlier call brings them back at once.
+            options. Its stage stays in the folder, so the earlier call brings them back at once. Any other `color.ply`,
+            and one with labels, is never replaced.
         config: the schedule; that of 3DGS when not given.
         report: receives one line per stage.
         progress: True shows a bar; a function receives the rows of the history as they appear.
         device: where to train, see `training_device`; the result lies on the CPU.
 
     Raises:
-        ValueError: if a camera has distortion, there is no such device, the scene has no points to start from, or the
-            split has no views.
+        ValueError: if a camera has distortion, there is no such device, the scene has no points to start from, the
+            split has no views, or `folder/color.ply` is a file that no fit in this folder wrote.
     """
     config, progress = config or ColorConfig.paper(), as_progress(progress)
     scene.views(config.split)  # raises for a split without views
@@ -208,18 +210,33 @@ def fit_color(
 def make_color(
     run: Run, scene: Scene, config: ColorConfig, device: torch.device, progress: Progress, *, overwrite: bool
 ) -> ColorResult:
-    """The colour stage of a run, and the PLY file of its Gaussians; `overwrite`: also where another `color.ply` is there."""
-    params = _color_stage(run, scene, scene.views(config.split), config, device, progress)
-    result = ColorResult(params.activated().detach(), run.folder / "color.ply", run.stages)
-    if run.look_only or _is_saved(result):
+    """The colour stage of a run, and the PLY file of its Gaussians.
+
+    Args:
+        overwrite: replace the `color.ply` of another colour stage of the run; any other file there is an error, before
+            training. If False, a file that is there stays.
+    """
+    path = run.folder / "color.ply"
+
+    def check() -> None:
+        if overwrite and not may_replace(run, path):
+            raise ValueError(
+                f"{path}: expected no file, or what an earlier colour fit of {run.folder} wrote, found another file (or "
+                "labels added to it); move it away, or name another run folder (--out)"
+            )
+
+    params = _color_stage(run, scene, scene.views(config.split), config, device, progress, check)
+    result = ColorResult(params.activated().detach(), path, run.stages)
+    if run.look_only or is_saved(path, result.gaussians):
         return result
-    if result.path.exists():
+    if os.path.lexists(path):
         if not overwrite:
-            here = f"the {len(result.gaussians):,} of the field, which are in {result.stages[-1].folder}"
-            run.say(f"color.ply: left as it is; it holds other Gaussians than {here}")
+            here = f"the {len(result.gaussians):,} Gaussians of the field are in {result.stages[-1].folder}"
+            run.say(f"color.ply: left as it is; it {what_is(path)}; {here}")
             return result
+        check()  # it may have come during training
         run.say(f"color.ply: replaced; Gaussians that were trained in {run.folder} before stay in its stages")
-    write_splats(result.path, result.gaussians)
+    write_splats(path, result.gaussians)
     return result
 
 
@@ -241,7 +258,7 @@ def find_color(run: Run, scene: Scene, config: ColorConfig) -> Gaussians | None:
     if best is None or best[0] <= config.field.steps:
         return None
     run.say(f"geometry: the colours of {best[0]:,} steps that are in {run.folder}")
-    return GaussianParams.from_tensors(load_file(best[1] / "params.safetensors")).activated().detach()
+    return stage_gaussians(best[1])
 
 
 def _inputs(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig) -> dict[str, Any]:
@@ -265,10 +282,13 @@ def _color_stage(
     config: ColorConfig,
     device: torch.device,
     progress: Progress,
+    check: Callable[[], None],
 ) -> GaussianParams:
+    """The stage's parameters; `check` is called before training, but not for a stage that is finished."""
     inputs = _inputs(run, scene, views, config)
 
     def train(checkpoint: Path) -> FieldFit:
+        check()
         generator = stage_generator(config.seed, "color")
         start = GaussianParams.from_points(
             scene.points,
@@ -290,19 +310,6 @@ def _color_stage(
         )
 
     return field_stage(run, "color", inputs, train)[0]
-
-
-def _is_saved(result: ColorResult) -> bool:
-    """Whether the file has this cloud already; then it is not written again, because it may have labels now."""
-    try:
-        saved = read_splats(result.path).gaussians
-    except (OSError, ValueError):
-        return False
-    ours = result.gaussians
-    if saved.sh is None or len(saved) != len(ours):
-        return False
-    same = all(torch.equal(getattr(saved, name), getattr(ours, name)) for name in ("means", "quats", "sh"))
-    return same and all(torch.allclose(getattr(saved, name), getattr(ours, name)) for name in ("scales", "opacities"))
 
 
 def _training_camera(camera: Camera, scale: float) -> Camera:

@@ -222,7 +222,7 @@ def _field(sizes: Sizes) -> StagePlan:
     """Training; the stage and the finished field stay on disk, the checkpoint does not."""
     options, channels = sizes.config.field, _channels(sizes)
     mean, last = gaussian_counts(options, sizes.points)
-    what = f"{options.steps:,} steps, {sizes.points / 1e3:.1f}k points, perhaps {last / 1e3:.1f}k Gaussians"
+    what = f"{options.steps:,} steps, {sizes.points:,} points, perhaps {last:,} Gaussians"
     if sizes.shape is None:
         return _stage(sizes, "field", what, options.steps, None)
     book = 0 if sizes.config.mode == "decouple" else FLOAT * sizes.config.codebook.maximum * sizes.shape[2]
@@ -238,7 +238,7 @@ def _color(sizes: Sizes) -> StagePlan:
     """Training of Gaussians on the pictures, to fuse onto; not needed with the user's splat."""
     options, colors = sizes.config.color.field, color_channels(sizes.config)
     mean, last = gaussian_counts(options, sizes.points, full=True)
-    what = f"{options.steps:,} steps on the pictures, at most {last / 1e3:.1f}k Gaussians; none with --splat"
+    what = f"{options.steps:,} steps on the pictures, at most {last:,} Gaussians; not needed if you have a splat"
     size, table = gaussian_bytes(last, colors), FLOAT * last * (14 + colors)  # color.ply has normals, too
     photos = round(sum(4 * height * width for height, width in sizes.pictures) * sizes.config.color.picture_scale**2)
     more = photos + TRAINING * gaussian_bytes(last - round(mean), colors)
@@ -250,7 +250,8 @@ def _color(sizes: Sizes) -> StagePlan:
 def _uplift(sizes: Sizes) -> StagePlan:
     """Averaging maps onto the Gaussians, and correction."""
     options = sizes.config.uplift
-    what = f"{sizes.count} maps onto the Gaussians, at most {options.max_gaussians or 'all'} left"
+    kept = "all are kept" if options.max_gaussians is None else f"at most {options.max_gaussians:,} are kept"
+    what = f"{sizes.count} maps onto the Gaussians, of which {kept}"
     if sizes.shape is None:
         return _stage(sizes, "uplift", what, sizes.count, None)
     h, w, D = sizes.shape

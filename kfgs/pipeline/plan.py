@@ -178,6 +178,8 @@ def plan_scene(
         done=frozenset(done),
     )
     notes = [] if stored.note is None else [stored.note]
+    if run is not None and not Path(run).is_dir():
+        notes.append(f"there is no folder {run} yet, so no stage is finished")
     if isinstance(teacher, NamedTeacher) and teacher.weights is not None and not sizes.missing:
         notes.append(f"no map is missing, so {teacher.name} and its weights were not looked at")
     with TemporaryDirectory(prefix="kfgs-plan-") as place:

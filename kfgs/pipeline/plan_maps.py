@@ -12,6 +12,7 @@ import torch
 from ..features import FeatureFolder, pictures_of, read_manifest, write_npy_map
 from ..scenes import Scene
 from ..teachers import TRANSFORMERS, LSeg, LSegConfig, LSegOptions, Teacher, as_teacher, load_teacher, teacher_names
+from ..teachers.load import check_teacher_name
 from ..teachers.lseg.network import LSegNetwork
 from .estimate import Sizes
 from .trial import EncodedPicture, memory_now, time_picture
@@ -33,6 +34,9 @@ class NamedTeacher:
     name: str
     weights: str | Path | None = None
     options: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_teacher_name(self.name)
 
     def load(self) -> tuple[Teacher | None, str | None]:
         """The teacher, or None if its weights are not on this machine, with a note; raises as `load_teacher`."""
@@ -96,7 +100,8 @@ def find_stored(scene: Scene, split: str, folder: Path, teacher: Any) -> StoredM
                 return replace(nothing, note=f"maps that exist are not counted: {error}")
         kept = [i for i, yes in enumerate(there) if yes]
         if not kept:
-            return replace(nothing, maps=maps, shape=None if maps is None else maps.shape)
+            note = f"no maps of these views in {folder}" if maps is None else None
+            return replace(nothing, maps=maps, shape=None if maps is None else maps.shape, note=note)
         sample = FeatureFolder(folder, [stems[i] for i in kept], sizes=[sizes[i] for i in kept])
         for i in range(len(kept)):
             sample.grid(i, sample.shape[:2], 1)  # reads one feature: checks existence, size and finite values

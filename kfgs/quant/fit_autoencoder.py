@@ -46,7 +46,7 @@ class AutoencoderConfig:
     decay: bool = True
     """Lower the learning rate to a fiftieth along a cosine."""
     blends: int = 256
-    """Blends of codewords per step, whose blended latents are to decode to the blended features; 0 as in the paper."""
+    """Blends of codewords per step: their blended latents are trained to decode to the blended features; 0 as in the paper."""
     weight_decay: float = 5e-6
     """L2 penalty in Adam's gradient (script)."""
     record_every: int = 100

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._check import check_range, check_shapes
-from .engines import ops
+from .._check import check_shapes
+from .engines import check_sizes, ops
 from .engines.contract import ALPHA_MIN, Tiles
 from .engines.table import choose_compiled
 from .project import Projected, pixel_box
@@ -34,7 +34,7 @@ def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16
         The P (tile, Gaussian) pairs, grouped by tile; equally deep Gaussians are in order of their index.
 
     Raises:
-        ValueError: if shapes disagree or a size is not positive, or the engine is unknown or cannot work on these
+        ValueError: if shapes disagree or a size is not a positive whole number, or the engine is unknown or cannot work on these
             tensors.
         ImportError: if the named engine's package is missing.
     """
@@ -45,8 +45,7 @@ def bin_tiles(projected: Projected, width: int, height: int, tile_size: int = 16
         ("projected.opacities", projected.opacities, "M"),
         ("projected.extents", projected.extents, "M 2"),
     )
-    for name, size in (("width", width), ("height", height), ("tile_size", tile_size)):
-        check_range(name, size, 1, closed=(True, False))
+    check_sizes(width, height, tile_size)
     compiled = choose_compiled(engine, "bin", "projected", *projected[:5])
     if compiled:
         tensors = (value.contiguous() for value in projected[:5])

@@ -59,13 +59,7 @@ def load_teacher(name: str, weights: str | Path | None = None, **options: Any) -
     """
     if ":" in name:
         return _imported(name, weights, options)
-    names = teacher_names()
-    if name not in names:
-        near = difflib.get_close_matches(name.lower(), names, n=1)
-        raise ValueError(
-            f"teacher: expected one of {', '.join(names)}, or package.module:name of your own, got {name!r}"
-            + (f"; did you mean {near[0]!r}?" if near else "; name one of them")
-        )
+    check_teacher_name(name)
     if weights is None:
         what = "a checkpoint file" if name in ("lseg", "sam") else "a folder of save_pretrained, or a hub id"
         raise ValueError(f"weights: expected {what} for teacher {name!r}, got none; kfgs downloads nothing by itself")
@@ -74,12 +68,23 @@ def load_teacher(name: str, weights: str | Path | None = None, **options: Any) -
     return loader(weights, **options)
 
 
+def check_teacher_name(name: str) -> None:
+    """Raise a ValueError unless it is one of `teacher_names()`, or `package.module:name`, which is not imported here."""
+    names = teacher_names()
+    if ":" not in name and name not in names:
+        near = difflib.get_close_matches(name.lower(), names, n=1)
+        raise ValueError(
+            f"teacher: expected one of {', '.join(names)}, or package.module:name of your own, got {name!r}"
+            + (f"; did you mean {near[0]!r}?" if near else "; name one of them")
+        )
+
+
 def _check_options(name: str, loader: Callable[..., Teacher], options: dict[str, Any]) -> None:
     known = [option for option in inspect.signature(loader).parameters if option not in ("kind", "source", "weights")]
     for option in options:
         if option not in known:
-            words = f"one of {', '.join(known)}" if known else "none"
-            raise ValueError(f"{option}: expected {words} as option of teacher {name!r}, got {option}; leave it out")
+            has = f"the options {', '.join(known)}" if known else "no options"
+            raise ValueError(f"{option}: teacher {name!r} has {has}, but got {option}; leave it out")
 
 
 def _imported(name: str, weights: str | Path | None, options: dict[str, Any]) -> Teacher:

@@ -161,6 +161,9 @@ def test_views_label_what_they_show_and_their_neighbours():
     gaussians = Gaussians.cat([splats.gaussians, splats.gaussians.select(torch.tensor([0, 1])).replace(means=hidden)])
     splats = SplatFile(gaussians)
     attached = attach(a_field(), splats, CLASSES, cameras=CAMERAS, by="views")
+    labelled = int((attached.labels >= 0).sum())  # by views and by distance
+    assert repr(attached).startswith(f"Attached({labelled:,} of {len(splats):,} Gaussians labelled, 3 classes, lambda ")
+    assert len(repr(attached)) < 200
     assert accuracy(attached.labels, splats) > 0.95
     assert attached.labels[-2] == 2
     assert attached.labels[-1] == -1

@@ -123,13 +123,49 @@ def test_the_colours_of_a_shorter_fit_are_kept(scene, maps, tmp_path):
     told = [line for line in lines if line.startswith("color.ply: left as it is")]
     assert len(told) == 1
     assert str(made.stages[0].folder) in told[0]
-    assert f"{len(trained['means']):,} of the field" in told[0]
+    assert f"{len(trained['means']):,} Gaussians of the field" in told[0]
+    assert "holds other Gaussians" in told[0]
     replaced = fit_color(scene, tmp_path, quick, report=lines.append)  # asked for by name, and said
     assert replaced.stages[0].reused
     assert shorter.path.read_bytes() != before
     assert sum(line.startswith("color.ply: replaced") for line in lines) == 1
     assert fit_color(scene, tmp_path, dataclasses.replace(quick, field=quick.field.with_steps(20))).stages[0].reused
     assert shorter.path.read_bytes() == before
+
+
+def test_a_color_ply_of_another_hand_is_never_replaced(scene, maps, tmp_path):
+    config = dataclasses.replace(CONFIG.color, field=ColorConfig.quick().field.with_steps(3), picture_scale=0.5)
+    path = tmp_path / "color.ply"
+
+    def refused(steps=3):
+        with pytest.raises(ValueError, match=tells(path, "found another file", "move it", "--out")):
+            fit_color(scene, tmp_path, dataclasses.replace(config, field=config.field.with_steps(steps)))
+
+    path.write_text("mine")
+    refused()
+    assert path.read_text() == "mine"
+    assert not list(tmp_path.glob("stages/color-*"))  # refused before training
+    lines = []
+    fit_scene(scene, maps, tmp_path, dataclasses.replace(CONFIG, color=config), report=lines.append)
+    assert [line.split(";")[1] for line in lines if line.startswith("color.ply: left")] == [" it is another file"]
+    path.unlink()
+    path.symlink_to(tmp_path / "nowhere.ply")
+    refused(4)
+    refused()  # the stage is finished, but its Gaussians cannot be written
+    lines.clear()
+    fit_scene(scene, maps, tmp_path, dataclasses.replace(CONFIG, color=config, seed=0), report=lines.append)
+    assert any("is a link to a file that does not exist" in line for line in lines)
+    assert path.is_symlink()
+    path.unlink()
+
+    made = fit_color(scene, tmp_path, config)
+    labels = torch.zeros(len(made.gaussians), dtype=torch.int64)
+    write_splats(path, made.gaussians.replace(labels=labels))  # as `kfgs attach --out run/color.ply` does
+    labelled = path.read_bytes()
+    assert fit_color(scene, tmp_path, config).stages[-1].reused
+    refused(4)
+    assert path.read_bytes() == labelled
+    assert sorted(one.name for one in tmp_path.glob(".*")) == []
 
 
 def test_the_paper_takes_no_splat(scene, maps, splat, tmp_path):

@@ -124,7 +124,7 @@ def test_modes_have_their_own_stages(mode, names):
 def test_the_default_method_trains_colours_and_uplifts_once():
     found = plan(sizes(FitConfig()))
     assert list(stages(found)) == ["features", "color", "uplift"]
-    assert "at most 30000 left" in found.stages[-1].what
+    assert "at most 30,000 are kept" in found.stages[-1].what
     assert found.disk_bytes > found.kept_bytes  # the working maps are a temporary file
     more = stages(sizes(FitConfig(), views=180))
     assert more["uplift"].seconds == 181
@@ -334,7 +334,7 @@ def test_a_teacher_stays_on_its_device(untimed, room, tmp_path, monkeypatch):
     assert found.stages[0].seconds > 0
     named = Moving()  # loaded for the plan alone
     monkeypatch.setattr(NamedTeacher, "load", lambda self: (named, None))
-    plan_scene(room, teacher="moving", features=tmp_path / "none", config=FitConfig(device="cpu"))
+    plan_scene(room, teacher="own:moving", features=tmp_path / "none", config=FitConfig(device="cpu"))
     assert set(named.seen) == {"cpu"}
 
 

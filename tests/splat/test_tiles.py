@@ -7,7 +7,7 @@ import torch
 from cases_splat import random_splats, splats_from
 from messages import tells
 
-from kfgs.splat import Projected, available_engines
+from kfgs.splat import Projected, accumulate_pixels, available_engines, composite
 from kfgs.splat import bin_tiles as bin_tiles_by
 
 KINDS = ["round", "needles", "huge", "subpixel", "faint"]
@@ -189,3 +189,19 @@ def test_compiled_engine_refuses_mixed_dtypes():
     with pytest.raises(ValueError, match=tells("projected:", "float64", "got torch.float32")):
         bin_tiles_by(mixed, 70, 45, engine="numba")
     assert torch.equal(bin_tiles_by(mixed, 70, 45).rows, bin_tiles_by(projected, 70, 45).rows)
+
+
+SIZES = {"width": 70, "height": 45, "tile_size": 16}
+
+
+@pytest.mark.parametrize(("name", "size"), [("width", 33.5), ("height", 45.0), ("tile_size", 0)])
+def test_sizes_are_whole_numbers_with_every_engine(bin_tiles, name, size):
+    engine, splats = bin_tiles.keywords["engine"], _splats("round", torch.float32)
+    with pytest.raises(ValueError, match=tells(f"{name}:", f"got {size}")):
+        bin_tiles(splats, **(SIZES | {name: size}))
+    tiles = bin_tiles(splats, **SIZES)._replace(**{name: size})
+    footprints = splats.means2d, splats.conics, splats.opacities
+    with pytest.raises(ValueError, match=tells(f"tiles.{name}:", f"got {size}")):
+        composite(*footprints, torch.rand(len(splats.means2d), 2), tiles, engine=engine)
+    with pytest.raises(ValueError, match=tells(f"tiles.{name}:", f"got {size}")):
+        accumulate_pixels(*footprints, torch.rand(45, 70, 2), tiles, engine=engine)

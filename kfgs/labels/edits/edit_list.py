@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..._card import cut
 from ..._files import read_json, write_json
 from ...formats.splat_file import SplatFile
 from .._json import build, checked_object
@@ -47,6 +48,15 @@ class EditList:
                 if not isinstance(edit, Edit):
                     raise TypeError(f"{name}[{i}]: expected an edit, got {edit!r:.80}; use one of {_names()}")
             object.__setattr__(self, name, edits)
+
+    def __repr__(self) -> str:
+        undone = f"; {len(self.undone)} undone" if self.undone else ""
+        shown = (
+            f": {cut(', '.join(map(repr, self.edits[:9])) + (', ...' if len(self) > 9 else ''), 140)}"
+            if self.edits
+            else ""
+        )
+        return f"EditList({len(self)} edits{shown}{undone})"
 
     def __len__(self) -> int:
         return len(self.edits)

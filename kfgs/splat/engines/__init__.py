@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..._check import check_shapes
+from ..._check import check_shapes, check_whole
 from . import ops
 from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Splats, Tiles
 from .cpu.memory import free_memory
@@ -113,6 +113,7 @@ def accumulate_pixels(
     Raises:
         ValueError: as `composite`, and if `pixels` is not as large as the image of `tiles`.
     """
+    check_sizes(*tiles[2:], prefix="tiles.")
     check_shapes(
         ("means2d", means2d, "M 2"),
         ("conics", conics, "M 3"),
@@ -160,7 +161,15 @@ def _check_integers(
         raise ValueError(f"{name}: expected {kinds}, got {value.dtype}; {advice}")
 
 
+def check_sizes(width: int, height: int, tile_size: int, prefix: str = "") -> None:
+    """Raise a ValueError unless the sizes of an image and of its tiles are whole numbers of pixels, at least 1."""
+    for name, size in (("width", width), ("height", height), ("tile_size", tile_size)):
+        if not isinstance(size, torch.SymInt) and not torch.compiler.is_compiling():  # a traced size has no value yet
+            check_whole(prefix + name, size, 1)
+
+
 def _check_tiles(tiles: Tiles, means2d: Tensor) -> None:
+    check_sizes(*tiles[2:], prefix="tiles.")
     rows, columns = tiles.grid
     check_shapes(("tiles.rows", tiles.rows, "P"), ("tiles.offsets", tiles.offsets, (rows * columns + 1,)))
     for name, value in (("rows", tiles.rows), ("offsets", tiles.offsets)):

@@ -71,6 +71,9 @@ class Cloud(NamedTuple):
     scales: Tensor  # [N, 3] standard deviations
     opacities: Tensor  # [N]
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 class Pinhole(NamedTuple):
     """The camera and the options of `project`."""
@@ -82,6 +85,9 @@ class Pinhole(NamedTuple):
     near: float  # smallest depth
     low_pass: float  # added variance, pixels^2
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 class Splats(NamedTuple):
     """The M projected Gaussians and what they show."""
@@ -92,6 +98,9 @@ class Splats(NamedTuple):
     features: Tensor  # [N, D]
     background: Tensor  # [D]
     index: Tensor | None  # type: ignore[assignment]  # [M] int64, the row of `features` of each; None: row m of Gaussian m
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 class Tiles(NamedTuple):
@@ -122,3 +131,6 @@ class Composited(NamedTuple):
     maps: Tensor  # [H, W, D]
     alphas: Tensor  # [H, W]
     trace: Tensor  # one int32 tensor of the engine's own, for its backward pass
+
+    def __repr__(self) -> str:
+        return short_repr(self)

@@ -103,7 +103,7 @@ def _vector(element: Any) -> Any:
 
 
 def _integers(element: Any) -> Any:
-    """As many bits as the elements have, as integers."""
+    """The vector type of integers that are as wide as the elements."""
     return ir.VectorType(_I32 if element == types.float32 else _I64, LANES)
 
 

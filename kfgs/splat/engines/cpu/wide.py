@@ -173,7 +173,7 @@ def store_tile(values: Any, start: int, stride: int, tile: Any) -> None:
 def composite_square(
     packed: Any, span: tuple[int, int, int], state: Any, dark: Any, wide: Any, scratch: Any, trace: Any
 ) -> tuple[int, Any]:
-    """Composite a square's Gaussians; returns where in the list it was done, and bits of the blocks that have sums.
+    """Composite a square's Gaussians; returns where in the list it stopped, and a bit mask of the blocks with sums.
 
     The arguments are those of `narrow.composite_square`, but `wide` is features (flat), where each Gaussian's row begins,
     and D; `scratch` is corners, sums [PIXELS, padded D] in the order of blocks, kept (see `weigh_block`), hits and counts.
