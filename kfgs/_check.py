@@ -92,7 +92,9 @@ def as_tensor(name: str, value: Any, *, floating: bool = False) -> Tensor:
 
 def _from_numbers(name: str, value: Any, floating: bool) -> Tensor:
     """Lists and whatever NumPy calls an array. Our own sequences, which may read a file for each item, are not looked into."""
-    is_list = isinstance(value, list | tuple | range | numbers.Real)
+    is_list = type(value) in (list, tuple, range) or isinstance(
+        value, numbers.Real
+    )  # a named tuple is an object of ours
     array, kind = np.empty(0, dtype=object), type(value).__name__
     if isinstance(value, np.ma.MaskedArray):
         raise TypeError(
@@ -106,7 +108,7 @@ def _from_numbers(name: str, value: Any, floating: bool) -> Tensor:
         ):  # rows of different lengths, another library's array
             array = np.asarray(value)
     if array.dtype.kind not in "fiub":
-        rows = isinstance(value, list | tuple) and len(value)
+        rows = type(value) in (list, tuple) and len(value)
         advice = "pass numbers, in rows of equal length" if rows else _instead(value)
         raise TypeError(f"{name}: expected a tensor, got {kind}; {advice}")
     if not array.dtype.isnative:

@@ -59,8 +59,8 @@ class CF3Config:
 
     @staticmethod
     def short() -> CF3Config:
-        """For two cores: 3 epochs, 480 steps on small views."""
-        return CF3Config(epochs=3, steps=480, pixels=40_000)
+        """For two cores: 12 epochs, 480 steps on small views."""
+        return CF3Config(epochs=12, steps=480, pixels=40_000)
 
 
 def structure_loss(latents: Tensor, features: Tensor) -> Tensor:  # [n, 3], [n, D] unit rows -> []
@@ -117,7 +117,7 @@ def merge_pairs(cloud: Gaussians, weights: Tensor, pairs: Tensor) -> Gaussians: 
 
 
 def find_pairs(cloud: Gaussians, like: float, allowed: Tensor) -> Tensor:  # [N] bool -> [P, 2] int64
-    """Neighbours that may merge, no Gaussian twice: like features, and each centre within the other's 95 % ellipsoid.
+    """Neighbours that may merge, no Gaussian twice: like features, and one centre within the 95 % ellipsoid of the other.
 
     Of all candidates the nearest pairs are taken first; two of one pair must find each other.
     """

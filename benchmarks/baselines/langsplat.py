@@ -54,8 +54,8 @@ class LangSplatConfig:
 
     @staticmethod
     def short() -> LangSplatConfig:
-        """For two cores: 10 epochs of 30,000 rows in batches of 512, 600 steps on small views, at 2 and 4 times the rates."""
-        return LangSplatConfig(10, 512, 1.4e-3, 30_000, True, 600, 1e-2, 20_000)
+        """For two cores: 20 epochs of 30,000 rows in batches of 128, 600 steps on small views at 4 times the rate."""
+        return LangSplatConfig(20, 128, 7e-4, 30_000, True, 600, 1e-2, 20_000)
 
 
 class Autoencoder(torch.nn.Module):

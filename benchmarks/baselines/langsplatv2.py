@@ -31,10 +31,12 @@ class LangSplatV2Config:
 
     steps: int = 10_000
     rate: float = 2.5e-3
-    """Of logits and codes."""
+    """Of logits."""
     rows: int = 200_000
     """Most features that the first codes are the means of."""
     pixels: int | None = None
+    code_rate: float = 2.5e-3
+    """Of codes. They have unit length, so that a step at a higher rate replaces the means they start from."""
 
     @staticmethod
     def published() -> LangSplatV2Config:
@@ -43,7 +45,7 @@ class LangSplatV2Config:
 
     @staticmethod
     def short() -> LangSplatV2Config:
-        """For two cores: 400 steps on small views, 20 times the rate."""
+        """For two cores: 400 steps on small views, 20 times the rate of logits."""
         return LangSplatV2Config(400, 5e-2, 30_000, 10_000)
 
 
@@ -62,11 +64,11 @@ def cosine_loss(found: Tensor, wanted: Tensor, known: Tensor) -> Tensor:  # [...
 class Mixtures(torch.nn.Module):
     """Logits of each Gaussian, and the codes."""
 
-    def __init__(self, gaussians: int, codes: Tensor, rate: float, generator: torch.Generator) -> None:
+    def __init__(self, gaussians: int, codes: Tensor, config: LangSplatV2Config, generator: torch.Generator) -> None:
         super().__init__()
         self.logits = torch.nn.Parameter(START * torch.randn(gaussians, len(codes), generator=generator))
         self.codes = torch.nn.Parameter(codes.clone())
-        self.optimizers = [adam([self.logits, self.codes], rate)]
+        self.optimizers = [adam([self.logits], config.rate), adam([self.codes], config.code_rate)]
 
     def splatted(self) -> Tensor:  # [N, K]
         """The sparse weights."""
@@ -89,7 +91,7 @@ def fit(task: Task, config: LangSplatV2Config) -> Fitted:
     with clock.stage("codes"):
         rows = unit_rows(sample_rows(maps, config.rows, generator))
         codes = spherical_kmeans(rows, torch.ones(len(rows)), CODES, generator=generator).centres
-    model, schedule = Mixtures(len(frozen), codes, config.rate, generator), Schedule(config.steps, config.pixels)
+    model, schedule = Mixtures(len(frozen), codes, config, generator), Schedule(config.steps, config.pixels)
     with clock.stage("mixtures"):
         history = train(frozen, task.cameras, maps, model, schedule, generator=generator, progress=task.progress)
     own, codes = model.splatted().detach(), model.codes.detach()
