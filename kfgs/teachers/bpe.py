@@ -13,7 +13,7 @@ import html
 import json
 import re
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from importlib.resources import files
 from itertools import pairwise
@@ -100,17 +100,34 @@ class Tokenizer:
             return (self.ids[word],)
         parts = [self._bytes[byte] for byte in word.encode("utf-8")]
         parts[-1] += _END
-        while len(parts) > 1:
-            best = min(pairwise(parts), key=lambda pair: self._ranks.get(pair, len(self._ranks)))
-            if best not in self._ranks:
-                break
-            merged, index = [], 0
-            while index < len(parts):
-                width = 2 if (parts[index], *parts[index + 1 : index + 2]) == best else 1
-                merged.append("".join(parts[index : index + width]))
-                index += width
-            parts = merged
+        parts = _merge(parts, self._ranks)
         return tuple(self.ids[part] for part in parts)
+
+
+def _merge(parts: list[str], ranks: Mapping[tuple[str, str], int], least: int = 1) -> list[str]:
+    """Merge neighbours, the pair of the lowest rank first, until no pair has a rank or `least` parts are left."""
+    while len(parts) > least:
+        best = min(pairwise(parts), key=lambda pair: ranks.get(pair, len(ranks)))
+        if best not in ranks:
+            break
+        merged, index = [], 0
+        while index < len(parts):
+            width = 2 if (parts[index], *parts[index + 1 : index + 2]) == best else 1
+            merged.append("".join(parts[index : index + width]))
+            index += width
+        parts = merged
+    return parts
+
+
+def _shipped_merges() -> list[tuple[str, str]]:
+    """The merges behind the symbols that kfgs ships: the merges before a symbol leave two parts of it, which it joins."""
+    packed = files("kfgs.teachers").joinpath("data", "clip_bpe_symbols.txt.bz2").read_bytes()
+    ranks: dict[tuple[str, str], int] = {}
+    for symbol in bz2.decompress(packed).decode("utf-8").split("\n"):
+        word = symbol.removesuffix(_END)
+        first, second = _merge([*word[:-1], word[-1] + symbol[len(word) :]], ranks, least=2)
+        ranks[first, second] = len(ranks)
+    return list(ranks)
 
 
 def load_tokenizer(path: str | Path | None = None) -> Tokenizer:
@@ -125,8 +142,7 @@ def load_tokenizer(path: str | Path | None = None) -> Tokenizer:
         ValueError: if it does not hold CLIP's 48,894 merges, or its ids differ from CLIP's.
     """
     if path is None:
-        packed = files("kfgs.teachers").joinpath("data", "clip_bpe_merges.txt.bz2").read_bytes()
-        return Tokenizer(_parse(bz2.decompress(packed).decode("utf-8").split("\n"), "kfgs"))
+        return Tokenizer(_shipped_merges())
     path = Path(path)
     if path.is_dir():
         return _from_folder(path)

@@ -1,4 +1,3 @@
-import bz2
 import gzip
 import hashlib
 import json
@@ -15,7 +14,8 @@ from oracles_bpe import hugging_face, read_merges, vocabulary
 import kfgs
 from kfgs.teachers.bpe import Tokenizer, _words, load_tokenizer
 
-SHIPPED = Path(kfgs.__file__).parent / "teachers" / "data" / "clip_bpe_merges.txt.bz2"
+HEADER = '"bpe_simple_vocab_16e6.txt#version: 0.2'
+SHIPPED = Path(kfgs.__file__).parent / "teachers" / "data" / "clip_bpe_symbols.txt.bz2"
 NAMES = Path(__file__).resolve().parents[3] / "shared" / "data" / "text" / "names.json"
 
 ODD = [
@@ -48,7 +48,7 @@ def oracle():
 
 def test_shipped_merges_are_openais(tokenizer: Tokenizer) -> None:
     """The digest of OpenAI's lines 1 to 48,895, computed from the file whose SHA-256 the NOTICE gives."""
-    text = bz2.decompress(SHIPPED.read_bytes())
+    text = "\n".join([HEADER, *read_merges(SHIPPED), ""]).encode()
     assert hashlib.sha256(text).hexdigest() == "685491abbdad36159d094ecdc23bebc0dd53f8d1df35c4d74ef6036db2ba7572"
     assert text.split(b"\n")[:2] == [b'"bpe_simple_vocab_16e6.txt#version: 0.2', b"i n"]
     assert len(tokenizer.ids) == 49408
@@ -151,7 +151,9 @@ def test_wrong_prompts(tokenizer: Tokenizer, prompts, error, match: str) -> None
 
 
 def test_other_sources_give_the_same_ids(tokenizer: Tokenizer, oracle, tmp_path: Path) -> None:
-    text = bz2.decompress(SHIPPED.read_bytes()) + b"extra merge\n" * 1000  # OpenAI's file has 213,250 more
+    text = (
+        "\n".join([HEADER, *read_merges(SHIPPED), ""]).encode() + b"extra merge\n" * 1000
+    )  # OpenAI's file has 213,250 more
     (tmp_path / "bpe.txt").write_bytes(text)
     (tmp_path / "bpe.txt.gz").write_bytes(gzip.compress(text, 1))
     old = tmp_path / "old"
@@ -174,7 +176,7 @@ def test_wrong_sources(tmp_path: Path) -> None:
     (tmp_path / "short.txt").write_text("#version: 0.2\na b\nc d\n")
     with pytest.raises(ValueError, match=tells("short.txt:", "48,894", "got 2")):
         load_tokenizer(tmp_path / "short.txt")
-    (tmp_path / "cut.txt.gz").write_bytes(gzip.compress(bz2.decompress(SHIPPED.read_bytes()))[:5000])
+    (tmp_path / "cut.txt.gz").write_bytes(gzip.compress(SHIPPED.read_bytes())[:5000])
     with pytest.raises(ValueError, match=tells("cut.txt.gz:", "vocabulary", "read")):
         load_tokenizer(tmp_path / "cut.txt.gz")
     (tmp_path / "noise.txt").write_bytes(b"\xff\xfe\x00")
