@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+from kfgs.cli import main
 from kfgs.fields import FieldConfig
 from kfgs.pipeline import FitConfig
 from kfgs.quant import AutoencoderConfig, CodebookConfig
@@ -39,3 +40,10 @@ def make_room(folder: Path) -> Path:
 
 def config(**changes):
     return dataclasses.replace(CONFIG, **changes)
+
+
+def fit_run(room: Path, out: Path) -> Path:
+    """A fitted run, made through the command line, without an autoencoder for speed."""
+    arguments = ["fit", str(room), "--features", str(room / "features"), "--out", str(out)]
+    assert main([*arguments, "--method", "paper", "--mode", "adc", "--steps", "60", "--max-gaussians", "2000"]) == 0
+    return out

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from messages import tells
 from PIL import Image
-from small_room import make_room
+from small_room import fit_run, make_room
 
 from kfgs.cli import main
 from kfgs.formats.ply import read_ply, write_ply
@@ -21,11 +21,7 @@ def room(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(room, tmp_path_factory):
-    """A fitted run, made through the command line, without an autoencoder for speed."""
-    out = tmp_path_factory.mktemp("run")
-    arguments = ["fit", str(room), "--features", str(room / "features"), "--out", str(out)]
-    assert main([*arguments, "--method", "paper", "--mode", "adc", "--steps", "60", "--max-gaussians", "2000"]) == 0
-    return out
+    return fit_run(room, tmp_path_factory.mktemp("run"))
 
 
 def test_fit_names_what_it_wrote(run):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from evaluated_room import REMOVED, save_splats
 from PIL import Image
-from small_room import make_room
+from small_room import fit_run, make_room
 
 from kfgs import SemanticField, load_scene
 from kfgs.cli import main
@@ -24,10 +24,7 @@ def room(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(room, tmp_path_factory):
-    out = tmp_path_factory.mktemp("run")
-    arguments = ["fit", str(room), "--features", str(room / "features"), "--out", str(out)]
-    assert main([*arguments, "--method", "paper", "--mode", "adc", "--steps", "60", "--max-gaussians", "2000"]) == 0
-    return out
+    return fit_run(room, tmp_path_factory.mktemp("run"))
 
 
 @pytest.fixture(scope="module")
