@@ -22,9 +22,10 @@ from kfgs.fields import FieldConfig, GaussianParams, UpliftConfig, fit_field, up
 from kfgs.gaussians import Gaussians
 from kfgs.labels.views import sum_pixels
 from kfgs.metrics import semantic_storage_bytes
+from kfgs.quant.fit_autoencoder import quick_on_a_cpu
 from kfgs.splat import covariance_3d, rasterize
 
-from .common import Clock, Fitted, Task, one_thread, seeded, within
+from .common import Clock, Fitted, Task, seeded, within
 from .langsplat import Autoencoder
 from .methods import RenderedMethod
 
@@ -184,7 +185,7 @@ def fit(task: Task, config: CF3Config) -> Fitted:
     with clock.stage("autoencoder"):
         assert lifted.features is not None
         rows = unit_rows(found.latents.decode(lifted.features))
-        with one_thread():
+        with quick_on_a_cpu():
             network = fit_autoencoder(rows, config, task.seed)
         with torch.no_grad():
             latents = torch.cat([network.encode(part) for part in rows.split(16_384)])

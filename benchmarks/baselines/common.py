@@ -102,19 +102,6 @@ def seeded(seed: int) -> Iterator[None]:
         yield
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """One torch thread, and denormal numbers taken as zero: small networks train faster so, above all on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # the denormal mode is a property of this thread alone
-    torch.set_flush_denormal(True)
-    try:
-        yield
-    finally:
-        torch.set_flush_denormal(False)
-        torch.set_num_threads(threads)
-
-
 def within(camera: Camera, pixels: int | None) -> Camera:
     """The camera at the largest size of its shape with at most `pixels` pixels; None changes nothing."""
     if pixels is None or camera.width * camera.height <= pixels:

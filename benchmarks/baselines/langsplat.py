@@ -16,8 +16,9 @@ from torch.nn.functional import cosine_similarity, mse_loss
 
 from kfgs._rows import unit_rows
 from kfgs.cameras import resize_labels
+from kfgs.quant.fit_autoencoder import quick_on_a_cpu
 
-from .common import FLOAT, Clock, Fitted, KeptMaps, Task, is_shown, one_thread, sample_rows, seeded
+from .common import FLOAT, Clock, Fitted, KeptMaps, Task, is_shown, sample_rows, seeded
 from .methods import RenderedMethod
 from .trainer import Schedule, adam, train
 
@@ -180,7 +181,7 @@ def fit(task: Task, config: LangSplatConfig) -> Fitted:
     clock, frozen, maps, generator = Clock(), task.frozen, KeptMaps(task.maps), task.generator()
     with clock.stage("autoencoder"):
         rows = unit_rows(sample_rows(maps, config.rows, generator))
-        with one_thread():
+        with quick_on_a_cpu():
             network = fit_autoencoder(rows, config, task.seed)
         targets = EncodedMaps(maps, network)
     model, schedule = Latents(len(frozen), config, generator), Schedule(config.steps, config.pixels)

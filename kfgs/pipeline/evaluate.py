@@ -31,12 +31,9 @@ def evaluate(
     protocol: str = "kfgs-pooled/1",
     *,
     encode: Encode | LabelSet | None = None,
-    truth: str | Path | None = None,
-    split: str | None = None,
-    images: str | Path | None = None,
     with_file: str | Path | None = None,
-    options: Mapping[str, Any] | None = None,
     command: str = "",
+    **asked: Any,
 ) -> Report:
     """Score a result in a scene under a protocol.
 
@@ -46,9 +43,9 @@ def evaluate(
         scene: its folder; or a question that was opened before (`open_question`), to ask several methods the same.
         protocol: a name of `kfgs.evaluation.PROTOCOLS`.
         encode: a label set, or the teacher's text encoder. Not needed for colours and edits.
-        truth, split, images, options: as in `open_question`; not with a question.
         with_file: a second file of a foreign result, see `load_foreign`.
         command: kept in the report.
+        **asked: `truth`, `split`, `images` and `options`, as in `open_question`; not with a question.
 
     Returns:
         Scores with protocol, options, digests of data and field, command and machine.
@@ -62,11 +59,11 @@ def evaluate(
         question = scene
     else:
         check_kind(field, protocol)
-        question = open_question(scene, protocol, truth=truth, split=split, images=images, options=options)
+        question = open_question(scene, protocol, **asked)
     method = open_result(field, question, with_file) if isinstance(field, str | Path) else field
     name = question.protocol.name
-    asked = TableEncoder(encode) if isinstance(encode, LabelSet) else encode
-    report = question.score(colors_of(method, name) if name in OF_COLORS else method, asked)
+    encoder = TableEncoder(encode) if isinstance(encode, LabelSet) else encode
+    report = question.score(colors_of(method, name) if name in OF_COLORS else method, encoder)
     return report.of(command=command, digests={"field": digest_method(method)}, machine=this_machine())
 
 

@@ -132,7 +132,7 @@ def fit_autoencoder(
     optimizer = torch.optim.Adam(weights, lr=config.learning_rate, weight_decay=config.weight_decay, fused=True)
     history: list[dict[str, Any]] = []
     progress = as_progress(progress)
-    with _quick_on_a_cpu():
+    with quick_on_a_cpu():
         for step in tqdm(range(1, config.steps + 1), desc="autoencoder", disable=progress is not True):
             latents = unit_latents(_normalised_mlp(encoder, norms, target))
             low, high = latents.detach().amin(), latents.detach().amax()
@@ -156,7 +156,7 @@ def fit_autoencoder(
 
 
 @contextmanager
-def _quick_on_a_cpu() -> Iterator[None]:
+def quick_on_a_cpu() -> Iterator[None]:
     """One torch thread, and denormal numbers taken as zero, for a while.
 
     The weights of dead units shrink to denormal numbers, which a CPU multiplies some ten times slower. And at most some hundred
