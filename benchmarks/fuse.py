@@ -31,7 +31,7 @@ from kfgs import (
 )
 from kfgs._files import write_json
 from kfgs.evaluation import load_label_map
-from kfgs.fields.packed import pack_field, rounded
+from kfgs.fields import pack_field, unpack_field
 from kfgs.labels import vote_labels
 from kfgs.pipeline import score_scene, score_teacher, true_labels
 
@@ -69,10 +69,10 @@ class Room:
 
 
 def open_vocabulary(room: Room, field: SemanticField, words: Path) -> dict[str, float]:
-    """Rounded latents against the average of all channels on the same Gaussians, weighted by the pixels that they fill."""
+    """The latents of a packed field against the average of all channels on its Gaussians, weighted by the pixels they fill."""
     rows = torch.nn.functional.normalize(torch.from_numpy(np.load(words)).float(), dim=1)
     exact = _average_all(room, field)
-    own = rounded(field).own_features(torch.arange(len(field)))
+    own = field.own_features(torch.arange(len(field)))
     cosine = torch.nn.functional.cosine_similarity(own, exact, dim=1)
     same = (own @ rows.T).argmax(1) == (exact @ rows.T).argmax(1)
     assert field.seen is not None
@@ -139,7 +139,8 @@ def main() -> None:
     for seed in args.seeds:
         config = dataclasses.replace(FitConfig(), seed=seed)
         result = fit_scene(room.scene, room.maps, args.out / str(seed), config, splat=args.splat, report=print)
-        field, packed = result.field, len(pack_field(result.field)) / 2**20
+        field, data = result.field, pack_field(result.field)
+        packed = unpack_field(data)
         miou, accuracy = room.score(field)
         row = {
             "seed": seed,
@@ -148,10 +149,10 @@ def main() -> None:
             "queries": room.queries(field),
             "gaussians": len(field),
             "latents": field.channels,
-            "packed_mib": packed,
-            "miou_packed": room.score(rounded(field))[0],
+            "packed_mib": len(data) / 2**20,
+            "miou_packed": room.score(packed)[0],
             "seconds": {stage.name: round(stage.seconds, 1) for stage in result.stages},
-            **({} if args.words is None or seed != args.seeds[0] else open_vocabulary(room, field, args.words)),
+            **({} if args.words is None or seed != args.seeds[0] else open_vocabulary(room, packed, args.words)),
         }
         rows.append(row)
         print(row, flush=True)

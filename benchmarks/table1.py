@@ -7,7 +7,7 @@ that put features on coloured Gaussians share one cloud, which no semantic loss 
 first. Each row runs in a process of its own; a row that is finished is read back, so a killed run goes on where it stopped.
 
 --quick: `short()` of every baseline, few steps of the paper's rows, and every third test view: under 20 minutes for room_0 on two
-idle cores. Without it baselines take five times as many steps and all views count. --preset paper: the published schedules.
+idle cores. Without it `medium()` of every baseline, and all test views: an hour or two. --preset paper: the published schedules.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from pathlib import Path
 from typing import Any
 
 from table1_report import draw_plots, print_table, save_report
-from table1_rows import LONGER, REQUEST, RESULT, ROWS, config_of
+from table1_rows import REQUEST, RESULT, ROWS, config_of
 
-from kfgs._files import digest_file, read_json, write_json
+import kfgs
+from kfgs._files import digest_file, digest_value, read_json, write_json
 from kfgs.evaluation import load_label_set
 from kfgs.features import FeatureFolder
 from kfgs.pipeline import ColorConfig, fit_color, score_teacher, true_labels
@@ -38,12 +39,12 @@ def main() -> None:
     start = time.perf_counter()
     args.out.mkdir(parents=True, exist_ok=True)
     splat, geometry_seconds = find_splat(args)
-    teacher = read_teacher(args)
+    teacher, data = read_teacher(args), data_digests(args, splat)
     results: list[dict[str, Any]] = []
     failed = []
     for key in args.rows:
         for seed in args.seeds:
-            found = row_result(args, key, seed, splat)
+            found = row_result(args, key, seed, splat, data)
             if found is None:
                 failed.append(f"{key}, seed {seed}")
                 continue
@@ -55,7 +56,7 @@ def main() -> None:
     about = {
         "machine": this_machine(),
         "command": "python benchmarks/table1.py " + " ".join(sys.argv[1:]), "preset": preset_of(args),
-        "geometry_seconds": geometry_seconds, "seconds": time.perf_counter() - start, "teacher": teacher, "longer": LONGER,
+        "geometry_seconds": geometry_seconds, "seconds": time.perf_counter() - start, "teacher": teacher,
     }  # fmt: skip
     save_report(args.out / "table1.json", about, results)
     print_table(args.out / "table1.md", about, results)
@@ -104,22 +105,38 @@ def every(args: argparse.Namespace) -> int:
     return args.every or (3 if args.quick else 1)
 
 
-def row_result(args: argparse.Namespace, key: str, seed: int, splat: Path) -> dict[str, Any] | None:
-    """A row's result: read back if it is there and was asked for in the same way, else made in a process of its own."""
-    preset = preset_of(args)
-    uses_splat = ROWS[key].mode is None
-    request = {
-        "row": key, "seed": seed, "preset": preset, "steps": args.steps, "scene": str(args.scene), "truth": args.truth,
-        "features": str(args.features), "every": every(args), "splat": str(splat) if uses_splat else None,
-        "splat_digest": digest_file(splat) if uses_splat else None, "config": config_of(key, preset, args.steps, seed),
+def data_digests(args: argparse.Namespace, splat: Path) -> dict[str, str]:
+    """SHA-256 of what a row depends on beside its configuration, so that a row of other data or other code is made again."""
+    sources = [*Path(kfgs.__file__).parent.rglob("*.py"), *HERE.glob("baselines/*.py"), HERE / "table1_rows.py"]
+    parts = {
+        "code": sources,
+        "maps": [file for file in args.features.iterdir() if file.is_file() and not file.name.startswith(".")],
+        "scene": [
+            file
+            for folder in (args.scene / "sparse", args.scene / args.truth)
+            for file in folder.rglob("*") if file.is_file()
+        ] + [file for file in args.scene.iterdir() if file.is_file()],
     }  # fmt: skip
-    folder = args.out / "rows" / f"{key}-{preset}-{seed}"
+    digests = {name: digest_value(sorted(digest_file(file) for file in files)) for name, files in parts.items()}
+    return digests | {"splat": digest_file(splat) if splat.is_file() else ""}
+
+
+def row_result(
+    args: argparse.Namespace, key: str, seed: int, splat: Path, digests: dict[str, str]
+) -> dict[str, Any] | None:
+    """A row's result: read back if it is there and was asked for in the same way, else made in a process of its own."""
+    preset, mode = preset_of(args), ROWS[key].mode
+    facts = {
+        "row": key, "seed": seed, "preset": preset, "steps": args.steps, "truth": args.truth, "every": every(args),
+        "config": config_of(key, preset, args.steps, seed), "digests": digests | ({} if mode is None else {"splat": ""}),
+        "given": args.splat is not None and mode is None,
+    }  # fmt: skip
+    paths = {"scene": str(args.scene), "features": str(args.features), "splat": str(splat) if mode is None else None}
+    request = facts | paths
+    folder = args.out / "rows" / f"{key}-{preset}-{seed}-{digest_value(facts)[:8]}"
     if (folder / RESULT).is_file():
-        found = read_json(folder / RESULT)
-        if same(found["request"], request):
-            return dict(found)
+        return dict(read_json(folder / RESULT))
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / RESULT).unlink(missing_ok=True)
     write_json(folder / REQUEST, request)
     command = [sys.executable, str(HERE / "table1_rows.py"), str(folder)]
     with (folder / "log.txt").open("w") as log:
@@ -128,15 +145,6 @@ def row_result(args: argparse.Namespace, key: str, seed: int, splat: Path) -> di
         print(f"{key}, seed {seed}: failed with {code}:\n" + (folder / "log.txt").read_text()[-1_500:], file=sys.stderr)
         return None
     return dict(read_json(folder / RESULT))
-
-
-def same(one: Any, other: Any) -> bool:
-    """Whether two requests ask for the same; a tuple is a list in JSON."""
-    if isinstance(one, dict) and isinstance(other, dict):
-        return one.keys() == other.keys() and all(same(one[name], other[name]) for name in one)
-    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
-        return len(one) == len(other) and all(map(same, one, other))
-    return bool(one == other)
 
 
 def parse_arguments() -> argparse.Namespace:
@@ -153,7 +161,15 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--every", type=int, help="score every so many test views")
     parser.add_argument("--truth", default="labels_scored")
     parser.add_argument("--seeds", "--seed", type=int, nargs="+", default=[0])
-    return parser.parse_args()
+    args = parser.parse_args()
+    if args.splat is not None and not args.splat.is_file():
+        parser.error(f"--splat: expected a file, got {args.splat}, which does not exist")
+    if not (args.scene / args.truth).is_dir():
+        found = ", ".join(sorted(entry.name for entry in args.scene.glob("labels*"))) or "none"
+        parser.error(
+            f"--truth: expected a folder of label pictures in {args.scene}, got {args.truth!r}; there: {found}"
+        )
+    return args
 
 
 if __name__ == "__main__":

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from statistics import mean
+from statistics import mean, median
 from typing import Any
 
 import numpy as np
-from table1_rows import ROWS
+from table1_rows import ROWS, fitting_seconds
 
 from kfgs._files import atomic_path, write_json
 from kfgs.evaluation import load_label_map, load_label_set
@@ -19,13 +19,14 @@ from kfgs.viz.pictures import legend_strip, picture_grid
 
 COLUMNS = 5  # of the picture of labels
 HEAD = (
-    "row", "dim", "mIoU", "accuracy", "agrees with teacher: accuracy, IoU7", "minutes (stages, s)", "Gaussians",
-    "storage, MiB", "on disk, MiB", "FPS maps", "FPS labels", "peak, GB", "paper: mIoU, min, Gaussians, MB, FPS",
+    "row", "dim", "mIoU", "by nearest text / by votes", "accuracy", "agrees with teacher: accuracy, IoU7",
+    "codec: cosine, class kept", "minutes (stages, s)", "Gaussians",
+    "storage, MiB", "on disk, MiB", "FPS maps", "FPS labels", "peak of the fit, GB", "paper: mIoU, min, Gaussians, MB, FPS",
 )  # fmt: skip
 PRESETS = {
-    "quick": "baselines by their `short()`, few steps of the paper's rows, every third test view",
-    "cpu": "baselines by their `short()` with {longer} times the steps, kfgs's rows by its preset `cpu`",
-    "paper": "published schedules",
+    "quick": "baselines by their `short()`, few steps of the paper's rows",
+    "cpu": "baselines by their `medium()`, fields of the paper's rows by `FieldConfig.cpu()`",
+    "paper": "`published()` of every baseline, the paper's schedule",
 }
 
 
@@ -44,7 +45,7 @@ def print_table(path: Path, about: dict[str, Any], results: list[dict[str, Any]]
 
 def table_text(about: dict[str, Any], results: list[dict[str, Any]]) -> str:
     """The table with what has to be said about it."""
-    lines = [f"{about['command']}", "", f"Preset {about['preset']}: {PRESETS[about['preset']].format(**about)}."]
+    lines = [f"{about['command']}", "", f"Preset {about['preset']}: {PRESETS[about['preset']]}."]
     lines.append(f"{about['machine']}; {about['seconds'] / 60:.1f} minutes in all (rows read back take none).")
     if about["geometry_seconds"] is not None:
         lines.append(
@@ -72,18 +73,24 @@ def cells(title: str, paper: dict[str, Any] | None, found: list[dict[str, Any]])
 
     spread = "" if len(found) == 1 else " ({:.1f} to {:.1f})".format(*_range([100 * one["miou"] for one in found]))
     stages = ", ".join(f"{name} {mean(one['stages'][name] for one in found):.0f}" for name in found[0]["stages"])
+    minutes = median(fitting_seconds(one["stages"]) for one in found) / 60
     agrees = "-"
     if "teacher_accuracy" in found[0]:
         agrees = f"{100 * average('teacher_accuracy'):.1f}, {100 * average('teacher_iou7'):.1f}"
+    rules, codec = "-", "-"
+    if "miou_votes" in found[0]:
+        rules = f"{100 * average('miou_nearest'):.1f} / {100 * average('miou_votes'):.1f}"
+    if "codec_cosine" in found[0]:
+        codec = f"{average('codec_cosine'):.3f}, {100 * average('codec_same'):.1f}"
     packed = "" if "packed" not in found[0] else f" (packed {average('packed') / MIB:.2f})"
     published = "-"
     if paper is not None:
         published = f"{paper['miou']}, {paper['minutes']}, {paper['gaussians'] / 1_000:.1f}k, {paper['mib']}, {paper['fps']:.1f}"
     return [
-        title, found[0]["dim"], f"{100 * average('miou'):.1f}{spread}", f"{100 * average('accuracy'):.1f}", agrees,
-        f"{mean(sum(one['stages'].values()) for one in found) / 60:.2f} ({stages})", f"{average('gaussians') / 1_000:.1f}k",
+        title, found[0]["dim"], f"{100 * average('miou'):.1f}{spread}", rules, f"{100 * average('accuracy'):.1f}", agrees,
+        codec, f"{minutes:.2f} ({stages})", f"{average('gaussians') / 1_000:.1f}k",
         f"{average('storage') / MIB:.2f}", f"{average('disk') / MIB:.2f}{packed}", f"{average('fps_maps'):.1f}",
-        f"{average('fps_labels'):.1f}", f"{average('peak') / 1e9:.2f}", published,
+        f"{average('fps_labels'):.1f}", f"{average('peak_fit') / 1e9:.2f}", published,
     ]  # fmt: skip
 
 
@@ -102,7 +109,7 @@ def draw_plots(out: Path, scene: Path, truth: str, results: list[dict[str, Any]]
         if found:
             title, miou = row.title.strip("*"), mean(one["miou"] for one in found)
             sizes[title] = mean(one["storage"] for one in found) / MIB, miou
-            times[title] = max(mean(sum(one["stages"].values()) for one in found) / 60, 1e-3), miou
+            times[title] = max(median(fitting_seconds(one["stages"]) for one in found) / 60, 1e-3), miou
     paper = {f"{row.title.split(' (')[0]} (paper)": row.paper for row in ROWS.values() if row.paper is not None}
     figure = new_figure(12, 8)  # large enough for the names of both kinds of points
     plot_quality_storage(
@@ -133,7 +140,7 @@ def draw_labels(out: Path, folder: Path, truth: str, results: list[dict[str, Any
         maps["truth"] = load_label_map(folder / truth / f"{stem}.png")
     for result in results:
         request = result["request"]
-        labels = out / "rows" / f"{request['row']}-{request['preset']}-{request['seed']}" / "labels.png"
+        labels = out / "rows" / result["folder"] / "labels.png"
         if result["picture"] == stem and request["seed"] == seed and labels.is_file():
             maps[ROWS[request["row"]].title.strip("*")] = load_label_map(labels)
     pictures = [photo, *(overlay_labels(photo, labels) for labels in maps.values())]

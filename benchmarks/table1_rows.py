@@ -6,6 +6,7 @@ python benchmarks/table1_rows.py FOLDER    # reads FOLDER/request.json, writes F
 from __future__ import annotations
 
 import re
+import shutil
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -16,16 +17,18 @@ from typing import Any
 
 import torch
 from baselines import cf3, feature_3dgs, langsplat, langsplatv2, legaussians, occam, plain_uplift
-from baselines.common import FLOAT, Fitted, Task
+from baselines.common import FLOAT, Fitted, Task, sample_rows
+from baselines.methods import LabelMaps
 from safetensors.torch import save_file
 
 from kfgs._files import read_json, write_json
+from kfgs._rows import unit_rows
 from kfgs.cameras import Camera
 from kfgs.evaluation import FieldMethod, LabelTruth, Method, TeacherMethod, View, label_view, load_label_set
-from kfgs.evaluation.segmentation import evaluate_segmentation
+from kfgs.evaluation.segmentation import SegmentationReport, evaluate_segmentation
 from kfgs.evaluation.teacher_agreement import TeacherAgreement
 from kfgs.features import FeatureFolder
-from kfgs.fields import SemanticField, pack_field
+from kfgs.fields import FieldConfig, SemanticField, pack_field
 from kfgs.formats import read_splats
 from kfgs.labels import LabelSet
 from kfgs.pipeline import FitConfig, fit_scene, true_labels
@@ -33,10 +36,9 @@ from kfgs.pipeline.apply import save_label_map
 from kfgs.pipeline.maps import Maps
 from kfgs.scenes import Scene, load_scene
 
-LONGER = 5
-"""Times the steps of `short()` when the table is not to be quick."""
-QUICK_STEPS = {"decouple": 350, "adc": 350, "adc+sc": 800}
+QUICK_STEPS = {"decouple": 350, "adc": 350, "adc+sc": 800, "own-adc+sc": 800}
 FPS_VIEWS = 5
+CODEC_ROWS = 20_000  # features that the codec's scores are taken over
 REQUEST, RESULT = "request.json", "row.json"
 
 
@@ -53,6 +55,8 @@ class Row:
     """Of the presets of its configuration."""
     mode: str | None = None
     """Of kfgs's `--method paper`; a row with neither is kfgs's default."""
+    own: bool = False
+    """Whether a row with a mode has kfgs's codebook and autoencoder instead of the paper's."""
 
 
 def _paper(dim: str, miou: float, minutes: str, gaussians: float, mib: float, fps: float) -> dict[str, Any]:
@@ -69,6 +73,7 @@ ROWS = {
     "decouple": Row("just decouple", _paper("512", 73.5, "263", 29.6, 59.4, 6.26), mode="decouple"),
     "adc": Row("decouple + ADC", _paper("512", 77.9, "220", 28.7, 57.6, 9.37), mode="adc"),
     "adc+sc": Row("decouple + ADC + SC", _paper("9", 76.6, "8", 110.5, 13.0, 36.08), mode="adc+sc"),
+    "own-adc+sc": Row("ADC + SC, kfgs's codebook", mode="adc+sc", own=True),
     "kfgs": Row("**kfgs default**"),
     "langsplatv2": Row("LangSplatV2 (one level)", module=langsplatv2),
     "occam": Row("Occam's LGS", module=occam),
@@ -85,20 +90,24 @@ CONFIGS = {
 
 
 def baseline_config(row: Row, preset: str) -> Any:
-    """A baseline's configuration: `quick` is `short()`, `cpu` has five times its steps, `paper` is `published()`."""
+    """A baseline's configuration: `quick` is `short()`, `cpu` is `medium()`, `paper` is `published()`."""
     kind = CONFIGS[row.module]
-    if preset == "paper":
-        return kind.published(*row.options)
-    config = kind.short(*row.options)
-    return replace(config, steps=LONGER * config.steps) if preset == "cpu" and hasattr(config, "steps") else config
+    make = {"quick": kind.short, "cpu": kind.medium, "paper": kind.published}[preset]
+    return make(*row.options)
 
 
 def kfgs_config(row: Row, key: str, preset: str, steps: int | None, seed: int) -> FitConfig:
-    """The configuration of one of kfgs's own rows."""
+    """The configuration of one of kfgs's own rows.
+
+    Codebook and autoencoder of the paper's rows are the paper's; only `--preset paper` has its schedule of the field, too.
+    """
     if row.mode is None:
         return FitConfig(seed=seed)
-    config = FitConfig.paper() if preset == "paper" else FitConfig.cpu()
-    config = replace(config, method="paper", mode=row.mode, seed=seed)
+    config = (
+        FitConfig(method="paper", mode=row.mode, seed=seed) if row.own else FitConfig.paper(mode=row.mode, seed=seed)
+    )
+    if preset != "paper":
+        config = replace(config, field=FieldConfig.cpu())
     steps = QUICK_STEPS[key] if preset == "quick" and steps is None else steps
     return config if steps is None else replace(config, field=config.field.with_steps(steps))
 
@@ -117,6 +126,10 @@ class Made:
     method: Method
     render: Callable[[Camera], Any]
     facts: dict[str, Any]
+    nearest: Method
+    """The same, labelled by the text nearest to each pixel's feature."""
+    codec: Callable[[torch.Tensor], torch.Tensor] | None
+    """See `Fitted.codec`."""
 
 
 class Room:
@@ -128,7 +141,7 @@ class Room:
         self.features = features
         self.maps: Maps = FeatureFolder(features).of(self.scene, "train")
         views = [View(self.scene.stem(i), self.scene.cameras[i]) for i in self.scene.views("test")]
-        self.all_views, self.views = views, views[::every]
+        self.views = views[::every]
         found = true_labels(self.scene, folder / truth, "test")
         self.truth = LabelTruth(
             tuple(self.classes.names), {v.stem: found[v.stem] for v in self.views if v.stem in found}
@@ -139,28 +152,52 @@ class Room:
         """The classes."""
         return torch.nn.functional.normalize(self.classes.embeddings.float(), dim=1)
 
-    def score(self, method: Method) -> dict[str, Any]:
-        """`kfgs-pooled/1` over the views that were chosen, and, if the teacher has maps of them, the agreement with it."""
-        views = {view.stem: view for view in self.views}
-        report = evaluate_segmentation(
-            lambda stem: label_view(method, views[stem], self.text), self.truth.maps, self.truth.names
-        )
-        scores: dict[str, Any] = {
-            "pooled": report.to_json(),
-            "miou": report.miou.value,
-            "accuracy": report.accuracy.value,
-        }
+    def score(self, method: Method, nearest: Method) -> dict[str, Any]:
+        """`kfgs-pooled/1` over the chosen views by three rules, and, if the teacher has maps of them, the agreement with it.
+
+        Args:
+            method: labels views by a rule of its own.
+            nearest: the same method, by the nearest text of the rendered feature.
+        """
+        maps = LabelMaps(method, self.text)
+        report = self.pooled(maps)
+        scores = {"pooled": report.to_json(), "miou": report.miou.value, "accuracy": report.accuracy.value}
+        scores["miou_nearest"] = scores["miou"] if nearest is method else self.pooled(nearest).miou.value
+        scores["miou_votes"] = self.pooled(LabelMaps(method, self.text, votes=True)).miou.value
         try:
-            maps = FeatureFolder(self.features).of(self.scene, "test")
+            taught = TeacherMethod(FeatureFolder(self.features).of(self.scene, "test"), align_corners=True)
         except FileNotFoundError:
             return scores
-        agreement = TeacherAgreement(texts=tuple(self.classes.names))
-        found = agreement.score(method, TeacherMethod(maps, align_corners=True), self.all_views, lambda _: self.text)
+        agreement = TeacherAgreement(texts=tuple(self.classes.names), split=None)
+        found = agreement.score(maps, taught, self.views, lambda _: self.text)
         return scores | {
             "teacher": found.to_json(),
             "teacher_accuracy": found["accuracy"],
             "teacher_iou7": found["mIoU"],
         }
+
+    def pooled(self, method: Method) -> SegmentationReport:
+        """`kfgs-pooled/1` of a method's labels over the chosen views."""
+        views = {view.stem: view for view in self.views}
+        return evaluate_segmentation(
+            lambda stem: label_view(method, views[stem], self.text), self.truth.maps, self.truth.names
+        )
+
+    def codec_scores(self, codec: Callable[[torch.Tensor], torch.Tensor] | None, seed: int) -> dict[str, float]:
+        """What compression alone costs: cosine with the teacher's features, and the share that keeps its best class."""
+        if codec is None:
+            return {}
+        rows = sample_rows(self.maps, CODEC_ROWS, torch.Generator().manual_seed(seed)).float()
+        with torch.no_grad():
+            found = unit_rows(torch.cat([codec(part) for part in rows.split(8_192)]))
+        cosine = (unit_rows(rows) * found).sum(dim=1).mean()
+        same = (rows @ self.text.T).argmax(dim=1) == (found @ self.text.T).argmax(dim=1)
+        return {"codec_cosine": float(cosine), "codec_same": float(same.double().mean())}
+
+
+def fitting_seconds(stages: dict[str, float]) -> float:
+    """The time that a method takes. Fused answers of the paper's fields are kfgs's own addition, and label no view."""
+    return sum(seconds for name, seconds in stages.items() if name != "answers")
 
 
 def frames_per_second(work: Callable[[Any], object], items: Sequence[Any]) -> float:
@@ -196,13 +233,14 @@ def make_baseline(row: Row, room: Room, request: dict[str, Any], folder: Path) -
         "dim": fitted.dim, "gaussians": len(fitted.method.gaussians), "storage": fitted.storage,
         "disk": file.stat().st_size + shape, "stages": fitted.seconds, "history": fitted.history,
     }  # fmt: skip
-    return Made(fitted.method, fitted.method.render, facts)
+    return Made(fitted.method, fitted.method.render, facts, fitted.method, fitted.codec)
 
 
 def make_kfgs(row: Row, room: Room, request: dict[str, Any], folder: Path) -> Made:
     """Fit one of kfgs's own rows."""
     config = kfgs_config(row, request["row"], request["preset"], request["steps"], request["seed"])
     splat = request["splat"] if row.mode is None else None
+    shutil.rmtree(folder / "run", ignore_errors=True)  # stages of a killed run would count too few seconds
     result = fit_scene(room.scene, room.maps, folder / "run", config, splat=splat, report=print)
     field: SemanticField = result.field
     stages: dict[str, float] = {}
@@ -214,7 +252,19 @@ def make_kfgs(row: Row, room: Room, request: dict[str, Any], folder: Path) -> Ma
     }  # fmt: skip
     if row.mode is None:
         facts["packed"] = len(pack_field(field))
-    return Made(FieldMethod(field), partial(_render, field), facts)
+    method, nearest = FieldMethod(field), FieldMethod(field, own_labels=False)
+    return Made(method, partial(_render, field), facts, nearest, field_codec(field))
+
+
+def field_codec(field: SemanticField) -> Callable[[torch.Tensor], torch.Tensor] | None:
+    """What a field's compression alone makes of features; None if it stores them as they are."""
+    book, network, linear = field.codebook, field.autoencoder, field.linear
+    if book is None:
+        return None if linear is None or field.method != "fused" else lambda rows: linear.decode(linear.encode(rows))
+    if network is None:
+        return lambda rows: book.codewords[book.quantize(rows)]
+    decoded = network.decode(network.encode(book.codewords))
+    return lambda rows: book.codewords[book.quantize(decoded)][book.quantize(rows)]
 
 
 def _render(field: SemanticField, camera: Camera) -> None:
@@ -233,11 +283,12 @@ def run_row(folder: Path) -> dict[str, Any]:
         fps = frames_per_second(lambda view: made.render(view.camera), shown)
         label_fps = frames_per_second(lambda view: label_view(made.method, view, text), shown)
     fitted = time.perf_counter()
-    scores = room.score(made.method)
+    scores = room.score(made.method, made.nearest) | room.codec_scores(made.codec, request["seed"])
     middle = room.views[len(room.views) // 2]
     save_label_map(folder / "labels.png", label_view(made.method, middle, text))
     return {
-        "request": request, **made.facts, **scores, "fps_maps": fps, "fps_labels": label_fps, "peak_fit": fit_peak,
+        "request": request, "folder": folder.name,
+        **made.facts, **scores, "fps_maps": fps, "fps_labels": label_fps, "peak_fit": fit_peak,
         "peak": peak_memory(), "views": len(room.truth.maps), "picture": middle.stem, "threads": torch.get_num_threads(),
         "scoring_seconds": time.perf_counter() - fitted, "wall_seconds": time.perf_counter() - start,
     }  # fmt: skip

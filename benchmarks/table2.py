@@ -14,10 +14,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from table1_rows import FPS_VIEWS, QUICK_STEPS, Room, frames_per_second
+from table1 import data_digests
+from table1_rows import FPS_VIEWS, QUICK_STEPS, Room, field_codec, fitting_seconds, frames_per_second
 
 from kfgs._files import atomic_path, digest_value, read_json, write_json
 from kfgs.evaluation import FieldMethod
+from kfgs.fields import FieldConfig
 from kfgs.metrics import MIB
 from kfgs.pipeline import FitConfig, fit_scene
 from kfgs.viz.figures import new_figure, save_figure
@@ -31,8 +33,9 @@ PAPER = {  # mIoU, minutes, thousand Gaussians, MB, FPS
 
 def config_of(dim: int, args: argparse.Namespace) -> FitConfig:
     """Of one row: `adc+sc` with so many latents, or `adc`."""
-    config = FitConfig.paper() if args.preset == "paper" else FitConfig.cpu()
-    config = replace(config, method="paper", mode="adc" if dim == FULL else "adc+sc", seed=args.seed)
+    config = FitConfig.paper(mode="adc" if dim == FULL else "adc+sc", seed=args.seed)
+    if args.preset != "paper":
+        config = replace(config, field=FieldConfig.cpu())
     if dim != FULL:
         config = replace(config, autoencoder=replace(config.autoencoder, latent=dim))
     steps = args.steps or (QUICK_STEPS[config.mode] if args.quick else None)
@@ -43,15 +46,21 @@ def run(dim: int, room: Room, args: argparse.Namespace) -> dict[str, Any]:
     """One row, fitted and scored, or read back."""
     config = config_of(dim, args)
     result = fit_scene(room.scene, room.maps, args.out / "run", config, report=print)
-    asked = {"stages": [stage.key for stage in result.stages], "views": [view.stem for view in room.views]}
+    asked = {
+        "stages": [stage.key for stage in result.stages],
+        "views": [view.stem for view in room.views],
+        "truth": args.truth,
+        "digests": data_digests(args, args.out / "none"),
+    }
     file = args.out / "rows" / f"{dim}-{digest_value(asked)[:12]}.json"
     if file.is_file():
         return dict(read_json(file))
-    method = FieldMethod(result.field)
     field = result.field
+    method, nearest = FieldMethod(field), FieldMethod(field, own_labels=False)
     seconds = {stage.name: stage.seconds for stage in result.stages}
     row = {
-        "dim": dim, **room.score(method), "stages": seconds, "gaussians": len(field), "storage": field.storage(),
+        "dim": dim, **room.score(method, nearest), **room.codec_scores(field_codec(field), args.seed), "stages": seconds,
+        "gaussians": len(field), "storage": field.storage(),
         "fps_maps": frames_per_second(lambda view: field.render(view.camera), room.views[:FPS_VIEWS]),
         "steps": config.field.steps,
     }  # fmt: skip
@@ -71,7 +80,7 @@ def table_text(rows: list[dict[str, Any]], command: str) -> str:
     for row in rows:
         paper = PAPER.get(row["dim"])
         published = "-" if paper is None else "{}, {}, {}k, {}, {:.1f}".format(*paper)
-        minutes, count = sum(row["stages"].values()) / 60, row["gaussians"] / 1_000
+        minutes, count = fitting_seconds(row["stages"]) / 60, row["gaussians"] / 1_000
         lines.append(
             f"| {row['dim']} | {100 * row['miou']:.1f} | {100 * row['accuracy']:.1f} | {minutes:.2f} | {count:.1f}k | "
             f"{row['storage'] / MIB:.2f} | {row['fps_maps']:.1f} | {row['steps']} | {published} |"

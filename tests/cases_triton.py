@@ -22,7 +22,7 @@ import torch
 from cases_splat import a_camera, gaussians_before, random_splats
 from torch import Tensor
 
-from kfgs.splat import Tiles, accumulate_pixels, bin_tiles, composite, rasterize
+from kfgs.splat import Tiles, accumulate_pixels, bin_tiles, composite, rank_channels, rasterize
 from kfgs.splat.engines import ops
 from kfgs.splat.engines.contract import Composited, Splats
 
@@ -67,6 +67,7 @@ CASES = {
     # 1e-3 is left after three; the fourth would leave 5e-5, so it is not drawn, nor the fifth, which would leave 9e-4
     "stop": Case(5, opacities=(0.9, 0.9, 0.9, 0.95, 0.1), stack=True),
     "stop in the third chunk": Case(opacities=(*[0.1] * 36, 0.9, 0.9, 0.995, *[0.02] * 20), stack=True),
+    "ties": Case(70, opacities=(0.5, 0.5, 0.5), stack=True),
     "skipped": Case(opacities=(0.999 / 255, 0.5, 0.999 / 255), stack=True),
     "opacity 0": Case(opacities=(0.0, 0.5), stack=True),
     "empty tiles": Case(count=3, size=(100, 40), sigma=(0.7, 2.0)),
@@ -132,11 +133,42 @@ def run_case(case: Case, device: str) -> dict[str, float | bool]:
     sums, weights = accumulate_pixels(*inputs[:3], cotangents[0], tiles, engine="triton")
     actual = {"maps": maps, "alphas": alphas, "sums": sums, "weights": weights, **dict(zip(GRADS, grads, strict=True))}
     facts = compare(actual, reference(inputs, index, tiles, *cotangents))
+    facts |= check_ranks(inputs, index, tiles, ties=set(case.opacities) == {0.5})
     facts["inputs untouched"] = all(torch.equal(a, b) for a, b in zip(inputs, before, strict=True))
     facts["differentiable"] = (
         maps.requires_grad and alphas.requires_grad and not (sums + weights[:, None]).requires_grad
     )
     return facts | check_manners(inputs, index, tiles, cotangents, grads) if case.manners else facts
+
+
+def check_ranks(inputs: list[Tensor], index: Tensor | None, tiles: Tiles, *, ties: bool) -> dict[str, float | bool]:
+    """Whether the best channels are those of the maps of the reference, in order, wherever rounding cannot change it."""
+    truth, alphas = composite(
+        *(value.detach().cpu().double() for value in inputs[:3]),
+        inputs[3].detach().cpu().double(),
+        tiles._replace(rows=tiles.rows.cpu(), offsets=tiles.offsets.cpu()),
+        index=index if index is None else index.cpu(),
+        engine="reference",
+    )
+    facts: dict[str, float | bool] = {}
+    channels = truth.shape[2]
+    for top in sorted({1, min(3, channels)}):
+        found = rank_channels(*inputs[:4], tiles, top=top, index=index, engine="triton")
+        labels, scores = found.labels.cpu(), found.scores.cpu().double()
+        drawn = (alphas > 0)[..., None]
+        ordered = truth.sort(dim=-1, descending=True).values[..., :top]
+        facts[f"top {top}: drawn"] = torch.equal(labels >= 0, drawn.expand_as(labels))
+        facts[f"top {top}: scores"] = largest((scores - ordered) * drawn) <= 1e-5
+        facts[f"top {top}: labels"] = largest((truth.gather(2, labels.clamp_min(0)) - ordered) * drawn) <= 1e-5
+        distinct = labels.sort(dim=-1).values.diff(dim=-1) > 0
+        facts[f"top {top}: each once"] = bool((distinct | ~drawn).all())
+        facts[f"top {top}: alphas"] = largest(found.alphas.cpu().double() - alphas) <= 1e-5
+    if ties:  # sums of halves, quarters and so on are exact
+        same = rank_channels(*inputs[:3], torch.ones_like(inputs[3]), tiles, top=channels, index=index, engine="triton")
+        facts["ties go to the lowest"] = torch.equal(
+            same.labels.cpu(), torch.arange(channels).where((alphas > 0)[..., None], -1)
+        )
+    return facts
 
 
 def check_manners(
@@ -229,12 +261,13 @@ class Build(NamedTuple):
     indexed: bool = True
 
 
-KERNELS = ("composite", "accumulate", "differentiate")
+KERNELS = ("composite", "accumulate", "differentiate", "rank")
 BUILDS = {
     **{f"{kernel}, 512 channels, sm_{cc}": Build(kernel, 512, cc) for kernel in KERNELS for cc in (80, 90, 100)},
     "differentiate, 130 channels, sm_90": Build("differentiate", 130, 90),
     **{f"{kernel}, 9 channels, sm_90": Build(kernel, 9, 90) for kernel in KERNELS},
     "composite, 1 channel, tiles of 5": Build("composite", 1, 80, tile_size=5, indexed=False),
+    "rank, 1 channel, tiles of 5": Build("rank", 1, 80, tile_size=5, indexed=False),
     "differentiate, 1 channel, tiles of 5": Build("differentiate", 1, 80, tile_size=5, indexed=False),
     "differentiate, 9 channels, tiles of 2": Build("differentiate", 9, 90, tile_size=2),
 }
@@ -249,22 +282,26 @@ def compile_ahead(build: Build) -> dict[str, Any]:
     from kfgs.splat.engines.triton import engine as triton_gpu
     from kfgs.splat.engines.triton import kernels as triton_kernels
     from kfgs.splat.engines.triton import kernels_backward as triton_kernels_backward
+    from kfgs.splat.engines.triton import kernels_rank as triton_kernels_rank
 
     kernel = {
         "composite": triton_kernels.composite_kernel,
         "accumulate": triton_kernels.accumulate_kernel,
         "differentiate": triton_kernels_backward.differentiate_kernel,
+        "rank": triton_kernels_rank.rank_kernel,
     }[build.kernel]
     sizes = triton_gpu.launch_options(build.kernel, build.channels, build.tile_size)
     options = {name: sizes.pop(name) for name in ("num_warps", "num_stages", "enable_fp_fusion")}
     if build.kernel == "differentiate":
         sizes |= {"OF_SPLATS": True, "OF_FEATURES": True}
+    if build.kernel == "rank":
+        sizes |= {"TOP": 4}
     if build.channels == 1:  # as triton does with an argument that is 1
         sizes["channels"] = 1
     if not build.indexed and build.kernel != "accumulate":
         sizes["index"] = None
-    types = {"index": "*i64", "rows": "*i32", "offsets": "*i64", "stops": "*i32"}
-    types |= dict.fromkeys(("width", "height", "columns", "channels"), "i32") | dict.fromkeys(sizes, "constexpr")
+    types = {"index": "*i64", "rows": "*i32", "offsets": "*i64", "stops": "*i32", "labels": "*i64"}
+    types |= dict.fromkeys(("width", "height", "columns", "channels", "top"), "i32") | dict.fromkeys(sizes, "constexpr")
     signature = {name: types.get(name, "*fp32") for name in kernel.arg_names}
     aligned = {(k,): [["tt.divisibility", 16]] for k, of in enumerate(signature.values()) if of.startswith("*")}
     if build.channels % 16 == 0:  # and with one that 16 divides

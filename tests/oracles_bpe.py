@@ -9,7 +9,7 @@ from typing import Any
 def read_merges(path: Path) -> list[str]:
     """The lines "a b" behind a packed list of joined symbols: each is taken apart by the merges before it."""
     ranks: dict[tuple[str, str], int] = {}
-    for symbol in bz2.decompress(path.read_bytes()).decode("utf-8").split("\n"):
+    for symbol in bz2.decompress(path.read_bytes()).replace(b"\r", b"</w>\n").decode("utf-8").split("\n"):
         ended = symbol.endswith("</w>")
         parts = list(symbol[:-4] if ended else symbol)
         if ended:

@@ -150,9 +150,13 @@ def select_argmax(cosines, texts, text):
 
 def select_by_relevancy(cosines, text, negatives, means, *, threshold, smoothed, neighbours=10):
     levels, count = cosines[text].shape
-    known = [n for n in range(count) if not np.isnan(cosines[text][:, n]).any()]
     found, tops = [], []
     for level in range(levels):
+        known = [n for n in range(count) if not np.isnan(cosines[text][level, n])]
+        if not known:
+            found.append(np.zeros(count, bool))
+            tops.append(-math.inf)
+            continue
         r = np.array([relevancy(cosines[text][level, n], [cosines[m][level, n] for m in negatives]) for n in known])
         if smoothed:
             around = [nearest([means[m] for m in known], means[n], neighbours) for n in known]
@@ -206,7 +210,7 @@ def rotation(q):
     )
 
 
-def gaussian_truth(means, quats, scales, points, labels, nearest_count=1000, radius=5.0, balanced=True):
+def gaussian_truth(means, quats, scales, points, labels, nearest_count=1000, radius=5.0, balanced=True, far=False):
     """Labels count from 1, 0 = none."""
     out = []
     known = [i for i in range(len(points)) if labels[i] > 0]
@@ -217,7 +221,8 @@ def gaussian_truth(means, quats, scales, points, labels, nearest_count=1000, rad
         sums, counts = {}, {}
         for i in near:
             d = points[i] - mean
-            sums[labels[i]] = sums.get(labels[i], 0.0) + math.exp(-0.5 * d @ inverse @ d)
+            squared = d @ inverse @ d
+            sums[labels[i]] = sums.get(labels[i], 0.0) + (math.sqrt(squared) if far else math.exp(-0.5 * squared))
             counts[labels[i]] = counts.get(labels[i], 0) + 1
         best = [(-sums[c] / (counts[c] if balanced else 1), c) for c in sums]
         out.append(min(best)[1] if best else 0)

@@ -77,6 +77,28 @@ def test_numbers_are_those_of_evaluate_and_pictures_show_something(run, room, ke
         assert pixels(picture).shape[1] > 6 * 320  # photograph, truth, four results
 
 
+def test_second_files_reach_their_results(run, room, kept, tmp_path, capsys):
+    features, scene = kept / "features.npy", ["--scene", str(room)]
+    expected = json.loads((kept / "exact.json").read_text())
+    capsys.readouterr()
+    one = [str(run), str(kept / "before.ply"), "--with-file", str(features), *scene, "--pictures", "0"]
+    assert main(["compare", *one, "--out", str(tmp_path / "one")]) == 0
+    found = json.loads((tmp_path / "one" / "compare.json").read_text())
+    (exact,) = (report for report in found.values() if report["digests"]["field"] == expected["digests"]["field"])
+    assert exact["scores"] == expected["scores"]
+    shutil.copy(kept / "before.ply", tmp_path / "b=c.ply")
+    np.save(tmp_path / "zero.npy", np.roll(np.load(features), 1, 0))
+    files = [f"{kept}/before.ply={features}", f"{tmp_path}/b=c.ply={tmp_path}/zero.npy"]
+    two = [str(kept / "before.ply"), str(tmp_path / "b=c.ply"), *scene, "--pictures", "1"]
+    assert (
+        main(["compare", *two, "--with-file", files[0], "--with-file", files[1], "--out", str(tmp_path / "two")]) == 0
+    )
+    found = json.loads((tmp_path / "two" / "compare.json").read_text())
+    assert found["before"]["scores"] == expected["scores"]
+    assert found["b=c"]["scores"] != expected["scores"]
+    assert len(list((tmp_path / "two").glob("*.png"))) == 1
+
+
 def test_errors_are_where_labels_differ(room, run):
     words = load_label_set(room / "classes.json", room / "text.npy")
     question = open_question(room)
@@ -145,9 +167,26 @@ def test_a_field_that_changed_is_not_drawn(room, run, kept, tmp_path, capsys):
         ("{kept}/field.json", "RUNS: expected at least two different results, got 1"),
         ("{kept}/field.json {kept}/field.json", "RUNS: expected at least two different results, got 1"),
         ("", "RUNS: expected at least two different results, got 0"),
+        ("{run} {run}", "RUNS: expected at least two different results, got 1"),
         ("{kept}/field.json {kept}/other.json", "other.json: expected a report in JSON"),
         ("{kept}/field.json {kept}/nothing.json", "nothing.json: no such file"),
         ("{kept}/field.json {run} --split train", "differ in digest of the truth"),
+        (
+            "{kept}/field.json {run} --with-file a.pth",
+            "--with-file: expected RUN=FILE with one of no run .* leave it out",
+        ),
+        (
+            "{kept}/field.json {run} --with-file {run}=a.pth",
+            "--with-file: expected none with a result of kfgs, got a.pth",
+        ),
+        (
+            "{kept}/before.ply {kept}/painted.ply --with-file a.npy",
+            r"--with-file: expected RUN=FILE with one of .*before.ply, .*painted.ply .*, got a.npy; write .*before.ply=FILE",
+        ),
+        (
+            "{kept}/before.ply {run} --with-file a.npy --with-file b.npy",
+            "--with-file: expected one file for .*before.ply, got a.npy and b.npy",
+        ),
     ],
 )
 def test_numbers_that_cannot_be_compared_are_refused(words, message, kept, run, capsys):

@@ -60,8 +60,13 @@ class CF3Config:
 
     @staticmethod
     def short() -> CF3Config:
-        """For two cores: 12 epochs, 480 steps on small views."""
+        """For two cores: 12 epochs, 480 steps of 40,000 pixels."""
         return CF3Config(epochs=12, steps=480, pixels=40_000)
+
+    @staticmethod
+    def medium() -> CF3Config:
+        """For an hour: all 30 epochs, 2,400 steps of 80,000 pixels."""
+        return CF3Config(steps=2_400, pixels=80_000)
 
 
 def structure_loss(latents: Tensor, features: Tensor) -> Tensor:  # [n, 3], [n, D] unit rows -> []
@@ -218,4 +223,4 @@ def fit(task: Task, config: CF3Config) -> Fitted:
     tensors |= {f"decoder.{name}": value for name, value in network.decoder.state_dict().items()}
     storage = semantic_storage_bytes(len(cloud), 3, parameters)
     method = RenderedMethod("CF3", cloud, network, torch.ones(len(cloud), dtype=torch.bool))
-    return Fitted(method, "3", storage, tensors, clock.seconds, history, own_geometry=True)
+    return Fitted(method, "3", storage, tensors, clock.seconds, history, network.forward, own_geometry=True)

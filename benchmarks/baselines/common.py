@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -57,6 +57,8 @@ class Fitted:
     seconds: dict[str, float]
     """Time of each stage."""
     history: list[dict[str, Any]] = field(default_factory=list)
+    codec: Callable[[Tensor], Tensor] | None = None
+    """What compression alone makes of the teacher's features, [n, D] -> [n, D], without Gaussians; None if there is none."""
     own_geometry: bool = False
     """Whether the method has Gaussians of its own, so that those of the colours are not needed."""
 

@@ -45,8 +45,13 @@ class LangSplatV2Config:
 
     @staticmethod
     def short() -> LangSplatV2Config:
-        """For two cores: 400 steps on small views, 20 times the rate of logits."""
-        return LangSplatV2Config(400, 5e-2, 30_000, 10_000)
+        """For two cores: 400 steps of 20,000 pixels, 20 times the rate of logits."""
+        return LangSplatV2Config(400, 5e-2, 30_000, 20_000)
+
+    @staticmethod
+    def medium() -> LangSplatV2Config:
+        """For an hour: 600 steps of 40,000 pixels, 16 times the rate of logits."""
+        return LangSplatV2Config(600, 4e-2, 60_000, 40_000)
 
 
 def sparse_weights(logits: Tensor, kept: int = KEPT) -> Tensor:  # [N, K] -> [N, K]
@@ -81,8 +86,11 @@ class Mixtures(torch.nn.Module):
 
 
 def storage_bytes(gaussians: int, codes: int, channels: int, levels: int = 1) -> int:
-    """A weight of 2 bytes and an index of 1 for each of 4 codes and each level, and the codes in float32."""
-    return levels * (gaussians * KEPT * 3 + FLOAT * codes * channels)
+    """A weight in float32 and an index of 1 byte for each of 4 codes and each level, and the codes in float32.
+
+    On disk the weights are half precision, as a viewer would keep them.
+    """
+    return levels * (gaussians * KEPT * (FLOAT + 1) + FLOAT * codes * channels)
 
 
 def fit(task: Task, config: LangSplatV2Config) -> Fitted:

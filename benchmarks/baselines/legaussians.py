@@ -59,10 +59,18 @@ class LEGaussiansConfig:
 
     @staticmethod
     def short() -> LEGaussiansConfig:
-        """For two cores: 40 epochs on 512 features a map, 10 times the rate; 600 steps on small views at higher rates."""
+        """For two cores: 40 epochs on 512 features a map at 10 times the rate, 600 steps of 20,000 pixels at higher rates."""
         return LEGaussiansConfig(
             epochs=40, images=16, rows=512, code_rate=1e-3, steps=600, feature_rate=2e-2, network_rate=5e-3,
-            smooth_sample=10_000, pixels=8_000,
+            smooth_sample=10_000, pixels=20_000,
+        )  # fmt: skip
+
+    @staticmethod
+    def medium() -> LEGaussiansConfig:
+        """For an hour: 120 epochs on 512 features a map at 5 times the rate, 1,500 steps of 40,000 pixels."""
+        return LEGaussiansConfig(
+            epochs=120, images=16, rows=512, code_rate=5e-4, steps=1_500, feature_rate=1e-2, network_rate=2e-3,
+            smooth_sample=10_000, pixels=40_000,
         )  # fmt: skip
 
 
@@ -101,9 +109,13 @@ def fit_codes(maps: KeptMaps, config: LEGaussiansConfig, generator: torch.Genera
             for i in range(first, min(first + config.images, len(maps))):
                 rows = maps[i].flatten(0, 1)
                 rows = rows[rows.any(dim=1)]
+                if len(rows) == 0:
+                    continue
                 if config.rows is not None:
                     rows = rows[torch.randint(len(rows), (config.rows,), generator=generator)]
                 parts.append(rows)
+            if not parts:
+                continue
             loss = quantiser_loss(torch.cat(parts), codes, config.split)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
@@ -236,4 +248,8 @@ def fit(task: Task, config: LEGaussiansConfig) -> Fitted:
     tensors = {"features": own, "codes": codes}
     tensors |= {f"decoder.{name}": value for name, value in decoder.network.state_dict().items()}
     storage = storage_bytes(len(frozen), len(codes), codes.shape[1], decoder.parameters_stored)
-    return Fitted(method, str(FEATURES), storage, tensors, clock.seconds, history)
+
+    def codec(rows: Tensor) -> Tensor:  # [n, D] -> [n, D]
+        return codes[similarities(rows, codes, config.split).argmax(dim=1), :text_part]
+
+    return Fitted(method, str(FEATURES), storage, tensors, clock.seconds, history, codec)

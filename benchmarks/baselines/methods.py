@@ -10,7 +10,8 @@ from torch import Tensor
 
 from kfgs._rows import unit_rows
 from kfgs.cameras import Camera
-from kfgs.evaluation import View
+from kfgs.evaluation import Method, View, label_view
+from kfgs.fields.views import divide_votes, rank_votes
 from kfgs.gaussians import Gaussians
 from kfgs.splat import Rendering, rasterize
 
@@ -99,3 +100,46 @@ class RenderedMethod:
         rendering = rasterize(self.gaussians.replace(features=products), camera)
         scores = rendering.map if decoder.bias is None else rendering.map + text @ decoder.bias
         return scores.argmax(dim=2).masked_fill(rendering.alpha <= 0, -1)
+
+
+class LabelMaps:
+    """The label maps of a method for some classes, each made once however often it is asked for; a `Method` and a `Labeller`.
+
+    Args:
+        method: what is asked.
+        text: the classes, unit rows [K, D]; other rows than these are an error.
+        votes: let the Gaussians vote, as kfgs's default field does: each gives its softmax of 100 cosines to its pixels.
+    """
+
+    levels = 1
+
+    def __init__(self, method: Method, text: Tensor, *, votes: bool = False) -> None:
+        assert method.gaussians is not None
+        self.method, self.text, self.name, self.gaussians = method, text, method.name, method.gaussians
+        self._votes = None
+        if votes:
+            cosines = method.gaussian_cosines(text)[0]
+            self._votes = divide_votes(cosines.nan_to_num(), ~cosines.isnan().any(dim=1))
+        self._made: dict[tuple[str, tuple[int, int]], Tensor] = {}
+
+    def labels(self, view: View, text: Tensor) -> Tensor:  # [K, D] unit rows -> [H, W] int64
+        """The class of each pixel, -1 where nothing was drawn."""
+        if text.shape != self.text.shape or not torch.allclose(text, self.text, atol=1e-5):
+            raise ValueError("text: expected the classes that these maps are of, got other rows; make maps for them")
+        key = view.stem, view.camera.size
+        if key not in self._made:
+            self._made[key] = self._label(view)
+        return self._made[key]
+
+    def _label(self, view: View) -> Tensor:
+        if self._votes is None:
+            return label_view(self.method, view, self.text)
+        return rank_votes(self.gaussians, view.camera, self._votes).labels[..., 0]
+
+    def cosines(self, view: View, text: Tensor) -> Tensor:  # [K, D] -> [1, H, W, K]
+        """Those of the method."""
+        return self.method.cosines(view, text)
+
+    def gaussian_cosines(self, text: Tensor) -> Tensor:  # [K, D] -> [1, N, K]
+        """Those of the method."""
+        return self.method.gaussian_cosines(text)

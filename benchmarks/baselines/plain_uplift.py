@@ -29,6 +29,8 @@ class PlainUpliftConfig:
         """Views of 80,000 pixels."""
         return PlainUpliftConfig()
 
+    medium = short
+
 
 def storage_bytes(gaussians: int, latents: int, channels: int) -> int:
     """The latents, and the basis that decodes them."""
@@ -46,4 +48,13 @@ def fit(task: Task, config: PlainUpliftConfig) -> Fitted:
     assert own is not None
     method = RenderedMethod("plain uplift", found.gaussians, LinearDecoder(basis))
     storage = storage_bytes(len(own), own.shape[1], len(basis))
-    return Fitted(method, str(own.shape[1]), storage, {"features": own, "basis": basis}, clock.seconds)
+    tensors = {"features": own, "basis": basis}
+    latents = found.latents
+    return Fitted(
+        method,
+        str(own.shape[1]),
+        storage,
+        tensors,
+        clock.seconds,
+        codec=lambda rows: latents.decode(latents.encode(rows)),
+    )

@@ -24,6 +24,7 @@ from .evaluate import compare, evaluate
 from .features import features, plan
 from .fit import color, demo, fit, sfm, uplift
 from .output import say, warnings_as_notes
+from .pack import pack
 from .query import info, label, segment, select
 from .splats import attach, convert, edit
 from .text import text
@@ -33,6 +34,7 @@ GROUPS: dict[str, tuple[Any, ...]] = {
     "Start here": (demo, info),
     "Make a semantic field": (sfm, plan, features, text, fit, uplift),
     "Ask it": (select, segment, label, view),
+    "Store it": (pack,),
     "Score it": (evaluate, compare),
     "Colour splats": (color, attach, edit, convert),
 }

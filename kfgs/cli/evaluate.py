@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import tyro
 
 from .files import check_file, check_folder, is_field
-from .options import Classes, Flag, Given, Name, Positional, Several, Teacher
+from .options import Classes, Flag, Given, GivenRule, Name, Positional, Several, Teacher
 from .output import say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
@@ -23,6 +23,7 @@ def evaluate(
     protocol: Annotated[str, tyro.conf.arg(metavar="NAME")] = "kfgs-pooled/1",
     truth: Given[Path] = None,
     split: Name = None,
+    labels: GivenRule = None,
     set: Several = (),
     with_file: Given[Path] = None,
     out: Given[Path] = None,
@@ -45,6 +46,8 @@ def evaluate(
         protocol: Its name, with or without version; a wrong name lists all.
         truth: Folder or file of the ground truth, if it is not in the scene; the teacher's maps for feature3dgs-teacher.
         split: Which views: train, test, another split, or all. By default test views with labels, or all views with masks.
+        labels: Who says the class of a pixel in a field of kfgs: the field itself (own), or the nearest text, as for other
+            results. By default own in kfgs's protocols, nearest in those of others.
         set: An option of the protocol, threshold=0.5; --long shows them. texts=classes asks the scene's classes. Can be
             given several times.
         with_file: A second file of a foreign result: LangSplat's autoencoder, LEGaussians' codebook, or features of a splat.
@@ -62,16 +65,22 @@ def evaluate(
     classes = with_scene(classes, field)
     encode = find_encoder(teacher, classes, field)
     options = find_options(protocol, set, encode)
-    asked: dict[str, Any] = {"truth": truth, "split": split, "images": classes.images, "options": options}
+    asked: dict[str, Any] = {
+        "truth": truth,
+        "split": split,
+        "images": classes.images,
+        "options": options,
+        "labels": labels,
+    }
     assert classes.scene is not None
     question = open_question(classes.scene, protocol, **asked)
     command = shlex.join(["kfgs", *getattr(sys, "argv", [])[1:]])
     found = evaluate_result(field, question, encode=encode, with_file=with_file, command=command)
-    say(found.text if long else str(found))
+    say(found.text if long else "\n".join([str(found), *(f"note: {note}" for note in found.notes)]))
     if out is not None:
         inputs = {"field": field, "with_file": with_file, "truth": truth, **dataclasses.asdict(classes)}
         places = {name: None if place is None else str(place.resolve()) for name, place in inputs.items()}
-        words = {"split": split, "set": list(set), **dataclasses.asdict(teacher)}
+        words = {"split": split, "labels": labels, "set": list(set), **dataclasses.asdict(teacher)}
         write_json(out, {**found.to_json(), "inputs": {**places, **words}})
         wrote([out])
 
@@ -83,7 +92,9 @@ def compare(
     protocol: Name = None,
     truth: Given[Path] = None,
     split: Name = None,
+    labels: GivenRule = None,
     set: Several = (),
+    with_file: Several = (),
     pictures: int = 3,
     teacher: Teacher,
     classes: Classes,
@@ -96,6 +107,8 @@ def compare(
     Examples:
         kfgs compare run_a run_b --out compared/
         kfgs compare a.json b.json output/figurines --out compared/ --pictures 5
+        kfgs compare run output/figurines --with-file best_ckpt.pth
+        kfgs compare output/a output/b --with-file output/a=a_ckpt.pth --with-file output/b=b_ckpt.pth
 
     Args:
         runs: Two or more: whatever `kfgs evaluate` takes, or JSON files that it wrote.
@@ -103,111 +116,55 @@ def compare(
         protocol: Its name; by default that of the first JSON file, else kfgs-pooled/1.
         truth: Folder or file of the ground truth, if it is not in the scene.
         split: Which views, as for `kfgs evaluate`.
+        labels: The rule for labels, as for `kfgs evaluate`.
         set: An option of the protocol, threshold=0.5. Can be given several times.
+        with_file: A second file of a foreign result, as for `kfgs evaluate`; RUN=FILE if several results are foreign. Can be
+            given several times.
         pictures: How many views are drawn.
     """
     from .._check import check_range
-    from ..evaluation import LabelSet
-    from ..evaluation.encoders import TableEncoder
-    from ..pipeline.evaluate import check_kind, digest_method, open_result
-    from ..pipeline.evaluate import evaluate as evaluate_result
-    from ..pipeline.question import open_question
-    from ..pipeline.side_by_side import check_comparable, rank, show_views, table_text, write_pictures
+    from ..pipeline.results import Results
+    from ..pipeline.side_by_side import table_text
 
     check_range("pictures", pictures, 0)
     if out is not None:
         check_folder("out", out)
-    kept = {path: _read_kept(path) for path in runs if path.suffix == ".json"}
-    first: dict[str, Any] = next(iter(kept.values()))[1] if kept else {}
-    plain = [path for path in runs if path not in kept]
-    protocol = protocol or (next(iter(kept.values()))[0].protocol if kept else "kfgs-pooled/1")
-    for path in plain:
-        check_kind(path, protocol)
-    reports = {path: report for path, (report, _) in kept.items()}
-    if len({*runs}) < 2 or not plain:
-        check_comparable({str(path): report for path, report in reports.items()})  # before anything is computed
-    draw = out is not None and pictures > 0
-    opened: dict[Path, Any] = {}
-    if plain or draw:
-        remembered = {
-            name: Path(place) for name in ("scene", "images", "classes", "text") if (place := first.get(name))
-        }
-        given = {name: place for name, place in dataclasses.asdict(classes).items() if place is not None}
-        classes = with_scene(Classes(**{**remembered, **given}), (plain or runs)[0])
-        teacher = teacher if teacher.teacher else Teacher(first.get("teacher"), first.get("weights"))
-        encode = find_encoder(teacher, classes, (plain or [Path(str(first.get("field")))])[0])
-        options = find_options(protocol, set or tuple(first.get("set", ())), encode)
-        place = truth if truth is not None else first.get("truth")
-        words: dict[str, Any] = {"truth": place, "split": split or first.get("split"), "images": classes.images}
-        assert classes.scene is not None
-        question = open_question(classes.scene, protocol, options=options, **words)
-        for path in runs:
-            if path in kept:
-                if draw:
-                    _reopen(path, kept[path], question, opened, open_result, digest_method)
-                continue
-            method = opened[path] = open_result(path, question)
-            reports[path] = evaluate_result(method, question, encode=encode)
-    titles = _titles({path: reports[path] for path in runs})
-    named = {titles[path]: reports[path] for path in dict.fromkeys(runs)}
-    check_comparable(named)
-    text = table_text(named)
-    say(text)
+    results = Results.read(runs, with_file)
+    protocol = protocol or (results.first.report.protocol if results.first else "kfgs-pooled/1")
+    results.check(protocol)
+    question, encode, draw = None, None, out is not None and pictures > 0
+    if results.new or draw:
+        words = {"protocol": protocol, "truth": truth, "split": split, "labels": labels, "set": set}
+        question, encode = _ask_alike(results, words, teacher, classes)
+    compared = results.score(question, encode, draw=draw)
+    say("\n".join([table_text(compared.reports), *(f"note: {note}" for note in compared.notes)]))
     if out is None:
         return
-    from .._files import atomic_path, write_json
-
-    write_json(out / "compare.json", {title: report.to_json() for title, report in rank(named).items()})
-    with atomic_path(out / "compare.txt") as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
-    written = [out / "compare.txt", out / "compare.json"]
-    if draw:
-        asked = TableEncoder(encode) if isinstance(encode, LabelSet) else encode
-        shown = show_views(question, {titles[path]: opened[path] for path in runs if path in opened}, asked, pictures)
-        if not shown:
-            say(f"note: no pictures: {question.protocol.name} scores no pictures of its own")
-        written += write_pictures(out, shown)
+    written = compared.write(out, question, encode, pictures)
+    if draw and question is not None and not any(path.suffix == ".png" for path in written):
+        say(f"note: no pictures: {question.protocol.name} scores no pictures of its own")
     wrote(written)
 
 
-def _read_kept(path: Path) -> tuple[Any, dict[str, Any]]:
-    """The report that `kfgs evaluate --out` kept, and what it was asked with."""
-    from .._files import read_json
-    from ..evaluation import Report
+def _ask_alike(results: Any, words: dict[str, Any], teacher: Teacher, classes: Classes) -> tuple[Any, Any]:
+    """The question and the text encoder of a comparison: options, and what they leave open as the first JSON file has it."""
+    from ..pipeline.question import open_question
 
-    top = read_json(path)
-    try:
-        return Report.from_json(top), dict(top.get("inputs", {}))
-    except (ValueError, AttributeError, TypeError) as error:
-        raise ValueError(
-            f"{path}: {str(error).removeprefix('value: ')}; give what `kfgs evaluate --out` wrote"
-        ) from error
-
-
-def _reopen(
-    path: Path, kept: Any, question: Any, opened: dict[Path, Any], open_result: Any, digest_method: Any
-) -> None:
-    """Open the result that a JSON file is about, to draw it; a note says why if that is not possible."""
-    report, inputs = kept
-    try:
-        found = open_result(Path(inputs["field"]), question, inputs.get("with_file"))
-    except (KeyError, TypeError, ValueError, OSError) as error:
-        say(f"note: {path} is not drawn: {error}")
-        return
-    if digest_method(found) != report.digests.get("field"):
-        say(f"note: {path} is not drawn: {inputs['field']} has changed since it was scored")
-        return
-    opened[path] = found
-
-
-def _titles(reports: dict[Path, Any]) -> dict[Path, str]:
-    """The name of each method; with its file or folder where several have one name."""
-    names = [report.method for report in reports.values()]
-    short = {path: path.name if not report.method else report.method for path, report in reports.items()}
-    long = {path: f"{short[path]} ({path.stem if path.suffix == '.json' else path.name})" for path in reports}
-    titles = {path: long[path] if names.count(report.method) > 1 else short[path] for path, report in reports.items()}
-    repeated = [title for title in titles.values() if list(titles.values()).count(title) > 1]
-    return {path: f"{short[path]} ({path})" if title in repeated else title for path, title in titles.items()}
+    first: dict[str, Any] = results.first.inputs if results.first else {}
+    remembered = {name: Path(place) for name in ("scene", "images", "classes", "text") if (place := first.get(name))}
+    given = {name: place for name, place in dataclasses.asdict(classes).items() if place is not None}
+    classes = with_scene(Classes(**{**remembered, **given}), (results.new or results.paths)[0])
+    teacher = teacher if teacher.teacher else Teacher(first.get("teacher"), first.get("weights"))
+    encode = find_encoder(teacher, classes, (results.new or [Path(str(first.get("field")))])[0])
+    asked: dict[str, Any] = {
+        "truth": words["truth"] if words["truth"] is not None else first.get("truth"),
+        "split": words["split"] or first.get("split"),
+        "labels": words["labels"] or first.get("labels"),
+        "images": classes.images,
+        "options": find_options(words["protocol"], words["set"] or tuple(first.get("set", ())), encode),
+    }
+    assert classes.scene is not None
+    return open_question(classes.scene, words["protocol"], **asked), encode
 
 
 def with_scene(classes: Classes, field: Path) -> Classes:
@@ -219,9 +176,9 @@ def with_scene(classes: Classes, field: Path) -> Classes:
             f"scene: expected a scene folder, got none, and {field} is no field that remembers one; pass --scene"
         )
     from ..fields import SemanticField, recall_scene
+    from ..fields.store import find_field
 
-    folder = field if (field / "field.json").is_file() else field / "field"
-    loaded = SemanticField.load(folder)
+    loaded = SemanticField.load(find_field(field) or field)
     return dataclasses.replace(classes, scene=recall_scene(loaded.info, loaded.folder))
 
 
@@ -237,9 +194,10 @@ def find_encoder(teacher: Teacher, classes: Classes, field: Path) -> Any:
         return classes.load_classes()
     if is_field(field):
         from ..fields import SemanticField
+        from ..fields.store import find_field
 
-        loaded = SemanticField.load(field if (field / "field.json").is_file() else field / "field")
-        return loaded.label_set() if "classes" in loaded.info else None
+        loaded = SemanticField.load(find_field(field) or field)
+        return loaded.label_set() if loaded.has_classes else None
     return None
 
 

@@ -43,22 +43,26 @@ def check_alone(name: str, given: object, why: str) -> None:
 
 
 def is_field(path: Path) -> bool:
-    """Whether a path is a field folder, or a run folder with one in it (`open_field` then names that one)."""
-    return any((folder / "field.json").is_file() for folder in (path, path / "field"))
+    """Whether a path is a field: a folder, one file, or a run folder with one in it (`open_field` then names that one)."""
+    from ..fields.store import find_field
+
+    return find_field(path) is not None
 
 
 def open_field(name: str, field: Path) -> Any:
     """Load a semantic field. Raises a ValueError if the path is no field."""
     from ..fields import SemanticField
+    from ..fields.store import SUFFIX, find_field
 
-    if not (field / "field.json").is_file():
+    if find_field(field) != field:
         inside = field / "field"
         what = "a file" if field.is_file() else "a folder without one" if field.is_dir() else "no such folder"
         hint = "make one with `kfgs fit`"
         if is_field(inside):
             what, hint = "a run folder", f"pass {inside}"
         raise ValueError(
-            f"{name}: expected the folder that `kfgs fit` wrote (RUN/field, with field.json), got {field}, {what}; {hint}"
+            f"{name}: expected the folder that `kfgs fit` wrote (RUN/field, with field.json), or a field in one file "
+            f"(*{SUFFIX}), got {field}, {what}; {hint}"
         )
     return SemanticField.load(field)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .features import check_discard, choose_teacher, stored_maps
-from .files import check_alone, check_folder, open_field, open_splats
+from .files import check_alone, check_folder, is_field, open_field, open_splats
 from .options import FieldMethod, Flag, Given, Maps, MapTeacher, Positional, SceneFolder, Training, Views, fit_config
 from .output import say, wrote
 
@@ -184,11 +184,7 @@ def uplift(
     as_taken = views.load(scene)
     loaded = as_taken.undistorted()
     found = stored_maps(as_taken, loaded.views(views.split), maps.folder(scene), maps.level)
-    cloud = (
-        open_field("splat", splat).gaussians
-        if (splat / "field.json").is_file()
-        else open_splats("splat", splat).gaussians
-    )
+    cloud = (open_field if is_field(splat) else open_splats)("splat", splat).gaussians
     fused = UpliftConfig(max_gaussians=max_gaussians)
     config = FitConfig(uplift=fused, split=views.split, undistorted_features=maps.undistorted_features)
     field = uplift_scene(loaded, found, cloud, config, folder=out, progress=True, report=say)

@@ -40,9 +40,13 @@ def _choice(kind: Any) -> PrimitiveConstructorSpec[Any]:
 Level = Literal["default", "s", "m", "l"]  # of LangSplat: SAM's own choice of masks; subparts, parts, wholes
 Mode = Literal["decouple", "adc", "adc+sc"]  # of the paper's Table 1
 By = Literal["views", "distance"]
+LabelRule = Literal["own", "nearest"]  # of `kfgs evaluate`: who says the class of a pixel
 GivenLevel = Annotated[Level | None, _choice(Level), _quiet]
 GivenMode = Annotated[Mode | None, _choice(Mode), _quiet]
 GivenBy = Annotated[By | None, _choice(By), _quiet]
+Precision = Literal["lossless", "fine", "small", "tiny"]  # `fields.precision`, without its imports
+GivenPrecision = Annotated[Precision | None, _choice(Precision), _quiet]
+GivenRule = Annotated[LabelRule | None, _choice(LabelRule), _quiet]
 
 SceneFolder = Annotated[
     Path, Positional, tyro.conf.arg(help="Folder with images and a COLMAP model or transforms.json.")
@@ -219,7 +223,7 @@ class Classes(SceneOption):
     def of_field(self, field: Any) -> Any:
         """The label set of these options; without options, that of the field."""
         given = any(path is not None for path in (self.scene, self.classes, self.text))
-        return self.load_classes() if given or "classes" not in field.info else field.label_set()
+        return self.load_classes() if given or not field.has_classes else field.label_set()
 
     def open_field(self, name: str, path: Path) -> Any:
         """Open a field with fused features; an old field computes them from the views of --scene, if given."""

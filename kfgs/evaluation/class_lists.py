@@ -9,6 +9,8 @@ from typing import Any
 
 from .._check import check_choice
 
+VOID_NAMES = ("void", "unlabeled", "unlabelled", "unknown", "ignore")
+"""Names that mean "no class": what has them is not scored."""
 FILES = ("ade20k", "legaussians", "legaussians_views", "lerf_ovs", "scannet", "scenesplat")
 
 
@@ -26,3 +28,15 @@ def load_classes(name: str) -> dict[str, Any]:
     check_choice("name", name, FILES)
     found: dict[str, Any] = json.loads(files("kfgs.evaluation").joinpath("data", f"{name}.json").read_text("utf-8"))
     return found
+
+
+def name_key(name: str) -> str:
+    """A name as names are compared: without regard to case, spaces, hyphens and underscores.
+
+    Data sets write one class in several ways: NYU40 has "showercurtain", SceneSplat-Bench "shower curtain".
+
+    Example:
+        >>> name_key("Shower-Curtain") == name_key("showercurtain")
+        True
+    """
+    return name.casefold().translate(str.maketrans("", "", " -_"))

@@ -15,6 +15,7 @@ from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels.scores import CANONICAL, TEMPERATURE
 from ..splat import rasterize
+from .class_lists import load_classes, name_key
 from .method import Method, View, annotated, best_labels, check_level
 from .relevancy import Encode, encode_unit, lerf_relevancy, mask_iou, stretch
 from .report import Report, Row, make_report, mean
@@ -81,11 +82,13 @@ class LerfOvs3D:
     silhouette: float = 0.7
     """A pixel is covered above this alpha. VALA cuts 8-bit pictures at 10: 10 / 255."""
     texts: tuple[str, ...] = ()
-    """The scene's texts, for argmax (`load_classes("lerf_ovs")`); empty: those that the truth has."""
+    """What argmax chooses from. Empty: the published list of the scene (`load_classes("lerf_ovs")`) if the truth knows its
+    scene, and the annotated texts. The report's note says which."""
     neighbours: int = 10
     """Nearest Gaussians of the smoothing, the Gaussian itself included."""
     level: Literal["chosen"] | int = "chosen"
-    """Of a method with several: the one with the largest score of the text, or a fixed one."""
+    """Of a method with several: the one with the largest score of the text, or a fixed one. Each level has its own known
+    Gaussians: neighbours, smoothing and stretching are among these."""
     scale: float = TEMPERATURE
     """Of the cosines in the relevancy."""
     negatives: tuple[str, ...] = CANONICAL
@@ -115,7 +118,8 @@ class LerfOvs3D:
             TypeError: if the method has no Gaussians.
             ValueError: if a frame has no view, a mask has another size than its view, or `texts` lacks an annotated text.
         """
-        selected = self.select(method, truth.texts, encode)
+        asked, note = self.competing(truth.texts, truth.scene) if self.selection == "argmax" else (truth.texts, "")
+        selected = self.select(method, truth.texts, encode, asked)
         assert method.gaussians is not None
         rows: list[Row] = []
         for view in annotated(views, truth.frames):
@@ -125,49 +129,94 @@ class LerfOvs3D:
                 rows.append({"view": view.stem, "text": text, "IoU": mask_iou(seen, mask), "Gaussians": count})
         ious = [row["IoU"] for row in rows]
         scores = {"mIoU": mean(ious), "Acc@0.25": share_above(ious, 0.25), "Acc@0.5": share_above(ious, 0.5)}
-        return make_report(self, method.name, scores, rows)
+        return make_report(self, method.name, scores, rows, [note] if note else [])
 
-    def select(self, method: Method, texts: Sequence[str], encode: Encode) -> dict[str, Tensor]:  # [N] bool each
+    def competing(self, texts: Sequence[str], scene: str | None = None) -> tuple[tuple[str, ...], str]:
+        """The texts that argmax chooses from, and in words where they are from.
+
+        Args:
+            texts: those that are annotated.
+            scene: of LERF-OVS, whose published list also has texts that no annotated frame shows.
+
+        Raises:
+            ValueError: if `self.texts` lacks one of `texts`.
+        """
+        if self.texts:
+            if missing := [text for text in texts if text not in self.texts]:
+                raise ValueError(f"texts: expected all annotated texts, got none of {', '.join(missing)}; add them")
+            return self.texts, f"argmax over the {len(self.texts)} texts of the option `texts`"
+        published = load_classes("lerf_ovs")["texts"].get(scene, ())
+        if not published:
+            return tuple(
+                texts
+            ), f"argmax over the annotated texts ({len(texts)}): no published list of the scene is known"
+        written = {name_key(text): text for text in texts}
+        asked = tuple(written.get(name_key(text), text) for text in published)
+        more = [text for text in texts if text not in asked]
+        besides = f", and of the truth besides: {', '.join(more)}" if more else ""
+        return (*asked, *more), f"argmax over the {len(asked)} published texts of {scene}{besides}"
+
+    def select(
+        self, method: Method, texts: Sequence[str], encode: Encode, asked: Sequence[str] | None = None
+    ) -> dict[str, Tensor]:  # [N] bool each
         """The Gaussians of each text.
+
+        Args:
+            method: with Gaussians.
+            texts: what is looked for.
+            encode: the teacher's text encoder.
+            asked: what argmax chooses from; None: what `competing` says of `texts` alone.
 
         Raises:
             TypeError: if the method has no Gaussians.
-            ValueError: if `self.texts` lacks one of `texts`.
+            ValueError: if `self.texts` or `asked` lacks one of `texts`.
         """
         if method.gaussians is None:
             raise TypeError(f"method: expected one with Gaussians, got {method.name!r} without; use lerf-ovs-2d/1")
         check_level(method, self.level)
         if self.selection == "argmax":
-            return self._best(method, texts, encode)
+            return self._best(method, texts, encode, self.competing(texts)[0] if asked is None else asked)
         cosines = method.gaussian_cosines(encode_unit(encode, [*texts, *self.negatives]))
         scores = lerf_relevancy(cosines[..., : len(texts)], cosines[..., len(texts) :], self.scale)
-        scores = self._levels(scores)
-        known = ~scores.isnan().any(-1).any(0)
+        scores = self._levels(scores)  # [levels, N, K]
+        known = ~scores.isnan().any(-1)  # [levels, N]: each level may know other Gaussians
+        selected = {text: torch.zeros_like(known[0]) for text in texts}
         if not bool(known.any()):
-            return dict.fromkeys(texts, known)
-        near = (
-            nearest_gaussians(method.gaussians.means[known], self.neighbours) if self.selection == "smoothed" else None
-        )
-        selected = {}
-        for i, text in enumerate(texts):
-            score = scores[:, known, i]
-            if near is not None:
-                score = 0.5 * (score + score[:, near].mean(-1))
-            selected[text] = known.clone()
-            score = score[int(score.amax(-1).argmax())]
-            selected[text][known] = score >= self.threshold if near is None else stretch(score, 1) > self.threshold
+            return selected
+        if self.selection == "smoothed":
+            scores = self._smooth(method.gaussians.means, scores, known)
+        tops = scores.masked_fill(~known[..., None], -torch.inf).amax(1)  # [levels, K]
+        for i, (text, level) in enumerate(zip(texts, tops.argmax(0).tolist(), strict=True)):
+            score = scores[level, known[level], i]
+            chosen = stretch(score, 1) > self.threshold if self.selection == "smoothed" else score >= self.threshold
+            selected[text][known[level]] = chosen
         return selected
 
-    def _best(self, method: Method, texts: Sequence[str], encode: Encode) -> dict[str, Tensor]:
-        asked = self.texts or tuple(texts)
-        missing = [text for text in texts if text not in asked]
-        if missing:
-            raise ValueError(f"texts: expected all annotated texts, got none of {', '.join(missing)}; add them")
+    def _smooth(self, means: Tensor, scores: Tensor, known: Tensor) -> Tensor:  # [levels, N, K]
+        """Each level's relevancy, half and half with the mean of the nearest Gaussians that the level knows."""
+        found = scores.clone()
+        for level, mine in enumerate(known):
+            if not bool(mine.any()):
+                continue
+            if level == 0 or not torch.equal(mine, known[level - 1]):
+                near = nearest_gaussians(means[mine], self.neighbours)
+            some = scores[level, mine]
+            for i in range(some.shape[1]):  # one text at a time: [n, neighbours]
+                found[level, mine, i] = 0.5 * (some[:, i] + some[near, i].mean(-1))
+        return found
+
+    def _best(
+        self, method: Method, texts: Sequence[str], encode: Encode, asked: Sequence[str]
+    ) -> dict[str, Tensor]:  # [N] bool each
+        if missing := [text for text in texts if text not in asked]:
+            raise ValueError(
+                f"asked: expected all texts that are looked for, got none of {', '.join(missing)}; add them"
+            )
         cosines = self._levels(method.gaussian_cosines(encode_unit(encode, asked)))
         labels = best_labels(cosines)  # [levels, N]
         selected = {}
         for text in texts:
-            i = asked.index(text)
+            i = list(asked).index(text)
             mine = labels == i
             top = cosines[..., i].masked_fill(~mine, -torch.inf).amax(-1)
             selected[text] = mine[int(top.argmax())]

@@ -11,13 +11,15 @@ from torch import Tensor
 
 from ..gaussians import Gaussians
 from ..scenes import Scene
+from .class_lists import VOID_NAMES, name_key
 from .color import COLOR_PROTOCOL, score_views
-from .editing import RECOLOR, REMOVAL, RecolorReport, RemovalReport, score_recolor, score_removal
+from .edit_reports import RECOLOR, REMOVAL, RecolorReport, RemovalReport
+from .editing import score_recolor, score_removal
 from .method import Method, View, annotated, best_labels, check_level, label_view
 from .relevancy import Encode, encode_unit
 from .report import Report, Row, make_report
 from .scannet_points import needed
-from .scenesplat import matched
+from .scenesplat import match_names
 from .segmentation import PROTOCOL, evaluate_segmentation
 from .surface import SURFACE_PROTOCOL, score_surface
 from .truth import LabelTruth, PointTruth
@@ -68,23 +70,32 @@ class KfgsSurface:
     ) -> Report:
         """Label the Gaussians with the truth's names, and carry the labels to its points; `views` are not used.
 
+        A name that means "no class" (`VOID_NAMES`) is not asked, and its points are not scored; a note counts them.
+
         Raises:
             TypeError: if the method has no Gaussians.
-            ValueError: if no Gaussian gets a label, or no point has one.
+            ValueError: if no Gaussian gets a label, no point has one, or the truth names no class.
         """
         if method.gaussians is None:
             raise TypeError(
                 f"method: expected one with Gaussians, got {method.name!r} without; use a protocol of views"
             )
         check_level(method, self.level)
-        names = tuple(dict.fromkeys(truth.names.values()))
+        void = {name_key(name) for name in VOID_NAMES}
+        names = tuple(dict.fromkeys(name for name in truth.names.values() if name_key(name) not in void))
+        if not names:
+            got = ", ".join(truth.names.values()) or "none"
+            raise ValueError(f"truth: expected names of classes, got {got}; give the names of the points' labels")
         cosines = method.gaussian_cosines(encode_unit(needed(encode), names))[self.level]
         points = truth.points.to(method.gaussians.means)
-        found = score_surface(method.gaussians.means, best_labels(cosines), points, matched(truth, names))
+        target = match_names(truth, names)
+        found = score_surface(method.gaussians.means, best_labels(cosines), points, target.labels)
         rows: list[Row] = [
             {"lambda": found.transfer.distance, "labelled": found.transfer.labelled, "points": found.points}
         ]
-        return make_report(self, method.name, {"agreement": found.agreement}, rows)
+        left_out = ", ".join(f"{name} ({count} points)" for name, count in target.left_out.items())
+        notes = [f"not scored, no class: {left_out}"] if left_out else []
+        return make_report(self, method.name, {"agreement": found.agreement}, rows, notes)
 
 
 @dataclass(frozen=True)

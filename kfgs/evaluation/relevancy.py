@@ -62,7 +62,9 @@ def fill_unknown(
     """Give pixels where nothing is known (NaN) the least known value of their map, or 0 if all are unknown.
 
     The official scripts have no unknown pixels: they decode a rendered zero into an arbitrary feature. The least value is
-    neutral: it is never selected, and min-max stretches the other pixels as without it.
+    neutral where maps are stretched: minimum and maximum stay as they were, and a threshold above 0 does not select it. A
+    threshold of the relevancy itself (`legaussians-mip360/1`, `3dovs-threshold/1` unstretched) selects unknown pixels if it
+    selects every known one. Smoothing before the stretching mixes them with their neighbours.
     """
     least = maps.nan_to_num(nan=torch.inf).amin((-2, -1), keepdim=True)
     return torch.where(maps.isnan(), least.masked_fill(least.isinf(), 0), maps)

@@ -43,6 +43,8 @@ class Report:
     """What was run."""
     machine: str = ""
     """Where it was run."""
+    notes: tuple[str, ...] = ()
+    """What the protocol decided by the data: which texts were asked, which names were not scored."""
 
     def __post_init__(self) -> None:
         if not self.scores:
@@ -74,6 +76,7 @@ class Report:
         lines = [f"{self.method}: {self}" if self.method else str(self)]
         lines += [f"  {self.about}"] if self.about else []
         lines += [f"  {name} = {value}" for name, value in self.options.items()]
+        lines += [f"  note: {note}" for note in self.notes]
         lines += [f"  {name}: {value}" for name, value in self.digests.items()]
         lines += [f"  command: {self.command}"] if self.command else []
         lines += [f"  machine: {self.machine}"] if self.machine else []
@@ -104,6 +107,7 @@ class Report:
             "digests": plain(self.digests),
             "command": self.command,
             "machine": self.machine,
+            "notes": list(self.notes),
         }
 
     @staticmethod
@@ -122,6 +126,7 @@ class Report:
                 rows=tuple(value["rows"]),
                 changed=tuple(value["changed"]),
                 always=tuple(value["always"]),
+                notes=tuple(value.get("notes", ())),
                 **parts,
             )
         except (KeyError, TypeError, AttributeError, ValueError) as error:
@@ -130,7 +135,13 @@ class Report:
             ) from error
 
 
-def make_report(protocol: Any, method: str, scores: Mapping[str, float], rows: list[Row] | tuple[Row, ...]) -> Report:
+def make_report(
+    protocol: Any,
+    method: str,
+    scores: Mapping[str, float],
+    rows: list[Row] | tuple[Row, ...],
+    notes: Sequence[str] = (),
+) -> Report:
     """The report of a protocol: a frozen dataclass with `name` and `about`, whose fields are its options."""
     options = {option.name: plain(getattr(protocol, option.name)) for option in fields(protocol)}
     usual = type(protocol)()
@@ -144,6 +155,7 @@ def make_report(protocol: Any, method: str, scores: Mapping[str, float], rows: l
         options=options,
         changed=changed,
         always=getattr(protocol, "always", ()),
+        notes=tuple(notes),
     )
 
 
@@ -168,7 +180,8 @@ def average(reports: Sequence[Report]) -> Report:
                 )
     rows = [{"scene": report.digests.get("scene", i), **report.scores} for i, report in enumerate(reports)]
     scores = {name: mean(report.scores[name] for report in reports) for name in first.scores}
-    return replace(first, scores=scores, rows=tuple(rows), digests={}, command="")
+    notes = tuple(dict.fromkeys(note for report in reports for note in report.notes))
+    return replace(first, scores=scores, rows=tuple(rows), notes=notes, digests={}, command="")
 
 
 def mean(values: Iterable[float]) -> float:

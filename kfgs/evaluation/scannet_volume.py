@@ -27,6 +27,8 @@ from .scannet_points import (
 )
 from .truth import PointTruth
 
+Vote = Literal["near", "far"]
+VOTES = ("near", "far")
 PAIRS = 500_000  # of a Gaussian and a vertex at once: 80 MB
 
 
@@ -44,6 +46,7 @@ def gaussian_truth(
     nearest: int = 1000,
     radius: float = 5.0,
     balanced: bool = True,
+    vote: Vote = "near",
 ) -> Tensor:  # [N] int64, -1 = none
     """A class for each Gaussian, from the labelled points around it.
 
@@ -54,10 +57,12 @@ def gaussian_truth(
     Args:
         gaussians: geometry only.
         points: vertices of the mesh.
-        labels: class indices; points with -1 do not take part.
+        labels: class indices. Points with -1 are neither candidates nor counted among the `nearest`: our reading, protocols.md
+            d2 does not say what VALA does with them.
         nearest: most candidates.
         radius: in largest scales.
         balanced: False leaves the division out, so that frequent classes win.
+        vote: "far" sums the distances d themselves: Dr.Splat's Eq. 8, among the same candidates.
     """
     cloud = gaussians.detach().to("cpu", torch.float64)
     known = labels.cpu() >= 0
@@ -77,7 +82,8 @@ def gaussian_truth(
         owner, column = inside.nonzero().T
         which = torch.from_numpy(index)[owner, column]
         offsets = (places[which] - cloud.means[rows][owner])[:, None] @ whitening[rows][owner]  # [m, 1, 3]
-        votes = (-0.5 * offsets.square().sum((1, 2))).exp()
+        squares = offsets.square().sum((1, 2))
+        votes = (-0.5 * squares).exp() if vote == "near" else squares.sqrt()
         cell = owner * C + classes[which]
         sums = torch.zeros(len(rows) * C, dtype=torch.float64).index_add_(0, cell, votes)
         members = torch.bincount(cell, minlength=len(rows) * C)
@@ -101,8 +107,12 @@ def _alike(count: Tensor) -> Iterator[Tensor]:  # [N] -> [n] int64 each
 class ScanNetVolume:
     """VALA's `eval/evaluator3D.py`: Gaussians get a true class from the vertices around them, and count by their volume.
 
-    Gaussians without a labelled vertex nearby are not scored. Dr.Splat's own rule (its Eq. 8: the largest *sum of distances*)
-    favours far and frequent classes; it is not implemented. Vertices of none of the classes do not vote.
+    Gaussians without a labelled vertex nearby are not scored. Vertices of none of the classes do not vote, and a Gaussian next
+    to them takes the class of others in reach: that is our reading of VALA.
+
+    Dr.Splat's own rule (its Eq. 8: the largest *sum of distances*) favours far and frequent classes: `vote="far"` with
+    `balanced=False`. Which vertices it sums over is not settled by protocols.md d2. Here they are VALA's candidates, so the
+    figures that Dr.Splat published are not to be expected.
     """
 
     name: ClassVar[str] = "scannet-volume/1"
@@ -119,6 +129,8 @@ class ScanNetVolume:
     """Vertices vote within this many times the Gaussian's largest scale."""
     balanced: bool = True
     """Whether a class's votes are divided by its number of candidates."""
+    vote: Vote = "near"
+    """How a vertex at Mahalanobis distance d votes: "near" with exp(-d^2 / 2) (VALA), "far" with d (Dr.Splat's Eq. 8)."""
     unknown: Literal["first class", "none"] = "none"
     """What a Gaussian without a feature predicts: nothing, which is wrong, or the first class."""
     level: int = 0
@@ -128,6 +140,7 @@ class ScanNetVolume:
         check_choice("classes", self.classes, COUNTS)
         check_whole("nearest", self.nearest, 1)
         check_range("radius", self.radius, 0, closed=(False, False))
+        check_choice("vote", self.vote, VOTES)
         check_choice("unknown", self.unknown, ("first class", "none"))
 
     def score(
@@ -153,6 +166,7 @@ class ScanNetVolume:
             nearest=self.nearest,
             radius=self.radius,
             balanced=self.balanced,
+            vote=self.vote,
         )
         amount, predicted = significance(gaussians), predicted.cpu()
         found = class_scores(predicted, target, self.classes, amount)

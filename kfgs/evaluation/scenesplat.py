@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from .._card import short_repr
 from .._check import check_choice, check_whole
 from ..metrics import ConfusionMatrix
-from .class_lists import load_classes
+from ..scenes.files import some
+from .class_lists import VOID_NAMES, load_classes, name_key
 from .method import Method, View, best_labels, check_level
 from .relevancy import Encode, encode_unit
 from .report import Report, Row, make_report, mean
@@ -62,7 +65,8 @@ class SceneSplatBench:
     """SceneSplat-Bench's `open_vocab_seg_*.py`: foreground mIoU over the points of many scenes.
 
     `score` takes one scene, `score_scenes` those of a table, which are pooled in one confusion matrix. A scene's labels are
-    matched with the benchmark's classes by name. ScanNet++'s several labels of a point are not supported: the first counts.
+    matched with the benchmark's classes by name (`match_names`); the report's notes count the points of other names, which
+    are not scored. ScanNet++'s several labels of a point are not supported: the first counts.
     """
 
     name: ClassVar[str] = "scenesplat-fmiou/1"
@@ -78,8 +82,11 @@ class SceneSplatBench:
     """What is asked for a class; HoliCity has six prompts of its own."""
     neighbours: int = 25
     """Gaussians that vote for a point."""
-    drop_unknown: bool = False
-    """Whether Gaussians without a feature are left out of the vote, as for ScanNet++; else they vote for "none"."""
+    ignored: tuple[str, ...] = ()
+    """Names of the truth that are no class and are not scored. Without need where the truth names all classes besides."""
+    drop_unknown: bool | None = None
+    """Whether Gaussians without a feature are left out of the vote; else they vote for "none". None: as published, which is
+    True for scannetpp100 and False for the others."""
     within_instances: bool = False
     """Take the majority inside each *true* instance, as `enable_clustering` in the script for Occam's LGS. It inflates."""
     least_cosine: float | None = None
@@ -108,20 +115,23 @@ class SceneSplatBench:
 
         Raises:
             TypeError: if a method has no Gaussians.
-            ValueError: if there is no scene, none of its names is a class of the benchmark, or instances are missing.
+            ValueError: if there is no scene, points have a name that may be a class in another spelling, or instances are
+                missing.
         """
         lists = load_classes("scenesplat")[self.benchmark]
         classes: list[str] = lists["classes"]
         prompts = lists.get("prompts") or [[self.template.format(name), i] for i, name in enumerate(classes)]
         text = encode_unit(encode, [prompt for prompt, _ in prompts])
         meant = torch.tensor([index for _, index in prompts])
-        pooled, name, count = ConfusionMatrix(len(classes)), "", 0
+        pooled, name, count, left_out = ConfusionMatrix(len(classes)), "", 0, Counter[str]()
         for method, truth in scenes:
-            pooled.update(self._predict(method, truth, text, meant), matched(truth, classes))
+            target = match_names(truth, classes, self.ignored)
+            pooled.update(self._predict(method, truth, text, meant), target.labels)
+            left_out.update(target.left_out)
             name, count = method.name, count + 1
         if count == 0:
             raise ValueError("scenes: expected at least one, got none; pass pairs of a method and its truth")
-        return self._report(pooled, classes, lists["dropped"], name)
+        return self._report(pooled, lists, name, left_out)
 
     def _predict(self, method: Method, truth: PointTruth, text: Tensor, meant: Tensor) -> Tensor:  # [P] int64
         if method.gaussians is None:
@@ -135,7 +145,7 @@ class SceneSplatBench:
             labels = labels.masked_fill(cosines.nan_to_num(-2.0).amax(-1) < self.least_cosine, -1)
         labels = meant[labels.clamp_min(0)].where(labels >= 0, -1)
         means = method.gaussians.means.cpu()
-        if self.drop_unknown:
+        if self._drops:
             means, labels = means[labels >= 0], labels[labels >= 0]
         found = vote_nearest(truth.points, means, labels, self.neighbours)
         if not self.within_instances:
@@ -144,7 +154,14 @@ class SceneSplatBench:
             raise ValueError("truth: expected instances for within_instances, got None; leave the option out")
         return vote_instances(found, truth.instances.cpu())
 
-    def _report(self, pooled: ConfusionMatrix, classes: Sequence[str], dropped: Sequence[str], method: str) -> Report:
+    @property
+    def _drops(self) -> bool:
+        return self.benchmark == "scannetpp100" if self.drop_unknown is None else self.drop_unknown
+
+    def _report(
+        self, pooled: ConfusionMatrix, lists: Mapping[str, Any], method: str, left_out: Mapping[str, int]
+    ) -> Report:
+        classes, dropped = lists["classes"], lists["dropped"]
         counts = pooled.matrix.double()
         true, hits = counts.sum(1) + pooled.misses, counts.diagonal()
         iou, recall = hits / (true + counts.sum(0) - hits), hits / true
@@ -159,23 +176,68 @@ class SceneSplatBench:
             for prefix, some in (("f-", front), ("", rows))
             for score, key in (("mIoU", "IoU"), ("mAcc", "recall"))
         }
-        return make_report(self, method, means | {"accuracy": pooled.accuracy()}, rows)
+        notes = [f"Gaussians without a feature {'are left out of the vote' if self._drops else 'vote for none'}"]
+        if left_out:
+            names = ", ".join(f"{name} ({count} points)" for name, count in left_out.items())
+            notes.append(f"not scored, no class of {self.benchmark}: {names}")
+        return make_report(self, method, means | {"accuracy": pooled.accuracy()}, rows, notes)
 
 
-def matched(truth: PointTruth, classes: Sequence[str]) -> Tensor:  # [P] int64
+class Matched(NamedTuple):
+    """Points with the classes of a protocol."""
+
+    labels: Tensor  # [P] int64, -1 = not scored
+    left_out: dict[str, int]  # points of each name of the truth that is no class
+
+    def __repr__(self) -> str:
+        return short_repr(self)
+
+
+def match_names(truth: PointTruth, classes: Sequence[str], ignored: Sequence[str] = ()) -> Matched:
     """The labels of points as indices into some classes, by name; -1 for all others.
 
+    Names are compared by `name_key`. A name that is no class may be one in another spelling. It is left out if nothing can
+    be lost by that: the truth names all classes besides (ScanNet's 40 names have the 20 of the benchmark), the name means
+    "no class" (`VOID_NAMES`), or it is in `ignored`.
+
+    Args:
+        truth: labelled points; a label without a name is unlabelled.
+        classes: what labels are indices of.
+        ignored: names of the truth that are not scored.
+
     Raises:
-        ValueError: if no name of the truth is a class.
+        ValueError: if no name of the truth is a class, an ignored one is, or points have a name that may be a class.
     """
-    ids = {label: classes.index(name) for label, name in truth.names.items() if name in classes}
-    if not ids:
-        some = ", ".join(list(truth.names.values())[:3])
+    keys = {name_key(name): i for i, name in reversed(list(enumerate(classes)))}
+    if wrong := [name for name in ignored if name_key(name) in keys]:
         raise ValueError(
-            f"truth: expected names such as {', '.join(classes[:3])} (of the benchmark), got {some or 'none'}"
+            f"ignored: expected names that are no classes of the protocol, got {some(wrong)}; leave them out"
+        )
+    ids = {
+        label: classes.index(name) if name in classes else keys[name_key(name)]
+        for label, name in truth.names.items()
+        if name_key(name) in keys
+    }
+    if not ids:
+        got = ", ".join(list(truth.names.values())[:3])
+        raise ValueError(
+            f"truth: expected names such as {', '.join(classes[:3])} (of the benchmark), got {got or 'none'}"
         )
     labels = truth.labels.cpu()
-    found = torch.full_like(labels, -1)
-    for label, index in ids.items():
-        found[labels == label] = index
-    return found
+    found, left_out = torch.full_like(labels, -1), dict[str, int]()
+    for label, count in zip(*(column.tolist() for column in labels.unique(return_counts=True)), strict=True):
+        if label in ids:
+            found[labels == label] = ids[label]
+        elif label in truth.names:
+            name = truth.names[label]
+            left_out[name] = left_out.get(name, 0) + count
+    known = {name_key(name) for name in (*VOID_NAMES, *ignored)}
+    strange = [name for name in left_out if name_key(name) not in known]
+    nameless = [name for i, name in enumerate(classes) if i not in ids.values()]
+    if strange and nameless:
+        raise ValueError(
+            f"truth: expected names of {len(classes)} classes, {some(nameless, 3)} among them, got points named "
+            f"{', '.join(strange)}; correct names that are a class in another spelling, and give the others as "
+            f"ignored={','.join(strange)}"
+        )
+    return Matched(found, left_out)

@@ -49,8 +49,9 @@ def stable_mask(
     is taken. Without any run it is the level with the largest relevancy, at 0.5.
 
     Note:
-        Our reading of the official script in three points that decide little: the ends of the median filter mirror, an empty
-        mask has mean score 0, and the slope of a run is the mean of its differences.
+        Our reading of the official script in four points: the differences lose their sign before the median, not after it;
+        the ends of the median filter mirror; an empty mask has mean score 0; the slope of a run is the mean of its
+        differences.
     """
     low, high = relevancy.amin((-2, -1), keepdim=True), relevancy.amax((-2, -1), keepdim=True)
     scores = (relevancy - low) / (high - low).clamp_min(1e-9)

@@ -109,7 +109,7 @@ class TeacherAgreement:
         Args:
             method: the field.
             truth: the teacher, a `TeacherMethod` or any other method.
-            views: all views of the scene; `split` chooses some.
+            views: all views of the scene; `split` chooses some, and a note says how many.
             encode: the teacher's text encoder.
 
         Raises:
@@ -128,7 +128,16 @@ class TeacherAgreement:
             accuracy, iou = teacher_agreement(taught, found, self.most)
             rows.append({"view": view.stem, "mIoU": iou, "accuracy": accuracy})
         scores = {name: mean(row[name] for row in rows) for name in ("mIoU", "accuracy")}
-        return make_report(self, method.name, scores, rows)
+        return make_report(self, method.name, scores, rows, self._notes(len(chosen), len(views)))
+
+    def _notes(self, scored: int, given: int) -> list[str]:
+        if self.split is None:
+            return []
+        step, first = self.split
+        return [
+            f"{scored} of {given} views are scored: one in {step} from index {first}, in the order of the numbers in their "
+            "names; split=none scores all"
+        ]
 
     def chosen(self, views: Sequence[View]) -> list[View]:
         """The views of `split`, sorted by the numbers in their names.

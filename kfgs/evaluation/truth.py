@@ -48,6 +48,8 @@ class MaskTruth:
 
     frames: Mapping[str, Mapping[str, MaskAndBoxes]]
     """By the picture's stem, then by text. A text that a frame lacks is not asked there."""
+    scene: str | None = None
+    """The data set's name of the scene ("figurines"), where a protocol has a list of texts for it."""
 
     __repr__ = short_repr
 

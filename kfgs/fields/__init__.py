@@ -6,11 +6,13 @@ from .examples import Box, Clicks, Mask, Picked, label_set_from_examples, read_e
 from .fit import FieldFit, fit_field
 from .loss import ColorLoss, Loss, l1_loss
 from .merge import merge_gaussians
-from .packed import pack_field
+from .packed import pack_field, unpack_field
 from .params import GaussianParams
+from .precision import Rounding
 from .remembered import recall_scene, remember
 from .semantic_field import Rule, SemanticField
 from .uplift import UpliftConfig, uplift_maps
+from .views import score_pixels
 
 __all__ = [
     "Answers",
@@ -23,6 +25,7 @@ __all__ = [
     "Loss",
     "Mask",
     "Picked",
+    "Rounding",
     "Rule",
     "Seen",
     "SemanticField",
@@ -36,5 +39,7 @@ __all__ = [
     "read_examples",
     "recall_scene",
     "remember",
+    "score_pixels",
+    "unpack_field",
     "uplift_maps",
 ]

@@ -1,21 +1,18 @@
-"""Helpers of `SemanticField`: check that its parts fit together, and label views."""
+"""Helpers of `SemanticField`: check that its parts fit together."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from .._check import as_tensor, check_shapes
-from ..cameras import Camera
 from ..gaussians import Gaussians
-from ..labels import LOGIT_SCALES, CodewordLabels, label_pixels
+from ..labels import LabelSet
 from ..labels.questions import Classes
+from ..metrics import MIB
 from ..quant import Autoencoder, Codebook, LinearLatents
-from ..splat import Rendering, rasterize
 
 CHUNK = 8192  # latents decoded at once: the decoder's widest layer then holds 32 MB
 
@@ -81,43 +78,45 @@ def info_lines(info: dict[str, Any]) -> list[str]:
     return [*lines, *(f"  {name}: {value}" for name, value in info.items() if not isinstance(value, list | dict))]
 
 
-def blend_votes(
-    gaussians: Gaussians,
-    camera: Camera,
-    cosines: Tensor,  # [N, C]
-    known: Tensor,  # [N] bool
-) -> Tensor:  # [H, W] int64
-    """The class with most votes at each pixel: each Gaussian divides one vote, and votes are blended like colours."""
-    with torch.no_grad():
-        winners = cosines.argmax(dim=1)[known].unique()  # a class that no Gaussian prefers wins no pixel
-        if len(winners) == 0:
-            return torch.full(camera.size, -1, dtype=torch.int64, device=cosines.device)
-        votes = torch.softmax(LOGIT_SCALES["clip"] * cosines[:, winners], dim=1) * known[:, None]
-        blended = rasterize(gaussians.replace(features=votes.contiguous(), sh=None), camera).map
-        most, index = blended.max(dim=-1)
-        return winners[index].masked_fill(most <= 0, -1)
+def classes_to_ask(field: Any, target: str | Tensor, negatives: Any) -> LabelSet | None:
+    """The classes of a field that a query needs: to look up a name, or to compare with; None if there are none to compare."""
+    compared = isinstance(negatives, str) and negatives != "none"
+    if not isinstance(target, str) and not (compared and field.has_classes):
+        return None
+    try:
+        found: LabelSet = field.label_set()
+    except (FileNotFoundError, ValueError):
+        if isinstance(target, str) or negatives != "auto":  # an embedding needs no classes
+            raise
+        return None
+    return found
 
 
-def label_rendered(
-    rendering: Rendering,
-    decode: Callable[[Tensor], Tensor],
-    unit: Tensor,  # [C, D] unit rows
-) -> Tensor:  # [H, W] int64
-    """The class that is most similar to each pixel's decoded feature; -1 for empty pixels."""
-    pixels = [decode(part) for part in rendering.map.flatten(0, 1).split(CHUNK)]
-    found = torch.cat([(part @ unit.T).max(dim=1).indices.masked_fill(~part.any(dim=1), -1) for part in pixels])
-    return found.view(rendering.alpha.shape).masked_fill(rendering.alpha <= 0, -1)
+def card_facts(field: Any) -> dict[str, object]:
+    """A field's facts for its card in a notebook."""
+    facts: dict[str, object] = {"method": field.method, "Gaussians": len(field), "channels": field.channels}
+    facts |= {
+        "channels of the teacher": field.dim,
+        "codewords": None if field.codebook is None else field.codebook.size,
+    }
+    facts |= {"training views": len(field.cameras), "size as Table 1 counts it": f"{field.storage() / MIB:.2f} MiB"}
+    return facts | {
+        "teacher": teacher_name(field.info),
+        "folder": None if field.folder is None else str(field.folder),
+    }
 
 
-def label_latents(
-    rendering: Rendering,
-    codebook: Codebook,
-    labels: CodewordLabels,
-    autoencoder: Autoencoder | None,
-    *,
-    exact: bool,
-) -> Tensor:  # [H, W] int64
-    """The class of each pixel's codeword: of the decoded latent (`exact`), or the codeword with the nearest latent."""
-    decode: Literal["exact", "latent"] = "exact" if exact else "latent"
-    covered = rendering.alpha > 0
-    return label_pixels(rendering.map, codebook, labels, autoencoder, decode=decode, covered=covered)
+def summary_text(field: Any) -> str:
+    """See `SemanticField.summary`."""
+    codewords = "no codebook" if field.codebook is None else f"{field.codebook.size} codewords"
+    channels = f"{field.channels} channels for {field.dim}"
+    lines = [
+        f"semantic field ({field.method}): {len(field)} Gaussians, {channels}, {codewords}",
+        f"  size as Table 1 counts it: {field.storage() / MIB:.2f} MiB",
+        *info_lines(field.info),
+    ]
+    if field.words is not None:
+        lines.append(f"  classes: {len(field.words)}, with their text table")
+    noted = info if isinstance(info := field.info.get("rounded"), list) else []
+    lines += [f"  rounded: precision {one.get('precision')!s:.20}" for one in noted if isinstance(one, dict)]
+    return "\n".join(lines)

@@ -18,13 +18,15 @@ from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels import Classification, CodewordLabels, LabelSet, Score, Selection, label_codewords, select_by_similarity
 from ..labels.questions import Classes, Negatives, check_rows, class_rows, make_question
-from ..metrics import MIB, semantic_storage_bytes
+from ..metrics import semantic_storage_bytes
 from ..quant import Autoencoder, Codebook, LinearLatents
-from ..splat import Rendering, rasterize
+from ..splat import Ranked, Rendering, rasterize
 from . import parts
 from .answers import Answers, Seen, fused_answers
+from .precision import PrecisionName, Rounding
 from .remembered import recall_classes
 from .store import load_field, save_field
+from .views import rank_classes
 
 Rule = Literal["fused", "paper"]
 
@@ -56,8 +58,10 @@ class SemanticField:
     """How well the training views show each Gaussian."""
     cameras: tuple[Camera, ...] = ()
     """The training views, undistorted."""
+    words: LabelSet | None = None
+    """The classes of its scene with their text table, if the field holds them itself."""
     folder: Path | None = None
-    """The folder it was loaded from."""
+    """The folder or file it was loaded from."""
 
     def __post_init__(self) -> None:
         parts.check_parts(self.gaussians, self.codebook, self.autoencoder, self.linear, self.answers)
@@ -99,14 +103,7 @@ class SemanticField:
         return f"SemanticField({self.method}: {len(self)} Gaussians, {self.channels} channels for {self.dim})"
 
     def _repr_html_(self) -> str:
-        facts: dict[str, object] = {"method": self.method, "Gaussians": len(self), "channels": self.channels}
-        facts |= {
-            "channels of the teacher": self.dim,
-            "codewords": None if self.codebook is None else self.codebook.size,
-        }
-        facts |= {"training views": len(self.cameras), "size as Table 1 counts it": f"{self.storage() / MIB:.2f} MiB"}
-        facts |= {"teacher": parts.teacher_name(self.info), "folder": None if self.folder is None else str(self.folder)}
-        return html_card("SemanticField", facts)
+        return html_card("SemanticField", parts.card_facts(self))
 
     # Maps
 
@@ -214,13 +211,7 @@ class SemanticField:
             target = as_tensor("target", target, floating=True)
         if score == "cosine" and isinstance(negatives, str) and negatives == "auto":
             negatives = "none"
-        compared = isinstance(negatives, str) and negatives != "none"  # needs classes or their canonical words
-        if classes is None and (isinstance(target, str) or (compared and "classes" in self.info)):
-            try:
-                classes = self.label_set()
-            except (FileNotFoundError, ValueError):
-                if isinstance(target, str) or negatives != "auto":  # an embedding needs no classes
-                    raise
+        classes = parts.classes_to_ask(self, target, negatives) if classes is None else classes
         asked = make_question(target, classes, negatives, self.dim, self.info)
         others = [] if asked.negatives is None else [asked.negatives.to(asked.row)]
         rows = torch.cat([asked.row[None], *others])
@@ -246,16 +237,12 @@ class SemanticField:
         Raises:
             ValueError: if shapes disagree or `rule` is unknown.
         """
+        return self.rank(camera, classes, rule=rule).labels[..., 0]
+
+    def rank(self, camera: Camera, classes: Classes | None = None, *, top: int = 1, rule: Rule = "fused") -> Ranked:
+        """The `top` best classes of each pixel by the rule of `segment`, and their scores; see `kfgs.fields.views`."""
         check_choice("rule", rule, get_args(Rule))
-        rows = self._rows(classes)
-        if rule == "fused" and self._is_linear:
-            return parts.blend_votes(self.gaussians, camera, self.cosines(rows), self.known)
-        rendering = self.render(camera)
-        if self.codebook is None or (rule == "fused" and self.autoencoder is None):
-            return parts.label_rendered(rendering, self.decode, unit_embeddings(rows).to(self.features))
-        return parts.label_latents(
-            rendering, self.codebook, self.codeword_labels(rows), self.autoencoder, exact=rule == "paper"
-        )
+        return rank_classes(self, camera, self._rows(classes), rule, top)
 
     def codeword_labels(self, embeddings: Tensor) -> CodewordLabels:  # [C, D]
         """The class of each codeword (Sec. 3.4).
@@ -287,13 +274,18 @@ class SemanticField:
         return replace(self, cameras=tuple(cameras))
 
     def label_set(self) -> LabelSet:
-        """The classes that the field remembers from its scene.
+        """The classes that the field holds or remembers from its scene.
 
         Raises:
-            ValueError: if it remembers none, or they have changed.
+            ValueError: if there are none, or they have changed.
             FileNotFoundError: if their files are missing.
         """
-        return recall_classes(self.info, self.folder)
+        return recall_classes(self.info, self.folder) if self.words is None else self.words
+
+    @property
+    def has_classes(self) -> bool:
+        """Whether the field holds classes, or remembers where they are."""
+        return self.words is not None or "classes" in self.info
 
     # Size and files
 
@@ -310,31 +302,26 @@ class SemanticField:
 
     def summary(self) -> str:
         """A few lines of text: counts, channels, codewords, size."""
-        codewords = "no codebook" if self.codebook is None else f"{self.codebook.size} codewords"
-        lines = [
-            f"semantic field ({self.method}): {len(self)} Gaussians, {self.channels} channels for {self.dim}, {codewords}",
-            f"  size as Table 1 counts it: {self.storage() / MIB:.2f} MiB",
-            *parts.info_lines(self.info),
-        ]
-        return "\n".join(lines)
+        return parts.summary_text(self)
 
-    def save(self, path: str | Path) -> None:
-        """Write a folder with `field.safetensors` and `field.json`, whole or not at all; an older field is replaced.
+    def save(self, path: str | Path, precision: PrecisionName | Rounding | None = None) -> None:
+        """Write a folder (`field.safetensors` and `field.json`), or one file if `path` ends in `.kfgs.safetensors`.
 
-        Raises:
-            FileExistsError: if there is something other than a field at `path`.
-            ValueError: if `info` is not JSON.
+        It is written whole or not at all; an older field is replaced. One file also holds the classes and their text table.
+
+        Args:
+            path: of the folder or file.
+            precision: of one file: "lossless" (the default), "fine", "small", "tiny" or your own `Rounding`. All but the first
+                sort the Gaussians, and note their errors in `info["rounded"]`.
+
+        A FileExistsError if there is something other than a field at `path`, a ValueError if `info` is not JSON, a number is not
+        finite, or a folder gets a precision.
         """
-        save_field(path, vars(self))
+        save_field(path, vars(self), precision)
 
     @classmethod
     def load(cls, path: str | Path) -> SemanticField:
-        """Read what `save` wrote.
-
-        Raises:
-            FileNotFoundError: if there is no field at `path`.
-            ValueError: if it is damaged, from another version, or no field.
-        """
+        """Read what `save` wrote; a FileNotFoundError if nothing is there, a ValueError if it is no field or damaged."""
         return cls(**load_field(path), folder=Path(path))
 
     @property

@@ -1,4 +1,4 @@
-"""A semantic field on disk: one folder with `field.safetensors` (numbers) and `field.json` (their description)."""
+"""A semantic field on disk: a folder with `field.safetensors` and `field.json`, or one packed file."""
 
 from __future__ import annotations
 
@@ -12,62 +12,92 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from .._files import atomic_folder, digest_file, read_json, write_json
+from .._check import check_choice
+from .._files import atomic_folder, atomic_path, digest_file, read_json, write_json
 from ..cameras import Camera
 from ..gaussians import Gaussians
+from ..labels import LabelSet
 from ..quant import Autoencoder, Codebook, LinearLatents
 from .answers import Seen
-from .remembered import rebased
+from .container import HEADER, pack_tensors, peek, unpack_tensors
+from .parts import check_parts
+from .precision import PRECISIONS, Rounding
+from .remembered import rebased, recall_classes
 
-FORMAT, VERSIONS = "kfgs.semantic_field", (1, 2)
-"""Version 2 may hold linear latents, fused answers and cameras."""
+FORMAT, VERSIONS = "kfgs.semantic_field", (1, 2, 3)
+"""Version 2 may hold linear latents, fused answers and cameras; version 3 the classes."""
 TENSORS, DESCRIPTION = "field.safetensors", "field.json"
+SUFFIX = ".kfgs.safetensors"
+"""Of a field in one file."""
 
 
-def save_field(path: str | Path, parts: Mapping[str, Any]) -> None:
-    """Write the parts of a field, as returned by `load_field`, into a folder; see `SemanticField.save`."""
+def find_field(path: str | Path) -> Path | None:
+    """The field at a path: a field folder, a packed field, or the field of a run folder; None if there is none."""
     path = Path(path)
-    if path.exists() and not (path / DESCRIPTION).is_file() and not (path.is_dir() and not any(path.iterdir())):
-        raise FileExistsError(
-            f"path: expected a new folder or an older field at {path}, got something else; give another"
+    found = (one for one in (path, path / "field") if (one / DESCRIPTION).is_file())
+    return next(found, path if _peek(path) is not None else None)
+
+
+def field_data(path: Path) -> Path:
+    """The file with the numbers of a field: in its folder, or the packed file."""
+    return path / TENSORS if path.is_dir() else path
+
+
+def save_field(path: str | Path, parts: Mapping[str, Any], precision: str | Rounding | None = None) -> None:
+    """Write the parts of a field, as returned by `load_field`; see `SemanticField.save`."""
+    path = Path(path)
+    single = path.name.endswith(SUFFIX)
+    if precision is not None and not single:
+        raise ValueError(
+            f"path: expected a name that ends in {SUFFIX} for a field in one file, got {path}; give another, or leave "
+            "precision out to write a folder"
         )
-    gaussians, cameras = parts["gaussians"], parts["cameras"]
-    info = rebased(parts["info"], parts["folder"], path)
-    try:
-        json.dumps(info, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"info: expected what JSON can hold, got {error}; use strings and finite numbers") from error
-    tensors = {f"gaussians.{name}": value for name, value in vars(gaussians).items() if value is not None}
-    for part in ("codebook", "autoencoder", "linear"):
-        if parts[part] is not None:
-            tensors |= {f"{part}.{name}": value for name, value in parts[part].to_tensors().items()}
-    if parts["answers"] is not None:
-        tensors["answers.latents"] = parts["answers"]
-    if parts["seen"] is not None:
-        tensors |= {f"seen.{name}": value for name, value in parts["seen"]._asdict().items()}
-    if cameras:
-        tensors["cameras.viewmats"] = torch.stack([camera.viewmat for camera in cameras])
-        tensors["cameras.Ks"] = torch.stack([camera.K for camera in cameras])
+    if single:
+        older = not path.exists() or _peek(path) is not None
+    else:
+        older = not path.exists() or (path / DESCRIPTION).is_file() or (path.is_dir() and not any(path.iterdir()))
+    if not older:
+        raise FileExistsError(
+            f"path: expected a new {'file' if single else 'folder'} or an older field at {path}, got something else; "
+            "give another"
+        )
+    parts = {**parts, "info": rebased(parts["info"], parts["folder"], path)}
+    if single:
+        data = pack_parts({**parts, "words": _words(parts, path)}, precision or "lossless")
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(data)
+        return
+    tensors, description = _to_tensors(parts)
     with atomic_folder(path) as folder:
-        whole = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
-        save_file(whole, folder / TENSORS)
-        description = {
-            "format": FORMAT,
-            "version": VERSIONS[-1],
-            "sha256": digest_file(folder / TENSORS),
-            "gaussians": len(gaussians),
-            "cameras": [[camera.name, camera.width, camera.height, camera.near] for camera in cameras],
-            "info": info,
-        }
-        write_json(folder / DESCRIPTION, description)
+        save_file(tensors, folder / TENSORS)
+        version = VERSIONS[-1] if "words" in description else VERSIONS[-2]
+        about = {"format": FORMAT, "version": version, "sha256": digest_file(folder / TENSORS)}
+        write_json(folder / DESCRIPTION, about | description)
+
+
+def pack_parts(parts: Mapping[str, Any], precision: str | Rounding) -> bytes:
+    """The bytes of a packed field; see `pack_field`."""
+    if not isinstance(precision, Rounding):
+        check_choice("precision", precision, PRECISIONS)
+    tensors, description = _to_tensors(parts)
+    return pack_tensors(tensors, description, precision)
+
+
+def unpack_parts(data: bytes, name: str = "data") -> dict[str, Any]:
+    """The parts of a field from the bytes of `pack_parts`; a ValueError that begins with `name` for others."""
+    tensors, description = unpack_tensors(data, name)
+    return _from_tensors(name, tensors, description)
 
 
 def load_field(path: str | Path) -> dict[str, Any]:
     """The parts of a field, by name; see `SemanticField.load`."""
     path = Path(path)
+    if path.is_file():
+        return unpack_parts(b"" if _peek(path) is None else path.read_bytes(), str(path))
     if not (path / DESCRIPTION).is_file():
         raise FileNotFoundError(
-            f"{path}: expected the folder of a saved field, found no {DESCRIPTION} in it; pass what SemanticField.save got"
+            f"{path}: expected a saved field, a file or a folder with {DESCRIPTION}, found none; pass what "
+            "SemanticField.save got"
         )
     description = read_json(path / DESCRIPTION)
     found = description.get("format") if isinstance(description, dict) else None
@@ -85,22 +115,94 @@ def load_field(path: str | Path) -> dict[str, Any]:
         )
     try:
         tensors = load_file(path / TENSORS)
-        linear, seen, answers = (_part(tensors, name) for name in ("linear", "seen", "answers"))
-        codebook, autoencoder = _part(tensors, "codebook"), _part(tensors, "autoencoder")
-        return {
+    except SafetensorError as error:
+        raise ValueError(
+            f"{path}: expected a field, but its parts do not fit together ({error}); fit it again"
+        ) from error
+    return _from_tensors(str(path), tensors, description)
+
+
+def _peek(path: Path) -> dict[str, Any] | None:
+    """See `peek`; None for a folder."""
+    if not path.is_file():
+        return None
+    with path.open("rb") as file:
+        return peek(file.read(HEADER + 8))
+
+
+def _words(parts: Mapping[str, Any], path: Path) -> LabelSet | None:
+    """The classes that a field holds or remembers; None if their files are gone or have changed."""
+    try:
+        return parts["words"] or recall_classes(parts["info"], path)
+    except (OSError, ValueError):
+        return None
+
+
+def _to_tensors(parts: Mapping[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """All tensors of a field by name, and the rest of it as JSON."""
+    gaussians, cameras, words = parts["gaussians"], parts["cameras"], parts["words"]
+    try:
+        json.dumps(parts["info"], allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"info: expected what JSON can hold, got {error}; use strings and finite numbers") from error
+    tensors = {f"gaussians.{name}": value for name, value in vars(gaussians).items() if value is not None}
+    for part in ("codebook", "autoencoder", "linear"):
+        if parts[part] is not None:
+            tensors |= {f"{part}.{name}": value for name, value in parts[part].to_tensors().items()}
+    if parts["answers"] is not None:
+        tensors["answers.latents"] = parts["answers"]
+    if parts["seen"] is not None:
+        tensors |= {f"seen.{name}": value for name, value in parts["seen"]._asdict().items()}
+    if cameras:
+        tensors["cameras.viewmats"] = torch.stack([camera.viewmat for camera in cameras])
+        tensors["cameras.Ks"] = torch.stack([camera.K for camera in cameras])
+    description = {
+        "gaussians": len(gaussians),
+        "cameras": [[camera.name, camera.width, camera.height, camera.near] for camera in cameras],
+        "info": parts["info"],
+    }
+    if words is not None:
+        tensors["words.embeddings"] = words.embeddings
+        if words.negatives is not None:
+            tensors["words.negatives"] = words.negatives
+        names = {"names": words.names, "negative_names": words.negative_names, "info": words.info}
+        description["words"] = json.loads(json.dumps(names))
+    whole = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+    return whole, description
+
+
+def _from_tensors(name: str, tensors: dict[str, Tensor], description: dict[str, Any]) -> dict[str, Any]:
+    """The parts of a field, which fit together; a ValueError that begins with `name` if they do not."""
+    try:
+        linear, seen, answers = (_part(tensors, part) for part in ("linear", "seen", "answers"))
+        codebook, autoencoder, words = (_part(tensors, part) for part in ("codebook", "autoencoder", "words"))
+        found: dict[str, Any] = {
             "gaussians": Gaussians(**_part(tensors, "gaussians")),
             "codebook": Codebook.from_tensors(codebook) if codebook else None,
             "autoencoder": Autoencoder.from_tensors(autoencoder) if autoencoder else None,
-            "info": description["info"],
+            "info": dict(description["info"]),
             "linear": LinearLatents.from_tensors(linear) if linear else None,
             "answers": answers.get("latents"),
             "seen": Seen(**seen) if seen else None,
             "cameras": _cameras(description.get("cameras", []), _part(tensors, "cameras")),
+            "words": _label_set(words, description["words"]) if words else None,
         }
-    except (SafetensorError, TypeError, KeyError) as error:
+        check_parts(*(found[one] for one in ("gaussians", "codebook", "autoencoder", "linear", "answers")))
+    except (TypeError, LookupError, ValueError, AttributeError, RuntimeError) as error:
         raise ValueError(
-            f"{path}: expected a field, but its parts do not fit together ({error}); fit it again"
+            f"{name}: expected a field, but its parts do not fit together ({error}); fit it again"
         ) from error
+    return found
+
+
+def _label_set(tensors: dict[str, Tensor], names: dict[str, Any]) -> LabelSet:
+    return LabelSet(
+        tuple(names["names"]),
+        tensors["embeddings"],
+        tensors.get("negatives"),
+        tuple(names["negative_names"]),
+        dict(names["info"]),
+    )
 
 
 def _cameras(rows: list[Any], tensors: dict[str, Tensor]) -> tuple[Camera, ...]:

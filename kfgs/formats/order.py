@@ -44,12 +44,35 @@ def morton_order(
     low = points.min(0)
     size = np.maximum(points.max(0) - low, np.finfo(np.float64).tiny)  # an axis without extent: all 0
     cells = ((points - low) / size * (2**_BITS - 1)).astype(np.uint64)
-    codes = sum(_spread(cells[:, axis]) << np.uint64(axis) for axis in range(3))
-    return torch.from_numpy(np.argsort(codes, kind="stable").astype(np.int64)).to(means.device)
+    return torch.from_numpy(np.argsort(morton_codes(cells), kind="stable").astype(np.int64)).to(means.device)
+
+
+def morton_codes(
+    cells: NDArray[np.uint64],  # [N, 3] below 2^21
+) -> NDArray[np.uint64]:  # [N]
+    """Interleave the bits of x, y and z, with x in the lowest bit."""
+    x, y, z = (_spread(cells[:, axis]) << np.uint64(axis) for axis in range(3))
+    return x | y | z
+
+
+def morton_cells(
+    codes: NDArray[np.uint64],  # [N]
+) -> NDArray[np.uint64]:  # [N, 3]
+    """The inverse of `morton_codes`; the highest bit is ignored."""
+    return np.stack([_gather(codes >> np.uint64(axis)) for axis in range(3)], axis=1)
 
 
 def _spread(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:  # [N] of 21 bits -> [N] of 63
     """Put two zeros before every bit."""
     for shift, mask in _SPREAD:
         bits = (bits | bits << np.uint64(shift)) & np.uint64(mask)
+    return bits
+
+
+def _gather(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:  # [N] of 63 -> [N] of 21 bits
+    """Keep every third bit."""
+    masks = [(1 << _BITS) - 1, *(mask for _, mask in _SPREAD)]
+    bits = bits & np.uint64(masks[-1])
+    for (shift, _), mask in zip(_SPREAD[::-1], masks[-2::-1], strict=True):
+        bits = (bits | bits >> np.uint64(shift)) & np.uint64(mask)
     return bits

@@ -8,6 +8,7 @@ from .._check import one_line
 from .._files import bytes_in_words, read_json
 from ..features.manifest import MANIFEST, read_manifest
 from ..fields import SemanticField
+from ..fields.store import find_field
 from ..formats import SplatFile, find_format, read_splats
 from ..formats.ply import read_ply
 from ..scenes import load_scene
@@ -23,6 +24,10 @@ def describe(path: str | Path) -> str:
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder; expected a field, a run, a scene or a splat file")
+    field = find_field(path)
+    if field is not None:
+        size = [f"  one file of {path.stat().st_size / 2**20:.2f} MiB"] if path.is_file() else []
+        return "\n".join([SemanticField.load(field).summary(), *size])
     if path.is_file():
         if find_format(path).NAME == "ply":
             columns = read_ply(path)
@@ -30,10 +35,6 @@ def describe(path: str | Path) -> str:
                 count = len(next(iter(columns.values())))
                 return f"{path}: PLY with {count} vertices; columns {', '.join(columns)}"
         return _describe_splats(path, read_splats(path))
-    if (path / "field.json").is_file():
-        return SemanticField.load(path).summary()
-    if (path / "field" / "field.json").is_file():
-        return SemanticField.load(path / "field").summary()
     if (path / MANIFEST).is_file():
         return _describe_maps(path)
     if (path / "stages").is_dir():

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, Literal
 
-from .._files import bytes_in_words, seconds_in_words
+from .._files import seconds_in_words
 from ..fields import FieldConfig
 from ..fields.answers import MOST
 from ..fields.working_maps import WORKING
@@ -308,28 +308,6 @@ def training_bytes(sizes: Sizes) -> int:
     config, channels = sizes.config, color_channels(sizes.config) if fuse else _channels(sizes)
     _, last = gaussian_counts(config.color.field if fuse else config.field, sizes.points, full=fuse)
     return TRAINING * gaussian_bytes(last, channels) + 3 * FLOAT * sizes.render * ((3 if fuse else channels) + 2)
-
-
-def notes_on(sizes: Sizes) -> list[str]:
-    """Notes for the reader of the numbers."""
-    found = [
-        "times are those of small runs on this machine as busy as it is now, scaled up: within a factor of two or so"
-    ]
-    if any(sizes.made) and sizes.dense != "recompute":
-        found.append(f"{sum(sizes.made)} of {sizes.count} maps exist and are not made again")
-    if sizes.points < 2:
-        found.append(f"the scene has {sizes.points} points; training needs some: estimate them with `kfgs sfm`")
-    if not sizes.missing or sizes.shape is None:
-        return found
-    whole = sizes.samples * sizes.count == sizes.pixels
-    if sizes.dense == "recompute" and whole and sizes.config.method == "paper":
-        found.append(
-            "the codebook looks at every feature of these maps: keeping them takes no more disk, and half the time"
-        )
-    if sizes.dense == "keep" and not sizes.config.needs_maps:
-        size = bytes_in_words(sizes.map_bytes(range(sizes.count)))
-        found.append(f"the {size} of maps can be deleted once the field is made (kfgs fit --discard-features)")
-    return found
 
 
 def _say(sizes: Sizes) -> str:

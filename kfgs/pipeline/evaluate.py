@@ -6,6 +6,7 @@ import os
 import platform
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,10 @@ from ..evaluation.encoders import TableEncoder
 from ..evaluation.foreign import SplattedMethod, load_foreign
 from ..features.manifest import MANIFEST
 from ..fields import SemanticField
+from ..fields.store import field_data, find_field
 from ..formats import read_splats
 from ..gaussians import Gaussians
+from .beside import notes_beside
 from .question import IN_SPACE, OF_COLORS, Question, colors_of, open_question, read_teacher
 
 MAPS = ("*_fmap_CxHxW.pt", "*_s.npy", "*.npy")  # files of maps in a folder that kfgs did not fill
@@ -45,10 +48,11 @@ def evaluate(
         encode: a label set, or the teacher's text encoder. Not needed for colours and edits.
         with_file: a second file of a foreign result, see `load_foreign`.
         command: kept in the report.
-        **asked: `truth`, `split`, `images` and `options`, as in `open_question`; not with a question.
+        **asked: `truth`, `split`, `images`, `options` and `labels`, as in `open_question`; not with a question.
 
     Returns:
-        Scores with protocol, options, digests of data and field, command and machine.
+        Scores with protocol, options, digests of data and field, command and machine. Its notes say what belongs beside a
+        score: the rule for labels, which views were trained on, the size of the pictures, the teacher.
 
     Raises:
         FileNotFoundError: if the result, the scene or its truth is missing.
@@ -64,6 +68,8 @@ def evaluate(
     name = question.protocol.name
     encoder = TableEncoder(encode) if isinstance(encode, LabelSet) else encode
     report = question.score(colors_of(method, name) if name in OF_COLORS else method, encoder)
+    beside = notes_beside(question, report.options.get("labels"), method, encode)
+    report = replace(report, notes=(*report.notes, *beside))
     return report.of(command=command, digests={"field": digest_method(method)}, machine=this_machine())
 
 
@@ -84,11 +90,12 @@ def open_result(path: str | Path, question: Question, with_file: str | Path | No
         ValueError: if it is of no known kind.
     """
     path = Path(path)
-    folder = next((one for one in (path, path / "field") if (one / "field.json").is_file()), None)
+    folder = find_field(path)
     if with_file is not None and (folder is not None or is_maps(path)):
         raise ValueError(f"with_file: expected none with a result of kfgs, got {with_file}; leave it out")
     if question.protocol.name in OF_COLORS:
-        places = (path, path / "color.ply", path.parent / "color.ply" if folder == path else path)
+        places: tuple[Path, ...] = (path, path / "color.ply", path.parent / "color.ply" if folder == path else path)
+        places = tuple(one for one in places if one != folder)
         splat = next((one for one in places if one.is_file() and one.suffix not in (".pth", ".pt")), None)
         if splat is not None:
             return read_splats(splat).gaussians
@@ -97,18 +104,23 @@ def open_result(path: str | Path, question: Question, with_file: str | Path | No
                 f"{path / 'color.ply'}: no such file; expected a colour splat for {question.protocol.name}; name one"
             )
     if folder is not None:
-        return FieldMethod(SemanticField.load(folder))
+        return FieldMethod(SemanticField.load(folder), own_labels=question.rule == "own")
+    if (path / "stages").is_dir() and (path / "color.ply").is_file():
+        raise ValueError(
+            f"field: expected a result with features for {question.protocol.name}, got {path}, which has colours (color.ply) "
+            f"but no features; give it some with `kfgs fit SCENE --out {path}`, or with `kfgs uplift SCENE "
+            f"{path / 'color.ply'} --out FIELD`"
+        )
     if (path / "stages").is_dir():
         raise ValueError(f"field: expected a finished run, got {path}, an unfinished one; fit it again to go on")
     if is_maps(path):
-        chosen = getattr(question.protocol, "chosen", list)(list(question.views))
-        return read_teacher(path, question.scene, chosen, align_corners=False)
+        return read_teacher(path, question.scene, question.scored, align_corners=False)
     return load_foreign(path, with_file)
 
 
 def is_maps(path: Path) -> bool:
     """Whether a folder has a teacher's feature maps."""
-    if not path.is_dir() or (path / "field.json").is_file():
+    if not path.is_dir() or find_field(path) == path:
         return False
     return (
         (path / MANIFEST).is_file()
@@ -121,7 +133,7 @@ def digest_method(method: Any) -> str:
     """SHA-256 of what decides a method's answers: a field's file, Gaussians and decoders, or a teacher's maps of the views."""
     if isinstance(method, FieldMethod):
         folder = method.field.folder
-        file = None if folder is None else folder / "field.safetensors"
+        file = None if folder is None else field_data(folder)
         if file is not None and file.is_file():
             return digest_file(file)
         return digest_data([method.field.gaussians, method.field.features])

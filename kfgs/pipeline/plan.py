@@ -17,7 +17,7 @@ from ..features import FeatureFolder
 from ..scenes import Scene
 from ..teachers import Teacher
 from .config import FitConfig
-from .estimate import DENSE, Dense, Sizes, StagePlan, add, gaussian_counts, notes_on, plan_stages, training_bytes
+from .estimate import DENSE, Dense, Sizes, StagePlan, add, gaussian_counts, plan_stages, training_bytes
 from .fit import finished_stages
 from .plan_maps import NamedTeacher, find_stored, run_teacher
 from .train import training_device
@@ -231,3 +231,25 @@ def _title(sizes: Sizes, teacher: str, device: torch.device) -> str:
         f"{sizes.count} views of {width}x{height}, {teacher} ({maps}, {stored}), {method}, {steps} steps, on {device} "
         f"({torch.get_num_threads()} threads)"
     )
+
+
+def notes_on(sizes: Sizes) -> list[str]:
+    """Notes for the reader of the numbers."""
+    found = [
+        "times are those of small runs on this machine as busy as it is now, scaled up: within a factor of two or so"
+    ]
+    if any(sizes.made) and sizes.dense != "recompute":
+        found.append(f"{sum(sizes.made)} of {sizes.count} maps exist and are not made again")
+    if sizes.points < 2:
+        found.append(f"the scene has {sizes.points} points; training needs some: estimate them with `kfgs sfm`")
+    if not sizes.missing or sizes.shape is None:
+        return found
+    whole = sizes.samples * sizes.count == sizes.pixels
+    if sizes.dense == "recompute" and whole and sizes.config.method == "paper":
+        found.append(
+            "the codebook looks at every feature of these maps: keeping them takes no more disk, and half the time"
+        )
+    if sizes.dense == "keep" and not sizes.config.needs_maps:
+        size = bytes_in_words(sizes.map_bytes(range(sizes.count)))
+        found.append(f"the {size} of maps can be deleted once the field is made (kfgs fit --discard-features)")
+    return found

@@ -6,14 +6,26 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
 from .._card import short_repr
+from .._check import check_choice
 from ..cameras import undistort_labels
-from ..evaluation import Encode, LabelTruth, MaskTruth, PointTruth, Report, TeacherMethod, View, get_protocol
+from ..evaluation import (
+    Encode,
+    FieldMethod,
+    Labeller,
+    LabelTruth,
+    MaskTruth,
+    PointTruth,
+    Report,
+    TeacherMethod,
+    View,
+    get_protocol,
+)
 from ..evaluation.datasets import find_labels, find_masks, find_points, truth_views
 from ..evaluation.datasets.files import ReadWhenAsked
 from ..evaluation.digests import digest_data
@@ -33,6 +45,10 @@ IN_SPACE = ("kfgs-surface/1", "lerf-ovs-3d/1", "scannet-points/1", "scannet-volu
 OF_COLORS = ("kfgs-color/1", *EDIT_INPUTS)
 """Protocols that score Gaussians with colours instead of a method."""
 
+LABELLED = ("kfgs-pooled/1", "feature3dgs-teacher/1", "3dovs-closed/1")
+"""Protocols that take one class per pixel, so that a method's own rule for it counts."""
+
+Labels = Literal["own", "nearest"]
 Truth = LabelTruth | MaskTruth | PointTruth | TeacherMethod
 
 
@@ -53,8 +69,26 @@ class Question:
     """Of views and truth."""
     inputs: Mapping[str, Any]
     """Of the protocols of edits: before, and the class."""
+    labels: Labels | None = None
+    """The rule for classes of pixels that was asked for; `rule` is the one that counts."""
 
     __repr__ = short_repr
+
+    @property
+    def rule(self) -> Labels:
+        """Who says the class of a pixel: the field (`SemanticField.segment`), or the text with the largest cosine.
+
+        If none was asked for: the field in kfgs's own protocols, the nearest text in those that others published, which
+        define the class so.
+        """
+        return self.labels or ("own" if self.protocol.name.startswith("kfgs-") else "nearest")
+
+    @property
+    def scored(self) -> tuple[View, ...]:
+        """The views whose pictures are scored; none of a protocol of points."""
+        if self.protocol.name in OF_COLORS:
+            return tuple(_views(self.scene, self.protocol.split))
+        return tuple(getattr(self.protocol, "chosen", list)(list(self.views)))
 
     def score(self, method: Any, encode: Encode | None = None) -> Report:
         """Ask a method; of colours and edits, Gaussians.
@@ -72,8 +106,24 @@ class Question:
         if encode is None:
             raise ValueError("text: expected text embeddings, got none; pass a label set or a teacher's text encoder")
         noted = NotedEncoder(encode)
+        method = self._with_rule(method)
         found: Report = self.protocol.score(method, self.truth, list(self.views), noted)
+        if self.protocol.name in LABELLED:
+            found = self._name_rule(found, method)
         return found.of(digests={**self.digests, "texts": digest_data(noted.rows)})
+
+    def _with_rule(self, method: Any) -> Any:
+        if self.labels is None or not isinstance(method, FieldMethod):
+            return method
+        return FieldMethod(method.field, method.name, own_labels=self.labels == "own")
+
+    def _name_rule(self, report: Report, method: Any) -> Report:
+        """The report with the option `labels`. A method without a rule of its own can be compared under either."""
+        rule = self.rule
+        if isinstance(method, Labeller):
+            rule = "own" if getattr(method, "own_labels", True) else "nearest"
+        changed = ("labels",) if rule != replace(self, labels=None).rule else ()
+        return replace(report, options={**report.options, "labels": rule}, changed=(*report.changed, *changed))
 
 
 def open_question(
@@ -84,6 +134,7 @@ def open_question(
     split: str | None = None,
     images: str | Path | None = None,
     options: Mapping[str, Any] | None = None,
+    labels: Labels | None = None,
 ) -> Question:
     """Read a scene and its ground truth for a protocol.
 
@@ -97,14 +148,22 @@ def open_question(
         images: folder of the pictures.
         options: of the protocol, as published where left out; and the inputs of an edit's protocol: `before` (a splat file),
             `removed` or `painted` (a class), `rgb`.
+        labels: who says the class of a pixel, of a field of kfgs: `own`, the field (`SemanticField.segment`), or `nearest`,
+            the text with the largest cosine, as of other methods. None: as the protocol has it (`Question.rule`).
 
     Raises:
         FileNotFoundError: if the scene or its truth is missing.
-        ValueError: if protocol, options, split or truth do not fit.
+        ValueError: if protocol, options, split, truth or labels do not fit.
     """
     given, folder = dict(options or {}), Path(scene)
     name = get_protocol(protocol).name
     inputs = _edit_inputs(name, given)
+    if labels is not None:
+        check_choice("labels", labels, get_args(Labels))
+        if name not in LABELLED:
+            raise ValueError(
+                f"labels: expected none with {name}, which takes no class per pixel, got {labels!r}; leave it out"
+            )
     if split is not None and name in OF_COLORS:
         given["split"] = split
     chosen = get_protocol(name, **given)
@@ -121,15 +180,15 @@ def open_question(
         return Question(chosen, folder, loaded, None, (), digests, inputs)
     kind = type(chosen).score.__annotations__["truth"]
     if kind == "PointTruth":
-        points = find_points(truth or folder)
+        points = find_points(truth or folder, getattr(chosen, "benchmark", None))
         return Question(chosen, folder, loaded, points, (), {"truth": digest_data(points)}, inputs)
     if kind == "Method":
-        return _ask_teacher(chosen, folder, loaded, truth, split)
+        return replace(_ask_teacher(chosen, folder, loaded, truth, split), labels=labels)
     found: LabelTruth | MaskTruth = (find_labels if kind == "LabelTruth" else find_masks)(truth or folder)
     found = _without_lens(_of_split(found, loaded, split), loaded)
     views = tuple(truth_views(loaded, found))
     digests = {"views": _digest_views(views), "truth": _digest_truth(found)}
-    return Question(chosen, folder, loaded, found, views, digests, inputs)
+    return Question(chosen, folder, loaded, found, views, digests, inputs, labels)
 
 
 def _edit_inputs(name: str, given: dict[str, Any]) -> dict[str, Any]:
@@ -199,7 +258,7 @@ def _of_split(truth: Any, scene: Scene, split: str | None) -> Any:
                 f"the {len(known)} pictures with truth; choose another"
             )
     kept = ReadWhenAsked({stem: partial(known.__getitem__, stem) for stem in chosen})
-    return LabelTruth(truth.names, kept) if labels else MaskTruth(kept)
+    return replace(truth, maps=kept) if labels else replace(truth, frames=kept)
 
 
 def _without_lens(truth: Any, scene: Scene) -> Any:

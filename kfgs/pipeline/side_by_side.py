@@ -46,10 +46,7 @@ def check_comparable(reports: Mapping[str, Report]) -> None:
     Args:
         reports: by title, at least two. Digests of fields may differ.
     """
-    if len(reports) < 2:
-        raise ValueError(
-            f"runs: expected at least two different results, got {len(reports)}; name others to compare with"
-        )
+    check_several(len(reports))
     (first, one), *others = reports.items()
     for title, other in others:
         found: list[tuple[str, Any, Any]] = [("protocol", one.protocol, other.protocol)]
@@ -66,6 +63,12 @@ def check_comparable(reports: Mapping[str, Report]) -> None:
                 f"runs: expected scores that can be compared, but {first} and {title} differ in {'; '.join(different)}; score "
                 "both in the same way, on the same data"
             )
+
+
+def check_several(count: int) -> None:
+    """Raise a ValueError unless there are two results or more."""
+    if count < 2:
+        raise ValueError(f"runs: expected at least two different results, got {count}; name others to compare with")
 
 
 def table_text(reports: Mapping[str, Report]) -> str:
@@ -104,11 +107,7 @@ def show_views(
     if isinstance(question.truth, PointTruth) or (protocol.name in OF_COLORS and question.inputs):
         return {}
     index = {question.scene.stem(i): i for i in range(len(question.scene))}
-    if protocol.name in OF_COLORS:
-        indices = question.scene.views(protocol.split)
-        views = [View(question.scene.stem(i), question.scene.cameras[i]) for i in indices]
-    else:
-        views = list(getattr(protocol, "chosen", list)(list(question.views)))
+    views = question.scored
     places = sorted({int(i) for i in np.linspace(0, len(views) - 1, min(count, len(views))).round()})
     found = {}
     for view in (views[i] for i in places):

@@ -9,9 +9,11 @@ from .engines import (
     available_engines,
     composite,
     free_memory,
+    rank_channels,
 )
+from .engines.contract import Ranked
 from .project import Projected, project
-from .rasterize import Rendering, rasterize
+from .rasterize import Rendering, rasterize, rasterize_labels
 from .sh import SH_C0, evaluate_sh, rgb_to_sh0, rotate_sh, sh0_to_rgb
 from .tiles import Tiles, bin_tiles
 from .transform import transform_gaussians
@@ -22,6 +24,7 @@ __all__ = [
     "SH_C0",
     "TRANSMITTANCE_MIN",
     "Projected",
+    "Ranked",
     "Rendering",
     "Tiles",
     "accumulate_pixels",
@@ -32,7 +35,9 @@ __all__ = [
     "evaluate_sh",
     "free_memory",
     "project",
+    "rank_channels",
     "rasterize",
+    "rasterize_labels",
     "rgb_to_sh0",
     "rotate_sh",
     "sh0_to_rgb",

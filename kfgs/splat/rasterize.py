@@ -5,13 +5,16 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from .._card import html_card, short_value
 from .._check import as_array
 from ..cameras.camera import Camera
 from ..gaussians import Gaussians, check_gaussians
-from .engines import composite
+from .engines import composite, ops, rank_channels
+from .engines.contract import Ranked
+from .engines.table import choose_compiled
 from .project import Projected, project
 from .sh import evaluate_sh
 from .tiles import bin_tiles
@@ -93,9 +96,63 @@ def rasterize(
     projected = project(gaussians, camera, near=near, engine=engine)
     tiles = bin_tiles(projected, camera.width, camera.height, engine=engine)
     splats = projected.means2d, projected.conics, projected.opacities
-    features, index = _seen(gaussians, camera, projected)
+    features, index = _seen(gaussians, camera, projected, engine)
     maps, alphas = composite(*splats, features, tiles, background=background, index=index, engine=engine)
     return Rendering(maps, alphas, projected)
+
+
+def rasterize_labels(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    top: int = 1,
+    engine: str = "auto",
+    near: float | None = None,
+) -> Ranked:
+    """Render scores of classes and keep each pixel's best classes, at about the price of a picture.
+
+    `gaussians.features` [N, C] are scores of C classes, for instance votes or cosines. The labels are those of the largest
+    of `rasterize(...).map`, but the map of all scores is never in memory. No gradient.
+
+    Args:
+        gaussians: with finite scores as `features`.
+        camera: as in `rasterize`.
+        top: how many classes are kept, from 1 to C.
+        engine: as in `composite`.
+        near: as in `rasterize`.
+
+    Returns:
+        Labels and scores [H, W, top], the best first, of equal scores the lowest class first; and the opacity [H, W].
+        Labels are -1 and scores 0 where nothing is drawn.
+
+    Raises:
+        TypeError: as `rasterize`.
+        ValueError: as `rasterize`, and if there are no features, or `top` is out of range.
+        ImportError: if a named engine is missing.
+
+    Example:
+        >>> import torch
+        >>> camera = Camera(torch.eye(4), torch.tensor([[10.0, 0, 2], [0, 10, 2], [0, 0, 1]]), 4, 4)
+        >>> ball = Gaussians(
+        ...     means=torch.tensor([[0.0, 0.0, 2.0]]),
+        ...     quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        ...     scales=torch.full((1, 3), 0.02),
+        ...     opacities=torch.tensor([0.5]),
+        ...     features=torch.tensor([[0.1, 0.7, 0.2]]),
+        ... )
+        >>> rasterize_labels(ball, camera, engine="reference").labels[..., 0].tolist()
+        [[-1, 1, 1, -1], [1, 1, 1, 1], [1, 1, 1, 1], [-1, 1, 1, -1]]
+    """
+    _check_arguments(gaussians, camera)
+    if gaussians.features is None:
+        raise ValueError(
+            "gaussians: expected scores of classes as features, got None; add them with gaussians.replace()"
+        )
+    with torch.no_grad():
+        projected = project(gaussians, camera, near=near, engine=engine)
+        tiles = bin_tiles(projected, camera.width, camera.height, engine=engine)
+        splats = projected.means2d, projected.conics, projected.opacities
+        return rank_channels(*splats, gaussians.features, tiles, top=top, index=projected.index, engine=engine)
 
 
 def _check_arguments(gaussians: Gaussians, camera: Camera) -> None:
@@ -113,11 +170,16 @@ def _check_arguments(gaussians: Gaussians, camera: Camera) -> None:
             )
 
 
-def _seen(gaussians: Gaussians, camera: Camera, projected: Projected) -> tuple[Tensor, Tensor | None]:
+def _seen(gaussians: Gaussians, camera: Camera, projected: Projected, engine: str) -> tuple[Tensor, Tensor | None]:
     """What the Gaussians show to the camera, and which row each visible one shows (None: one row each)."""
     if gaussians.features is not None:
         return gaussians.features, projected.index
     assert gaussians.sh is not None
+    center = camera.center.to(gaussians.means)
+    compiled = choose_compiled(engine, "shade", "gaussians", gaussians.sh, gaussians.means)
+    if compiled and not center.requires_grad:
+        tensors = gaussians.sh.contiguous(), gaussians.means.contiguous(), center.contiguous(), projected.index
+        return ops.shade(*tensors, compiled), None
     # index_select: its gradient takes half the time of that of an index in brackets
-    directions = gaussians.means.index_select(0, projected.index) - camera.center.to(gaussians.means)
+    directions = gaussians.means.index_select(0, projected.index) - center
     return evaluate_sh(gaussians.sh.index_select(0, projected.index), directions), None

@@ -13,9 +13,9 @@ from ..cameras.similarity import exact_rotation
 SH_C0 = 0.5 * sqrt(1 / pi)
 """The constant harmonic, 0.28209...: rgb = SH_C0 * coefficient + 0.5 at degree 0."""
 
-_C1 = sqrt(3 / (4 * pi))
-_C2 = sqrt(15 / (4 * pi)), sqrt(5 / (16 * pi)), sqrt(15 / (16 * pi))
-_C3 = sqrt(35 / (32 * pi)), sqrt(105 / (4 * pi)), sqrt(21 / (32 * pi)), sqrt(7 / (16 * pi)), sqrt(105 / (16 * pi))
+C1 = sqrt(3 / (4 * pi))  # of the higher harmonics, by degree
+C2 = sqrt(15 / (4 * pi)), sqrt(5 / (16 * pi)), sqrt(15 / (16 * pi))
+C3 = sqrt(35 / (32 * pi)), sqrt(105 / (4 * pi)), sqrt(21 / (32 * pi)), sqrt(7 / (16 * pi)), sqrt(105 / (16 * pi))
 
 
 def evaluate_sh(
@@ -43,9 +43,8 @@ def evaluate_sh(
         >>> evaluate_sh(sh, torch.tensor([[0.0, 0.0, 2.0]]))
         tensor([[0.7443, 0.7443, 0.7443]])
     """
-    K = check_shapes(("sh", sh, "N K 3"), ("directions", directions, "N 3"))["K"]
-    if K not in (1, 4, 9, 16):
-        raise ValueError(f"sh: expected 1, 4, 9 or 16 coefficients (degree 0 to 3), got {K}; cut it to a full degree")
+    check_shapes(("sh", sh, "N K 3"), ("directions", directions, "N 3"))
+    K = _check_degree(sh)
     return (torch.einsum("nk,nkc->nc", _basis(directions, K), sh) + 0.5).clamp(min=0)
 
 
@@ -74,9 +73,7 @@ def rotate_sh(
         >>> rotate_sh(sh, quarter)[0, :, 0].round(decimals=4).abs()  # ... becomes that of -y
         tensor([0., 1., 0., 0.])
     """
-    K = check_shapes(("sh", sh, "N K 3"))["K"]
-    if K not in (1, 4, 9, 16):
-        raise ValueError(f"sh: expected 1, 4, 9 or 16 coefficients (degree 0 to 3), got {K}; cut it to a full degree")
+    K = _check_degree(sh)
     R = exact_rotation("rotation", rotation)
     directions = _sphere(32)
     before, after = _basis(directions, K), _basis(directions @ R.T, K)
@@ -97,6 +94,14 @@ def sh0_to_rgb(sh0: Tensor) -> Tensor:
     return sh0 * SH_C0 + 0.5
 
 
+def _check_degree(sh: Tensor) -> int:
+    """The number of coefficients, which must be a full set of degrees."""
+    K = check_shapes(("sh", sh, "N K 3"))["K"]
+    if K not in (1, 4, 9, 16):
+        raise ValueError(f"sh: expected 1, 4, 9 or 16 coefficients (degree 0 to 3), got {K}; cut it to a full degree")
+    return K
+
+
 def _sphere(count: int) -> Tensor:  # [count, 3] float64
     """Unit vectors spread evenly over the sphere: equal steps of height, golden-angle steps of azimuth."""
     step = torch.arange(count, dtype=torch.float64) + 0.5
@@ -110,24 +115,24 @@ def _basis(directions: Tensor, K: int) -> Tensor:  # [N, 3] -> [N, K]
     x, y, z = torch.nn.functional.normalize(directions, dim=1).unbind(1)
     terms = [torch.full_like(x, SH_C0)]
     if K > 1:
-        terms += [-_C1 * y, _C1 * z, -_C1 * x]
+        terms += [-C1 * y, C1 * z, -C1 * x]
     if K > 4:
         xx, yy, zz = x * x, y * y, z * z
         terms += [
-            _C2[0] * x * y,
-            -_C2[0] * y * z,
-            _C2[1] * (2 * zz - xx - yy),
-            -_C2[0] * x * z,
-            _C2[2] * (xx - yy),
+            C2[0] * x * y,
+            -C2[0] * y * z,
+            C2[1] * (2 * zz - xx - yy),
+            -C2[0] * x * z,
+            C2[2] * (xx - yy),
         ]
     if K > 9:
         terms += [
-            -_C3[0] * y * (3 * xx - yy),
-            _C3[1] * x * y * z,
-            -_C3[2] * y * (4 * zz - xx - yy),
-            _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
-            -_C3[2] * x * (4 * zz - xx - yy),
-            _C3[4] * z * (xx - yy),
-            -_C3[0] * x * (xx - 3 * yy),
+            -C3[0] * y * (3 * xx - yy),
+            C3[1] * x * y * z,
+            -C3[2] * y * (4 * zz - xx - yy),
+            C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+            -C3[2] * x * (4 * zz - xx - yy),
+            C3[4] * z * (xx - yy),
+            -C3[0] * x * (xx - 3 * yy),
         ]
     return torch.stack(terms, dim=1)

@@ -120,10 +120,13 @@ def _merge(parts: list[str], ranks: Mapping[tuple[str, str], int], least: int = 
 
 
 def _shipped_merges() -> list[tuple[str, str]]:
-    """The merges behind the symbols that kfgs ships: the merges before a symbol leave two parts of it, which it joins."""
+    """The merges behind the symbols that kfgs ships: the merges before a symbol leave two parts of it, which it joins.
+
+    In the file a carriage return stands for the end of a word and of a line, which saves 3 kB.
+    """
     packed = files("kfgs.teachers").joinpath("data", "clip_bpe_symbols.txt.bz2").read_bytes()
     ranks: dict[tuple[str, str], int] = {}
-    for symbol in bz2.decompress(packed).decode("utf-8").split("\n"):
+    for symbol in bz2.decompress(packed).decode("utf-8").replace("\r", f"{_END}\n").split("\n"):
         word = symbol.removesuffix(_END)
         first, second = _merge([*word[:-1], word[-1] + symbol[len(word) :]], ranks, least=2)
         ranks[first, second] = len(ranks)

@@ -26,8 +26,8 @@ def test_unknown_pixels_count_as_cosine_0():
     assert float(langsplatv2.cosine_loss(found, wanted, wanted.any(dim=1))) == pytest.approx(0.5)
 
 
-def test_storage_counts_3_bytes_for_each_of_4():
-    assert langsplatv2.storage_bytes(1_000, 64, 512, levels=3) == 36_000 + 3 * 4 * 64 * 512
+def test_storage_counts_5_bytes_for_each_of_4():
+    assert langsplatv2.storage_bytes(1_000, 64, 512, levels=3) == 60_000 + 3 * 4 * 64 * 512
 
 
 def test_fit_lowers_the_loss():

@@ -14,9 +14,18 @@ MIB = 2**20
 def row(key, seed, miou):
     request = {
         "row": key, "seed": seed, "preset": "quick", "steps": None, "scene": "/secret/room_0", "features": "/secret/maps",
-        "truth": "labels_scored", "every": 3, "splat": "/secret/color.ply",
+        "truth": "labels_scored", "every": 3, "splat": "/secret/color.ply", "given": True,
+        "digests": {"code": "c", "maps": "m", "scene": "s", "splat": "p"},
     }  # fmt: skip
-    scores = {"miou": miou, "accuracy": 0.9, "teacher_iou7": 0.7, "fps_maps": 30.0, "fps_labels": 12.5}
+    scores = {
+        "miou": miou,
+        "miou_nearest": miou,
+        "miou_votes": 0.8,
+        "accuracy": 0.9,
+        "teacher_iou7": 0.7,
+        "fps_maps": 30.0,
+        "fps_labels": 12.5,
+    }
     facts = {
         "dim": "17",
         "gaussians": 30_000,
@@ -47,7 +56,7 @@ def test_a_row_has_mean_spread_seeds_machine_and_command(out, tmp_path, monkeypa
     text = page.read_text()
     kfgs, occam = (line for line in text.splitlines() if re.match(r"\| \d", line))
     assert kfgs.startswith(
-        "| 1 | **kfgs default** | 84.4 (84.2 to 84.7) | 90.0 | 70.0 | 1.50 | 3.00 | 12.5 | 0, 1, 2 | a machine"
+        "| 1 | **kfgs default** | 84.4 (84.2 to 84.7) | 84.4 / 80.0 | 90.0 | 70.0 | 1.50 | 3.00 | 12.5 | 0, 1, 2 | a machine"
     )
     assert kfgs.endswith(
         "`python benchmarks/table1.py ROOM_0 MAPS OUT --splat COLOR/color.ply --quick --rows kfgs --seeds 0 1 2` |"
@@ -73,6 +82,18 @@ def test_check_fails_on_a_changed_digit(out, tmp_path, monkeypatch):
         run(monkeypatch, runs, page, "--check")
 
 
+def test_maps_of_the_scene_s_own_folder_are_named_so(out):
+    request = row("occam", 0, 0.8)["request"] | {
+        "scene": "/secret/toy",
+        "features": "/secret/toy/features",
+        "truth": "labels",
+    }
+    said = leaderboard.command(request | {"every": 1, "given": False})
+    assert said == (
+        "python benchmarks/table1.py TOY TOY/features OUT --quick --every 1 --truth labels --rows occam --seeds 0"
+    )
+
+
 def test_rows_of_several_tables_are_joined(out, tmp_path, monkeypatch):
     table = read_json(out / "table1.json")
     write_json(
@@ -89,6 +110,18 @@ def test_rows_of_several_tables_are_joined(out, tmp_path, monkeypatch):
     other["request"]["config"] = {"steps": 7, "seed": 1}
     with pytest.raises(SystemExit, match="expected one configuration of occam, got several"):
         leaderboard.join([table, table | {"rows": [other]}])
+    for part in ("maps", "scene", "splat"):
+        other = row("occam", 1, 0.8)
+        other["request"]["digests"][part] = "x"
+        with pytest.raises(SystemExit, match=f"expected runs of one {part}, got 2"):
+            leaderboard.join([table, table | {"rows": [other]}])
+    for part, value in (("truth", "labels"), ("every", 1)):
+        other = row("occam", 1, 0.8)
+        other["request"][part] = value
+        with pytest.raises(SystemExit, match=f"expected runs of one --{part}, got .*{value}"):
+            leaderboard.join([table, table | {"rows": [other]}])
+    with pytest.raises(SystemExit, match="are their views the same"):
+        leaderboard.join([table, table | {"teacher": None}])
     with pytest.raises(SystemExit, match="--name"):
         run(monkeypatch, tmp_path / "runs", tmp_path / "page.md", "--add", out)
     with pytest.raises(SystemExit, match="expected JSON files of runs"):

@@ -1,6 +1,6 @@
 import pytest
 import torch
-from baselines.methods import LinearDecoder, RenderedMethod
+from baselines.methods import LabelMaps, LinearDecoder, RenderedMethod
 from small_task import cameras, cloud
 
 from kfgs.evaluation import Labeller, Method, View
@@ -53,3 +53,26 @@ def test_gaussians_without_a_feature_are_nan():
     found = method().gaussian_cosines(text(3))
     assert found.shape == (1, 12, 4)
     assert found[0].isnan().any(1).nonzero().tolist() == [[4]]
+
+
+def test_label_maps_are_made_once_and_for_these_classes_only():
+    one, rows, view = method(), text(3), View("view", cameras()[0])
+    maps = LabelMaps(one, rows)
+    found = maps.labels(view, rows)
+    assert torch.equal(found, one.labels(view, rows))
+    assert maps.labels(view, rows) is found
+    smaller = View("view", cameras()[0].resized(10, 12))
+    assert maps.labels(smaller, rows).shape == (10, 12)
+    with pytest.raises(ValueError, match="expected the classes that these maps are of"):
+        maps.labels(view, rows.flip(0))
+
+
+def test_votes_are_blended_softmaxes_of_what_each_gaussian_says():
+    one, rows, camera = method(), text(3), cameras()[0]
+    own = one.gaussian_cosines(rows)[0]
+    votes = (100 * own).softmax(dim=1).nan_to_num()  # Gaussian 4 knows nothing
+    blended = rasterize(one.gaussians.replace(features=votes), camera).map
+    expected = blended.argmax(dim=2).masked_fill(blended.sum(dim=2) <= 0, -1)
+    found = LabelMaps(one, rows, votes=True).labels(View("view", camera), rows)
+    assert torch.equal(found, expected)
+    assert not torch.equal(found, one.labels(View("view", camera), rows))  # the two rules differ

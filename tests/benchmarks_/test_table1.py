@@ -10,6 +10,7 @@ from small_task import MIB, cloud
 
 from kfgs.fields import FieldConfig
 from kfgs.formats import write_splats
+from kfgs.quant import AutoencoderConfig, CodebookConfig
 from kfgs.toy.room_folder import make_toy_room
 
 
@@ -23,20 +24,21 @@ def result(key, seed=0, **changes):
         "stages": {"codes": 30.0, "field": 90.0},
     }
     scores = {"miou": 0.321, "accuracy": 0.7, "teacher_accuracy": 0.81, "teacher_iou7": 0.4}
+    scores |= {"miou_nearest": 0.31, "miou_votes": 0.33, "codec_cosine": 0.912, "codec_same": 0.985}
     return {
         "request": request,
         **facts,
         **scores,
         "fps_maps": 77.0,
         "fps_labels": 7.0,
-        "peak": 2_500_000_000,
+        "peak_fit": 2_500_000_000,
         **changes,
     }
 
 
 ABOUT = {
     "command": "python table1.py", "preset": "quick", "machine": "m", "seconds": 600.0, "geometry_seconds": 120.0,
-    "teacher": {"miou": 0.731, "accuracy": 0.903, "views": 30}, "longer": 5,
+    "teacher": {"miou": 0.731, "accuracy": 0.903, "views": 30},
 }  # fmt: skip
 
 
@@ -44,9 +46,8 @@ def test_table_puts_the_paper_beside():
     text = table1_report.table_text(ABOUT, [result("legaussians"), result("kfgs", packed=MIB)])
     rows = [line for line in text.splitlines() if line.startswith("| ")]
     assert len(rows) == 3
-    assert rows[1].startswith(
-        "| LEGaussians (frozen) | 8 | 32.1 | 70.0 | 81.0, 40.0 | 2.00 (codes 30, field 90) | 571.0k | 18.00 |"
-    )
+    start = "| LEGaussians (frozen) | 8 | 32.1 | 31.0 / 33.0 | 70.0 | 81.0, 40.0 | 0.912, 98.5 | "
+    assert rows[1].startswith(start + "2.00 (codes 30, field 90) | 571.0k | 18.00 |")
     assert rows[1].endswith("| 2.50 | 32.0, 28, 571.0k, 18.1, 77.7 |")
     assert "20.00 (packed 1.00)" in rows[2]
     assert "Teacher: mIoU 73.1, accuracy 90.3 over 30 views" in text
@@ -60,7 +61,7 @@ def test_table_of_seeds_has_mean_and_range():
 def test_published_figures_are_those_of_the_paper():
     paper = {key: row.paper["miou"] for key, row in table1_rows.ROWS.items() if row.paper}
     assert list(paper.values()) == [32.0, 58.5, 73.4, 73.9, 73.5, 77.9, 76.6]
-    assert len(table1_rows.ROWS) == 12
+    assert len(table1_rows.ROWS) == 13
 
 
 @pytest.mark.parametrize("key", table1_rows.ROWS)
@@ -74,9 +75,28 @@ def test_presets_are_said(key):
         assert steps["quick"] < steps["cpu"] < steps["paper"]
 
 
-def test_same_takes_a_tuple_for_a_list():
-    assert table1.same({"a": (1, (2,)), "b": None}, {"a": [1, [2]], "b": None})
-    assert not table1.same({"a": 1}, {"a": 1, "b": 2})
+def test_the_paper_s_rows_have_the_paper_s_codebook_and_autoencoder():
+    for preset in ("quick", "cpu", "paper"):
+        for key in ("adc", "adc+sc"):
+            config = table1_rows.kfgs_config(table1_rows.ROWS[key], key, preset, None, 0)
+            assert config.codebook == CodebookConfig.paper()
+            assert config.autoencoder == AutoencoderConfig.paper()
+    own = table1_rows.kfgs_config(table1_rows.ROWS["own-adc+sc"], "own-adc+sc", "quick", None, 0)
+    assert (own.codebook, own.autoencoder) == (CodebookConfig(), AutoencoderConfig())
+
+
+def test_answers_are_not_counted_as_fitting():
+    assert table1_rows.fitting_seconds({"codebook": 3.0, "field": 4.0, "answers": 20.0}) == 7
+
+
+@pytest.mark.parametrize(("words", "said"), [(["--splat", "none.ply"], "none.ply"), ([], "labels_scored")])
+def test_wrong_files_are_refused_before_anything_runs(words, said, tmp_path, monkeypatch, capsys):
+    (tmp_path / "labels").mkdir()
+    monkeypatch.setattr(sys, "argv", ["table1.py", str(tmp_path), str(tmp_path), str(tmp_path / "out"), *words])
+    with pytest.raises(SystemExit):
+        table1.main()
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_run_writes_table_and_pictures_and_resumes(tmp_path, monkeypatch, capsys):
@@ -100,9 +120,16 @@ def test_a_run_writes_table_and_pictures_and_resumes(tmp_path, monkeypatch, caps
     assert row["storage"] < row["disk"]
     for name in ("quality_storage", "quality_time", "labels"):
         assert (out / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+    assert row["miou_nearest"] == row["miou"]  # its own rule
+    assert 0 < row["miou_votes"] < 1
+    assert 0.9 < row["codec_cosine"] <= 1
+    assert len(row["teacher"]["rows"]) == row["views"]
     monkeypatch.setattr(table1.subprocess, "run", lambda *args, **kwargs: pytest.fail("made again"))
     table1.main()
     assert json.loads((out / "table1.json").read_text())["rows"] == report["rows"]
+    (room / "features" / "more.txt").write_text("other data")
+    with pytest.raises(pytest.fail.Exception, match="made again"):
+        table1.main()
 
 
 def test_quick_steps_are_fewer_than_the_preset():

@@ -154,6 +154,7 @@ def test_coco(tmp_path: Path) -> None:
         ({"segmentation": {"size": [4, 3], "counts": [12]}}, ("annotation 9", "(3, 4)", "(4, 3)")),
         ({"segmentation": {"size": [3, 4], "counts": [2]}}, ("annotation 9", "add up to 3 x 4")),
         ({"bbox": [1, 2]}, ("annotation 9", "bbox")),
+        ({"segmentation": [[5, 0, 7, 0, 7, 2]]}, ("annotation 9", "4x3", "x 5 to 7, y 0 to 2", "outside")),
     ],
 )
 def test_coco_annotations_that_are_damaged(tmp_path: Path, changes: dict, parts: tuple[str, ...]) -> None:
@@ -161,6 +162,16 @@ def test_coco_annotations_that_are_damaged(tmp_path: Path, changes: dict, parts:
     path = _coco(tmp_path / "coco.json", annotations=[good | changes])
     with pytest.raises(ValueError, match=tells("coco.json", *parts)):
         load_coco_masks(path)
+
+
+def test_coco_objects_that_leave_their_picture_or_are_thin(tmp_path: Path) -> None:
+    good = {"id": 9, "image_id": 3, "category_id": 1, "bbox": [0, 0, 1, 1]}
+    for outline, mask in (
+        ([2, 1, 9, 1, 9, 9, 2, 9], [[0, 0, 0, 0], [0, 0, 1, 1], [0, 0, 1, 1]]),  # the rest of it is outside
+        ([1, 1, 1.2, 1, 1.2, 1.2], [[0] * 4] * 3),  # inside, but between the centres of pixels
+    ):
+        path = _coco(tmp_path / "coco.json", annotations=[good | {"segmentation": [outline]}])
+        assert load_coco_masks(path).frames["left/a"]["person"].mask.int().tolist() == mask
 
 
 def test_coco_files_that_are_damaged(tmp_path: Path) -> None:

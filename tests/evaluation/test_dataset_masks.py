@@ -61,6 +61,7 @@ def test_lerf_ovs_from_the_scene_or_the_folder_of_all(tmp_path: Path) -> None:
     (tmp_path / "ramen/images").mkdir(parents=True)
     for path, scene in ((tmp_path / "ramen", None), (tmp_path, "ramen"), (tmp_path, None)):
         assert len(load_lerf_ovs(path, scene).frames) == 7
+        assert load_lerf_ovs(path, scene).scene == "ramen"
     _lerf(tmp_path, "teatime")
     with pytest.raises(ValueError, match=tells("scene", "ramen, teatime", "None")):
         load_lerf_ovs(tmp_path)
@@ -90,6 +91,26 @@ def test_lerf_ovs_that_is_not_whole(tmp_path: Path) -> None:
     (folder / "frame_00006.json").write_text("{")
     with pytest.raises(ValueError, match=tells("frame_00006.json", "cannot be parsed")):
         load_lerf_ovs(folder)
+
+
+def test_lerf_ovs_objects_outside_their_picture(tmp_path: Path) -> None:
+    partly = _object("egg", [[-3, 8], [1, 8], [1, 14], [-3, 14]])  # the picture has 12 x 10 pixels
+    frame = load_lerf_ovs(_lerf(tmp_path, objects=[partly])).frames["frame_00006"]
+    expected = torch.zeros(10, 12, dtype=torch.bool)
+    expected[8:, :2] = True
+    assert torch.equal(frame["egg"].mask, expected)
+    for x, y in ((12, 0), (-4, 0), (0, 10), (0, -4)):
+        away = [[x, y], [x + 3, y], [x + 3, y + 3], [x, y + 3]]
+        folder = _lerf(tmp_path, objects=[partly, _object("bowl", away)])
+        parts = (
+            "frame_00006.json, object 1",
+            "'bowl'",
+            "12x10",
+            f"x {x} to {x + 3}, y {y} to {y + 3}",
+            "correct the file",
+        )
+        with pytest.raises(ValueError, match=tells(*parts)):
+            load_lerf_ovs(folder)
 
 
 def test_lerf_ovs_tables() -> None:

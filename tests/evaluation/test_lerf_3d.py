@@ -14,12 +14,14 @@ SIZE = (18, 24)
 TEXTS = ("mug", "spoon", "plate")
 
 
-def _scene(levels=3, seed=0):
+def _scene(levels=3, seed=0, apart=False):
     rng = np.random.default_rng(seed)
     cloud = cases.spread_gaussians(rng, 40, scale=0.25)
     own = {text: rng.uniform(0.1, 0.4, (levels, 40)) for text in (*TEXTS, *CANONICAL)}
     for values in own.values():
         values[:, 5] = np.nan  # nothing is known of one Gaussian
+        if apart:  # each level knows other Gaussians, the last none
+            values[0, 6:18], values[1, 14:30], values[2] = np.nan, np.nan, np.nan
     frames = {}
     for stem, texts in (("frame_1", TEXTS[:2]), ("frame_2", TEXTS)):
         frames[stem] = {t: MaskAndBoxes(torch.from_numpy(rng.uniform(size=SIZE) < 0.6)) for t in texts}
@@ -45,8 +47,9 @@ PROTOCOLS = {
 
 @pytest.mark.parametrize("name", PROTOCOLS)
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_whole_protocol_against_loops(name, seed):
-    method, truth, views = _scene(seed=seed)
+@pytest.mark.parametrize("apart", [False, True])
+def test_the_whole_protocol_against_loops(name, seed, apart):
+    method, truth, views = _scene(seed=seed, apart=apart)
     protocol = PROTOCOLS[name]
     report = protocol.score(method, truth, views, method.encode)
     own = {t: v[[1]] for t, v in method.own.items()} if name == "level" else method.own
@@ -72,6 +75,72 @@ def test_the_whole_protocol_against_loops(name, seed):
     assert report["mIoU"] == pytest.approx(np.mean(ious), abs=2e-3)  # float32 at the silhouette's threshold
     assert report["Acc@0.25"] == np.mean(np.array(ious) > 0.25)
     assert report["Acc@0.5"] == np.mean(np.array(ious) > 0.5)
+
+
+def _line(levels):
+    """Two texts' cosines with Gaussians on a line, by level; a relevancy is sigmoid(10 (cosine - 0.2))."""
+    cloud = cases.spread_gaussians(np.random.default_rng(0), len(levels[0]))
+    cloud = cloud.replace(means=torch.tensor([[float(i), 0, 3] for i in range(len(levels[0]))]))
+    own = {"mug": np.array(levels), **{text: np.where(np.isnan(levels), np.nan, 0.2) for text in CANONICAL}}
+    return cases.Numbers(list(own), own=own, gaussians=cloud)
+
+
+def test_each_level_has_its_own_gaussians_by_hand():
+    nan = np.nan
+    # level 0 knows Gaussians 0 to 2, level 1 knows 3 and 4: no Gaussian is known in both
+    method = _line([[0.3, 0.1, 0.1, nan, nan], [nan, nan, nan, 0.4, 0.1]])
+    found = LerfOvs3D.dr_splat().select(method, ["mug"], method.encode)["mug"]
+    assert found.tolist() == [False, False, False, True, False]  # sigmoid(2) of level 1 beats sigmoid(1)
+    fixed = LerfOvs3D(selection="relevancy", threshold=0.5, level=0).select(method, ["mug"], method.encode)["mug"]
+    assert fixed.tolist() == [True, False, False, False, False]
+    smooth = LerfOvs3D(selection="smoothed", threshold=0.6, neighbours=2)
+    # level 1: 0.881 and 0.269, each averaged with both (0.575): 0.728 > 0.422, stretched to 1 and 0
+    assert smooth.select(method, ["mug"], method.encode)["mug"].tolist() == [False, False, False, True, False]
+    # level 0 wins by its one Gaussian of 0.9 until it is blended with its neighbour: 0.999, 0.018 give 0.754, level 1 has 0.953
+    method = _line([[0.9, -0.2, nan, nan, nan], [nan, nan, nan, 0.5, 0.5]])
+    assert (
+        smooth.select(method, ["mug"], method.encode)["mug"].tolist() == [False] * 5
+    )  # a flat level: nothing above its mean
+    plain = LerfOvs3D.dr_splat().select(method, ["mug"], method.encode)["mug"]
+    assert plain.tolist() == [True, False, False, False, False]
+
+
+def test_argmax_asks_the_published_list_of_the_scene():
+    published = load_classes("lerf_ovs")["texts"]["teatime"]
+    rng = np.random.default_rng(3)
+    texts = ["Sheep", "stuffed bear", *(text for text in published if text not in ("sheep", "stuffed bear")), "kettle"]
+    own = {text: rng.uniform(0.1, 0.4, (1, 60)) for text in texts}
+    method = cases.Numbers(texts, own=own, gaussians=cases.spread_gaussians(rng, 60))
+    mask = MaskAndBoxes(torch.ones(SIZE, dtype=torch.bool))
+    frames = {"a": {"Sheep": mask, "stuffed bear": mask}}
+    views = [cases.view("a", *SIZE)]
+    counts = {}
+    for scene in ("teatime", None, "my desk"):
+        report = LerfOvs3D().score(method, MaskTruth(frames, scene), views, method.encode)
+        counts[scene] = sum(row["Gaussians"] for row in report.rows)
+        (note,) = report.notes
+        assert note.startswith(
+            "argmax over the 14 published texts of teatime"
+            if scene == "teatime"
+            else "argmax over the annotated texts (2)"
+        )
+    fourteen = [texts[0], *(text for text in published if text != "sheep")]
+    expected = [dull.select_argmax(own, fourteen, text).sum() for text in ("Sheep", "stuffed bear")]
+    assert counts == {"teatime": sum(expected), None: 60, "my desk": 60}
+    more = {"a": {"kettle": mask}}
+    report = LerfOvs3D().score(
+        method,
+        MaskTruth(more, "teatime"),
+        views,
+        lambda asked: method.encode(["Sheep" if text == "sheep" else text for text in asked]),
+    )
+    assert report.notes == ("argmax over the 14 published texts of teatime, and of the truth besides: kettle",)
+    given = LerfOvs3D(texts=("Sheep", "stuffed bear", "plate")).score(
+        method, MaskTruth(frames, "teatime"), views, method.encode
+    )
+    assert given.notes == ("argmax over the 3 texts of the option `texts`",)
+    with pytest.raises(ValueError, match="asked: expected all texts that are looked for, got none of plate; add them"):
+        LerfOvs3D().select(method, ["plate"], method.encode, ["Sheep"])
 
 
 def test_both_thresholds_are_printed():

@@ -53,6 +53,29 @@ def test_pooled_is_evaluate_segmentation():
         KfgsPooled().score(method, truth, views[:1] + views[2:], method.encode)
 
 
+def test_surface_neither_asks_nor_scores_names_that_mean_no_class():
+    rng = np.random.default_rng(2)
+    own = {name: rng.uniform(size=(1, 60)) for name in NAMES}
+    method = cases.Numbers(NAMES, own=own, gaussians=cases.spread_gaussians(rng, 60))
+    points = method.gaussians.means[rng.integers(0, 60, 90)]
+    ids = torch.from_numpy(rng.choice([2, 5, 7, 9], 90))
+    names = {2: "a", 5: "b", 9: "c"}
+    want = KfgsSurface().score(method, PointTruth(points, ids, names), (), method.encode)  # 7 has no name: not scored
+    asked = []
+
+    def encode(texts):
+        asked.extend(texts)
+        return method.encode(texts)
+
+    found = KfgsSurface().score(method, PointTruth(points, ids, {**names, 7: "Unlabelled"}), (), encode)
+    assert asked == ["a", "b", "c"]
+    assert (found.scores, found.rows) == (want.scores, want.rows)
+    assert want.notes == ()
+    assert found.notes == (f"not scored, no class: Unlabelled ({int((ids == 7).sum())} points)",)
+    with pytest.raises(ValueError, match="truth: expected names of classes, got void"):
+        KfgsSurface().score(method, PointTruth(points, ids, {7: "void"}), (), method.encode)
+
+
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
     return make_room(tmp_path_factory.mktemp("own") / "room")

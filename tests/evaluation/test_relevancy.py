@@ -92,6 +92,14 @@ def test_unknown_pixels_are_the_least_relevant():
     assert fill_unknown(maps).tolist() == torch.tensor([[[0.4, 0.4], [0.9, 0.6]], [[0, 0], [0, 0]]]).tolist()
 
 
+def test_an_unknown_pixel_is_selected_only_with_all_known_ones():
+    nan = float("nan")
+    for known, threshold, expected in (([0.6, 0.9], 0.5, True), ([0.6, 0.9], 0.7, False)):
+        assert bool((fill_unknown(torch.tensor([[*known, nan]])) >= threshold)[0, 2]) is expected
+    stretched = stretch(fill_unknown(torch.tensor([[0.6, 0.9, nan]])))
+    assert stretched.tolist() == [[0, 1, 0]]  # no threshold above 0 selects it
+
+
 def test_stretch_against_loops():
     values = np.random.default_rng(2).uniform(size=(3, 5, 4))
     found = stretch(torch.from_numpy(values))

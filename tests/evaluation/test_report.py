@@ -44,6 +44,16 @@ def test_json_says_how_to_get_the_score_again():
     assert data["digests"] == {"field": "abc"}
 
 
+def test_notes_are_kept_and_joined():
+    one, two = (make_report(Example(), "kfgs", {"mIoU": 0.5}, [], ["14 texts", scene]) for scene in ("a", "b"))
+    assert "  note: 14 texts\n  note: a" in one.text
+    assert "note" not in str(one)
+    assert Report.from_json(json.loads(json.dumps(one.to_json()))).notes == ("14 texts", "a")
+    assert average([one, two]).notes == ("14 texts", "a", "b")
+    older = {key: value for key, value in one.to_json().items() if key != "notes"}
+    assert Report.from_json(older).notes == ()
+
+
 def test_what_json_cannot_hold_is_named():
     assert plain({1: Path("a"), "b": torch.tensor([1.0]), "c": Example()}) == {
         "1": "a",

@@ -7,6 +7,7 @@ import torch
 from kfgs.evaluation import PointTruth, TeacherMethod
 from kfgs.evaluation.scannet_points import ScanNetPoints, class_indices, class_scores, scannet_classes
 from kfgs.evaluation.scannet_volume import ScanNetVolume, gaussian_truth, significance
+from kfgs.gaussians import Gaussians
 
 NYU = {i: str(i) for i in range(1, 41)}
 
@@ -92,22 +93,24 @@ def test_densified_scenes_ask_the_nearest_gaussian():
     assert tuple(report.scores.values()) == pytest.approx(want, abs=1e-12)
 
 
-@pytest.mark.parametrize(("nearest", "radius", "balanced"), [(1000, 5.0, True), (7, 2.0, True), (1000, 1.5, False)])
-def test_volume_against_loops(nearest, radius, balanced):
+@pytest.mark.parametrize(
+    ("nearest", "radius", "balanced", "vote"),
+    [(1000, 5.0, True, "near"), (7, 2.0, True, "near"), (1000, 1.5, False, "near"), (1000, 1.5, False, "far")],
+)
+def test_volume_against_loops(nearest, radius, balanced, vote):
     method, truth = _scene(2, points=150)
     ids, names = scannet_classes(19)
     cloud = method.gaussians
     parts = [x.double().numpy() for x in (cloud.means, cloud.quats, cloud.scales)]
     labels = _remap(truth.labels, ids)
-    gt = dull.gaussian_truth(*parts, truth.points.double().numpy(), labels, nearest, radius, balanced)
-    found = gaussian_truth(
-        cloud, truth.points, torch.from_numpy(labels) - 1, nearest=nearest, radius=radius, balanced=balanced
-    )
+    gt = dull.gaussian_truth(*parts, truth.points.double().numpy(), labels, nearest, radius, balanced, vote == "far")
+    options = {"nearest": nearest, "radius": radius, "balanced": balanced, "vote": vote}
+    found = gaussian_truth(cloud, truth.points, torch.from_numpy(labels) - 1, **options)
     assert np.array_equal(found.numpy() + 1, gt)
     assert len(set(gt.tolist())) > 3
     weights = parts[2].prod(1) * cloud.opacities.double().numpy()
     np.testing.assert_allclose(significance(cloud), weights, rtol=1e-12)
-    protocol = ScanNetVolume(nearest=nearest, radius=radius, balanced=balanced)
+    protocol = ScanNetVolume(**options)
     report = protocol.score(method, truth, (), method.encode)
     want = dull.scannet(_argmax(method, names, 0, 0), gt, weights)
     assert tuple(report.scores.values()) == pytest.approx(want, abs=1e-12)
@@ -121,12 +124,37 @@ def test_gaussians_far_from_every_vertex_are_not_scored():
     assert gaussian_truth(cloud, truth.points, torch.full((60,), -1)).eq(-1).all()
 
 
+def test_vertices_without_a_class_do_not_vote():
+    ball = Gaussians(torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3), torch.ones(1))
+    points = torch.tensor([[0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1], [3.0, 0, 0]])
+    labels = torch.tensor([-1, -1, -1, 4])
+    assert (
+        gaussian_truth(ball, points, labels).item() == 4
+    )  # a labelled one within 5 scales wins over three nearer ones
+    assert gaussian_truth(ball, points, labels, nearest=1).item() == 4  # which do not use up the nearest
+    assert gaussian_truth(ball, points, labels, radius=2.9).item() == -1
+
+
 def test_a_near_minority_beats_a_far_crowd_only_when_balanced():
     ball = cases.spread_gaussians(np.random.default_rng(0), 1).replace(means=torch.zeros(1, 3), scales=torch.ones(1, 3))
     points = torch.tensor([[0.1, 0, 0], *[[2.0, 0.01 * i, 0] for i in range(30)]])
     labels = torch.tensor([1] + [0] * 30)
     assert gaussian_truth(ball, points, labels).item() == 1
     assert gaussian_truth(ball, points, labels, balanced=False).item() == 0
+
+
+def test_the_sum_of_distances_prefers_far_and_frequent_classes():
+    ball = Gaussians(torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 2.0), torch.ones(1))
+    points = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 4]])  # at d = 0.5, 0.5 and 2
+    labels = torch.tensor([3, 3, 5])
+    assert gaussian_truth(ball, points, labels).item() == 3
+    assert gaussian_truth(ball, points, labels, vote="far", balanced=False).item() == 5  # 2 against 1
+    frequent = torch.tensor([3, 5, 5])
+    assert gaussian_truth(ball, points[[2, 0, 1]], frequent, vote="far", balanced=False).item() == 3
+    crowd = torch.cat([points[2:], points[:1].expand(5, 3)])  # 2 against 5 times 0.5
+    assert gaussian_truth(ball, crowd, torch.tensor([5] + [3] * 5), vote="far", balanced=False).item() == 3
+    with pytest.raises(ValueError, match="vote: expected one of 'near', 'far', got 'sum'"):
+        ScanNetVolume(vote="sum")
 
 
 @pytest.mark.parametrize("protocol", [ScanNetPoints(), ScanNetVolume()])

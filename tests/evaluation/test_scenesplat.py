@@ -5,11 +5,12 @@ import pytest
 import torch
 
 from kfgs.evaluation import PointTruth, TeacherMethod
-from kfgs.evaluation.class_lists import load_classes
-from kfgs.evaluation.scenesplat import BENCHMARKS, SceneSplatBench, vote_instances, vote_nearest
+from kfgs.evaluation.class_lists import load_classes, name_key
+from kfgs.evaluation.scenesplat import BENCHMARKS, SceneSplatBench, match_names, vote_instances, vote_nearest
 
 LISTS = load_classes("scenesplat")
 USED = ("wall", "floor", "chair", "table", "sink")
+OTHERS = ("something else",)
 
 
 def _scene(seed, texts, gaussians=70, points=90):
@@ -45,7 +46,7 @@ def _expected(method, truth, texts, classes, protocol):
 def test_several_scenes_share_one_matrix(options):
     classes, dropped = LISTS["scannet20"]["classes"], LISTS["scannet20"]["dropped"]
     texts = [f"this is a {name}" for name in classes]
-    protocol = SceneSplatBench(**options)
+    protocol = SceneSplatBench(**options, ignored=OTHERS)
     scenes = [_scene(seed, texts) for seed in (0, 1)]
     both = [_expected(*scene, texts, classes, protocol) for scene in scenes]
     report = protocol.score_scenes(scenes, scenes[0][0].encode)
@@ -89,7 +90,7 @@ def test_votes_by_hand():
 def test_true_instances_are_an_option():
     texts = [f"this is a {name}" for name in LISTS["scannet20"]["classes"]]
     method, truth = _scene(0, texts)
-    usual, inflated = SceneSplatBench(), SceneSplatBench(within_instances=True)
+    usual, inflated = SceneSplatBench(ignored=OTHERS), SceneSplatBench(within_instances=True, ignored=OTHERS)
     assert (
         usual.score(method, truth, (), method.encode).scores != inflated.score(method, truth, (), method.encode).scores
     )
@@ -103,6 +104,83 @@ def test_lists_are_complete():
     for name in BENCHMARKS:
         assert len(set(LISTS[name]["classes"])) == counts[name]
         assert set(LISTS[name]["dropped"]) <= set(LISTS[name]["classes"])
+        assert len({name_key(one) for one in LISTS[name]["classes"]}) == counts[name]
+
+
+def _named(labels, names):
+    return PointTruth(torch.zeros(len(labels), 3), torch.tensor(labels), names)
+
+
+NYU40 = {int(i): name for i, name in load_classes("scannet")["names"].items()}
+
+
+@pytest.mark.parametrize(("benchmark", "ceiling"), [("scannet20", -1), ("matterport21", 20)])
+def test_all_names_of_scannet_find_their_class(benchmark, ceiling):
+    classes = LISTS[benchmark]["classes"]
+    # ids of NYU40: wall, showercurtain, otherfurniture, ceiling, blinds (twice), none, not in the table
+    found = match_names(_named([1, 28, 39, 22, 13, 13, 0, 77], NYU40), classes)
+    assert found.labels.tolist() == [0, 15, 19, ceiling, -1, -1, -1, -1]
+    assert found.left_out == ({"blinds": 2} if ceiling == 20 else {"blinds": 2, "ceiling": 1})
+
+
+def test_names_in_another_spelling_are_matched_and_strange_ones_are_an_error():
+    classes = ("wall", "shower curtain", "tv stand")
+    found = match_names(
+        _named([0, 1, 2, 3, -1], {0: "Wall", 1: "shower_curtain", 2: "TV-Stand", 3: "Unlabelled"}), classes
+    )
+    assert found.labels.tolist() == [0, 1, 2, -1, -1]
+    assert found.left_out == {"Unlabelled": 1}
+    names = {0: "wall", 1: "showercurtains", 2: "sofa", 3: "nowhere"}  # two classes have no name: one may be theirs
+    strange = _named([0, 1, 2, 2], names)
+    with pytest.raises(
+        ValueError, match=r"shower curtain, tv stand among them, got points named showercurtains, sofa;"
+    ):
+        match_names(strange, classes)
+    with pytest.raises(ValueError, match="give the others as ignored=sofa$"):
+        match_names(strange, classes, ["Shower Curtains"])
+    found = match_names(strange, classes, ["Shower Curtains", "sofa"])
+    assert found.labels.tolist() == [0, -1, -1, -1]
+    assert found.left_out == {"showercurtains": 1, "sofa": 2}
+    with pytest.raises(ValueError, match="ignored: expected names that are no classes of the protocol, got TV stand"):
+        match_names(strange, classes, ["TV stand"])
+
+
+def test_an_exact_name_wins_over_another_spelling():
+    assert match_names(_named([0, 1], {0: "a-b", 1: "a b"}), ("a b", "a-b")).labels.tolist() == [1, 0]
+    assert match_names(_named([0], {0: "A B"}), ("a b", "a-b")).labels.tolist() == [0]
+
+
+def test_the_report_says_which_names_were_not_scored():
+    classes = LISTS["scannet20"]["classes"]
+    texts = [f"this is a {name}" for name in classes]
+    method, truth = _scene(0, texts)
+    count = int((truth.labels == 41).sum())
+    report = SceneSplatBench(ignored=OTHERS).score(method, truth, (), method.encode)
+    assert f"not scored, no class of scannet20: something else ({count} points)" in report.notes
+    with pytest.raises(ValueError, match="got points named something else; correct"):
+        SceneSplatBench().score(method, truth, (), method.encode)
+    known = truth.labels != 41
+    whole = PointTruth(truth.points[known], truth.labels[known], truth.names)
+    report = SceneSplatBench().score(method, whole, (), method.encode)
+    assert report.notes == ("Gaussians without a feature vote for none",)
+
+
+@pytest.mark.parametrize(("benchmark", "published"), [("scannetpp100", 1.0), ("scannet20", 0.0)])
+def test_gaussians_without_a_feature_vote_as_published(benchmark, published):
+    texts = [f"this is a {name}" for name in LISTS[benchmark]["classes"]]
+    own = {text: np.full((1, 5), 0.1) for text in texts}
+    own["this is a chair"][:] = 0.2
+    for values in own.values():
+        values[:, :3] = np.nan  # three of five know nothing: if they vote, "none" wins
+    method = cases.Numbers(texts, own=own, gaussians=cases.spread_gaussians(np.random.default_rng(0), 5))
+    truth = _named([7], {7: "chair"})
+    scores = {}
+    for drop in (None, True, False):
+        report = SceneSplatBench(benchmark=benchmark, drop_unknown=drop).score(method, truth, (), method.encode)
+        scores[drop] = report["mAcc"]
+        assert report.notes[0].endswith("left out of the vote" if scores[drop] else "vote for none")
+        assert ("drop_unknown" in str(report)) == (drop is not None)
+    assert scores == {None: published, True: 1.0, False: 0.0}
 
 
 def test_bad_input_is_named():
@@ -113,6 +191,6 @@ def test_bad_input_is_named():
     with pytest.raises(ValueError, match="scenes: expected at least one"):
         SceneSplatBench().score_scenes([], method.encode)
     with pytest.raises(TypeError, match="expected one with Gaussians, got 'teacher' without"):
-        SceneSplatBench().score(TeacherMethod({}), truth, (), method.encode)
+        SceneSplatBench(ignored=OTHERS).score(TeacherMethod({}), truth, (), method.encode)
     with pytest.raises(ValueError, match="template: expected a text with {}"):
         SceneSplatBench(template="a")

@@ -74,6 +74,9 @@ def test_the_whole_protocol_against_loops():
     assert [row["view"] for row in report.rows] == ["rgb_2", "rgb_10"]
     assert (report["accuracy"], report["mIoU"]) == pytest.approx(np.mean(scores, 0), abs=1e-9)
     assert str(report).endswith("(feature3dgs-teacher/1, texts=full, size=[9, 12])")
+    assert report.notes == (
+        "2 of 12 views are scored: one in 8 from index 2, in the order of the numbers in their names; split=none scores all",
+    )
 
 
 def test_other_texts_views_and_sizes():
@@ -84,6 +87,7 @@ def test_other_texts_views_and_sizes():
     report = protocol.score(teacher, teacher, wide, teacher.encode)
     assert report.scores == {"mIoU": 1.0, "accuracy": 1.0}
     assert len(report.rows) == 2
+    assert report.notes == ()
     with pytest.raises(ValueError, match="expected more than 2, got 2; pass split=None"):
         TeacherAgreement().score(student, teacher, wide, teacher.encode)
     with pytest.raises(ValueError, match="texts: expected one of 'first-word'"):

@@ -3,7 +3,7 @@ import pytest
 import torch
 from messages import tells
 
-from kfgs.formats.order import morton_order
+from kfgs.formats.order import morton_cells, morton_codes, morton_order
 
 
 def test_a_grid_is_ordered_by_interleaved_bits():
@@ -50,3 +50,9 @@ def test_positions_that_are_no_numbers_are_named():
         morton_order(means)
     with pytest.raises(ValueError, match=tells("means:", "[N, 3]", "got (3, 2)")):
         morton_order(torch.zeros(3, 2))
+
+
+def test_codes_interleave_bits_and_cells_take_them_apart():
+    assert morton_codes(np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 3]], np.uint64)).tolist() == [1, 2, 4, 44]
+    cells = np.random.default_rng(0).integers(0, 1 << 21, (200, 3)).astype(np.uint64)
+    assert (morton_cells(morton_codes(cells)) == cells).all()

@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
@@ -5,6 +7,7 @@ from messages import tells
 from oracles_labels import most_similar
 
 from kfgs.labels import label_codewords, label_pixels, nearest_codeword
+from kfgs.quant import Autoencoder
 from kfgs.quant.codebook import Codebook
 
 D, d, K = 16, 4, 6
@@ -115,3 +118,60 @@ def test_missing_pieces_are_named(setting):
         label_pixels(rendered, codebook, torch.arange(K), autoencoder, decode="fast")
     with pytest.raises(ValueError, match=tells("covered:", "(5, 7)", "got (7, 5)")):
         label_pixels(rendered, codebook, torch.arange(K), autoencoder, covered=torch.ones(7, 5, dtype=torch.bool))
+
+
+def decoder(bias=0.1, seed=0):
+    """A decoder of layers, whose last one and the comparison with codewords are one layer on the CPU."""
+    g = torch.Generator().manual_seed(seed)
+    widths = d, 24, 40, D
+    layers = tuple(
+        (torch.randn(out, into, generator=g) * (2 / into) ** 0.5, bias * torch.randn(out, generator=g))
+        for into, out in pairwise(widths)
+    )
+    return Autoencoder(((torch.randn(d, D, generator=g), torch.zeros(d)),), layers, -1.0, 1.0)
+
+
+def plainly(latents, codebook, table, autoencoder):
+    """Every latent decoded, and the codeword most similar to it: the slow path."""
+    features = autoencoder.decode(latents)
+    return table[codebook.quantize(features)].masked_fill(torch.linalg.vector_norm(features, dim=-1) <= 1e-8, -1)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("classes", [1, 3, 30])
+def test_decoders_of_layers_give_the_labels_of_the_slow_path(classes, dtype):
+    g = torch.Generator().manual_seed(classes)
+    autoencoder = decoder().to(dtype)
+    codebook = Codebook(autoencoder.decode(torch.rand(30, d, generator=g).to(dtype)))
+    table = torch.randint(-1, classes, (30,), generator=g)
+    latents = torch.rand(60, 50, d, generator=g).to(dtype)
+    covered = torch.rand(60, 50, generator=g) > 0.2
+    labels = label_pixels(latents, codebook, table, autoencoder, covered=covered)
+    assert labels.equal(plainly(latents, codebook, table, autoencoder).masked_fill(~covered, -1))
+    assert len(labels.unique()) > min(classes, 15)
+
+
+def test_pixels_between_two_classes_are_decoded_in_full(monkeypatch):
+    """Two codewords that differ by rounding, of two classes: no lead is sure, and the slow path decides."""
+    g = torch.Generator().manual_seed(1)
+    autoencoder, decoded = decoder(), []
+    codewords = autoencoder.decode(torch.rand(6, d, generator=g))
+    codebook = Codebook(torch.cat([codewords, codewords * (1 + 1e-7) + 3e-8]))
+    latents = torch.rand(4000, d, generator=g)
+    expected = plainly(latents, codebook, torch.arange(12), autoencoder)
+    decode = Autoencoder.decode
+    monkeypatch.setattr(Autoencoder, "decode", lambda *a, **k: decoded.append(len(a[1])) or decode(*a, **k))
+    assert label_pixels(latents, codebook, torch.arange(12), autoencoder).equal(expected)
+    assert sum(decoded) == 4000
+    decoded.clear()
+    assert label_pixels(latents, codebook, torch.arange(12) % 6, autoencoder).equal(expected % 6)
+    assert sum(decoded) < 100  # twins of one class need no decision
+
+
+def test_latents_that_decode_to_nothing_have_no_label():
+    autoencoder = decoder(bias=0.0)
+    codebook = Codebook(torch.eye(K, D))
+    latents = torch.cat([torch.zeros(3, d), torch.rand(5, d, generator=torch.Generator().manual_seed(2))])
+    labels = label_pixels(latents, codebook, torch.arange(K), autoencoder)
+    assert labels[:3].tolist() == [-1] * 3
+    assert labels.equal(plainly(latents, codebook, torch.arange(K), autoencoder))

@@ -13,7 +13,8 @@ from small_room import CONFIG, make_room
 from kfgs.features import FeatureFolder, extract_features, pictures_of, save_feature_map
 from kfgs.fields import FieldConfig
 from kfgs.pipeline import FitConfig, NamedTeacher, Plan, fit_color, fit_scene, plan_scene
-from kfgs.pipeline.estimate import GROWTH, MARGIN, Sizes, gaussian_counts, notes_on, plan_stages
+from kfgs.pipeline.estimate import GROWTH, MARGIN, Sizes, gaussian_counts, plan_stages
+from kfgs.pipeline.plan import notes_on
 from kfgs.pipeline.trial import PeakMemory, Timing
 from kfgs.quant import CodebookConfig
 from kfgs.scenes import load_scene

@@ -110,6 +110,14 @@ def test_project_passes_opcheck(dtype):
 
 
 @every_dtype
+def test_shade_passes_opcheck(dtype):
+    gaussians, camera = _scene(dtype)
+    sh = torch.randn(len(gaussians), 9, 3, generator=torch.Generator().manual_seed(1)).to(dtype)
+    inputs = *_leaves(sh, gaussians.means), camera.center, torch.arange(0, len(gaussians), 2), "numba"
+    torch.library.opcheck(ops.shade, inputs, test_utils=CHECKS)
+
+
+@every_dtype
 def test_bin_tiles_and_accumulate_pass_opcheck(dtype):
     gaussians, camera = _scene(dtype)
     seen = project(gaussians, camera)

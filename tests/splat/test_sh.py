@@ -6,6 +6,7 @@ from messages import tells
 from scipy.spatial.transform import Rotation
 
 from kfgs.splat import SH_C0, evaluate_sh, rgb_to_sh0, rotate_sh, sh0_to_rgb
+from kfgs.splat.engines import ops
 
 
 def _directions(N=50, seed=0):
@@ -132,3 +133,44 @@ def test_what_cannot_turn_colours_is_named():
         rotate_sh(_coefficients(4), 2 * torch.eye(3))
     with pytest.raises(ValueError, match=tells("sh:", "expected 1, 4, 9 or 16", "got 5")):
         rotate_sh(torch.zeros(2, 5, 3), torch.eye(3))
+
+
+def _seen(K, dtype=torch.float64, N=20):
+    generator = torch.Generator().manual_seed(K)
+    sh, means = (torch.randn(*shape, generator=generator).to(dtype) for shape in ((N, K, 3), (N, 3)))
+    return (2 * sh).requires_grad_(), means.requires_grad_(), torch.tensor([0.3, -0.2, 0.5], dtype=dtype)
+
+
+@pytest.mark.parametrize("K", [1, 4, 9, 16])
+def test_compiled_colours_and_gradients_are_those_of_evaluate_sh(K):
+    sh, means, center = _seen(K)
+    index = torch.tensor([0, 3, 4, 11, 19])
+    expected = evaluate_sh(sh[index], means[index] - center)
+    found = ops.shade(sh, means, center, index, "numba")
+    assert bool((expected == 0).any()), "no channel is clamped"
+    torch.testing.assert_close(found, expected)
+    weights = torch.linspace(-1, 1, 15, dtype=torch.float64).view(5, 3)
+    wanted = torch.autograd.grad((weights * expected).sum(), (sh, means), materialize_grads=True, allow_unused=True)
+    got = torch.autograd.grad((weights * found).sum(), (sh, means))
+    torch.testing.assert_close(got[0], wanted[0])
+    torch.testing.assert_close(got[1], wanted[1])
+
+
+def test_compiled_colours_in_single_precision_are_close_and_repeat():
+    sh, means, center = _seen(16, torch.float32, 30_000)  # several bands
+    index = torch.arange(0, 30_000, 2)
+    found = ops.shade(sh, means, center, index, "numba")
+    exact = evaluate_sh(sh[index].double(), (means[index] - center).double()).float()
+    torch.testing.assert_close(found, exact, rtol=1e-5, atol=1e-5)
+    assert torch.equal(found, ops.shade(sh, means, center, index, "numba"))
+
+
+def test_a_gaussian_at_the_camera_is_shaded():
+    sh, means, _ = _seen(9)
+    center = means[2].detach().clone()
+    expected = evaluate_sh(sh[2:3], means[2:3] - center)
+    found = ops.shade(sh, means, center, torch.tensor([2]), "numba")
+    torch.testing.assert_close(found, expected)
+    (got,) = torch.autograd.grad(found.sum(), means)
+    (wanted,) = torch.autograd.grad(expected.sum(), means)
+    torch.testing.assert_close(got, wanted)

@@ -164,11 +164,13 @@ def _on_cpu(dtype):
         "forward": (splats, tiles),
         "backward": ((maps, alphas), (True,) * 5, splats, tiles, Composited(maps, alphas, alphas.int())),
         "accumulate": (*footprints, maps, tiles),
+        "rank": (splats, tiles, 1),
     }
 
 
 @pytest.mark.parametrize(
-    ("function", "first"), [("forward", "means2d"), ("backward", "grad_maps"), ("accumulate", "means2d")]
+    ("function", "first"),
+    [("forward", "means2d"), ("backward", "grad_maps"), ("accumulate", "means2d"), ("rank", "means2d")],
 )
 def test_float64_is_refused(function, first):
     message = (f"{first}:", "'triton'", "got torch.float64", ".to(torch.float32)", "'numba'", "'reference'")
@@ -177,7 +179,7 @@ def test_float64_is_refused(function, first):
 
 
 @pytest.mark.skipif("cpu" in triton_gpu.devices(), reason="triton interprets in this process")
-@pytest.mark.parametrize("function", ["forward", "backward", "accumulate"])
+@pytest.mark.parametrize("function", ["forward", "backward", "accumulate", "rank"])
 def test_cpu_tensors_need_the_interpreter(function):
     with pytest.raises(ValueError, match=tells("'triton'", "cuda", "cpu", ".to(")):
         getattr(triton_gpu, function)(*_on_cpu(torch.float32)[function])

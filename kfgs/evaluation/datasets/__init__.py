@@ -9,6 +9,7 @@ from .ovs3d import OVS3D_REPORTED, OVS3D_SCENES, load_3dovs
 from .polygons import decode_rle, fill_polygon, fill_region
 from .replica import load_replica_points, load_semantic_nerf_labels
 from .scannet import load_scannet_points
+from .scenesplat import load_scenesplat_points
 from .surface_points import load_surface_points
 from .views import truth_views
 
@@ -29,6 +30,7 @@ __all__ = [
     "load_lerf_ovs",
     "load_replica_points",
     "load_scannet_points",
+    "load_scenesplat_points",
     "load_semantic_nerf_labels",
     "load_surface_points",
     "truth_views",

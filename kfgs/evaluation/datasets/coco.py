@@ -15,7 +15,7 @@ from ..._files import read_json
 from ...scenes.files import file_stem
 from ..truth import LabelTruth, MaskAndBoxes, MaskTruth
 from .files import ReadWhenAsked
-from .polygons import MOST, decode_rle, fill_region, union
+from .polygons import MOST, decode_rle, fill_region, say_range, union
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,22 @@ def _object(
             return int(category), mask
         if not isinstance(segmentation, list) or not segmentation:
             raise ValueError(f"segmentation: expected polygons or run lengths, got {segmentation!r:.60}")
-        return int(category), union([fill_region(_corners(polygon), size) for polygon in segmentation])
+        outlines = [_corners(polygon) for polygon in segmentation]
+        mask = union([fill_region(outline, size) for outline in outlines])
+        if not mask.any():
+            _check_inside([corner for outline in outlines for corner in outline], size)
+        return int(category), mask
     except ValueError as error:
         raise ValueError(f"{where}: {error}; export the annotations again") from error
+
+
+def _check_inside(corners: list[list[float]], size: tuple[int, int]) -> None:
+    """Of an object without a pixel: it may be so thin that it holds no pixel's centre, but it must be in the picture."""
+    height, width = size
+    if not any(0 <= x <= width and 0 <= y <= height for x, y in corners):
+        raise ValueError(
+            f"segmentation: expected polygons in the image of {width}x{height}, got {say_range(corners)}, all outside it"
+        )
 
 
 def _corners(polygon: Any) -> list[list[float]]:

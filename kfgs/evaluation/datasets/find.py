@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from .lerf_ovs import load_lerf_ovs
 from .ovs3d import load_3dovs
 from .replica import load_replica_points, load_semantic_nerf_labels
 from .scannet import load_scannet_points
+from .scenesplat import load_scenesplat_points
 from .surface_points import load_surface_points
 
 Reader = Callable[[Path], Any]
@@ -60,21 +62,28 @@ def find_masks(path: str | Path) -> MaskTruth:
     return _first(path, places, "masks", load_coco_masks, last=2 if _is_scene(path) else 0)
 
 
-def find_points(path: str | Path) -> PointTruth:
-    """The labelled points of a scene: of Replica, of ScanNet, or of kfgs's toy room.
+def find_points(path: str | Path, benchmark: str | None = None) -> PointTruth:
+    """The labelled points of a scene: of Replica, of ScanNet, of SceneSplat-Bench, or of kfgs's toy room.
+
+    Args:
+        path: the scene's folder, or the file of its labels.
+        benchmark: of SceneSplat-Bench, whose classes the labels are, see `load_scenesplat_points`; no other data set needs it.
 
     Raises:
         FileNotFoundError: if there are none.
-        ValueError: if a file is damaged.
+        ValueError: if a file is damaged, or the classes of SceneSplat's labels are unknown.
     """
     path = Path(path)
     places: list[tuple[str, Reader]] = [
         ("habitat/mesh_semantic.ply", load_replica_points),
         ("mesh_semantic.ply", load_replica_points),
         ("*_vh_clean_2.labels.ply", load_scannet_points),
+        ("coord.npy", partial(load_scenesplat_points, benchmark=benchmark)),
         ("surface.npz", load_surface_points),
     ]
-    as_file = load_scannet_points if path.name.endswith(".labels.ply") else load_replica_points
+    as_file: Reader = load_scannet_points if path.name.endswith(".labels.ply") else load_replica_points
+    if path.suffix == ".npy":
+        as_file = partial(load_scenesplat_points, benchmark=benchmark)
     return _first(path, places, "labelled points", as_file)
 
 

@@ -13,13 +13,12 @@ from torch import Tensor
 
 from ..._files import read_json
 from ...scenes.files import file_stem, list_images, some
+from ..class_lists import VOID_NAMES
 from ..truth import LabelTruth
 from .coco import load_coco_labels
 from .files import ReadWhenAsked, read_pixels
 from .replica import ids_in, relabel
 
-VOID_NAMES = ("void", "unlabeled", "unlabelled", "unknown", "ignore")
-"""Names in a table whose pixels are void: they are not scored."""
 TABLES = ("classes.json", "classes.csv", "colors.json", "colors.csv")
 
 Entry = int | tuple[int, int, int]

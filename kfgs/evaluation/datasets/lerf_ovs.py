@@ -19,7 +19,7 @@ from ...scenes.files import natural_key, some
 from ..class_lists import load_classes
 from ..truth import MaskAndBoxes, MaskTruth
 from .files import ReadWhenAsked, find_folder, open_picture
-from .polygons import MOST, fill_polygon, union
+from .polygons import MOST, fill_polygon, say_range, union
 
 
 def load_lerf_ovs(path: str | Path, scene: str | None = None) -> MaskTruth:
@@ -33,7 +33,7 @@ def load_lerf_ovs(path: str | Path, scene: str | None = None) -> MaskTruth:
         scene: the scene's name, if `path` is the folder of all.
 
     Returns:
-        Masks and boxes of each text, by the stem of the picture.
+        Masks and boxes of each text, by the stem of the picture; the scene's name is that of its folder.
 
     Raises:
         FileNotFoundError: if there are no labels, or a published picture of one of the four scenes has none.
@@ -59,7 +59,8 @@ def load_lerf_ovs(path: str | Path, scene: str | None = None) -> MaskTruth:
             f"{folder}: expected labels of all published pictures of {folder.name}, {some(missing)} missing; download the "
             "labels again"
         )
-    return MaskTruth(ReadWhenAsked({file.stem: partial(read_lerf_json, file) for file in files}))
+    name = folder.parent.name if folder.name == "label" else folder.name
+    return MaskTruth(ReadWhenAsked({file.stem: partial(read_lerf_json, file) for file in files}), scene=name)
 
 
 def _one_scene(path: Path) -> Path:
@@ -74,7 +75,7 @@ def read_lerf_json(path: Path) -> dict[str, MaskAndBoxes]:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is damaged, or of another size than the picture beside it.
+        ValueError: if it is damaged, of another size than the picture beside it, or an object lies outside its picture.
     """
     top = read_json(path)
     info, objects = (top.get("info"), top.get("objects")) if isinstance(top, dict) else (None, None)
@@ -119,4 +120,10 @@ def _object(path: Path, number: int, entry: Any, size: tuple[int, int]) -> tuple
             f"{path}, object {number} ({text!r:.40}): expected a 'category', a 'segmentation' [[x, y], ...] and a 'bbox' "
             f"[x1, y1, x2, y2], got {str(entry)[:120]}; correct the file"
         )
-    return text, fill_polygon(points.numpy(), size), box
+    mask = fill_polygon(points.numpy(), size)
+    if not mask.any():  # the boundary belongs to the mask, so a polygon that touches the picture has a pixel
+        raise ValueError(
+            f"{path}, object {number} ({text!r:.40}): expected a 'segmentation' in the picture of {size[1]}x{size[0]}, got "
+            f"{say_range(points.numpy())}, all outside it; correct the file"
+        )
+    return text, mask, box

@@ -135,6 +135,18 @@ def _draw_line(mask: Mask, start: NDArray[np.int64], end: NDArray[np.int64]) -> 
     mask[y[seen], x[seen]] = True
 
 
+def say_range(points: ArrayLike) -> str:  # [V, 2]
+    """Where an outline lies, for messages.
+
+    Example:
+        >>> say_range([(1, 0), (3, 0), (1, 2.5)])
+        'x 1 to 3, y 0 to 2.5'
+    """
+    corners = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+    low, high = corners.min(0), corners.max(0)
+    return f"x {low[0]:g} to {high[0]:g}, y {low[1]:g} to {high[1]:g}"
+
+
 def union(masks: Sequence[Tensor]) -> Tensor:  # [H, W] bool each
     """All pixels of any of the masks."""
     return torch.stack(list(masks)).any(dim=0)

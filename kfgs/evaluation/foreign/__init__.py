@@ -1,4 +1,8 @@
-"""Fields of other programs, read as data and scored by the same protocols. Nothing in their files is run."""
+"""Fields of other programs, read as data and scored by the same protocols. Nothing in their files is run.
+
+No sample of these programs could be had. What a value means (its length, its activation, how it is decoded) is from
+baselines.md, read in their code. Where it lies in a file is mostly our reading; each module says which is which.
+"""
 
 from .feature3dgs import load_feature3dgs
 from .find import load_foreign

@@ -71,6 +71,10 @@ def read_capture(
 ) -> dict[str, Any]:
     """The values that a training script of the 3DGS family keeps: a tuple in a fixed order, and the step.
 
+    From formats.md: (12 values, step), and that scales are logarithms, opacities logits, quaternions w, x, y, z (of the PLY;
+    a checkpoint holds what the PLY is written from). The order is our reading, confirmed by no sample; wrong shapes are
+    refused.
+
     Args:
         path: `chkpnt30000.pth`.
         extra: values besides the Gaussians, by their place in the tuple.

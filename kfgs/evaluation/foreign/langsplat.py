@@ -1,6 +1,13 @@
 """LangSplat, LangSplatV2 and Occam's LGS: one checkpoint per level (s, m, l).
 
-The layouts are those of baselines.md 1.2, 2.1 and 2.2. No sample could be had: the tests write files to those layouts.
+From baselines.md: LangSplat's 3 numbers per Gaussian, divided by their length + 1e-9, and the layers of its decoder (1.2);
+LangSplatV2's 64 logits per Gaussian, the 4 largest of their softmax divided by their sum + 1e-10, and the product with its
+codebook (2.1); that Occam's LGS keeps 512 numbers per Gaussian and level, and loses other Gaussians in each (2.2). From
+formats.md: a checkpoint `chkpnt<step>.pth` is (12 values, step), Occam's has `_langfeat_1`, `_2`, `_3` in its name.
+
+Our readings, confirmed by no sample: the order of the values (`files.read_capture`); that what was added stands at place 7
+(features, logits) and 8 (codebooks, [layers, K, D]); the names `decoder.0`, `decoder.2`, ... of the decoder's layers and
+`best_ckpt.pth` of its file; runs named `<scene>_1`, `_2`, `_3`; and that VALA's files are as Occam's.
 """
 
 from __future__ import annotations
@@ -102,7 +109,7 @@ def load_occam(run: str | Path, step: int | None = None) -> SplattedMethod:
     """Read a run of Occam's LGS: `chkpnt30000_langfeat_1.pth`, `_2`, `_3`, with the uplifted features as they are.
 
     Each level has lost other Gaussians (those that no view activated), so each is rendered with its own. VALA's checkpoints
-    have the same layout.
+    should have the same layout; no sample confirms it.
 
     Args:
         run: the run's folder, or one checkpoint.

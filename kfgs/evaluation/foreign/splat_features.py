@@ -1,4 +1,8 @@
-"""A splat with features: in its own columns, or in a file beside it."""
+"""A splat with features: in its own columns, or in a file beside it.
+
+From protocols.md f1: SceneSplat's language features are (N, D) in `.npy` or `.pth`. Our readings, confirmed by no sample: the
+`.pth` holds one tensor, and rows are in the order of the splat file.
+"""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..._check import check_shapes, check_whole
 from . import ops
-from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Splats, Tiles
+from .contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN, Ranked, Splats, Tiles
 from .cpu.memory import free_memory
 from .ops import check_values
 from .table import available_engines, choose, load, offers
@@ -20,6 +20,7 @@ __all__ = [
     "available_engines",
     "composite",
     "free_memory",
+    "rank_channels",
 ]
 
 
@@ -61,28 +62,62 @@ def composite(
     Note:
         On the CPU, large arrays are kept for the next frames, up to 1 GiB per thread; `free_memory` frees them.
     """
-    check_shapes(
-        ("means2d", means2d, "M 2"),
-        ("conics", conics, "M 3"),
-        ("opacities", opacities, "M"),
-        ("features", features, "M D" if index is None else "N D"),
-        ("background", background, "D"),
-        ("index", index, "M"),
-    )
-    _check_kinds({"conics": conics, "opacities": opacities, "features": features, "background": background}, means2d)
-    _check_integers("index", index, means2d, (torch.int64,), "pass Projected.index")
-    _check_tiles(tiles, means2d)
+    _check_splats(means2d, conics, opacities, features, tiles, background, index)
     name = choose(engine, means2d.device.type, means2d.dtype)
-    if background is None:
-        background = features.new_zeros(features.shape[1])
-    values = (value.contiguous() for value in (means2d, conics, opacities, features, background))
-    means2d, conics, opacities, features, background = values
-    splats, tiles = Splats(means2d, conics, opacities, features, background, index), _contiguous(tiles)
+    splats, tiles = _splats(means2d, conics, opacities, features, background, index), _contiguous(tiles)
+    means2d, features = splats.means2d, splats.features
     if offers(name, "composite"):  # differentiable as it stands
         check_values(len(means2d), len(features), index, tiles)
         return load(name).composite(splats, tiles)
     maps, alphas, _ = ops.composite(*splats, *tiles, name)
     return maps, alphas
+
+
+def rank_channels(
+    means2d: Tensor,  # [M, 2]
+    conics: Tensor,  # [M, 3]
+    opacities: Tensor,  # [M]
+    features: Tensor,  # [N, D]
+    tiles: Tiles,
+    *,
+    top: int = 1,
+    index: Tensor | None = None,  # [M] int64
+    engine: str = "auto",
+) -> Ranked:
+    """The channels with the largest composited values at each pixel: `composite` and arg-max in one kernel.
+
+    The maps [H, W, D] never reach memory. If features are scores of classes, the result is a label map. It carries no
+    gradient.
+
+    Args:
+        means2d: as in `composite`.
+        conics: as in `composite`.
+        opacities: as in `composite`.
+        features: finite scores; any number of channels from 1.
+        tiles: from `bin_tiles` on the same Gaussians.
+        top: how many channels are kept, from 1 to D.
+        index: as in `composite`.
+        engine: as in `composite`. An engine without this kernel composites maps and sorts them.
+
+    Returns:
+        Channels, the best first (of equal ones the lowest first), their values, and the opacity; -1 and 0 where nothing
+        was drawn.
+
+    Raises:
+        ValueError: as `composite`, and if `top` is out of range.
+    """
+    _check_splats(means2d, conics, opacities, features, tiles, None, index)
+    if not torch.compiler.is_compiling():
+        check_whole("top", top, 1, features.shape[1])
+    name = choose(engine, means2d.device.type, means2d.dtype)
+    with torch.no_grad():
+        if offers(name, "rank"):
+            splats = _splats(means2d.detach(), conics.detach(), opacities.detach(), features.detach(), None, index)
+            return Ranked(*ops.rank(*splats, *_contiguous(tiles), top, name))
+        maps, alphas = composite(means2d, conics, opacities, features, tiles, index=index, engine=name)
+        scores, labels = maps.sort(dim=-1, descending=True, stable=True)
+        empty = (alphas <= 0)[..., None]
+        return Ranked(labels[..., :top].masked_fill(empty, -1), scores[..., :top].masked_fill(empty, 0), alphas)
 
 
 def accumulate_pixels(
@@ -129,6 +164,43 @@ def accumulate_pixels(
         check_values(len(means2d), len(means2d), None, tiles)
         return load(name).accumulate(*values, tiles)
     return ops.accumulate(*values, *tiles, name)
+
+
+def _check_splats(
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    tiles: Tiles,
+    background: Tensor | None,
+    index: Tensor | None,
+) -> None:
+    check_shapes(
+        ("means2d", means2d, "M 2"),
+        ("conics", conics, "M 3"),
+        ("opacities", opacities, "M"),
+        ("features", features, "M D" if index is None else "N D"),
+        ("background", background, "D"),
+        ("index", index, "M"),
+    )
+    _check_kinds({"conics": conics, "opacities": opacities, "features": features, "background": background}, means2d)
+    _check_integers("index", index, means2d, (torch.int64,), "pass Projected.index")
+    _check_tiles(tiles, means2d)
+
+
+def _splats(
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    background: Tensor | None,
+    index: Tensor | None,
+) -> Splats:
+    if background is None:
+        background = features.new_zeros(features.shape[1])
+    values = (value.contiguous() for value in (means2d, conics, opacities, features, background))
+    means2d, conics, opacities, features, background = values
+    return Splats(means2d, conics, opacities, features, background, index)
 
 
 def _contiguous(tiles: Tiles) -> Tiles:

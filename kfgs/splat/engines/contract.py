@@ -13,7 +13,10 @@ and, if it can do better than kornia and torch,
     project(cloud, pinhole) -> the six tensors of `kfgs.splat.Projected`
     project_backward(grads, cloud, pinhole, index) -> gradients of the four tensors of `cloud`, zero for what was culled
         grads: of the loss in means2d, conics, depths and opacities; index: the last result of `project`
+    shade(sh [N, K, 3], means, center [3], index) -> colours [M, 3], as `kfgs.splat.evaluate_sh` has them
+    shade_backward(grad, sh, means, center, index) -> gradients of sh and means, zero for what was not seen
     bin(means2d, conics, depths, opacities, extents, width, height, tile_size) -> rows, offsets of `Tiles`
+    rank(splats, tiles, top) -> Ranked: the channels with the largest sums, without writing the sums; no background
 
 `ops` makes operators of these. The reference engine is plain torch under autograd: it has `composite(splats, tiles)`
 instead of forward and backward. No function takes more than eight parameters, except compiled kernels: a launch of Triton
@@ -37,12 +40,16 @@ The tensors an engine receives are contiguous, of one dtype and on one device.
    The CPU engines work in float64 too, so that `gradcheck` runs on them. No device moves, no
    printing, no edits to the caller's tensors.
 7. `accumulate` finds weights^T · pixels (for uplifting and pruning) and the sums of the weights in one walk over the view.
+8. `rank` finds, at each pixel, the `top` channels with the largest sums of weight * features, the largest first, and of
+   equal sums the lowest channel first. Where nothing is drawn, labels are -1 and scores 0. On the CPU the scores are the
+   bits of `maps`.
 
 Two engines differ by rounding only. Thresholds make that visible at a few pixels where alpha lies on 1/255, or T' on
 1e-4: two opaque hits give T' = (1 - 0.99)^2, which is just below 1e-4 in float32 and just above it in float64.
 
 An engine may also have `similarity`: SSIM of two pictures and its gradient, with the arguments and results of the function
-in `cpu/ssim.py`. The loss of colour fields uses it, and kornia's SSIM with the other engines.
+in `cpu/ssim.py`. The loss of colour fields uses it, and kornia's SSIM with the other engines. It may have `decide`, the
+largest output of a perceptron, as in `cpu/perceptron.py`: the exact decoding of a label map uses it, else torch decodes.
 """
 
 from __future__ import annotations
@@ -123,6 +130,17 @@ class Tiles(NamedTuple):
     def grid(self) -> tuple[int, int]:
         """Number of tiles as (rows, columns)."""
         return -(-self.height // self.tile_size), -(-self.width // self.tile_size)
+
+
+class Ranked(NamedTuple):
+    """The best channels of each pixel: classes, if the features are scores of classes."""
+
+    labels: Tensor  # [H, W, top] int64, the best first; -1 where nothing was drawn
+    scores: Tensor  # [H, W, top] their sums of weight * features; 0 where nothing was drawn
+    alphas: Tensor  # [H, W]
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 class Composited(NamedTuple):

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.library import register_autograd, register_fake
 
-from .contract import Cloud, Composited, Pinhole, Splats, Tiles
+from .contract import Cloud, Composited, Pinhole, Ranked, Splats, Tiles
 from .table import load
 
 SPLATS = "Tensor means2d, Tensor conics, Tensor opacities, Tensor features, Tensor background, Tensor? index"
@@ -137,6 +137,22 @@ def _(means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, *view:
     return pixels.new_empty(len(means2d), pixels.shape[2]), pixels.new_empty(len(means2d))
 
 
+@_operator(f"({SPLATS}, {TILES}, SymInt top, str engine) -> (Tensor, Tensor, Tensor)")
+def rank(*inputs: Any) -> Ranked:
+    """Labels, scores and alphas, see `kfgs.splat.engines.rank_channels`; without gradient."""
+    splats, tiles = Splats(*inputs[:6]), Tiles(*inputs[6:11])
+    check_values(len(splats.means2d), len(splats.features), splats.index, tiles)
+    return load(inputs[12]).rank(splats, tiles, inputs[11])
+
+
+@register_fake("kfgs::rank")
+def _(*inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
+    features, tiles, top = inputs[3], Tiles(*inputs[6:11]), inputs[11]
+    scores = features.new_empty(tiles.height, tiles.width, top)
+    labels = features.new_empty(tiles.height, tiles.width, top, dtype=torch.int64)
+    return labels, scores, features.new_empty(tiles.height, tiles.width)
+
+
 @_operator(f"({CLOUD}, {PINHOLE}, str engine) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)")
 def project(*inputs: Any) -> tuple[Tensor, ...]:
     """The six tensors of `kfgs.splat.Projected`."""
@@ -179,6 +195,40 @@ def _differentiate_project(ctx: Any, *grads: Tensor) -> tuple[Any, ...]:
 register_autograd("kfgs::project", _differentiate_project, setup_context=_save_project)
 
 
+@_operator("(Tensor sh, Tensor means, Tensor center, Tensor index, str engine) -> Tensor")
+def shade(sh: Tensor, means: Tensor, center: Tensor, index: Tensor, engine: str) -> Tensor:
+    """Colours of the visible Gaussians, as `kfgs.splat.evaluate_sh` has them."""
+    return load(engine).shade(sh, means, center, index)
+
+
+@register_fake("kfgs::shade")
+def _(sh: Tensor, means: Tensor, center: Tensor, index: Tensor, engine: str) -> Tensor:
+    return sh.new_empty(index.shape[0], 3)
+
+
+@_operator("(Tensor grad, Tensor sh, Tensor means, Tensor center, Tensor index, str engine) -> Tensor[]")
+def shade_backward(grad: Tensor, *inputs: Any) -> list[Tensor]:
+    """Gradients of sh and means."""
+    return load(inputs[-1]).shade_backward(grad, *inputs[:-1])
+
+
+@register_fake("kfgs::shade_backward")
+def _(grad: Tensor, sh: Tensor, means: Tensor, *others: Any) -> list[Tensor]:
+    return [torch.empty_like(sh), torch.empty_like(means)]
+
+
+def _save_shade(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    *tensors, ctx.engine = inputs
+    ctx.save_for_backward(*tensors)
+
+
+def _differentiate_shade(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
+    return *shade_backward(grad.contiguous(), *ctx.saved_tensors, ctx.engine), None, None, None
+
+
+register_autograd("kfgs::shade", _differentiate_shade, setup_context=_save_shade)
+
+
 @_operator(
     "(Tensor means2d, Tensor conics, Tensor depths, Tensor opacities, Tensor extents, "
     "SymInt width, SymInt height, SymInt tile_size, str engine) -> (Tensor, Tensor)"
@@ -196,5 +246,5 @@ def _(*inputs: Any) -> tuple[Tensor, Tensor]:
     return means2d.new_empty(pairs, dtype=torch.int32), means2d.new_empty(tiles + 1, dtype=torch.int64)
 
 
-for _name in ("composite_backward", "project_backward"):
+for _name in ("composite_backward", "project_backward", "shade_backward"):
     register_autograd(f"kfgs::{_name}", _refuse)

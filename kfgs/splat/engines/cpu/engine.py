@@ -9,13 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..contract import Composited, Splats, Tiles
+from ..contract import Composited, Ranked, Splats, Tiles
 from . import square, wide
 from .bands import accumulate_band, composite_narrow, composite_wide
 from .bands_backward import differentiate_narrow, differentiate_wide
 from .memory import take_memory
 from .narrow import FIRST, MOMENTS, plan_passes
+from .perceptron import decide
 from .project import project, project_backward
+from .ranks import find_candidates, rank_narrow, rank_wide
+from .shade import shade, shade_backward
 from .simd import LANES
 from .slots import chain_slots, gather_gradients, gather_sums, number_slots
 from .square import SQUARE_SIDE, View, pack_rows
@@ -25,7 +28,20 @@ from .tiles import bin
 
 row_length, padded_length = square.row_length.py_func, wide.padded_length.py_func  # one call is not worth compiling
 
-__all__ = ["accumulate", "backward", "bin", "devices", "forward", "project", "project_backward", "similarity"]
+__all__ = [
+    "accumulate",
+    "backward",
+    "bin",
+    "decide",
+    "devices",
+    "forward",
+    "project",
+    "project_backward",
+    "rank",
+    "shade",
+    "shade_backward",
+    "similarity",
+]
 
 MOST_BANDS, PAIRS_PER_BAND = 32, 2048
 """The most bands, and the fewest pairs of a band. More bands keep more threads busy, but give more Gaussians a gradient row
@@ -112,6 +128,29 @@ def accumulate(
     sums, weights = pixels.new_empty(len(means2d), channels), pixels.new_empty(len(means2d))
     run_bands(gather_sums, bands, bands, chains, out, length, sums.numpy(), weights.numpy())
     return sums, weights
+
+
+def rank(splats: Splats, tiles: Tiles, top: int) -> Ranked:
+    """The best channels of each pixel, as the contract says."""
+    means2d, conics, opacities, features, _, index = splats
+    channels, view = features.shape[1], _view(tiles)
+    bands = len(view.bounds) - 1
+    size = view.height, view.width
+    labels, scores = torch.empty(*size, top, dtype=torch.int64), features.new_empty(*size, top)
+    alphas = features.new_empty(size)
+    length = row_length(_packed(channels))
+    packed = take_memory(means2d, len(means2d) * length).numpy()
+    footprints = _flat(means2d), _flat(conics), _flat(opacities)
+    run_bands(pack_rows, bands, bands, footprints, _flat(features), _packed(channels), _index(index), packed)
+    images = _flat(labels), _flat(scores), _flat(alphas)
+    if channels <= NARROW_CHANNELS:
+        masks = np.empty(len(means2d) if top == 1 else 0, np.uint64)
+        run_bands(find_candidates, bands, bands, _flat(features), channels, _index(index), masks)
+        run_bands(rank_narrow, bands, view, packed, length, plan_passes(channels), channels, masks, images)
+    else:
+        begins = _begins(index, len(means2d), channels)
+        run_bands(rank_wide, bands, view, packed, length, _flat(features), begins, channels, images)
+    return Ranked(labels, scores, alphas)
 
 
 def _flat(tensor: Tensor) -> np.ndarray:

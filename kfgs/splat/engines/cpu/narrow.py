@@ -72,7 +72,7 @@ def plan_passes(channels: int) -> tuple[tuple[int, ...], tuple[int, ...], int]:
 
 @njit(**INLINE)
 def composite_square(
-    packed: Any, span: tuple[int, int, int], state: Any, dark: Any, passes: Any, scratch: Any, trace: Any
+    packed: Any, span: tuple[int, int, int], state: Any, dark: Any, passes: Any, scratch: Any, trace: Any, columns: Any
 ) -> int:
     """Composite a square's Gaussians; returns where in the list it was done.
 
@@ -83,7 +83,8 @@ def composite_square(
         dark: bits of blocks without pixels.
         passes: from `plan_passes`.
         scratch: corners; sums, one plane per channel; weights [CHUNK * LANES]; hits [BLOCKS * CHUNK]; counts [BLOCKS].
-        trace: written: the blocks in which each Gaussian changed the light, as bits.
+        trace: written: the blocks in which each Gaussian changed the light, as bits; None: there is no backward pass.
+        columns: four channels to composite in place of the first four; None: all.
     """
     rows, length, order = packed
     start, end, into = span
@@ -93,14 +94,18 @@ def composite_square(
         stop = min(position + CHUNK, end)
         list_hits(rows, length, order, (position, stop, into + position - start), dark, corners, hits, counts, trace)
         for block in range(BLOCKS):
-            if counts[block] and not _composite_block(packed, state, block, passes, scratch, trace, into - start):
+            if counts[block] and not _composite_block(
+                packed, state, block, passes, scratch, trace, into - start, columns
+            ):
                 dark |= np.uint32(1) << np.uint32(block)
         position = stop
     return position
 
 
 @njit(**INLINE)
-def _composite_block(packed: Any, state: Any, block: int, passes: Any, scratch: Any, trace: Any, into: int) -> bool:
+def _composite_block(
+    packed: Any, state: Any, block: int, passes: Any, scratch: Any, trace: Any, into: int, columns: Any
+) -> bool:
     """Composite the listed Gaussians into one block; returns whether some pixel has not stopped."""
     rows, length, order = packed
     first, more, channels = passes
@@ -113,16 +118,20 @@ def _composite_block(packed: Any, state: Any, block: int, passes: Any, scratch: 
         j = np.int64(fetch(hits, listed + k))
         at = np.int64(fetch(order, j)) * length
         _, _, _, alpha = weigh_pixels(rows, at, x, y)
-        changed = (light >= TRANSMITTANCE_MIN) & (alpha > 0)  # also where it stops the pixel and is not drawn itself
+        before = light
         weight = alpha * light
         light = light * (1 - alpha)  # falls on after a pixel has stopped, so that it never starts again
         drawn = light >= TRANSMITTANCE_MIN
         weight = select(drawn, weight, 0)
         final = select(drawn, light, final)
-        total = add_scaled(total, weight, spread_many(first, rows, at + FEATURES, 1))
+        if columns is None:
+            total = add_scaled(total, weight, spread_many(first, rows, at + FEATURES, 1))
+        else:
+            total = add_scaled(total, weight, _spread_columns(rows, at + FEATURES, columns))
         if len(more) > 0:
             store(weights, k * LANES, weight)
-        if not any_of(changed):
+        # a Gaussian that stops a pixel changes it, although it is not drawn itself
+        if trace is not None and not any_of((before >= TRANSMITTANCE_MIN) & (alpha > 0)):
             put(trace, into + j, np.uint32(fetch(trace, into + j)) & ~bit)
     store(state, LIGHT + p, light)
     store(state, FINAL + p, final)
@@ -131,6 +140,18 @@ def _composite_block(packed: Any, state: Any, block: int, passes: Any, scratch: 
         for channel in range(len(first), channels, LANES):
             _add_group(packed, FEATURES + channel, hits, listed, count, weights, sums, channel * PIXELS + p)
     return any_of(light >= TRANSMITTANCE_MIN)
+
+
+@njit(**INLINE)
+def _spread_columns(rows: Any, at: int, columns: Any) -> Any:
+    """Four numbers of a row, each in every lane of a vector."""
+    a, b, c, d = columns
+    return (
+        spread(rows, fetch(rows, at + a)),
+        spread(rows, fetch(rows, at + b)),
+        spread(rows, fetch(rows, at + c)),
+        spread(rows, fetch(rows, at + d)),
+    )
 
 
 @njit(**INLINE)

@@ -36,7 +36,16 @@ def project(cloud: Cloud, pinhole: Pinhole) -> tuple[Tensor, ...]:
     scratch = [*(means.new_empty(shape) for shape in shapes), means.new_empty(N, dtype=torch.int64)]
     counts = np.empty(bands, np.int64)
     lens = make_lens(pinhole)
-    run_bands(project_band, bands, bands, lens, _flat(*cloud), find_reach(cloud.opacities), _flat(*scratch), counts)
+    run_bands(
+        project_band,
+        bands,
+        bands,
+        lens,
+        flat_arrays(*cloud),
+        find_reach(cloud.opacities),
+        flat_arrays(*scratch),
+        counts,
+    )
 
     ends = np.cumsum(counts)
     outputs = [value.new_empty((int(ends[-1]), *value.shape[1:])) for value in scratch]
@@ -55,7 +64,16 @@ def project_backward(grads: Sequence[Tensor], cloud: Cloud, pinhole: Pinhole, in
     """Gradients of the loss in the cloud, given those in means2d, conics, depths and opacities."""
     bands, out = _bands(len(cloud.means)), [torch.empty_like(value) for value in cloud]
     lens = make_lens(pinhole)
-    run_bands(differentiate_band, bands, bands, lens, _flat(*cloud[:3]), _array(index), _flat(*grads), _flat(*out))
+    run_bands(
+        differentiate_band,
+        bands,
+        bands,
+        lens,
+        flat_arrays(*cloud[:3]),
+        _array(index),
+        flat_arrays(*grads),
+        flat_arrays(*out),
+    )
     return out
 
 
@@ -68,6 +86,6 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().numpy()
 
 
-def _flat(*tensors: Tensor) -> tuple[np.ndarray, ...]:
+def flat_arrays(*tensors: Tensor) -> tuple[np.ndarray, ...]:
     """Contiguous tensors as one-dimensional arrays on the same memory."""
     return tuple(_array(tensor.view(-1)) for tensor in tensors)

@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 
 from ..contract import ALPHA_MAX, ALPHA_MIN
+from .bits import WORDS, transpose_bits
 from .cache import cached_njit
 from .simd import (
     LANES,
@@ -63,6 +64,10 @@ STATE = 4 * PIXELS
 
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 INLINE: dict[str, Any] = OPTIONS | {"forceinline": True}
+
+_LISTED = 32
+"""Gaussians whose bits are listed together."""
+_SIXTEEN_BITS = np.uint64(0xFFFF)
 
 LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 _LOG2_E = math.log2(math.e)
@@ -238,16 +243,32 @@ def list_hits(
         corners: see `touched_blocks`.
         hits: [BLOCKS * CHUNK] int32, written: places in `order`.
         counts: [BLOCKS], written.
-        trace: written: the touched blocks' bits of each Gaussian.
+        trace: written: the touched blocks' bits of each Gaussian; None: there is no backward pass.
     """
     first, stop, into = span
     epsilon = rows.dtype.type(np.finfo(rows.dtype).eps)
     counts[:] = 0
-    for j in range(first, stop):
-        prefetch(rows, np.int64(fetch(order, min(j + PREFETCH_AHEAD, stop - 1))) * length)
-        touched = touched_blocks(rows, np.int64(fetch(order, j)) * length, corners, epsilon) & ~dark
-        put(trace, into + j - first, touched)
-        list_bits(touched, j, hits, counts)
+    words = np.zeros(WORDS, np.uint64)
+    for begin in range(first, stop, _LISTED):
+        words[:] = 0
+        for j in range(begin, min(begin + _LISTED, stop)):
+            prefetch(rows, np.int64(fetch(order, min(j + PREFETCH_AHEAD, stop - 1))) * length)
+            touched = touched_blocks(rows, np.int64(fetch(order, j)) * length, corners, epsilon) & ~dark
+            if trace is not None:
+                put(trace, into + j - first, touched)
+            k = j - begin
+            put(words, k // 4, fetch(words, k // 4) | (np.uint64(touched) << np.uint64(k % 4 * BLOCKS)))
+        transpose_bits(words)
+        for block in range(BLOCKS):
+            shift = np.uint64(block % 4 * BLOCKS)
+            low = (fetch(words, block // 4) >> shift) & _SIXTEEN_BITS
+            high = (fetch(words, 4 + block // 4) >> shift) & _SIXTEEN_BITS
+            touching, number = np.uint32(low | (high << np.uint64(16))), fetch(counts, block)
+            while touching:
+                put(hits, block * CHUNK + number, begin + trailing_zeros(touching))
+                touching &= touching - np.uint32(1)
+                number += 1
+            put(counts, block, number)
 
 
 class Picture(NamedTuple):

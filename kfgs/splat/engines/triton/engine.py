@@ -17,11 +17,12 @@ import torch
 import triton
 from torch import Tensor
 
-from ..contract import Composited, Splats, Tiles
+from ..contract import Composited, Ranked, Splats, Tiles
 from .kernels import accumulate_kernel, composite_kernel
 from .kernels_backward import differentiate_kernel
+from .kernels_rank import rank_kernel
 
-__all__ = ["accumulate", "backward", "devices", "forward"]
+__all__ = ["accumulate", "backward", "devices", "forward", "rank"]
 
 INTERPRETED = not isinstance(composite_kernel, triton.JITFunction)
 """Whether triton interprets the kernels. They then run in numpy, on the CPU."""
@@ -43,6 +44,7 @@ class Launch(NamedTuple):
 LAUNCHES = {
     # Nothing is shared between the programs of a tile but the loading of Gaussians: small ones, several on a processor.
     "composite": Launch(pixels=128, chunk=16, block=64, warps=4),
+    "rank": Launch(pixels=128, chunk=16, block=64, warps=4),
     # A program adds to a Gaussian once: a whole tile of 16 x 16 pixels, for the fewest atomics. The values of a pixel's
     # block of channels stay in its thread's registers.
     "accumulate": Launch(pixels=256, chunk=16, block=64, warps=8),
@@ -149,6 +151,28 @@ def accumulate(
                 width, height, tiles.grid[1], D, **options,
             )  # fmt: skip
     return sums, weights
+
+
+def rank(splats: Splats, tiles: Tiles, top: int) -> Ranked:
+    """The best channels of each pixel, as the contract says.
+
+    Raises:
+        ValueError: as `forward`.
+    """
+    means2d, conics, opacities, features, _, index = splats
+    rows, offsets, width, height, tile_size = tiles
+    _check(means2d=means2d, conics=conics, opacities=opacities, features=features)
+    labels = torch.full((height, width, top), -1, dtype=torch.int64, device=features.device)
+    scores, alphas = features.new_zeros(height, width, top), features.new_zeros(height, width)
+    if len(rows):
+        D = features.shape[1]
+        options = launch_options("rank", D, tile_size) | {"TOP": triton.next_power_of_2(top)}
+        with _on(means2d):
+            rank_kernel[(_programs(options, tiles),)](
+                means2d, conics, opacities, features, index, rows, offsets, labels, scores, alphas,
+                width, height, tiles.grid[1], D, top, **options,
+            )  # fmt: skip
+    return Ranked(labels, scores, alphas)
 
 
 def launch_options(kernel: str, channels: int, tile_size: int) -> dict[str, Any]:

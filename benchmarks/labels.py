@@ -1,0 +1,238 @@
+"""How long does a label map take: one kernel that keeps the best class, against maps of all scores?
+
+    python benchmarks/labels.py [--field FOLDER] [--scene SCENE] [--size 640x480] [--gaussians 30000] [--classes 18]
+                                [--repeats 20] [--threads 2] [--quick]
+
+Without a field: a furnished room of Gaussians with random linear latents, and a random decoder of the paper's widths. With
+one: its Gaussians, seen from its first training view or from the scene's first camera, at its own size. Both sides of a row
+take turns in one process. The old side of each row is written here, on public functions.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from engines_room import room, view
+from torch import Tensor
+
+from kfgs import Camera
+from kfgs.fields import SemanticField, score_pixels
+from kfgs.labels import LOGIT_SCALES, label_pixels, relevancy
+from kfgs.quant import Autoencoder, Codebook, LinearLatents
+from kfgs.scenes import load_scene
+from kfgs.splat import bin_tiles, project, rasterize, rasterize_labels
+
+DIM, LINEAR, LATENTS, CODEWORDS = 512, 24, 9, 100
+DECODER = 9, 32, 64, 128, 256, 1024, 512  # Sec. 4 of the paper
+CHUNK = 8192
+
+
+class Row(NamedTuple):
+    """What is compared: seconds of the old and of the new way, and whether their results are equal."""
+
+    name: str
+    old: list[float]
+    new: list[float]
+    equal: str
+
+    def __str__(self) -> str:
+        old, new = statistics.median(self.old), statistics.median(self.new)
+        quickest = min(self.old) / min(self.new)
+        return (
+            f"| {self.name} | {1e3 * old:.1f} | {1e3 * new:.1f} | {old / new:.1f} | {quickest:.1f} | {1 / new:.0f} "
+            f"| {1 / min(self.new):.0f} | {self.equal} |"
+        )
+
+
+def main() -> None:
+    """Print a table of both sides, and the parts of the new one."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--field", type=Path)
+    parser.add_argument("--scene", type=Path)
+    parser.add_argument("--size", default="640x480")
+    parser.add_argument("--gaussians", type=int, default=30_000)
+    parser.add_argument("--classes", type=int, default=18)
+    parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--threads", type=int)
+    parser.add_argument("--quick", action="store_true", help="a tiny case, which only proves that it runs")
+    args = parser.parse_args()
+    if args.quick:
+        args.size, args.gaussians, args.repeats = "48x32", 500, 2
+    if args.threads:
+        torch.set_num_threads(args.threads)
+    width, height = map(int, args.size.split("x"))
+    g = torch.Generator().manual_seed(0)
+    rows = torch.randn(args.classes, DIM, generator=g)
+    if args.field:
+        field = SemanticField.load(args.field)
+        cameras = load_scene(args.scene).cameras if args.scene else field.cameras
+        fields, camera = [field], cameras[0].resized(height, width)
+        rows = torch.randn(args.classes, field.dim, generator=g)
+    else:
+        fields, camera = (
+            [random_linear(args.gaussians, rows, g), random_decoded(args.gaussians, g)],
+            view(width, height),
+        )
+    print(f"{width} x {height} pixels, {len(fields[0])} Gaussians, {len(rows)} classes")
+    print(f"{torch.get_num_threads()} threads, load {os.getloadavg()[0]:.1f} at the start\n")
+    print("| what | old, ms | new, ms | ratio | of the quickest | per second | at best | equal |\n" + "|---" * 8 + "|")
+    for field in fields:
+        for row in compare(field, camera, rows, args.repeats):
+            print(row, flush=True)
+        if field.method == "fused":
+            print(parts(field, camera, rows, args.repeats), flush=True)
+    print(f"\nload {os.getloadavg()[0]:.1f} at the end")
+
+
+def random_linear(count: int, rows: Tensor, g: torch.Generator) -> SemanticField:
+    """A fused field, in which boxes of half a metre have one of the classes, and features some noise."""
+    basis = torch.linalg.qr(torch.randn(DIM, LINEAR, generator=g)).Q
+    cloud = room(count, LINEAR)
+    noise = 0.1 * torch.randn(count, LINEAR, generator=g)
+    latents = torch.nn.functional.normalize(rows @ basis)[boxes(cloud.means) % len(rows)] + noise
+    return SemanticField(cloud.replace(features=latents), linear=LinearLatents(basis))
+
+
+def boxes(means: Tensor) -> Tensor:
+    """A number for each box of half a metre, the same for all Gaussians in it."""
+    return ((means + 10) * 2).floor().long() @ torch.tensor([1, 7, 31])
+
+
+def random_decoded(count: int, g: torch.Generator) -> SemanticField:
+    """A field of the paper's method: Gaussians near random latents, and codewords that are their decoded features."""
+
+    def layers(widths: tuple[int, ...]) -> tuple[tuple[Tensor, Tensor], ...]:
+        return tuple(
+            (torch.randn(out, into, generator=g) * (2 / into) ** 0.5, 0.1 * torch.randn(out, generator=g))
+            for into, out in pairwise(widths)
+        )
+
+    autoencoder = Autoencoder(layers(DECODER[::-1]), layers(DECODER), -1.0, 1.0)
+    latents = torch.rand(CODEWORDS, LATENTS, generator=g)
+    cloud = room(count, LATENTS)
+    cloud = cloud.replace(
+        features=latents[boxes(cloud.means) % CODEWORDS] + 0.02 * torch.randn(count, LATENTS, generator=g)
+    )
+    return SemanticField(cloud, Codebook(autoencoder.decode(latents)), autoencoder)
+
+
+def compare(field: SemanticField, camera: Camera, rows: Tensor, repeats: int) -> list[Row]:
+    """The rows of a field of either kind."""
+    if field.method == "fused":
+        many = torch.randn(64, *rows.shape, generator=torch.Generator().manual_seed(1))
+        texts = (iter([*many] * 2 * (1 + repeats)) for _ in range(2))
+        old_texts, new_texts = texts
+        return [
+            measure("label map", lambda: blended(field, camera, rows), lambda: field.segment(camera, rows), repeats),
+            measure(
+                "label map, another text each time",
+                lambda: blended(field, camera, next(old_texts)),
+                lambda: field.segment(camera, next(new_texts)),
+                repeats,
+            ),
+            measure(
+                "text query, score of each pixel",
+                lambda: compared(field, camera, next(old_texts)),
+                lambda: score_pixels(field, camera, next(new_texts)[0], None, negatives=rows[1:5]).scores[..., 0],
+                repeats,
+                "blended scores, not scores of blended features",
+            ),
+            measure(
+                "5 best classes",
+                lambda: blended(field, camera, rows, 5),
+                lambda: field.rank(camera, rows, top=5).labels,
+                repeats,
+            ),
+        ]
+    if field.autoencoder is None:
+        raise SystemExit("--field: expected one with linear latents or with an autoencoder")
+    table = field.codeword_labels(rows)
+    rendering = field.render(camera)
+    covered = rendering.alpha > 0
+    return [
+        measure(
+            "exact decode",
+            lambda: decoded(field, rendering.map, table.labels, covered),
+            lambda: label_pixels(rendering.map, field.codebook, table, field.autoencoder, covered=covered),
+            max(2, repeats // 5),
+        )
+    ]
+
+
+def measure(
+    name: str, old: Callable[[], Tensor], new: Callable[[], Tensor], repeats: int, equal: str | None = None
+) -> Row:
+    """Both sides in turn, after one call each that compiles."""
+    one, other = old(), new()
+    if equal is None:
+        differing = int((one != other).sum())
+        equal = "yes" if differing == 0 else f"but {differing} of {one.numel()}"
+    seconds: tuple[list[float], list[float]] = ([], [])
+    for _ in range(repeats):
+        for call, times in zip((old, new), seconds, strict=True):
+            began = time.perf_counter()
+            call()
+            times.append(time.perf_counter() - began)
+    return Row(name, *seconds, equal)
+
+
+def blended(field: SemanticField, camera: Camera, rows: Tensor, top: int = 1) -> Tensor:
+    """The old label map: votes of all classes rendered to a map, and the largest of each pixel taken from it."""
+    cosines, known = field.cosines(rows), field.known
+    with torch.no_grad():
+        winners = cosines.argmax(dim=1)[known].unique()
+        votes = torch.softmax(LOGIT_SCALES["clip"] * cosines[:, winners], dim=1) * known[:, None]
+        seen = rasterize(field.gaussians.replace(features=votes.contiguous(), sh=None), camera).map
+        if top == 1:
+            most, index = seen.max(dim=-1)
+        else:
+            most, index = (value[..., :top] for value in seen.sort(dim=-1, descending=True, stable=True))
+        return winners[index].masked_fill(most <= 0, -1)
+
+
+def compared(field: SemanticField, camera: Camera, rows: Tensor) -> Tensor:
+    """The old text query: the features rendered, and each pixel compared with the target and four negatives."""
+    assert field.linear is not None
+    unit = torch.nn.functional.normalize(rows[:5], dim=1)
+    pixels = field.render(camera).map.flatten(0, 1)
+    cosines = torch.cat([field.linear.cosines(part, unit) for part in pixels.split(CHUNK)])
+    return relevancy(cosines[:, 0], cosines[:, 1:]).view(camera.size)
+
+
+def decoded(field: SemanticField, latents: Tensor, table: Tensor, covered: Tensor) -> Tensor:
+    """The old exact decode: every pixel's feature, and the codeword most similar to it."""
+    assert field.autoencoder is not None
+    assert field.codebook is not None
+    labels = torch.full(covered.shape, -1)
+    with torch.no_grad():
+        parts = latents[covered].split(CHUNK)
+        labels[covered] = torch.cat([table[field.codebook.quantize(field.autoencoder.decode(part))] for part in parts])
+    return labels
+
+
+def parts(field: SemanticField, camera: Camera, rows: Tensor, repeats: int) -> str:
+    """Medians of the parts of a label map, in ms."""
+    votes = torch.softmax(LOGIT_SCALES["clip"] * field.cosines(rows), dim=1)
+    cloud = field.gaussians.replace(features=votes)
+    with torch.no_grad():
+        projected = project(cloud, camera)
+        calls = {
+            "projection": lambda: project(cloud, camera),
+            "binning": lambda: bin_tiles(projected, camera.width, camera.height),
+            "projection, binning, compositing and arg-max": lambda: rasterize_labels(cloud, camera),
+            "the map of the same scores": lambda: rasterize(cloud, camera),
+        }
+        times = {name: statistics.median(measure(name, call, call, repeats, "").new) for name, call in calls.items()}
+    return "\nParts: " + ", ".join(f"{name} {1e3 * value:.1f} ms" for name, value in times.items()) + "\n"
+
+
+if __name__ == "__main__":
+    main()

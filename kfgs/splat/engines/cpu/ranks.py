@@ -1,0 +1,213 @@
+"""The compiled kernels over a band of tiles that rank channels: composite class scores, and keep each pixel's best classes.
+
+The sums of a square stay in cache, and only the best classes and their scores are written. There is no backward pass, so
+nothing is traced. The sums are those of `composite_narrow` and `composite_wide`, to the bit.
+
+If only the best class is wanted and no score is negative, most classes need no sum: a class can win only where some
+Gaussian of the tile gives it a fair share, at least one C-th of all that it gives (`find_candidates`). Elsewhere its sum
+is below the mean of all sums. With the votes of a room of 18 classes, a tile has 3 such classes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from . import narrow as narrow
+from . import wide as wide
+from .cache import cached_njit
+from .simd import LANES, fetch, load, load_many, put, select, spread, store, store_many, transpose
+from .square import (
+    BLOCK_SIDE,
+    BLOCKS,
+    CHUNK,
+    FINAL,
+    INLINE,
+    OPTIONS,
+    PIXELS,
+    STATE,
+    View,
+    aligned,
+    square_box,
+    start_square,
+)
+
+FEW, SIXTEEN = narrow.FEW, (0,) * LANES
+"""A block's pixels, or as many channels."""
+
+
+@njit(**INLINE)
+def _rank_block(planes: Any, place: int, stride: int, channels: int, final: Any, ranked: Any, columns: Any) -> None:
+    """The best channels of a block's 16 pixels, the best first; of equal ones the lowest first.
+
+    Args:
+        planes: channel c of the pixels is the vector at place + c * stride.
+        place: see `planes`.
+        stride: see `planes`.
+        channels: how many there are, at least 1.
+        final: the pixels' transmittance: 1 where nothing was drawn, and the channels are then -1.
+        ranked: channels and sums [top * LANES] each, written; numbers of the data's type, exact below 2^24.
+        columns: [channels], how the channels are named.
+    """
+    names, values = ranked
+    drawn = final < 1
+    last, chosen = spread(planes, np.inf), spread(planes, -1)
+    for rank in range(0, len(names), LANES):
+        best, which = spread(planes, -np.inf), spread(planes, 0)
+        for k in range(channels):
+            value, channel = load(planes, place + k * stride), fetch(columns, k)
+            better = value > best
+            if rank > 0:  # what comes after the channel chosen before, by value, then by number
+                better = better & ((value < last) | ((value <= last) & (chosen < channel)))
+            best, which = select(better, value, best), select(better, channel, which)
+        store(names, rank, select(drawn, which, -1))
+        store(values, rank, select(drawn, best, 0))
+        last, chosen = best, which
+
+
+@njit(**INLINE)
+def _write_ranks(ranked: Any, final: Any, box: Any, block: int, images: Any, width: int) -> None:
+    """Labels, scores and alphas of a block's pixels, as far as they lie in the box."""
+    names, values = ranked
+    labels, scores, alphas = images
+    top = len(names) // LANES
+    left, up = box[0] + block % BLOCK_SIDE * BLOCK_SIDE, box[1] + block // BLOCK_SIDE * BLOCK_SIDE
+    for y in range(min(box[3] - up, BLOCK_SIDE)):
+        for x in range(min(box[2] - left, BLOCK_SIDE)):
+            pixel, lane = (up + y) * width + left + x, y * BLOCK_SIDE + x
+            put(alphas, pixel, 1 - final[lane])
+            for rank in range(top):
+                put(labels, pixel * top + rank, np.int64(names[rank * LANES + lane]))
+                put(scores, pixel * top + rank, values[rank * LANES + lane])
+
+
+@cached_njit(**OPTIONS)
+def find_candidates(band: int, bands: int, features: Any, channels: int, index: Any, masks: Any) -> None:
+    """The channels of which a Gaussian gives at least a fair share, as bits; all channels if it gives less than nothing.
+
+    A thousandth less than the fair share is enough: sums of up to 8,000 Gaussians do not round by more. A Gaussian that
+    gives nothing counts for the first channel, which wins where all are 0.
+
+    Args:
+        band: which share of the Gaussians.
+        bands: how many shares.
+        features: [N * D].
+        channels: D, at most 64.
+        index: [M], the features' row of each Gaussian; empty if row m belongs to Gaussian m.
+        masks: [M] uint64, written.
+    """
+    count = len(masks)
+    for m in range(count * band // bands, count * (band + 1) // bands):
+        at = (fetch(index, m) if len(index) else m) * channels
+        total, least = 0.0, 0.0
+        for channel in range(channels):
+            value = float(fetch(features, at + channel))
+            total += value
+            least = min(least, value)
+        share, mask = 0.999 * total / channels, np.uint64(0)
+        for channel in range(channels):
+            if fetch(features, at + channel) >= share:
+                mask |= np.uint64(1) << np.uint64(channel)
+        mask = mask if total > 0 else np.uint64(1)
+        masks[m] = mask if least == 0 and total < np.inf else ~np.uint64(0)
+
+
+@njit(**INLINE)
+def _gather_columns(masks: Any, order: Any, start: int, end: int, channels: int, columns: Any) -> int:
+    """Write the channels that may win among some Gaussians, in order; returns how many there are."""
+    mask = np.uint64(0)
+    for j in range(start, end):
+        mask |= fetch(masks, np.int64(fetch(order, j)))
+    count = 0
+    for channel in range(channels):
+        columns[count] = channel
+        count += np.int64((mask >> np.uint64(channel)) & np.uint64(1))  # type: ignore[assignment]
+    return count
+
+
+@cached_njit(**OPTIONS)
+def rank_narrow(
+    band: int, view: View, rows: Any, length: int, passes: Any, channels: int, masks: Any, images: Any
+) -> None:
+    """Rank the tiles of one band, with few channels.
+
+    Args:
+        band: which.
+        view: the tiles.
+        rows: packed Gaussians with their features.
+        length: of a packed row.
+        passes: from `plan_passes`.
+        channels: D.
+        masks: from `find_candidates`; empty: every channel may be among the best.
+        images: labels and scores [H * W * top] and alphas [H * W], written.
+    """
+    top = len(images[0]) // len(images[2])
+    state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
+    sums, weights = aligned(passes[2] * PIXELS, rows), aligned(CHUNK * LANES, rows)
+    hits, counts = np.empty(BLOCKS * CHUNK, np.int32), np.empty(BLOCKS, np.int32)
+    ranked = aligned(top * LANES, rows), aligned(top * LANES, rows)
+    every, some = np.arange(channels), np.zeros(channels + len(FEW), np.int64)
+    for tile in range(view.bounds[band], view.bounds[band + 1]):
+        start, end = view.offsets[tile], view.offsets[tile + 1]
+        few = _gather_columns(masks, view.order, start, end, channels, some) if len(masks) else channels
+        for square in range(view.across**2):
+            box = square_box(view, tile, square)
+            if box[0] >= box[2] or box[1] >= box[3]:
+                continue
+            dark = start_square(state, corners, box)
+            packed, span, scratch = (
+                (rows, length, view.order),
+                (start, end, start),
+                (corners, sums, weights, hits, counts),
+            )
+            if few <= len(FEW) < channels:
+                count, names = few, some
+                sums[: len(FEW) * PIXELS] = 0
+                four = some[0], some[1], some[2], some[3]
+                narrow.composite_square(packed, span, state, dark, (FEW, (), len(FEW)), scratch, None, four)
+            else:
+                count, names = channels, every
+                sums[:] = 0
+                narrow.composite_square(packed, span, state, dark, passes, scratch, None, None)
+            for block in range(BLOCKS):
+                p = block * LANES
+                _rank_block(sums, p, PIXELS, count, load(state, FINAL + p), ranked, names)
+                _write_ranks(ranked, state[FINAL + p : FINAL + p + LANES], box, block, images, view.width)
+
+
+@cached_njit(**OPTIONS)
+def rank_wide(
+    band: int, view: View, rows: Any, length: int, features: Any, begins: Any, channels: int, images: Any
+) -> None:
+    """As `rank_narrow`, with many channels: the Gaussians are packed without features.
+
+    The features are flat; the row that Gaussian m shows begins at `begins[m]`.
+    """
+    top, stride = len(images[0]) // len(images[2]), wide.padded_length(channels)
+    state, corners = aligned(STATE, rows), aligned(2 * BLOCKS, rows)
+    sums, planes = aligned(PIXELS * stride, rows), aligned(stride * LANES, rows)
+    kept = wide.make_kept(rows)
+    hits, counts = np.empty(BLOCKS * CHUNK, np.int32), np.empty(BLOCKS, np.int32)
+    ranked = aligned(top * LANES, rows), aligned(top * LANES, rows)
+    every = np.arange(channels)
+    for tile in range(view.bounds[band], view.bounds[band + 1]):
+        start, end = view.offsets[tile], view.offsets[tile + 1]
+        for square in range(view.across**2):
+            box = square_box(view, tile, square)
+            if box[0] >= box[2] or box[1] >= box[3]:
+                continue
+            dark = start_square(state, corners, box)
+            packed, source = (rows, length, view.order), (features, begins, channels)
+            scratch = corners, sums, kept, hits, counts
+            _, filled = wide.composite_square(packed, (start, end, start), state, dark, source, scratch, None)
+            for block in range(BLOCKS):
+                p = block * LANES
+                final = load(state, FINAL + p)
+                if (filled >> np.uint32(block)) & 1:
+                    for channel in range(0, stride, LANES):
+                        pixels = load_many(SIXTEEN, sums, p * stride + channel, stride)
+                        store_many(planes, channel * LANES, LANES, transpose(pixels))
+                _rank_block(planes, 0, LANES, channels, final, ranked, every)
+                _write_ranks(ranked, state[FINAL + p : FINAL + p + LANES], box, block, images, view.width)

@@ -1,0 +1,63 @@
+"""The benchmark of size against quality: what is stored, which field is scored, and the table and the picture of it."""
+
+import dataclasses
+
+import pytest
+import rate
+import torch
+from cases_packed import field
+
+from kfgs.fields.precision import SMALL
+
+
+class Room:
+    """Scores a field by the labels of its Gaussians instead of views, and remembers it."""
+
+    def __init__(self, made):
+        self.classes, self.seen = made.words, []
+
+    def score(self, found, text=None):
+        self.seen.append(found.classify(self.classes if text is None else text).labels)
+        return {"miou": 80.0, "accuracy": 90.0, "same": 100.0}
+
+
+@pytest.fixture(scope="module")
+def made():
+    whole = field("fused", n=500)
+    return dataclasses.replace(whole, gaussians=whole.gaussians.replace(labels=None))
+
+
+def test_every_format_carries_the_labels_of_the_field(made, tmp_path):
+    room = Room(made)
+    points = rate.carried(room, made, tmp_path)
+    assert [one.kind for one in points] == ["ply", "spz", "spz", "sog", "sog"]
+    plain, stored = room.seen[0], made.classify(room.classes).labels
+    assert torch.equal(plain, stored)  # PLY keeps every number
+    for labels in room.seen[1:]:  # SPZ and SOG may sort
+        assert torch.equal(labels[labels < 0], stored[stored < 0])
+        assert (labels[labels >= 0].bincount() - stored[stored >= 0].bincount()).abs().max() <= 5
+    sizes = {one.name: one.bytes for one in points}
+    assert sizes["SPZ, labels"] < sizes["SPZ + float16 latents"] < sizes["PLY, latents as columns"]
+
+
+def test_the_curve_falls_in_size_as_its_errors_grow(made, tmp_path):
+    points = rate.packed(Room(made), made, tmp_path)
+    assert [one.name for one in points[:5]] == ["folder", "lossless", "fine", "small", "tiny"]
+    curve = [one.bytes for one in points if one.kind == "curve"]
+    assert curve == sorted(curve, reverse=True)
+    assert len(curve) == len(rate.FACTORS)
+    assert rate.scaled(1) == SMALL
+    assert rate.scaled(100).degrees == 30
+    text = rate.table(points, len(made)).splitlines()
+    assert len(text) == len(points) + 2
+    assert text[-1].startswith("| folder |")
+    rate.plot(tmp_path / "rate.png", points)
+    assert (tmp_path / "rate.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_bytes_of_folders_and_files_are_added(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "x").write_bytes(bytes(3))
+    (tmp_path / "b").write_bytes(bytes(4))
+    assert rate.size_of(tmp_path / "a", tmp_path / "b") == 7
+    assert rate.quickest(lambda: 5)[0] == 5

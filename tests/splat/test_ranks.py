@@ -1,0 +1,155 @@
+"""Ranking channels while compositing: the same labels as the arg-max over the maps, which is the slow path here."""
+
+import pytest
+import torch
+from cases_splat import a_camera, gaussians_before, random_splats
+from messages import tells
+
+from kfgs.splat import Tiles, available_engines, bin_tiles, composite, rank_channels, rasterize, rasterize_labels
+from kfgs.splat.engines import ops
+
+ENGINES = [name for name in available_engines("cpu") if name != "triton"]
+DTYPES = [torch.float32, torch.float64]
+every_engine = pytest.mark.parametrize("engine", ENGINES)
+
+
+def ordered(maps, alphas, top):
+    """The largest channels, of equal ones the lowest first; -1 and 0 where nothing was drawn."""
+    scores, labels = maps.sort(dim=-1, descending=True, stable=True)
+    empty = (alphas <= 0)[..., None]
+    return labels[..., :top].masked_fill(empty, -1), scores[..., :top].masked_fill(empty, 0)
+
+
+def scene(channels, size=(24, 18), count=40, dtype=torch.float32, tile_size=16, rounded=False, **options):
+    projected, features = random_splats(count, *size, seed=3, dtype=dtype, channels=channels, **options)
+    features = features.round() if rounded else features
+    footprints = projected.means2d, projected.conics, projected.opacities
+    return footprints, features, bin_tiles(projected, *size, tile_size)
+
+
+def assert_ranked(footprints, features, tiles, engine, top, index=None):
+    found = rank_channels(*footprints, features, tiles, top=top, index=index, engine=engine)
+    maps, alphas = composite(*footprints, features, tiles, index=index, engine=engine)
+    labels, scores = ordered(maps, alphas, top)
+    assert found.labels.dtype == torch.int64
+    assert found.labels.equal(labels)
+    assert found.scores.equal(scores)  # to the bit
+    assert found.alphas.equal(alphas)
+    return found
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("channels", [1, 4, 5, 10, 11, 26, 27, 150])
+@every_engine
+def test_labels_are_those_of_the_maps_to_the_bit(engine, channels, dtype):
+    case = scene(channels, dtype=dtype)
+    for top in sorted({1, min(3, channels)}):
+        assert_ranked(*case, engine, top)
+
+
+@every_engine
+def test_a_thousand_classes(engine):
+    found = assert_ranked(*scene(1000, size=(20, 9), count=25), engine, 1)
+    assert len(found.labels.unique()) > 20
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 2), (17, 5), (33, 16), (50, 47)])
+@pytest.mark.parametrize("tile_size", [5, 16, 32])
+@pytest.mark.parametrize("channels", [3, 40])
+@every_engine
+def test_small_and_odd_pictures(engine, channels, tile_size, size):
+    assert_ranked(*scene(channels, size=size, tile_size=tile_size), engine, 2)
+
+
+@pytest.mark.parametrize("channels", [3, 20, 40])
+@every_engine
+def test_a_tie_goes_to_the_lowest_class(engine, channels):
+    """Whole numbers: many classes have the same sums. And all classes may be equal."""
+    footprints, features, tiles = scene(channels, rounded=True)
+    assert_ranked(footprints, features, tiles, engine, channels)
+    same = assert_ranked(footprints, torch.ones_like(features), tiles, engine, channels)
+    drawn = same.alphas > 0
+    assert same.labels[drawn].equal(torch.arange(channels).expand(int(drawn.sum()), -1))
+
+
+@pytest.mark.parametrize("channels", [3, 40])
+@every_engine
+def test_where_nothing_is_drawn(engine, channels):
+    found = assert_ranked(*scene(channels, size=(100, 40), count=3, sigma=(0.7, 2.0)), engine, 2)
+    empty = found.alphas == 0
+    assert 0.5 < empty.float().mean() < 1
+    assert (found.labels[empty] == -1).all()
+    assert (found.scores[empty] == 0).all()
+    nobody = assert_ranked(*scene(channels, count=0), engine, 1)
+    assert (nobody.labels == -1).all()
+
+
+@pytest.mark.parametrize("channels", [3, 40])
+@every_engine
+def test_negative_scores_win_where_there_are_no_others(engine, channels):
+    footprints, features, tiles = scene(channels)
+    found = assert_ranked(footprints, -features.abs() - 1, tiles, engine, 1)
+    assert (found.scores[found.alphas > 0] < 0).all()
+
+
+@every_engine
+def test_gaussians_that_share_a_row_of_scores(engine):
+    footprints, features, tiles = scene(30)
+    index = torch.arange(40) % 7
+    assert_ranked(footprints, features[:9].contiguous(), tiles, engine, 2, index)
+
+
+def test_threads_and_repetition_change_nothing():
+    camera = a_camera(320, 200, focal=(200.0, 190.0), principal=(150.0, 90.0), dtype=torch.float32)
+    gaussians = gaussians_before(camera, 3000, seed=1, channels=18)
+    threads = torch.get_num_threads()
+    found = []
+    try:
+        for number in (1, 2, 2):
+            torch.set_num_threads(number)
+            found.append(rasterize_labels(gaussians, camera, top=2))
+    finally:
+        torch.set_num_threads(threads)
+    for other in found[1:]:
+        assert all(one.equal(two) for one, two in zip(found[0], other, strict=True))
+
+
+@every_engine
+def test_from_gaussians_and_a_camera(engine):
+    camera = a_camera(dtype=torch.float32)
+    gaussians = gaussians_before(camera, 60, seed=5, channels=9)
+    gaussians.features.requires_grad_()
+    found, seen = rasterize_labels(gaussians, camera, top=4, engine=engine), rasterize(gaussians, camera, engine=engine)
+    labels, scores = ordered(seen.map, seen.alpha, 4)
+    assert found.labels.equal(labels)
+    assert found.scores.equal(scores)
+    assert not found.scores.requires_grad
+    near = rasterize_labels(gaussians, camera, engine=engine, near=5.0)
+    assert near.alphas.equal(rasterize(gaussians, camera, engine=engine, near=5.0).alpha)
+
+
+@pytest.mark.skipif("numba" not in ENGINES, reason="needs numba")
+def test_operator_passes_opcheck():
+    footprints, features, tiles = scene(5)
+    background, index = torch.zeros(5), torch.arange(40)
+    arguments = (*footprints, features, background, index, *tiles, 2, "numba")
+    torch.library.opcheck(ops.rank, arguments, test_utils=("test_schema", "test_faketensor"))
+
+
+@pytest.mark.parametrize("top", [0, 6, 1.5])
+def test_top_out_of_range(top):
+    footprints, features, tiles = scene(5)
+    with pytest.raises((ValueError, TypeError), match=tells("top:", "5" if top == 6 else "")):
+        rank_channels(*footprints, features, tiles, top=top)
+
+
+def test_what_does_not_fit_is_refused():
+    footprints, features, tiles = scene(5)
+    with pytest.raises(ValueError, match=tells("features", "[M, D]")):
+        rank_channels(*footprints, features[:3], tiles)
+    with pytest.raises(ValueError, match=tells("tiles.rows:", "40", "bin the tiles again")):
+        rank_channels(*footprints, features, Tiles(tiles.rows + 40, *tiles[1:]))
+    camera = a_camera(dtype=torch.float32)
+    gaussians = gaussians_before(camera, 3, seed=5)
+    with pytest.raises(ValueError, match=tells("gaussians:", "scores", "got None", "replace")):
+        rasterize_labels(gaussians.replace(features=None, sh=torch.zeros(3, 1, 3)), camera)

@@ -1,0 +1,27 @@
+"""The labels' benchmark: one run of its smallest case, in which old and new labels are equal."""
+
+import importlib
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+if not (BENCHMARKS / "labels.py").is_file():  # a source distribution comes without them
+    pytest.skip(f"no folder {BENCHMARKS}", allow_module_level=True)
+pytest.importorskip("numba", reason="the kernels need `pip install numba`")
+
+
+def test_quick_run(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.setattr(sys, "argv", ["labels.py", "--quick"])
+    importlib.import_module("labels").main()
+    rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("| ")][1:]
+    assert [row[0] for row in rows] == [
+        "| label map",
+        "| label map, another text each time",
+        "| text query, score of each pixel",
+        "| 5 best classes",
+        "| exact decode",
+    ]
+    assert [row[-1] for row in rows if "query" not in row[0]] == ["yes |"] * 4
