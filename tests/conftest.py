@@ -1,8 +1,10 @@
 """Shared fixtures: where the real data lies, and a headless-safe environment for every test."""
 
+import faulthandler
 import gc
 import os
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -25,6 +27,17 @@ def pytest_collection_finish():
     gc.collect()
     gc.freeze()
     gc.enable()
+
+
+@pytest.fixture(autouse=True)
+def a_crash_says_where(pytestconfig):
+    """pycolmap, when loaded, takes over pytest's handler of a segfault, and its message is lost in what pytest captures."""
+    if "pycolmap" in sys.modules and not hasattr(pytestconfig, "kfgs_crashes"):
+        capture = pytestconfig.pluginmanager.getplugin("capturemanager")
+        with capture.global_and_fixture_disabled():
+            pytestconfig.kfgs_crashes = os.dup(2)
+        faulthandler.disable()
+        faulthandler.enable(pytestconfig.kfgs_crashes)
 
 
 def pytest_unconfigure():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 import os
 import subprocess
 import sys
@@ -120,10 +121,20 @@ def make_plotter(
     load_compilers()
     import pyvista as pv
 
+    free_closed_windows()
     options: dict[str, Any] = {"shape": shape} if shape != (1, 1) else {}
     plotter = pv.Plotter(off_screen=hidden, window_size=(width, height), **options)
     plotter.set_background(background)
     return plotter
+
+
+def free_closed_windows() -> None:
+    """Free closed windows now, to avoid a segfault.
+
+    pyvista's plotters lie in reference cycles. If Python's garbage collector frees the objects of a closed window between
+    two renders of another one, Mesa's software driver can crash at the next render.
+    """
+    gc.collect()
 
 
 @functools.cache

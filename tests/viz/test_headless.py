@@ -1,9 +1,12 @@
+import gc
 import os
 import subprocess
 import sys
+import weakref
 from types import SimpleNamespace
 
 import pytest
+from cases_window import an_explorer
 from messages import tells
 
 from kfgs.viz import available, headless, make_plotter
@@ -223,3 +226,19 @@ for entry in (
     done = run_bare(program, **hidden)
     assert (done.returncode, done.stderr) == (0, ""), done.stderr
     assert done.stdout == "True True\n" * 5
+
+
+@pytest.mark.skipif(not available(), reason=headless.probe().reason)
+def test_a_closed_window_is_freed_before_the_next_is_made():
+    """Freed between two renders of the next one, it has crashed Mesa."""
+    gc.disable()
+    try:
+        with an_explorer() as explorer:
+            explorer.screenshot()
+            window = weakref.ref(explorer.plotter)
+        del explorer
+        assert window() is not None  # a cycle: else this test would not show anything
+        make_plotter(20, 30, off_screen=True).close()
+        assert window() is None
+    finally:
+        gc.enable()
