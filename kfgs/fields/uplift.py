@@ -65,8 +65,8 @@ class UpliftConfig:
 
     @staticmethod
     def field(**changes: Any) -> UpliftConfig:
-        """At most 30,000 Gaussians, as in the paper's semantic fields, with changes."""
-        return UpliftConfig(**({"max_gaussians": 30_000} | changes))
+        """At most 50,000 Gaussians, with changes. 30,000 (as in the paper) cost 0.4 mIoU on room_0 and 1.3 on the toy room."""
+        return UpliftConfig(**({"max_gaussians": 50_000} | changes))
 
 
 @dataclass(frozen=True, eq=False)
