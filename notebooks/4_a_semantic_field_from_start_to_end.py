@@ -116,7 +116,7 @@ Image.fromarray(viz.picture_grid([[image, drawn]], ("unseen view", "colour field
 # `fit_scene` gives each Gaussian the mean of the teacher's features at the pixels that show it, weighted by how much of
 # each pixel it fills, and subtracts what its neighbours have added to those pixels. A wrong patch in one view is outvoted
 # by the other views *before* anything is compressed. Only then are the 512 channels kept as a few **latents**, numbers that
-# are linear in the feature. Gaussians that fill less than half a pixel are dropped, and where more than 30,000 are left,
+# are linear in the feature. Gaussians that fill less than half a pixel are dropped, and where more than 50,000 are left,
 # those with similar features are merged. Nothing is trained here: seconds, not minutes. `uplift` is the same with every
 # Gaussian kept, for a splat that is to stay as it is.
 

@@ -23,6 +23,7 @@ from .._files import atomic_folder, digest_file, digest_value, read_json, write_
 from ..cameras import Camera
 from ..cameras.camera import NEAR
 from ..scenes import Scene
+from ..splat.engines.table import say_compiling
 
 STAGE_FILE = "stage.json"
 STAGE_VERSION = 2
@@ -97,7 +98,7 @@ class Run:
             start = time.perf_counter()
             for left_over in target.parent.glob(f".{target.name}.*"):  # of a process that was killed
                 shutil.rmtree(left_over, ignore_errors=True)
-            with atomic_folder(target) as temporary:
+            with atomic_folder(target) as temporary, say_compiling(self.say):
                 earlier = make(temporary) or 0.0
                 seconds = time.perf_counter() - start + earlier
                 about = {"name": name, "inputs": inputs, "seconds": seconds, "files": _sizes(temporary)}

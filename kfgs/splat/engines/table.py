@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
@@ -88,6 +88,19 @@ def _own_symbols() -> Iterator[None]:
             yield
         finally:
             sys.setdlopenflags(flags)
+
+
+@contextmanager
+def say_compiling(say: Callable[[str], None]) -> Iterator[None]:
+    """Say so when the CPU engine's kernels must be compiled: the first use on a machine waits for it, about a minute."""
+    if "numba" not in available_engines():
+        yield
+        return
+    load("numba")
+    from .cpu.cache import on_compile
+
+    with on_compile(lambda: say("compiling the CPU engine's kernels: about a minute, once on this machine")):
+        yield
 
 
 def choose(engine: str, device: str, dtype: torch.dtype) -> str:

@@ -166,3 +166,23 @@ def test_no_kernel_goes_around():
     files = [path for path in sorted(FILE.parent.glob("*.py")) if path != FILE]
     assert len(files) > 10
     assert [path.name for path in files if "cache=True" in path.read_text()] == []
+
+
+SORT = """
+import numpy as np
+from kfgs.splat.engines.table import say_compiling
+from kfgs.splat.engines.cpu.radix import sort_rows
+
+with say_compiling(print):
+    for kind in (np.uint32, np.uint64):  # two compilations, one line
+        sort_rows(np.arange(3, dtype=kind))
+"""
+
+
+def test_the_first_process_says_that_it_compiles(tmp_path):
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    said = [
+        subprocess.run([sys.executable, "-c", SORT], env=environment, capture_output=True, text=True, check=True).stdout
+        for _ in range(2)
+    ]
+    assert said == ["compiling the CPU engine's kernels: about a minute, once on this machine\n", ""]
