@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -196,6 +196,17 @@ class FeatureFolder(Sequence[Tensor]):
         rows, columns = grid_slices(*self.shape[:2], step, samples=samples)
         return self._read(i, rows, columns).reshape(-1, self.shape[2])
 
+    def blocks(self, i: int) -> Iterator[Tensor]:  # each [at most 32, w, D] float32
+        """Read a map a few rows at a time, which takes less memory than `maps[i]`.
+
+        Raises:
+            ValueError: as when the whole map is read.
+        """
+        stored = self._checked(i)
+        for block in read_rows(stored):
+            self._refuse_bad(i, count_bad(block))
+            yield block
+
     def digests(self) -> list[list[str]] | None:
         """[file name, SHA-256] of each view's map, or None if the caller should compute them from the files.
 
@@ -232,18 +243,25 @@ class FeatureFolder(Sequence[Tensor]):
             )
         return self._finder.open(stem, file, replace(self.reading, size=size))
 
-    def _read(self, i: int, rows: slice = slice(None), columns: slice = slice(None)) -> Tensor:  # [h, w, D]
-        """Some rows and columns of view i's map, if it has the size of the first and they are finite."""
-        stored, (h, w, D) = self._open(i), self.shape
+    def _checked(self, i: int) -> StoredMap:  # [h, w, D]
+        """View i's map on disk, if it has the size of the first."""
+        stored = self._open(i)
         if tuple(stored.shape) != self.shape:
             raise ValueError(
                 f"{self.files[i]}: expected a map of (h, w, D) = {self.shape} as in {self.files[0].name}, got "
                 f"{tuple(stored.shape)}; encode all views with the same settings"
             )
-        values = torch.empty(len(range(h)[rows]), len(range(w)[columns]), D, dtype=torch.float32)
-        bad = sum(count_bad(block) for block in read_rows(stored, rows, columns, out=values))
+        return stored
+
+    def _refuse_bad(self, i: int, bad: int) -> None:
         if bad:
             raise ValueError(
                 f"{self.files[i]}: expected finite features, got {bad} NaN or infinite values; encode it again"
             )
+
+    def _read(self, i: int, rows: slice = slice(None), columns: slice = slice(None)) -> Tensor:  # [h, w, D]
+        """Some rows and columns of view i's map, if it has the size of the first and they are finite."""
+        stored, (h, w, D) = self._checked(i), self.shape
+        values = torch.empty(len(range(h)[rows]), len(range(w)[columns]), D, dtype=torch.float32)
+        self._refuse_bad(i, sum(count_bad(block) for block in read_rows(stored, rows, columns, out=values)))
         return values

@@ -18,6 +18,7 @@ from ..cameras import Camera
 from ..cameras.resample import from_bchw, to_bchw
 from ..quant import FeatureMaps
 from ..quant.linear import principal_directions
+from ..quant.maps import read_blocks
 from ..quant.sampling import sample_grid
 
 WORKING = 64
@@ -104,15 +105,9 @@ class WorkingMaps:
             return rows, torch.from_numpy(found["shape"]).double()
 
     def _make(self, i: int) -> tuple[Tensor, tuple[int, int]]:  # [h, w, d']
-        """Read a map, take unit features in the working directions, and shrink it to its working size."""
-        features = as_tensor(f"maps[{i}]", self._maps[i])
-        check_shapes((f"maps[{i}]", features, ("h", "w", len(self._directions))))
-        features = features.to(self._directions)
-        lengths = row_norms(features)
-        if not bool(torch.isfinite(lengths).all()):
-            raise ValueError(f"maps[{i}]: expected finite features, got NaN or infinity; encode that image again")
-        known = (lengths > EPS)[..., None]
-        rows = (features @ self._directions) / lengths.clamp_min(EPS)[..., None] * known
+        """Read a map in the working directions, and shrink it to its working size."""
+        found = [self._to_directions(i, block) for block in read_blocks(self._maps, i)]
+        rows, known = (torch.cat(parts) for parts in zip(*found, strict=True))
         height, width = rows.shape[:2]
         shrink = 1
         while (height // shrink) * (width // shrink) > self._pixels and shrink < min(height, width):
@@ -121,6 +116,16 @@ class WorkingMaps:
             rows, share = shrink_map(rows, shrink), shrink_map(known.to(rows), shrink)
             rows, known = rows / share.clamp_min(EPS), share > 0.5
         return torch.where(known, rows, torch.nan).contiguous(), (height, width)
+
+    def _to_directions(self, i: int, block: Tensor) -> tuple[Tensor, Tensor]:  # [r, w, D] -> [r, w, d'], [r, w, 1]
+        """Some rows of a map as unit features in the working directions, and which of them are known."""
+        check_shapes((f"maps[{i}]", block, ("h", "w", len(self._directions))))
+        features = block.to(self._directions)
+        lengths = row_norms(features)
+        if not bool(torch.isfinite(lengths).all()):
+            raise ValueError(f"maps[{i}]: expected finite features, got NaN or infinity; encode that image again")
+        known = (lengths > EPS)[..., None]
+        return (features @ self._directions) / lengths.clamp_min(EPS)[..., None] * known, known
 
 
 def working_directions(maps: FeatureMaps) -> Tensor:  # [D, d']

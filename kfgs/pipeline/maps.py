@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,6 +14,7 @@ from torch import Tensor
 from .._check import as_tensor
 from .._rows import EPS, row_norms
 from ..cameras import Camera, undistort
+from ..quant.maps import read_blocks
 from ..quant.sampling import SAMPLES, sample_grid
 from .stages import Run, describe_lens, digest_tensors
 
@@ -21,9 +22,9 @@ from .stages import Run, describe_lens, digest_tensors
 class Maps(Protocol):
     """Teacher maps, one per view, read at each access; an all-zero feature means "unknown".
 
-    Four more members are used if they exist: `identity`, JSON of the teacher; `digests() -> list[list[str]] | None`, a digest
-    of each map if known without reading the files; `shape`, (h, w, D) without reading values; and `grid(i, step, samples)`,
-    see `fit_codebook`.
+    Five more members are used if they exist: `identity`, JSON of the teacher; `digests() -> list[list[str]] | None`, a digest
+    of each map if known without reading the files; `shape`, (h, w, D) without reading values; `grid(i, step, samples)`, see
+    `fit_codebook`; and `blocks(i)`, the map a few rows at a time.
     """
 
     @property
@@ -86,6 +87,11 @@ class UndistortedMaps:
             change, key = partial(self._straighten, i), describe_lens(lens)
             return self.maps.grid_after(i, step, samples, change=change, key=key)  # type: ignore[no-any-return]
         return sample_grid(self[i], step, samples=samples)
+
+    def blocks(self, i: int) -> Iterator[Tensor]:  # each [at most 32, w, D]
+        """The map a few rows at a time; a view with distortion is whole in memory."""
+        lens = self.lenses[i]
+        return read_blocks(self.maps, i) if lens.distortion is None else iter(self[i].split(32))
 
     def _straighten(self, i: int, features: Tensor) -> Tensor:  # [h, w, D] -> [h, w, D]
         lens = self.lenses[i].resized(int(features.shape[0]), int(features.shape[1]))

@@ -7,7 +7,7 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -213,6 +213,9 @@ class _FewMaps(Sequence[Tensor]):
 
     def grid(self, i: int, step: tuple[int, int] | None, samples: int) -> Tensor:  # [n, D]
         return self._maps.grid(self._chosen[i], step, samples)
+
+    def blocks(self, i: int) -> Iterator[Tensor]:  # each [at most 32, w, D]
+        return self._maps.blocks(self._chosen[i])
 
 
 class PeakMemory:

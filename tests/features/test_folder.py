@@ -474,3 +474,27 @@ def test_stems_may_come_from_any_iterable(tmp_path):
         np.save(tmp_path / f"{stem}.npy", features(i).numpy())
     for stems in (("b", "a"), {"b": 1, "a": 2}, (stem for stem in "ba")):
         assert FeatureFolder(tmp_path, stems).stems == ["b", "a"]
+
+
+@pytest.mark.parametrize("layout", ["pt", "npy", "safetensors"])
+def test_blocks_are_the_map_and_never_the_whole(tmp_path, layout):
+    want = features(4, (70, 50, 8))
+    save_any(tmp_path, "a", layout, want)
+    maps = FeatureFolder(tmp_path, ["a"])
+    blocks = [block.clone() for block in maps.blocks(0)]
+    assert [len(block) for block in blocks] == [32, 32, 6]
+    assert torch.equal(torch.cat(blocks), maps[0])
+    want[50, 3, 2] = torch.inf
+    save_any(tmp_path, "a", layout, want)
+    read = FeatureFolder(tmp_path, ["a"]).blocks(0)
+    next(read)
+    with pytest.raises(ValueError, match=tells("a", "finite", "got 1 NaN")):
+        next(read)
+
+
+def test_blocks_of_a_map_of_another_size_are_refused(tmp_path):
+    for name, size in (("a", (4, 5, 8)), ("b", (5, 4, 8))):
+        save_any(tmp_path, name, "npy", features(4, size))
+    maps = FeatureFolder(tmp_path, ["a", "b"])
+    with pytest.raises(ValueError, match=tells("b.npy:", "(4, 5, 8)", "got (5, 4, 8)")):
+        next(maps.blocks(1))

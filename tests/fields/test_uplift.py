@@ -484,6 +484,35 @@ def test_gaussians_that_fill_little_of_the_views_are_pointed_out():
     assert any("of the views; are they in the cameras' frame?" in line for line in lines)
 
 
+class InBlocks:
+    """Maps that are read a few rows at a time, and never whole."""
+
+    def __init__(self, maps):
+        self.maps = maps
+
+    def __len__(self):
+        return len(self.maps)
+
+    def __getitem__(self, i):
+        raise AssertionError("a whole map was read")
+
+    def grid(self, i, step, samples):
+        return self.maps[i].reshape(-1, self.maps[i].shape[-1])
+
+    def blocks(self, i):
+        return iter(self.maps[i].split(3))
+
+
+def test_maps_that_are_read_in_blocks_give_the_same():
+    maps = random_maps(cameras())
+    maps[1][2:4] = 0  # unknown
+    whole, parts = (uplift_maps(cloud(), cameras(), given, PLAIN) for given in (maps, InBlocks(maps)))
+    torch.testing.assert_close(parts.gaussians.features, whole.gaussians.features)
+    maps[2][9, 0, 1] = torch.nan
+    with pytest.raises(ValueError, match=tells("maps[2]:", "got NaN")):
+        uplift_maps(cloud(), cameras(), InBlocks(maps), PLAIN)
+
+
 # Wrong input
 
 
@@ -522,7 +551,7 @@ def test_options_are_checked():
         with pytest.raises(ValueError, match=tells(f"{name}:", f"got {value}")):
             UpliftConfig(**{name: value})
     assert UpliftConfig().max_gaussians is None
-    assert UpliftConfig.field() == UpliftConfig(max_gaussians=30_000)
+    assert UpliftConfig.field() == UpliftConfig(max_gaussians=50_000)
     assert UpliftConfig.field(max_gaussians=7, keep=0.9) == UpliftConfig(max_gaussians=7, keep=0.9)
 
 

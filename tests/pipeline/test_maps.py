@@ -40,6 +40,15 @@ def test_without_distortion_a_map_is_left_alone():
     assert UndistortedMaps(_Maps([features]), [_lens(160, 120, None)])[0] is features
 
 
+def test_blocks_are_the_undistorted_map():
+    features = torch.rand(70, 40, 5, generator=torch.Generator().manual_seed(0)) + 0.5
+    maps = UndistortedMaps(_Maps([features, features]), [_lens(160, 280), _lens(160, 280, None)])
+    for i in range(2):
+        blocks = list(maps.blocks(i))
+        assert [len(block) for block in blocks] == [32, 32, 6]
+        assert torch.equal(torch.cat(blocks), maps[i])
+
+
 def test_unknown_pixels_become_nan_and_nothing_else_changes():
     features = torch.ones(2, 2, 3)
     features[0, 1] = 0
