@@ -1,8 +1,10 @@
-"""How much memory and time do 90 maps of 360 x 480 x 512 take, from pictures to index maps?
+"""How much memory and time do 90 maps of 360 x 480 x 512 take, from pictures to index maps, or to a field?
 
     python benchmarks/streaming.py SCENE [--images 90] [--size 360 480] [--channels 512] [--epochs 28] [--folder DIR]
+        [--splat PLY]
 
-With --epochs, the codebook is fitted as in the paper, in so many epochs.
+With --epochs, the codebook is fitted as in the paper, in so many epochs. With --splat, the maps are also fused onto that file's
+Gaussians, merged and compressed, as `kfgs fit --splat` does by default.
 
 Each stage runs in a process of its own, whose highest resident memory is what Linux says (VmHWM): writing the maps with
 `extract_features`, fitting the codebook, making the index maps. The teacher is a seeded random matrix on smoothed
@@ -26,10 +28,15 @@ import torch
 
 from kfgs.cameras import resize_map
 from kfgs.features import FeatureFolder, Picture, extract_features, pictures_of
+from kfgs.fields import UpliftConfig
+from kfgs.formats import read_splats
+from kfgs.pipeline.fuse import uplift_stage
+from kfgs.pipeline.maps import map_digests
+from kfgs.pipeline.stages import Run
 from kfgs.quant import Codebook, CodebookConfig, fit_codebook, quantize_maps
 from kfgs.scenes import load_scene
 
-STAGES = ("start", "extract", "codebook", "index maps")
+STAGES = ("start", "extract", "codebook", "index maps", "uplift")
 
 
 class RandomTeacher:
@@ -63,6 +70,7 @@ def main() -> None:
     parser.add_argument("--channels", type=int, default=512)
     parser.add_argument("--epochs", type=int, help="fit the codebook as in the paper, in so many epochs")
     parser.add_argument("--folder", type=Path, help="where the maps go, and stay; a temporary folder if not given")
+    parser.add_argument("--splat", type=Path, help="also fuse the maps onto these Gaussians")
     parser.add_argument("--json", type=Path, help="also write the numbers here")
     parser.add_argument("--stage", choices=STAGES, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -71,7 +79,7 @@ def main() -> None:
         return
     with tempfile.TemporaryDirectory(prefix="kfgs_streaming_") as temporary:
         args.folder = args.folder or Path(temporary)
-        rows = [run_apart(args, stage) for stage in STAGES]
+        rows = [run_apart(args, stage) for stage in STAGES if stage != "uplift" or args.splat]
     dense = args.images * args.size[0] * args.size[1] * args.channels * 2
     print(
         f"{args.images} maps of {args.size[0]} x {args.size[1]} x {args.channels}: {dense / 1e9:.2f} GB in half precision"
@@ -85,7 +93,7 @@ def main() -> None:
 
 def run_apart(args: argparse.Namespace, stage: str) -> dict[str, Any]:
     """One stage in a fresh process."""
-    size, options = map(str, args.size), ("images", "channels", "epochs", "folder")
+    size, options = map(str, args.size), ("images", "channels", "epochs", "folder", "splat")
     command = [sys.executable, __file__, str(args.scene), "--stage", stage, "--size", *size]
     given = [name for name in options if getattr(args, name) is not None]
     command += [text for name in given for text in (f"--{name}", str(getattr(args, name)))]
@@ -97,7 +105,10 @@ def run_apart(args: argparse.Namespace, stage: str) -> dict[str, Any]:
 def run_stage(args: argparse.Namespace) -> dict[str, Any]:
     """One stage in this process: its name, seconds, peak memory in bytes, and a word about the result."""
     start = time.perf_counter()
-    work = {"start": lambda args: "imports alone", "extract": extract, "codebook": codebook, "index maps": index_maps}
+    work = {
+        "start": lambda args: "imports alone", "extract": extract, "codebook": codebook, "index maps": index_maps,
+        "uplift": uplift,
+    }  # fmt: skip
     note = work[args.stage](args)
     return {"stage": args.stage, "seconds": time.perf_counter() - start, "peak": highest_memory(), "note": note}
 
@@ -125,6 +136,21 @@ def index_maps(args: argparse.Namespace) -> str:
     found = quantize_maps(FeatureFolder(args.folder / "maps"), book, progress=True)
     found.save(args.folder / "index_maps.safetensors")
     return f"{found.nbytes / 1e6:.1f} MB"
+
+
+def uplift(args: argparse.Namespace) -> str:
+    """Maps and Gaussians to a field."""
+    scene, maps = load_scene(args.scene).undistorted(), FeatureFolder(args.folder / "maps")
+    cameras = [scene.cameras[i % len(scene.cameras)] for i in range(len(maps))]
+    run, config = Run(args.folder / "run", print_line), UpliftConfig.field()
+    inputs = {"features": {"files": map_digests(run, maps)}, "config": {}, "seed": 0}
+    field = uplift_stage(run, read_splats(args.splat).gaussians, cameras, maps, config, inputs, True)
+    return f"{len(field.gaussians)} Gaussians, {field.gaussians.features.shape[1]} latents"
+
+
+def print_line(text: str) -> None:
+    """Say what happens beside the bar."""
+    print(text, file=sys.stderr)
 
 
 def highest_memory() -> int:

@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 from small_room import make_room
 
+from kfgs.fields import GaussianParams
+from kfgs.formats import write_splats
 from kfgs.quant import IndexMaps
+from kfgs.scenes import load_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 if not (ROOT / "benchmarks" / "streaming.py").is_file():  # a source distribution comes without them
@@ -30,14 +33,31 @@ def test_each_stage_is_measured_and_the_maps_stay_only_where_asked(tmp_path, mon
 
     monkeypatch.setattr(streaming, "run_apart", run)
     scene, table = make_room(tmp_path / "scene"), tmp_path / "table.json"
-    options = ["--images", "11", "--size", "12", "16", "--channels", "7", "--epochs", "2", "--json", str(table)]
+    read = load_scene(scene)
+    splat = GaussianParams.from_points(read.points, colors=read.colors, sh_degree=0).activated()
+    write_splats(tmp_path / "splat.ply", splat)
+    options = [
+        "--splat",
+        str(tmp_path / "splat.ply"),
+        "--images",
+        "11",
+        "--size",
+        "12",
+        "16",
+        "--channels",
+        "7",
+        "--epochs",
+        "2",
+        "--json",
+        str(table),
+    ]
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr(streaming.tempfile, "tempdir", str(tmp_path / "temporary"))
     monkeypatch.setattr("sys.argv", ["streaming.py", str(scene), *options, "--folder", str(tmp_path / "kept")])
     streaming.main()
     found = json.loads(table.read_text())
     assert found["dense_bytes"] == 11 * 12 * 16 * 7 * 2
-    assert [row["stage"] for row in found["stages"]] == ["start", "extract", "codebook", "index maps"]
+    assert [row["stage"] for row in found["stages"]] == ["start", "extract", "codebook", "index maps", "uplift"]
     assert 5e7 < found["stages"][0]["peak"] < 2e9
     assert len(list((tmp_path / "kept" / "maps").glob("*.npy"))) == 11  # more than the room has pictures
     maps = IndexMaps.load(tmp_path / "kept" / "index_maps.safetensors")
