@@ -18,9 +18,11 @@ if TYPE_CHECKING:  # only a type here: any object with its encode and decode wor
 
 Decode = Literal["exact", "latent"]
 
+Layers = tuple[tuple[Tensor, Tensor], ...]  # weight [out, in], bias [out] of each
+
 LEAD = 1e-4
 """Of the best codeword's score. Sums of a decoder's 1,000 products in another order differ by about 1e-6 of it (float32); where
-codewords of two classes are nearer to each other, the pixel is decoded in full."""
+codewords of two classes are nearer to each other, the plain computation decides."""
 
 
 def label_pixels(
@@ -75,13 +77,16 @@ def label_pixels(
                 labels[part] = classify(_decoded(rows[part], autoencoder), embeddings).labels
             return labels.reshape(shape)
         table = _table(codebook, codeword_labels).to(rows.device)
-        centres = autoencoder.encode(codebook.codewords) if autoencoder is not None and decode == "latent" else None
-        if autoencoder is not None and decode == "exact" and _can_decide(rows, autoencoder):
-            labels[which], unsure = _decide(rows[which], table, codebook, autoencoder)
+        centres = None
+        if autoencoder is not None and decode == "latent":
+            centres = autoencoder.encode(codebook.codewords).to(rows)
+        layers = None if autoencoder is None else _score_layers(rows, codebook, autoencoder, centres)
+        if layers is not None:
+            labels[which], unsure = _decide(rows[which], table, layers)
             which = which[unsure]
         for part in which.split(chunk):
             if centres is not None:
-                labels[part] = table[nearest_codeword(rows[part], centres.to(rows))]
+                labels[part] = table[nearest_codeword(rows[part], centres)]
             else:
                 features = _decoded(rows[part], autoencoder)
                 found = table[codebook.quantize(features)]
@@ -89,25 +94,43 @@ def label_pixels(
     return labels.reshape(shape)
 
 
-def _decide(rows: Tensor, table: Tensor, codebook: Codebook, autoencoder: Autoencoder) -> tuple[Tensor, Tensor]:
-    """Labels of decoded latents without decoding them: [n] int64, and which of them are not sure, [n] bool.
+def _score_layers(
+    rows: Tensor,  # [n, d]
+    codebook: Codebook,
+    autoencoder: Autoencoder,
+    centres: Tensor | None,  # [K, d] the codewords' latents, if the nearest of them is wanted
+) -> Layers | None:
+    """Linear layers whose largest output is the codeword of a latent; None if no engine evaluates them for these rows.
 
     With a decoder W h + b and unit codewords C, argmax over C (W h + b) / |W h + b| is argmax over (C W) h + C b: one layer
-    in place of the last one and of the comparison. Sums in another order differ by rounding. So labels are sure only where the
-    best codeword leads those of other classes by more than LEAD.
+    in place of the last one and of the comparison. The nearest latent is argmax over 2 c·x - |c|^2, to which a constant is added
+    that makes the largest output positive.
     """
-    weight, bias = autoencoder.decoder[-1]
+    if rows.dtype not in (torch.float32, torch.float64) or not offers(_engine(rows), "decide"):
+        return None
+    if centres is not None:
+        squares = centres.square().sum(dim=-1)
+        return ((2 * centres, 2 * squares.max() - squares),)
+    decoder = getattr(autoencoder, "decoder", ())
+    if not decoder or decoder[0][0].dtype != rows.dtype:
+        return None
+    weight, bias = decoder[-1]
     unit = codebook.unit.to(rows)
-    layers = (*autoencoder.decoder[:-1], (unit @ weight, unit @ bias))
-    winners, leads = load(choose("auto", rows.device.type, rows.dtype)).decide(layers, table, rows)
+    return *decoder[:-1], (unit @ weight, unit @ bias)
+
+
+def _decide(rows: Tensor, table: Tensor, layers: Layers) -> tuple[Tensor, Tensor]:
+    """Labels of latents [n] int64, and which of them are not sure, [n] bool.
+
+    Sums in another order differ by rounding. So labels are sure only where the best codeword leads those of other classes by
+    more than LEAD.
+    """
+    winners, leads = load(_engine(rows)).decide(layers, table, rows)
     return table[winners], ~(leads > LEAD)
 
 
-def _can_decide(rows: Tensor, autoencoder: Autoencoder) -> bool:
-    """Whether the decoder is one of layers, and an engine evaluates them for these rows."""
-    layers = getattr(autoencoder, "decoder", ())
-    known = layers and rows.dtype in (torch.float32, torch.float64) and rows.dtype == layers[0][0].dtype
-    return bool(known) and offers(choose("auto", rows.device.type, rows.dtype), "decide")
+def _engine(rows: Tensor) -> str:
+    return choose("auto", rows.device.type, rows.dtype)
 
 
 def nearest_codeword(

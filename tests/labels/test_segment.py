@@ -6,7 +6,7 @@ import torch
 from messages import tells
 from oracles_labels import most_similar
 
-from kfgs.labels import label_codewords, label_pixels, nearest_codeword
+from kfgs.labels import label_codewords, label_pixels, nearest_codeword, segment
 from kfgs.quant import Autoencoder
 from kfgs.quant.codebook import Codebook
 
@@ -166,6 +166,25 @@ def test_pixels_between_two_classes_are_decoded_in_full(monkeypatch):
     decoded.clear()
     assert label_pixels(latents, codebook, torch.arange(12) % 6, autoencoder).equal(expected % 6)
     assert sum(decoded) < 100  # twins of one class need no decision
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("spread", [0.01, 1.0, 1e4])
+def test_nearest_latents_are_those_of_the_plain_comparison(monkeypatch, spread, dtype):
+    """Near the codewords, between them, and far outside, where scores are large and nearly equal."""
+    g, compared = torch.Generator().manual_seed(4), []
+    autoencoder = decoder().to(dtype)
+    codebook = Codebook(autoencoder.decode(torch.rand(40, d, generator=g).to(dtype)))
+    centres = autoencoder.encode(codebook.codewords)
+    table = torch.arange(40) % 7
+    latents = centres[torch.randint(40, (5000,), generator=g)] + spread * torch.randn(5000, d, generator=g).to(dtype)
+    latents[0], latents[1] = torch.nan, (centres[3] + centres[4]) / 2
+    expected = table[nearest_codeword(latents, centres)]
+    plain = segment.nearest_codeword
+    monkeypatch.setattr(segment, "nearest_codeword", lambda x, c: compared.append(len(x)) or plain(x, c))
+    assert label_pixels(latents, codebook, table, autoencoder, decode="latent").equal(expected)
+    assert sum(compared) < 2500 if spread < 1e4 else sum(compared) <= 5000
+    assert len(expected.unique()) > 4
 
 
 def test_latents_that_decode_to_nothing_have_no_label():
