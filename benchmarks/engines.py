@@ -24,7 +24,7 @@ peak is that of torch's float32 matrix product with as many threads, multiply an
   which taichi has for CUDA only; only its projection and harmonics run on a CPU;
 - warp-lang 1.19.0: installs and compiles for CPUs, but brings no rasteriser;
 - gaussian-splatting 2.11.0: wraps the CUDA rasterisers;
-- splatkit 0.1.0: trains through gsplat; nerfview 0.1.3: a viewer, which draws what it is given; brush in the index is a laboratory's
+- splatkit 0.1.0: trains through gsplat; nerfview 0.1.3: a viewer, without a rasteriser; `brush` in the index is a laboratory's
   logger, and the rasteriser of that name is a program in Rust without a package;
 - torch-splatting, opensplat, diff-gaussian-rasterization: not in the index. OpenSplat's CPU rasteriser needs a C++
   compiler and torch-splatting a checkout; `reference/engine.md` has what they took on such a machine.
