@@ -7,7 +7,7 @@ latents are differences to the nearest of the Gaussians that come shortly before
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,8 +22,12 @@ Array = NDArray[Any]
 Entry = dict[str, Any]
 DTYPES = {
     str(one).removeprefix("torch."): one
-    for one in (torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.int32, torch.bool)
+    for one in (
+        *(torch.float64, torch.float32, torch.float16, torch.bfloat16),
+        *(torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8, torch.bool),
+    )
 }
+"""What a file can hold."""
 LARGEST = 1 << 22
 """Most steps from zero: they stay exact in float32."""
 CELLS = (1 << 21) - 1
@@ -33,6 +37,10 @@ WINDOW = 16
 TURN = 2.1
 """Radians of a rotation per step of its x, y and z. Half a step of each moves (x, y, z) by sqrt(3) / 2 steps and w, which is at
 least 0.85 after `nearest_turn`, by 0.61 times as much: the quaternion by 1.02 steps, the rotation by twice that."""
+
+
+QR_MOST = 1 << 31
+"""Most rows x columns^2 of a basis that is rounded: its QR decomposition takes a second. 4,096 channels may have 724 latents."""
 
 
 class Coded(NamedTuple):
@@ -115,6 +123,11 @@ def encode_rows(values: Array, share: float, coding: str = "rows") -> Coded:  # 
     return Coded(coded.entry, steps.tobytes() + coded.plain)
 
 
+def qr_work(shape: Sequence[int]) -> int:
+    """What a QR decomposition costs: rows x columns^2."""
+    return shape[0] * shape[1] ** 2
+
+
 def plain_size(entry: Entry, shape: tuple[int, ...]) -> int:
     """The bytes that a coded tensor must have; a ValueError if the entry makes no sense. No memory is taken."""
     coding, numbers = entry["coding"], math.prod(shape)
@@ -129,6 +142,8 @@ def plain_size(entry: Entry, shape: tuple[int, ...]) -> int:
         raise ValueError(f"shape: expected [N, {columns}] for {coding}, got {shape}")
     if not 1 <= len(shape) <= 2 or (coding in ("rows", "basis", "near") and len(shape) != 2):
         raise ValueError(f"shape: expected that of rows for {coding}, got {shape}")
+    if coding == "basis" and qr_work(shape) > QR_MOST:
+        raise ValueError(f"shape: expected a basis that is quickly made orthonormal, got {shape}")
     stored = {"curve": numbers // 3, "turns": numbers // 4 * 3}.get(coding, numbers)
     steps = {"rows": shape[0], "basis": shape[-1]}.get(coding, 0)
     return stored * int(entry["width"]) + 4 * steps

@@ -64,7 +64,7 @@ class SemanticField:
     """The folder or file it was loaded from."""
 
     def __post_init__(self) -> None:
-        parts.check_parts(self.gaussians, self.codebook, self.autoencoder, self.linear, self.answers)
+        parts.check_parts(self.gaussians, self.codebook, self.autoencoder, self.linear, self.answers, self.seen)
 
     @property
     def features(self) -> Tensor:  # [N, d]
