@@ -240,7 +240,22 @@ class SemanticField:
         return self.rank(camera, classes, rule=rule).labels[..., 0]
 
     def rank(self, camera: Camera, classes: Classes | None = None, *, top: int = 1, rule: Rule = "fused") -> Ranked:
-        """The `top` best classes of each pixel by the rule of `segment`, and their scores; see `kfgs.fields.views`."""
+        """The `top` best classes of each pixel by the rule of `segment`, and their scores.
+
+        Args:
+            camera: any viewpoint.
+            classes: as in `segment`.
+            top: how many classes, from 1 to C.
+            rule: as in `segment`.
+
+        Returns:
+            Labels and scores [H, W, top], the best first; -1 and 0 where there is no class. And the opacity [H, W]. Scores are
+            blended votes, from 0 to 1; of a trained field with codewords, cosines of the pixel's codeword with the classes;
+            without codewords, by the rule `paper`, numbers that only compare the classes of one pixel.
+
+        Raises:
+            ValueError: as `segment`, and if `top` is out of range.
+        """
         check_choice("rule", rule, get_args(Rule))
         return rank_classes(self, camera, self._rows(classes), rule, top)
 
