@@ -68,7 +68,7 @@ def encode_exact(value: Tensor) -> Coded:
     return Coded({"coding": "exact", "dtype": str(value.dtype).removeprefix("torch."), "error": 0.0}, plain)
 
 
-def encode_means(means: Array, step: float) -> tuple[Coded, Place]:  # [N, 3], sorted by `sort_by_cell`
+def encode_means(means: Array, step: float) -> tuple[Coded, Place]:  # [N, 3], sorted by their Morton codes
     """The steps between Morton codes: after sorting, they hold little more than the set of positions."""
     origin = means.min(0) if len(means) else np.zeros(3)
     cells = np.round((means - origin) / step).astype(np.int64)
@@ -112,7 +112,7 @@ def encode_near(values: Array, share: float, place: Place) -> Coded:  # [N, d]
 
 
 def encode_rows(values: Array, share: float, coding: str = "rows") -> Coded:  # [K, D]
-    """Multiples of a step of its own for each row; the coding "basis" takes columns for rows."""
+    """Each row has its own step, and holds multiples of it. The coding "basis" treats columns so."""
     values = values.T if coding == "basis" else values
     rms = np.sqrt(np.square(values).mean(1)) if values.size else np.zeros(len(values))
     steps = np.maximum(share * math.sqrt(12) * rms, np.abs(values).max(1, initial=0) / LARGEST).astype("<f4")
@@ -166,7 +166,7 @@ def decode(entry: Entry, shape: tuple[int, ...], plain: bytes, place: Place | No
 
 
 def find_before(cells: Array) -> Place:  # [N, 3] int64
-    """The nearest of the `WINDOW` rows before each row; of equally near ones the latest. Whole numbers: the same everywhere."""
+    """The nearest of the `WINDOW` rows before each row; of equally near ones the latest. Exact on every machine."""
     N = len(cells)
     cells, best = np.ascontiguousarray(cells.T), np.full(N, np.iinfo(np.int64).max)
     before = np.full(N, N)

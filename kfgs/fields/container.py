@@ -49,7 +49,7 @@ LEVEL = 19  # of zstd: the best compression that takes only seconds
 HEADER, WORDS = 1 << 20, 8 << 20
 """Most bytes of a header, and of the description."""
 SPARE, RATIO = 64 << 20, 100
-"""A file may unpack to so many bytes, and as many times its own size. A cloud that compresses better is stored uncompressed."""
+"""A file may unpack to SPARE bytes plus RATIO times its own size. A cloud that compresses better is stored uncompressed."""
 EDGE = 1e-4
 """Unpacked opacities keep this distance from 0 and 1, as everywhere in kfgs."""
 HUGE = 1e37
@@ -130,7 +130,7 @@ def unpack_tensors(data: bytes, name: str) -> tuple[dict[str, Tensor], dict[str,
 
 
 def peek(head: bytes) -> dict[str, Any] | None:
-    """What the header of a file says: kind, version, precision, Gaussians. None if it is no packed field."""
+    """What the header of a file says: kind, version, precision, number of Gaussians. None if it is no packed field."""
     if len(head) < 8:
         return None
     (length,) = struct.unpack("<Q", head[:8])
@@ -255,13 +255,13 @@ def _bounded(name: str, value: Tensor, entry: Entry) -> Tensor:
 
 
 def _compress(plain: bytes) -> bytes:
-    """Compressed, or as they are if that is no longer."""
+    """Compress bytes; return them unchanged if that does not make them shorter."""
     packed = zstandard.ZstdCompressor(level=LEVEL).compress(plain)
     return packed if len(packed) < len(plain) else plain
 
 
 def _decompress(stream: bytes, size: int | None, most: int) -> bytes:
-    """The inverse of `_compress`: as they are if they have that size already."""
+    """The inverse of `_compress`: a stream of `size` bytes is not compressed. A ValueError for more than `most` bytes."""
     if size is not None and len(stream) == size:
         return stream
     found = zstandard.get_frame_parameters(stream).content_size

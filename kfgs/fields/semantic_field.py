@@ -329,8 +329,10 @@ class SemanticField:
             precision: of one file: "lossless" (the default), "fine", "small", "tiny" or your own `Rounding`. All but the first
                 sort the Gaussians, and note their errors in `info["rounded"]`.
 
-        A FileExistsError if there is something other than a field at `path`, a ValueError if `info` is not JSON, a number is not
-        finite, or a folder gets a precision.
+        Raises:
+            FileExistsError: if there is something other than a field at `path`.
+            ValueError: if `info` is not JSON, the precision is unknown, or a folder gets one. For one file also if a number is
+                not finite, an opacity lies outside [0, 1], a scale is negative, or a number is too large to be rounded.
         """
         save_field(path, vars(self), precision)
 

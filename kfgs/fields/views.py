@@ -113,7 +113,7 @@ def score_pixels(
         camera: any viewpoint.
         target: the name of a class, or an embedding [D].
         classes: as in `SemanticField.query`.
-        options: the keyword arguments of `SemanticField.query`.
+        options: the other keyword arguments of `SemanticField.query`, but no threshold.
 
     Returns:
         Scores [H, W, 1] (by default relevancies, above 0.5 where the target fits best) and alphas [H, W]. Labels are 0, and
