@@ -64,6 +64,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int)
     parser.add_argument("--quick", action="store_true", help="a tiny case, which only proves that it runs")
     args = parser.parse_args()
+    if args.classes < 5:
+        parser.error(f"--classes: expected at least 5, of which a row takes the best, got {args.classes}")
     if args.quick:
         args.size, args.gaussians, args.repeats = "48x32", 500, 2
     if args.threads:

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import traceback
+import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -163,6 +164,10 @@ def check_ranks(inputs: list[Tensor], index: Tensor | None, tiles: Tiles, *, tie
         distinct = labels.sort(dim=-1).values.diff(dim=-1) > 0
         facts[f"top {top}: each once"] = bool((distinct | ~drawn).all())
         facts[f"top {top}: alphas"] = largest(found.alphas.cpu().double() - alphas) <= 1e-5
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the interpreter's, about NaN
+        nothing = rank_channels(*inputs[:3], inputs[3] * torch.nan, tiles, index=index, engine="triton")
+    facts["no label out of range"] = bool((nothing.labels == -1).all())
     if ties:  # sums of halves, quarters and so on are exact
         same = rank_channels(*inputs[:3], torch.ones_like(inputs[3]), tiles, top=channels, index=index, engine="triton")
         facts["ties go to the lowest"] = torch.equal(

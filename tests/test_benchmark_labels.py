@@ -25,3 +25,11 @@ def test_quick_run(monkeypatch, capsys):
         "| exact decode",
     ]
     assert [row[-1] for row in rows if "query" not in row[0]] == ["yes |"] * 4
+
+
+def test_too_few_classes_for_its_rows_are_an_error_in_one_line(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.setattr(sys, "argv", ["labels.py", "--quick", "--classes", "3"])
+    with pytest.raises(SystemExit):
+        importlib.import_module("labels").main()
+    assert "--classes: expected at least 5" in capsys.readouterr().err

@@ -7,7 +7,7 @@ latents are differences to the nearest of the Gaussians that come shortly before
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,8 +22,12 @@ Array = NDArray[Any]
 Entry = dict[str, Any]
 DTYPES = {
     str(one).removeprefix("torch."): one
-    for one in (torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.int32, torch.bool)
+    for one in (
+        *(torch.float64, torch.float32, torch.float16, torch.bfloat16),
+        *(torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8, torch.bool),
+    )
 }
+"""What a file can hold."""
 LARGEST = 1 << 22
 """Most steps from zero: they stay exact in float32."""
 CELLS = (1 << 21) - 1
@@ -33,6 +37,10 @@ WINDOW = 16
 TURN = 2.1
 """Radians of a rotation per step of its x, y and z. Half a step of each moves (x, y, z) by sqrt(3) / 2 steps and w, which is at
 least 0.85 after `nearest_turn`, by 0.61 times as much: the quaternion by 1.02 steps, the rotation by twice that."""
+
+
+QR_MOST = 1 << 31
+"""Most rows x columns^2 of a basis that is rounded: its QR decomposition takes a second. 4,096 channels may have 724 latents."""
 
 
 class Coded(NamedTuple):
@@ -60,7 +68,7 @@ def encode_exact(value: Tensor) -> Coded:
     return Coded({"coding": "exact", "dtype": str(value.dtype).removeprefix("torch."), "error": 0.0}, plain)
 
 
-def encode_means(means: Array, step: float) -> tuple[Coded, Place]:  # [N, 3], sorted by `sort_by_cell`
+def encode_means(means: Array, step: float) -> tuple[Coded, Place]:  # [N, 3], sorted by their Morton codes
     """The steps between Morton codes: after sorting, they hold little more than the set of positions."""
     origin = means.min(0) if len(means) else np.zeros(3)
     cells = np.round((means - origin) / step).astype(np.int64)
@@ -104,7 +112,7 @@ def encode_near(values: Array, share: float, place: Place) -> Coded:  # [N, d]
 
 
 def encode_rows(values: Array, share: float, coding: str = "rows") -> Coded:  # [K, D]
-    """Multiples of a step of its own for each row; the coding "basis" takes columns for rows."""
+    """Each row has its own step, and holds multiples of it. The coding "basis" treats columns so."""
     values = values.T if coding == "basis" else values
     rms = np.sqrt(np.square(values).mean(1)) if values.size else np.zeros(len(values))
     steps = np.maximum(share * math.sqrt(12) * rms, np.abs(values).max(1, initial=0) / LARGEST).astype("<f4")
@@ -113,6 +121,11 @@ def encode_rows(values: Array, share: float, coding: str = "rows") -> Coded:  # 
         {"coding": coding, "error": share * math.sqrt(3)}, np.round(values / steps[:, None]).astype(np.int64)
     )
     return Coded(coded.entry, steps.tobytes() + coded.plain)
+
+
+def qr_work(shape: Sequence[int]) -> int:
+    """What a QR decomposition costs: rows x columns^2."""
+    return shape[0] * shape[1] ** 2
 
 
 def plain_size(entry: Entry, shape: tuple[int, ...]) -> int:
@@ -129,6 +142,8 @@ def plain_size(entry: Entry, shape: tuple[int, ...]) -> int:
         raise ValueError(f"shape: expected [N, {columns}] for {coding}, got {shape}")
     if not 1 <= len(shape) <= 2 or (coding in ("rows", "basis", "near") and len(shape) != 2):
         raise ValueError(f"shape: expected that of rows for {coding}, got {shape}")
+    if coding == "basis" and qr_work(shape) > QR_MOST:
+        raise ValueError(f"shape: expected a basis that is quickly made orthonormal, got {shape}")
     stored = {"curve": numbers // 3, "turns": numbers // 4 * 3}.get(coding, numbers)
     steps = {"rows": shape[0], "basis": shape[-1]}.get(coding, 0)
     return stored * int(entry["width"]) + 4 * steps
@@ -151,7 +166,7 @@ def decode(entry: Entry, shape: tuple[int, ...], plain: bytes, place: Place | No
 
 
 def find_before(cells: Array) -> Place:  # [N, 3] int64
-    """The nearest of the `WINDOW` rows before each row; of equally near ones the latest. Whole numbers: the same everywhere."""
+    """The nearest of the `WINDOW` rows before each row; of equally near ones the latest. Exact on every machine."""
     N = len(cells)
     cells, best = np.ascontiguousarray(cells.T), np.full(N, np.iinfo(np.int64).max)
     before = np.full(N, N)

@@ -10,7 +10,7 @@ import json
 import math
 import struct
 import zlib
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import safetensors.torch
@@ -23,6 +23,8 @@ from ..formats.order import morton_codes
 from ..formats.values import unit_quats
 from .coding import (
     CELLS,
+    DTYPES,
+    QR_MOST,
     Array,
     Coded,
     Entry,
@@ -36,6 +38,7 @@ from .coding import (
     encode_steps,
     encode_turns,
     plain_size,
+    qr_work,
 )
 from .precision import CUSTOM, PRECISIONS, Rounding
 from .turns import nearest_turn
@@ -46,20 +49,23 @@ LEVEL = 19  # of zstd: the best compression that takes only seconds
 HEADER, WORDS = 1 << 20, 8 << 20
 """Most bytes of a header, and of the description."""
 SPARE, RATIO = 64 << 20, 100
-"""A file may unpack to so many bytes, and as many times its own size. A cloud that compresses better is stored uncompressed."""
+"""A file may unpack to SPARE bytes plus RATIO times its own size. A cloud that compresses better is stored uncompressed."""
 EDGE = 1e-4
 """Unpacked opacities keep this distance from 0 and 1, as everywhere in kfgs."""
+HUGE = 1e37
+"""Largest number that is rounded: a step away from it, float32 does not overflow yet."""
 
 
 def pack_tensors(tensors: dict[str, Tensor], description: dict[str, Any], precision: str | Rounding) -> bytes:
     """The file of a field, given what `to_tensors` made of it.
 
     Raises:
-        ValueError: if a number is not finite, or the description is larger than a reader takes.
+        ValueError: if no reader would take the file: a number is not finite, or too large to be rounded; an opacity lies outside
+            [0, 1]; a scale is negative; a tensor has an unknown type; or the description is too large.
     """
     kept = {name: value.detach().cpu() for name, value in tensors.items()}
     for name, value in kept.items():
-        _check_finite(name, value)
+        _check_values(name, value)
     chosen, precision = (PRECISIONS[precision], precision) if isinstance(precision, str) else (precision, CUSTOM)
     coded = {name: encode_exact(value) for name, value in kept.items()} if chosen is None else _round(kept, chosen)
     shapes = {name: list(value.shape) for name, value in kept.items()}
@@ -124,7 +130,7 @@ def unpack_tensors(data: bytes, name: str) -> tuple[dict[str, Tensor], dict[str,
 
 
 def peek(head: bytes) -> dict[str, Any] | None:
-    """What the header of a file says: kind, version, precision, Gaussians. None if it is no packed field."""
+    """What the header of a file says: kind, version, precision, number of Gaussians. None if it is no packed field."""
     if len(head) < 8:
         return None
     (length,) = struct.unpack("<Q", head[:8])
@@ -147,6 +153,9 @@ def _round(tensors: dict[str, Tensor], chosen: Rounding) -> dict[str, Coded]:
     """Every tensor in whole steps; the Gaussians in the order of their cells."""
     arrays = {name: value.double().numpy() for name, value in tensors.items() if value.is_floating_point()}
     means, scales = arrays["gaussians.means"], arrays["gaussians.scales"]
+    for name, array in arrays.items():
+        if np.abs(array).max(initial=0) > HUGE:
+            raise ValueError(f"{name}: expected numbers up to {HUGE:g} to round, got larger ones; pack without loss")
     N, radius = len(means), np.median(np.sort(scales, axis=1)[:, 1:]) if len(means) else 1.0
     extent = float(np.ptp(means, axis=0).max()) if N else 0.0
     step = max(2 * chosen.means * float(radius), extent / CELLS) or 1.0
@@ -185,7 +194,7 @@ def _round_one(
             return encode_near(array, chosen.latents, place)
         case ["seen", "pixels"]:
             return encode_logs(array, chosen.pixels, 1.0)
-        case ["linear", "basis"]:
+        case ["linear", "basis"] if qr_work(value.shape) <= QR_MOST:
             return encode_rows(array, chosen.decoder, "basis")
         case ["codebook", "codewords"] | ["words", _]:
             return encode_rows(array, chosen.decoder)
@@ -208,7 +217,9 @@ def _unpack(data: bytes) -> tuple[dict[str, Tensor], dict[str, Any]]:
         if stream.dtype != torch.uint8 or stream.ndim != 1:
             raise ValueError(f"{name}: expected a stream of bytes, got {stream.dtype} {tuple(stream.shape)}")
     packed = {name: stream.numpy().tobytes() for name, stream in streams.items()}
-    description = json.loads(_decompress(packed.pop(ABOUT), None, WORDS), parse_constant=_no_constant)
+    description = json.loads(
+        _decompress(packed.pop(ABOUT), None, WORDS), parse_constant=_no_constant, parse_float=_finite
+    )
     entries = description.pop("tensors")
     description.pop("precision")
     if set(entries) != set(packed):
@@ -227,35 +238,30 @@ def _unpack(data: bytes) -> tuple[dict[str, Tensor], dict[str, Any]]:
         if zlib.crc32(content) != entries[name]["crc32"]:
             raise ValueError(f"{name}: expected other bytes, by its checksum")
         value, place = decode(entries[name], shapes[name], content, place)
-        _check_finite(name, value)
         tensors[name] = _bounded(name, value, entries[name])
+        _check_values(name, tensors[name])
     return tensors, description
 
 
 def _bounded(name: str, value: Tensor, entry: Entry) -> Tensor:
-    """Rounded opacities inside (0, 1), and rounded scales above 0; a ValueError for values that no Gaussian has."""
-    rounded, array = entry["coding"] != "exact", _plain(value)
-    if name == "gaussians.opacities" and array.size:
-        if rounded:
+    """Rounded opacities inside (0, 1), and rounded scales above 0."""
+    if entry["coding"] != "exact":
+        array = _plain(value)
+        if name == "gaussians.opacities":
             np.clip(array, EDGE, 1 - EDGE, out=array)
-        if not 0 <= array.min() <= array.max() <= 1:
-            raise ValueError(f"{name}: expected numbers from 0 to 1, got others")
-    if name == "gaussians.scales" and array.size:
-        if rounded:
+        if name == "gaussians.scales":
             np.maximum(array, float(entry["error"]) * float(entry["least"]) / 2, out=array)
-        if not array.min() >= 0:
-            raise ValueError(f"{name}: expected no negative number, got one")
     return value
 
 
 def _compress(plain: bytes) -> bytes:
-    """Compressed, or as they are if that is no longer."""
+    """Compress bytes; return them unchanged if that does not make them shorter."""
     packed = zstandard.ZstdCompressor(level=LEVEL).compress(plain)
     return packed if len(packed) < len(plain) else plain
 
 
 def _decompress(stream: bytes, size: int | None, most: int) -> bytes:
-    """The inverse of `_compress`: as they are if they have that size already."""
+    """The inverse of `_compress`: a stream of `size` bytes is not compressed. A ValueError for more than `most` bytes."""
     if size is not None and len(stream) == size:
         return stream
     found = zstandard.get_frame_parameters(stream).content_size
@@ -283,9 +289,22 @@ def _checked_shape(shape: Any) -> tuple[int, ...]:
     return tuple(shape)
 
 
-def _check_finite(name: str, value: Tensor) -> None:
+def _check_values(name: str, value: Tensor) -> None:
+    """A ValueError for values that no field has. What is refused here when a file is read is not written either."""
+    if value.dtype not in DTYPES.values():
+        raise ValueError(
+            f"{name}: expected one of {', '.join(DTYPES)}, got {value.dtype}; convert it with .long() or .float()"
+        )
     if value.is_floating_point() and not np.isfinite(_plain(value)).all():
         raise ValueError(f"{name}: expected finite numbers, got NaN or infinity; fit the field again")
+    most = {"gaussians.opacities": 1.0, "gaussians.scales": math.inf}.get(name)
+    if most is not None and value.numel():
+        low, high = float(_plain(value).min()), float(_plain(value).max())
+        if not 0 <= low <= high <= most:
+            raise ValueError(
+                f"{name}: expected numbers from 0 to {most:g}, got {low if low < 0 else high:g}; clamp them, or fit the field "
+                "again"
+            )
 
 
 def _plain(value: Tensor) -> Array:
@@ -293,5 +312,9 @@ def _plain(value: Tensor) -> Array:
     return value.float().numpy() if value.dtype == torch.bfloat16 else value.numpy()
 
 
-def _no_constant(word: str) -> None:
-    raise ValueError(f"expected numbers in JSON, got {word}")
+def _finite(word: str) -> float:
+    return float(word) if math.isfinite(float(word)) else _no_constant(word)
+
+
+def _no_constant(word: str) -> NoReturn:
+    raise ValueError(f"expected finite numbers in JSON, got {word}")

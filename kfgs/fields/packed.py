@@ -12,7 +12,7 @@ def pack_field(field: SemanticField, precision: PrecisionName | Rounding = "smal
     """The bytes of one file with the field, and its classes if they can be read.
 
     Raises:
-        ValueError: if the precision is unknown, a number is not finite, or `info` is not JSON.
+        ValueError: as `SemanticField.save` for one file.
     """
     words: LabelSet | None = None
     if field.has_classes:

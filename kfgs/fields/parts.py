@@ -13,6 +13,7 @@ from ..labels import LabelSet
 from ..labels.questions import Classes
 from ..metrics import MIB
 from ..quant import Autoencoder, Codebook, LinearLatents
+from .answers import Seen
 
 CHUNK = 8192  # latents decoded at once: the decoder's widest layer then holds 32 MB
 
@@ -23,11 +24,15 @@ def check_parts(
     autoencoder: Autoencoder | None,
     linear: LinearLatents | None,
     answers: Tensor | None,  # [N, e]
+    seen: Seen | None,
 ) -> None:
     """Raise a ValueError unless these parts fit together; they are those of `SemanticField`."""
     features = gaussians.features
     if features is None:
         raise ValueError("gaussians: expected features [N, d], got None; fit them with fit_field")
+    if seen is not None:
+        pixels, agreement = ("seen.pixels", seen.pixels, "N"), ("seen.agreement", seen.agreement, "N")
+        check_shapes(("gaussians.means", gaussians.means, "N 3"), pixels, agreement)
     if autoencoder is not None and codebook is None:
         raise ValueError("codebook: expected the one that the autoencoder was fitted to, got None; pass it as well")
     if linear is None and answers is not None:

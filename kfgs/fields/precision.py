@@ -17,7 +17,7 @@ class Rounding:
     means: float
     """Of each coordinate, as a share of the median radius of the cloud's Gaussians."""
     scales: float
-    """Share of a scale, plus the same share of twice the largest error of a coordinate: thinner than that is not seen."""
+    """Share of a scale, plus the same share of twice the largest error of a coordinate. Thinner Gaussians look no different."""
     degrees: float
     """Angle between a rotation and its stored one. Axes may change their order: the ellipsoid is the same."""
     opacities: float

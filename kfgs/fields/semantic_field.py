@@ -64,7 +64,7 @@ class SemanticField:
     """The folder or file it was loaded from."""
 
     def __post_init__(self) -> None:
-        parts.check_parts(self.gaussians, self.codebook, self.autoencoder, self.linear, self.answers)
+        parts.check_parts(self.gaussians, self.codebook, self.autoencoder, self.linear, self.answers, self.seen)
 
     @property
     def features(self) -> Tensor:  # [N, d]
@@ -240,7 +240,22 @@ class SemanticField:
         return self.rank(camera, classes, rule=rule).labels[..., 0]
 
     def rank(self, camera: Camera, classes: Classes | None = None, *, top: int = 1, rule: Rule = "fused") -> Ranked:
-        """The `top` best classes of each pixel by the rule of `segment`, and their scores; see `kfgs.fields.views`."""
+        """The `top` best classes of each pixel by the rule of `segment`, and their scores.
+
+        Args:
+            camera: any viewpoint.
+            classes: as in `segment`.
+            top: how many classes, from 1 to C.
+            rule: as in `segment`.
+
+        Returns:
+            Labels and scores [H, W, top], the best first; -1 and 0 where there is no class. And the opacity [H, W]. Scores are
+            blended votes, from 0 to 1; of a trained field with codewords, cosines of the pixel's codeword with the classes;
+            without codewords, by the rule `paper`, numbers that only compare the classes of one pixel.
+
+        Raises:
+            ValueError: as `segment`, and if `top` is out of range.
+        """
         check_choice("rule", rule, get_args(Rule))
         return rank_classes(self, camera, self._rows(classes), rule, top)
 
@@ -314,8 +329,10 @@ class SemanticField:
             precision: of one file: "lossless" (the default), "fine", "small", "tiny" or your own `Rounding`. All but the first
                 sort the Gaussians, and note their errors in `info["rounded"]`.
 
-        A FileExistsError if there is something other than a field at `path`, a ValueError if `info` is not JSON, a number is not
-        finite, or a folder gets a precision.
+        Raises:
+            FileExistsError: if there is something other than a field at `path`.
+            ValueError: if `info` is not JSON, the precision is unknown, or a folder gets one. For one file also if a number is
+                not finite, an opacity lies outside [0, 1], a scale is negative, or a number is too large to be rounded.
         """
         save_field(path, vars(self), precision)
 

@@ -187,7 +187,7 @@ def _from_tensors(name: str, tensors: dict[str, Tensor], description: dict[str, 
             "cameras": _cameras(description.get("cameras", []), _part(tensors, "cameras")),
             "words": _label_set(words, description["words"]) if words else None,
         }
-        check_parts(*(found[one] for one in ("gaussians", "codebook", "autoencoder", "linear", "answers")))
+        check_parts(*(found[one] for one in ("gaussians", "codebook", "autoencoder", "linear", "answers", "seen")))
     except (TypeError, LookupError, ValueError, AttributeError, RuntimeError) as error:
         raise ValueError(
             f"{name}: expected a field, but its parts do not fit together ({error}); fit it again"

@@ -53,10 +53,9 @@ def divide_votes(cosines: Tensor, known: Tensor) -> Votes:  # [N, C], [N] bool
 
 def rank_votes(gaussians: Gaussians, camera: Camera, votes: Votes, top: int = 1) -> Ranked:
     """The classes with most votes at each pixel; votes are blended like colours. Beyond the classes voted for: -1, 0."""
-    size, found = camera.size, min(top, len(votes.classes))
-    if found == 0:
-        nothing = votes.shares.new_zeros(*size, top)
-        return Ranked(nothing.long() - 1, nothing, nothing[..., 0])
+    if not len(votes.classes):  # nothing is known about any Gaussian: no votes for one class, and the opacity
+        votes = Votes(votes.classes.new_zeros(1), votes.shares.new_zeros(len(votes.shares), 1))
+    found = min(top, len(votes.classes))
     with torch.no_grad():
         labels, scores, alphas = rasterize_labels(gaussians.replace(features=votes.shares, sh=None), camera, top=found)
         labels = votes.classes[labels].masked_fill_(scores <= 0, -1)
@@ -75,6 +74,15 @@ def rank_classes(field: SemanticField, camera: Camera, rows: Tensor, rule: Rule,
         rows: embeddings [C, D].
         rule: see `SemanticField.segment`.
         top: how many, from 1 to C.
+
+    Returns:
+        Labels and scores [H, W, top], the best first, and alphas [H, W]. Labels are -1 and scores 0 where nothing is drawn or
+        known, and for classes without a vote. What a score is depends on the rule: blended votes, in [0, 1]; of a field with
+        codewords, the cosine of the pixel's codeword; else, by the rule "paper", the blended dot product of feature and
+        class plus twice the blended length of the features, which only compares the classes of one pixel.
+
+    Raises:
+        ValueError: if `top` is out of range.
     """
     check_whole("top", top, 1, len(rows))
     if field.codebook is None or field.method == "fused" or (rule == "fused" and field.autoencoder is None):
@@ -105,7 +113,7 @@ def score_pixels(
         camera: any viewpoint.
         target: the name of a class, or an embedding [D].
         classes: as in `SemanticField.query`.
-        options: the keyword arguments of `SemanticField.query`.
+        options: the other keyword arguments of `SemanticField.query`, but no threshold.
 
     Returns:
         Scores [H, W, 1] (by default relevancies, above 0.5 where the target fits best) and alphas [H, W]. Labels are 0, and

@@ -12,7 +12,7 @@ import zstandard
 from cases_packed import LOSSY, METHODS, assert_same, assert_same_notes, assert_within, field
 from messages import tells
 
-from kfgs.fields import Seen, SemanticField, container, pack_field, unpack_field
+from kfgs.fields import Seen, SemanticField, coding, container, pack_field, store, unpack_field
 from kfgs.fields.coding import WINDOW, find_before
 from kfgs.fields.precision import SMALL
 
@@ -135,6 +135,37 @@ def test_saving_replaces_an_older_file_and_nothing_else(tmp_path):
         field().save(path.with_suffix(".safetensors").rename(tmp_path / "plain.safetensors"))
 
 
+UNREADABLE = {
+    "gaussians.opacities": ({"opacities": torch.full((40,), 1.5)}, "0 to 1"),
+    "gaussians.scales": ({"scales": torch.full((40, 3), -0.1)}, "-0.1"),
+    "gaussians.labels": ({"labels": torch.arange(40).to(torch.uint16)}, "int64"),
+}
+
+
+@pytest.mark.parametrize("precision", ["lossless", "small"])
+@pytest.mark.parametrize("name", UNREADABLE)
+def test_what_no_reader_takes_is_not_written(tmp_path, name, precision):
+    changes, expected = UNREADABLE[name]
+    path = tmp_path / f"a{ENDING}"
+    field(n=3).save(path)
+    with pytest.raises(ValueError, match=tells(f"{name}:", expected)):
+        field(n=40, **changes).save(path, precision)
+    assert len(SemanticField.load(path)) == 3
+
+
+def test_numbers_that_overflow_when_rounded_are_kept_by_lossless_alone():
+    made = field(n=40, scales=torch.full((40, 3), 3.4e38))
+    assert_same(made, unpack_field(pack_field(made, "lossless")))
+    with pytest.raises(ValueError, match=tells("gaussians.scales:", "1e+37", "without loss")):
+        pack_field(made, "small")
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int8, torch.int16, torch.int32])
+def test_labels_of_every_width_come_back(dtype):
+    made = field(n=40, labels=torch.arange(40).to(dtype))
+    assert_same(made, unpack_field(pack_field(made, "lossless")))
+
+
 def test_a_precision_of_your_own_is_kept_under_its_own_name():
     made = field(n=50)
     back = unpack_field(pack_field(made, replace(SMALL, degrees=0.01)))
@@ -156,13 +187,13 @@ def test_options_that_do_not_fit_are_named(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def remade(data, change, key="description"):
-    """A packed field whose description `change` has edited, or whose metadata if the key is "kfgs"."""
+def remade(data, change, key="description", replaced=("", "")):
+    """A packed field whose description `change` has edited, or whose metadata if the key is "kfgs"; then text is replaced."""
     streams = safetensors.torch.load(data)
     about = json.loads(json.loads(data[8 : 8 + struct.unpack("<Q", data[:8])[0]])["__metadata__"]["kfgs"])
     words = json.loads(zstandard.decompress(streams["description"].numpy().tobytes()))
     change(about if key == "kfgs" else words)
-    text = json.dumps(words).encode()
+    text = json.dumps(words).replace(*replaced).encode()
     streams["description"] = torch.frombuffer(bytearray(zstandard.compress(text)), dtype=torch.uint8)
     return safetensors.torch.save(streams, metadata={"kfgs": json.dumps(about)})
 
@@ -180,6 +211,7 @@ HOSTILE = {
     "more rows than bytes": entry("gaussians.means", shape=[400_000_000, 3]),
     "rows below 0": entry("gaussians.means", shape=[-1, 3]),
     "rows that are no number": entry("gaussians.means", shape=["3", 3]),
+    "scales without end": entry("gaussians.scales", error="inf"),
     "no shape": entry("gaussians.means", shape=None),
     "another count": entry("gaussians.quats", shape=[299, 4]),
     "an unknown coding": entry("gaussians.means", coding="pickle"),
@@ -206,6 +238,29 @@ HOSTILE = {
     "NaN": lambda words: words.update(info={"loss": float("nan")}),
     "more words than a description may have": lambda words: words.update(info={"a": "b" * container.WORDS}),
 }
+
+
+def test_pixels_of_other_gaussians_are_refused():
+    tensors, description = store._to_tensors(vars(field(n=40)))
+    tensors["seen.pixels"] = torch.ones(39)
+    with pytest.raises(ValueError, match=tells("data:", "seen.pixels", "39")):
+        unpack_field(container.pack_tensors(tensors, description, "lossless"))
+
+
+def test_a_basis_whose_decomposition_takes_too_long_is_neither_rounded_nor_read(monkeypatch):
+    made = field()  # 24 channels, 5 latents: 600
+    rounded = pack_field(made)
+    for module in (coding, container):
+        monkeypatch.setattr(module, "QR_MOST", 599)
+    assert torch.equal(unpack_field(pack_field(made)).linear.basis, made.linear.basis)
+    with pytest.raises(ValueError, match=tells("data:", "quickly", "(24, 5)")):
+        unpack_field(rounded)
+
+
+def test_infinity_in_json_is_refused():
+    data = remade(pack_field(field()), lambda words: None, replaced=('"nested"', '"loss": 1e999, "nested"'))
+    with pytest.raises(ValueError, match=tells("data:", "finite", "1e999")):
+        unpack_field(data)
 
 
 @pytest.mark.parametrize("what", HOSTILE)

@@ -98,7 +98,10 @@ def test_classes_beyond_those_with_votes_are_none():
     assert (found.labels[..., 1:] == -1).all()
     assert (found.scores[..., 1:] == 0).all()
     nobody = replace(field, gaussians=field.gaussians.replace(features=torch.zeros(200, 6)))
-    assert (nobody.rank(camera(), few, top=2).labels == -1).all()
+    none = nobody.rank(camera(), few, top=2)
+    assert (none.labels == -1).all()
+    assert (none.scores == 0).all()
+    assert none.alphas.equal(found.alphas)
 
 
 @pytest.mark.parametrize("rule", ["fused", "paper"])

@@ -99,6 +99,17 @@ def test_gaussians_that_share_a_row_of_scores(engine):
     assert_ranked(footprints, features[:9].contiguous(), tiles, engine, 2, index)
 
 
+@pytest.mark.parametrize("channels", [3, 30])
+@every_engine
+def test_an_index_with_gaps_in_memory(engine, channels):
+    footprints, features, tiles = scene(channels)
+    index = (torch.arange(80) % 7)[::2]
+    found = assert_ranked(footprints, features[:9].contiguous(), tiles, engine, 2, index)
+    same = rank_channels(*footprints, features[index].contiguous(), tiles, top=2, engine=engine)
+    assert found.labels.equal(same.labels)
+    assert found.scores.equal(same.scores)
+
+
 def test_threads_and_repetition_change_nothing():
     camera = a_camera(320, 200, focal=(200.0, 190.0), principal=(150.0, 90.0), dtype=torch.float32)
     gaussians = gaussians_before(camera, 3000, seed=1, channels=18)

@@ -200,7 +200,7 @@ def _splats(
         background = features.new_zeros(features.shape[1])
     values = (value.contiguous() for value in (means2d, conics, opacities, features, background))
     means2d, conics, opacities, features, background = values
-    return Splats(means2d, conics, opacities, features, background, index)
+    return Splats(means2d, conics, opacities, features, background, None if index is None else index.contiguous())
 
 
 def _contiguous(tiles: Tiles) -> Tiles:

@@ -14,7 +14,7 @@ import triton.language as tl
 from .kernels import SIZES, find_alphas, find_features, find_list, load_block, load_splats, place_pixels, weigh
 
 NONE = tl.constexpr(2**30)
-"""Larger than any channel."""
+"""Larger than any channel. It stays where no score is a number: the label is then -1, not an index out of range."""
 
 
 @triton.jit
@@ -79,7 +79,7 @@ def rank_kernel(
     taken = 0
     while taken < top:
         value, name, best = take_best(best, named)
-        tl.store(labels + pixel * top + taken, tl.where(drawn, name, -1).to(tl.int64), mask=inside)
+        tl.store(labels + pixel * top + taken, tl.where(drawn & (name < NONE), name, -1).to(tl.int64), mask=inside)
         tl.store(scores + pixel * top + taken, tl.where(drawn, value, 0.0), mask=inside)
         taken += 1
     tl.store(alphas + pixel, 1.0 - light, mask=inside)
