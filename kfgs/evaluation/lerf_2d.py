@@ -16,6 +16,7 @@ from .relevancy import (
     FILTERS,
     Encode,
     Filter,
+    check_relevancy,
     clean_mask,
     encode_unit,
     fill_unknown,
@@ -99,6 +100,7 @@ class LerfOvs2D:
 
     def __post_init__(self) -> None:
         check_choice("filter", self.filter, FILTERS)
+        check_relevancy(self.scale, self.negatives, self.threshold)
         if isinstance(self.level, str):
             check_choice("level", self.level, ("chosen", "oracle"))
 

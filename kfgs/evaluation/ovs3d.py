@@ -9,12 +9,12 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from .._check import check_choice, check_range
+from .._check import check_choice, check_range, check_whole
 from ..cameras import resize_labels
 from ..labels.scores import CANONICAL, TEMPERATURE
 from .lerf_2d import activate, relevancies
 from .method import Method, View, annotated, check_level, label_view
-from .relevancy import FILTERS, Encode, Filter, clean_mask, encode_unit, mask_iou
+from .relevancy import FILTERS, Encode, Filter, check_relevancy, clean_mask, encode_unit, mask_iou
 from .report import Report, Row, make_report, mean
 from .stable_threshold import stable_mask
 from .truth import MaskTruth
@@ -115,6 +115,7 @@ class OVS3DThreshold:
 
     def __post_init__(self) -> None:
         check_choice("filter", self.filter, FILTERS)
+        check_relevancy(self.scale, self.negatives, self.threshold)
         if isinstance(self.level, str):
             check_choice("level", self.level, ("chosen",))
 
@@ -167,6 +168,9 @@ class OVS3DStability:
 
     def __post_init__(self) -> None:
         check_range("steepest", self.steepest, 0, closed=(False, False))
+        check_range("fractions (highest)", self.fractions[1], self.fractions[0], closed=(False, True))
+        check_whole("run", self.run, 1)
+        check_relevancy(self.scale, self.negatives)
 
     def score(self, method: Method, truth: MaskTruth, views: Sequence[View], encode: Encode) -> Report:
         """Look for each text in each annotated view.

@@ -120,7 +120,7 @@ class SceneSplatBench:
         """
         lists = load_classes("scenesplat")[self.benchmark]
         classes: list[str] = lists["classes"]
-        prompts = lists.get("prompts") or [[self.template.format(name), i] for i, name in enumerate(classes)]
+        prompts = lists.get("prompts") or [[self.template.replace("{}", name), i] for i, name in enumerate(classes)]
         text = encode_unit(encode, [prompt for prompt, _ in prompts])
         meant = torch.tensor([index for _, index in prompts])
         pooled, name, count, left_out = ConfusionMatrix(len(classes)), "", 0, Counter[str]()
