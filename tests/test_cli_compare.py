@@ -3,7 +3,9 @@
 import json
 import re
 import shutil
+from types import SimpleNamespace
 
+import cases_methods as cases
 import numpy as np
 import pytest
 import torch
@@ -12,10 +14,11 @@ from PIL import Image
 from small_room import fit_run, make_room
 
 from kfgs.cli import main
+from kfgs.evaluation import LerfOvs2D, MaskAndBoxes, MaskTruth
 from kfgs.labels import load_label_set
 from kfgs.pipeline import open_question
 from kfgs.pipeline.evaluate import open_result
-from kfgs.pipeline.side_by_side import VOID, WRONG, _errors, show_views
+from kfgs.pipeline.side_by_side import VOID, WRONG, _errors, _show_labels, show_views
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +116,21 @@ def test_errors_are_where_labels_differ(room, run):
         vermilion = (errors[..., 0] - errors[..., 2]) > 0.3
         assert bool((vermilion == wrong).all())
         assert picture.shape == tuple(errors.shape)
+
+
+def test_pixels_that_no_level_knows_have_no_class_in_pictures():
+    truth, maps = torch.zeros(2, 3, dtype=torch.bool), torch.full((2, 2, 3), torch.nan)
+    truth[:, :2] = True
+    low, high = maps.clone(), maps.clone()
+    low[0, :, 1:], high[1, :, 1:] = 0.1, 0.2  # each level knows one text's score; the first column is unknown to both
+    low[1, :, 1:], high[0, :, 1:] = -0.3, -0.2
+    method = cases.Numbers(["mug", "spoon"], {"a": {"mug": low, "spoon": high}})
+    view = cases.view("a", 2, 3)
+    question = SimpleNamespace(
+        protocol=LerfOvs2D(), truth=MaskTruth({"a": {t: MaskAndBoxes(truth) for t in method.texts}})
+    )
+    shown = _show_labels(question, torch.rand(2, 3, 3), view, {"it": method}, method.encode)
+    assert shown.labels[1].tolist() == [[-1, 1, 1]] * 2
 
 
 def test_void_is_plain_grey():

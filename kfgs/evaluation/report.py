@@ -91,7 +91,10 @@ class Report:
         return replace(self, command=command or self.command, digests=both, machine=machine or self.machine)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values: protocol, version, options, scores, rows, digests, command. A number that is not finite is null."""
+        """Plain values: protocol, version, options, scores, rows, digests, command.
+
+        A number that is not finite is null; but an infinite score, such as the PSNR of equal pictures, is the text "inf".
+        """
         name, _, version = self.protocol.partition("/")
         return {
             "protocol": self.protocol,
@@ -102,7 +105,7 @@ class Report:
             "options": plain(self.options),
             "changed": list(self.changed),
             "always": list(self.always),
-            "scores": plain(self.scores),
+            "scores": {name: str(score) if math.isinf(score) else plain(score) for name, score in self.scores.items()},
             "rows": plain(self.rows),
             "digests": plain(self.digests),
             "command": self.command,

@@ -159,7 +159,9 @@ def _show_labels(question: Question, photo: Tensor, view: View, methods: Mapping
         if isinstance(level, int):
             found = label_view(method, view, text, level).cpu()
         else:
-            found = best_labels(method.cosines(view, text).nan_to_num(-torch.inf).amax(0)).cpu()
+            cosines = method.cosines(view, text)  # [levels, H, W, K]
+            best = cosines.masked_fill(cosines.isnan(), -torch.inf).amax(0)
+            found = best_labels(best.masked_fill(best.isinf(), torch.nan)).cpu()
         labels = places[found.clamp_min(0)].where(found >= 0, -1)
         wrong = (labels != truth) & (truth >= 0)
         share = float(wrong.sum() / (truth >= 0).sum().clamp_min(1))

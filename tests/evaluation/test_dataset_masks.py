@@ -62,6 +62,10 @@ def test_lerf_ovs_from_the_scene_or_the_folder_of_all(tmp_path: Path) -> None:
     for path, scene in ((tmp_path / "ramen", None), (tmp_path, "ramen"), (tmp_path, None)):
         assert len(load_lerf_ovs(path, scene).frames) == 7
         assert load_lerf_ovs(path, scene).scene == "ramen"
+    (tmp_path / "label/ramen").rename(tmp_path / "ramen/label")  # a scene with labels of its own
+    for truth in (load_lerf_ovs(tmp_path / "ramen"), find_masks(tmp_path / "ramen")):
+        assert (len(truth.frames), truth.scene) == (7, "ramen")
+    _lerf(tmp_path, "ramen")
     _lerf(tmp_path, "teatime")
     with pytest.raises(ValueError, match=tells("scene", "ramen, teatime", "None")):
         load_lerf_ovs(tmp_path)
