@@ -59,6 +59,7 @@ def test_lerf_ovs_objects_of_one_text_are_one_mask_with_several_boxes(tmp_path: 
 def test_lerf_ovs_from_the_scene_or_the_folder_of_all(tmp_path: Path) -> None:
     _lerf(tmp_path)
     (tmp_path / "ramen/images").mkdir(parents=True)
+    (tmp_path / "ramen/transforms.json").write_text("{}")  # no label
     for path, scene in ((tmp_path / "ramen", None), (tmp_path, "ramen"), (tmp_path, None)):
         assert len(load_lerf_ovs(path, scene).frames) == 7
         assert load_lerf_ovs(path, scene).scene == "ramen"

@@ -41,7 +41,7 @@ def load_lerf_ovs(path: str | Path, scene: str | None = None) -> MaskTruth:
     """
     path = Path(path)
     root = path / scene if scene else path
-    places = [root, root.parent / "label" / root.name, root / "label"]
+    places = [root.parent / "label" / root.name, root / "label", root]  # a scene may have other JSONs: transforms.json
     folder = (
         find_folder(places, "*.json", "labels of LERF-OVS")
         if scene or not (path / "label").is_dir() or next((path / "label").glob("*.json"), None) is not None
