@@ -14,7 +14,7 @@ from PIL import Image
 from small_room import fit_run, make_room
 
 from kfgs.cli import main
-from kfgs.evaluation import LerfOvs2D, MaskAndBoxes, MaskTruth
+from kfgs.evaluation import LerfOvs2D, MaskAndBoxes, MaskTruth, OVS3DClosed
 from kfgs.labels import load_label_set
 from kfgs.pipeline import open_question
 from kfgs.pipeline.evaluate import open_result
@@ -131,6 +131,16 @@ def test_pixels_that_no_level_knows_have_no_class_in_pictures():
     )
     shown = _show_labels(question, torch.rand(2, 3, 3), view, {"it": method}, method.encode)
     assert shown.labels[1].tolist() == [[-1, 1, 1]] * 2
+
+
+def test_pictures_of_a_closed_set_choose_from_all_texts():
+    mask, maps = torch.ones(2, 3, dtype=torch.bool), torch.full((1, 2, 3), 0.1)
+    method = cases.Numbers(["mug", "spoon"], {"a": {"mug": maps, "spoon": maps + 0.1}})
+    truth = MaskTruth({"a": {"mug": MaskAndBoxes(mask)}}, listed=("mug", "spoon"))  # no spoon in this view
+    question = SimpleNamespace(protocol=OVS3DClosed(), truth=truth)
+    shown = _show_labels(question, torch.rand(2, 3, 3), cases.view("a", 2, 3), {"it": method}, method.encode)
+    assert shown.labels[1].eq(1).all()
+    assert shown.answers["it"][2] == 1
 
 
 def test_void_is_plain_grey():

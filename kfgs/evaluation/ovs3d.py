@@ -58,7 +58,8 @@ class OVS3DClosed:
     )
 
     texts: tuple[str, ...] = ()
-    """The scene's list (`classes.txt`); empty: the texts that the truth has."""
+    """What pixels choose from. Empty: the scene's list (`MaskTruth.listed`, from `classes.txt`), or the texts that have a mask
+    if there is no list. The report's note says which."""
     level: int = 0
     """Of a method with several."""
 
@@ -68,7 +69,7 @@ class OVS3DClosed:
         Raises:
             ValueError: if a picture has no view, or `texts` lacks an annotated text.
         """
-        asked = self.texts or truth.texts
+        asked = self.texts or truth.listed or truth.texts
         missing = [text for text in truth.texts if text not in asked]
         if missing:
             raise ValueError(f"texts: expected all annotated texts, got none of {', '.join(missing)}; add them")
@@ -83,7 +84,14 @@ class OVS3DClosed:
                 rows.append({"view": view.stem, "text": text, "IoU": mask_iou(labels == asked.index(text), mask)})
             shares.append(one_hot_accuracy(labels, [known.get(text, nothing) for text in asked]))
         scores = {"mIoU": mean(row["IoU"] for row in rows), "accuracy": mean(shares)}
-        return make_report(self, method.name, scores, rows)
+        origin = (
+            "the option `texts`"
+            if self.texts
+            else "the scene's list"
+            if truth.listed
+            else "the masks: no list is known"
+        )
+        return make_report(self, method.name, scores, rows, [f"argmax over {len(asked)} texts of {origin}"])
 
 
 @dataclass(frozen=True)

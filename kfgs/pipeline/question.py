@@ -294,9 +294,8 @@ def _digest_truth(truth: LabelTruth | MaskTruth) -> str:
     """Of what is scored, as it was read; one picture in memory at a time."""
     if isinstance(truth, LabelTruth):
         return digest_data([list(truth.names), [[stem, digest_data(_labels(truth.maps[stem]))] for stem in truth.maps]])
-    return digest_data(
-        [[stem, digest_data({k: list(v) for k, v in truth.frames[stem].items()})] for stem in truth.frames]
-    )
+    masks = [[stem, digest_data({k: list(v) for k, v in truth.frames[stem].items()})] for stem in truth.frames]
+    return digest_data([*masks, list(truth.listed)] if truth.listed else masks)
 
 
 def _digest_scene(scene: Scene, folder: Path, protocol: Any, inputs: Mapping[str, Any]) -> str:

@@ -18,7 +18,7 @@ from ..evaluation.segmentation import load_label_map
 from ..splat import rasterize
 from ..viz import overlay_labels, save_picture
 from ..viz.pictures import legend_strip, picture_grid
-from .question import OF_COLORS, Question, colors_of
+from .question import LABELLED, OF_COLORS, Question, colors_of
 
 WRONG = (0.835, 0.369, 0.0)  # vermilion of Okabe and Ito, over a grey photograph
 VOID = 0.5  # grey, as the palette's "no class"
@@ -178,10 +178,12 @@ def _truth_of(question: Question, view: View, encode: Encode) -> tuple[Tensor, S
         labels = found if isinstance(found, Tensor) else load_label_map(found)
         return labels.cpu(), truth.names, list(range(len(truth.names)))
     if isinstance(truth, MaskTruth):
-        names, labels = truth.texts, torch.full(view.camera.size, -1, dtype=torch.int64)
+        closed = question.protocol.name in LABELLED  # then pixels choose from all texts, not from those of the view
+        names = (question.protocol.texts or truth.listed or truth.texts) if closed else truth.texts
+        labels = torch.full(view.camera.size, -1, dtype=torch.int64)
         for text, (mask, _) in truth.frames[view.stem].items():  # a later mask covers an earlier one
             labels[mask] = names.index(text)
-        return labels, names, [names.index(text) for text in truth.frames[view.stem]]
+        return labels, names, [names.index(text) for text in (names if closed else truth.frames[view.stem])]
     texts = question.protocol.texts
     names = tuple(load_classes("ade20k")[texts]) if isinstance(texts, str) else texts
     assert isinstance(truth, Method)

@@ -149,6 +149,7 @@ def _3dovs(folder: Path) -> Path:
 
 def test_3dovs(tmp_path: Path) -> None:
     truth = load_3dovs(_3dovs(tmp_path / "bed"))
+    assert truth.listed == ("banana", "black leather shoe")
     assert isinstance(truth, MaskTruth)
     assert {stem: list(texts) for stem, texts in truth.frames.items()} == {
         "00": ["banana", "black leather shoe"],
