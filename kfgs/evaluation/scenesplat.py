@@ -115,8 +115,8 @@ class SceneSplatBench:
 
         Raises:
             TypeError: if a method has no Gaussians.
-            ValueError: if there is no scene, points have a name that may be a class in another spelling, or instances are
-                missing.
+            ValueError: if there is no scene, points have a name that may be a class in another spelling, instances are
+                missing, or no point has a class.
         """
         lists = load_classes("scenesplat")[self.benchmark]
         classes: list[str] = lists["classes"]
@@ -131,6 +131,10 @@ class SceneSplatBench:
             name, count = method.name, count + 1
         if count == 0:
             raise ValueError("scenes: expected at least one, got none; pass pairs of a method and its truth")
+        if int(pooled.matrix.sum() + pooled.misses.sum()) == 0:
+            raise ValueError(
+                f"truth: expected points of some class of {self.benchmark}, got none in {count} scenes; are these its labels?"
+            )
         return self._report(pooled, lists, name, left_out)
 
     def _predict(self, method: Method, truth: PointTruth, text: Tensor, meant: Tensor) -> Tensor:  # [P] int64
