@@ -199,6 +199,11 @@ def test_a_field_that_changed_is_not_drawn(room, run, kept, tmp_path, capsys):
         ("{kept}/field.json {kept}/other.json", "other.json: expected a report in JSON"),
         ("{kept}/field.json {kept}/nothing.json", "nothing.json: no such file"),
         ("{kept}/field.json {run} --split train", "differ in digest of the truth"),
+        ("{kept}/field.json {run} --protocol kfgs-surface", "--protocol: expected kfgs-pooled/1, that of .*field.json"),
+        ("{kept}/field.json {kept}/fewer.json", r"differ in scores \(.*accuracy.* and .*mIoU.*\)"),
+        ("{kept}/field.json {kept}/list.json", "list.json: expected a report in JSON"),
+        ("{kept}/field.json {kept}/null.json", "null.json: expected a report in JSON"),
+        ("{kept}/number.json {run}", "number.json: expected texts in 'inputs'"),
         (
             "{kept}/field.json {run} --with-file a.pth",
             "--with-file: expected RUN=FILE with one of no run .* leave it out",
@@ -222,6 +227,21 @@ def test_numbers_that_cannot_be_compared_are_refused(words, message, kept, run, 
     one["options"]["level"] = 1
     (kept / "options.json").write_text(json.dumps(one))
     (kept / "other.json").write_text("[]")
+    broken = {"list": {"options": [1]}, "null": {"digests": None}, "number": {"inputs": {"scene": 5}}}
+    for name, part in (*broken.items(), ("fewer", {"scores": {"mIoU": 0.5}})):
+        (kept / f"{name}.json").write_text(json.dumps(one | {"options": {"level": 0, "labels": "own"}} | part))
     capsys.readouterr()
     assert main(["compare", *words.format(kept=kept, run=run).split()]) == 1
     assert re.search(message, capsys.readouterr().err)
+
+
+def test_scores_whose_scene_is_gone_are_compared_without_pictures(kept, tmp_path, capsys):
+    for name in ("field", "exact"):
+        one = json.loads((kept / f"{name}.json").read_text())
+        one["inputs"]["scene"] = str(tmp_path / "gone")
+        (tmp_path / f"{name}.json").write_text(json.dumps(one))
+    both = [str(tmp_path / f"{name}.json") for name in ("field", "exact")]
+    capsys.readouterr()
+    assert main(["compare", *both, "--out", str(tmp_path / "out")]) == 0
+    assert re.search(r"(?s)mIoU +accuracy.*note: no pictures: .*gone: no such folder", capsys.readouterr().out)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["compare.json", "compare.txt"]

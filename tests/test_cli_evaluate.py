@@ -126,6 +126,11 @@ def test_digests_say_what_differs(room, splats, tmp_path):
     assert changed["truth"] != one["truth"]
 
 
+def test_a_splat_before_the_edit_that_is_missing_is_named(room):
+    with pytest.raises(FileNotFoundError, match=tells("none.ply", "no such file", "before the edit")):
+        open_question(room, "kfgs-removal", options={"before": "none.ply", "removed": REMOVED})
+
+
 def test_a_question_has_its_own_options(room, splats):
     with pytest.raises(TypeError, match=tells("scene", "split, labels", "open_question")):
         evaluate(splats / "before.ply", open_question(room), split="train", labels="nearest")

@@ -203,6 +203,8 @@ def _edit_inputs(name: str, given: dict[str, Any]) -> dict[str, Any]:
             f"set: expected {words} with {name} (what the splat was before, and what was edited), got none; add it"
         )
     inputs = {key: given.pop(key) for key in wanted}
+    if "before" in inputs and not Path(inputs["before"]).is_file():
+        raise FileNotFoundError(f"{inputs['before']}: no such file; expected the splat before the edit there")
     if "rgb" in inputs:
         inputs["rgb"] = parse_color(inputs["rgb"], "rgb")
     return inputs

@@ -41,7 +41,7 @@ class Shown(NamedTuple):
 
 
 def check_comparable(reports: Mapping[str, Report]) -> None:
-    """Raise a ValueError unless scores are of one protocol, with the same options, of the same data.
+    """Raise a ValueError unless scores are of one protocol and names, with the same options, of the same data.
 
     Args:
         reports: by title, at least two. Digests of fields may differ.
@@ -51,9 +51,10 @@ def check_comparable(reports: Mapping[str, Report]) -> None:
     for title, other in others:
         found: list[tuple[str, Any, Any]] = [("protocol", one.protocol, other.protocol)]
         if one.protocol == other.protocol:
+            found += [("scores", list(one.scores), list(other.scores))]
             found += [
                 (f"option {key}", one.options.get(key), other.options.get(key))
-                for key in {*one.options, *other.options}
+                for key in sorted({*one.options, *other.options})
             ]
             kept = sorted({*one.digests, *other.digests} - {"field"})
             found += [(f"digest of the {key}", one.digests.get(key), other.digests.get(key)) for key in kept]
