@@ -130,11 +130,11 @@ def join(tables: list[dict[str, Any]], about: str = "") -> dict[str, Any]:
     presets = {table["preset"] for table in tables}
     if len(presets) != 1:
         sys.exit(f"--add: expected runs of one preset, got {', '.join(sorted(presets))}; add them under two names")
-    first = tables[0]
-    scene = Path(first["rows"][0]["request"]["scene"]).name
-    digests = {
-        part: max(row["request"]["digests"][part] for row in first["rows"]) for part in ("maps", "scene", "splat")
-    }
+    first, requests = tables[0], [row["request"] for table in tables for row in table["rows"]]
+    if not requests:
+        sys.exit("--add: expected finished rows, got none; run table1.py again, its log says why they failed")
+    scene = Path(requests[0]["scene"]).name
+    digests = {part: max(one["digests"][part] for one in requests) for part in ("maps", "scene", "splat")}
     listed = sorted(rows.values(), key=lambda row: (row["row"], row["seed"]))
     return {
         "scene": scene,

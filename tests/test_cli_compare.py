@@ -3,7 +3,9 @@
 import json
 import re
 import shutil
+from types import SimpleNamespace
 
+import cases_methods as cases
 import numpy as np
 import pytest
 import torch
@@ -12,10 +14,11 @@ from PIL import Image
 from small_room import fit_run, make_room
 
 from kfgs.cli import main
+from kfgs.evaluation import LerfOvs2D, MaskAndBoxes, MaskTruth, OVS3DClosed
 from kfgs.labels import load_label_set
 from kfgs.pipeline import open_question
 from kfgs.pipeline.evaluate import open_result
-from kfgs.pipeline.side_by_side import VOID, WRONG, _errors, show_views
+from kfgs.pipeline.side_by_side import VOID, WRONG, _errors, _show_labels, show_views
 
 
 @pytest.fixture(scope="module")
@@ -115,6 +118,31 @@ def test_errors_are_where_labels_differ(room, run):
         assert picture.shape == tuple(errors.shape)
 
 
+def test_pixels_that_no_level_knows_have_no_class_in_pictures():
+    truth, maps = torch.zeros(2, 3, dtype=torch.bool), torch.full((2, 2, 3), torch.nan)
+    truth[:, :2] = True
+    low, high = maps.clone(), maps.clone()
+    low[0, :, 1:], high[1, :, 1:] = 0.1, 0.2  # each level knows one text's score; the first column is unknown to both
+    low[1, :, 1:], high[0, :, 1:] = -0.3, -0.2
+    method = cases.Numbers(["mug", "spoon"], {"a": {"mug": low, "spoon": high}})
+    view = cases.view("a", 2, 3)
+    question = SimpleNamespace(
+        protocol=LerfOvs2D(), truth=MaskTruth({"a": {t: MaskAndBoxes(truth) for t in method.texts}})
+    )
+    shown = _show_labels(question, torch.rand(2, 3, 3), view, {"it": method}, method.encode)
+    assert shown.labels[1].tolist() == [[-1, 1, 1]] * 2
+
+
+def test_pictures_of_a_closed_set_choose_from_all_texts():
+    mask, maps = torch.ones(2, 3, dtype=torch.bool), torch.full((1, 2, 3), 0.1)
+    method = cases.Numbers(["mug", "spoon"], {"a": {"mug": maps, "spoon": maps + 0.1}})
+    truth = MaskTruth({"a": {"mug": MaskAndBoxes(mask)}}, listed=("mug", "spoon"))  # no spoon in this view
+    question = SimpleNamespace(protocol=OVS3DClosed(), truth=truth)
+    shown = _show_labels(question, torch.rand(2, 3, 3), cases.view("a", 2, 3), {"it": method}, method.encode)
+    assert shown.labels[1].eq(1).all()
+    assert shown.answers["it"][2] == 1
+
+
 def test_void_is_plain_grey():
     photo = torch.rand(4, 5, 3)
     wrong, void = torch.zeros(4, 5), torch.zeros(4, 5, dtype=torch.bool)
@@ -171,6 +199,11 @@ def test_a_field_that_changed_is_not_drawn(room, run, kept, tmp_path, capsys):
         ("{kept}/field.json {kept}/other.json", "other.json: expected a report in JSON"),
         ("{kept}/field.json {kept}/nothing.json", "nothing.json: no such file"),
         ("{kept}/field.json {run} --split train", "differ in digest of the truth"),
+        ("{kept}/field.json {run} --protocol kfgs-surface", "--protocol: expected kfgs-pooled/1, that of .*field.json"),
+        ("{kept}/field.json {kept}/fewer.json", r"differ in scores \(.*accuracy.* and .*mIoU.*\)"),
+        ("{kept}/field.json {kept}/list.json", "list.json: expected a report in JSON"),
+        ("{kept}/field.json {kept}/null.json", "null.json: expected a report in JSON"),
+        ("{kept}/number.json {run}", "number.json: expected texts in 'inputs'"),
         (
             "{kept}/field.json {run} --with-file a.pth",
             "--with-file: expected RUN=FILE with one of no run .* leave it out",
@@ -194,6 +227,21 @@ def test_numbers_that_cannot_be_compared_are_refused(words, message, kept, run, 
     one["options"]["level"] = 1
     (kept / "options.json").write_text(json.dumps(one))
     (kept / "other.json").write_text("[]")
+    broken = {"list": {"options": [1]}, "null": {"digests": None}, "number": {"inputs": {"scene": 5}}}
+    for name, part in (*broken.items(), ("fewer", {"scores": {"mIoU": 0.5}})):
+        (kept / f"{name}.json").write_text(json.dumps(one | {"options": {"level": 0, "labels": "own"}} | part))
     capsys.readouterr()
     assert main(["compare", *words.format(kept=kept, run=run).split()]) == 1
     assert re.search(message, capsys.readouterr().err)
+
+
+def test_scores_whose_scene_is_gone_are_compared_without_pictures(kept, tmp_path, capsys):
+    for name in ("field", "exact"):
+        one = json.loads((kept / f"{name}.json").read_text())
+        one["inputs"]["scene"] = str(tmp_path / "gone")
+        (tmp_path / f"{name}.json").write_text(json.dumps(one))
+    both = [str(tmp_path / f"{name}.json") for name in ("field", "exact")]
+    capsys.readouterr()
+    assert main(["compare", *both, "--out", str(tmp_path / "out")]) == 0
+    assert re.search(r"(?s)mIoU +accuracy.*note: no pictures: .*gone: no such folder", capsys.readouterr().out)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["compare.json", "compare.txt"]

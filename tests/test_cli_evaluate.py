@@ -8,6 +8,7 @@ import shutil
 import numpy as np
 import pytest
 from evaluated_room import REMOVED, save_splats
+from messages import tells
 from PIL import Image
 from small_room import fit_run, make_room
 
@@ -123,6 +124,16 @@ def test_digests_say_what_differs(room, splats, tmp_path):
     changed = open_question(other).digests
     assert changed["views"] == one["views"]
     assert changed["truth"] != one["truth"]
+
+
+def test_a_splat_before_the_edit_that_is_missing_is_named(room):
+    with pytest.raises(FileNotFoundError, match=tells("none.ply", "no such file", "before the edit")):
+        open_question(room, "kfgs-removal", options={"before": "none.ply", "removed": REMOVED})
+
+
+def test_a_question_has_its_own_options(room, splats):
+    with pytest.raises(TypeError, match=tells("scene", "split, labels", "open_question")):
+        evaluate(splats / "before.ply", open_question(room), split="train", labels="nearest")
 
 
 def test_label_pictures_of_test_views_are_scored_unless_a_split_is_named(room):

@@ -133,11 +133,17 @@ def compare(
     protocol = protocol or (results.first.report.protocol if results.first else "kfgs-pooled/1")
     results.check(protocol)
     question, encode, draw = None, None, out is not None and pictures > 0
+    missing = []
     if results.new or draw:
         words = {"protocol": protocol, "truth": truth, "split": split, "labels": labels, "set": set}
-        question, encode = _ask_alike(results, words, teacher, classes)
+        try:
+            question, encode = _ask_alike(results, words, teacher, classes)
+        except FileNotFoundError as error:  # scores that were kept need no files
+            if results.new:
+                raise
+            missing = [f"no pictures: {error}"]
     compared = results.score(question, encode, draw=draw)
-    say("\n".join([table_text(compared.reports), *(f"note: {note}" for note in compared.notes)]))
+    say("\n".join([table_text(compared.reports), *(f"note: {note}" for note in (*missing, *compared.notes))]))
     if out is None:
         return
     written = compared.write(out, question, encode, pictures)

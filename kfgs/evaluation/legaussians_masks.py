@@ -9,12 +9,11 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from .._check import check_range
 from ..cameras import resize_labels
 from ..labels.scores import CANONICAL, TEMPERATURE
 from .lerf_2d import relevancies
 from .method import Method, View, annotated, check_level
-from .relevancy import Encode
+from .relevancy import Encode, check_relevancy
 from .report import Report, Row, make_report, mean
 from .truth import MaskTruth
 
@@ -83,7 +82,7 @@ class LEGaussiansMasks:
     """Of a method with several."""
 
     def __post_init__(self) -> None:
-        check_range("threshold", self.threshold, 0, 1)
+        check_relevancy(self.scale, self.negatives, self.threshold)
 
     def score(self, method: Method, truth: MaskTruth, views: Sequence[View], encode: Encode) -> Report:
         """Look for the texts of each annotated picture.

@@ -16,6 +16,7 @@ from .relevancy import (
     FILTERS,
     Encode,
     Filter,
+    check_relevancy,
     clean_mask,
     encode_unit,
     fill_unknown,
@@ -75,7 +76,7 @@ class LerfOvs2D:
     """LangSplat's `eval/evaluate_iou_loc.py`: each text that is annotated in a frame is looked for in that frame.
 
     The evaluated frames are training views in LangSplat, LangSplatV2 and GAGS; Occam's LGS and VALA hold them out. Say which.
-    Pixels of which a method knows nothing count as the least relevant ones of their map.
+    Pixels of which a method knows nothing count as the least relevant ones of their map; a map of such pixels alone hits no box.
     """
 
     name: ClassVar[str] = "lerf-ovs-2d/1"
@@ -99,6 +100,7 @@ class LerfOvs2D:
 
     def __post_init__(self) -> None:
         check_choice("filter", self.filter, FILTERS)
+        check_relevancy(self.scale, self.negatives, self.threshold)
         if isinstance(self.level, str):
             check_choice("level", self.level, ("chosen", "oracle"))
 
@@ -132,7 +134,10 @@ class LerfOvs2D:
         ious = [mask_iou(one, mask) for one in masks]
         if self.level == "oracle":
             level = ious.index(max(ious))
-        hit = None if boxes is None or len(boxes) == 0 else localise(smoothed, boxes)
+        known = bool(
+            (seen > 0).any()
+        )  # relevancy is positive; unknown pixels of an unknown map are 0, and all of them its largest
+        hit = None if boxes is None or len(boxes) == 0 else known and localise(smoothed, boxes)
         return {"level": self.level if fixed else level, "IoU": ious[level], "hit": hit}
 
 

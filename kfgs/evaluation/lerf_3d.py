@@ -17,7 +17,7 @@ from ..labels.scores import CANONICAL, TEMPERATURE
 from ..splat import rasterize
 from .class_lists import load_classes, name_key
 from .method import Method, View, annotated, best_labels, check_level
-from .relevancy import Encode, encode_unit, lerf_relevancy, mask_iou, stretch
+from .relevancy import Encode, check_relevancy, encode_unit, lerf_relevancy, mask_iou, stretch
 from .report import Report, Row, make_report, mean
 from .truth import MaskTruth
 
@@ -96,6 +96,7 @@ class LerfOvs3D:
 
     def __post_init__(self) -> None:
         check_choice("selection", self.selection, RULES)
+        check_relevancy(self.scale, self.negatives, self.threshold)
         check_range("silhouette", self.silhouette, 0, 1)
         check_whole("neighbours", self.neighbours, 1)
         if isinstance(self.level, str):
@@ -214,6 +215,8 @@ class LerfOvs3D:
             )
         cosines = self._levels(method.gaussian_cosines(encode_unit(encode, asked)))
         labels = best_labels(cosines)  # [levels, N]
+        if labels.shape[1] == 0:
+            return {text: labels[0] == 0 for text in texts}
         selected = {}
         for text in texts:
             i = list(asked).index(text)

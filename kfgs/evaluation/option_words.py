@@ -77,6 +77,8 @@ def _parse_tuple(inside: tuple[Any, ...], text: str) -> tuple[Any, ...]:
         if nested or text.startswith("[")
         else [part.strip() for part in text.split(",") if part.strip()]
     )
+    if not isinstance(parts, list):
+        raise ValueError(text)
     kinds = [inside[0]] * len(parts) if inside[-1] is Ellipsis else list(inside)
     if len(kinds) != len(parts):
         raise ValueError(text)

@@ -9,12 +9,12 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from .._check import check_choice, check_range
+from .._check import check_choice, check_range, check_whole
 from ..cameras import resize_labels
 from ..labels.scores import CANONICAL, TEMPERATURE
 from .lerf_2d import activate, relevancies
 from .method import Method, View, annotated, check_level, label_view
-from .relevancy import FILTERS, Encode, Filter, clean_mask, encode_unit, mask_iou
+from .relevancy import FILTERS, Encode, Filter, check_relevancy, clean_mask, encode_unit, mask_iou
 from .report import Report, Row, make_report, mean
 from .stable_threshold import stable_mask
 from .truth import MaskTruth
@@ -58,7 +58,8 @@ class OVS3DClosed:
     )
 
     texts: tuple[str, ...] = ()
-    """The scene's list (`classes.txt`); empty: the texts that the truth has."""
+    """What pixels choose from. Empty: the scene's list (`MaskTruth.listed`, from `classes.txt`), or the texts that have a mask
+    if there is no list. The report's note says which."""
     level: int = 0
     """Of a method with several."""
 
@@ -68,7 +69,7 @@ class OVS3DClosed:
         Raises:
             ValueError: if a picture has no view, or `texts` lacks an annotated text.
         """
-        asked = self.texts or truth.texts
+        asked = self.texts or truth.listed or truth.texts
         missing = [text for text in truth.texts if text not in asked]
         if missing:
             raise ValueError(f"texts: expected all annotated texts, got none of {', '.join(missing)}; add them")
@@ -83,7 +84,14 @@ class OVS3DClosed:
                 rows.append({"view": view.stem, "text": text, "IoU": mask_iou(labels == asked.index(text), mask)})
             shares.append(one_hot_accuracy(labels, [known.get(text, nothing) for text in asked]))
         scores = {"mIoU": mean(row["IoU"] for row in rows), "accuracy": mean(shares)}
-        return make_report(self, method.name, scores, rows)
+        origin = (
+            "the option `texts`"
+            if self.texts
+            else "the scene's list"
+            if truth.listed
+            else "the masks: no list is known"
+        )
+        return make_report(self, method.name, scores, rows, [f"argmax over {len(asked)} texts of {origin}"])
 
 
 @dataclass(frozen=True)
@@ -115,6 +123,7 @@ class OVS3DThreshold:
 
     def __post_init__(self) -> None:
         check_choice("filter", self.filter, FILTERS)
+        check_relevancy(self.scale, self.negatives, self.threshold)
         if isinstance(self.level, str):
             check_choice("level", self.level, ("chosen",))
 
@@ -167,6 +176,9 @@ class OVS3DStability:
 
     def __post_init__(self) -> None:
         check_range("steepest", self.steepest, 0, closed=(False, False))
+        check_range("fractions (highest)", self.fractions[1], self.fractions[0], closed=(False, True))
+        check_whole("run", self.run, 1)
+        check_relevancy(self.scale, self.negatives)
 
     def score(self, method: Method, truth: MaskTruth, views: Sequence[View], encode: Encode) -> Report:
         """Look for each text in each annotated view.

@@ -74,7 +74,7 @@ class KfgsSurface:
 
         Raises:
             TypeError: if the method has no Gaussians.
-            ValueError: if no Gaussian gets a label, no point has one, or the truth names no class.
+            ValueError: if no point has a class, or the truth names none.
         """
         if method.gaussians is None:
             raise TypeError(

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .._check import check_choice, check_whole
+from .._check import check_choice, check_range, check_whole
 from .._rows import unit_embeddings
 
 Encode = Callable[[Sequence[str]], Tensor]
@@ -22,6 +22,14 @@ Filter = Literal["langsplat", "langsplatv2"]
 FILTERS = ("langsplat", "langsplatv2")
 _Window = tuple[Tensor, Tensor]
 """First index, and one past the last, of the window of each place."""
+
+
+def check_relevancy(scale: float, negatives: Sequence[str], threshold: float = 0.5) -> None:
+    """Raise a ValueError unless the scale is positive, there are negatives, and the threshold lies in [0, 1]."""
+    check_range("threshold", threshold, 0, 1)
+    check_range("scale", scale, 0, closed=(False, False))
+    if len(negatives) == 0:
+        raise ValueError("negatives: expected at least one text to compare with, got none; name one, such as object")
 
 
 def encode_unit(encode: Encode, texts: Sequence[str]) -> Tensor:  # [K, D]

@@ -91,7 +91,10 @@ class Report:
         return replace(self, command=command or self.command, digests=both, machine=machine or self.machine)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values: protocol, version, options, scores, rows, digests, command. A number that is not finite is null."""
+        """Plain values: protocol, version, options, scores, rows, digests, command.
+
+        A number that is not finite is null; but an infinite score, such as the PSNR of equal pictures, is the text "inf".
+        """
         name, _, version = self.protocol.partition("/")
         return {
             "protocol": self.protocol,
@@ -102,7 +105,7 @@ class Report:
             "options": plain(self.options),
             "changed": list(self.changed),
             "always": list(self.always),
-            "scores": plain(self.scores),
+            "scores": {name: str(score) if math.isinf(score) else plain(score) for name, score in self.scores.items()},
             "rows": plain(self.rows),
             "digests": plain(self.digests),
             "command": self.command,
@@ -119,16 +122,11 @@ class Report:
         """
         try:
             scores = {str(name): math.nan if score is None else float(score) for name, score in value["scores"].items()}
-            names = ("protocol", "about", "method", "options", "digests", "command", "machine")
-            parts = {name: value[name] for name in names if name in value}
-            return Report(
-                scores=scores,
-                rows=tuple(value["rows"]),
-                changed=tuple(value["changed"]),
-                always=tuple(value["always"]),
-                notes=tuple(value.get("notes", ())),
-                **parts,
-            )
+            texts = ("protocol", "about", "method", "command", "machine")
+            parts: dict[str, Any] = {name: str(value[name]) for name in texts if name in value}
+            parts |= {name: dict(value[name]) for name in ("options", "digests") if name in value}
+            parts |= {name: tuple(map(str, value.get(name, ()))) for name in ("changed", "always", "notes")}
+            return Report(scores=scores, rows=tuple(dict(row) for row in value["rows"]), **parts)
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise ValueError(
                 f"value: expected a report in JSON, as `kfgs evaluate --out` writes it, got something else ({error!r})"

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from .._check import check_choice, check_range
 from ..gaussians import Gaussians
-from .class_lists import load_classes
+from ..scenes.files import some
+from .class_lists import load_classes, name_key
 from .method import Method, View, best_labels, check_level
 from .relevancy import Encode, encode_unit
 from .report import Report, Row, make_report, mean
@@ -69,6 +70,32 @@ def class_indices(labels: Tensor, ids: Sequence[int]) -> Tensor:  # [P] int64 ->
     found = torch.full_like(labels, -1)
     for i, label in enumerate(ids):
         found[labels == label] = i
+    return found
+
+
+def scannet_labels(truth: PointTruth, ids: Sequence[int], names: Sequence[str]) -> Tensor:  # [P] int64
+    """The labels of a truth as indices into some classes of NYU40; -1 for all others.
+
+    Raises:
+        ValueError: if the truth calls an id by another name than NYU40, so that its labels are another data set's, or if no
+            point has one of the classes.
+    """
+    other = [
+        f"{i} = {truth.names[i]!r}"
+        for i, name in zip(ids, names, strict=True)
+        if i in truth.names and name_key(truth.names[i]) != name_key(name)
+    ]
+    if other:
+        raise ValueError(
+            f"truth: expected ids of NYU40 ({ids[0]} = {names[0]!r}, ...), got {some(other, 3)}; give ScanNet's labels "
+            "(*_vh_clean_2.labels.ply), or use kfgs-surface/1 or scenesplat-fmiou/1, which go by names"
+        )
+    found = class_indices(truth.labels.cpu(), ids)
+    if not bool((found >= 0).any()):
+        raise ValueError(
+            f"truth: expected points of some of the {len(ids)} classes ({some(list(names), 3)}), got none among {len(found)}; "
+            "are these the labels of the scene?"
+        )
     return found
 
 
@@ -144,11 +171,11 @@ class ScanNetPoints:
 
         Raises:
             TypeError: if the method has no Gaussians, or `encode` is missing.
-            ValueError: if there are more or fewer Gaussians than vertices.
+            ValueError: if there are more or fewer Gaussians than vertices, the labels are not NYU40's, or no vertex is scored.
         """
         ids, names = scannet_classes(self.classes)
         gaussians, predicted = predict_classes(method, names, needed(encode), level=self.level, unknown=self.unknown)
-        opacities, target = gaussians.opacities.detach().cpu(), class_indices(truth.labels.cpu(), ids)
+        opacities, target = gaussians.opacities.detach().cpu(), scannet_labels(truth, ids, names)
         predicted = predicted.cpu()
         if self.assign == "nearest":
             tree = cKDTree(gaussians.means.detach().cpu().double().numpy())
@@ -160,6 +187,11 @@ class ScanNetPoints:
                 "freeze the positions, or use scannet-volume/1"
             )
         target[opacities < self.least_opacity] = -1
+        if not bool((target >= 0).any()):
+            raise ValueError(
+                f"method: expected Gaussians of an opacity of at least {self.least_opacity:g} at some labelled vertex, got "
+                "none; lower least_opacity, or score other Gaussians"
+            )
         accuracy = float((predicted == target)[target >= 0].double().mean())
         return report_classes(self, method, names, class_scores(predicted, target, self.classes), accuracy)
 

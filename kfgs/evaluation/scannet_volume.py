@@ -18,12 +18,12 @@ from .relevancy import Encode
 from .report import Report
 from .scannet_points import (
     COUNTS,
-    class_indices,
     class_scores,
     needed,
     predict_classes,
     report_classes,
     scannet_classes,
+    scannet_labels,
 )
 from .truth import PointTruth
 
@@ -83,7 +83,9 @@ def gaussian_truth(
         which = torch.from_numpy(index)[owner, column]
         offsets = (places[which] - cloud.means[rows][owner])[:, None] @ whitening[rows][owner]  # [m, 1, 3]
         squares = offsets.square().sum((1, 2))
-        votes = (-0.5 * squares).exp() if vote == "near" else squares.sqrt()
+        # The nearest point's square is subtracted: it scales all votes of a Gaussian alike. A flat Gaussian's would all be 0.
+        least = torch.full((len(rows),), torch.inf, dtype=torch.float64).scatter_reduce(0, owner, squares, "amin")
+        votes = (-0.5 * (squares - least[owner])).exp() if vote == "near" else squares.sqrt()
         cell = owner * C + classes[which]
         sums = torch.zeros(len(rows) * C, dtype=torch.float64).index_add_(0, cell, votes)
         members = torch.bincount(cell, minlength=len(rows) * C)
@@ -156,18 +158,24 @@ class ScanNetVolume:
 
         Raises:
             TypeError: if the method has no Gaussians, or `encode` is missing.
+            ValueError: if the labels are not NYU40's, or no Gaussian has a labelled vertex nearby.
         """
         ids, names = scannet_classes(self.classes)
         gaussians, predicted = predict_classes(method, names, needed(encode), level=self.level, unknown=self.unknown)
         target = gaussian_truth(
             gaussians,
             truth.points,
-            class_indices(truth.labels, ids),
+            scannet_labels(truth, ids, names),
             nearest=self.nearest,
             radius=self.radius,
             balanced=self.balanced,
             vote=self.vote,
         )
+        if not bool((target >= 0).any()):
+            raise ValueError(
+                f"method: expected Gaussians with a labelled vertex within {self.radius:g} scales, got none among "
+                f"{len(target)}; are they and the mesh in one frame?"
+            )
         amount, predicted = significance(gaussians), predicted.cpu()
         found = class_scores(predicted, target, self.classes, amount)
         total = float(amount[target >= 0].sum())

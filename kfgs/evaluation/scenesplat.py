@@ -115,12 +115,12 @@ class SceneSplatBench:
 
         Raises:
             TypeError: if a method has no Gaussians.
-            ValueError: if there is no scene, points have a name that may be a class in another spelling, or instances are
-                missing.
+            ValueError: if there is no scene, points have a name that may be a class in another spelling, instances are
+                missing, or no point has a class.
         """
         lists = load_classes("scenesplat")[self.benchmark]
         classes: list[str] = lists["classes"]
-        prompts = lists.get("prompts") or [[self.template.format(name), i] for i, name in enumerate(classes)]
+        prompts = lists.get("prompts") or [[self.template.replace("{}", name), i] for i, name in enumerate(classes)]
         text = encode_unit(encode, [prompt for prompt, _ in prompts])
         meant = torch.tensor([index for _, index in prompts])
         pooled, name, count, left_out = ConfusionMatrix(len(classes)), "", 0, Counter[str]()
@@ -131,6 +131,10 @@ class SceneSplatBench:
             name, count = method.name, count + 1
         if count == 0:
             raise ValueError("scenes: expected at least one, got none; pass pairs of a method and its truth")
+        if int(pooled.matrix.sum() + pooled.misses.sum()) == 0:
+            raise ValueError(
+                f"truth: expected points of some class of {self.benchmark}, got none in {count} scenes; are these its labels?"
+            )
         return self._report(pooled, lists, name, left_out)
 
     def _predict(self, method: Method, truth: PointTruth, text: Tensor, meant: Tensor) -> Tensor:  # [P] int64

@@ -55,8 +55,10 @@ def score_surface(
 ) -> SurfaceReport:
     """Carry the labels of Gaussians to surface points, and compare (protocol `kfgs-surface/1`).
 
+    If no Gaussian has a label, no point receives one, and the agreement is 0.
+
     Raises:
-        ValueError: if shapes disagree, no Gaussian has a label, or no point has a true class.
+        ValueError: if shapes disagree, or no point has a true class.
     """
     check_shapes(("points", points, "P 3"), ("truth", truth, "P"))
     scored = truth >= 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple
@@ -10,7 +9,8 @@ from typing import ClassVar, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from .._check import check_choice
+from .._check import check_choice, check_size, check_whole
+from ..scenes.files import natural_key
 from .class_lists import load_classes
 from .method import Method, View, label_view
 from .relevancy import Encode, encode_unit
@@ -102,6 +102,12 @@ class TeacherAgreement:
     def __post_init__(self) -> None:
         if isinstance(self.texts, str):
             check_choice("texts", self.texts, ("first-word", "full"))
+        if self.split is not None:
+            check_whole("split (step)", self.split[0], 1)
+            check_whole("split (first)", self.split[1], 0)
+        check_size(self.largest, "largest")
+        check_size(self.size)
+        check_whole("most", self.most, 1)
 
     def score(self, method: Method, truth: Method, views: Sequence[View], encode: Encode) -> Report:
         """Compare a method with its teacher.
@@ -145,15 +151,10 @@ class TeacherAgreement:
         Raises:
             ValueError: if there is none.
         """
-        ordered = sorted(views, key=lambda view: _by_number(view.stem))
+        ordered = sorted(views, key=lambda view: natural_key(view.stem))
         found = ordered if self.split is None else ordered[self.split[1] :: self.split[0]]
         if not found:
             raise ValueError(
                 f"views: expected more than {(self.split or (0, 0))[1]}, got {len(ordered)}; pass split=None"
             )
         return found
-
-
-def _by_number(stem: str) -> list[tuple[int, str]]:
-    """A key that puts rgb_2 before rgb_10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", stem)]

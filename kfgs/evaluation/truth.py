@@ -50,6 +50,8 @@ class MaskTruth:
     """By the picture's stem, then by text. A text that a frame lacks is not asked there."""
     scene: str | None = None
     """The data set's name of the scene ("figurines"), where a protocol has a list of texts for it."""
+    listed: tuple[str, ...] = ()
+    """The data set's own list of the scene's texts (`classes.txt` of 3D-OVS), whether a picture has a mask of each or not."""
 
     __repr__ = short_repr
 
@@ -64,7 +66,7 @@ class MaskTruth:
 
     @property
     def texts(self) -> tuple[str, ...]:
-        """All texts of the scene, in the order of their first appearance."""
+        """All texts that have a mask, in the order of their first appearance."""
         return tuple(dict.fromkeys(text for texts in self.frames.values() for text in texts))
 
 

@@ -1,4 +1,4 @@
-"""What to say beside a score: the rule for labels, which scored views were trained on, the size of the pictures, the teacher."""
+"""What to say beside a score: rule for labels, level, which scored views were trained on, size of the pictures, teacher."""
 
 from __future__ import annotations
 
@@ -26,6 +26,9 @@ def notes_beside(question: Question, rule: str | None, method: Any, encode: Enco
         notes.append(
             "the class of a pixel is the field's own, by votes of the Gaussians, not the text nearest to the rendered feature"
         )
+    levels, level = getattr(method, "levels", 1), getattr(question.protocol, "level", None)
+    if levels > 1 and isinstance(level, int):
+        notes.append(f"level {level} of 0 to {levels - 1} is scored; level=N takes another")
     views = question.scored
     if field is not None:
         names = field.info.get("views") or [camera.name for camera in field.cameras]

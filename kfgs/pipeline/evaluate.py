@@ -44,7 +44,7 @@ def evaluate(
         field: a field folder or a run folder of kfgs, a result of another program (`load_foreign`), a splat with features, a
             folder of a teacher's feature maps; or a `Method`. For colours and edits, a colour splat.
         scene: its folder; or a question that was opened before (`open_question`), to ask several methods the same.
-        protocol: a name of `kfgs.evaluation.PROTOCOLS`.
+        protocol: a name of `kfgs.evaluation.PROTOCOLS`; a question has its own.
         encode: a label set, or the teacher's text encoder. Not needed for colours and edits.
         with_file: a second file of a foreign result, see `load_foreign`.
         command: kept in the report.
@@ -57,9 +57,13 @@ def evaluate(
     Raises:
         FileNotFoundError: if the result, the scene or its truth is missing.
         ValueError: if something does not fit, such as an unknown protocol, or texts without embeddings.
-        TypeError: if a protocol of Gaussians is asked about a teacher.
+        TypeError: if a protocol of Gaussians is asked about a teacher, or a question and something that belongs to it are given.
     """
     if isinstance(scene, Question):
+        if asked:
+            raise TypeError(
+                f"scene: expected a folder with {', '.join(asked)}, got a question, which has these; pass them to open_question"
+            )
         question = scene
     else:
         check_kind(field, protocol)

@@ -203,6 +203,8 @@ def _edit_inputs(name: str, given: dict[str, Any]) -> dict[str, Any]:
             f"set: expected {words} with {name} (what the splat was before, and what was edited), got none; add it"
         )
     inputs = {key: given.pop(key) for key in wanted}
+    if "before" in inputs and not Path(inputs["before"]).is_file():
+        raise FileNotFoundError(f"{inputs['before']}: no such file; expected the splat before the edit there")
     if "rgb" in inputs:
         inputs["rgb"] = parse_color(inputs["rgb"], "rgb")
     return inputs
@@ -294,9 +296,8 @@ def _digest_truth(truth: LabelTruth | MaskTruth) -> str:
     """Of what is scored, as it was read; one picture in memory at a time."""
     if isinstance(truth, LabelTruth):
         return digest_data([list(truth.names), [[stem, digest_data(_labels(truth.maps[stem]))] for stem in truth.maps]])
-    return digest_data(
-        [[stem, digest_data({k: list(v) for k, v in truth.frames[stem].items()})] for stem in truth.frames]
-    )
+    masks = [[stem, digest_data({k: list(v) for k, v in truth.frames[stem].items()})] for stem in truth.frames]
+    return digest_data([*masks, list(truth.listed)] if truth.listed else masks)
 
 
 def _digest_scene(scene: Scene, folder: Path, protocol: Any, inputs: Mapping[str, Any]) -> str:

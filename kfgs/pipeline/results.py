@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from .._card import short_repr
 from .._files import atomic_path, read_json, write_json
-from ..evaluation import Encode, LabelSet, Report
+from ..evaluation import Encode, LabelSet, Report, get_protocol
 from ..evaluation.encoders import TableEncoder
 from .evaluate import check_kind, digest_method, evaluate, is_maps, open_result
 from .question import Question
@@ -102,6 +102,13 @@ class Results:
         check_several(len(self.paths))
         if not self.new:
             check_comparable({str(path): kept.report for path, kept in self.kept.items()})
+            return
+        others = [path for path, one in self.kept.items() if get_protocol(protocol).name != one.report.protocol]
+        if others:
+            raise ValueError(
+                f"protocol: expected {self.kept[others[0]].report.protocol}, that of {others[0]}, got {protocol}; leave it out, "
+                "or score its field again"
+            )
 
     def score(
         self, question: Question | None, encode: Encode | LabelSet | None = None, *, draw: bool = False
@@ -150,7 +157,11 @@ def _all_notes(reports: Mapping[str, Report]) -> list[str]:
 def _read_kept(path: Path) -> Kept:
     top = read_json(path)
     try:
-        return Kept(Report.from_json(top), dict(top.get("inputs", {})))
+        report, inputs = Report.from_json(top), dict(top.get("inputs", {}))
+        words = {name: value for name, value in inputs.items() if name != "set"}
+        if not all(isinstance(word, str | None) for word in (*words.values(), *inputs.get("set", ()))):
+            raise ValueError("expected texts in 'inputs', got other values")
+        return Kept(report, inputs)
     except (ValueError, AttributeError, TypeError) as error:
         raise ValueError(
             f"{path}: {str(error).removeprefix('value: ')}; give what `kfgs evaluate --out` wrote"

@@ -18,7 +18,7 @@ from ..evaluation.segmentation import load_label_map
 from ..splat import rasterize
 from ..viz import overlay_labels, save_picture
 from ..viz.pictures import legend_strip, picture_grid
-from .question import OF_COLORS, Question, colors_of
+from .question import LABELLED, OF_COLORS, Question, colors_of
 
 WRONG = (0.835, 0.369, 0.0)  # vermilion of Okabe and Ito, over a grey photograph
 VOID = 0.5  # grey, as the palette's "no class"
@@ -41,7 +41,7 @@ class Shown(NamedTuple):
 
 
 def check_comparable(reports: Mapping[str, Report]) -> None:
-    """Raise a ValueError unless scores are of one protocol, with the same options, of the same data.
+    """Raise a ValueError unless scores are of one protocol and names, with the same options, of the same data.
 
     Args:
         reports: by title, at least two. Digests of fields may differ.
@@ -51,9 +51,10 @@ def check_comparable(reports: Mapping[str, Report]) -> None:
     for title, other in others:
         found: list[tuple[str, Any, Any]] = [("protocol", one.protocol, other.protocol)]
         if one.protocol == other.protocol:
+            found += [("scores", list(one.scores), list(other.scores))]
             found += [
                 (f"option {key}", one.options.get(key), other.options.get(key))
-                for key in {*one.options, *other.options}
+                for key in sorted({*one.options, *other.options})
             ]
             kept = sorted({*one.digests, *other.digests} - {"field"})
             found += [(f"digest of the {key}", one.digests.get(key), other.digests.get(key)) for key in kept]
@@ -159,7 +160,9 @@ def _show_labels(question: Question, photo: Tensor, view: View, methods: Mapping
         if isinstance(level, int):
             found = label_view(method, view, text, level).cpu()
         else:
-            found = best_labels(method.cosines(view, text).nan_to_num(-torch.inf).amax(0)).cpu()
+            cosines = method.cosines(view, text)  # [levels, H, W, K]
+            best = cosines.masked_fill(cosines.isnan(), -torch.inf).amax(0)
+            found = best_labels(best.masked_fill(best.isinf(), torch.nan)).cpu()
         labels = places[found.clamp_min(0)].where(found >= 0, -1)
         wrong = (labels != truth) & (truth >= 0)
         share = float(wrong.sum() / (truth >= 0).sum().clamp_min(1))
@@ -176,10 +179,12 @@ def _truth_of(question: Question, view: View, encode: Encode) -> tuple[Tensor, S
         labels = found if isinstance(found, Tensor) else load_label_map(found)
         return labels.cpu(), truth.names, list(range(len(truth.names)))
     if isinstance(truth, MaskTruth):
-        names, labels = truth.texts, torch.full(view.camera.size, -1, dtype=torch.int64)
+        closed = question.protocol.name in LABELLED  # then pixels choose from all texts, not from those of the view
+        names = (question.protocol.texts or truth.listed or truth.texts) if closed else truth.texts
+        labels = torch.full(view.camera.size, -1, dtype=torch.int64)
         for text, (mask, _) in truth.frames[view.stem].items():  # a later mask covers an earlier one
             labels[mask] = names.index(text)
-        return labels, names, [names.index(text) for text in truth.frames[view.stem]]
+        return labels, names, [names.index(text) for text in (names if closed else truth.frames[view.stem])]
     texts = question.protocol.texts
     names = tuple(load_classes("ade20k")[texts]) if isinstance(texts, str) else texts
     assert isinstance(truth, Method)

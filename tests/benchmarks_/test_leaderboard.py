@@ -132,3 +132,17 @@ def test_the_page_in_the_docs_is_that_of_its_runs(monkeypatch):
     if not (DOCS / "leaderboard.md").is_file():
         pytest.skip("kfgs is installed without its repository")
     run(monkeypatch, DOCS / "runs", DOCS / "leaderboard.md", "--check")
+
+
+def test_the_shared_gaussians_of_a_later_table_are_named(out):
+    later = read_json(out / "table1.json")
+    none = {
+        **row("adc", 0, 0.7)["request"],
+        "given": False,
+        "digests": {"code": "c", "maps": "m", "scene": "s", "splat": ""},
+    }
+    first = {**later, "rows": [{**row("adc", 0, 0.7), "request": none}]}
+    for tables in ([first, later], [later, first], [{**later, "rows": []}, later]):
+        assert leaderboard.join(tables)["digests"] == {"maps": "m", "scene": "s", "splat": "p"}
+    with pytest.raises(SystemExit, match="expected finished rows, got none"):
+        leaderboard.join([{**later, "rows": []}])

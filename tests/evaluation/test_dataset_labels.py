@@ -149,6 +149,7 @@ def test_coco(tmp_path: Path) -> None:
     ("changes", "parts"),
     [
         ({"category_id": 7}, ("annotation 9", "category", "7")),
+        ({"category_id": [7]}, ("annotation 9", "category", "[7]")),
         ({"segmentation": [[1, 2, 3, 4]]}, ("annotation 9", "polygons")),
         ({"segmentation": []}, ("annotation 9", "polygons or run lengths")),
         ({"segmentation": {"size": [4, 3], "counts": [12]}}, ("annotation 9", "(3, 4)", "(4, 3)")),
@@ -172,6 +173,22 @@ def test_coco_objects_that_leave_their_picture_or_are_thin(tmp_path: Path) -> No
     ):
         path = _coco(tmp_path / "coco.json", annotations=[good | {"segmentation": [outline]}])
         assert load_coco_masks(path).frames["left/a"]["person"].mask.int().tolist() == mask
+
+
+def test_a_category_of_coco_that_means_no_class_is_not_scored(tmp_path: Path) -> None:
+    named = [{"id": 18, "name": "Un-labelled"}, {"id": 1, "name": "person"}, {"id": 7, "name": "cat"}]
+    here = {"image_id": 3, "bbox": [0, 0, 2, 1]}
+    both = [
+        here | {"category_id": 1, "segmentation": [[0, 0, 4, 0, 4, 3, 0, 3]]},
+        here | {"category_id": 18, "segmentation": [[1, 0, 3, 0, 3, 2, 1, 2]]},  # over the person
+    ]
+    truth = load_coco_labels(_coco(tmp_path / "coco.json", categories=named, annotations=both))
+    assert truth.names == ("person", "cat")
+    assert truth.maps["left/a"].tolist() == [[0, -1, -1, 0], [0, -1, -1, 0], [0, 0, 0, 0]]
+    assert truth.maps["b"].tolist() == [[-1, -1]]
+    assert list(load_coco_masks(tmp_path / "coco.json").frames["left/a"]) == ["person"]
+    alone = _coco(tmp_path / "coco.json", categories=named, annotations=both[1:])
+    assert list(load_coco_masks(alone).frames) == []
 
 
 def test_coco_files_that_are_damaged(tmp_path: Path) -> None:

@@ -97,3 +97,15 @@ def test_nothing_in_a_checkpoint_is_run(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=tells("chkpnt30000_langfeat_1.pth", "nothing was run", "do not trust")):
         load_occam(tmp_path)
     assert not mark.exists()
+
+
+def test_runs_of_levels_beside_the_run_of_the_colours_are_langsplats(tmp_path: Path) -> None:
+    torch.save(decoder_of((3, 9)).state_dict(), tmp_path / "ae.pth")
+    for level in (1, 2, 3):
+        save_capture(tmp_path / f"ramen_{level}/chkpnt30000.pth", [random_rows(N, 3, seed=level)])
+    want = load_langsplat(tmp_path / "ramen", tmp_path / "ae.pth")
+    save_ply(tmp_path / "ramen/point_cloud/iteration_30000/point_cloud.ply", {})
+    found = load_foreign(tmp_path / "ramen", tmp_path / "ae.pth")
+    assert found.levels == 3
+    text = random_rows(2, 9)
+    assert torch.equal(found.gaussian_cosines(text), want.gaussian_cosines(text))

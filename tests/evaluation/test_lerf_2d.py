@@ -110,3 +110,12 @@ def test_bad_input_is_named():
     frames = {"frame_00002": {"mug": MaskAndBoxes(torch.zeros(3, 3).bool())}}
     with pytest.raises(ValueError, match="use cameras of the size of the annotated pictures"):
         LerfOvs2D().score(method, MaskTruth(frames), views, method.encode)
+
+
+def test_a_method_that_knows_nothing_of_a_view_hits_no_box():
+    texts = ["mug", *CANONICAL]
+    method = cases.Numbers(texts, {"a": {text: torch.full((2, 12, 16), torch.nan) for text in texts}})
+    mask = torch.ones(12, 16, dtype=torch.bool)
+    truth = MaskTruth({"a": {"mug": MaskAndBoxes(mask, torch.tensor([[3.0, 3, 9, 9]]))}})
+    report = LerfOvs2D().score(method, truth, [cases.view("a", 12, 16)], method.encode)
+    assert dict(report.scores) == {"mIoU": 0, "localisation": 0}

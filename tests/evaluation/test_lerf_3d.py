@@ -204,3 +204,11 @@ def test_bad_input_is_named():
         LerfOvs3D().score(TeacherMethod({}), truth, views, method.encode)
     with pytest.raises(ValueError, match="selection: expected one of 'argmax'"):
         LerfOvs3D(selection="leaf")
+
+
+@pytest.mark.parametrize("protocol", [LerfOvs3D(), LerfOvs3D.vala(), LerfOvs3D.dr_splat()])
+def test_a_method_without_gaussians_selects_none(protocol):
+    method, truth, views = _scene()
+    method.gaussians = method.gaussians.select(torch.zeros(40, dtype=torch.bool))
+    method.own = {text: values[:, :0] for text, values in method.own.items()}
+    assert protocol.score(method, truth, views, method.encode).value == 0

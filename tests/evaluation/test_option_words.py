@@ -45,6 +45,9 @@ def test_words_that_do_not_fit(word, message):
 def test_numbers_that_are_none_and_pairs_of_three():
     with pytest.raises(ValueError, match="expected split as whole numbers between commas or none"):
         parse_options("feature3dgs-teacher", ["split=1,2,3"])
+    for word in ("merged=5", "merged={}", "merged=[5]", "merged=[[1, 2, 3]]", "merged=[[1"):
+        with pytest.raises(ValueError, match="expected merged as a JSON list of pairs"):
+            parse_options("feature3dgs-teacher", [word])
     with pytest.raises(ValueError, match="expected stretched as true or false"):
         parse_options("3dovs-threshold", ["stretched=maybe"])
 

@@ -149,7 +149,7 @@ def test_pictures_and_edits_are_scored_as_their_functions_do(room):
     recolor = KfgsRecolor().score(before, before, room, names[index], (1, 0, 0))
     found = score_recolor(before, before, room, names[index], (1, 0, 0))
     assert recolor["hue inside"] == found.hue_inside
-    assert recolor.to_json()["scores"]["psnr outside"] is None  # infinite: nothing changed
+    assert recolor.to_json()["scores"]["psnr outside"] == "inf"  # nothing changed
     assert "kfgs-recolor/1" in found.text
 
 
@@ -159,3 +159,9 @@ def test_a_named_score_is_short_and_its_text_long():
     assert report.miou.text.startswith("mIoU 0.2500 (kfgs-pooled/1: one confusion matrix")
     assert "void (255) ignored" in report.text
     assert "void" not in str(report)
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_surface_without_a_label_has_no_agreement(count):
+    found = score_surface(torch.zeros(count, 3), torch.full((count,), -1), torch.zeros(2, 3), torch.tensor([0, 1]))
+    assert (found.agreement, found.transfer.labelled, found.points) == (0, 0, 2)

@@ -3,6 +3,7 @@ import inspect
 from pathlib import Path
 
 import pytest
+from messages import tells
 
 from kfgs.evaluation import PROTOCOLS, LerfOvs3D, get_protocol
 
@@ -10,6 +11,7 @@ DOC = Path(__file__).resolve().parents[2] / "docs" / "protocols.md"
 NAMES = """kfgs-pooled/1 kfgs-surface/1 kfgs-color/1 kfgs-removal/1 kfgs-recolor/1 feature3dgs-teacher/1 lerf-ovs-2d/1
 lerf-ovs-3d/1 legaussians-mip360/1 scannet-points/1 scannet-volume/1 3dovs-closed/1 3dovs-threshold/1 3dovs-stability/1
 scenesplat-fmiou/1"""
+RELEVANCY = ("lerf-ovs-2d", "lerf-ovs-3d", "legaussians-mip360", "3dovs-threshold", "3dovs-stability")
 
 
 def test_all_protocols_are_there():
@@ -47,3 +49,23 @@ def test_wrong_names_get_a_hint():
         get_protocol("lerf-ovs-2d/2")
     with pytest.raises(TypeError, match="expected options among split, got level; leave them out"):
         get_protocol("kfgs-color", level=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "option", "value", "says"),
+    [
+        *((name, "negatives", (), "at least one text") for name in RELEVANCY),
+        *((name, "scale", 0.0, "(0, inf)") for name in RELEVANCY),
+        *((name, "threshold", float("nan"), "[0, 1]") for name in RELEVANCY if name != "3dovs-stability"),
+        ("3dovs-stability", "run", 0, "[1, inf)"),
+        ("3dovs-stability", "fractions", (0.9, 0.1), "(0.9, inf)"),
+        ("feature3dgs-teacher", "most", 0, "[1, inf)"),
+        ("feature3dgs-teacher", "split", (0, 2), "[1, inf)"),
+        ("feature3dgs-teacher", "split", (8, -1), "[0, inf)"),
+        ("feature3dgs-teacher", "size", (0, 5), "[1, inf)"),
+        ("feature3dgs-teacher", "largest", (0, 5), "[1, inf)"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(name, option, value, says):
+    with pytest.raises(ValueError, match=tells(option, says)):
+        get_protocol(name, **{option: value})

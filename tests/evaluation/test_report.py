@@ -1,4 +1,5 @@
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -8,6 +9,7 @@ import torch
 
 from kfgs.evaluation import LabelTruth, MaskAndBoxes, MaskTruth, PointTruth, Report, average
 from kfgs.evaluation.report import make_report, plain
+from kfgs.pipeline.side_by_side import rank
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,14 @@ def test_json_says_how_to_get_the_score_again():
     assert data["options"] == {"threshold": 0.5, "sizes": [1, 2]}
     assert data["command"] == "kfgs evaluate F"
     assert data["digests"] == {"field": "abc"}
+
+
+def test_an_infinite_score_survives_json_and_stays_the_best():
+    best = make_report(Example(), "kfgs", {"PSNR": math.inf, "hue": math.nan}, [])
+    read = Report.from_json(json.loads(json.dumps(best.to_json(), allow_nan=False)))
+    assert read.value == math.inf
+    assert math.isnan(read["hue"])
+    assert list(rank({"good": make_report(Example(), "", {"PSNR": 30.0}, []), "best": read})) == ["best", "good"]
 
 
 def test_notes_are_kept_and_joined():

@@ -194,3 +194,6 @@ def test_bad_input_is_named():
         SceneSplatBench(ignored=OTHERS).score(TeacherMethod({}), truth, (), method.encode)
     with pytest.raises(ValueError, match="template: expected a text with {}"):
         SceneSplatBench(template="a")
+    nothing = PointTruth(truth.points, torch.full_like(truth.labels, -1), truth.names)
+    with pytest.raises(ValueError, match="truth: expected points of some class of scannet20, got none in 1 scenes"):
+        SceneSplatBench().score(method, nothing, (), method.encode)

@@ -50,6 +50,14 @@ def test_votes_are_said_only_where_they_count():
         assert any("by votes of the Gaussians" in note for note in notes) == said
 
 
+def test_the_level_of_a_method_with_several_is_said():
+    for levels, level, said in ((3, 1, True), (1, 0, False), (3, "chosen", False)):
+        method, asked = cases.Numbers("a", own={"a": torch.zeros(levels, 2)}), question()
+        asked.protocol.level = level
+        notes = notes_beside(asked, None, method, None)
+        assert notes == (["level 1 of 0 to 2 is scored; level=N takes another"] if said else [])
+
+
 class Network:
     name = "clip\nfake"
 

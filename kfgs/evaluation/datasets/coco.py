@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..._files import read_json
 from ...scenes.files import file_stem
+from ..class_lists import VOID_NAMES, name_key
 from ..truth import LabelTruth, MaskAndBoxes, MaskTruth
 from .files import ReadWhenAsked
 from .polygons import MOST, decode_rle, fill_region, say_range, union
@@ -27,7 +28,8 @@ class _Picture:
 def load_coco_masks(path: str | Path) -> MaskTruth:
     """Read a COCO JSON as masks of texts: the categories that each picture has, several objects as one mask with a box each.
 
-    Polygons are filled by the centres of pixels (`fill_region`); run lengths may be a list or COCO's compressed text.
+    Polygons are filled by the centres of pixels (`fill_region`); run lengths may be a list or COCO's compressed text. Categories
+    in `VOID_NAMES` are no texts.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -35,15 +37,15 @@ def load_coco_masks(path: str | Path) -> MaskTruth:
     """
     path = Path(path)
     names, pictures = _read(path)
-    return MaskTruth(
-        ReadWhenAsked({stem: partial(_masks, path, names, p) for stem, p in pictures.items() if p.objects})
-    )
+    void = [category for category in names if _is_void(names[category])]
+    shown = {s: p for s, p in pictures.items() if any(one.get("category_id") not in void for _, one in p.objects)}
+    return MaskTruth(ReadWhenAsked({stem: partial(_masks, path, names, p) for stem, p in shown.items()}))
 
 
 def load_coco_labels(path: str | Path) -> LabelTruth:
     """Read a COCO JSON as labels: one class per pixel, -1 where no object is; a later object covers an earlier one.
 
-    Classes are all categories of the file, in its order.
+    Classes are the categories of the file, in its order, without those in `VOID_NAMES`: their objects are void.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -51,9 +53,10 @@ def load_coco_labels(path: str | Path) -> LabelTruth:
     """
     path = Path(path)
     names, pictures = _read(path)
-    index = {category: i for i, category in enumerate(names)}
+    asked = [category for category in names if not _is_void(names[category])]
+    index = {category: asked.index(category) if category in asked else -1 for category in names}
     readers = {stem: partial(_labels, path, index, p) for stem, p in pictures.items()}
-    return LabelTruth(tuple(names.values()), ReadWhenAsked(readers))
+    return LabelTruth(tuple(names[category] for category in asked), ReadWhenAsked(readers))
 
 
 def _read(path: Path) -> tuple[dict[int, str], dict[str, _Picture]]:
@@ -83,11 +86,17 @@ def _masks(path: Path, names: dict[int, str], picture: _Picture) -> dict[str, Ma
     found: dict[int, list[tuple[Tensor, Tensor]]] = {}
     for place, annotation in picture.objects:
         category, mask = _object(path, place, annotation, names, picture.size)
+        if _is_void(names[category]):
+            continue
         found.setdefault(category, []).append((mask, _box(path, place, annotation)))
     return {
         names[category]: MaskAndBoxes(union([mask for mask, _ in parts]), torch.stack([box for _, box in parts]))
         for category, parts in found.items()
     }
+
+
+def _is_void(name: str) -> bool:
+    return name_key(name) in VOID_NAMES
 
 
 def _labels(path: Path, index: dict[int, int], picture: _Picture) -> Tensor:  # [H, W] int64
@@ -104,7 +113,7 @@ def _object(
     where = f"{path}, annotation {annotation.get('id', place)}"
     category: Any = annotation.get("category_id")
     segmentation: Any = annotation.get("segmentation")
-    if category not in known:
+    if not isinstance(category, int) or category not in known:
         raise ValueError(f"{where}: expected a category of the file ({len(known)} ids), got {category!r:.40}")
     try:
         if isinstance(segmentation, dict):

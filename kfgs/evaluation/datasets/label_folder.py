@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..._files import read_json
 from ...scenes.files import file_stem, list_images, some
-from ..class_lists import VOID_NAMES
+from ..class_lists import VOID_NAMES, name_key
 from ..truth import LabelTruth
 from .coco import load_coco_labels
 from .files import ReadWhenAsked, read_pixels
@@ -64,7 +64,7 @@ def load_labels(path: str | Path, table: str | Path | None = None, void: int = 2
         )
     source = _find_table(path) if table is None else Path(table)
     named = read_table(source)
-    names = tuple(name for name in named if name.lower() not in VOID_NAMES)
+    names = tuple(name for name in named if name_key(name) not in VOID_NAMES)
     index = {entry: names.index(name) if name in names else -1 for name, entry in named.items()}
     in_color = isinstance(next(iter(index)), tuple)
     if not in_color:

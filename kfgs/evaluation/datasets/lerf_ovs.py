@@ -28,8 +28,8 @@ def load_lerf_ovs(path: str | Path, scene: str | None = None) -> MaskTruth:
     GAGS's Mip-NeRF360-OVS has the same layout. Polygons are filled as OpenCV does (`fill_polygon`).
 
     Args:
-        path: `lerf_ovs/label/figurines`; or the scene `lerf_ovs/figurines`, whose labels are in `../label/figurines`; or
-            `lerf_ovs` together with `scene`.
+        path: `lerf_ovs/label/figurines`; or the scene `lerf_ovs/figurines`, whose labels are in `../label/figurines` or in its
+            own `label`; or `lerf_ovs` together with `scene`.
         scene: the scene's name, if `path` is the folder of all.
 
     Returns:
@@ -41,10 +41,10 @@ def load_lerf_ovs(path: str | Path, scene: str | None = None) -> MaskTruth:
     """
     path = Path(path)
     root = path / scene if scene else path
-    places = [root, root.parent / "label" / root.name, root / "label"]
+    places = [root.parent / "label" / root.name, root / "label", root]  # a scene may have other JSONs: transforms.json
     folder = (
         find_folder(places, "*.json", "labels of LERF-OVS")
-        if scene or not (path / "label").is_dir()
+        if scene or not (path / "label").is_dir() or next((path / "label").glob("*.json"), None) is not None
         else _one_scene(path)
     )
     files = sorted(folder.glob("*.json"), key=lambda file: natural_key(file.name))

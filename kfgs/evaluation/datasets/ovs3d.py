@@ -24,7 +24,7 @@ def load_3dovs(path: str | Path) -> MaskTruth:
         path: the scene, or its `segmentations`.
 
     Returns:
-        Masks by the stem of the picture; read when asked, as they are as large as the photographs.
+        Masks by the stem of the picture, read when asked, as they are as large as the photographs; and the list of texts.
 
     Raises:
         FileNotFoundError: if there is no `classes.txt`.
@@ -40,7 +40,7 @@ def load_3dovs(path: str | Path) -> MaskTruth:
         )
     stems = _stems(folder.parent, [view.name for view in views])
     readers = {stem: partial(_read_view, view, texts) for stem, view in zip(stems, views, strict=True)}
-    return MaskTruth(ReadWhenAsked(readers))
+    return MaskTruth(ReadWhenAsked(readers), listed=tuple(texts))
 
 
 def read_texts(folder: Path) -> list[str]:

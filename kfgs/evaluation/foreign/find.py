@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from .feature3dgs import load_feature3dgs
-from .langsplat import load_langsplat, load_langsplat_v2, load_occam
+from .langsplat import has_levels, level_runs, load_langsplat, load_langsplat_v2, load_occam
 from .legaussians import load_legaussians_field
 from .splat_features import load_splat_features
 from .splatted import SplattedMethod
@@ -31,8 +31,8 @@ def load_foreign(path: str | Path, with_file: str | Path | None = None) -> Splat
         ValueError: if no program is recognised, or a file is damaged.
     """
     path = Path(path)
-    runs = [path] if path.exists() else [path.with_name(f"{path.name}_{level}") for level in (1, 2, 3)]
-    if not runs[0].exists():
+    run = path if path.exists() else level_runs(path)[0]
+    if not run.exists():
         raise FileNotFoundError(f"{path}: no such file or folder; expected a result: {LAYOUTS}")
     if path.is_file() and path.suffix not in (".pth", ".pt"):
         return _read_splats(path, with_file)
@@ -49,9 +49,9 @@ def load_foreign(path: str | Path, with_file: str | Path | None = None) -> Splat
         try:
             return load_feature3dgs(path, decoder=with_file)
         except ValueError as error:  # other programs write such a PLY too, without these columns
-            if "semantic_0" not in str(error) or not _has(path, "chkpnt*.pth"):
+            if "semantic_0" not in str(error) or not (_has(path, "chkpnt*.pth") or has_levels(path)):
                 raise
-    if path.is_file() or _has(runs[0], "chkpnt*.pth") or not path.exists():
+    if path.is_file() or _has(run, "chkpnt*.pth") or run != path or has_levels(path):
         return _read_langsplat(path, with_file)
     raise ValueError(f"{path}: expected a result of a known program, got a folder without one; known are {LAYOUTS}")
 

@@ -141,12 +141,21 @@ def load_occam(run: str | Path, step: int | None = None) -> SplattedMethod:
     return SplattedMethod("Occam's LGS", levels)
 
 
+def level_runs(base: Path) -> list[Path]:
+    """The folders of the three runs that have a name in common: `figurines_1`, `figurines_2`, `figurines_3`."""
+    return [base.with_name(f"{base.name}_{level}") for level in (1, 2, 3)]
+
+
+def has_levels(base: Path) -> bool:
+    """Whether all three are there. They then count, and not what is in `figurines` itself, which is the run of the colours."""
+    return all(run.is_dir() for run in level_runs(base))
+
+
 def _checkpoints(runs: Runs, step: int | None, pattern: str, what: str) -> list[Path]:
     """The checkpoint of each level."""
     if isinstance(runs, str | Path):
         base = Path(runs)
-        listed = [base.with_name(f"{base.name}_{level}") for level in (1, 2, 3)]
-        folders = [base] if base.exists() and not all(folder.is_dir() for folder in listed) else listed
+        folders = [base] if base.exists() and not has_levels(base) else level_runs(base)
     else:
         folders = [Path(run) for run in runs]
     if not folders:
