@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 from torch import Tensor
 
 from ..gaussians import Gaussians
@@ -117,7 +118,10 @@ class KfgsColor:
 
 @dataclass(frozen=True)
 class KfgsRemoval:
-    """Is a removed class gone, and nothing else: `score_removal` as a protocol."""
+    """Is a removed class gone, and nothing else: `score_removal` as a protocol.
+
+    The headline is the lowest of its four shares, so that a scene where everything was deleted does not come first.
+    """
 
     name: ClassVar[str] = "kfgs-removal/1"
     about: ClassVar[str] = REMOVAL.partition(": ")[2]
@@ -128,8 +132,8 @@ class KfgsRemoval:
     def score(self, before: Gaussians, after: Gaussians, scene: str | Path, removed: str) -> Report:
         """Compare a colour field with the same field without the class `removed`; see `score_removal`."""
         found = score_removal(before, after, scene, removed, split=self.split)
-        shares = ("gone_pixels", "untouched_pixels", "gone_points", "kept_points")
-        return _of_edit(self, found, shares)
+        shares = _named(found, ("gone_pixels", "untouched_pixels", "gone_points", "kept_points"))
+        return _of_edit(self, found, {"lowest share": float(np.min(list(shares.values())))} | shares)  # NaN if one is
 
 
 @dataclass(frozen=True)
@@ -147,10 +151,14 @@ class KfgsRecolor:
     ) -> Report:
         """Compare a colour field with the same field where the class `painted` has the colour `rgb`; see `score_recolor`."""
         found = score_recolor(before, after, scene, painted, rgb, split=self.split)
-        return _of_edit(self, found, ("psnr_outside", "hue_inside"))
+        return _of_edit(self, found, _named(found, ("psnr_outside", "hue_inside")))
 
 
-def _of_edit(protocol: object, found: RemovalReport | RecolorReport, shown: Sequence[str]) -> Report:
+def _named(found: RemovalReport | RecolorReport, names: Sequence[str]) -> dict[str, float]:
+    return {name.replace("_", " "): getattr(found, name) for name in names}
+
+
+def _of_edit(protocol: object, found: RemovalReport | RecolorReport, scores: dict[str, float]) -> Report:
     values: dict[str, Any] = found.to_json()
     row: Row = {"class": found.name, **{key: values[key] for key in values if key not in ("name", "protocol")}}
-    return make_report(protocol, "", {name.replace("_", " "): getattr(found, name) for name in shown}, [row])
+    return make_report(protocol, "", scores, [row])
