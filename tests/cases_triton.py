@@ -164,6 +164,15 @@ def check_ranks(inputs: list[Tensor], index: Tensor | None, tiles: Tiles, *, tie
         distinct = labels.sort(dim=-1).values.diff(dim=-1) > 0
         facts[f"top {top}: each once"] = bool((distinct | ~drawn).all())
         facts[f"top {top}: alphas"] = largest(found.alphas.cpu().double() - alphas) <= 1e-5
+    from kfgs.splat.engines.triton import engine as triton_engine
+
+    most, triton_engine.MOST_RANKED = triton_engine.MOST_RANKED, 0  # as for more channels than registers hold
+    try:
+        many = rank_channels(*inputs[:4], tiles, top=top, index=index, engine="triton")
+    finally:
+        triton_engine.MOST_RANKED = most
+    facts["sorted maps: drawn"] = torch.equal(many.labels >= 0, found.labels >= 0)
+    facts["sorted maps: scores"] = largest(many.scores - found.scores) <= 1e-5
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the interpreter's, about NaN
         nothing = rank_channels(*inputs[:3], inputs[3] * torch.nan, tiles, index=index, engine="triton")

@@ -146,7 +146,11 @@ def test_pictures_and_edits_are_scored_as_their_functions_do(room):
     assert removal.rows[0]["kept_points"] == found.kept_points
     assert removal.value == min(removal.scores.values()) == removal["lowest share"]
     nothing = KfgsRemoval().score(before, before.select(labels < 0), room, names[index])
-    assert (nothing["gone pixels"], nothing["kept points"], nothing.value) == (1, 0, 0)  # everything deleted is no removal
+    assert (nothing["gone pixels"], nothing["kept points"], nothing.value) == (
+        1,
+        0,
+        0,
+    )  # everything deleted is no removal
     assert "held-out views" in found.text
     assert "held-out views" in removal.to_json()["about"]
     recolor = KfgsRecolor().score(before, before, room, names[index], (1, 0, 0))

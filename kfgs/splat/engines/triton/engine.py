@@ -59,6 +59,8 @@ GPUs (see tests/splat/test_triton.py). Not tuned by timing: none of this has bee
 SMALLEST = 16
 """Least size of an axis of a tensor-core product: less is padded."""
 
+MOST_RANKED = 64
+"""Most channels that a pixel keeps in registers; for more of them the map is sorted."""
 
 DTYPES = (torch.float32,)
 PROOFS = ("cpu",)
@@ -162,6 +164,11 @@ def rank(splats: Splats, tiles: Tiles, top: int) -> Ranked:
     means2d, conics, opacities, features, _, index = splats
     rows, offsets, width, height, tile_size = tiles
     _check(means2d=means2d, conics=conics, opacities=opacities, features=features)
+    if top > MOST_RANKED:
+        maps, alphas, _ = forward(splats, tiles)
+        scores, labels = (value[..., :top] for value in maps.sort(dim=-1, descending=True, stable=True))
+        empty = (alphas <= 0)[..., None]
+        return Ranked(labels.masked_fill(empty, -1), scores.masked_fill(empty, 0), alphas)
     labels = torch.full((height, width, top), -1, dtype=torch.int64, device=features.device)
     scores, alphas = features.new_zeros(height, width, top), features.new_zeros(height, width)
     if len(rows):
