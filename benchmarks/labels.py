@@ -1,7 +1,7 @@
 """How long does a label map take: one kernel that keeps the best class, against maps of all scores?
 
     python benchmarks/labels.py [--field FOLDER] [--scene SCENE] [--size 640x480] [--gaussians 30000] [--classes 18]
-                                [--repeats 20] [--threads 2] [--quick]
+                                [--repeats 20] [--threads 2] [--device cuda] [--quick]
 
 Without a field: a furnished room of Gaussians with random linear latents, and a random decoder of the paper's widths. With
 one: its Gaussians, seen from its first training view or from the scene's first camera, at its own size. Both sides of a row
@@ -62,6 +62,7 @@ def main() -> None:
     parser.add_argument("--classes", type=int, default=18)
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--threads", type=int)
+    parser.add_argument("--device", default="cpu")
     parser.add_argument("--quick", action="store_true", help="a tiny case, which only proves that it runs")
     args = parser.parse_args()
     if args.classes < 5:
@@ -83,8 +84,9 @@ def main() -> None:
             [random_linear(args.gaussians, rows, g), random_decoded(args.gaussians, g)],
             view(width, height),
         )
+    fields, camera, rows = [field.to(args.device) for field in fields], camera.to(args.device), rows.to(args.device)
     print(f"{width} x {height} pixels, {len(fields[0])} Gaussians, {len(rows)} classes")
-    print(f"{torch.get_num_threads()} threads, load {os.getloadavg()[0]:.1f} at the start\n")
+    print(f"{args.device}, {torch.get_num_threads()} threads, load {os.getloadavg()[0]:.1f} at the start\n")
     print("| what | old, ms | new, ms | ratio | of the quickest | per second | at best | equal |\n" + "|---" * 8 + "|")
     for field in fields:
         for row in compare(field, camera, rows, args.repeats):
@@ -129,7 +131,7 @@ def random_decoded(count: int, g: torch.Generator) -> SemanticField:
 def compare(field: SemanticField, camera: Camera, rows: Tensor, repeats: int) -> list[Row]:
     """The rows of a field of either kind."""
     if field.method == "fused":
-        many = torch.randn(64, *rows.shape, generator=torch.Generator().manual_seed(1))
+        many = torch.randn(64, *rows.shape, generator=torch.Generator().manual_seed(1)).to(rows)
         texts = (iter([*many] * 2 * (1 + repeats)) for _ in range(2))
         old_texts, new_texts = texts
         return [
@@ -180,10 +182,18 @@ def measure(
     seconds: tuple[list[float], list[float]] = ([], [])
     for _ in range(repeats):
         for call, times in zip((old, new), seconds, strict=True):
+            wait()
             began = time.perf_counter()
             call()
+            wait()
             times.append(time.perf_counter() - began)
     return Row(name, *seconds, equal)
+
+
+def wait() -> None:
+    """Until the GPU has finished, if one is used."""
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
 
 
 def blended(field: SemanticField, camera: Camera, rows: Tensor, top: int = 1) -> Tensor:
@@ -213,7 +223,7 @@ def decoded(field: SemanticField, latents: Tensor, table: Tensor, covered: Tenso
     """The old exact decode: every pixel's feature, and the codeword most similar to it."""
     assert field.autoencoder is not None
     assert field.codebook is not None
-    labels = torch.full(covered.shape, -1)
+    labels = torch.full(covered.shape, -1, device=covered.device)
     with torch.no_grad():
         parts = latents[covered].split(CHUNK)
         labels[covered] = torch.cat([table[field.codebook.quantize(field.autoencoder.decode(part))] for part in parts])

@@ -105,6 +105,19 @@ class SemanticField:
     def _repr_html_(self) -> str:
         return html_card("SemanticField", parts.card_facts(self))
 
+    def to(self, *args: Any, **kwargs: Any) -> SemanticField:
+        """The field on another device or in another dtype; the arguments are those of `torch.Tensor.to`.
+
+        Cameras that you pass to `segment` and `render` afterwards must be on the same device.
+        """
+        names = ("gaussians", "codebook", "autoencoder", "linear", "answers")
+        moved: dict[str, Any] = {
+            name: part.to(*args, **kwargs) for name in names if (part := getattr(self, name)) is not None
+        }
+        if self.seen is not None:
+            moved["seen"] = Seen(*(value.to(*args, **kwargs) for value in self.seen))
+        return replace(self, **moved, cameras=tuple(camera.to(*args, **kwargs) for camera in self.cameras))
+
     # Maps
 
     def render(self, camera: Camera, *, engine: str = "auto") -> Rendering:

@@ -535,3 +535,20 @@ def test_classes_may_be_a_list_of_rows():
     assert torch.equal(field().classify(rows.tolist()).labels, field().classify(rows).labels)
     with pytest.raises(TypeError, match=tells("classes", "LabelSet", "list")):
         field().classify(["chair", "table"])
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_another_dtype_gives_the_same_answers(mode):
+    count = 8
+    seen = Seen(torch.ones(count), torch.ones(count))
+    one = replace(field(mode, count), cameras=(a_camera(),), seen=seen if mode == "fused" else None)
+    other = one.to(torch.float64)
+    assert {other.gaussians.means.dtype, other.features.dtype, other.cameras[0].K.dtype} == {torch.float64}
+    assert one.gaussians.means.dtype == torch.float32  # the field itself stays
+    camera = a_camera(24, 18)
+    for rule in RULES if mode == "fused" else ["paper"]:
+        labels = one.classify(embeddings(), rule=rule).labels
+        assert other.classify(embeddings(), rule=rule).labels.equal(labels)
+        picture = one.segment(camera, embeddings(), rule=rule)
+        assert other.segment(camera.to(torch.float64), embeddings(), rule=rule).equal(picture)
+    assert other.to(torch.float32).features.equal(one.features)
