@@ -142,9 +142,10 @@ def uplift(args: argparse.Namespace) -> str:
     """Maps and Gaussians to a field."""
     scene, maps = load_scene(args.scene).undistorted(), FeatureFolder(args.folder / "maps")
     cameras = [scene.cameras[i % len(scene.cameras)] for i in range(len(maps))]
-    run, config = Run(args.folder / "run", print_line), UpliftConfig.field()
-    inputs = {"features": {"files": map_digests(run, maps)}, "config": {}, "seed": 0}
-    field = uplift_stage(run, read_splats(args.splat).gaussians, cameras, maps, config, inputs, True)
+    with tempfile.TemporaryDirectory(prefix="kfgs_streaming_") as folder:  # a finished stage would be found again
+        run, config = Run(Path(folder), print_line), UpliftConfig.field()
+        inputs = {"features": {"files": map_digests(run, maps)}, "config": {}, "seed": 0}
+        field = uplift_stage(run, read_splats(args.splat).gaussians, cameras, maps, config, inputs, True)
     return f"{len(field.gaussians)} Gaussians, {field.gaussians.features.shape[1]} latents"
 
 

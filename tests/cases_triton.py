@@ -172,6 +172,8 @@ def check_ranks(inputs: list[Tensor], index: Tensor | None, tiles: Tiles, *, tie
     finally:
         triton_engine.MOST_RANKED = most
     facts["sorted maps: drawn"] = torch.equal(many.labels >= 0, found.labels >= 0)
+    chosen = truth.gather(2, many.labels.cpu().clamp_min(0))
+    facts["sorted maps: labels"] = largest((chosen - ordered) * drawn) <= 1e-5
     facts["sorted maps: scores"] = largest(many.scores - found.scores) <= 1e-5
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the interpreter's, about NaN

@@ -32,8 +32,8 @@ def pytest_collection_finish():
 @pytest.fixture(autouse=True)
 def a_crash_says_where(pytestconfig):
     """pycolmap, when loaded, takes over pytest's handler of a segfault, and its message is lost in what pytest captures."""
-    if "pycolmap" in sys.modules and not hasattr(pytestconfig, "kfgs_crashes"):
-        capture = pytestconfig.pluginmanager.getplugin("capturemanager")
+    capture = pytestconfig.pluginmanager.getplugin("capturemanager")
+    if "pycolmap" in sys.modules and capture is not None and not hasattr(pytestconfig, "kfgs_crashes"):
         with capture.global_and_fixture_disabled():
             pytestconfig.kfgs_crashes = os.dup(2)
         faulthandler.disable()

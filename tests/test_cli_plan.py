@@ -79,4 +79,4 @@ def test_a_typo_is_not_hidden_by_maps_that_exist(room, tmp_path, capsys):
     assert not (tmp_path / "nowhere").exists()
     assert "--splat" not in said  # which plan does not have
     assert re.search(r"at most [\d,]+ Gaussians", said)
-    assert "at most 30,000 are kept" in said
+    assert "at most 50,000 are kept" in said

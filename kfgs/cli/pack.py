@@ -46,7 +46,7 @@ def pack(
     Args:
         field: A field folder (RUN/field), or a field in one file.
         out: A file whose name ends in .kfgs.safetensors; any other name is a folder.
-        precision: lossless; fine (labels hardly change); small (the default: half a megabyte for 30,000 Gaussians); tiny. The
+        precision: lossless; fine (labels hardly change); small (the default: 0.6 MB for 50,000 Gaussians); tiny. The
             errors of each are printed, and kept in the file. All but lossless sort the Gaussians.
         scores: What `kfgs evaluate --out` wrote about this field: its scores travel in the file. Can be given several times.
     """

@@ -11,7 +11,7 @@ REMOVAL = (
     "nearest to the class's surface. Pixels of the class that such Gaussians gave at least 1/4 of their light: gone = less "
     "than half of that light is left; changed = some channel moved by 8/255. Pixels of other classes: untouched = no "
     "channel moved by 8/255. Surface points whose density (sum of o exp(-d^2 / 2)) was at least 0.05: of the class, gone = "
-    "less than half is left; of others, kept = at least half is left"
+    "less than half is left; of others, kept = at least half is left. As a protocol, the lowest of the four shares leads"
 )
 RECOLOR = (
     "kfgs-recolor/1: test views of a scene with exact labels. Outside = PSNR of after against before over all pixels of "

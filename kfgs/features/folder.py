@@ -200,7 +200,7 @@ class FeatureFolder(Sequence[Tensor]):
         """Read a map a few rows at a time, which takes less memory than `maps[i]`.
 
         Raises:
-            ValueError: as when the whole map is read.
+            ValueError: as when the whole map is read; values that are not finite are counted in the first block that has any.
         """
         stored = self._checked(i)
         for block in read_rows(stored):

@@ -108,7 +108,7 @@ class SemanticField:
     def to(self, *args: Any, **kwargs: Any) -> SemanticField:
         """The field on another device or in another dtype; the arguments are those of `torch.Tensor.to`.
 
-        Cameras that you pass to `segment` and `render` afterwards must be on the same device.
+        Cameras that you pass to `segment` and `render` afterwards must be on the same device. `folder` stays.
         """
         names = ("gaussians", "codebook", "autoencoder", "linear", "answers")
         moved: dict[str, Any] = {

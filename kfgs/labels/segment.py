@@ -103,8 +103,8 @@ def _score_layers(
     """Linear layers whose largest output is the codeword of a latent; None if no engine evaluates them for these rows.
 
     With a decoder W h + b and unit codewords C, argmax over C (W h + b) / |W h + b| is argmax over (C W) h + C b: one layer
-    in place of the last one and of the comparison. The nearest latent is argmax over 2 c·x - |c|^2, to which a constant is added
-    that makes the largest output positive.
+    in place of the last one and of the comparison. The nearest latent is argmax over 2 c·x - |c|^2. The constant that is
+    added makes the largest output positive for latents like the codewords'; for others the plain computation decides.
     """
     if rows.dtype not in (torch.float32, torch.float64) or not offers(_engine(rows), "decide"):
         return None

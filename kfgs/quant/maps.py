@@ -29,7 +29,7 @@ class FeatureMaps(Protocol):
 
 
 def read_blocks(maps: FeatureMaps, i: int) -> Iterator[Tensor]:  # each [at most 32, w, D]
-    """A map, a few rows at a time: from `maps.blocks(i)` if there is such a member, so that it is never whole in memory."""
+    """A map, a few rows at a time: from `maps.blocks(i)` if there is such a member, so that it need not be whole in memory."""
     blocks = getattr(maps, "blocks", None)
     yield from as_tensor(f"maps[{i}]", maps[i]).split(32) if blocks is None else blocks(i)
 

@@ -61,6 +61,6 @@ def test_scores_are_products_with_the_decoded_feature():
 def test_fit_lowers_the_loss():
     config = LangSplatConfig(4, 32, 1e-2, 1_000, False, 120, 2e-2)
     found = langsplat.fit(task(), config)
-    assert found.history[-1]["loss"] < 0.9 * found.history[0]["loss"]
+    assert found.history[-1]["loss"] < 0.95 * found.history[0]["loss"]
     assert list(found.seconds) == ["autoencoder", "latents"]
     assert found.storage == langsplat.storage_bytes(12, found.method.decoder.decoder_parameters, levels=1)

@@ -125,7 +125,7 @@ def test_modes_have_their_own_stages(mode, names):
 def test_the_default_method_trains_colours_and_uplifts_once():
     found = plan(sizes(FitConfig()))
     assert list(stages(found)) == ["features", "color", "uplift"]
-    assert "at most 30,000 are kept" in found.stages[-1].what
+    assert "at most 50,000 are kept" in found.stages[-1].what
     assert found.disk_bytes > found.kept_bytes  # the working maps are a temporary file
     more = stages(sizes(FitConfig(), views=180))
     assert more["uplift"].seconds == 181

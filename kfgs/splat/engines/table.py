@@ -90,16 +90,25 @@ def _own_symbols() -> Iterator[None]:
             sys.setdlopenflags(flags)
 
 
+COMPILING = "compiling the CPU engine's kernels: a minute or two in all, once on this machine"
+_SAID: list[str] = []  # the line above, once it was said
+
+
 @contextmanager
 def say_compiling(say: Callable[[str], None]) -> Iterator[None]:
-    """Say so when the CPU engine's kernels must be compiled: the first use on a machine waits for it, about a minute."""
-    if "numba" not in available_engines():
+    """Say so, once in a process, when the CPU engine's kernels must be compiled: the first use on a machine waits for it."""
+    if _SAID or "numba" not in available_engines():
         yield
         return
     load("numba")
     from .cpu.cache import on_compile
 
-    with on_compile(lambda: say("compiling the CPU engine's kernels: about a minute, once on this machine")):
+    def tell() -> None:
+        if not _SAID:
+            _SAID.append(COMPILING)
+            say(COMPILING)
+
+    with on_compile(tell):
         yield
 
 

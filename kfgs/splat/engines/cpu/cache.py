@@ -44,8 +44,8 @@ class _First(event.Listener):
         self._tell, self._told = tell, False
 
     def on_start(self, event: event.Event) -> None:
-        kernel = event.data["dispatcher"].py_func.__module__
-        if not self._told and kernel.startswith("kfgs."):
+        function = getattr(event.data["dispatcher"], "py_func", None)
+        if not self._told and (getattr(function, "__module__", None) or "").startswith("kfgs."):
             self._told = True
             self._tell()
 
