@@ -78,7 +78,10 @@ def main() -> None:
         field = SemanticField.load(args.field)
         cameras = load_scene(args.scene).cameras if args.scene else field.cameras
         fields, camera = [field], cameras[0].resized(height, width)
-        rows = torch.randn(args.classes, field.dim, generator=g)
+        try:
+            rows = field.label_set().embeddings  # the field's own classes, whatever --classes says
+        except ValueError:
+            rows = torch.randn(args.classes, field.dim, generator=g)
     else:
         fields, camera = (
             [random_linear(args.gaussians, rows, g), random_decoded(args.gaussians, g)],
@@ -136,6 +139,12 @@ def compare(field: SemanticField, camera: Camera, rows: Tensor, repeats: int) ->
         old_texts, new_texts = texts
         return [
             measure("label map", lambda: blended(field, camera, rows), lambda: field.segment(camera, rows), repeats),
+            measure(
+                "label map by rendered features",
+                lambda: similar(field, camera, rows),
+                lambda: field.segment(camera, rows, rule="paper"),
+                repeats,
+            ),
             measure(
                 "label map, another text each time",
                 lambda: blended(field, camera, next(old_texts)),
@@ -210,6 +219,16 @@ def blended(field: SemanticField, camera: Camera, rows: Tensor, top: int = 1) ->
         return winners[index].masked_fill(most <= 0, -1)
 
 
+def similar(field: SemanticField, camera: Camera, rows: Tensor) -> Tensor:
+    """The label map of the first versions: the features rendered, and similarities [H W, C] of all pixels."""
+    assert field.linear is not None
+    seen = field.render(camera)
+    unit = torch.nn.functional.normalize(rows, dim=1)
+    pixels = seen.map.flatten(0, 1)
+    labels = torch.cat([field.linear.cosines(part, unit).argmax(dim=1) for part in pixels.split(CHUNK)])
+    return labels.view(camera.size).masked_fill(seen.alpha <= 0, -1)
+
+
 def compared(field: SemanticField, camera: Camera, rows: Tensor) -> Tensor:
     """The old text query: the features rendered, and each pixel compared with the target and four negatives."""
     assert field.linear is not None
@@ -240,6 +259,7 @@ def parts(field: SemanticField, camera: Camera, rows: Tensor, repeats: int) -> s
             "projection": lambda: project(cloud, camera),
             "binning": lambda: bin_tiles(projected, camera.width, camera.height),
             "projection, binning, compositing and arg-max": lambda: rasterize_labels(cloud, camera),
+            "the same for labels alone": lambda: rasterize_labels(cloud, camera, early=True),
             "the map of the same scores": lambda: rasterize(cloud, camera),
         }
         times = {name: statistics.median(measure(name, call, call, repeats, "").new) for name, call in calls.items()}

@@ -250,7 +250,8 @@ class SemanticField:
         Raises:
             ValueError: if shapes disagree or `rule` is unknown.
         """
-        return self.rank(camera, classes, rule=rule).labels[..., 0]
+        check_choice("rule", rule, get_args(Rule))
+        return rank_classes(self, camera, self._rows(classes), rule, early=True).labels[..., 0]
 
     def rank(self, camera: Camera, classes: Classes | None = None, *, top: int = 1, rule: Rule = "fused") -> Ranked:
         """The `top` best classes of each pixel by the rule of `segment`, and their scores.

@@ -36,6 +36,9 @@ class Votes(NamedTuple):
         return short_repr(self)
 
 
+LEAST_SHARE = 1e-30
+"""A smaller share of a vote counts as none: blended, it would be a denormal number, with which a CPU takes ten times as long."""
+
 _KEPT: WeakKeyDictionary[Any, tuple[Any, Tensor, Votes]] = WeakKeyDictionary()
 """For each field: the rule, the text, and the votes that follow from them."""
 
@@ -48,24 +51,32 @@ def divide_votes(cosines: Tensor, known: Tensor) -> Votes:  # [N, C], [N] bool
     with torch.no_grad():
         classes = cosines.argmax(dim=1)[known].unique()
         shares = torch.softmax(LOGIT_SCALES["clip"] * cosines[:, classes], dim=1) * known[:, None]
-        return Votes(classes, shares.contiguous())
+        return Votes(classes, torch.nn.functional.threshold(shares, LEAST_SHARE, 0))
 
 
-def rank_votes(gaussians: Gaussians, camera: Camera, votes: Votes, top: int = 1) -> Ranked:
-    """The classes with most votes at each pixel; votes are blended like colours. Beyond the classes voted for: -1, 0."""
+def rank_votes(gaussians: Gaussians, camera: Camera, votes: Votes, top: int = 1, *, early: bool = False) -> Ranked:
+    """The classes with most votes at each pixel; votes are blended like colours. Beyond the classes voted for: -1, 0.
+
+    `early` is that of `rasterize_labels`.
+    """
     if not len(votes.classes):  # nothing is known about any Gaussian: no votes for one class, and the opacity
         votes = Votes(votes.classes.new_zeros(1), votes.shares.new_zeros(len(votes.shares), 1))
     found = min(top, len(votes.classes))
     with torch.no_grad():
-        labels, scores, alphas = rasterize_labels(gaussians.replace(features=votes.shares, sh=None), camera, top=found)
-        labels = votes.classes[labels].masked_fill_(scores <= 0, -1)
+        shown = gaussians.replace(features=votes.shares, sh=None)
+        labels, scores, alphas = rasterize_labels(shown, camera, top=found, early=early)
+        if len(votes.classes) <= int(votes.classes[-1]):  # else they are all classes, in order
+            labels = votes.classes[labels]
+        labels.masked_fill_(scores <= 0, -1)
     if found < top:
         labels = torch.nn.functional.pad(labels, (0, top - found), value=-1)
         scores = torch.nn.functional.pad(scores, (0, top - found))
     return Ranked(labels, scores, alphas)
 
 
-def rank_classes(field: SemanticField, camera: Camera, rows: Tensor, rule: Rule, top: int = 1) -> Ranked:
+def rank_classes(
+    field: SemanticField, camera: Camera, rows: Tensor, rule: Rule, top: int = 1, *, early: bool = False
+) -> Ranked:
     """The best classes of each pixel by the rule of `SemanticField.segment`, and their scores.
 
     Args:
@@ -74,6 +85,7 @@ def rank_classes(field: SemanticField, camera: Camera, rows: Tensor, rule: Rule,
         rows: embeddings [C, D].
         rule: see `SemanticField.segment`.
         top: how many, from 1 to C.
+        early: as in `rasterize_labels`, where votes are blended.
 
     Returns:
         Labels and scores [H, W, top], the best first, and alphas [H, W]. Labels are -1 and scores 0 where nothing is drawn or
@@ -86,7 +98,7 @@ def rank_classes(field: SemanticField, camera: Camera, rows: Tensor, rule: Rule,
     """
     check_whole("top", top, 1, len(rows))
     if field.codebook is None or field.method == "fused" or (rule == "fused" and field.autoencoder is None):
-        return rank_votes(field.gaussians, camera, _votes(field, rows, rule), top)
+        return rank_votes(field.gaussians, camera, _votes(field, rows, rule), top, early=early)
     rendering = field.render(camera)
     index = label_pixels(
         rendering.map,

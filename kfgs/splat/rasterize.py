@@ -106,6 +106,7 @@ def rasterize_labels(
     camera: Camera,
     *,
     top: int = 1,
+    early: bool = False,
     engine: str = "auto",
     near: float | None = None,
 ) -> Ranked:
@@ -118,6 +119,8 @@ def rasterize_labels(
         gaussians: with finite scores as `features`.
         camera: as in `rasterize`.
         top: how many classes are kept, from 1 to C.
+        early: for labels alone, in about half of the time: with `top` 1 a pixel is left as soon as its label is certain. Its
+            score and its opacity are then those reached until there. The CPU engine does so for up to 26 classes.
         engine: as in `composite`.
         near: as in `rasterize`.
 
@@ -152,7 +155,9 @@ def rasterize_labels(
         projected = project(gaussians, camera, near=near, engine=engine)
         tiles = bin_tiles(projected, camera.width, camera.height, engine=engine)
         splats = projected.means2d, projected.conics, projected.opacities
-        return rank_channels(*splats, gaussians.features, tiles, top=top, index=projected.index, engine=engine)
+        return rank_channels(
+            *splats, gaussians.features, tiles, top=top, early=early, index=projected.index, engine=engine
+        )
 
 
 def _check_arguments(gaussians: Gaussians, camera: Camera) -> None:

@@ -92,6 +92,60 @@ def test_negative_scores_win_where_there_are_no_others(engine, channels):
     assert (found.scores[found.alphas > 0] < 0).all()
 
 
+def votes(features, sharpness):
+    return torch.softmax(sharpness * features, dim=1).contiguous()
+
+
+def assert_early(footprints, features, tiles, engine):
+    """The labels are the same, also of pixels that were left early; how many of the covered pixels were."""
+    whole = rank_channels(*footprints, features, tiles, engine=engine)
+    early = rank_channels(*footprints, features, tiles, engine=engine, early=True)
+    assert early.labels.equal(whole.labels)
+    assert early.alphas.le(whole.alphas).all()
+    if (features >= 0).all():
+        assert early.scores.gt(0).equal(whole.scores.gt(0))
+    left = early.alphas < whole.alphas
+    return float(left.float().mean())
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("sharpness", [0.1, 3.0, 100.0])
+@pytest.mark.parametrize("channels", [1, 2, 4, 5, 18, 26, 40])
+@every_engine
+def test_labels_alone_are_the_same(engine, channels, sharpness, dtype):
+    """Votes that hardly differ, and votes for one class alone: few and many channels may win in a tile."""
+    footprints, features, tiles = scene(channels, size=(70, 50), count=800, dtype=dtype)
+    assert_early(footprints, votes(features, sharpness), tiles, engine)
+
+
+@pytest.mark.parametrize("classes", [1, 3, 7])
+@every_engine
+def test_pixels_are_left_where_the_label_is_certain(engine, classes):
+    footprints, features, tiles = scene(18, size=(70, 50), count=800)
+    some = torch.nn.functional.one_hot(torch.arange(len(features)) % classes, 18).to(features)
+    left = assert_early(footprints, some, tiles, engine)
+    if engine == "numba":
+        assert left > 0.5
+
+
+@every_engine
+def test_gaussians_without_votes_decide_nothing(engine):
+    """In front of the others they take light, so that pixels of the others are decided later, or never seen."""
+    footprints, features, tiles = scene(6, size=(70, 50), count=800)
+    some = votes(features, 10.0) * (torch.arange(800) % 3 == 0)[:, None]
+    assert_early(footprints, some.contiguous(), tiles, engine)
+    assert_early(footprints, torch.zeros_like(some), tiles, engine)
+
+
+@every_engine
+def test_ties_are_never_certain(engine):
+    footprints, features, tiles = scene(5, size=(70, 50), count=800)
+    halves = torch.tensor([[0.0, 0.5, 0.0, 0.5, 0.0]]).expand_as(features).contiguous()
+    assert_early(footprints, halves, tiles, engine)
+    assert_early(footprints, (0.5 * features.round()).abs(), tiles, engine)
+    assert_early(footprints, features - 0.5, tiles, engine)  # negative ones among them
+
+
 @every_engine
 def test_gaussians_that_share_a_row_of_scores(engine):
     footprints, features, tiles = scene(30)
@@ -143,7 +197,7 @@ def test_from_gaussians_and_a_camera(engine):
 def test_operator_passes_opcheck():
     footprints, features, tiles = scene(5)
     background, index = torch.zeros(5), torch.arange(40)
-    arguments = (*footprints, features, background, index, *tiles, 2, "numba")
+    arguments = (*footprints, features, background, index, *tiles, 2, False, "numba")
     torch.library.opcheck(ops.rank, arguments, test_utils=("test_schema", "test_faketensor"))
 
 

@@ -164,7 +164,7 @@ def _on_cpu(dtype):
         "forward": (splats, tiles),
         "backward": ((maps, alphas), (True,) * 5, splats, tiles, Composited(maps, alphas, alphas.int())),
         "accumulate": (*footprints, maps, tiles),
-        "rank": (splats, tiles, 1),
+        "rank": (splats, tiles, 1, False),
     }
 
 

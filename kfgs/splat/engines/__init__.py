@@ -81,6 +81,7 @@ def rank_channels(
     tiles: Tiles,
     *,
     top: int = 1,
+    early: bool = False,
     index: Tensor | None = None,  # [M] int64
     engine: str = "auto",
 ) -> Ranked:
@@ -96,6 +97,8 @@ def rank_channels(
         features: finite scores; any number of channels from 1.
         tiles: from `bin_tiles` on the same Gaussians.
         top: how many channels are kept, from 1 to D.
+        early: for labels alone, in about half of the time: with `top` 1 a pixel is left as soon as the label is certain.
+            Its score and its opacity are then those reached until there.
         index: as in `composite`.
         engine: as in `composite`. An engine without this kernel composites maps and sorts them.
 
@@ -113,7 +116,7 @@ def rank_channels(
     with torch.no_grad():
         if offers(name, "rank"):
             splats = _splats(means2d.detach(), conics.detach(), opacities.detach(), features.detach(), None, index)
-            return Ranked(*ops.rank(*splats, *_contiguous(tiles), top, name))
+            return Ranked(*ops.rank(*splats, *_contiguous(tiles), top, early, name))
         maps, alphas = composite(means2d, conics, opacities, features, tiles, index=index, engine=name)
         scores, labels = maps.sort(dim=-1, descending=True, stable=True)
         empty = (alphas <= 0)[..., None]

@@ -16,7 +16,7 @@ and, if it can do better than kornia and torch,
     shade(sh [N, K, 3], means, center [3], index) -> colours [M, 3], as `kfgs.splat.evaluate_sh` has them
     shade_backward(grad, sh, means, center, index) -> gradients of sh and means, zero for what was not seen
     bin(means2d, conics, depths, opacities, extents, width, height, tile_size) -> rows, offsets of `Tiles`
-    rank(splats, tiles, top) -> Ranked: the channels with the largest sums, without writing the sums; no background
+    rank(splats, tiles, top, early) -> Ranked: the channels with the largest sums, without writing the sums; no background
 
 `ops` makes operators of these. The reference engine is plain torch under autograd: it has `composite(splats, tiles)`
 instead of forward and backward. No function takes more than eight parameters, except compiled kernels: a launch of Triton
@@ -42,7 +42,8 @@ The tensors an engine receives are contiguous, of one dtype and on one device.
 7. `accumulate` finds weights^T · pixels (for uplifting and pruning) and the sums of the weights in one walk over the view.
 8. `rank` finds, at each pixel, the `top` channels with the largest sums of weight * features, the largest first, and of
    equal sums the lowest channel first. Where nothing is drawn, labels are -1 and scores 0. On the CPU the scores are the
-   bits of `maps`.
+   bits of `maps`. With `early` and one channel wanted, an engine may stop at a pixel where the sum of the best channel is
+   positive and no other can overtake it: the label is the same, score and alpha are those reached there.
 
 Two engines differ by rounding only. Thresholds make that visible at a few pixels where alpha lies on 1/255, or T' on
 1e-4: two opaque hits give T' = (1 - 0.99)^2, which is just below 1e-4 in float32 and just above it in float64.

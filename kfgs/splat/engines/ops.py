@@ -137,12 +137,12 @@ def _(means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor, *view:
     return pixels.new_empty(len(means2d), pixels.shape[2]), pixels.new_empty(len(means2d))
 
 
-@_operator(f"({SPLATS}, {TILES}, SymInt top, str engine) -> (Tensor, Tensor, Tensor)")
+@_operator(f"({SPLATS}, {TILES}, SymInt top, bool early, str engine) -> (Tensor, Tensor, Tensor)")
 def rank(*inputs: Any) -> Ranked:
     """Labels, scores and alphas, see `kfgs.splat.engines.rank_channels`; without gradient."""
     splats, tiles = Splats(*inputs[:6]), Tiles(*inputs[6:11])
     check_values(len(splats.means2d), len(splats.features), splats.index, tiles)
-    return load(inputs[12]).rank(splats, tiles, inputs[11])
+    return load(inputs[13]).rank(splats, tiles, inputs[11], inputs[12])
 
 
 @register_fake("kfgs::rank")

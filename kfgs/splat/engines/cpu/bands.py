@@ -98,7 +98,8 @@ def composite_narrow(
             sums[: passes[2] * PIXELS] = 0
             span = start, end, start * squares + square * (end - start)
             scratch = corners, sums, weights, hits, counts
-            done = narrow.composite_square((rows, length, view.order), span, state, dark, passes, scratch, drawn, None)
+            packed = rows, length, view.order
+            done = narrow.composite_square(packed, span, state, dark, passes, scratch, drawn, None, None)
             trace[tile * squares + square] = done - start
             _write_alphas(state, box, alphas, finals, view.width)
             for block in range(BLOCKS):

@@ -130,23 +130,25 @@ def accumulate(
     return sums, weights
 
 
-def rank(splats: Splats, tiles: Tiles, top: int) -> Ranked:
+def rank(splats: Splats, tiles: Tiles, top: int, early: bool) -> Ranked:
     """The best channels of each pixel, as the contract says."""
     means2d, conics, opacities, features, _, index = splats
     channels, view = features.shape[1], _view(tiles)
     bands = len(view.bounds) - 1
     size = view.height, view.width
-    labels, scores = torch.empty(*size, top, dtype=torch.int64), features.new_empty(*size, top)
-    alphas = features.new_empty(size)
+    labels = take_memory(torch.empty(0, dtype=torch.int64), *size, top)
+    scores, alphas = take_memory(features, *size, top), take_memory(features, *size)
     length = row_length(_packed(channels))
     packed = take_memory(means2d, len(means2d) * length).numpy()
     footprints = _flat(means2d), _flat(conics), _flat(opacities)
     run_bands(pack_rows, bands, bands, footprints, _flat(features), _packed(channels), _index(index), packed)
     images = _flat(labels), _flat(scores), _flat(alphas)
     if channels <= NARROW_CHANNELS:
-        masks = np.empty(len(means2d) if top == 1 else 0, np.uint64)
-        run_bands(find_candidates, bands, bands, _flat(features), channels, _index(index), masks)
-        run_bands(rank_narrow, bands, view, packed, length, plan_passes(channels), channels, masks, images)
+        some = len(means2d) if top == 1 else 0
+        contest = np.empty(some, np.uint64), _flat(features.new_empty(some))
+        run_bands(find_candidates, bands, bands, _flat(features), channels, _index(index), *contest)
+        shared = (view, packed, length, plan_passes(channels), channels, contest, early, images)
+        run_bands(rank_narrow, bands, *shared)
     else:
         begins = _begins(index, len(means2d), channels)
         run_bands(rank_wide, bands, view, packed, length, _flat(features), begins, channels, images)

@@ -3,6 +3,9 @@
 The sums of a square stay in cache, and only the best classes and their scores are written. There is no backward pass, so
 nothing is traced. The sums are those of `composite_narrow` and `composite_wide`, to the bit.
 
+If labels alone are wanted, a block of pixels is done when its best classes lead by more than the light that is left could
+change: after about half of its Gaussians.
+
 If only the best class is wanted and no score is negative, most classes need no sum: a class can win only where some
 Gaussian of the tile gives it a fair share, at least one C-th of all that it gives (`find_candidates`). Elsewhere its sum
 is below the mean of all sums. With the votes of a room of 18 classes, a tile has 3 such classes.
@@ -84,7 +87,7 @@ def _write_ranks(ranked: Any, final: Any, box: Any, block: int, images: Any, wid
 
 
 @cached_njit(**OPTIONS)
-def find_candidates(band: int, bands: int, features: Any, channels: int, index: Any, masks: Any) -> None:
+def find_candidates(band: int, bands: int, features: Any, channels: int, index: Any, masks: Any, favours: Any) -> None:
     """The channels of which a Gaussian gives at least a fair share, as bits; all channels if it gives less than nothing.
 
     A thousandth less than the fair share is enough: sums of up to 8,000 Gaussians do not round by more. A Gaussian that
@@ -97,39 +100,44 @@ def find_candidates(band: int, bands: int, features: Any, channels: int, index: 
         channels: D, at most 64.
         index: [M], the features' row of each Gaussian; empty if row m belongs to Gaussian m.
         masks: [M] uint64, written.
+        favours: [M], written: the largest feature minus the smallest.
     """
     count = len(masks)
     for m in range(count * band // bands, count * (band + 1) // bands):
         at = (fetch(index, m) if len(index) else m) * channels
-        total, least = 0.0, 0.0
+        total, least, most = 0.0, np.inf, -np.inf
         for channel in range(channels):
             value = float(fetch(features, at + channel))
             total += value
-            least = min(least, value)
+            least, most = min(least, value), max(most, value)
+        put(favours, m, most - least)
         share, mask = 0.999 * total / channels, np.uint64(0)
         for channel in range(channels):
             if fetch(features, at + channel) >= share:
                 mask |= np.uint64(1) << np.uint64(channel)
         mask = mask if total > 0 else np.uint64(1)
-        masks[m] = mask if least == 0 and total < np.inf else ~np.uint64(0)
+        masks[m] = mask if least >= 0 and total < np.inf else ~np.uint64(0)
 
 
 @njit(**INLINE)
-def _gather_columns(masks: Any, order: Any, start: int, end: int, channels: int, columns: Any) -> int:
-    """Write the channels that may win among some Gaussians, in order; returns how many there are."""
-    mask = np.uint64(0)
+def _gather_columns(contest: Any, order: Any, start: int, end: int, channels: int, columns: Any) -> tuple[int, float]:
+    """Write the channels that may win among some Gaussians, in order; returns how many there are, and the largest favour."""
+    masks, favours = contest
+    mask, favour = np.uint64(0), 0.0
     for j in range(start, end):
-        mask |= fetch(masks, np.int64(fetch(order, j)))
+        m = np.int64(fetch(order, j))
+        mask |= fetch(masks, m)
+        favour = max(favour, fetch(favours, m))
     count = 0
     for channel in range(channels):
         columns[count] = channel
         count += np.int64((mask >> np.uint64(channel)) & np.uint64(1))  # type: ignore[assignment]
-    return count
+    return count, favour
 
 
 @cached_njit(**OPTIONS)
 def rank_narrow(
-    band: int, view: View, rows: Any, length: int, passes: Any, channels: int, masks: Any, images: Any
+    band: int, view: View, rows: Any, length: int, passes: Any, channels: int, contest: Any, early: bool, images: Any
 ) -> None:
     """Rank the tiles of one band, with few channels.
 
@@ -140,7 +148,8 @@ def rank_narrow(
         length: of a packed row.
         passes: from `plan_passes`.
         channels: D.
-        masks: from `find_candidates`; empty: every channel may be among the best.
+        contest: masks and favours from `find_candidates`; empty: every channel may be among the best.
+        early: stop where the best channel is certain. Scores and alphas are then not complete.
         images: labels and scores [H * W * top] and alphas [H * W], written.
     """
     top = len(images[0]) // len(images[2])
@@ -151,7 +160,10 @@ def rank_narrow(
     every, some = np.arange(channels), np.zeros(channels + len(FEW), np.int64)
     for tile in range(view.bounds[band], view.bounds[band + 1]):
         start, end = view.offsets[tile], view.offsets[tile + 1]
-        few = _gather_columns(masks, view.order, start, end, channels, some) if len(masks) else channels
+        few, favour = channels, np.inf
+        if len(contest[0]):
+            few, favour = _gather_columns(contest, view.order, start, end, channels, some)
+        favour = rows.dtype.type(favour if early else np.inf)
         for square in range(view.across**2):
             box = square_box(view, tile, square)
             if box[0] >= box[2] or box[1] >= box[3]:
@@ -165,12 +177,12 @@ def rank_narrow(
             if few <= len(FEW) < channels:
                 count, names = few, some
                 sums[: len(FEW) * PIXELS] = 0
-                four = some[0], some[1], some[2], some[3]
-                narrow.composite_square(packed, span, state, dark, (FEW, (), len(FEW)), scratch, None, four)
+                four, plan = (some[0], some[1], some[2], some[3]), (FEW, (), len(FEW))
+                narrow.composite_square(packed, span, state, dark, plan, scratch, None, four, (few, favour))
             else:
                 count, names = channels, every
                 sums[:] = 0
-                narrow.composite_square(packed, span, state, dark, passes, scratch, None, None)
+                narrow.composite_square(packed, span, state, dark, passes, scratch, None, None, (channels, favour))
             for block in range(BLOCKS):
                 p = block * LANES
                 _rank_block(sums, p, PIXELS, count, load(state, FINAL + p), ranked, names)

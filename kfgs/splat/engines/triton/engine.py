@@ -155,8 +155,8 @@ def accumulate(
     return sums, weights
 
 
-def rank(splats: Splats, tiles: Tiles, top: int) -> Ranked:
-    """The best channels of each pixel, as the contract says.
+def rank(splats: Splats, tiles: Tiles, top: int, early: bool) -> Ranked:
+    """The best channels of each pixel, as the contract says; `early` makes no difference.
 
     Raises:
         ValueError: as `forward`.
