@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ...sh import C1, C2, C3, SH_C0
 from .cache import cached_njit
+from .memory import take_memory
 from .project import flat_arrays
 from .project_math import OPTIONS, PLAIN
 from .threads import run_bands
@@ -35,7 +36,7 @@ def shade(sh: Tensor, means: Tensor, center: Tensor, index: Tensor) -> Tensor:
 @torch.no_grad()
 def shade_backward(grad: Tensor, sh: Tensor, means: Tensor, center: Tensor, index: Tensor) -> list[Tensor]:
     """Gradients in the coefficients and the means, given that in the colours; zero for what was not seen."""
-    out = torch.zeros_like(sh), torch.zeros_like(means)
+    out = take_memory(sh, *sh.shape).zero_(), take_memory(means, *means.shape).zero_()
     _run(_differentiate_band, index, int(sh.shape[1]), grad, sh, means, center, index, *out)
     return list(out)
 

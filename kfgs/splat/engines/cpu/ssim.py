@@ -1,7 +1,7 @@
-"""SSIM of two pictures and its gradient in one of them, compiled by numba: some ten times faster than convolutions.
+"""SSIM of two pictures, their mean absolute difference, and the gradient of a mixture of both, compiled by numba.
 
-Channels stay side by side, so every inner loop runs over neighbouring numbers. Each row of windows is blurred downwards,
-then along; the gradient takes the same two steps back. No two shares of rows write the same memory.
+Channels stay side by side, so a vector holds neighbouring numbers. Each row of windows is blurred downwards, then along;
+the gradient takes the same two steps back. A blurred row stays in cache. No two shares of rows write the same memory.
 """
 
 from __future__ import annotations
@@ -14,7 +14,9 @@ from numba import njit
 from torch import Tensor
 
 from .cache import cached_njit
-from .project_math import OPTIONS
+from .memory import take_memory
+from .simd import LANES, fetch, fma, lanes_below, load, load_part, maximum, put, select, spread, store, store_part
+from .square import INLINE, OPTIONS, aligned
 from .threads import run_bands
 
 __all__ = ["similarity"]
@@ -24,7 +26,6 @@ WINDOW = 11
 
 _LAST = WINDOW - 1
 _BAND = 32  # rows of a share
-_FAST = {"contract", "nsz", "arcp", "reassoc"}
 
 
 @torch.no_grad()
@@ -34,8 +35,9 @@ def similarity(
     counted: Tensor | None,  # [H - 10, W - 10] bool
     window: Tensor,  # [11] weights of the window along an axis; symmetric, sum 1
     constants: tuple[float, float],
-) -> tuple[Tensor, Tensor]:  # [] , [H, W, D]
-    """Mean SSIM over the (counted) windows inside the picture, and its gradient in `picture`.
+    mix: tuple[float, float] = (1.0, 0.0),
+) -> tuple[Tensor, Tensor, Tensor]:  # [], [], [H, W, D]
+    """Mean SSIM over the (counted) windows inside the picture, mean absolute difference, and a gradient in `picture`.
 
     Args:
         picture: contiguous float32 or float64 on the CPU, at least 11 pixels on each side.
@@ -43,138 +45,177 @@ def similarity(
         counted: which windows count, at least one; None = all.
         window: of the picture's dtype.
         constants: (K1 peak)^2 and (K2 peak)^2, which keep flat windows finite.
+        mix: the gradient is that of mix[0] times the SSIM plus mix[1] times the absolute difference.
     """
     height, width, channels = picture.shape
-    a, b = (value.detach().numpy().reshape(height, width * channels) for value in (picture, target))
+    a, b = (value.detach().view(-1).numpy() for value in (picture, target))
     rows, across = height - _LAST, (width - _LAST) * channels
+    padded = -(-across // LANES) * LANES
     kind = a.dtype.type
     mask = np.empty((0, 0), bool) if counted is None else np.repeat(counted.numpy(), channels, axis=1)
     count = rows * across if counted is None else int(mask.sum())
-    slopes, out = np.empty((3, rows, across), a.dtype), np.empty_like(a)
+    slopes, out = take_memory(picture, 3 * rows * padded), take_memory(picture, *picture.shape)
     bands = -(-rows // _BAND)
-    sums = np.empty(bands)
-    weights, limits = window.numpy(), (kind(constants[0]), kind(constants[1]))
-    pair = Pair(a, b, channels)
-    run_bands(compare_band, bands, bands, weights, limits, pair, mask, slopes, sums)
-    run_bands(spread_band, bands, bands, weights, kind(1 / count), pair, slopes, out)
-    return picture.new_tensor(sums.sum() / count), torch.from_numpy(out).view_as(picture)
-
-
-class Pair(NamedTuple):
-    """Two pictures, their channels side by side."""
-
-    picture: Any  # [H, W D]
-    target: Any  # [H, W D]
-    channels: int  # D
-
-
-@njit(fastmath=_FAST, inline="always", **OPTIONS)
-def _along(values: Any, j: Any, step: Any, w: Any) -> Any:
-    """The window's weighted sum of 11 numbers, `step` apart, from `values[j]` on."""
-    return (
-        w[0] * (values[j] + values[j + 10 * step])
-        + w[1] * (values[j + step] + values[j + 9 * step])
-        + w[2] * (values[j + 2 * step] + values[j + 8 * step])
-        + w[3] * (values[j + 3 * step] + values[j + 7 * step])
-        + w[4] * (values[j + 4 * step] + values[j + 6 * step])
-        + w[5] * values[j + 5 * step]
+    sums = np.empty((2, bands))
+    shape = Shape(height, width * channels, channels, padded)
+    limits, factors = (kind(constants[0]), kind(constants[1])), (kind(mix[0] / count), kind(mix[1] / len(a)))
+    run_bands(compare_band, bands, bands, window.numpy(), limits, shape, (a, b), mask, slopes.numpy(), sums[0])
+    run_bands(
+        spread_band, bands, bands, window.numpy(), factors, shape, (a, b), slopes.numpy(), out.view(-1).numpy(), sums[1]
     )
+    return picture.new_tensor(sums[0].sum() / count), picture.new_tensor(sums[1].sum() / len(a)), out
 
 
-@cached_njit(fastmath=_FAST, **OPTIONS)
+class Shape(NamedTuple):
+    """Of pictures whose channels lie side by side."""
+
+    height: int
+    length: int  # numbers in a row: W D
+    channels: int  # D
+    padded: int  # numbers from one row of slopes to the next: (W - 10) D, up to whole vectors
+
+
+@njit(**INLINE)
+def _along(values: Any, j: Any, step: Any, w: Any) -> Any:
+    """The window's weighted sums, of numbers `step` apart, that begin at LANES places from j on."""
+    total = load(values, j + 5 * step) * w[5]
+    total = fma(load(values, j) + load(values, j + 10 * step), w[0], total)
+    total = fma(load(values, j + step) + load(values, j + 9 * step), w[1], total)
+    total = fma(load(values, j + 2 * step) + load(values, j + 8 * step), w[2], total)
+    total = fma(load(values, j + 3 * step) + load(values, j + 7 * step), w[3], total)
+    return fma(load(values, j + 4 * step) + load(values, j + 6 * step), w[4], total)
+
+
+@cached_njit(**OPTIONS)
 def compare_band(
     band: int,
     bands: int,
     window: Any,  # [11]
     constants: tuple[Any, Any],
-    pair: Pair,
+    shape: Shape,
+    pictures: Any,  # two [H W D]
     counted: Any,  # [H - 10, (W - 10) D] bool, or empty
-    slopes: Any,  # [3, H - 10, (W - 10) D], written
+    slopes: Any,  # [3 * (H - 10) * padded], written
     sums: Any,  # [bands], written
 ) -> None:
     """Sum SSIM over a share of the windows; keep its slopes in the windows' means of a, a^2 and a b."""
-    picture, target, channels = pair
-    rows, length = picture.shape[0] - 10, picture.shape[1]
-    across = length - 10 * channels
+    picture, target = pictures
+    height, length, channels, padded = shape
+    rows, across = height - 10, length - 10 * channels
     w = (window[0], window[1], window[2], window[3], window[4], window[5])
-    v_a, v_b = np.empty(length, window.dtype), np.empty(length, window.dtype)
-    v_aa, v_bb, v_ab = np.empty(length, window.dtype), np.empty(length, window.dtype), np.empty(length, window.dtype)
-    found = np.empty(across, window.dtype)
-    one, two = window.dtype.type(1), window.dtype.type(2)
+    room = length + 10 * channels + 2 * LANES
+    v_a, v_b, v_square, v_ab = (
+        aligned(room, window),
+        aligned(room, window),
+        aligned(room, window),
+        aligned(room, window),
+    )
+    for values in (v_a, v_b, v_square, v_ab):
+        values[:] = 0
+    found = aligned(padded, window)
     total = 0.0
     for i in range(rows * band // bands, rows * (band + 1) // bands):
-        for values in (v_a, v_b, v_aa, v_bb, v_ab):
-            values[:] = 0
-        for k in range(11):
-            weight, row_a, row_b = window[k], picture[i + k], target[i + k]
-            for j in range(length):
-                a, b = row_a[j], row_b[j]
-                wa, wb = weight * a, weight * b
-                v_a[j] += wa
-                v_b[j] += wb
-                v_aa[j] += wa * a
-                v_bb[j] += wb * b
-                v_ab[j] += wa * b
-        by_a, by_aa, by_ab = slopes[0, i], slopes[1, i], slopes[2, i]
-        for j in range(across):
+        for j in range(0, length, LANES):
+            inside = lanes_below(window, length - j)
+            zero = spread(window, 0)
+            s_a, s_b, s_square, s_ab = zero, zero, zero, zero
+            for k in range(11):
+                at = (i + k) * length + j
+                a, b = load_part(picture, at, inside), load_part(target, at, inside)
+                weighted, other = a * window[k], b * window[k]
+                s_a, s_b = s_a + weighted, s_b + other
+                s_square = fma(other, b, fma(weighted, a, s_square))
+                s_ab = fma(weighted, b, s_ab)
+            store(v_a, j, s_a)
+            store(v_b, j, s_b)
+            store(v_square, j, s_square)
+            store(v_ab, j, s_ab)
+        by_a, by_square, by_ab = i * padded, (rows + i) * padded, (2 * rows + i) * padded
+        for j in range(0, padded, LANES):
             m_a, m_b = _along(v_a, j, channels, w), _along(v_b, j, channels, w)
-            m_aa, m_bb, m_ab = _along(v_aa, j, channels, w), _along(v_bb, j, channels, w), _along(v_ab, j, channels, w)
+            m_square, m_ab = _along(v_square, j, channels, w), _along(v_ab, j, channels, w)
             # SSIM = (2 m_a m_b + c1) (2 cov + c2) / ((m_a^2 + m_b^2 + c1) (var_a + var_b + c2))
-            light, shape = two * m_a * m_b + constants[0], two * (m_ab - m_a * m_b) + constants[1]
-            per_light = one / (m_a * m_a + m_b * m_b + constants[0])
-            per_shape = one / ((m_aa - m_a * m_a) + (m_bb - m_b * m_b) + constants[1])
-            scale = per_light * per_shape
-            value = light * shape * scale
-            found[j] = value
-            by_a[j] = two * m_b * (shape - light) * scale - two * m_a * value * (per_light - per_shape)
-            by_aa[j] = -value * per_shape
-            by_ab[j] = two * light * scale
+            both, squares = m_a * m_b, fma(m_a, m_a, m_b * m_b)
+            light, structure = both * 2 + constants[0], (m_ab - both) * 2 + constants[1]
+            under_light, under_structure = squares + constants[0], m_square - squares + constants[1]
+            scale = 1 / (under_light * under_structure)
+            value = light * structure * scale
+            store(found, j, value)
+            difference = (under_structure - under_light) * scale  # 1 / under_light - 1 / under_structure
+            store(slopes, by_a + j, (m_b * (structure - light) * scale - m_a * value * difference) * 2)
+            store(slopes, by_square + j, value * under_light * scale * -1)
+            store(slopes, by_ab + j, light * scale * 2)
         if counted.size:
             for j in range(across):
                 if not counted[i, j]:
-                    found[j] = 0
-                    by_a[j] = 0
-                    by_aa[j] = 0
-                    by_ab[j] = 0
-        row_sum = 0.0
+                    put(found, j, 0)
+                    put(slopes, by_a + j, 0)
+                    put(slopes, by_square + j, 0)
+                    put(slopes, by_ab + j, 0)
         for j in range(across):
-            row_sum += found[j]
-        total += row_sum
+            total += fetch(found, j)
     sums[band] = total
 
 
-@cached_njit(fastmath=_FAST, **OPTIONS)
+@cached_njit(**OPTIONS)
 def spread_band(
     band: int,
     bands: int,
     window: Any,  # [11]
-    factor: Any,
-    pair: Pair,
-    slopes: Any,  # [3, H - 10, (W - 10) D]
-    out: Any,  # [H, W D], written
+    factors: tuple[Any, Any],
+    shape: Shape,
+    pictures: Any,  # two [H W D]
+    slopes: Any,  # [3 * (H - 10) * padded]
+    out: Any,  # [H W D], written
+    sums: Any,  # [bands], written
 ) -> None:
-    """Carry the windows' slopes back to a share of the picture's rows, times `factor`."""
-    picture, target, channels = pair
-    height, length = picture.shape
-    across, first = length - 10 * channels, 10 * channels
+    """Carry the windows' slopes back to a share of the picture's rows, and add those of the absolute difference.
+
+    Args:
+        band: which share.
+        bands: how many shares.
+        window: weights.
+        factors: of the slopes and of the sign of the difference.
+        shape: of the pictures.
+        pictures: the picture and the target.
+        slopes: from `compare_band`.
+        out: the gradient.
+        sums: of the absolute difference over the share.
+    """
+    picture, target = pictures
+    height, length, channels, padded = shape
+    rows, first = height - 10, 10 * channels
+    across = length - first
     w = (window[0], window[1], window[2], window[3], window[4], window[5])
-    wide = length + first  # zeros beside the windows
-    v_a, v_aa, v_ab = np.zeros(wide, window.dtype), np.zeros(wide, window.dtype), np.zeros(wide, window.dtype)
-    two = window.dtype.type(2)
+    room = padded + 2 * first + 2 * LANES  # zeros beside the windows
+    v_a, v_square, v_ab = aligned(room, window), aligned(room, window), aligned(room, window)
+    for values in (v_a, v_square, v_ab):
+        values[:] = 0
+    far = aligned(LANES, window)
+    total = 0.0
     for i in range(height * band // bands, height * (band + 1) // bands):
-        for values in (v_a, v_aa, v_ab):
-            values[:] = 0
-        for k in range(max(0, i + 11 - height), min(11, i + 1)):
-            weight = window[k]
-            by_a, by_aa, by_ab = slopes[0, i - k], slopes[1, i - k], slopes[2, i - k]
-            for j in range(across):
-                v_a[j + first] += weight * by_a[j]
-                v_aa[j + first] += weight * by_aa[j]
-                v_ab[j + first] += weight * by_ab[j]
-        a, b, row = picture[i], target[i], out[i]
-        for j in range(length):
-            row[j] = factor * (
-                _along(v_a, j, channels, w)
-                + two * a[j] * _along(v_aa, j, channels, w)
-                + b[j] * _along(v_ab, j, channels, w)
-            )
+        for j in range(0, padded, LANES):
+            inside, zero = lanes_below(window, across - j), spread(window, 0)
+            s_a, s_square, s_ab = zero, zero, zero
+            for k in range(max(0, i + 11 - height), min(11, i + 1)):
+                at = (i - k) * padded + j
+                s_a = fma(load(slopes, at), window[k], s_a)
+                s_square = fma(load(slopes, at + rows * padded), window[k], s_square)
+                s_ab = fma(load(slopes, at + 2 * rows * padded), window[k], s_ab)
+            store_part(v_a, first + j, inside, s_a)
+            store_part(v_square, first + j, inside, s_square)
+            store_part(v_ab, first + j, inside, s_ab)
+        apart = spread(window, 0)
+        for j in range(0, length, LANES):
+            inside, at = lanes_below(window, length - j), i * length + j
+            a, b = load_part(picture, at, inside), load_part(target, at, inside)
+            slope = fma(a * 2, _along(v_square, j, channels, w), _along(v_a, j, channels, w))
+            slope = fma(b, _along(v_ab, j, channels, w), slope) * factors[0]
+            difference = a - b
+            apart = apart + maximum(difference, b - a)
+            sign = select(difference > 0, factors[1], select(difference < 0, -factors[1], spread(window, 0)))
+            store_part(out, at, inside, slope + sign)
+        store(far, 0, apart)
+        for lane in range(LANES):
+            total += far[lane]
+    sums[band] = total
