@@ -48,8 +48,9 @@ The tensors an engine receives are contiguous, of one dtype and on one device.
 Two engines differ by rounding only. Thresholds make that visible at a few pixels where alpha lies on 1/255, or T' on
 1e-4: two opaque hits give T' = (1 - 0.99)^2, which is just below 1e-4 in float32 and just above it in float64.
 
-An engine may also have `similarity`: SSIM and absolute difference of two pictures and a gradient, with the arguments and
-results of the function in `cpu/ssim.py`. The loss of colour fields uses it, and kornia's SSIM with the other engines. It may
+An engine may also have `absolute`, the mean absolute difference of two maps and its gradient, and `similarity`, SSIM and the
+same difference of two pictures and a gradient, with the arguments and results of the functions in `cpu/absolute.py` and
+`cpu/ssim.py`. The losses use them; with the other engines torch's operations and kornia's SSIM. It may
 have `decide`, the largest output of a perceptron, as in `cpu/perceptron.py`: the exact decoding of a label map uses it, else
 torch decodes.
 """

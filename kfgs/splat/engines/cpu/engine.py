@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..contract import Composited, Ranked, Splats, Tiles
 from . import square, wide
+from .absolute import absolute
 from .bands import accumulate_band, composite_narrow, composite_wide
 from .bands_backward import differentiate_narrow, differentiate_wide
 from .memory import take_memory
@@ -29,6 +30,7 @@ from .tiles import bin
 row_length, padded_length = square.row_length.py_func, wide.padded_length.py_func  # one call is not worth compiling
 
 __all__ = [
+    "absolute",
     "accumulate",
     "backward",
     "bin",
