@@ -87,6 +87,8 @@ def fit_field(
         saved = read_checkpoint(path, identity)
         if saved is not None:
             trainer.restore_(saved)
+    if trainer.step < config.steps:
+        trainer.warm_up()
     with tqdm(total=config.steps, initial=trainer.step, disable=progress is not True, desc="field", unit="step") as bar:
         while trainer.step < config.steps:
             row = trainer.advance_()

@@ -46,6 +46,10 @@ class FieldOptimizer:
         """Apply the gradients of step number `step`, then forget them."""
         self._groups["means"]["lr"] = self.means_lr(step)
         self._adam.step()
+        self.forget_()
+
+    def forget_(self) -> None:
+        """Drop the gradients."""
         self._adam.zero_grad(set_to_none=True)
 
     def replace_(

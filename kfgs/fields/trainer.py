@@ -16,10 +16,12 @@ from ..splat import rasterize
 from .checkpoint import Checkpoint
 from .config import FieldConfig
 from .densify import GradientStatistics, densify, lowered_opacities
-from .loss import Loss
+from .loss import ColorLoss, Loss, l1_loss
 from .optimizer import FieldOptimizer
 from .params import GaussianParams
 from .working_maps import shrink_camera, shrink_map
+
+WARM_UP_SIZE = 16  # pixels: more than a window of SSIM
 
 
 class Trainer:
@@ -61,6 +63,17 @@ class Trainer:
                 self.optimizer.set_opacities_(lowered_opacities(logits, config.reset_opacity))
         self._seconds += time.perf_counter() - started
         return self._report_() if self.step % config.report_every == 0 or self.step == config.steps else None
+
+    def warm_up(self) -> None:
+        """Compute the gradients of a tiny view and forget them: kernels are compiled or loaded now, not in step 1."""
+        params = self.optimizer.params
+        camera = self._cameras[0].to(params.means).resized(WARM_UP_SIZE, WARM_UP_SIZE)
+        rendering = rasterize(params.activated(), camera, engine=self._config.engine)
+        loss = self._loss if isinstance(self._loss, ColorLoss) else l1_loss  # not a caller's own one: it may keep count
+        value = loss(rendering.map, rendering.alpha, torch.zeros_like(rendering.map))
+        if value.requires_grad:
+            value.backward()
+        self.optimizer.forget_()
 
     def _learn_(self, view: int) -> None:
         params = self.optimizer.params
