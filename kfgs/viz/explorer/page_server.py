@@ -1,0 +1,222 @@
+"""A small web server on this machine for one page: its files, and the calls that its script makes.
+
+Only who has the link is answered: the path begins with a secret, a request from another page (Origin) or with another
+machine's name (Host) is refused before anything is read, and the browser may load nothing from elsewhere. Every request
+has a thread of its own, which ends with it; so a tab that reads slowly holds up no other, and closing leaves nothing behind.
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+import secrets
+import socket
+import struct
+from collections.abc import Callable, Mapping
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from ipaddress import ip_address
+from threading import Thread
+from typing import Any, NamedTuple
+from urllib.parse import urlsplit
+
+from ..._check import check_whole, error_line
+
+REFUSED = "This page opens with the whole link that kfgs gave.\n"
+LONGEST_CALL = 16 << 20
+"""Bytes: a selection of many million Gaussians, as bits."""
+PATIENCE = 60.0
+"""Seconds after which a connection that neither sends nor reads is closed."""
+POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src 'self' blob: data:; "
+    "connect-src 'self'; worker-src blob:; form-action 'none'; base-uri 'none'; frame-ancestors 'self'"
+)
+
+Call = Callable[[str, dict[str, Any], bytes], tuple[dict[str, Any], bytes]]
+"""(name, arguments, attached bytes) -> answer and attached bytes. A ValueError or TypeError is told to the page."""
+
+
+class Served(NamedTuple):
+    """A file of the page, in memory."""
+
+    kind: str
+    """Media type, `text/html` for instance."""
+    content: bytes
+
+
+class PageServer:
+    """Serves a page from a thread of its own, until `close` or the end of a `with` block.
+
+    A call is a POST to `call`: 4 bytes with the length of a JSON text (little-endian), the JSON {"name", "args"}, and
+    attached bytes; the answer has the same form.
+
+    Args:
+        files: by name; the one without a name is the page.
+        call: answers calls, in several threads at once.
+        host: address to listen on. With one that other machines can reach, everyone who has the link can look and save.
+        port: 0: a free one.
+
+    Raises:
+        ValueError: if the address is not one of this machine, or the port is taken.
+    """
+
+    def __init__(self, files: Mapping[str, Served], call: Call, host: str = "127.0.0.1", port: int = 0) -> None:
+        check_whole("port", port, 0, 65535)
+        if not host.strip():
+            raise ValueError(
+                f"host: expected an address of this machine, got {host!r}; 127.0.0.1 is for this machine alone, 0.0.0.0 "
+                "for everyone"
+            )
+        self.secret = secrets.token_urlsafe(24)
+        self._host = host
+        handler = type("Handler", (_Handler,), {"files": files, "call": staticmethod(call), "page": self})
+        try:
+            self._server = _server_class(host)((host.strip("[]"), port), handler)
+        except OSError as error:
+            raise ValueError(
+                f"host, port: expected an address of this machine and a port that is free, got {host!r} and {port} "
+                f"({error_line(error)}); choose another, or port 0"
+            ) from error
+        self._thread = Thread(target=self._server.serve_forever, name="kfgs-page", daemon=True)
+        self._thread.start()
+
+    @property
+    def url(self) -> str:
+        """The link of the page, with the secret."""
+        name = socket.gethostname() if self._host in ("0.0.0.0", "::") else self._host.strip("[]")
+        name = f"[{name}]" if ":" in name else name
+        return f"http://{name}:{self._server.server_address[1]}/{self.secret}/"
+
+    @property
+    def local(self) -> bool:
+        """Whether it can be reached from this machine only."""
+        return is_loopback(self._host)
+
+    def close(self) -> None:
+        """Stop listening; a second call does nothing."""
+        if self._thread.is_alive():
+            self._server.shutdown()
+            self._thread.join()
+        self._server.server_close()
+
+    def __enter__(self) -> PageServer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a server on this address can be reached from this machine only."""
+    try:
+        return ip_address(host.strip("[]")).is_loopback
+    except ValueError:  # a name
+        return host.lower() == "localhost"
+
+
+def pack_message(answer: Mapping[str, Any], attached: bytes = b"") -> bytes:
+    """A JSON text with its length before it, and bytes after it."""
+    text = json.dumps(answer).encode()
+    return struct.pack("<I", len(text)) + text + attached
+
+
+def read_message(message: bytes) -> tuple[dict[str, Any], bytes]:
+    """The inverse of `pack_message`; a ValueError for anything else."""
+    if len(message) < 4:
+        raise ValueError(f"message: expected at least 4 bytes, got {len(message)}; send what the page's script makes")
+    (length,) = struct.unpack_from("<I", message)
+    try:
+        answer = json.loads(message[4 : 4 + length])
+    except (ValueError, RecursionError) as error:
+        raise ValueError(
+            f"message: expected JSON ({type(error).__name__}); send what the page's script makes"
+        ) from None
+    if length > len(message) - 4 or not isinstance(answer, dict):
+        raise ValueError("message: expected an object and its length, got others; send what the page's script makes")
+    return answer, message[4 + length :]
+
+
+def _server_class(host: str) -> type[ThreadingHTTPServer]:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    return type(
+        "Server", (ThreadingHTTPServer,), {"address_family": family, "daemon_threads": True, "block_on_close": False}
+    )
+
+
+class _Handler(BaseHTTPRequestHandler):
+    files: Mapping[str, Served]
+    call: Call
+    page: PageServer
+    timeout = PATIENCE
+
+    def do_GET(self) -> None:
+        name = self._name()
+        if name is None:
+            return
+        if name not in self.files:
+            self._answer(404, "text/plain", b"There is no such file.\n")
+            return
+        self._answer(200, *self.files[name])
+
+    def do_POST(self) -> None:
+        name = self._name()
+        if name is None:
+            return
+        length = self.headers.get("Content-Length", "")
+        if name != "call" or not length.isdecimal() or int(length) > LONGEST_CALL:
+            self._answer(400, "text/plain", b"This address is the page's own.\n")
+            return
+        try:
+            asked, attached = read_message(self.rfile.read(int(length)))
+            answer, more = self.call(str(asked.get("name")), dict(asked.get("args") or {}), attached)
+        except (ValueError, TypeError, OSError) as error:
+            answer, more = {"error": str(error) or type(error).__name__}, b""
+        self._answer(200, "application/octet-stream", pack_message(answer, more))
+
+    def _name(self) -> str | None:
+        """The file asked for; None if the request was refused."""
+        parts = urlsplit(self.path).path.split("/", 2)
+        host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
+        allowed = len(parts) == 3 and hmac.compare_digest(parts[1].encode(), self.page.secret.encode())
+        if self.page.local and not is_loopback(_host_name(host)):
+            allowed = False
+        if origin is not None and _host_of(origin) != host.lower():
+            allowed = False
+        if not allowed:
+            self._answer(403, "text/plain", REFUSED.encode())
+            return None
+        return parts[2]
+
+    def _answer(self, status: int, kind: str, content: bytes) -> None:
+        try:
+            self.send_response(status)
+            headers = {
+                "Content-Type": kind,
+                "Content-Length": str(len(content)),
+                "Content-Security-Policy": POLICY,
+                "Referrer-Policy": "no-referrer",  # the address holds the secret
+                "X-Content-Type-Options": "nosniff",
+                "Cache-Control": "no-store",
+            }
+            for name, value in headers.items():
+                self.send_header(name, value)
+            self.end_headers()
+            self.wfile.write(content)
+        except (ConnectionError, TimeoutError):  # the tab was closed while it loaded
+            self.close_connection = True
+
+    def log_message(self, *_: Any) -> None:
+        """Say nothing: addresses hold the secret."""
+
+
+def _host_name(host: str) -> str:
+    try:
+        return urlsplit(f"//{host}").hostname or ""
+    except ValueError:  # brackets that do not match
+        return ""
+
+
+def _host_of(origin: str) -> str:
+    try:
+        return urlsplit(origin).netloc.lower()
+    except ValueError:
+        return ""

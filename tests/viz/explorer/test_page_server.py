@@ -1,0 +1,138 @@
+"""The page's server: who is answered, what calls look like, and that nothing is left behind."""
+
+import http.client
+import threading
+import time
+from urllib.parse import urlsplit
+
+import pytest
+from messages import tells
+
+from kfgs.viz.explorer.page_server import LONGEST_CALL, PageServer, Served, pack_message, read_message
+
+FILES = {"": Served("text/html", b"<p>page</p>"), "pack": Served("application/octet-stream", bytes(range(256)))}
+
+
+def answer(name, args, attached):
+    if name == "fail":
+        raise ValueError(f"words: expected {args['wanted']}")
+    if name == "wait":
+        time.sleep(float(args["seconds"]))
+    return {"name": name, "args": args}, attached[::-1]
+
+
+@pytest.fixture
+def server():
+    with PageServer(FILES, answer) as made:
+        yield made
+
+
+def ask(server, path, method="GET", body=None, **headers):
+    address = urlsplit(server.url)
+    connection = http.client.HTTPConnection(address.hostname, address.port, timeout=30)
+    connection.request(method, path, body, {"Host": address.netloc} | headers)
+    response = connection.getresponse()
+    found = response.status, response.read(), dict(response.headers)
+    connection.close()
+    return found
+
+
+def secret(server):
+    return f"/{server.secret}/"
+
+
+def test_the_link_opens_the_page(server):
+    status, text, headers = ask(server, secret(server))
+    assert (status, text) == (200, FILES[""].content)
+    assert headers["Content-Security-Policy"].startswith("default-src 'none'")
+    assert headers["Referrer-Policy"] == "no-referrer"
+    assert ask(server, secret(server) + "pack")[1] == FILES["pack"].content
+    assert ask(server, secret(server) + "other")[0] == 404
+
+
+@pytest.mark.parametrize("path", ["/", "//", "/index.html", "/x/", "/x/pack", "/%2e%2e/etc/passwd", "*"])
+def test_without_the_secret_nothing_is_told(server, path):
+    status, text, _ = ask(server, path)
+    assert status == 403
+    assert b"link" in text
+
+
+def test_other_pages_and_other_names_are_refused(server):
+    port = urlsplit(server.url).port
+    own = f"127.0.0.1:{port}"
+    for refused in (
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Host": f"evil.example:{port}"},
+        {"Host": "["},
+    ):
+        assert ask(server, secret(server), **refused)[0] == 403
+    assert ask(server, secret(server), Origin=f"http://{own}")[0] == 200
+    assert ask(server, secret(server), Host=f"localhost:{port}")[0] == 200
+
+
+def test_a_call_and_its_answer(server):
+    body = pack_message({"name": "ask", "args": {"words": "chair"}}, b"abc")
+    status, content, _ = ask(server, secret(server) + "call", "POST", body)
+    assert status == 200
+    assert read_message(content) == ({"name": "ask", "args": {"words": "chair"}}, b"cba")
+
+
+def test_an_error_of_a_call_is_told(server):
+    body = pack_message({"name": "fail", "args": {"wanted": "a class"}})
+    assert read_message(ask(server, secret(server) + "call", "POST", body)[1])[0] == {
+        "error": "words: expected a class"
+    }
+
+
+@pytest.mark.parametrize(
+    "body", [b"", b"abc", b"\xff\xff\xff\x7f{}", pack_message({})[:5], b"\x02\0\0\0[]", b"\x90\x5f\1\0" + b"[" * 90_000]
+)
+def test_a_body_that_is_no_call(server, body):
+    status, content, _ = ask(server, secret(server) + "call", "POST", body)
+    assert status == 200
+    assert "message: expected" in read_message(content)[0]["error"]
+
+
+def test_bodies_too_long_or_of_unknown_length_are_refused(server):
+    assert ask(server, secret(server) + "call", "POST", b"", **{"Content-Length": str(LONGEST_CALL + 1)})[0] == 400
+    assert ask(server, secret(server) + "call", "POST", b"", **{"Content-Length": "-5"})[0] == 400
+    assert ask(server, secret(server) + "pack", "POST", b"")[0] == 400
+
+
+def test_a_slow_call_holds_up_no_other(server):
+    slow = threading.Thread(
+        target=ask,
+        args=(server, secret(server) + "call", "POST", pack_message({"name": "wait", "args": {"seconds": 2}})),
+    )
+    slow.start()
+    began = time.monotonic()
+    assert ask(server, secret(server))[0] == 200
+    assert time.monotonic() - began < 1.5
+    slow.join()
+
+
+def test_closing_leaves_no_thread_behind():
+    before = threading.active_count()
+    server = PageServer(FILES, answer)
+    for _ in range(5):
+        ask(server, secret(server))
+    server.close()
+    server.close()
+    end = time.monotonic() + 10
+    while threading.active_count() > before and time.monotonic() < end:
+        time.sleep(0.01)
+    assert threading.active_count() == before
+    with pytest.raises(ConnectionRefusedError):
+        ask(server, "/")
+
+
+def test_wrong_addresses():
+    with pytest.raises(ValueError, match=tells("host", "127.0.0.1")):
+        PageServer(FILES, answer, host=" ")
+    with pytest.raises(ValueError, match=tells("port", "70000")):
+        PageServer(FILES, answer, port=70000)
+    with PageServer(FILES, answer) as server, pytest.raises(ValueError, match=tells("host, port", "free")):
+        PageServer(FILES, answer, port=urlsplit(server.url).port)
+    with PageServer(FILES, answer, host="::1") as server:
+        assert ask(server, secret(server))[0] == 200
