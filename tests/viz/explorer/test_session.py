@@ -1,0 +1,99 @@
+"""What the viewer asks of Python: the same answers as the explorer's state, and files that hold what was selected."""
+
+import json
+
+import cases_explorer
+import numpy as np
+import pytest
+import torch
+from messages import tells
+
+from kfgs.formats import read_splats
+from kfgs.labels import EditList
+from kfgs.splat import rgb_to_sh0
+from kfgs.viz.explorer import Exploration, FieldMeaning
+from kfgs.viz.explorer.session import PNG, Session, bits_of
+
+
+@pytest.fixture
+def session(tmp_path):
+    meaning = FieldMeaning(cases_explorer.field("fused"), cases_explorer.classes())
+    color = cases_explorer.cloud(
+        torch.rand(60, 3, generator=torch.Generator().manual_seed(2)) * 2 + torch.tensor([-1, -1, 4])
+    )
+    color = color.replace(sh=rgb_to_sh0(torch.rand(60, 3))[:, None])
+    state = Exploration(meaning, color, cameras=cases_explorer.cameras(), distance=0.4)
+    return Session(state, tmp_path / "out")
+
+
+def test_an_answer_is_that_of_the_state(session):
+    answer, attached = session.call("ask", {"words": " chair "})
+    asked = session.state.meaning.ask("chair")
+    scores = torch.from_numpy(np.frombuffer(attached, "<f4").copy())
+    assert answer["words"] == "chair"
+    assert answer["number"] == session.state.meaning.names.index("chair")
+    assert (answer["gamma"], answer["low"], answer["high"]) == (asked.selection.threshold, asked.low, asked.high)
+    assert scores.isnan().equal(~asked.valid)
+    assert scores[asked.valid].equal(asked.selection.scores[asked.valid].float())
+    assert (scores > answer["gamma"]).equal(asked.selection.mask)
+
+
+def test_what_surrounds_a_gaussian(session):
+    found, _ = session.call("describe", {"side": "semantic", "index": 5})
+    picked = session.state.pick("semantic", 5)
+    assert [one["index"] for one in found["neighbours"]] == [i for i, _, _ in picked.neighbours]
+    assert len(found["views"]) == len(picked.views)
+
+
+def test_a_selection_by_hand_is_written(session):
+    masks = {side: torch.arange(len(session.state.cloud(side))) % 3 == 0 for side in session.state.sides}
+    attached = b"".join(map(bits_of, masks.values()))
+    args = {"words": None, "gamma": None, "lambda": 0.5, "sides": list(masks)}
+    answer, _ = session.call("save_selection", args, attached)
+    folder = session.out / "selection_001"
+    assert {path.rsplit("/", 1)[1] for path in answer["paths"]} == {path.name for path in folder.iterdir()}
+    details = json.loads((folder / "selection.json").read_text())
+    for side, mask in masks.items():
+        assert details[side]["selected"] == int(mask.sum())
+        assert len(read_splats(folder / f"selection_{side}.ply").gaussians) == int(mask.sum())
+    assert details["lambda"] == 0.5
+
+
+def test_edits_are_written_and_can_be_replayed(session):
+    edits = {"removed": [3, 4], "recolored": {"255,0,0": [0, 1]}, "opacity": {"0.500": [1, 2]}}
+    session.call("save_edits", {"sides": {"color": edits, "semantic": {"removed": []}}})
+    folder = session.out / "edited_001"
+    made, before = read_splats(folder / "color.ply").gaussians, session.state.cloud("color")
+    assert len(made) == len(before) - 2
+    torch.testing.assert_close(made.opacities[2], 0.5 * before.opacities[2])
+    assert [edit.op for edit in EditList.load(folder / "color.json")] == ["recolor", "opacity", "remove"]
+    assert not (folder / "semantic.ply").exists()
+
+
+def test_a_picture_is_written(session):
+    answer, _ = session.call("save_picture", {}, PNG + b"rest")
+    assert answer["paths"] == [str(session.out / "picture_001.png")]
+    assert (session.out / "picture_001.png").read_bytes() == PNG + b"rest"
+
+
+@pytest.mark.parametrize(
+    ("name", "args", "attached", "words"),
+    [
+        ("ask", {}, b"", ["args", "words"]),
+        ("ask", {"words": 3}, b"", ["words"]),
+        ("ask", {"words": "sky"}, b"", ["sky"]),
+        ("describe", {"side": "left", "index": 1}, b"", ["side"]),
+        ("describe", {"side": "color", "index": 10**9}, b"", ["index"]),
+        ("save_selection", {"sides": ["color"]}, b"\0", ["attached"]),
+        ("save_selection", {"sides": []}, b"", ["selection"]),
+        ("save_edits", {"sides": {"color": {"removed": [10**9]}}}, b"", ["indices"]),
+        ("save_edits", {"sides": {}}, b"", ["edits"]),
+        ("save_edits", {"sides": {"color": {"recolored": {"300,0,0": [1]}}}}, b"", ["recolored"]),
+        ("save_picture", {}, b"GIF", ["PNG"]),
+        ("delete", {}, b"", ["name"]),
+    ],
+)
+def test_wrong_calls(session, name, args, attached, words):
+    with pytest.raises((ValueError, TypeError), match=tells(*words)):
+        session.call(name, args, attached)
+    assert not session.out.exists()
