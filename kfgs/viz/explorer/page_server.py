@@ -27,7 +27,7 @@ LONGEST_CALL = 16 << 20
 PATIENCE = 60.0
 """Seconds after which a connection that neither sends nor reads is closed."""
 POLICY = (
-    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src 'self' blob: data:; "
+    "default-src 'none'; script-src 'unsafe-inline' blob:; style-src 'unsafe-inline'; img-src 'self' blob: data:; "
     "connect-src 'self'; worker-src blob:; form-action 'none'; base-uri 'none'; frame-ancestors 'self'"
 )
 

@@ -1,0 +1,117 @@
+"""Write an exploration as one web page that works offline, without Python."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+from ..._files import atomic_path
+from ..web import APP, inline_script, read_text
+from .carried import Array
+from .pack import pack_scene
+from .state import Exploration
+
+# Nothing may be loaded: pictures and the worker are made in the page.
+POLICY = "default-src 'none'; script-src 'unsafe-inline' blob:; worker-src blob:; style-src 'unsafe-inline'; img-src blob: data:"
+OFFLINE_START = """\
+    const text = (id) => document.getElementById(id).textContent;
+    const bytes = Uint8Array.from(atob(text("data")), (letter) => letter.charCodeAt(0));
+    document.getElementById("data").remove();
+    const packed = { header: JSON.parse(text("header")), data: await kfgs.inflate(bytes) };
+    window.viewer = await kfgs.mount(root, packed, new kfgs.OfflineLink(packed));"""
+PYTHON_START = """\
+    const loaded = await fetch("pack");
+    if (!loaded.ok) throw new Error("Python does not answer.");
+    const [about, data] = kfgs.readMessage(await loaded.arrayBuffer());
+    const link = new kfgs.PythonLink(kfgs.callPage, about.phrases);
+    window.viewer = await kfgs.mount(root, { header: about.header, data }, link);
+    if (about.ask) await window.viewer.ask(about.ask);"""
+PAGE = """\
+<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<link rel="icon" href="data:,">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+{policy}
+<title>{title}</title>
+<style>
+html, body {{ height: 100%; margin: 0; }}
+{style}
+</style>
+</head>
+<body>
+<div id="kfgs"></div>
+{data}
+<script>
+{script}
+addEventListener("DOMContentLoaded", async () => {{
+  const root = document.getElementById("kfgs");
+  try {{
+{start}
+  }} catch (error) {{
+    if (!root.childElementCount) root.textContent = `This scene cannot be shown: ${{error.message}}`;
+  }}
+}});
+</script>
+</body>
+</html>
+"""
+
+
+def save_html(
+    exploration: Exploration,
+    path: str | Path,
+    *,
+    title: str = "kfgs",
+    thumbnails: Iterable[Array | None] = (),  # [h, w, 3] uint8, one for each camera
+) -> Path:
+    """Write one file with the scene and the viewer. It opens with a double click and loads nothing.
+
+    Classes can be searched, gamma and lambda changed, Gaussians selected and edited. New phrases need Python.
+
+    Args:
+        exploration: its lambda is the first one in the page.
+        path: a name that ends in .html.
+        title: title of the page.
+        thumbnails: pictures of the exploration's cameras, in their order; None leaves one out.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: if the name does not end in .html.
+    """
+    target = Path(path)
+    if target.suffix.lower() != ".html":
+        raise ValueError(f"path: expected a name that ends in .html, got {target.name!r}; rename it")
+    packed = pack_scene(exploration, title=title, thumbnails=thumbnails)
+    data = f"""\
+<script type="application/json" id="header">{_json(packed.header)}</script>
+<script type="text/plain" id="data">{base64.b64encode(packed.compressed()).decode()}</script>"""
+    policy = f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+    page = document(title, OFFLINE_START, data, policy)
+    with atomic_path(target) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    return target
+
+
+def document(title: str, start: str, data: str = "", policy: str = "") -> str:
+    """The page: the viewer's script and style, and what starts it.
+
+    Args:
+        title: of the page.
+        start: JavaScript that loads a scene and mounts the viewer in `root`.
+        data: elements that it reads.
+        policy: an element that says what may be loaded, where no server does.
+    """
+    parts = {"title": html.escape(title), "style": read_text("app.css"), "script": inline_script(APP)}
+    return PAGE.format(start=start, data=data, policy=policy, **parts)
+
+
+def _json(value: object) -> str:
+    """JSON inside a script element: class names may contain "</script>"."""
+    return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")

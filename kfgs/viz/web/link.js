@@ -1,0 +1,168 @@
+/** Who answers what the page cannot: in an exported file the packed scores; later the server or the notebook. */
+
+import { bufferOf } from "./clouds.js";
+
+const NEEDS_PYTHON = "Searching for any words needs Python: open the scene with “kfgs view” or in a notebook. This file knows its classes only";
+
+/** Answers questions about classes from the scores in the pack. */
+export class OfflineLink {
+  constructor(packed) {
+    this.packed = packed;
+    this.names = packed.header.classes.map((one) => one.name);
+    this.phrases = false; // whether it answers any words
+  }
+
+  /**
+   * @param {string} words a class name, in any case
+   * @returns {Promise<{words, number, scores, gamma, how, low, high}>} `scores` is NaN where nothing is known
+   * @throws {Error} a sentence for people, if there is no such class
+   */
+  async ask(words) {
+    const name = className(words, this.names);
+    const found = this.packed.header.query[name];
+    if (!found) throw new Error(explain(words, this.names));
+    const number = Number(found.buffer.split("/")[1]);
+    return { ...found, words: name, number, scores: bufferOf(this.packed, found.buffer) };
+  }
+}
+
+/** The class that is meant: found exactly, then without regard to case if only one spelling fits; else null. */
+export function className(words, names) {
+  const wanted = words.trim();
+  if (names.includes(wanted)) return wanted;
+  const folded = [...new Set(names)].filter((name) => name.toLowerCase() === wanted.toLowerCase());
+  return folded.length === 1 ? folded[0] : null;
+}
+
+/** Class names for what was typed so far: those that begin with it, then those that contain it. */
+export function suggestions(typed, names) {
+  const stem = typed.trim().toLowerCase();
+  const unique = [...new Set(names)];
+  const begins = unique.filter((name) => name.toLowerCase().startsWith(stem));
+  return [...begins, ...unique.filter((name) => !begins.includes(name) && name.toLowerCase().includes(stem))];
+}
+
+function explain(words, names) {
+  const near = nearest(words.trim(), names);
+  return `“${words.trim()}” is none of the classes. ${near ? `Did you mean “${near}”? ` : ""}${NEEDS_PYTHON}: ${listed(names)}.`;
+}
+
+function listed(names) {
+  const more = names.length - 8;
+  return names.slice(0, 8).join(", ") + (more > 0 ? ` and ${more} more` : "");
+}
+
+/** The class name with the most pairs of letters in common with the words; null if they have less than half. */
+function nearest(words, names) {
+  const pairs = (text) => new Set([...text.toLowerCase()].map((_, i) => text.toLowerCase().slice(i, i + 2)));
+  const asked = pairs(words);
+  const scored = names.map((name) => {
+    const own = pairs(name);
+    return [(2 * [...own].filter((pair) => asked.has(pair)).length) / (own.size + asked.size), name];
+  });
+  scored.sort((a, b) => b[0] - a[0]);
+  return scored.length && scored[0][0] >= 0.5 ? scored[0][1] : null;
+}
+
+/** Answers from Python: session.py at the other end of a page's address or of a notebook's kernel. */
+export class PythonLink {
+  /**
+   * @param {(name: string, args: object, attached?: Uint8Array) => Promise<[object, ArrayBuffer]>} call `callPage` or `callWidget`
+   * @param {boolean} phrases whether it answers any words
+   */
+  constructor(call, phrases) {
+    Object.assign(this, { call, phrases, python: true });
+  }
+
+  /** As `OfflineLink.ask`; `number` is null for words that are no class. */
+  async ask(words) {
+    const [answer, scores] = await this.call("ask", { words });
+    return { ...answer, scores: new Float32Array(scores) };
+  }
+
+  /** Neighbours and views of a Gaussian: {neighbours: [{index, distance}], views: [{index, name, weight}]}. */
+  async describe(side, index) {
+    return (await this.call("describe", { side, index }))[0];
+  }
+
+  /** Write the selected Gaussians of some sides into Python's folder; returns the paths. */
+  async saveSelection({ words, gamma, lambda, masks }) {
+    const bits = Object.values(masks).map(bitsOf);
+    const [answer] = await this.call("save_selection", { words, gamma, lambda, sides: Object.keys(masks) }, joined(bits));
+    return answer.paths;
+  }
+
+  /** Write the edited splats, and the edits as JSON; `sides` as in `Model.toJSON`. */
+  async saveEdits(sides, lambda) {
+    return (await this.call("save_edits", { sides, lambda }))[0].paths;
+  }
+
+  /** Write a picture, a PNG file as a Blob. */
+  async savePicture(blob) {
+    return (await this.call("save_picture", {}, new Uint8Array(await blob.arrayBuffer())))[0].paths;
+  }
+}
+
+/** Call Python over the page's own address; see page_server.py for the form of a message. */
+export async function callPage(name, args, attached) {
+  const sent = await fetch("call", { method: "POST", body: packMessage({ name, args }, attached) }).catch(() => null);
+  if (!sent?.ok) throw new Error("Python does not answer: has “kfgs view” ended?");
+  return checked(readMessage(await sent.arrayBuffer()));
+}
+
+/** What `callPage` is, for a widget of a notebook: `model` is anywidget's. */
+export function callWidget(model) {
+  const waiting = new Map();
+  let last = 0;
+  model.on("msg:custom", (message, buffers) => {
+    const answered = waiting.get(message.id);
+    waiting.delete(message.id);
+    answered?.([message.answer, buffers[0] ? plain(buffers[0]) : new ArrayBuffer(0)]);
+  });
+  return async (name, args, attached = new Uint8Array(0)) => {
+    const id = ++last;
+    const answered = new Promise((resolve) => waiting.set(id, resolve));
+    model.send({ id, name, args }, undefined, [attached]);
+    return checked(await answered);
+  };
+}
+
+/** A JSON text with its length before it, and bytes after it. */
+export function packMessage(answer, attached = new Uint8Array(0)) {
+  const text = new TextEncoder().encode(JSON.stringify(answer));
+  return joined([new Uint8Array(new Uint32Array([text.length]).buffer), text, attached]);
+}
+
+/** The inverse of `packMessage`: [object, ArrayBuffer]. */
+export function readMessage(buffer) {
+  const length = new DataView(buffer).getUint32(0, true);
+  const text = new TextDecoder().decode(new Uint8Array(buffer, 4, length));
+  return [JSON.parse(text), buffer.slice(4 + length)];
+}
+
+function checked([answer, attached]) {
+  if (answer.error) throw new Error(answer.error);
+  return [answer, attached];
+}
+
+function joined(parts) {
+  const all = new Uint8Array(parts.reduce((sum, part) => sum + part.length, 0));
+  let at = 0;
+  for (const part of parts) {
+    all.set(part, at);
+    at += part.length;
+  }
+  return all;
+}
+
+/** A mask with one bit for each Gaussian, the lowest first. */
+function bitsOf(mask) {
+  const bits = new Uint8Array(Math.ceil(mask.length / 8));
+  for (let i = 0; i < mask.length; i++) bits[i >> 3] |= (mask[i] ? 1 : 0) << (i & 7);
+  return bits;
+}
+
+/** An ArrayBuffer of its own from a DataView or a typed array. */
+function plain(view) {
+  return view.buffer.slice(view.byteOffset, view.byteOffset + view.byteLength);
+}
