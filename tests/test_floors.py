@@ -45,12 +45,9 @@ THIRD_PARTY = {
     "transformers": "kfgs/teachers/",
     "tokenizers": "kfgs/teachers/",
     "huggingface_hub": "kfgs/teachers/",
-    "trame": "kfgs/viz/explorer/",
-    "trame_client": "kfgs/viz/explorer/",
-    "wslink": "kfgs/viz/",
-    "aiohttp": "kfgs/viz/explorer/",
     "IPython": "kfgs/viz/explorer/",
-    "trame_vtk": "kfgs/viz/",
+    "anywidget": "kfgs/viz/explorer/",
+    "traitlets": "kfgs/viz/explorer/",
 }
 
 

@@ -24,10 +24,10 @@ FEW = 0.05  # of a colour cloud within lambda, under which the frames probably d
 class Display:
     """Options of the display and of the page."""
 
-    show: Literal["labels", "rgb", "score", "latents"] = "labels"
-    """The meaning of the colours at the start."""
+    show: Given[Literal["labels", "rgb", "score", "latents"]] = None
+    """The meaning of the colours at the start. When not given: the page shows colours if there are any, all else labels."""
     style: Literal["auto", "gaussians", "points"] = "auto"
-    """gaussians as they are rasterised, points (quick); auto: Gaussians if a frame of them is quick."""
+    """Window and picture: gaussians as they are rasterised, points (quick); auto: Gaussians if a frame of them is quick."""
     host: str = "127.0.0.1"
     """Address on which the page listens. Anything but 127.0.0.1 lets others look and save."""
     port: int = 0
@@ -48,9 +48,9 @@ def view(
 ) -> None:
     """Explore a field: type "chair", change gamma and lambda, click a Gaussian, save the selection.
 
-    The semantic cloud and the colour cloud stand side by side, in a window or in a browser page that only this machine can
-    open. A selection in the semantic cloud lights up in the colour cloud. Gamma is the score that a Gaussian must
-    exceed; lambda is the distance within which the colour cloud lights up too.
+    It opens a page in the browser, which only this machine can open. A selection in the semantic cloud lights up in the colour
+    cloud. Gamma is the score that a Gaussian must exceed; lambda is the distance within which the colour cloud
+    lights up too.
 
     Examples:
         kfgs view run/field --color run/color.ply
@@ -62,13 +62,12 @@ def view(
         color: Colour splat in the same frame, any splat file; without it the source is shown alone.
         ask: A first question.
         distance: Lambda at the start, in world units; by default from the clouds' spacing.
-        where: window, browser, or picture (writes OUT/view.png and ends). auto: a window if there is a display, else the
-            browser.
+        where: browser, window (pyvista: two clouds side by side), or picture (writes OUT/view.png and ends). auto: browser.
         out: Folder for saved pictures and selections.
     """
     from .._check import check_range, check_whole
-    from ..viz.explorer import Exploration, ExploreOptions, Explorer
-    from ..viz.explorer.entry import check_place, find_place
+    from ..viz.explorer import Exploration, ExploreOptions
+    from ..viz.explorer.entry import check_place
     from ..viz.headless import require
 
     check_folder("out", out)
@@ -76,13 +75,14 @@ def view(
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
     classes.check_images()
-    place = where if where != "auto" else "window" if find_place() == "window" else "browser"
+    place = "browser" if where == "auto" else where
     if place != "browser":
         for name, given, usual in (("host", display.host, "127.0.0.1"), ("port", display.port, 0)):
             check_alone(name, None if given == usual else given, "without --where browser, whose page listens there")
     try:
         check_place(place)
-        require()
+        if place != "browser":
+            require()
     except RuntimeError as error:  # nothing to open, or nothing draws here
         raise ValueError(str(error)) from error
     say("reading")
@@ -92,26 +92,37 @@ def view(
     _note(state)
     height, width = (680, 980) if place == "window" else (600, 1200)  # a window has a panel next to the clouds
     options = ExploreOptions(height=height, width=width, style=display.style, out=out)
-    with Explorer(state, options, off_screen=place != "window") as explorer:
-        explorer.set_show(display.show)
-        if ask is not None:
-            explorer.ask(ask)
-        for line in explorer.lines():
-            say(line)
-        _open(explorer, place, display.host, display.port)
-
-
-def _open(explorer: Any, place: Where, host: str, port: int) -> None:
-    """Show an explorer until the user closes it, or write its picture."""
-    from ..viz.explorer import open_window, serve
-
-    if place == "picture":
-        explorer.screenshot(explorer.options.out / "view.png")
-        wrote([explorer.options.out / "view.png"])
-    elif place == "window":
-        open_window(explorer)
+    if ask is not None:
+        state.ask(ask)
+    for line in state.lines():
+        say(line)
+    if place == "browser":
+        _serve(state, options, source, ask, display)
     else:
-        serve(explorer, host=host, port=port, report=say)
+        _draw(state, options, place, display.show)
+
+
+def _serve(state: Any, options: Any, source: Path, ask: str | None, display: Display) -> None:
+    """Serve the page until Ctrl-C."""
+    from ..viz.explorer import Viewer
+
+    viewer = Viewer(state, options, title=source.resolve().stem)
+    if ask is not None:
+        viewer.ask(ask)
+    viewer.serve(display.host, display.port, show=display.show, report=say)
+
+
+def _draw(state: Any, options: Any, place: Where, show: Any) -> None:
+    """Open a window until the user closes it, or write its picture."""
+    from ..viz.explorer import Explorer, open_window
+
+    with Explorer(state, options, off_screen=place != "window") as explorer:
+        explorer.set_show(show or "labels")
+        if place == "window":
+            open_window(explorer)
+        else:
+            explorer.screenshot(options.out / "view.png")
+            wrote([options.out / "view.png"])
 
 
 def _meaning(source: Path, classes: Classes, teacher: Teacher) -> tuple[Any, list[Any]]:

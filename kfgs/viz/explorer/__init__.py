@@ -4,12 +4,13 @@ from .desktop import open_window
 from .entry import explore
 from .explorer import Explorer
 from .hit_test import gaussian_at
+from .html import save_html
 from .meaning import Asked, FieldMeaning, Meaning, SplatMeaning
-from .notebook import show_in_notebook
 from .options import ExploreOptions
 from .picked import Picked
+from .session import Session
 from .state import Exploration, Show
-from .web import serve
+from .viewer import Viewer
 
 __all__ = [
     "Asked",
@@ -19,11 +20,12 @@ __all__ = [
     "FieldMeaning",
     "Meaning",
     "Picked",
+    "Session",
     "Show",
     "SplatMeaning",
+    "Viewer",
     "explore",
     "gaussian_at",
     "open_window",
-    "serve",
-    "show_in_notebook",
+    "save_html",
 ]

@@ -16,10 +16,10 @@ from ..headless import has_display
 from .desktop import open_window
 from .explorer import Explorer
 from .meaning import FieldMeaning, Meaning, SplatMeaning
-from .notebook import close_earlier, in_notebook, show_in_notebook
 from .options import ExploreOptions
 from .state import Exploration
-from .web import require_web, serve
+from .viewer import Viewer
+from .widget import in_notebook, require_widget
 
 if TYPE_CHECKING:
     from ...fields import SemanticField
@@ -37,13 +37,14 @@ def explore(
     distance: float | None = None,
     where: Where = "auto",
     options: ExploreOptions = ExploreOptions(),  # noqa: B008  frozen
-) -> Explorer:
-    """Explore a scene: search by text, change gamma and lambda, pick Gaussians, save selections.
+) -> Explorer | Viewer:
+    """Explore a scene: search by text, change gamma and lambda, pick and select Gaussians, edit, save.
 
-    The semantic cloud is on the left, the colour cloud on the right. A selection on the left also lights up on the right:
-    each colour Gaussian takes the label of the nearest semantic one within lambda (Sec. 3.4). Everything you can click
-    you can also call on the returned explorer: `ask("chair")`, `set_gamma(0.6)`, `set_distance(0.05)`, `pick(x, y)`,
-    `screenshot("chair.png")`, `save_selection()`.
+    A selection in the semantic cloud also lights up in the colour cloud: each colour Gaussian takes the label of the
+    nearest semantic one within lambda (Sec. 3.4). A window and a picture are drawn by pyvista, with both clouds side by side;
+    everything is a method of the returned `Explorer`: `ask("chair")`, `set_gamma(0.6)`, `set_distance(0.05)`,
+    `pick(x, y)`, `screenshot("chair.png")`, `save_selection()`. A page and a notebook are drawn by the browser: a `Viewer`,
+    with `ask` and `save_html`.
 
     Args:
         source: a semantic field (search by text) or a labelled splat (search by class).
@@ -54,14 +55,13 @@ def explore(
         embed: the teacher's text encoder, text -> [D], to search for more than the classes.
         distance: lambda, world units; None: from the clouds' spacing.
         where: `window` (blocks until you close it), `browser` (a page that only this machine can open; blocks until
-            Ctrl-C), `notebook` (the page inside the cell; running the cell again closes the earlier explorer; without
-            the extra `web`, a picture and the install line), or `picture` (opens nothing). `auto`: the notebook if there
-            is one, else a window if there is a display, else a picture.
+            Ctrl-C), `notebook` (a widget, as the last value of a cell), or `picture` (opens nothing). `auto`: the notebook if
+            there is one, else a window if there is a display, else a picture.
         options: size, style, where files are saved.
 
     Raises:
         ValueError: if there is nothing to show, or arguments contradict each other.
-        ImportError: if the extra `web` is missing for `browser`, or IPython for `notebook`.
+        ImportError: if anywidget is missing for `notebook`.
         RuntimeError: if nothing can be drawn here, or there is no display for a window.
     """
     check_choice("where", where, get_args(Where))
@@ -72,12 +72,18 @@ def explore(
     meaning = meaning_of(source, classes, cameras=cameras, embed=embed)
     cloud = color.gaussians if isinstance(color, SplatFile) else color
     state = Exploration(meaning, cloud, cameras=cameras, distance=distance)
+    if place in ("browser", "notebook"):
+        viewer = Viewer(state, options)
+        if place == "browser":
+            viewer.serve()
+        return viewer
     explorer = Explorer(state, options, off_screen=place != "window")
-    try:
-        show(explorer, place)
-    except BaseException:
-        explorer.close()
-        raise
+    if place == "window":
+        try:
+            open_window(explorer)
+        except BaseException:
+            explorer.close()
+            raise
     return explorer
 
 
@@ -112,21 +118,10 @@ def find_place() -> Where:
 
 def check_place(place: Where) -> None:
     """Raise an ImportError or a RuntimeError if the browser page or a window is impossible here."""
-    if place == "browser":
-        require_web()
+    if place == "notebook":
+        require_widget()
     if place == "window" and not has_display():
         raise RuntimeError(
             "where: expected a display for 'window', got none (neither DISPLAY nor WAYLAND_DISPLAY is set); use 'browser' or "
             "'picture'"
         )
-
-
-def show(explorer: Explorer, place: Where) -> None:
-    """Open the explorer at a place; a picture opens nothing."""
-    if place == "window":
-        open_window(explorer)
-    elif place == "browser":
-        serve(explorer)
-    elif place == "notebook":
-        close_earlier(explorer)
-        show_in_notebook(explorer)

@@ -28,6 +28,7 @@ PYTHON_START = """\
     const [about, data] = kfgs.readMessage(await loaded.arrayBuffer());
     const link = new kfgs.PythonLink(kfgs.callPage, about.phrases);
     window.viewer = await kfgs.mount(root, { header: about.header, data }, link);
+    if (about.mode && about.mode in window.viewer.modes) window.viewer.setMode(about.mode);
     if (about.ask) await window.viewer.ask(about.ask);"""
 PAGE = """\
 <!doctype html>

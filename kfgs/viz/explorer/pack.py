@@ -243,9 +243,7 @@ def _classes(state: Exploration) -> list[dict[str, Any]]:
     return [{"name": name, "color": color.tolist()} for name, color in zip(state.meaning.names, colors, strict=True)]
 
 
-def _cameras(
-    buffers: _Buffers, cameras: Iterable[Camera], thumbnails: Iterable[Array | None]
-) -> list[dict[str, Any]]:
+def _cameras(buffers: _Buffers, cameras: Iterable[Camera], thumbnails: Iterable[Array | None]) -> list[dict[str, Any]]:
     pictures = iter(thumbnails)
     packed = []
     for index, camera in enumerate(cameras):

@@ -25,6 +25,7 @@ def open_page(
     out: str | Path = "kfgs_view",
     thumbnails: Iterable[Array | None] = (),  # [h, w, 3] uint8, one for each camera
     ask: str | None = None,
+    mode: str | None = None,
     host: str = "127.0.0.1",
     port: int = 0,
 ) -> PageServer:
@@ -36,6 +37,7 @@ def open_page(
         out: folder for files that are saved from the page.
         thumbnails: pictures of the exploration's cameras, in their order; None leaves one out.
         ask: a first question.
+        mode: what the colours mean at the start: `color`, `labels`, `score` or `latents`.
         host: as in `PageServer`.
         port: as in `PageServer`.
 
@@ -43,7 +45,7 @@ def open_page(
         ValueError: if the address is not one of this machine, or the port is taken.
     """
     packed = pack_scene(exploration, title=title, thumbnails=thumbnails)
-    about = {"header": packed.header, "phrases": exploration.meaning.phrases, "ask": ask}
+    about = {"header": packed.header, "phrases": exploration.meaning.phrases, "ask": ask, "mode": mode}
     files = {
         "": Served("text/html; charset=utf-8", document(title, PYTHON_START).encode()),
         "pack": Served("application/octet-stream", pack_message(about, packed.data)),

@@ -1,6 +1,5 @@
-"""What tests of a file share: a window; a Chromium and a server (while one is open, asyncio does not run)."""
+"""What tests of a file share: a window."""
 
-import cases_browser
 import cases_desktop
 import pytest
 from cases_window import an_explorer
@@ -30,18 +29,6 @@ def explorer(shared_explorer):
     shared_explorer.set_style("gaussians")
     shared_explorer.state.drop_pick()
     return shared_explorer
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with cases_browser.chromium() as opened:
-        yield opened
-
-
-@pytest.fixture(scope="module")
-def server(tmp_path_factory):
-    with cases_browser.served(tmp_path_factory.mktemp("page")) as started:
-        yield started
 
 
 @pytest.fixture

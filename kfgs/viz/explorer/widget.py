@@ -1,0 +1,138 @@
+"""The viewer as a notebook widget: anywidget carries the scene and the calls through the kernel."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from PIL import Image
+
+from ..web import APP, inline_script, read_text
+from .carried import Array
+from .pack import pack_scene
+from .session import Session
+from .state import Exploration
+
+if TYPE_CHECKING:
+    from anywidget import AnyWidget
+
+HEIGHT = 640  # CSS pixels
+START = """
+export default {
+  async render({ model, el }) {
+    const root = document.createElement("div");
+    root.style.height = `${model.get("height")}px`;
+    el.append(root);
+    const raw = model.get("data");
+    const bytes = new Uint8Array(raw.buffer, raw.byteOffset, raw.byteLength);
+    const packed = { header: model.get("header"), data: await kfgs.inflate(bytes) };
+    const link = new kfgs.PythonLink(kfgs.callWidget(model), model.get("phrases"));
+    const app = await kfgs.mount(root, packed, link);
+    const follow = async () => { try { await app.ask(model.get("question")); } catch (error) { console.error(error); } };
+    model.on("change:question", follow);
+    if (model.get("question")) await follow();
+    return () => app.dispose();
+  },
+};
+"""
+
+
+def require_widget() -> None:
+    """Raise an ImportError with the install line if anywidget is missing."""
+    try:
+        import anywidget  # noqa: F401
+    except ImportError:
+        raise ImportError(
+            'where: expected the package anywidget for a notebook, got none; pip install "kfgs[notebook]"'
+        ) from None
+
+
+def in_notebook() -> bool:
+    """Whether a Jupyter kernel runs this program."""
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    return getattr(shell, "kernel", None) is not None
+
+
+def make_widget(
+    exploration: Exploration,
+    *,
+    title: str = "kfgs",
+    out: str | Path = "kfgs_view",
+    thumbnails: Iterable[Array | None] = (),  # [h, w, 3] uint8, one for each camera
+    ask: str | None = None,
+    height: int = HEIGHT,
+    still: Array | None = None,  # [h, w, 3] uint8
+) -> AnyWidget:
+    """The viewer of an exploration as a widget for Jupyter, VS Code and Colab; display it as a cell's last value.
+
+    Args:
+        exploration: its lambda is the first one in the widget.
+        title: shown in the widget.
+        out: folder for files that are saved from the widget, on the kernel's machine.
+        thumbnails: pictures of the exploration's cameras, in their order; None leaves one out.
+        ask: a first question; set `widget.question` to ask another.
+        height: CSS pixels.
+        still: a picture shown where widgets cannot run, on a page of GitHub for instance.
+
+    Raises:
+        ImportError: if anywidget is missing.
+    """
+    require_widget()
+    import anywidget
+    import traitlets
+
+    session = Session(exploration, out)
+    packed = pack_scene(exploration, title=title, thumbnails=thumbnails)
+
+    class Viewer(anywidget.AnyWidget):  # type: ignore[misc]
+        """The viewer; see `make_widget`."""
+
+        _esm = inline_script(APP) + START
+        _css = read_text("app.css")
+        header = traitlets.Dict().tag(sync=True)
+        data = traitlets.Bytes().tag(sync=True)
+        phrases = traitlets.Bool().tag(sync=True)
+        question = traitlets.Unicode().tag(sync=True)
+        height = traitlets.Int().tag(sync=True)
+
+        def _repr_mimebundle_(self, **options: Any) -> Any:
+            found = super()._repr_mimebundle_(**options)
+            bundle = found[0] if isinstance(found, tuple) else found
+            if bundle is not None and still is not None:
+                bundle["text/html"] = picture_html(still)
+            return found
+
+    widget = Viewer(
+        header=packed.header,
+        data=packed.compressed(),
+        phrases=exploration.meaning.phrases,
+        question=ask or "",
+        height=height,
+    )
+
+    def answer(_: Any, message: Any, buffers: list[Any]) -> None:
+        attached = bytes(buffers[0]) if buffers else b""
+        try:
+            found, more = session.call(str(message.get("name")), dict(message.get("args") or {}), attached)
+        except (ValueError, TypeError, OSError) as error:
+            found, more = {"error": str(error) or type(error).__name__}, b""
+        widget.send({"id": message.get("id"), "answer": found}, [more])
+
+    widget.on_msg(answer)
+    return widget
+
+
+def picture_html(picture: Array) -> str:
+    """A picture as an element for a saved notebook."""
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "JPEG", quality=80, optimize=True)
+    data = base64.b64encode(file.getvalue()).decode("ascii")
+    return (
+        f'<img alt="{html.escape("the viewer, as it was")}" style="max-width:100%" src="data:image/jpeg;base64,{data}">'
+    )

@@ -1,0 +1,85 @@
+"""The notebook widget: what is sent to the browser, and how calls are answered. Its JavaScript: tests/viz/web."""
+
+import subprocess
+import sys
+
+import cases_explorer
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("anywidget")
+
+from kfgs.splat import rgb_to_sh0
+from kfgs.viz import explore
+from kfgs.viz.explorer import Exploration, FieldMeaning, Viewer, pack
+from kfgs.viz.explorer.widget import make_widget
+
+
+def exploration():
+    generator = torch.Generator().manual_seed(2)
+    means = torch.rand(60, 3, generator=generator) * 2 + torch.tensor([-1, -1, 4])
+    color = cases_explorer.cloud(means, sh=rgb_to_sh0(torch.rand(60, 3, generator=generator))[:, None])
+    meaning = FieldMeaning(cases_explorer.field("fused"), cases_explorer.classes())
+    return Exploration(meaning, color, cameras=cases_explorer.cameras(), distance=0.4)
+
+
+def answers(widget, *messages):
+    sent = []
+    widget.send = lambda *found: sent.append(found)
+    for message in messages:
+        widget._handle_custom_msg(message, [b""])
+    return sent
+
+
+def test_the_scene_is_sent_once(tmp_path):
+    widget = make_widget(exploration(), title="room", out=tmp_path, ask="chair")
+    packed = pack.pack_scene(exploration(), title="room")
+    assert widget.header == packed.header
+    assert widget.data == packed.compressed()
+    assert (widget.question, widget.phrases) == ("chair", False)
+
+
+def test_calls_are_answered_with_their_number(tmp_path):
+    widget = make_widget(exploration(), out=tmp_path)
+    (first, scores), (second, _) = answers(
+        widget, {"id": 7, "name": "ask", "args": {"words": "chair"}}, {"id": 8, "name": "ask", "args": {"words": "sky"}}
+    )
+    assert first["id"] == 7
+    asked = exploration().meaning.ask("chair")
+    assert np.array_equal(np.frombuffer(scores[0], "<f4") > 0.5, asked.selection.mask.numpy())
+    assert second["id"] == 8
+    assert "sky" in second["answer"]["error"]
+    ((wrong, _),) = answers(widget, {"id": 9})
+    assert "name" in wrong["answer"]["error"]
+
+
+def test_explore_in_a_notebook_gives_a_viewer():
+    state = exploration()
+    viewer = explore(
+        cases_explorer.field("fused"), state.cloud("color"), classes=cases_explorer.classes(), where="notebook"
+    )
+    assert isinstance(viewer, Viewer)
+    viewer.ask("chair")
+    assert viewer.widget.question == "chair"
+    viewer.ask(None)
+    assert viewer.widget.question == ""
+    bundle = viewer._repr_mimebundle_()
+    assert "application/vnd.jupyter.widget-view+json" in (bundle[0] if isinstance(bundle, tuple) else bundle)
+    viewer.close()
+
+
+def test_a_picture_stands_in_where_widgets_cannot_run():
+    still = np.zeros((6, 8, 3), np.uint8)
+    bundle = make_widget(exploration(), still=still)._repr_mimebundle_()
+    assert (bundle[0] if isinstance(bundle, tuple) else bundle)["text/html"].startswith("<img alt=")
+
+
+def test_without_anywidget_the_install_line_is_told():
+    code = (
+        "import sys; sys.modules['anywidget'] = None\n"
+        "from kfgs.viz.explorer.widget import require_widget\n"
+        "try: require_widget()\nexcept ImportError as error: print(error)"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "kfgs[notebook]" in said
