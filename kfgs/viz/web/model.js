@@ -1,0 +1,495 @@
+/** The viewer's state and rules: question, gamma, lambda, hidden classes, selection, edits, undo. Uses no DOM. */
+
+import { bufferOf } from "./clouds.js";
+
+const MOST_UNDONE = 50; // steps; a step holds at most the masks that it changed
+const BINS = 64; // of the histograms
+const REACH = 3; // grow by so many typical distances between neighbours
+export const SIDE_WORDS = { color: "colour", semantic: "semantic" };
+
+/** A whole number with separators: 100,000. */
+export const whole = (value) => Math.round(value).toLocaleString("en-US");
+
+/** A number with about three digits. */
+export const short = (value) => (Number.isFinite(value) ? String(Number(value.toPrecision(3))) : "unknown");
+
+export class Model extends EventTarget {
+  /**
+   * @param {{header: object, data: ArrayBuffer}} packed see kfgs/viz/explorer/pack.py
+   */
+  constructor(packed) {
+    super();
+    const { header } = packed;
+    this.packed = packed;
+    this.names = header.classes.map((one) => one.name);
+    this.sides = ["color", "semantic"].filter((side) => header.sides[side]);
+    this.side = this.sides[0];
+    this.own = bufferOf(packed, "semantic/labels");
+    this.ownScores = bufferOf(packed, "semantic/label_scores");
+    this.source = bufferOf(packed, "color/source");
+    this.far = bufferOf(packed, "color/far");
+    this.lambda = header.lambda ? header.lambda.value : Infinity;
+    this.hidden = new Set();
+    this.picked = null; // {side, index}
+    this.now = { answer: null, gamma: null, gammaHow: "", hand: {}, removed: {}, colors: {}, opacity: {}, what: "" };
+    this.past = [];
+    this.future = [];
+    this.cache = new Map();
+    this.positions = {}; // side -> Float32Array [3 N], given by the renderer
+  }
+
+  /** Number of Gaussians of a side, removed ones included. */
+  total(side) {
+    return this.packed.header.sides[side].count;
+  }
+
+  get answer() {
+    return this.now.answer;
+  }
+
+  get gamma() {
+    return this.now.gamma;
+  }
+
+  /** Whether anything can be shown as selected: a question, or a selection by hand. */
+  get selecting() {
+    return this.answer !== null || this.byHand;
+  }
+
+  get byHand() {
+    return Object.keys(this.now.hand).length > 0;
+  }
+
+  /** Show the answer to a question (see link.js); null clears it. The selection is then the question's. */
+  ask(answer) {
+    const { gamma = null, how = "" } = answer ?? {};
+    this.step(answer ? `search for ${answer.words}` : "clear the search", { answer, gamma, gammaHow: how, hand: {} });
+  }
+
+  /** Select Gaussians that score above gamma; steps of one drag of a slider are one step of undo. */
+  setGamma(gamma, dragging = false) {
+    if (!this.answer || !Number.isFinite(gamma)) return;
+    const { low, high } = this.answer;
+    const value = Math.min(Math.max(gamma, low), high);
+    this.step("change gamma", { gamma: value, gammaHow: "given", hand: {} }, dragging);
+  }
+
+  setLambda(lambda) {
+    if (!(lambda > 0)) return;
+    this.lambda = lambda;
+    this.changed();
+  }
+
+  /** Hide these labels (-1: no class), show all others. */
+  setHidden(labels) {
+    this.hidden = new Set(labels);
+    this.changed();
+  }
+
+  toggleHidden(label) {
+    const hidden = new Set(this.hidden);
+    if (!hidden.delete(label)) hidden.add(label);
+    this.setHidden(hidden);
+  }
+
+  /** Show one class alone; a second call shows all. */
+  solo(label) {
+    const others = [-1, ...this.names.keys()].filter((one) => one !== label);
+    this.setHidden(this.isSolo(label) ? [] : others);
+  }
+
+  isSolo(label) {
+    return !this.hidden.has(label) && this.hidden.size === this.names.length;
+  }
+
+  /** Labels of a side, -1 = none. A colour Gaussian takes its source's label if that is closer than lambda. */
+  labels(side) {
+    if (side === "semantic") return this.own;
+    return this.cached(`labels ${this.lambda}`, () => this.carry(this.own, -1, Int16Array));
+  }
+
+  /** Scores of the question, or of the labels without a question; NaN where unknown. */
+  scores(side) {
+    const own = this.answer ? this.answer.scores : this.labelScores();
+    return side === "semantic" ? own : this.carry(own, NaN, Float32Array);
+  }
+
+  labelScores() {
+    return this.cached("label scores", () => this.ownScores.map((score, i) => (this.own[i] < 0 ? NaN : score)));
+  }
+
+  /** What the question selects on a side, hidden, removed or not; the comparison is Python's, in float32. */
+  questioned(side) {
+    if (!this.answer) return new Uint8Array(this.total(side));
+    const gamma = Math.fround(this.gamma);
+    const make = () => {
+      const own = Uint8Array.from(this.answer.scores, (score) => (score > gamma ? 1 : 0));
+      return side === "semantic" ? own : this.carry(own, 0, Uint8Array);
+    };
+    return this.cached(`selected ${side} ${this.answer.words} ${gamma} ${side === "color" ? this.lambda : ""}`, make);
+  }
+
+  /** Selected Gaussians that are not removed, Uint8Array. */
+  selected(side) {
+    const mask = this.byHand ? this.now.hand[side] ?? new Uint8Array(this.total(side)) : this.questioned(side);
+    const removed = this.now.removed[side];
+    return removed ? mask.map((on, i) => on & ~removed[i] & 1) : mask;
+  }
+
+  /** Gaussians that are neither hidden nor removed. */
+  drawn(side) {
+    const labels = this.labels(side);
+    const removed = this.now.removed[side];
+    return Uint8Array.from(labels, (label, i) => (this.hidden.has(label) || removed?.[i] ? 0 : 1));
+  }
+
+  /** Counts of a side, without removed Gaussians: {total, selected, removed, classes: [..], none}. */
+  counts(side) {
+    const key = `counts ${side} ${this.lambda} ${this.now.id}`;
+    return this.cached(key, () => {
+      const labels = this.labels(side);
+      const removed = this.now.removed[side];
+      const classes = new Array(this.names.length).fill(0);
+      const found = { total: 0, selected: sum(this.selected(side)), removed: removed ? sum(removed) : 0, none: 0, classes };
+      for (let i = 0; i < labels.length; i++) {
+        if (removed?.[i]) continue;
+        found.total += 1;
+        if (labels[i] < 0) found.none += 1;
+        else classes[labels[i]] += 1;
+      }
+      return found;
+    });
+  }
+
+  /**
+   * Change the selection by hand: replace (only this side stays selected), add or subtract. Hidden Gaussians are not
+   * selected. With `joins`, further parts of one brush stroke are one step of undo.
+   */
+  select(side, mask, how = "replace", joins = false) {
+    const drawn = this.drawn(side);
+    const old = this.selected(side);
+    const rules = {
+      replace: (i) => mask[i] & drawn[i],
+      add: (i) => old[i] | (mask[i] & drawn[i]),
+      subtract: (i) => old[i] & ~(mask[i] & drawn[i]),
+    };
+    const made = old.map((_, i) => rules[how](i));
+    this.step("select", { hand: how === "replace" ? { [side]: made } : { ...this.bySides(), [side]: made } }, joins);
+  }
+
+  /** One part of a brush stroke. */
+  paint(side, mask, how, first) {
+    this.select(side, mask, first || how === "subtract" ? how : "add", !first);
+  }
+
+  /** Select everything that is not selected now, on the side shown. */
+  invert(side = this.side) {
+    const drawn = this.drawn(side);
+    this.step("invert selection", { hand: { [side]: this.selected(side).map((on, i) => (on ? 0 : drawn[i])) } });
+  }
+
+  /** Drop the question and the selection by hand. */
+  clear() {
+    if (this.selecting) this.step("clear selection", { answer: null, gamma: null, gammaHow: "", hand: {} });
+  }
+
+  /** Add the neighbours of selected Gaussians (grow) or drop those next to unselected ones (shrink). */
+  grow(side = this.side, shrink = false) {
+    const [mask, drawn] = [this.selected(side), this.drawn(side)];
+    const from = shrink ? mask.map((on, i) => (on ? 0 : drawn[i])) : mask;
+    const near = within(this.positions[side], from, this.reach(side));
+    const made = mask.map((on, i) => (shrink ? (on && !near[i] ? 1 : 0) : on || (near[i] && drawn[i]) ? 1 : 0));
+    this.step(shrink ? "shrink selection" : "grow selection", { hand: { ...this.bySides(), [side]: made } });
+  }
+
+  reach(side) {
+    return this.cached(`reach ${side}`, () => REACH * spacing(this.positions[side]));
+  }
+
+  /** Remove the selected Gaussians of both sides; the selection ends. Returns how many. */
+  remove() {
+    const removed = { ...this.now.removed };
+    let count = 0;
+    for (const side of this.sides) {
+      const mask = this.selected(side);
+      if (!sum(mask)) continue;
+      count += sum(mask);
+      removed[side] = removed[side] ? mask.map((on, i) => on | removed[side][i]) : mask;
+    }
+    if (count) this.step("remove", { removed, answer: null, gamma: null, gammaHow: "", hand: {} });
+    return count;
+  }
+
+  /** Give the selected Gaussians a colour, [r, g, b] 0-255. */
+  recolor(rgb) {
+    const colors = { ...this.now.colors };
+    this.eachSelected((side, mask) => {
+      const made = colors[side]?.slice() ?? new Uint8Array(4 * mask.length);
+      for (let i = 0; i < mask.length; i++) if (mask[i]) made.set([...rgb, 255], 4 * i);
+      colors[side] = made;
+    });
+    this.step("recolour", { colors });
+  }
+
+  /** Set the opacity factor (0-1) of the selected Gaussians. */
+  fade(factor) {
+    const opacity = { ...this.now.opacity };
+    this.eachSelected((side, mask) => {
+      const old = opacity[side] ?? new Uint8Array(mask.length).fill(255);
+      opacity[side] = old.map((value, i) => (mask[i] ? Math.round(255 * factor) : value));
+    });
+    this.step("fade", { opacity });
+  }
+
+  /** Undo everything that changed the Gaussians; a step of its own. */
+  restore() {
+    this.step("restore all", { removed: {}, colors: {}, opacity: {} });
+  }
+
+  get edited() {
+    return ["removed", "colors", "opacity"].some((kind) => Object.keys(this.now[kind]).length);
+  }
+
+  undo() {
+    if (!this.past.length) return;
+    this.future.push(this.now);
+    this.now = this.past.pop();
+    this.changed();
+  }
+
+  redo() {
+    if (!this.future.length) return;
+    this.past.push(this.now);
+    this.now = this.future.pop();
+    this.changed();
+  }
+
+  /** Pick a Gaussian; index < 0 picks nothing. */
+  pick(side, index) {
+    this.picked = index >= 0 ? { side, index } : null;
+    this.changed();
+  }
+
+  /** What is known about the picked Gaussian; null without one. `distance` is that to the nearest labelled one. */
+  describe() {
+    if (!this.picked) return null;
+    const { side, index } = this.picked;
+    const label = this.labels(side)[index];
+    const source = side === "color" ? this.source[index] : index;
+    const reached = side === "semantic" || this.far[index] < this.lambda;
+    const own = this.answer ? this.answer.scores : this.labelScores();
+    const score = reached && source >= 0 ? own[source] : NaN;
+    const distance = side === "color" && source >= 0 ? this.far[index] : null;
+    return { side, index, label, name: this.names[label] ?? "no class", score, source, distance, reached };
+  }
+
+  /** Where the position of a Gaussian is, [x, y, z]; null while the renderer has not said it. */
+  position(side, index) {
+    const found = this.positions[side];
+    return found ? [...found.subarray(3 * index, 3 * index + 3)] : null;
+  }
+
+  /** The nearest Gaussians of the same side that are not removed: [class name, distance], nearest first. */
+  nearest(side, index, count) {
+    const points = this.positions[side];
+    if (!points) return [];
+    const found = [];
+    for (let i = 0; i < points.length / 3; i++) {
+      if (i === index || this.now.removed[side]?.[i]) continue;
+      const far = squared(points, index, i);
+      if (found.length < count || far < found[count - 1][1]) {
+        found.push([i, far]);
+        found.sort((a, b) => a[1] - b[1]);
+        found.length = Math.min(found.length, count);
+      }
+    }
+    const labels = this.labels(side);
+    return found.map(([i, far]) => [this.names[labels[i]] ?? "no class", Math.sqrt(far)]);
+  }
+
+  /** Middle and radius of the selected Gaussians of a side, or of all that are drawn; outliers do not count. */
+  extent(side) {
+    const mask = sum(this.selected(side)) ? this.selected(side) : this.drawn(side);
+    const points = this.positions[side];
+    const axes = [0, 1, 2].map((axis) => {
+      const own = [];
+      for (let i = 0; i < mask.length; i++) if (mask[i]) own.push(points[3 * i + axis]);
+      own.sort((a, b) => a - b);
+      return [own[Math.floor(0.02 * own.length)], own[Math.floor(0.98 * (own.length - 1))]];
+    });
+    if (axes[0][0] === undefined) return null;
+    const radius = Math.hypot(...axes.map(([low, high]) => (high - low) / 2));
+    return { center: axes.map(([low, high]) => (low + high) / 2), radius: Math.max(radius, 1e-3) };
+  }
+
+  /** The state as JSON: question, gamma, lambda, selection and edits by the numbers of Gaussians. */
+  toJSON() {
+    const { removed, colors, opacity } = this.now;
+    const by = (values, key) => {
+      const groups = {};
+      values?.forEach((value, i) => value !== 255 && (groups[key(value)] ??= []).push(i));
+      return groups;
+    };
+    const colored = (rgba) => {
+      const groups = {};
+      for (let i = 0; rgba && i < rgba.length; i += 4) if (rgba[i + 3]) (groups[`${rgba.subarray(i, i + 3)}`] ??= []).push(i / 4);
+      return groups;
+    };
+    const sides = this.sides.map((side) => [
+      side,
+      {
+        selected: indices(this.selected(side)),
+        removed: indices(removed[side] ?? []),
+        recolored: colored(colors[side]), // "r,g,b" -> Gaussians
+        opacity: by(opacity[side], (value) => (value / 255).toFixed(3)), // factor -> Gaussians
+      },
+    ]);
+    return { words: this.answer?.words ?? null, gamma: this.gamma, lambda: this.source ? this.lambda : null, ...Object.fromEntries(sides) };
+  }
+
+  /** Counts of the question's scores in bins from `low` to `high`. */
+  gammaHistogram() {
+    const { words, scores, low, high } = this.answer;
+    return this.cached(`gamma bins ${words}`, () => bins(scores, (score) => (score - low) / (high - low)));
+  }
+
+  /** Counts of the distances to the nearest labelled Gaussian, in bins of the logarithm. */
+  lambdaHistogram() {
+    const [low, span] = this.lambdaSpan();
+    return this.cached("lambda bins", () => bins(this.far, (far) => (Math.log(Math.max(far, 1e-30)) - low) / span));
+  }
+
+  /** Logarithm of the smallest lambda, and the width of its range. */
+  lambdaSpan() {
+    const { low, high } = this.packed.header.lambda;
+    return [Math.log(low), Math.max(Math.log(high / low), 1e-6)];
+  }
+
+  /** The state in sentences, for people. */
+  sentences() {
+    const lines = [];
+    const counts = this.counts(this.side);
+    const kind = `${SIDE_WORDS[this.side]} Gaussians`;
+    if (this.byHand) lines.push(`${whole(counts.selected)} of ${whole(counts.total)} ${kind} are selected by hand.`);
+    else if (this.answer)
+      lines.push(`${whole(counts.selected)} of ${whole(counts.total)} ${kind} score above ${short(this.gamma)} for “${this.answer.words}”.`);
+    else lines.push(`${whole(counts.total)} ${kind}.`);
+    if (counts.removed) lines.push(`${whole(counts.removed)} are removed.`);
+    return lines;
+  }
+
+  /** How many colour Gaussians have no label at this lambda, in a sentence. */
+  lambdaSentence() {
+    const { none, total } = this.counts("color");
+    return `${whole(none)} of ${whole(total)} Gaussians are farther than ${short(this.lambda)} from any labelled one, so they have no class.`;
+  }
+
+  // private
+
+  step(what, change, joins = false) {
+    const last = this.now;
+    if (!(joins && last.what === what)) {
+      this.past.push(last);
+      if (this.past.length > MOST_UNDONE) this.past.shift();
+    }
+    this.future = [];
+    this.now = { ...last, ...change, what, id: (this.steps = (this.steps ?? 0) + 1) };
+    this.changed();
+  }
+
+  changed() {
+    this.dispatchEvent(new Event("change"));
+  }
+
+  bySides() {
+    return Object.fromEntries(this.sides.map((side) => [side, this.selected(side)]));
+  }
+
+  eachSelected(visit) {
+    for (const side of this.sides) {
+      const mask = this.selected(side);
+      if (sum(mask)) visit(side, mask);
+    }
+  }
+
+  carry(values, nothing, Kind) {
+    const made = new Kind(this.source.length).fill(nothing);
+    for (let i = 0; i < made.length; i++) if (this.far[i] < this.lambda) made[i] = values[this.source[i]];
+    return made;
+  }
+
+  cached(key, make) {
+    if (!this.cache.has(key)) {
+      if (this.cache.size > 30) this.cache.delete(this.cache.keys().next().value);
+      this.cache.set(key, make());
+    }
+    return this.cache.get(key);
+  }
+}
+
+/** Sum of a mask: how many are set. */
+export function sum(mask) {
+  let count = 0;
+  for (let i = 0; i < mask.length; i++) count += mask[i];
+  return count;
+}
+
+const indices = (mask) => [...mask.keys()].filter((i) => mask[i]);
+
+function bins(values, place) {
+  const made = new Float64Array(BINS);
+  for (let i = 0; i < values.length; i++) {
+    const at = Math.floor(BINS * place(values[i]));
+    if (at >= 0) made[Math.min(at, BINS - 1)] += Number.isFinite(values[i]) ? 1 : 0;
+  }
+  return made;
+}
+
+/** The median distance to the nearest other Gaussian, from a sample. */
+function spacing(points) {
+  const count = points.length / 3;
+  const step = Math.max(1, Math.floor(count / 200));
+  const found = [];
+  for (let i = 0; i < count; i += step) {
+    let least = Infinity;
+    for (let j = 0; j < count; j++) {
+      const far = squared(points, i, j);
+      if (far > 0 && far < least) least = far;
+    }
+    found.push(Math.sqrt(least));
+  }
+  found.sort((a, b) => a - b);
+  return found[found.length >> 1] || 1e-6;
+}
+
+function squared(points, i, j) {
+  const [x, y, z] = [points[3 * i] - points[3 * j], points[3 * i + 1] - points[3 * j + 1], points[3 * i + 2] - points[3 * j + 2]];
+  return x * x + y * y + z * z;
+}
+
+/** Which points lie within a distance of one that the mask has; with a grid of cells of that size. */
+export function within(points, mask, reach) {
+  const cell = (i, axis) => Math.floor(points[3 * i + axis] / reach);
+  const key = (x, y, z) => `${x},${y},${z}`;
+  const cells = new Map();
+  const count = points.length / 3;
+  for (let i = 0; i < count; i++) {
+    if (!mask[i]) continue;
+    const name = key(cell(i, 0), cell(i, 1), cell(i, 2));
+    if (cells.has(name)) cells.get(name).push(i);
+    else cells.set(name, [i]);
+  }
+  const near = new Uint8Array(count);
+  for (let i = 0; i < count; i++) near[i] = mask[i] || closeTo(i) ? 1 : 0;
+  return near;
+
+  function closeTo(i) {
+    for (let x = -1; x <= 1; x++)
+      for (let y = -1; y <= 1; y++)
+        for (let z = -1; z <= 1; z++) {
+          const others = cells.get(key(cell(i, 0) + x, cell(i, 1) + y, cell(i, 2) + z));
+          if (others?.some((j) => squared(points, i, j) <= reach * reach)) return true;
+        }
+    return false;
+  }
+}

@@ -1,0 +1,165 @@
+/** The panel beside the view: search result, lambda, classes, selection and edits, the picked Gaussian. */
+
+import { h, histogramSlider, iconButton, textButton } from "./dom.js";
+import { SIDE_WORDS, short, whole } from "./model.js";
+
+const MANY = 12; // classes from which on the list has a filter
+const css = (rgb) => `rgb(${rgb.join(",")})`;
+
+/** Build the panel. `act`: {ask(words), fit(), saveJson()}. Returns {element, refresh()}. */
+export function makePanel(model, act) {
+  const parts = [scorePart(model), model.source ? lambdaPart(model) : null, classesPart(model, act), selectionPart(model, act), pickPart(model)];
+  const shown = parts.filter(Boolean);
+  return {
+    element: h("aside", { class: "panel", "aria-label": "Search, classes and selection" }, ...shown.map((one) => one.element)),
+    refresh: () => shown.forEach((one) => one.refresh()),
+  };
+}
+
+const section = (title, ...children) => h("section", {}, h("h2", {}, title), ...children);
+
+function scorePart(model) {
+  const slider = histogramSlider({
+    label: "Gamma: the score to exceed", id: "gamma", above: true,
+    toFraction: (value) => (value - model.answer.low) / (model.answer.high - model.answer.low),
+    toValue: (place) => model.answer.low + place * (model.answer.high - model.answer.low),
+    onvalue: (value, dragging) => model.setGamma(value, dragging),
+  });
+  const title = h("h2");
+  const how = h("p", { class: "note" });
+  const element = h("section", { hidden: true }, title, slider.element, how);
+  const refresh = () => {
+    element.hidden = !model.answer;
+    if (!model.answer) return;
+    title.textContent = `Search: ${model.answer.words}`;
+    slider.set(model.gamma, model.gammaHistogram());
+    how.textContent = model.now.gammaHow === "given" ? `Suggested: ${short(model.answer.gamma)} (${model.answer.how})` : `Suggested: ${model.now.gammaHow}`;
+  };
+  return { element, refresh };
+}
+
+function lambdaPart(model) {
+  const [low, span] = model.lambdaSpan();
+  const slider = histogramSlider({
+    label: "Lambda: how far labels reach", id: "lambda", above: false,
+    toFraction: (value) => (Math.log(value) - low) / span,
+    toValue: (place) => Math.exp(low + place * span),
+    onvalue: (value) => model.setLambda(value),
+  });
+  const said = h("p", { id: "lambda-said" });
+  const element = section("Labels of the colour cloud", slider.element, said);
+  const refresh = () => {
+    slider.set(model.lambda, model.lambdaHistogram());
+    said.textContent = model.lambdaSentence();
+  };
+  return { element, refresh };
+}
+
+function classesPart(model, act) {
+  const present = new Set(model.own);
+  const labels = [...model.names.keys()].filter((label) => present.has(label));
+  if (model.source || present.has(-1)) labels.push(-1);
+  const rows = labels.map((label) => classRow(model, label, act));
+  const list = h("ul", { class: "classes" }, ...rows.map((row) => row.element));
+  const all = textButton("Show all", () => model.setHidden([]), { class: "link" });
+  const filter = h("input", {
+    type: "search", class: "filter", placeholder: "Filter classes", "aria-label": "Filter classes", hidden: labels.length <= MANY,
+    oninput: () => rows.forEach((row) => (row.element.hidden = !row.name.toLowerCase().includes(filter.value.trim().toLowerCase()))),
+  });
+  const element = section("Classes", all, filter, list);
+  const refresh = () => {
+    const counts = model.counts(model.side);
+    rows.forEach((row) => row.refresh(counts));
+    all.hidden = !model.hidden.size;
+  };
+  return { element, refresh };
+}
+
+function classRow(model, label, act) {
+  const name = model.names[label] ?? "no class";
+  const color = model.packed.header.classes[label]?.color ?? [128, 128, 128];
+  const count = h("span", { class: "count" });
+  const solo = iconButton("solo", `Show only ${name}`, () => model.solo(label));
+  const eye = h("button", { type: "button", class: "tool eye", onclick: () => model.toggleHidden(label) });
+  const [open, shut] = [iconButton("eye", "").firstChild, iconButton("hidden", "").firstChild];
+  const words = label >= 0 ? textButton(name, () => act.ask(name), { class: "name", title: `Search for ${name}` }) : h("span", { class: "name" }, name);
+  const swatch = h("span", { class: "swatch", style: `background:${css(color)}` });
+  const element = h("li", { "data-label": label }, swatch, words, count, solo, eye);
+  const refresh = (counts) => {
+    const hidden = model.hidden.has(label);
+    count.textContent = whole(label < 0 ? counts.none : counts.classes[label]);
+    element.classList.toggle("off", hidden);
+    element.classList.toggle("asked", model.answer?.words === name);
+    eye.replaceChildren(hidden ? shut : open);
+    eye.title = `${hidden ? "Show" : "Hide"} ${name}`;
+    eye.setAttribute("aria-label", eye.title);
+    eye.setAttribute("aria-pressed", String(hidden));
+    solo.setAttribute("aria-pressed", String(model.isSolo(label)));
+  };
+  return { element, name, refresh };
+}
+
+function selectionPart(model, act) {
+  const said = h("p", { id: "selection-said" });
+  const button = (text, title, run, props = {}) => textButton(text, run, { title, ...props });
+  const change = [
+    button("Grow", "Add the neighbours of the selected Gaussians", () => model.grow()),
+    button("Shrink", "Drop the selected Gaussians at the border", () => model.grow(model.side, true)),
+    button("Invert", "Select everything else (Ctrl+I)", () => model.invert()),
+    button("Fit", "Move the camera to the selection (F)", act.fit),
+    button("Clear", "Select nothing (Escape)", () => model.clear()),
+  ];
+  const color = h("input", { type: "color", value: "#c04040", "aria-label": "New colour", onchange: () => model.recolor(hex(color.value)) });
+  const opacity = h("input", { type: "range", min: 0, max: 100, value: 100, "aria-label": "Opacity", onchange: () => model.fade(opacity.value / 100) });
+  const edits = [
+    button("Remove", "Remove the selected Gaussians (Delete)", () => model.remove(), { class: "danger" }),
+    h("label", { class: "pair", title: "Give the selection a colour" }, "Recolour", color),
+    h("label", { class: "pair", title: "Make the selection transparent" }, "Opacity", opacity),
+  ];
+  const restore = button("Restore all", "Undo all removals, colours and opacities", () => model.restore(), { class: "link" });
+  const save = button("Save as JSON", "Save the question, the selection and the edits, with the numbers of the Gaussians", act.saveJson);
+  const boxes = h("div", {}, h("div", { class: "buttons" }, ...change), h("div", { class: "buttons" }, ...edits));
+  const element = section("Selection", restore, said, boxes, save);
+  const refresh = () => {
+    const count = model.counts(model.side).selected;
+    const other = model.sides.find((side) => side !== model.side && model.counts(side).selected > 0);
+    boxes.hidden = !count && !other;
+    save.hidden = boxes.hidden && !model.edited;
+    restore.hidden = !model.edited;
+    const more = other ? `, and ${whole(model.counts(other).selected)} ${SIDE_WORDS[other]} ones` : "";
+    said.textContent = boxes.hidden
+      ? "Search for a class, or select with the box, the lasso or the brush."
+      : `${whole(count)} ${SIDE_WORDS[model.side]} Gaussians${more}`;
+  };
+  return { element, refresh };
+}
+
+function pickPart(model) {
+  const body = h("div", { class: "picked", "aria-live": "polite" });
+  const element = section("Picked Gaussian", iconButton("close", "Unpick", () => model.pick(model.side, -1)), body);
+  const refresh = () => {
+    const found = model.describe();
+    element.hidden = !found;
+    if (found) body.replaceChildren(...pickLines(model, found));
+  };
+  return { element, refresh };
+}
+
+function pickLines(model, found) {
+  const color = model.packed.header.classes[found.label]?.color ?? [128, 128, 128];
+  const place = model.position(found.side, found.index);
+  const score = Number.isFinite(found.score) ? `, score ${found.score.toFixed(3)}` : "";
+  const lines = [
+    h("p", {}, h("span", { class: "swatch", style: `background:${css(color)}` }), h("strong", {}, found.name), score),
+    h("p", { class: "note" }, `${SIDE_WORDS[found.side]} Gaussian ${found.index}${place ? ` at ${place.map(short).join(", ")}` : ""}`),
+  ];
+  if (found.distance !== null) {
+    const reach = found.reached ? "Its label is from" : "Out of reach: the nearest labelled one is";
+    lines.push(h("p", { class: "note" }, `${reach} semantic Gaussian ${found.source}, ${short(found.distance)} away`));
+  }
+  const others = model.nearest(found.side, found.index, 4).map(([name, far]) => `${name} ${far.toPrecision(2)}`);
+  if (others.length) lines.push(h("p", { class: "note" }, `Nearest: ${others.join(", ")}`));
+  return lines;
+}
+
+const hex = (text) => [1, 3, 5].map((at) => parseInt(text.slice(at, at + 2), 16));
