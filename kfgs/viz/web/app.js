@@ -1,16 +1,18 @@
 /** The viewer's interface: `mount` puts it into an element. Data come from a pack, answers from a link. */
 
 import { choice, download, h, iconButton, searchBox, select, textButton } from "./dom.js";
-import { ViewCamera } from "./camera.js";
+import { viewOf } from "./camera.js";
+import { Eye } from "./eye.js";
 import { suggestions } from "./link.js";
-import { Model, SIDE_WORDS, whole } from "./model.js";
+import { Model, whole } from "./model.js";
 import { makePanel } from "./panel.js";
 import { Renderer } from "./renderer.js";
 import { Tools } from "./tools.js";
 
 const MODES = { color: "Colour", labels: "Classes", score: "Score", latents: "Latents" };
 const TOOLS = { move: ["Move the view", "1"], box: ["Box selection", "2"], lasso: ["Lasso selection", "3"], brush: ["Brush selection", "4"] };
-const BACKGROUND = { light: [244, 245, 247], dark: [24, 26, 30] };
+const BACKGROUND = { light: [0.957, 0.961, 0.969], dark: [0.094, 0.102, 0.118] };
+const REST = 160; // milliseconds without a move, after which the picture is drawn in full
 const GLIDE = 350; // milliseconds of a move to another view
 const BRUSH = [6, 24, 120]; // pixels: smallest, first, largest radius
 const HELP = [
@@ -27,7 +29,7 @@ const HELP = [
  * @param {HTMLElement} root filled and given a size by the page
  * @param {{header: object, data: ArrayBuffer}} packed see kfgs/viz/explorer/pack.py
  * @param {object} link see link.js
- * @returns {Promise<App>} has `model`, `renderer`, `camera`, `ask(words)`, `settled()`, `dispose()`
+ * @returns {Promise<App>} has `model`, `renderer`, `eye`, `ask(words)`, `settled()`, `dispose()`
  */
 export async function mount(root, packed, link) {
   const app = new App(root, packed, link);
@@ -45,6 +47,7 @@ class App {
     Object.assign(this, { root, packed, link, header: packed.header, model: new Model(packed) });
     this.modes = this.possibleModes();
     this.panes = [{ mode: "color" in this.modes ? "color" : "labels", side: this.model.side }];
+    this.pane = this.panes[0];
     this.layout = "one";
     this.slider = 0.5;
     this.brushRadius = BRUSH[1];
@@ -67,13 +70,13 @@ class App {
     this.renderer = await Renderer.create(this.canvas, { background: BACKGROUND[this.theme], onlost: lost });
     this.renderer.load(this.packed);
     this.renderer.onorder = () => this.redraw();
-    for (const side of this.model.sides) this.model.positions[side] = this.renderer.positions(side);
-    this.camera = new ViewCamera({ up: this.header.up, near: this.header.cameras[0]?.near ?? 0.01 });
-    this.tools = new Tools(this.stage, this.camera, this);
+    for (const side of this.model.sides) this.model.positions[side] = this.renderer.means(side);
+    this.eye = new Eye(this.header, this.renderer.means(this.model.side));
+    this.tools = new Tools(this.stage, this.eye, this);
     this.firstView();
     this.model.addEventListener("change", () => this.refresh());
     this.watch();
-    this.refresh();
+    this.refreshPanes();
     await this.settled();
     this.root.removeAttribute("aria-busy");
     this.loading.remove();
@@ -93,7 +96,7 @@ class App {
     this.toast = h("p", { class: "toast", role: "alert", hidden: true });
     this.panel = makePanel(this.model, { ask: (words) => this.ask(words), fit: () => this.fit(), saveJson: () => this.saveJson() });
     this.help = h("dialog", { class: "help", "aria-label": "Keys" }, h("h2", {}, "Keys and mouse"), helpList(), textButton("Close", () => this.help.close()));
-    this.stage.append(this.loading, this.makeRail(), this.makeCaptions(), this.makeViews(), this.said, this.toast);
+    this.stage.append(this.loading, this.makeRail(), this.makeCaptions(), ...this.makePhoto(), h("div", { class: "foot" }, this.said, this.makeViews()), this.toast);
     this.root.replaceChildren(this.makeTop(), this.stage, this.panel.element, this.help);
   }
 
@@ -143,24 +146,30 @@ class App {
       if (sides.length < 2) return null;
       return select("Cloud", sides.map((side) => [side, cloudName(side)]), pane.side, (side) => ((pane.side = side), this.refreshPanes()));
     });
-    const handle = h("input", { type: "range", class: "divider", min: 0, max: 1, step: 0.005, value: this.slider, "aria-label": "Border between the two pictures", oninput: (event) => ((this.slider = Number(event.target.value)), this.redraw()) });
+    const handle = h("input", { type: "range", class: "divider", min: 0, max: 1, step: 0.005, value: this.slider, "aria-label": "Border between the two pictures", oninput: (event) => this.setSlider(Number(event.target.value)) });
+    this.line = h("span", { class: "line", hidden: this.layout === "one" });
     this.captions.className = `captions ${this.layout}`;
-    this.captions.replaceChildren(...captions.filter(Boolean), ...(this.layout === "slider" ? [handle] : []));
+    this.captions.replaceChildren(...captions.filter(Boolean), this.line, ...(this.layout === "slider" ? [handle] : []));
+    this.line.style.left = `${100 * (this.layout === "slider" ? this.slider : 0.5)}%`;
   }
 
-  /** Buttons that go to the scene's cameras, with their thumbnails; and the photo over the view. */
+  /** Buttons that go to the scene's cameras, with their thumbnails. */
   makeViews() {
-    const { cameras } = this.header;
-    this.photoImage = h("img", { class: "photo", alt: "", hidden: true });
-    this.viewButtons = cameras.map((camera, at) => {
-      const url = this.thumbnail(at);
-      const name = camera.name || `view ${at + 1}`;
-      return h("button", { type: "button", title: `Go to ${name}`, "aria-label": `Go to ${name}`, onclick: () => this.goTo(at) }, url ? h("img", { src: url, alt: "", loading: "lazy" }) : String(at + 1));
+    this.viewButtons = this.header.cameras.map((camera, at) => {
+      const [url, label] = [this.thumbnail(at), `Go to ${camera.name || `view ${at + 1}`}`];
+      const content = url ? h("img", { src: url, alt: "", loading: "lazy" }) : String(at + 1);
+      return h("button", { type: "button", title: label, "aria-label": label, onclick: () => this.goTo(at) }, content);
     });
-    this.opacity = h("input", { type: "range", min: 0, max: 1, step: 0.01, value: 1, "aria-label": "Opacity of the photo", oninput: () => (this.photoImage.style.opacity = this.opacity.value) });
+    return h("div", { class: "views card", role: "group", "aria-label": "The scene's views", hidden: !this.viewButtons.length, onwheel: (event) => (event.currentTarget.scrollLeft += event.deltaY) }, ...this.viewButtons);
+  }
+
+  /** The photo of a view, to lay over the scene, and its opacity. */
+  makePhoto() {
+    this.photoImage = h("img", { class: "photo", alt: "", hidden: true });
+    const fade = () => (this.photoImage.style.opacity = this.opacity.value);
+    this.opacity = h("input", { type: "range", min: 0, max: 1, step: 0.01, value: 1, "aria-label": "Opacity of the photo", oninput: fade });
     this.opacityLabel = h("label", { class: "pair card photo-opacity", hidden: true }, "Photo", this.opacity);
-    const strip = h("div", { class: "views card", role: "group", "aria-label": "The scene's views", hidden: !cameras.length }, ...this.viewButtons);
-    return h("div", { class: "layer" }, this.photoImage, this.opacityLabel, strip);
+    return [this.photoImage, this.opacityLabel];
   }
 
   thumbnail(at) {
@@ -213,11 +222,18 @@ class App {
 
   setLayout(layout) {
     this.hidePhoto();
-    this.layout = layout;
+    this.layout = this.layoutSelect.value = layout;
     const [first] = this.panes;
     const other = this.model.sides.length > 1 && layout === "split" ? this.model.sides.find((side) => side !== first.side) : first.side;
     this.panes = layout === "one" ? [first] : [first, { mode: first.mode === "labels" && this.modes.color ? "color" : "labels", side: other }];
     this.refreshPanes();
+  }
+
+  setSlider(place) {
+    this.slider = place;
+    this.line.style.left = `${100 * place}%`;
+    this.camera = null; // the renderer forgets the old borders
+    this.redraw();
   }
 
   setTool(tool) {
@@ -228,54 +244,62 @@ class App {
   setTheme(theme) {
     this.theme = theme;
     this.root.dataset.theme = theme;
-    this.renderer.setBackground(BACKGROUND[theme]);
+    this.renderer.background = BACKGROUND[theme];
     this.redraw();
   }
 
   /** A click picks; in a split view it also makes this pane the one that counts are of. */
   click(x, y) {
-    const pane = this.activate(x);
-    const [index] = this.at(pane, x, y, (u, v) => [this.renderer.pick(u, v)]);
-    this.model.pick(pane.side, index);
+    const { side } = this.activate(x);
+    this.model.pick(side, this.under(x, y));
   }
 
   twice(x, y) {
-    const pane = this.activate(x);
-    const [index] = this.at(pane, x, y, (u, v) => [this.renderer.pick(u, v)]);
+    const { side } = this.activate(x);
+    const index = this.under(x, y);
     if (index < 0) return;
-    this.camera.pivot = this.model.position(pane.side, index);
-    this.moved();
+    this.glide(() => this.eye.setPivot(this.model.position(side, index), true));
+  }
+
+  /** A drag begins: turn about what is in the middle of the picture. */
+  grab() {
+    if (!this.eye.loose) return;
+    const index = this.under(this.stage.clientWidth / (this.layout === "split" ? 4 : 2), this.stage.clientHeight / 2, this.panes[0]);
+    if (index >= 0) this.eye.setPivot(this.model.position(this.panes[0].side, index));
   }
 
   shape(polygon, how) {
     const pane = this.activate(polygon[0][0]);
     this.prepare(pane);
-    const inside = this.renderer.within({ polygon: polygon.map(([x, y]) => this.pixels(pane, x, y)) });
-    this.model.select(pane.side, inside, how);
+    this.model.select(pane.side, this.renderer.within({ polygon: polygon.map((place) => place.map((value) => value * this.ratio)) }), how);
   }
 
   /** Paint the selection: a ball around the Gaussian under the pointer, as wide as the brush there. */
   brush(x, y, how, first) {
-    const pane = first ? this.activate(x) : this.pane;
-    const [index] = this.at(pane, x, y, (u, v) => [this.renderer.pick(u, v)]);
+    const { side } = first ? this.activate(x) : this.pane;
+    const index = this.under(x, y);
     if (index < 0) return;
-    const center = this.model.position(pane.side, index);
-    const view = this.cameraOf(pane);
-    const [a, b, c, d] = view.viewmat.subarray(8, 12);
-    const depth = a * center[0] + b * center[1] + c * center[2] + d;
-    const radius = (this.brushRadius * this.ratio * depth) / view.fx;
-    this.model.paint(pane.side, this.renderer.within({ sphere: { center, radius } }), how, first);
+    const center = this.model.position(side, index);
+    const { viewmat } = this.camera;
+    const depth = viewmat[8] * center[0] + viewmat[9] * center[1] + viewmat[10] * center[2] + viewmat[11];
+    this.model.paint(side, this.model.ball(side, center, (this.brushRadius * depth) / this.eye.focal), how, first);
+  }
+
+  /** The Gaussian at a place of the stage, in the active pane; -1 if there is none. */
+  under(x, y, pane = this.pane) {
+    this.prepare(pane);
+    return this.renderer.pick(x * this.ratio, y * this.ratio);
   }
 
   /** Move the camera so that the selection, or everything, fills the view. */
   fit() {
     const found = this.model.extent(this.model.side);
-    if (found) this.glide(() => this.camera.fit(found.center, found.radius));
+    if (found) this.glide(() => this.eye.fit(found));
   }
 
   goTo(at) {
     this.view = at;
-    this.glide(() => this.camera.lookThrough(this.header.cameras[at]));
+    this.glide(() => this.eye.lookThrough(this.header.cameras[at]));
     this.viewButtons.forEach((button, own) => button.setAttribute("aria-current", String(own === at)));
     this.viewButtons[at].scrollIntoView({ block: "nearest", inline: "nearest" });
   }
@@ -295,10 +319,10 @@ class App {
   }
 
   nearestView() {
-    const here = centerOf(this.camera.at(100, 100).viewmat);
+    const here = this.eye.view.position;
     let [best, least] = [null, Infinity];
     this.header.cameras.forEach(({ viewmat, thumbnail }, at) => {
-      const far = centerOf(viewmat).reduce((all, value, axis) => all + (value - here[axis]) ** 2, 0);
+      const far = viewOf(viewmat, 1).position.reduce((all, value, axis) => all + (value - here[axis]) ** 2, 0);
       if (thumbnail && far < least) [best, least] = [at, far];
     });
     return best;
@@ -335,26 +359,23 @@ class App {
   firstView() {
     const at = this.header.default_view;
     if (at !== null && at !== undefined) this.goTo(at);
-    else {
-      const { center, radius } = this.model.extent(this.model.side);
-      this.camera.fit(center, radius);
-    }
   }
 
   /** Change the camera over a third of a second. */
   glide(change) {
-    const from = this.camera.state();
+    const from = this.eye.view;
     change();
-    const to = this.camera.state();
+    const to = this.eye.view;
     cancelAnimationFrame(this.gliding);
     if (!this.started || matchMedia("(prefers-reduced-motion: reduce)").matches) return this.redraw();
     const start = performance.now();
     const step = (now) => {
       const t = Math.min(Math.max((now - start) / GLIDE, 0), 1);
-      this.camera.setState(t < 1 ? ViewCamera.mix(from, to, t * t * (3 - 2 * t)) : to);
-      this.draw();
+      this.eye.toward(from, to, t * t * (3 - 2 * t));
+      this.moves();
       if (t < 1) this.gliding = requestAnimationFrame(step);
     };
+    this.eye.view = from;
     this.gliding = requestAnimationFrame(step);
   }
 
@@ -364,6 +385,15 @@ class App {
     this.viewButtons[this.view]?.removeAttribute("aria-current");
     this.view = null;
     this.hidePhoto();
+    this.moves();
+  }
+
+  /** The camera moves: frames may be coarse until it rests. */
+  moves() {
+    this.moving = true;
+    this.camera = null;
+    clearTimeout(this.resting);
+    this.resting = setTimeout(() => ((this.moving = false), this.redraw()), REST);
     this.redraw();
   }
 
@@ -389,6 +419,7 @@ class App {
     this.ratio = Math.min(devicePixelRatio || 1, 2);
     this.canvas.width = Math.max(1, Math.round(this.stage.clientWidth * this.ratio));
     this.canvas.height = Math.max(1, Math.round(this.stage.clientHeight * this.ratio));
+    this.camera = null;
     this.draw();
   }
 
@@ -398,6 +429,7 @@ class App {
 
   /** Resolves when the picture is that of the state. */
   async settled() {
+    this.moving = false;
     this.draw();
     await this.renderer.settled();
     this.draw();
@@ -406,31 +438,40 @@ class App {
   draw() {
     cancelAnimationFrame(this.frame);
     this.frame = null;
+    this.placeCamera();
     for (const pane of this.panes) {
       this.prepare(pane);
-      this.renderer.draw(this.viewport(pane));
+      this.renderer.draw({ ...this.viewport(pane), moving: this.moving });
     }
     this.placePhoto();
   }
 
-  /** Where a pane is, device pixels from the top left of the canvas. */
+  /** Give the renderer the camera, if it moved: both panes have the same one. */
+  placeCamera() {
+    if (this.camera) return;
+    const { width, height } = this.canvas;
+    this.camera = this.eye.at(this.layout === "split" ? Math.floor(width / 2) : width, height);
+    this.eye.focal = this.camera.fx / this.ratio;
+    this.renderer.setCamera(this.camera);
+  }
+
+  /** Where a pane is, device pixels from the top left of the canvas. Both sides of the slider are parts of one picture. */
   viewport(pane) {
     const { width, height } = this.canvas;
     const second = pane === this.panes[1];
-    if (this.panes.length === 1) return { x: 0, y: 0, width, height };
-    const border = Math.round(width * (this.layout === "slider" ? this.slider : 0.5));
-    return second ? { x: border, y: 0, width: width - border, height } : { x: 0, y: 0, width: border, height };
+    const whole = { x: 0, y: 0, width, height };
+    if (this.layout === "one") return whole;
+    const border = this.border();
+    const part = { x: second ? border : 0, y: 0, width: second ? width - border : border, height };
+    return this.layout === "slider" ? { ...whole, clip: part } : { ...part, width: Math.floor(width / 2) };
   }
 
-  /** The camera of a pane. Both sides of the slider are parts of one picture. */
-  cameraOf(pane) {
-    const { x, width, height } = this.viewport(pane);
-    if (this.layout !== "slider") return this.camera.at(width, height);
-    const whole = this.camera.at(this.canvas.width, height);
-    return { ...whole, cx: whole.cx - x, width };
+  /** Where the second pane begins. */
+  border() {
+    return Math.round(this.canvas.width * (this.layout === "slider" ? this.slider : 0.5));
   }
 
-  /** Give the renderer a pane's side, masks, look and camera. */
+  /** Give the renderer a pane's side, masks and look. */
   prepare(pane) {
     const { model, renderer } = this;
     renderer.setSide(pane.side);
@@ -443,46 +484,37 @@ class App {
       mode: pane.mode, question: answer ? this.question(answer) : null, gamma: model.gamma ?? 0, lambda: model.lambda,
       low, high, hidden, dim: model.selecting, mixing: 1,
     });
-    renderer.setCamera(this.cameraOf(pane));
   }
 
-  /** The renderer's number of a question; scores that came from Python are sent once. */
+  /** What the renderer calls a question; scores that came from Python are sent once. */
   question(answer) {
-    answer.number ??= this.renderer.setScores(answer.words, answer.scores);
+    if (answer.number === undefined) {
+      answer.number = answer.words;
+      this.renderer.setScores(answer.words, answer.scores);
+    }
     return answer.number;
   }
 
+  /** Send the masks that changed since the last time. */
   sendMasks(side) {
-    const { now } = this.model;
-    const masks = { selected: this.model.byHand ? this.model.selected(side) : null, removed: now.removed[side] ?? null, fade: now.opacity[side] ?? null };
+    const { renderer, model } = this;
+    const { now } = model;
     const sent = (this.sent[side] ??= {});
-    const key = this.model.byHand ? now.id : null;
-    for (const [name, mask] of Object.entries(masks)) {
-      const own = name === "selected" ? key : mask;
-      if ((sent[name] ?? null) === own) continue;
-      this.renderer.setMask(name, mask);
-      sent[name] = own;
-    }
-    const colors = now.colors[side] ?? null;
-    if ((sent.colors ?? null) !== colors) this.renderer.setColors(colors);
-    sent.colors = colors;
+    const send = (name, value, key, set) => {
+      if ((sent[name] ?? null) !== key) set(value);
+      sent[name] = key;
+    };
+    const selected = model.byHand ? model.selected(side) : null;
+    send("selected", selected, selected && now.id, (mask) => renderer.setMask("selected", mask));
+    for (const [name, set] of [["removed", (mask) => renderer.setMask("removed", mask)], ["opacity", (mask) => renderer.setFade(mask)], ["colors", (rgba) => renderer.setColors(rgba)]])
+      send(name, now[name][side] ?? null, now[name][side] ?? null, set);
   }
 
   /** The pane at a place becomes the active one. */
   activate(x) {
-    this.pane = this.panes.find((pane) => x * this.ratio < this.viewport(pane).x + this.viewport(pane).width) ?? this.panes[0];
+    this.pane = this.panes.length > 1 && x * this.ratio >= this.border() ? this.panes[1] : this.panes[0];
     this.model.side = this.pane.side;
     return this.pane;
-  }
-
-  /** A place of the stage in a pane's own pixels. */
-  pixels(pane, x, y) {
-    return [x * this.ratio - this.viewport(pane).x, y * this.ratio];
-  }
-
-  at(pane, x, y, ask) {
-    this.prepare(pane);
-    return ask(...this.pixels(pane, x, y));
   }
 
   placePhoto() {
@@ -496,14 +528,15 @@ class App {
   // showing the state
 
   refreshPanes() {
-    this.model.side = this.panes[0].side;
+    this.pane = this.panes[0];
+    this.model.side = this.pane.side;
+    this.camera = null;
     this.fillCaptions();
     this.refresh();
   }
 
   refresh() {
     const { model } = this;
-    if (!this.captions.className.includes(this.layout)) this.fillCaptions();
     this.panel.refresh();
     this.search.set(model.answer?.words ?? "");
     this.modeChoice.set(this.photo !== null ? "photo" : this.panes[0].mode);
@@ -552,8 +585,3 @@ class App {
 
 const cloudName = (side) => (side === "color" ? "Colour cloud" : "Semantic field");
 const helpList = () => h("dl", {}, ...HELP.flatMap(([keys, what]) => [h("dt", {}, keys), h("dd", {}, what)]));
-
-/** The camera's centre, -R^T t, of a row-major world-to-camera matrix. */
-function centerOf(m) {
-  return [0, 1, 2].map((axis) => -(m[axis] * m[3] + m[4 + axis] * m[7] + m[8 + axis] * m[11]));
-}

@@ -182,6 +182,13 @@ export class Model extends EventTarget {
     this.select(side, mask, first || how === "subtract" ? how : "add", !first);
   }
 
+  /** A mask of the Gaussians whose centres lie in a ball. */
+  ball(side, [x, y, z], radius) {
+    const points = this.positions[side];
+    const inside = (i) => (points[3 * i] - x) ** 2 + (points[3 * i + 1] - y) ** 2 + (points[3 * i + 2] - z) ** 2 <= radius * radius;
+    return new Uint8Array(this.total(side)).map((_, i) => (inside(i) ? 1 : 0));
+  }
+
   /** Select everything that is not selected now, on the side shown. */
   invert(side = this.side) {
     const drawn = this.drawn(side);

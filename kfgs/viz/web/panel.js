@@ -8,7 +8,7 @@ const css = (rgb) => `rgb(${rgb.join(",")})`;
 
 /** Build the panel. `act`: {ask(words), fit(), saveJson()}. Returns {element, refresh()}. */
 export function makePanel(model, act) {
-  const parts = [scorePart(model), model.source ? lambdaPart(model) : null, classesPart(model, act), selectionPart(model, act), pickPart(model)];
+  const parts = [scorePart(model), pickPart(model), selectionPart(model, act), model.source ? lambdaPart(model) : null, classesPart(model, act)];
   const shown = parts.filter(Boolean);
   return {
     element: h("aside", { class: "panel", "aria-label": "Search, classes and selection" }, ...shown.map((one) => one.element)),
@@ -26,14 +26,15 @@ function scorePart(model) {
     onvalue: (value, dragging) => model.setGamma(value, dragging),
   });
   const title = h("h2");
-  const how = h("p", { class: "note" });
-  const element = h("section", { hidden: true }, title, slider.element, how);
+  const note = h("p", { class: "note" });
+  const element = h("section", { hidden: true }, title, slider.element, note);
   const refresh = () => {
     element.hidden = !model.answer;
     if (!model.answer) return;
     title.textContent = `Search: ${model.answer.words}`;
     slider.set(model.gamma, model.gammaHistogram());
-    how.textContent = model.now.gammaHow === "given" ? `Suggested: ${short(model.answer.gamma)} (${model.answer.how})` : `Suggested: ${model.now.gammaHow}`;
+    const { gamma, how } = model.answer;
+    note.textContent = `${model.now.gammaHow === "given" ? "Suggested was" : "Suggested:"} ${short(gamma)} (${how})`;
   };
   return { element, refresh };
 }

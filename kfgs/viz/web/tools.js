@@ -3,19 +3,19 @@
 import { svg } from "./dom.js";
 
 const CLICK = 5; // pixels that a click may move
-const FLY = 0.7; // distances to the pivot in a second; three times with Shift
+const FAST = 3; // times as fast with Shift
 const FLY_KEYS = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] };
 const TURN_KEYS = { ArrowLeft: [-24, 0], ArrowRight: [24, 0], ArrowUp: [0, -24], ArrowDown: [0, 24] };
 
 export class Tools {
   /**
    * @param {HTMLElement} stage what the pointer works on
-   * @param {object} camera see camera.js
-   * @param {{moved(), click(x, y, event), twice(x, y), shape(polygon, how), brush(x, y, how, first), brushSize()}} on
+   * @param {Eye} eye the camera
+   * @param {{moved(), grab(), click(x, y, event), twice(x, y), shape(polygon, how), brush(x, y, how, first), brushSize()}} on
    *   places are CSS pixels of the stage; `how`: replace, add, subtract
    */
-  constructor(stage, camera, on) {
-    Object.assign(this, { stage, camera, on, tool: "move", points: new Map(), keys: new Set(), drag: null });
+  constructor(stage, eye, on) {
+    Object.assign(this, { stage, eye, on, tool: "move", points: new Map(), keys: new Set(), drag: null });
     this.overlay = svg("svg", { class: "overlay", "aria-hidden": "true" });
     stage.append(this.overlay);
     const listen = (name, handler) => stage.addEventListener(name, handler.bind(this), { passive: false });
@@ -52,6 +52,7 @@ export class Tools {
     const how = event.altKey ? "subtract" : event.shiftKey ? "add" : "replace";
     this.drag = { kind, how, start: place, last: place, path: [place], far: 0 };
     if (kind === "brush") this.paint(place, true);
+    if (kind === "orbit" && !this.flying) this.on.grab();
   }
 
   move(event) {
@@ -64,15 +65,15 @@ export class Tools {
   }
 
   pull(place) {
-    const { drag, camera } = this;
+    const { drag, eye } = this;
     const [dx, dy] = [place[0] - drag.last[0], place[1] - drag.last[1]];
     drag.far = Math.max(drag.far, Math.hypot(place[0] - drag.start[0], place[1] - drag.start[1]));
     drag.last = place;
     if (drag.kind === "orbit" || drag.kind === "pan") {
       if (drag.far < CLICK) return;
-      if (drag.kind === "pan") camera.pan(dx, dy, this.stage.clientHeight);
-      else if (this.flying) camera.turn(dx, dy);
-      else camera.orbit(dx, dy);
+      if (drag.kind === "pan") eye.pan(dx, dy);
+      else if (this.flying) eye.turn(dx, dy);
+      else eye.orbit(dx, dy);
       this.on.moved();
     } else if (drag.kind === "brush") this.paint(place, false);
     else {
@@ -108,8 +109,8 @@ export class Tools {
     const after = [...this.points.values()];
     const apart = ([a, b]) => Math.hypot(a[0] - b[0], a[1] - b[1]) || 1;
     const middle = ([a, b], axis) => (a[axis] + b[axis]) / 2;
-    this.camera.zoom(apart(before) / apart(after));
-    this.camera.pan(middle(after, 0) - middle(before, 0), middle(after, 1) - middle(before, 1), this.stage.clientHeight);
+    this.eye.zoom(apart(before) / apart(after));
+    this.eye.pan(middle(after, 0) - middle(before, 0), middle(after, 1) - middle(before, 1));
     this.on.moved();
   }
 
@@ -117,7 +118,7 @@ export class Tools {
     if (event.target.closest(".card")) return;
     event.preventDefault();
     const lines = event.deltaMode ? 30 : 1;
-    this.camera.zoom(Math.exp(Math.min(Math.max(event.deltaY * lines, -200), 200) / 600));
+    this.eye.zoom(Math.exp(Math.min(Math.max(event.deltaY * lines, -200), 200) / 600));
     this.on.moved();
   }
 
@@ -143,8 +144,8 @@ export class Tools {
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     if (event.ctrlKey || event.metaKey || event.altKey) return false;
     this.fast = event.shiftKey;
-    if (TURN_KEYS[key]) this.camera.orbit(...TURN_KEYS[key]);
-    else if (key === "+" || key === "-") this.camera.zoom(key === "+" ? 0.9 : 1 / 0.9);
+    if (TURN_KEYS[key]) this.eye.orbit(...TURN_KEYS[key]);
+    else if (key === "+" || key === "-") this.eye.zoom(key === "+" ? 0.9 : 1 / 0.9);
     else if (FLY_KEYS[key]) this.keys.add(key);
     else return false;
     if (FLY_KEYS[key] && this.keys.size === 1 && !this.timer) this.fly(performance.now());
@@ -164,10 +165,9 @@ export class Tools {
   fly(before) {
     this.timer = requestAnimationFrame((now) => {
       this.timer = null;
-      const step = (Math.min(now - before, 100) / 1000) * FLY * (this.fast ? 3 : 1);
-      const along = [0, 1, 2].map((axis) => step * [...this.keys].reduce((all, key) => all + FLY_KEYS[key][axis], 0));
       if (!this.keys.size) return;
-      this.camera.fly(...along);
+      const seconds = Math.min((now - before) / 1000, 0.2) * (this.fast ? FAST : 1);
+      this.eye.fly(seconds, [0, 1, 2].map((axis) => [...this.keys].reduce((all, key) => all + FLY_KEYS[key][axis], 0)));
       this.on.moved();
       this.fly(now);
     });

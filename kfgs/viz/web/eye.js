@@ -1,0 +1,87 @@
+/** The camera that a person moves: a view (camera.js) with its lens and its upward direction. */
+
+import { ballOf, between, cameraOf, fit, fly, letterboxed, lookAround, lookAt, orbit, pan, pivot, viewOf, viewmatOf, zoom } from "./camera.js";
+
+const FOV = 0.9; // radians, if the scene has no cameras
+const TURN = 0.006; // radians for a pixel
+const FLY = 0.4; // of the scene's radius for a second
+
+export class Eye {
+  /**
+   * @param {{up: number[], cameras: object[]}} header of the pack
+   * @param {Float32Array} means positions of the scene
+   */
+  constructor({ up, cameras }, means) {
+    this.up = up;
+    this.ball = ballOf(means);
+    this.lens = cameras[0] ?? null;
+    this.focal = 1; // CSS pixels, of the last picture
+    this.loose = true; // whether the pivot's distance is only a guess
+    const aside = Math.abs(up[0]) < 0.9 ? [1, 0.6, 0.6] : [0.6, 1, 0.6];
+    const away = aside.map((value, axis) => this.ball.center[axis] + this.ball.radius * (value + up[axis]));
+    this.view = lookAt(away, this.ball.center, up);
+    this.fit(this.ball);
+  }
+
+  /** What Renderer.setCamera takes. */
+  at(width, height) {
+    const near = this.lens?.near ?? 0.01;
+    if (!this.lens) return cameraOf(this.view, width, height, Math.min(FOV, (FOV * height) / width), near);
+    return letterboxed({ ...this.lens, viewmat: viewmatOf(this.view) }, width, height);
+  }
+
+  /** Look through a camera of the pack. */
+  lookThrough(camera) {
+    const view = viewOf(camera.viewmat, 1);
+    const ahead = this.ball.center.reduce((all, value, axis) => all + (value - view.position[axis]) * view.R[6 + axis], 0);
+    this.view = { ...view, distance: Math.max(ahead, 0.3 * this.ball.radius) };
+    this.lens = camera;
+    this.loose = true;
+  }
+
+  fit({ center, radius }) {
+    const { fx, fy, width, height } = this.at(100, 100);
+    this.view = fit(this.view, center, radius, 2 * Math.atan(Math.min(width / fx, height / fy) / 2));
+    this.loose = false;
+  }
+
+  /** Turn about a point from now on; with `turned`, look at it. */
+  setPivot(point, turned = false) {
+    const { position, R } = this.view;
+    if (turned) this.view = lookAt(position, point, this.up);
+    else this.view = { ...this.view, distance: Math.max(point.reduce((all, value, axis) => all + (value - position[axis]) * R[6 + axis], 0), 1e-3) };
+    this.loose = false;
+  }
+
+  get pivot() {
+    return pivot(this.view);
+  }
+
+  orbit(dx, dy) {
+    this.view = orbit(this.view, -TURN * dx, TURN * dy, this.up);
+  }
+
+  turn(dx, dy) {
+    this.view = lookAround(this.view, (TURN / 2) * dx, -(TURN / 2) * dy, this.up);
+    this.loose = true;
+  }
+
+  pan(dx, dy) {
+    this.view = pan(this.view, dx, dy, this.focal);
+  }
+
+  zoom(factor) {
+    this.view = zoom(this.view, factor);
+  }
+
+  /** Fly for so many seconds along [right, up, forward]. */
+  fly(seconds, direction) {
+    this.view = fly(this.view, direction.map((value) => value * seconds * FLY * this.ball.radius));
+    this.loose = true;
+  }
+
+  /** The views on the way to another one. */
+  toward(from, to, t) {
+    this.view = between(from, to, t);
+  }
+}
