@@ -164,6 +164,19 @@ class Exploration:
         self.cloud(side)
         return self._own_labels if self._carried is None or side == "semantic" else self._take(self._own_labels, -1)
 
+    @property
+    def carried(self) -> Carried | None:
+        """The source of each colour Gaussian; None without a colour side."""
+        return self._carried
+
+    def base_colors(self, side: Side) -> Array:  # [N, 3] uint8
+        """The colours of a side from everywhere; if it has none, those of the other side."""
+        return self._colors.rgb(side)
+
+    def latents(self, side: Side) -> Array:  # [N, 3] uint8
+        """The latents of a side as colours."""
+        return self._colors.latents(side, self.distance)
+
     def selected(self, side: Side) -> Array:  # [N] bool
         """Which Gaussians of a side are selected, hidden or not; none without a question."""
         cloud = self.cloud(side)

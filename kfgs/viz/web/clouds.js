@@ -1,0 +1,130 @@
+/** Reads the pack: buffers, positions, shapes, classes and scores of the Gaussians, with the rules that Python has. */
+
+const MEAN_STEPS = 2 ** 21 - 1;
+const ARRAYS = {
+  float32: Float32Array, float64: Float64Array, uint32: Uint32Array, int32: Int32Array,
+  uint16: Uint16Array, int16: Int16Array, uint8: Uint8Array, int8: Int8Array,
+};
+/** Instead of NaN in textures: graphics cards may compare NaN as they like. */
+export const UNKNOWN = -3e38;
+
+/**
+ * A buffer of the pack as a typed array, or null.
+ * @param {{header: object, data: ArrayBuffer}} packed
+ * @param {string} name
+ */
+export function bufferOf(packed, name) {
+  const entry = packed.header.buffers[name];
+  if (!entry) return null;
+  const kind = ARRAYS[entry.type];
+  return new kind(packed.data, entry.offset, entry.length / kind.BYTES_PER_ELEMENT);
+}
+
+/**
+ * The data of a pack from its compressed form.
+ * @param {Uint8Array} bytes a zlib stream (Packed.compressed)
+ * @returns {Promise<ArrayBuffer>}
+ */
+export function inflate(bytes) {
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return new Response(stream).arrayBuffer();
+}
+
+/** One cloud of the pack. Arrays are indexed by Gaussian, as in Python. */
+export class Cloud {
+  constructor(packed, side) {
+    this.side = side;
+    this.meta = packed.header.sides[side];
+    this.count = this.meta.count;
+    this.splats = bufferOf(packed, `${side}/splats`).slice(); // moves change it
+    this.dc = bufferOf(packed, `${side}/dc`);
+    this.sh = bufferOf(packed, `${side}/sh`);
+    this.source = side === "color" ? bufferOf(packed, "color/source") : null;
+    this.far = side === "color" ? bufferOf(packed, "color/far") : null;
+    this.labels = bufferOf(packed, "semantic/labels");
+    this.means = this.#decodeMeans();
+    this.removed = null; // masks, Uint8Array or null
+    this.selected = null;
+    this.fade = null;
+  }
+
+  /** The label of Gaussian i, -1 = none, when labels reach as far as lambda. */
+  labelOf(i, lambda) {
+    if (!this.source) return this.labels[i];
+    return this.far[i] < lambda ? this.labels[this.source[i]] : -1;
+  }
+
+  /** Whether Gaussian i has a score > gamma (compared in float32, as torch does), given the semantic side's scores. */
+  chosen(i, scores, gamma, lambda) {
+    if (this.selected) return this.selected[i] > 0;
+    if (!scores) return false;
+    const at = this.source ? (this.far[i] < lambda ? this.source[i] : -1) : i;
+    return at >= 0 && scores[at] > Math.fround(gamma);
+  }
+
+  /** The opacity of Gaussian i. */
+  opacityOf(i) {
+    return ((this.splats[4 * i + 3] >>> 24) / 255) * (this.fade ? this.fade[i] / 255 : 1);
+  }
+
+  /** The three standard deviations of Gaussian i. */
+  scalesOf(i) {
+    const word = this.splats[4 * i + 3];
+    const [low, step] = this.meta.scale;
+    return [0, 8, 16].map((shift) => Math.exp(low + step * ((word >>> shift) & 255)));
+  }
+
+  /** The unit quaternion (w, x, y, z) of Gaussian i. */
+  quatOf(i) {
+    const word = this.splats[4 * i + 2];
+    const small = [0, 10, 20].map((shift) => (((word >>> shift) & 1023) / 1023 - 0.5) * Math.SQRT2);
+    const rest = Math.sqrt(Math.max(0, 1 - small.reduce((sum, v) => sum + v * v, 0)));
+    small.splice(word >>> 30, 0, rest);
+    return small;
+  }
+
+  /** For each Gaussian, the largest distance from its mean at which it may be seen; negative where it never is. */
+  radii() {
+    const radii = new Float32Array(this.count);
+    for (let i = 0; i < this.count; i++) {
+      const word = this.splats[4 * i + 3];
+      const opacity = word >>> 24;
+      const [low, step] = this.meta.scale;
+      const largest = Math.max(word & 255, (word >>> 8) & 255, (word >>> 16) & 255);
+      radii[i] = opacity > 1 ? Math.sqrt(2 * Math.log(opacity)) * Math.exp(low + step * largest) * 1.001 : -1;
+    }
+    return radii;
+  }
+
+  /** Give Gaussians new positions. */
+  setMeans(indices, means) {
+    const {center, half} = this.meta;
+    for (let k = 0; k < indices.length; k++) {
+      const whole = [0, 1, 2].map((axis) => {
+        const u = (means[3 * k + axis] - center[axis]) / half[axis];
+        const v = Math.abs(u) <= 1 ? u : (2 - 1 / Math.abs(u)) * Math.sign(u);
+        this.means[3 * indices[k] + axis] = means[3 * k + axis];
+        return Math.round(((v + 2) / 4) * MEAN_STEPS);
+      });
+      this.splats[4 * indices[k]] = whole[0] | (whole[1] << 21);
+      this.splats[4 * indices[k] + 1] = (whole[1] >>> 11) | (whole[2] << 10);
+    }
+  }
+
+  #decodeMeans() {
+    const {center, half} = this.meta;
+    const means = new Float32Array(3 * this.count);
+    const open = (whole, axis) => {
+      const v = (4 * whole) / MEAN_STEPS - 2;
+      const u = Math.abs(v) <= 1 ? v : Math.sign(v) / Math.max(2 - Math.abs(v), 1e-6);
+      return center[axis] + half[axis] * u;
+    };
+    for (let i = 0; i < this.count; i++) {
+      const a = this.splats[4 * i], b = this.splats[4 * i + 1];
+      means[3 * i] = open(a & 0x1fffff, 0);
+      means[3 * i + 1] = open((a >>> 21) | ((b & 1023) << 11), 1);
+      means[3 * i + 2] = open((b >>> 10) & 0x1fffff, 2);
+    }
+    return means;
+  }
+}

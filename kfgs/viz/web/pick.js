@@ -1,0 +1,118 @@
+/** Finds the Gaussian under a pixel, and the Gaussians in a region: what kfgs.viz.explorer.gaussian_at computes. */
+
+const LEAST = 1 / 255;
+const BACKGROUND = 0.05; // a pixel covered less shows the background
+
+/**
+ * The Gaussian with the largest weight T alpha at a pixel; -1 for the background.
+ * @param {Cloud} cloud
+ * @param {{viewmat: Float32Array, fx: number, fy: number, cx: number, cy: number, width: number, height: number, near: number}} camera
+ * @param {number} x pixels from the left
+ * @param {number} y pixels from the top
+ * @param {function(number): boolean} drawn which Gaussians exist here
+ */
+export function gaussianAt(cloud, camera, x, y, drawn) {
+  const hits = hitsAt(cloud, camera, x, y, drawn);
+  hits.sort((a, b) => a.depth - b.depth || a.index - b.index);
+  let left = 1, covered = 0, best = -1, most = 0;
+  for (const {index, alpha} of hits) {
+    const after = left * (1 - alpha);
+    if (after < 1e-4) break;
+    const weight = alpha * left;
+    covered += weight;
+    if (weight > most) [best, most] = [index, weight];
+    left = after;
+  }
+  return covered < BACKGROUND ? -1 : best;
+}
+
+/** Which Gaussians reach a pixel, with depth and alpha. */
+function hitsAt(cloud, camera, x, y, drawn) {
+  const {viewmat: m, fx, fy, cx, cy, width, height, near} = camera;
+  const {means, reach} = {means: cloud.means, reach: cloud.reach ??= cloud.radii()};
+  const limits = [(width / 2 - cx) / fx, (0.65 * width) / fx, (height / 2 - cy) / fy, (0.65 * height) / fy];
+  const hits = [];
+  for (let i = 0, j = 0; i < cloud.count; i++, j += 3) {
+    if (reach[i] < 0) continue;
+    const a = means[j], b = means[j + 1], c = means[j + 2];
+    const z = m[8] * a + m[9] * b + m[10] * c + m[11];
+    if (!(z > near)) continue;
+    const tx = (m[0] * a + m[1] * b + m[2] * c + m[3]) / z;
+    const ty = (m[4] * a + m[5] * b + m[6] * c + m[7]) / z;
+    const jx = Math.min(Math.max(tx, limits[0] - limits[1]), limits[0] + limits[1]);
+    const jy = Math.min(Math.max(ty, limits[2] - limits[3]), limits[2] + limits[3]);
+    const dx = x - (fx * tx + cx), dy = y - (fy * ty + cy);
+    const rx = (fx / z) * reach[i], ry = (fy / z) * reach[i]; // 3.4 = what the low-pass of 0.3 adds, squared
+    if (dx * dx > rx * rx * (1 + jx * jx) + 3.4 || dy * dy > ry * ry * (1 + jy * jy) + 3.4) continue;
+    if (!drawn(i)) continue;
+    const alpha = alphaAt(cloud, i, m, [fx / z, fy / z], [jx, jy], [dx, dy]);
+    if (alpha >= LEAST) hits.push({index: i, depth: Math.fround(z), alpha});
+  }
+  return hits;
+}
+
+/** alpha of Gaussian i at an offset (dx, dy) from its centre on the screen. */
+function alphaAt(cloud, i, m, focal, tangent, offset) {
+  const [w, x, y, z] = cloud.quatOf(i);
+  const s = cloud.scalesOf(i);
+  const R = [
+    [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+    [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+    [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+  ];
+  let a = 0.3, b = 0, c = 0.3; // the low-pass
+  for (let k = 0; k < 3; k++) {
+    const turned = [0, 4, 8].map((row) => m[row] * R[0][k] + m[row + 1] * R[1][k] + m[row + 2] * R[2][k]);
+    const u = focal[0] * (turned[0] - tangent[0] * turned[2]) * s[k];
+    const v = focal[1] * (turned[1] - tangent[1] * turned[2]) * s[k];
+    a += u * u;
+    b += u * v;
+    c += v * v;
+  }
+  const [dx, dy] = offset;
+  const power = (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / (a * c - b * b);
+  return Math.min(0.99, cloud.opacityOf(i) * Math.exp(-0.5 * power));
+}
+
+/**
+ * Which Gaussians lie in a region.
+ * @param {Cloud} cloud
+ * @param {object} region {polygon: [[x, y], ...] in pixels} | {box: {min: [3], max: [3]}} | {sphere: {center: [3], radius}}
+ * @param {object} camera of the picture that a polygon lies in
+ * @param {function(number): boolean} drawn
+ * @returns {Uint8Array} 1 where the centre of a drawn Gaussian is inside
+ */
+export function gaussiansIn(cloud, region, camera, drawn) {
+  const inside = region.polygon ? inPolygon(region.polygon, camera) : region.box ? inBox(region.box) : inSphere(region.sphere);
+  const mask = new Uint8Array(cloud.count);
+  const {means} = cloud;
+  for (let i = 0, j = 0; i < cloud.count; i++, j += 3) {
+    if (inside(means[j], means[j + 1], means[j + 2]) && drawn(i)) mask[i] = 1;
+  }
+  return mask;
+}
+
+const inBox = ({min, max}) => (x, y, z) =>
+  x >= min[0] && x <= max[0] && y >= min[1] && y <= max[1] && z >= min[2] && z <= max[2];
+
+const inSphere = ({center, radius}) => (x, y, z) =>
+  (x - center[0]) ** 2 + (y - center[1]) ** 2 + (z - center[2]) ** 2 <= radius * radius;
+
+/** Even-odd rule on the projected centre. */
+function inPolygon(polygon, {viewmat: m, fx, fy, cx, cy, near}) {
+  const edges = polygon.map((from, k) => [...from, ...polygon[(k + 1) % polygon.length]]);
+  const xs = polygon.map(([x]) => x), ys = polygon.map(([, y]) => y);
+  const [x0, x1, y0, y1] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
+  return (a, b, c) => {
+    const depth = m[8] * a + m[9] * b + m[10] * c + m[11];
+    if (!(depth > near)) return false;
+    const x = (fx * (m[0] * a + m[1] * b + m[2] * c + m[3])) / depth + cx;
+    const y = (fy * (m[4] * a + m[5] * b + m[6] * c + m[7])) / depth + cy;
+    if (x < x0 || x > x1 || y < y0 || y > y1) return false;
+    let inside = false;
+    for (const [ax, ay, bx, by] of edges) {
+      if (ay > y !== by > y && x < ((bx - ax) * (y - ay)) / (by - ay) + ax) inside = !inside;
+    }
+    return inside;
+  };
+}

@@ -1,0 +1,643 @@
+/**
+ * Draws clouds of Gaussians with WebGL 2 by the rules of kfgs's rasteriser. Class, score and distance to the semantic cloud
+ * are textures, so that gamma, lambda, hidden classes and modes change with a uniform and without Python.
+ */
+import {Cloud, UNKNOWN, bufferOf} from "./clouds.js";
+import {gaussianAt, gaussiansIn} from "./pick.js";
+import {COVERED, FINISH, PREPARE, SPLAT_FRAGMENT, SPLAT_VERTEX, WHOLE, WIDTH} from "./shaders.js";
+import {startSorter} from "./sorter.js";
+
+const MODES = ["color", "labels", "score", "latents"];
+const LEVELS = [1, 0.7, 0.5, 0.35]; // sizes of the picture while the camera moves
+const SLOW = 90; // ms for a moving frame: then the next ones are smaller
+const PIECES = 8; // parts of the order, between which covered pixels are found
+const MARGIN = 1.1; // of the picture whose Gaussians are sorted, so that a turn shows no empty border
+const LOOK = {
+  mode: "color", question: null, gamma: 0, lambda: 1, low: 0, high: 1, hidden: null, dim: true, mixing: 1,
+  outline: [1, 0.85, 0.1],
+};
+
+/** One canvas, up to two clouds. */
+export class Renderer {
+  /**
+   * Start WebGL on a canvas.
+   * @param {HTMLCanvasElement} canvas
+   * @param {{background?: number[], onlost?: function}} options background: red, green, blue in 0..1; onlost: called when
+   *   the browser takes the graphics context away
+   * @throws {Error} with a sentence for people
+   */
+  static async create(canvas, options = {}) {
+    const gl = canvas.getContext("webgl2", {antialias: false, depth: false, alpha: false, preserveDrawingBuffer: true});
+    if (!gl) {
+      throw new Error("This browser has no WebGL 2. Switch on hardware acceleration in its settings, or try another browser.");
+    }
+    return new Renderer(canvas, gl, options);
+  }
+
+  constructor(canvas, gl, {background = [1, 1, 1], onlost = null} = {}) {
+    Object.assign(this, {canvas, gl, background, onorder: null});
+    this.stats = {drawn: 0, sortMs: 0, frameMs: 0, scale: 1};
+    const float = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
+    this.format = float ? gl.RGBA16F : gl.RGBA8; // 8 bits cost accuracy, not more
+    this.programs = {
+      prepare: program(gl, WHOLE.replace("DEPTH", "0.0"), PREPARE),
+      splat: program(gl, SPLAT_VERTEX, SPLAT_FRAGMENT),
+      outlined: program(gl, SPLAT_VERTEX, SPLAT_FRAGMENT.replace("precision", "#define OUTLINE\nprecision")),
+      covered: program(gl, WHOLE.replace("DEPTH", "-1.0"), COVERED),
+      finish: program(gl, WHOLE.replace("DEPTH", "0.0"), FINISH),
+    };
+    this.empty = gl.createVertexArray();
+    this.look = {...LOOK};
+    this.sides = {};
+    this.side = null;
+    this.camera = null;
+    this.target = null;
+    this.views = new Map(); // what was drawn since the camera was set
+    this.level = 0;
+    this.waiting = [];
+    this.sorter = startSorter((answer) => this.#sorted(answer));
+    this.onlost = (event) => {
+      event.preventDefault();
+      onlost?.();
+    };
+    canvas.addEventListener("webglcontextlost", this.onlost);
+  }
+
+  /** Load a pack: {header, data: ArrayBuffer}. What was loaded before is dropped. */
+  load(packed) {
+    this.#forget();
+    const {gl} = this;
+    const {header} = packed;
+    this.names = header.classes;
+    this.scores = {null: bufferOf(packed, "semantic/label_scores")};
+    Object.values(header.query).forEach(({buffer}, k) => (this.scores[k] = bufferOf(packed, buffer)));
+    const semantic = new Cloud(packed, "semantic");
+    const latents = bufferOf(packed, "semantic/latents");
+    this.shared = {
+      labels: sheet(gl, gl.R16I, semantic.count, semantic.labels),
+      scores: sheet(gl, gl.R32F, semantic.count, null),
+      latents: sheet(gl, gl.RGBA8, semantic.count, latents ? withAlpha(latents) : null),
+      colormap: row(gl, withAlpha(bufferOf(packed, "colormap"))),
+      classes: row(gl, new Uint8Array(4 * (this.names.length + 1))),
+    };
+    this.inTexture = undefined;
+    for (const side of Object.keys(header.sides)) {
+      this.#addSide(side === "semantic" ? semantic : new Cloud(packed, side));
+    }
+    this.side = "color" in this.sides ? "color" : "semantic";
+    this.setLook({});
+  }
+
+  /** Choose the cloud that is drawn next: "color" or "semantic". */
+  setSide(side) {
+    if (!(side in this.sides)) throw new Error(`There is no ${side} cloud in this file.`);
+    this.side = side;
+  }
+
+  /**
+   * Set the view.
+   * @param {object} camera {viewmat: 16 numbers, row-major, world to camera (x right, y down, z forward), fx, fy, cx?, cy?,
+   *   width, height, near?}; pixels of the camera's own picture, which is stretched to the viewport
+   */
+  setCamera(camera) {
+    const {width, height} = camera;
+    this.camera = {cx: width / 2, cy: height / 2, near: 0.01, ...camera, viewmat: Float32Array.from(camera.viewmat)};
+    this.views.clear();
+  }
+
+  /** Change some of the options of `LOOK`. question: number of a question of the pack, name given to setScores, or null. */
+  setLook(changes) {
+    this.look = {...this.look, ...changes};
+    const {gl, look} = this;
+    if (!this.shared) return;
+    const groups = new Uint8Array(4 * (this.names.length + 1));
+    const colors = [[128, 128, 128], ...this.names.map(({color}) => color)];
+    colors.forEach((color, k) => {
+      const hidden = look.hidden?.[k === 0 ? this.names.length : k - 1]; // the last is "no class"
+      groups.set([...color, hidden ? 0 : 255], 4 * k);
+    });
+    gl.bindTexture(gl.TEXTURE_2D, this.shared.classes);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, colors.length, 1, gl.RGBA, gl.UNSIGNED_BYTE, groups);
+    this.#showScores();
+  }
+
+  /** Scores of the semantic Gaussians for a new question; NaN where nothing is known. */
+  setScores(name, scores) {
+    this.scores[name] = scores;
+    if (this.inTexture === name) this.inTexture = undefined;
+    this.#showScores();
+  }
+
+  /** Mark Gaussians of the current side: "selected" (instead of the question's) or "removed"; null takes the marks away. */
+  setMask(kind, mask) {
+    this.#current().cloud[kind] = mask;
+    this.#showMarks();
+  }
+
+  /** Factors of the opacity of the current side's Gaussians, 0..255; null: none. */
+  setFade(factors) {
+    this.#current().cloud.fade = factors;
+    this.#showMarks();
+  }
+
+  /** Colours of the current side's Gaussians, [N * 4] bytes, alpha 255 where they replace the own ones; null: none. */
+  setColors(colors) {
+    const {cloud, textures} = this.#current();
+    fill(this.gl, textures.paints, this.gl.RGBA8, colors ?? new Uint8Array(4 * cloud.count));
+  }
+
+  /** Move Gaussians of the current side: indices and their new means, [n * 3]. */
+  setMeans(indices, means) {
+    const {cloud, textures} = this.#current();
+    cloud.setMeans(indices, means);
+    fill(this.gl, textures.splats, this.gl.RGBA32UI, cloud.splats);
+    const moved = {indices: Uint32Array.from(indices), means: Float32Array.from(means)};
+    this.sorter.send({kind: "move", side: cloud.side, ...moved});
+    this.#current().asked = null;
+  }
+
+  /** The centres of a side's Gaussians, [N * 3]; not to be changed. */
+  means(side = this.side) {
+    return this.sides[side].cloud.means;
+  }
+
+  /**
+   * Draw a frame of the current side with the last order, and ask the worker for one that fits the camera.
+   * @param {object} viewport {x, y, width, height} in pixels of the canvas from its top left; all of it if missing. `clip`:
+   *   the same for the part that is drawn. `moving`: the picture may be coarser, so that it keeps up with the mouse.
+   */
+  draw(viewport = {}) {
+    const view = {x: 0, y: 0, width: this.canvas.width, height: this.canvas.height, ...viewport};
+    view.side = this.side;
+    const clip = view.clip ?? view;
+    this.views.set(`${clip.x},${clip.y},${clip.width},${clip.height}`, view);
+    const state = this.#current();
+    this.#ask(state);
+    this.#render(state, view);
+    this.#time(view.moving);
+  }
+
+  /** Wait until frames with an up-to-date order have been drawn. */
+  async settled() {
+    const stale = () => [...this.views.values()].some(({side}) => this.sides[side].fresh !== this.sides[side].asked);
+    while (stale()) await new Promise((resolve) => this.waiting.push(resolve));
+    this.redraw();
+  }
+
+  /** Draw again, in full, what was drawn since the camera was set. */
+  redraw() {
+    const {side} = this;
+    for (const view of [...this.views.values()]) {
+      this.side = view.side;
+      this.draw({...view, moving: false});
+    }
+    this.side = side;
+  }
+
+  /** The number of the Gaussian seen at a pixel of the canvas, a selected one first if the others are dim; -1: none. */
+  pick(x, y) {
+    const {cloud, camera, left, top, drawn, chosen} = this.#under(x, y);
+    if (!cloud) return -1;
+    if (chosen) {
+      const found = gaussianAt(cloud, camera, x - left, y - top, (i) => chosen(i) && drawn(i));
+      if (found >= 0) return found;
+    }
+    return gaussianAt(cloud, camera, x - left, y - top, drawn);
+  }
+
+  /** A mask of the drawn Gaussians in a region; see `gaussiansIn`. Polygons are in pixels of the canvas. */
+  within(region) {
+    const [x, y] = region.polygon?.[0] ?? [0, 0];
+    const {cloud, camera, left, top, drawn} = this.#under(x, y, true);
+    const polygon = region.polygon?.map(([px, py]) => [px - left, py - top]);
+    return gaussiansIn(cloud, {...region, polygon}, camera, drawn);
+  }
+
+  /** What is on the canvas, as ImageData. */
+  toImage() {
+    const {gl} = this;
+    const {width, height} = this.canvas;
+    const pixels = new Uint8ClampedArray(4 * width * height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+    const flipped = new Uint8ClampedArray(pixels.length);
+    for (let y = 0; y < height; y++) {
+      flipped.set(pixels.subarray(4 * width * (height - 1 - y), 4 * width * (height - y)), 4 * width * y);
+    }
+    return new ImageData(flipped, width, height);
+  }
+
+  /** Free the worker and the graphics memory. */
+  dispose() {
+    this.sorter.close();
+    this.canvas.removeEventListener("webglcontextlost", this.onlost);
+    this.#forget();
+    this.gl.getExtension("WEBGL_lose_context")?.loseContext();
+  }
+
+  #current() {
+    return this.sides[this.side];
+  }
+
+  #addSide(cloud) {
+    const {gl} = this;
+    const {count} = cloud;
+    const planes = cloud.sh ? cloud.sh.length / 2 / count : 0;
+    const rows = Math.ceil(count / WIDTH);
+    const shape = target(gl, gl.RGBA32UI, WIDTH, rows);
+    const paint = target(gl, gl.RGBA32UI, WIDTH, rows);
+    const shs = texture(gl, gl.RG32UI, planes ? WIDTH : 1, Math.max(1, planes * rows));
+    for (let t = 0; t < planes; t++) {
+      fill(gl, shs, gl.RG32UI, cloud.sh.subarray(2 * t * count, 2 * (t + 1) * count), t * rows);
+    }
+    const textures = {
+      splats: sheet(gl, gl.RGBA32UI, count, cloud.splats),
+      dcs: sheet(gl, gl.R32UI, count, cloud.dc),
+      shs,
+      marks: sheet(gl, gl.RG8UI, count, null),
+      fars: sheet(gl, gl.RG32UI, cloud.far ? count : 1, cloud.far && new Uint32Array(cloud.far.slice().buffer)),
+      sources: sheet(gl, gl.R32I, cloud.far ? count : 1, cloud.source),
+      paints: sheet(gl, gl.RGBA8, count, new Uint8Array(4 * count)),
+    };
+    const order = gl.createBuffer();
+    const array = gl.createVertexArray();
+    gl.bindVertexArray(array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, order);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(0, 1);
+    gl.bindVertexArray(null);
+    const prepared = frame(gl, [shape, paint]);
+    this.sides[cloud.side] = {
+      cloud, textures, rows, planes, shape, paint, prepared, order, array, length: 0, asked: null, fresh: undefined, busy: false,
+    };
+    this.sorter.send({kind: "load", side: cloud.side, means: cloud.means, radii: cloud.radii()});
+    this.side = cloud.side;
+    this.#showMarks();
+  }
+
+  #showMarks() {
+    const {cloud, textures} = this.#current();
+    const {selected, removed, fade, count} = cloud;
+    const marks = new Uint8Array(2 * count);
+    for (let i = 0; i < count; i++) {
+      marks[2 * i] = (selected?.[i] ? 1 : 0) | (removed?.[i] ? 2 : 0);
+      marks[2 * i + 1] = fade ? fade[i] : 255;
+    }
+    fill(this.gl, textures.marks, this.gl.RG8UI, marks);
+  }
+
+  #showScores() {
+    const {question} = this.look;
+    if (!this.shared || this.inTexture === question) return;
+    const scores = this.scores[question];
+    if (!scores) throw new Error(`There are no scores for the question ${question}.`);
+    fill(this.gl, this.shared.scores, this.gl.R32F, scores.map((value) => (Number.isFinite(value) ? value : UNKNOWN)));
+    this.inTexture = question;
+  }
+
+  /** Ask for an order that fits the camera, unless the last request was for it; one request at a time. */
+  #ask(state) {
+    const {camera} = this;
+    if (state.asked === camera) return;
+    state.asked = camera;
+    if (!state.busy) this.#send(state);
+  }
+
+  #send(state) {
+    const camera = state.asked;
+    const {fx, fy, cx, cy, width, height, near, viewmat} = camera;
+    const grow = (low, high) => {
+      const [middle, half] = [(low + high) / 2, (MARGIN * (high - low)) / 2];
+      return [middle - half, middle + half];
+    };
+    const limits = [...grow(-cx / fx, (width - cx) / fx), ...grow(-cy / fy, (height - cy) / fy), 2 / Math.min(fx, fy)];
+    state.busy = true;
+    state.sent = camera;
+    this.sorter.send({kind: "sort", side: state.cloud.side, id: 0, view: viewmat, limits, near});
+  }
+
+  #sorted({side, order, ms}) {
+    const state = this.sides[side];
+    if (!state) return;
+    const {gl} = this;
+    state.busy = false;
+    state.length = order.length;
+    state.fresh = state.sent;
+    gl.bindVertexArray(null);
+    gl.bindBuffer(gl.ARRAY_BUFFER, state.order);
+    gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
+    this.stats.sortMs = ms;
+    if (state.asked !== state.fresh) this.#send(state);
+    this.waiting.splice(0).forEach((resolve) => resolve());
+    this.onorder?.(side);
+  }
+
+  #render(state, view) {
+    const {gl, look} = this;
+    const scale = view.moving ? LEVELS[this.level] : 1;
+    const width = Math.max(1, Math.round(view.width * scale));
+    const height = Math.max(1, Math.round(view.height * scale));
+    const chosen = look.question !== null || Boolean(state.cloud.selected);
+    this.#fitTarget(width, height, chosen);
+    this.#prepare(state, width, height);
+    const {target} = this;
+    const clip = view.clip ?? view;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, chosen ? target.both : target.one);
+    gl.viewport(0, 0, width, height);
+    gl.enable(gl.SCISSOR_TEST);
+    const [left, below] = [(clip.x - view.x) * scale - 2, (view.y + view.height - clip.y - clip.height) * scale - 2];
+    gl.scissor(Math.floor(left), Math.floor(below), Math.ceil(clip.width * scale) + 4, Math.ceil(clip.height * scale) + 4);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clearDepth(1);
+    gl.depthMask(true);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    this.#splat(state, width, height, chosen);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    const bottom = this.canvas.height - view.y - view.height;
+    gl.viewport(view.x, bottom, view.width, view.height);
+    gl.scissor(clip.x, this.canvas.height - clip.y - clip.height, clip.width, clip.height);
+    const {finish} = this.programs;
+    gl.useProgram(finish.program);
+    bind(gl, finish, {picture: target.picture, outline: target.outline});
+    gl.uniform4f(finish.at.viewport, view.x, bottom, view.width, view.height);
+    gl.uniform3fv(finish.at.paper, this.background);
+    gl.uniform3fv(finish.at.rim, look.outline);
+    gl.uniform1f(finish.at.width, chosen ? 1.5 : 0);
+    gl.bindVertexArray(this.empty);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.disable(gl.SCISSOR_TEST);
+    this.stats.drawn = state.length;
+    this.stats.scale = scale;
+  }
+
+  /** Compute the ellipse and the colour of every Gaussian. */
+  #prepare(state, width, height) {
+    const {gl, camera, look, shared} = this;
+    const {prepare} = this.programs;
+    const {cloud, textures} = state;
+    const {at} = prepare;
+    const {meta} = cloud;
+    const [sx, sy] = [width / camera.width, height / camera.height];
+    const m = camera.viewmat;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, state.prepared);
+    gl.viewport(0, 0, WIDTH, state.rows);
+    gl.disable(gl.BLEND);
+    gl.disable(gl.DEPTH_TEST);
+    gl.useProgram(prepare.program);
+    bind(gl, prepare, {...textures, ...shared});
+    gl.uniform1i(at.count, cloud.count);
+    gl.uniform1i(at.rows, state.rows);
+    gl.uniform1i(at.degree, state.planes ? meta.sh_degree : 0);
+    gl.uniform1i(at.mode, MODES.indexOf(look.mode));
+    gl.uniform1i(at.carried, cloud.source ? 1 : 0);
+    gl.uniform1i(at.asked, look.question === null ? 0 : 1);
+    gl.uniform1i(at.masked, cloud.selected ? 1 : 0);
+    gl.uniform1i(at.dim, look.dim ? 1 : 0);
+    gl.uniform3fv(at.center, meta.center);
+    gl.uniform3fv(at.spread, meta.half);
+    gl.uniform2fv(at.scaling, meta.scale);
+    gl.uniform2fv(at.dcScale, meta.dc);
+    gl.uniform2f(at.scoreRange, look.low, look.high);
+    gl.uniform1f(at.shStep, meta.sh_step);
+    gl.uniform1f(at.gamma, look.gamma);
+    gl.uniform1f(at.mixing, look.mixing);
+    gl.uniform1f(at.near, camera.near);
+    const bits = new Uint32Array(new Float64Array([look.lambda]).buffer);
+    gl.uniform2ui(at.lambda, bits[1], bits[0]);
+    gl.uniformMatrix4fv(at.view, true, m);
+    gl.uniform4f(at.pinhole, camera.fx * sx, camera.fy * sy, camera.cx * sx, camera.cy * sy);
+    gl.uniform2f(at.size, width, height);
+    gl.uniform3fv(at.eye, [0, 1, 2].map((k) => -(m[k] * m[3] + m[4 + k] * m[7] + m[8 + k] * m[11])));
+    gl.uniform3fv(at.paper, this.background);
+    gl.bindVertexArray(this.empty);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  /** Blend the ellipses, nearest first, leaving out pixels that are covered already. */
+  #splat(state, width, height, chosen) {
+    const {gl, target} = this;
+    const used = chosen ? this.programs.outlined : this.programs.splat;
+    const {covered} = this.programs;
+    gl.enable(gl.DEPTH_TEST);
+    gl.depthFunc(gl.LESS);
+    gl.blendFunc(gl.ONE_MINUS_DST_ALPHA, gl.ONE);
+    const piece = Math.ceil(state.length / PIECES);
+    for (let from = 0; from < state.length; from += piece) {
+      if (from > 0) {
+        gl.bindFramebuffer(gl.FRAMEBUFFER, target.depthOnly);
+        gl.useProgram(covered.program);
+        bind(gl, covered, {picture: target.picture});
+        gl.disable(gl.BLEND);
+        gl.depthMask(true);
+        gl.bindVertexArray(this.empty);
+        gl.drawArrays(gl.TRIANGLES, 0, 3);
+        gl.bindFramebuffer(gl.FRAMEBUFFER, chosen ? target.both : target.one);
+      }
+      gl.useProgram(used.program);
+      bind(gl, used, {shapes: state.shape, paints: state.paint});
+      gl.uniform2f(used.at.size, width, height);
+      gl.enable(gl.BLEND);
+      gl.depthMask(false);
+      gl.bindVertexArray(state.array);
+      gl.bindBuffer(gl.ARRAY_BUFFER, state.order);
+      gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 4 * from);
+      gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, Math.min(piece, state.length - from));
+    }
+    gl.disable(gl.BLEND);
+    gl.disable(gl.DEPTH_TEST);
+  }
+
+  /** The picture that is blended into, of this size; with a second one for the outline if there is a selection. */
+  #fitTarget(width, height, chosen) {
+    const {gl} = this;
+    const had = this.target;
+    if (had && had.width === width && had.height === height && (had.both || !chosen)) return;
+    this.#dropTarget();
+    const picture = target(gl, this.format, width, height, gl.LINEAR);
+    const outline = target(gl, gl.RGBA8, chosen ? width : 1, chosen ? height : 1, gl.LINEAR);
+    const depth = gl.createRenderbuffer();
+    gl.bindRenderbuffer(gl.RENDERBUFFER, depth);
+    gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, width, height);
+    const both = chosen ? frame(gl, [picture, outline], depth) : null;
+    this.target = {
+      width, height, picture, outline, depth, both, one: frame(gl, [picture], depth), depthOnly: frame(gl, [], depth),
+    };
+  }
+
+  #dropTarget() {
+    const {gl, target} = this;
+    if (!target) return;
+    [target.picture, target.outline].forEach((made) => gl.deleteTexture(made));
+    [target.one, target.both, target.depthOnly].forEach((made) => made && gl.deleteFramebuffer(made));
+    gl.deleteRenderbuffer(target.depth);
+    this.target = null;
+  }
+
+  /** Measure the time until the frame is drawn, and choose the size of the next moving frames by it. */
+  #time(moving) {
+    if (this.timing) return;
+    const {gl} = this;
+    const start = performance.now();
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    this.timing = true;
+    const look = () => {
+      const status = gl.clientWaitSync(fence, 0, 0);
+      if (status === gl.TIMEOUT_EXPIRED) return void setTimeout(look, 2);
+      gl.deleteSync(fence);
+      this.timing = false;
+      this.stats.frameMs = performance.now() - start;
+      if (!moving) {
+        if (this.level === 0 && this.stats.frameMs > 2 * SLOW) this.level = 2;
+      } else if (this.stats.frameMs > SLOW) {
+        this.level = Math.min(this.level + 1, LEVELS.length - 1);
+      } else if (this.stats.frameMs < SLOW / 4) {
+        this.level = Math.max(this.level - 1, 0);
+      }
+    };
+    setTimeout(look, 0);
+  }
+
+  /** Which Gaussians can be picked, and the camera of the viewport under a pixel. */
+  #under(x, y, anyway = false) {
+    const views = [...this.views.values()].reverse();
+    const holds = ({x: left, y: top, width, height}) => x >= left && x < left + width && y >= top && y < top + height;
+    const view = views.find((one) => holds(one.clip ?? one)) ?? (anyway ? views[0] : null);
+    if (!view) return {};
+    const {cloud} = this.sides[view.side];
+    const {camera, look} = this;
+    const [sx, sy] = [view.width / camera.width, view.height / camera.height];
+    const stretched = {
+      ...camera, fx: camera.fx * sx, cx: camera.cx * sx, fy: camera.fy * sy, cy: camera.cy * sy,
+      width: view.width, height: view.height,
+    };
+    const {hidden, lambda} = look;
+    const drawn = (i) => {
+      if (cloud.removed?.[i]) return false;
+      if (!hidden) return true;
+      const label = cloud.labelOf(i, lambda);
+      return !hidden[label < 0 ? this.names.length : label];
+    };
+    const scores = look.question === null ? null : this.scores[look.question];
+    const chosen = look.dim && (scores || cloud.selected) ? (i) => cloud.chosen(i, scores, look.gamma, lambda) : null;
+    return {cloud, camera: stretched, left: view.x, top: view.y, drawn, chosen};
+  }
+
+  #forget() {
+    const {gl} = this;
+    for (const {textures, shape, paint, prepared, order, array} of Object.values(this.sides)) {
+      [...Object.values(textures), shape, paint].forEach((made) => gl.deleteTexture(made));
+      gl.deleteFramebuffer(prepared);
+      gl.deleteBuffer(order);
+      gl.deleteVertexArray(array);
+    }
+    Object.values(this.shared ?? {}).forEach((made) => gl.deleteTexture(made));
+    this.#dropTarget();
+    this.sides = {};
+    this.shared = null;
+    this.views.clear();
+  }
+}
+
+/** Compile a program; `at` has the places of its uniforms. */
+function program(gl, vertex, fragment) {
+  const made = gl.createProgram();
+  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, text);
+    gl.compileShader(shader);
+    gl.attachShader(made, shader);
+  }
+  gl.bindAttribLocation(made, 0, "index");
+  gl.linkProgram(made);
+  if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) {
+    const logs = gl.getAttachedShaders(made).map((shader) => gl.getShaderInfoLog(shader));
+    throw new Error(`The graphics driver refused a shader: ${[gl.getProgramInfoLog(made), ...logs].join(" ")}`);
+  }
+  const at = {};
+  for (let k = 0; k < gl.getProgramParameter(made, gl.ACTIVE_UNIFORMS); k++) {
+    const {name} = gl.getActiveUniform(made, k);
+    at[name] = gl.getUniformLocation(made, name);
+  }
+  return {program: made, at};
+}
+
+/** Give a program its textures; those that it does not use are left out. */
+function bind(gl, {at}, textures) {
+  let unit = 0;
+  for (const [name, made] of Object.entries(textures)) {
+    if (!(name in at)) continue;
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.bindTexture(gl.TEXTURE_2D, made);
+    gl.uniform1i(at[name], unit++);
+  }
+}
+
+function texture(gl, format, width, height, filter = gl.NEAREST) {
+  const made = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, made);
+  gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, filter);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, filter);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
+  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+  return made;
+}
+
+const target = texture;
+
+/** A texture with one texel for each Gaussian. */
+function sheet(gl, format, count, values) {
+  const made = texture(gl, format, WIDTH, Math.ceil(count / WIDTH));
+  if (values) fill(gl, made, format, values);
+  return made;
+}
+
+/** A texture of one row of colours. */
+function row(gl, values) {
+  const made = texture(gl, gl.RGBA8, values.length / 4, 1);
+  gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, values.length / 4, 1, gl.RGBA, gl.UNSIGNED_BYTE, values);
+  return made;
+}
+
+/** Write values into a sheet: the full rows, then the rest. */
+function fill(gl, made, format, values, top = 0) {
+  const [layout, type, channels] = {
+    [gl.RGBA32UI]: [gl.RGBA_INTEGER, gl.UNSIGNED_INT, 4],
+    [gl.RG32UI]: [gl.RG_INTEGER, gl.UNSIGNED_INT, 2],
+    [gl.R32UI]: [gl.RED_INTEGER, gl.UNSIGNED_INT, 1],
+    [gl.R32I]: [gl.RED_INTEGER, gl.INT, 1],
+    [gl.R16I]: [gl.RED_INTEGER, gl.SHORT, 1],
+    [gl.RG8UI]: [gl.RG_INTEGER, gl.UNSIGNED_BYTE, 2],
+    [gl.R32F]: [gl.RED, gl.FLOAT, 1],
+    [gl.RGBA8]: [gl.RGBA, gl.UNSIGNED_BYTE, 4],
+  }[format];
+  const full = Math.floor(values.length / channels / WIDTH);
+  const rest = values.length / channels - full * WIDTH;
+  gl.bindTexture(gl.TEXTURE_2D, made);
+  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+  if (full) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, top, WIDTH, full, layout, type, values);
+  if (rest) {
+    const last = values.subarray(full * WIDTH * channels);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, top + full, rest, 1, layout, type, last);
+  }
+}
+
+/** A framebuffer of textures and, if there is one, a depth buffer. */
+function frame(gl, textures, depth = null) {
+  const made = gl.createFramebuffer();
+  gl.bindFramebuffer(gl.FRAMEBUFFER, made);
+  const places = textures.map((_, k) => gl.COLOR_ATTACHMENT0 + k);
+  places.forEach((place, k) => gl.framebufferTexture2D(gl.FRAMEBUFFER, place, gl.TEXTURE_2D, textures[k], 0));
+  if (depth) gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, depth);
+  gl.drawBuffers(places.length ? places : [gl.NONE]);
+  return made;
+}
+
+/** Bytes of red, green, blue with an opaque alpha. */
+function withAlpha(rgb) {
+  const made = new Uint8Array((rgb.length / 3) * 4).fill(255);
+  for (let i = 0; i < rgb.length / 3; i++) made.set(rgb.subarray(3 * i, 3 * i + 3), 4 * i);
+  return made;
+}

@@ -1,0 +1,246 @@
+/**
+ * The three programs. "prepare" runs once for each Gaussian and writes its ellipse and its colour into textures; "splat"
+ * draws a rectangle around each ellipse, nearest first; "finish" puts the picture over the background and draws the outline
+ * of the selection. The numbers are those of kfgs/splat/project.py and kfgs/splat/engines/contract.py.
+ */
+
+/** Width of every texture with one texel per Gaussian; a power of two. */
+export const WIDTH = 2048;
+
+const HEAD = `#version 300 es
+precision highp float;
+precision highp int;
+precision highp sampler2D;
+precision highp usampler2D;
+precision highp isampler2D;
+`;
+
+export const WHOLE = `${HEAD}
+void main() {
+  gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, DEPTH, 1.0);
+}`;
+
+export const PREPARE = `${HEAD}
+uniform usampler2D splats, dcs, shs, marks, fars;
+uniform isampler2D labels, sources;
+uniform sampler2D scores, latents, colormap, classes, paints;
+uniform int count, rows, degree, mode;          // mode: 0 color, 1 labels, 2 score, 3 latents
+uniform bool carried, asked, masked, dim;       // carried: labels come from the source; masked: selection is a mask
+uniform vec3 center, spread;                    // of the box of the means
+uniform vec2 scaling, dcScale, scoreRange;      // lowest log and step
+uniform float shStep, gamma, mixing, near;
+uniform uvec2 lambda;                           // the bits of a float64: high, low
+uniform mat4 view;
+uniform vec4 pinhole;                           // fx, fy, cx, cy in pixels of the target
+uniform vec2 size;
+uniform vec3 eye, paper;
+layout(location = 0) out uvec4 shape;           // centre x, y; two half-axes as pairs of half floats
+layout(location = 1) out uvec4 paint;           // rg, b and opacity as half floats; selected
+
+const float UNKNOWN = -1e38;
+const vec3 GREY = vec3(128.0 / 255.0);
+
+ivec2 place(int i) { return ivec2(i & ${WIDTH - 1}, i >> ${Math.log2(WIDTH)}); }
+
+float opened(float whole, float half_) {
+  float v = whole * (4.0 / 2097151.0) - 2.0;
+  float u = abs(v) <= 1.0 ? v : sign(v) / max(2.0 - abs(v), 1e-6);
+  return u * half_;
+}
+
+vec3 meanOf(uvec4 s) {
+  uvec3 whole = uvec3(s.x & 0x1fffffu, (s.x >> 21) | ((s.y & 1023u) << 11), (s.y >> 10) & 0x1fffffu);
+  return center + vec3(opened(float(whole.x), spread.x), opened(float(whole.y), spread.y), opened(float(whole.z), spread.z));
+}
+
+mat3 rotationOf(uint word) {
+  vec3 s = (vec3(word & 1023u, (word >> 10) & 1023u, (word >> 20) & 1023u) / 1023.0 - 0.5) * sqrt(2.0);
+  float r = sqrt(max(0.0, 1.0 - dot(s, s)));
+  uint k = word >> 30;
+  vec4 q = k == 0u ? vec4(r, s) : k == 1u ? vec4(s.x, r, s.yz) : k == 2u ? vec4(s.xy, r, s.z) : vec4(s, r);
+  q = normalize(q);
+  float w = q.x, x = q.y, y = q.z, z = q.w;
+  return mat3(
+    1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
+    2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x),
+    2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
+}
+
+vec4 bytesOf(uint word) {  // signed
+  return vec4(ivec4(int(word) << 24, int(word) << 16, int(word) << 8, int(word)) >> 24);
+}
+
+vec3 harmonics(int i, vec3 d) {
+  vec3 c[16];
+  ivec2 at = place(i);
+  int planes = degree == 1 ? 2 : degree == 2 ? 3 : 6;
+  float v[48];
+  for (int t = 0; t < planes; t++) {
+    uvec2 two = texelFetch(shs, ivec2(at.x, at.y + t * rows), 0).xy;
+    vec4 a = bytesOf(two.x), b = bytesOf(two.y);
+    for (int k = 0; k < 4; k++) {
+      v[8 * t + k] = a[k];
+      v[8 * t + 4 + k] = b[k];
+    }
+  }
+  for (int k = 0; k < 15; k++) c[k + 1] = vec3(v[3 * k], v[3 * k + 1], v[3 * k + 2]);
+  float x = d.x, y = d.y, z = d.z;
+  vec3 sum = 0.4886025119 * (-y * c[1] + z * c[2] - x * c[3]);
+  if (degree > 1) {
+    float xx = x * x, yy = y * y, zz = z * z;
+    sum += 1.0925484306 * (x * y * c[4] - y * z * c[5] - x * z * c[7])
+      + 0.3153915653 * (2.0 * zz - xx - yy) * c[6] + 0.5462742153 * (xx - yy) * c[8];
+    if (degree > 2) {
+      sum += -0.5900435899 * (y * (3.0 * xx - yy) * c[9] + x * (xx - 3.0 * yy) * c[15])
+        + 2.8906114426 * x * y * z * c[10]
+        - 0.4570457995 * (4.0 * zz - xx - yy) * (y * c[11] + x * c[13])
+        + 0.3731763326 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * c[12]
+        + 1.4453057213 * z * (xx - yy) * c[14];
+    }
+  }
+  return sum * shStep;
+}
+
+vec3 colorOf(int i, vec3 direction) {
+  uint word = texelFetch(dcs, place(i), 0).x;
+  vec3 base = vec3(word & 1023u, (word >> 10) & 1023u, (word >> 20) & 1023u) * dcScale.y + dcScale.x;
+  if (degree > 0) base += harmonics(i, direction);
+  vec4 painted = texelFetch(paints, place(i), 0);
+  return mix(max(base, 0.0), painted.rgb, painted.a);
+}
+
+void main() {
+  ivec2 at = ivec2(gl_FragCoord.xy);
+  int i = at.y * ${WIDTH} + at.x;
+  shape = uvec4(0u);
+  paint = uvec4(0u);
+  if (i >= count) return;
+
+  uvec4 s = texelFetch(splats, at, 0);
+  uvec2 mark = texelFetch(marks, at, 0).xy;     // flags, factor of the opacity
+  float opacity = float(s.w >> 24) / 255.0 * float(mark.y) / 255.0;
+  vec3 mean = meanOf(s);
+  vec3 p = (view * vec4(mean, 1.0)).xyz;
+  if (!(p.z > near) || opacity <= 1.0 / 255.0 || (mark.x & 2u) != 0u) return;
+
+  int source = i;                               // the semantic Gaussian that gives label and score
+  if (carried) {
+    uvec2 far = texelFetch(fars, at, 0).xy;
+    bool within = far.y < lambda.x || (far.y == lambda.x && far.x < lambda.y);
+    source = within ? texelFetch(sources, at, 0).x : -1;
+  }
+  int label = source < 0 ? -1 : texelFetch(labels, place(source), 0).x;
+  vec4 group = texelFetch(classes, ivec2(label + 1, 0), 0);
+  if (group.a == 0.0) return;                   // hidden
+  float score = source < 0 ? -3e38 : texelFetch(scores, place(source), 0).x;
+  bool chosen = masked ? (mark.x & 1u) != 0u : asked && score > UNKNOWN && score > gamma;
+
+  vec3 color = mode == 0 || mixing < 1.0 ? colorOf(i, normalize(mean - eye)) : vec3(0.0);
+  if (mode > 0) {
+    vec3 other = group.rgb;
+    if (mode == 2) {
+      float unit = clamp((score - scoreRange.x) / (scoreRange.y - scoreRange.x), 0.0, 1.0);
+      other = score > UNKNOWN ? texelFetch(colormap, ivec2(min(int(unit * 256.0), 255), 0), 0).rgb : GREY;
+    }
+    if (mode == 3) other = source < 0 ? GREY : texelFetch(latents, place(source), 0).rgb;
+    color = mix(color, other, mixing);
+  }
+  if (dim && !chosen && (asked || masked)) {
+    float light = dot(color, vec3(0.3, 0.6, 0.1));
+    color = mix(paper, mix(vec3(light), color, 0.3), 0.4);
+  }
+
+  vec2 focal = pinhole.xy;
+  vec2 middle = (size * 0.5 - pinhole.zw) / focal, half_ = 1.3 * size * 0.5 / focal;
+  vec2 tangent = clamp(p.xy / p.z, middle - half_, middle + half_);
+  mat3 turn = mat3(view) * rotationOf(s.z);
+  vec3 scales = exp(scaling.x + scaling.y * vec3(s.w & 255u, (s.w >> 8) & 255u, (s.w >> 16) & 255u));
+  // rows of J W R S
+  vec3 u = focal.x / p.z * (vec3(turn[0].x, turn[1].x, turn[2].x) - tangent.x * vec3(turn[0].z, turn[1].z, turn[2].z)) * scales;
+  vec3 v = focal.y / p.z * (vec3(turn[0].y, turn[1].y, turn[2].y) - tangent.y * vec3(turn[0].z, turn[1].z, turn[2].z)) * scales;
+  float a = dot(u, u), c = dot(v, v), b = dot(u, v);
+  vec3 area = cross(u, v);
+  float det = dot(area, area) + 0.3 * (a + c) + 0.09;  // of the dilated covariance, without a difference of squares
+  float mid = 0.5 * (a + c) + 0.3, gap = 0.5 * (a - c);
+  float large = mid + sqrt(gap * gap + b * b), small = det / large;
+  vec2 axis = gap >= 0.0 ? vec2(gap + sqrt(gap * gap + b * b), b) : vec2(b, sqrt(gap * gap + b * b) - gap);
+  axis = dot(axis, axis) > 1e-20 ? normalize(axis) : vec2(1.0, 0.0);
+  vec2 xy = focal * p.xy / p.z + pinhole.zw;
+  if (!(large < 1e8)) return;
+  shape = uvec4(floatBitsToUint(xy), packHalf2x16(axis * sqrt(large)), packHalf2x16(vec2(-axis.y, axis.x) * sqrt(small)));
+  paint = uvec4(packHalf2x16(color.rg), packHalf2x16(vec2(color.b, opacity)), chosen ? 1u : 0u, 0u);
+}`;
+
+export const SPLAT_VERTEX = `${HEAD}
+uniform usampler2D shapes, paints;
+uniform vec2 size;
+in uint index;
+out vec2 at;
+flat out vec4 color;
+flat out float chosen;
+
+void main() {
+  ivec2 texel = ivec2(int(index) & ${WIDTH - 1}, int(index) >> ${Math.log2(WIDTH)});
+  uvec4 paint = texelFetch(paints, texel, 0);
+  vec2 last = unpackHalf2x16(paint.y);
+  gl_Position = vec4(2.0, 2.0, 0.0, 1.0);       // outside
+  if (last.y <= 0.0) return;
+  uvec4 shape = texelFetch(shapes, texel, 0);
+  color = vec4(unpackHalf2x16(paint.x), last);
+  chosen = float(paint.z);
+  at = (vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0) * sqrt(2.0 * log(255.0 * color.a));
+  vec2 pixel = uintBitsToFloat(shape.xy) + at.x * unpackHalf2x16(shape.z) + at.y * unpackHalf2x16(shape.w);
+  gl_Position = vec4(pixel.x / size.x * 2.0 - 1.0, 1.0 - pixel.y / size.y * 2.0, 0.0, 1.0);
+}`;
+
+export const SPLAT_FRAGMENT = `${HEAD}
+in vec2 at;
+flat in vec4 color;
+flat in float chosen;
+layout(location = 0) out vec4 picture;
+#ifdef OUTLINE
+layout(location = 1) out vec4 outline;
+#endif
+
+void main() {
+  float alpha = min(0.99, color.a * exp(-0.5 * dot(at, at)));
+  if (alpha < 1.0 / 255.0) discard;
+  picture = vec4(color.rgb * alpha, alpha);
+#ifdef OUTLINE
+  outline = vec4(chosen * alpha, 0.0, 0.0, alpha);
+#endif
+}`;
+
+/** Marks pixels that are covered completely, so that nothing behind is drawn there. */
+export const COVERED = `${HEAD}
+uniform sampler2D picture;
+out vec4 nothing;
+void main() {
+  if (texelFetch(picture, ivec2(gl_FragCoord.xy), 0).a < 0.9999) discard;
+  nothing = vec4(0.0);
+}`;
+
+export const FINISH = `${HEAD}
+uniform sampler2D picture, outline;
+uniform vec4 viewport;                          // x, y from below, width, height on the canvas
+uniform vec3 paper;
+uniform vec3 rim;                               // colour of the outline
+uniform float width;                            // of the outline in pixels; 0: none
+out vec4 color;
+
+void main() {
+  vec2 at = (gl_FragCoord.xy - viewport.xy) / viewport.zw;
+  vec4 seen = texture(picture, at);
+  vec3 rgb = seen.rgb + (1.0 - seen.a) * paper;
+  if (width > 0.0) {
+    float here = texture(outline, at).r, most = here, least = here;
+    for (int k = 0; k < 8; k++) {
+      float turn = float(k) * 0.7853981634;
+      float near = texture(outline, at + vec2(cos(turn), sin(turn)) * width / viewport.zw).r;
+      most = max(most, near);
+      least = min(least, near);
+    }
+    rgb = mix(rgb, rim, smoothstep(0.3, 0.6, most) * (1.0 - smoothstep(0.4, 0.7, least)));
+  }
+  color = vec4(rgb, 1.0);
+}`;
