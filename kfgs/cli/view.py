@@ -16,7 +16,7 @@ from .text import note_other_teacher, text_encoder
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
-Where = Literal["auto", "window", "browser", "picture"]
+Where = Literal["auto", "window", "browser", "picture", "html"]
 FEW = 0.05  # of a colour cloud within lambda, under which the frames probably differ
 
 
@@ -55,6 +55,7 @@ def view(
     Examples:
         kfgs view run/field --color run/color.ply
         kfgs view labelled.ply --ask chair --where picture --out pictures/
+        kfgs view run/field --color run/color.ply --where html    # one file to share
         kfgs view run/field --teacher lseg --weights demo_e200.ckpt    # any text
 
     Args:
@@ -62,12 +63,13 @@ def view(
         color: Colour splat in the same frame, any splat file; without it the source is shown alone.
         ask: A first question.
         distance: Lambda at the start, in world units; by default from the clouds' spacing.
-        where: window, browser, or picture (writes OUT/view.png and ends). auto: a window if there is a display, else the
-            browser.
+        where: window, browser, picture (writes OUT/view.png and ends), or html (writes OUT/view.html, one file that any
+            browser opens without kfgs, and ends; with --scene it holds small photos). auto: a window if there is a
+            display, else the browser.
         out: Folder for saved pictures and selections.
     """
     from .._check import check_range, check_whole
-    from ..viz.explorer import Exploration, ExploreOptions, Explorer
+    from ..viz.explorer import Exploration, ExploreOptions, Explorer, save_html
     from ..viz.explorer.entry import check_place, find_place
     from ..viz.headless import require
 
@@ -81,8 +83,9 @@ def view(
         for name, given, usual in (("host", display.host, "127.0.0.1"), ("port", display.port, 0)):
             check_alone(name, None if given == usual else given, "without --where browser, whose page listens there")
     try:
-        check_place(place)
-        require()
+        if place != "html":  # the file is drawn by the browser that opens it
+            check_place(place)
+            require()
     except RuntimeError as error:  # nothing to open, or nothing draws here
         raise ValueError(str(error)) from error
     say("reading")
@@ -90,6 +93,12 @@ def view(
     cloud = None if color is None else open_splats("color", color).gaussians
     state = Exploration(meaning, cloud, cameras=cameras, distance=distance)
     _note(state)
+    if place == "html":
+        state.set_show(display.show)
+        state.ask(ask)
+        scene = None if classes.scene is None else classes.load_scene().undistorted()
+        wrote([save_html(state, out / "view.html", title=source.resolve().stem, scene=scene)])
+        return
     height, width = (680, 980) if place == "window" else (600, 1200)  # a window has a panel next to the clouds
     options = ExploreOptions(height=height, width=width, style=display.style, out=out)
     with Explorer(state, options, off_screen=place != "window") as explorer:

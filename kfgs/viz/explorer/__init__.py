@@ -4,6 +4,7 @@ from .desktop import open_window
 from .entry import explore
 from .explorer import Explorer
 from .hit_test import gaussian_at
+from .html import save_html
 from .meaning import Asked, FieldMeaning, Meaning, SplatMeaning
 from .notebook import show_in_notebook
 from .options import ExploreOptions
@@ -24,6 +25,7 @@ __all__ = [
     "explore",
     "gaussian_at",
     "open_window",
+    "save_html",
     "serve",
     "show_in_notebook",
 ]

@@ -8,6 +8,8 @@ from importlib.resources import files
 
 RENDERER = ("sorter.js", "camera.js", "clouds.js", "shaders.js", "pick.js", "renderer.js")
 """The modules of the renderer; a module comes after those that it imports."""
+APP = (*RENDERER, "eye.js", "link.js", "model.js", "dom.js", "panel.js", "tools.js", "app.js")
+"""The renderer and the interface."""
 
 _IMPORT = re.compile(r"""^import\s*\{([^}]*)\}\s*from\s*["']\./([\w.]+)["'];?[ \t]*$""", re.M)
 _EXPORT = re.compile(r"^export\s+(?=(?:async\s+)?(?:function\*?|class|const|let)\s+(\w+))", re.M)
