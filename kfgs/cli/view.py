@@ -16,7 +16,7 @@ from .text import note_other_teacher, text_encoder
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
-Where = Literal["auto", "window", "browser", "picture"]
+Where = Literal["auto", "browser", "html", "window", "picture"]
 FEW = 0.05  # of a colour cloud within lambda, under which the frames probably differ
 
 
@@ -54,6 +54,7 @@ def view(
 
     Examples:
         kfgs view run/field --color run/color.ply
+        kfgs view run/field --color run/color.ply --where html    # one file to share
         kfgs view labelled.ply --ask chair --where picture --out pictures/
         kfgs view run/field --teacher lseg --weights demo_e200.ckpt    # any text
 
@@ -62,7 +63,9 @@ def view(
         color: Colour splat in the same frame, any splat file; without it the source is shown alone.
         ask: A first question.
         distance: Lambda at the start, in world units; by default from the clouds' spacing.
-        where: browser, window (pyvista: two clouds side by side), or picture (writes OUT/view.png and ends). auto: browser.
+        where: browser; html (writes OUT/view.html, one file that any browser opens without kfgs, and ends); window (pyvista:
+            two clouds side by side); or picture (writes OUT/view.png and ends). auto: browser. With --scene the first two
+            show small photos, too.
         out: Folder for saved pictures and selections.
     """
     from .._check import check_range, check_whole
@@ -80,8 +83,9 @@ def view(
         for name, given, usual in (("host", display.host, "127.0.0.1"), ("port", display.port, 0)):
             check_alone(name, None if given == usual else given, "without --where browser, whose page listens there")
     try:
-        check_place(place)
-        if place != "browser":
+        if place != "html":
+            check_place(place)
+        if place in ("window", "picture"):
             require()
     except RuntimeError as error:  # nothing to open, or nothing draws here
         raise ValueError(str(error)) from error
@@ -96,20 +100,25 @@ def view(
         state.ask(ask)
     for line in state.lines():
         say(line)
-    if place == "browser":
-        _serve(state, options, source, ask, display)
-    else:
+    if place in ("window", "picture"):
         _draw(state, options, place, display.show)
+    else:
+        scene = None if classes.scene is None else classes.load_scene().undistorted()
+        _page(state, options, source.resolve().stem, scene, place, display)
 
 
-def _serve(state: Any, options: Any, source: Path, ask: str | None, display: Display) -> None:
-    """Serve the page until Ctrl-C."""
+def _page(state: Any, options: Any, title: str, scene: Any, place: Where, display: Display) -> None:
+    """Serve the page until Ctrl-C, or write it as a file."""
     from ..viz.explorer import Viewer
 
-    viewer = Viewer(state, options, title=source.resolve().stem)
-    if ask is not None:
-        viewer.ask(ask)
-    viewer.serve(display.host, display.port, show=display.show, report=say)
+    show = display.show or ("rgb" if "rgb" in state.show_choices else "labels")
+    state.set_show(show)
+    viewer = Viewer(state, options, title=title, scene=scene)
+    if place == "html":
+        options.out.mkdir(parents=True, exist_ok=True)
+        wrote([viewer.save_html(options.out / "view.html")])
+    else:
+        viewer.serve(display.host, display.port, report=say)
 
 
 def _draw(state: Any, options: Any, place: Where, show: Any) -> None:

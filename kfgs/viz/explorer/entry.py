@@ -73,6 +73,8 @@ def explore(
     cloud = color.gaussians if isinstance(color, SplatFile) else color
     state = Exploration(meaning, cloud, cameras=cameras, distance=distance)
     if place in ("browser", "notebook"):
+        if "rgb" in state.show_choices:
+            state.set_show("rgb")
         viewer = Viewer(state, options)
         if place == "browser":
             viewer.serve()

@@ -20,6 +20,7 @@ from ..linked import look_over, upwards
 from ..pictures import save_picture
 from .drawing import Drawn, Pane
 from .first_frame import FirstFrame
+from .html import save_html
 from .meaning import Asked
 from .numbered_files import numbered_path
 from .options import ExploreOptions, Style
@@ -29,6 +30,8 @@ from .while_open import while_open
 
 if TYPE_CHECKING:
     import pyvista as pv
+
+    from ...scenes import Scene
 
 Array = np.ndarray[Any, Any]
 
@@ -229,6 +232,15 @@ class Explorer:
         """
         with numbered_path(self.options.out, "selection") as folder:
             return self.state.save_selection(folder)
+
+    def save_html(self, path: str | Path, *, title: str = "kfgs", scene: Scene | None = None) -> Path:
+        """Write one file with the scene and a viewer, which opens in any browser, offline. See `save_html`.
+
+        Raises:
+            ValueError: if the name does not end in .html.
+        """
+        with self.lock:
+            return save_html(self.state, path, title=title, scene=scene)
 
     def lines(self) -> list[str]:
         """The status as lines of text: question, gamma, lambda, counts, picked Gaussian."""

@@ -5,17 +5,24 @@ from __future__ import annotations
 import base64
 import html
 import json
-from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
 
 from ..._files import atomic_path
+from ...cameras import Camera
+from ...scenes import Scene
+from ..pictures import as_bytes
 from ..web import APP, inline_script, read_text
 from .carried import Array
-from .pack import pack_scene
+from .pack import Packed, pack_scene
 from .state import Exploration
 
 # Nothing may be loaded: pictures and the worker are made in the page.
 POLICY = "default-src 'none'; script-src 'unsafe-inline' blob:; worker-src blob:; style-src 'unsafe-inline'; img-src blob: data:"
+PHOTO = 400  # pixels: the longer edge of a photo in the page, about 20 KB
 OFFLINE_START = """\
     const text = (id) => document.getElementById(id).textContent;
     const bytes = Uint8Array.from(atob(text("data")), (letter) => letter.charCodeAt(0));
@@ -25,11 +32,9 @@ OFFLINE_START = """\
 PYTHON_START = """\
     const loaded = await fetch("pack");
     if (!loaded.ok) throw new Error("Python does not answer.");
-    const [about, data] = kfgs.readMessage(await loaded.arrayBuffer());
-    const link = new kfgs.PythonLink(kfgs.callPage, about.phrases);
-    window.viewer = await kfgs.mount(root, { header: about.header, data }, link);
-    if (about.mode && about.mode in window.viewer.modes) window.viewer.setMode(about.mode);
-    if (about.ask) await window.viewer.ask(about.ask);"""
+    const [header, data] = kfgs.readMessage(await loaded.arrayBuffer());
+    const link = new kfgs.PythonLink(kfgs.callPage, header.phrases);
+    window.viewer = await kfgs.mount(root, { header, data }, link);"""
 PAGE = """\
 <!doctype html>
 <html lang="en">
@@ -68,17 +73,17 @@ def save_html(
     path: str | Path,
     *,
     title: str = "kfgs",
-    thumbnails: Iterable[Array | None] = (),  # [h, w, 3] uint8, one for each camera
+    scene: Scene | None = None,
 ) -> Path:
     """Write one file with the scene and the viewer. It opens with a double click and loads nothing.
 
     Classes can be searched, gamma and lambda changed, Gaussians selected and edited. New phrases need Python.
 
     Args:
-        exploration: its lambda is the first one in the page.
+        exploration: the page opens with its question, gamma, lambda and hidden classes.
         path: a name that ends in .html.
         title: title of the page.
-        thumbnails: pictures of the exploration's cameras, in their order; None leaves one out.
+        scene: has the photos of the exploration's cameras, found by name; None: without photos.
 
     Returns:
         The path.
@@ -89,7 +94,7 @@ def save_html(
     target = Path(path)
     if target.suffix.lower() != ".html":
         raise ValueError(f"path: expected a name that ends in .html, got {target.name!r}; rename it")
-    packed = pack_scene(exploration, title=title, thumbnails=thumbnails)
+    packed = pack_view(exploration, title=title, scene=scene)
     data = f"""\
 <script type="application/json" id="header">{_json(packed.header)}</script>
 <script type="text/plain" id="data">{base64.b64encode(packed.compressed()).decode()}</script>"""
@@ -111,6 +116,36 @@ def document(title: str, start: str, data: str = "", policy: str = "") -> str:
     """
     parts = {"title": html.escape(title), "style": read_text("app.css"), "script": inline_script(APP)}
     return PAGE.format(start=start, data=data, policy=policy, **parts)
+
+
+def pack_view(exploration: Exploration, *, title: str = "kfgs", scene: Scene | None = None) -> Packed:
+    """Pack an exploration with the photos of its cameras, and what it shows now; arguments as in `save_html`."""
+    asked = exploration.asked
+    questions = [*exploration.meaning.names, *([] if asked is None or asked.known else [asked.words])]
+    photos = [] if scene is None else [_photo(scene, camera) for camera in exploration.cameras]
+    packed = pack_scene(exploration, title=title, questions=questions, thumbnails=photos)
+    return packed._replace(header=packed.header | {"start": _start(exploration)})
+
+
+def _start(exploration: Exploration) -> dict[str, Any]:
+    """What the page shows first."""
+    asked, show = exploration.asked, exploration.show
+    return {
+        "show": "color" if show == "rgb" else show,
+        "hidden": sorted(exploration.hidden),
+        "words": None if asked is None else asked.words,
+        "gamma": exploration.gamma,
+    }
+
+
+def _photo(scene: Scene, camera: Camera) -> Array | None:  # [h, w, 3] uint8
+    """A small photo of a camera; None if the scene has no camera of this name."""
+    found = [index for index, own in enumerate(scene.cameras) if own.name == camera.name]
+    if not found:
+        return None
+    picture = Image.fromarray(as_bytes(scene.image(found[0])))
+    picture.thumbnail((PHOTO, PHOTO))
+    return np.asarray(picture)
 
 
 def _json(value: object) -> str:

@@ -5,50 +5,47 @@ from __future__ import annotations
 import contextlib
 import sys
 import webbrowser
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from threading import Event
+from typing import TYPE_CHECKING
 
 from ..headless import has_display
-from .carried import Array
-from .html import PYTHON_START, document
-from .pack import pack_scene
+from .html import PYTHON_START, document, pack_view
 from .page_server import PageServer, Served, pack_message
 from .session import Session
 from .state import Exploration
+
+if TYPE_CHECKING:
+    from ...scenes import Scene
 
 
 def open_page(
     exploration: Exploration,
     *,
     title: str = "kfgs",
+    scene: Scene | None = None,
     out: str | Path = "kfgs_view",
-    thumbnails: Iterable[Array | None] = (),  # [h, w, 3] uint8, one for each camera
-    ask: str | None = None,
-    mode: str | None = None,
     host: str = "127.0.0.1",
     port: int = 0,
 ) -> PageServer:
     """Serve the viewer of an exploration from a thread; `url` of the result is its link, `close()` ends it.
 
     Args:
-        exploration: its lambda is the first one in the page.
+        exploration: the page opens with its question, gamma, lambda and hidden classes.
         title: title of the page.
+        scene: as in `save_html`.
         out: folder for files that are saved from the page.
-        thumbnails: pictures of the exploration's cameras, in their order; None leaves one out.
-        ask: a first question.
-        mode: what the colours mean at the start: `color`, `labels`, `score` or `latents`.
         host: as in `PageServer`.
         port: as in `PageServer`.
 
     Raises:
         ValueError: if the address is not one of this machine, or the port is taken.
     """
-    packed = pack_scene(exploration, title=title, thumbnails=thumbnails)
-    about = {"header": packed.header, "phrases": exploration.meaning.phrases, "ask": ask, "mode": mode}
+    packed = pack_view(exploration, title=title, scene=scene)
     files = {
         "": Served("text/html; charset=utf-8", document(title, PYTHON_START).encode()),
-        "pack": Served("application/octet-stream", pack_message(about, packed.data)),
+        "pack": Served("application/octet-stream", pack_message(packed.header, packed.data)),
     }
     return PageServer(files, Session(exploration, out).call, host, port)
 

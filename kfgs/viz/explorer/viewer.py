@@ -2,31 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from .carried import Array
 from .html import save_html
 from .options import ExploreOptions
 from .serving import open_page, serve_page
-from .state import Exploration, Show
+from .state import Exploration
 from .widget import make_widget
 
-MODES: dict[Show, str] = {"labels": "labels", "rgb": "color", "score": "score", "latents": "latents"}
+if TYPE_CHECKING:
+    from ...scenes import Scene
 
 
 class Viewer:
     """The WebGL viewer of an exploration. As the last value of a notebook's cell it is a widget.
 
-    The browser draws, and keeps what a person changes; Python answers texts and writes files. So the viewer and `state` go
-    separate ways after the start, except that `ask` in Python also asks in an open widget.
+    The browser draws, and keeps what a person changes; Python answers texts and writes files. It opens with the state's question,
+    gamma, lambda, colours and hidden classes. Then both go separate ways, except that `ask` in Python also asks in an open
+    widget.
 
     Args:
-        exploration: its lambda is the first one.
+        exploration: the state.
         options: height of the widget, folder for files.
         title: shown above the scene.
-        pictures: of the exploration's cameras, [h, w, 3] uint8, in their order; None leaves one out.
+        scene: has the photos of the exploration's cameras, found by name; None: without photos.
     """
 
     def __init__(
@@ -35,10 +36,9 @@ class Viewer:
         options: ExploreOptions = ExploreOptions(),  # noqa: B008  frozen
         *,
         title: str = "kfgs",
-        pictures: Sequence[Array | None] = (),
+        scene: Scene | None = None,
     ) -> None:
-        self.state, self.options, self.title, self.pictures = exploration, options, title, pictures
-        self._question: str | None = None
+        self.state, self.options, self.title, self.scene = exploration, options, title, scene
         self._widget: Any = None
 
     def ask(self, words: str | None) -> None:
@@ -48,7 +48,6 @@ class Viewer:
             ValueError: if there is no answer to these words.
         """
         self.state.ask(words)
-        self._question = words
         if self._widget is not None:
             self._widget.question = words or ""
 
@@ -62,39 +61,28 @@ class Viewer:
         if self._widget is None:
             options = self.options
             self._widget = make_widget(
-                self.state, title=self.title, out=options.out, thumbnails=self.pictures, ask=self._question,
-                height=options.height,
-            )  # fmt: skip
+                self.state, title=self.title, scene=self.scene, out=options.out, height=options.height
+            )
         return self._widget
 
-    def serve(
-        self,
-        host: str = "127.0.0.1",
-        port: int = 0,
-        *,
-        show: Show | None = None,
-        report: Callable[[str], object] | None = None,
-    ) -> None:
+    def serve(self, host: str = "127.0.0.1", port: int = 0, *, report: Callable[[str], object] | None = None) -> None:
         """Serve the page until Ctrl-C; see `serve_page`.
 
         Args:
             host: address to listen on. With one that other machines can reach, everyone who has the link can look and save.
             port: 0: a free one.
-            show: meaning of the colours at the start.
             report: called with the link and hints, line by line; None: standard error.
 
         Raises:
             ValueError: if the address is not one of this machine, or the port is taken.
         """
-        page = open_page(
-            self.state, title=self.title, out=self.options.out, thumbnails=self.pictures, ask=self._question,
-            mode=None if show is None else MODES[show], host=host, port=port,
-        )  # fmt: skip
-        serve_page(page, out=self.options.out, report=report)
+        out = self.options.out
+        page = open_page(self.state, title=self.title, scene=self.scene, out=out, host=host, port=port)
+        serve_page(page, out=out, report=report)
 
     def save_html(self, path: str | Path) -> Path:
         """Write one file that works offline, from a double click; see `kfgs.viz.explorer.save_html`."""
-        return save_html(self.state, path, title=self.title, thumbnails=self.pictures)
+        return save_html(self.state, path, title=self.title, scene=self.scene)
 
     def close(self) -> None:
         """Close the widget, if there is one."""

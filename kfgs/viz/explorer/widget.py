@@ -6,7 +6,6 @@ import base64
 import html
 import io
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,12 +13,14 @@ from PIL import Image
 
 from ..web import APP, inline_script, read_text
 from .carried import Array
-from .pack import pack_scene
+from .html import pack_view
 from .session import Session
 from .state import Exploration
 
 if TYPE_CHECKING:
     from anywidget import AnyWidget
+
+    from ...scenes import Scene
 
 HEIGHT = 640  # CSS pixels
 START = """
@@ -33,9 +34,7 @@ export default {
     const packed = { header: model.get("header"), data: await kfgs.inflate(bytes) };
     const link = new kfgs.PythonLink(kfgs.callWidget(model), model.get("phrases"));
     const app = await kfgs.mount(root, packed, link);
-    const follow = async () => { try { await app.ask(model.get("question")); } catch (error) { console.error(error); } };
-    model.on("change:question", follow);
-    if (model.get("question")) await follow();
+    model.on("change:question", () => app.ask(model.get("question")));
     return () => app.dispose();
   },
 };
@@ -63,20 +62,18 @@ def make_widget(
     exploration: Exploration,
     *,
     title: str = "kfgs",
+    scene: Scene | None = None,
     out: str | Path = "kfgs_view",
-    thumbnails: Iterable[Array | None] = (),  # [h, w, 3] uint8, one for each camera
-    ask: str | None = None,
     height: int = HEIGHT,
     still: Array | None = None,  # [h, w, 3] uint8
 ) -> AnyWidget:
     """The viewer of an exploration as a widget for Jupyter, VS Code and Colab; display it as a cell's last value.
 
     Args:
-        exploration: its lambda is the first one in the widget.
+        exploration: the widget opens with its question, gamma, lambda and hidden classes; set `widget.question` to ask another.
         title: shown in the widget.
+        scene: as in `save_html`.
         out: folder for files that are saved from the widget, on the kernel's machine.
-        thumbnails: pictures of the exploration's cameras, in their order; None leaves one out.
-        ask: a first question; set `widget.question` to ask another.
         height: CSS pixels.
         still: a picture shown where widgets cannot run, on a page of GitHub for instance.
 
@@ -88,7 +85,7 @@ def make_widget(
     import traitlets
 
     session = Session(exploration, out)
-    packed = pack_scene(exploration, title=title, thumbnails=thumbnails)
+    packed = pack_view(exploration, title=title, scene=scene)
 
     class Viewer(anywidget.AnyWidget):  # type: ignore[misc]
         """The viewer; see `make_widget`."""
@@ -112,7 +109,7 @@ def make_widget(
         header=packed.header,
         data=packed.compressed(),
         phrases=exploration.meaning.phrases,
-        question=ask or "",
+        question="" if exploration.asked is None else exploration.asked.words,
         height=height,
     )
 

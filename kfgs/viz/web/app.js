@@ -76,11 +76,22 @@ class App {
     this.firstView();
     this.model.addEventListener("change", () => this.refresh());
     this.watch();
-    this.refreshPanes();
+    await this.begin();
     await this.settled();
     this.root.removeAttribute("aria-busy");
     this.loading.remove();
     this.stage.focus({ preventScroll: true });
+  }
+
+  /** Show what Python showed: mode, hidden classes, question, gamma. */
+  async begin() {
+    const { show, hidden = [], words, gamma } = this.header.start ?? {};
+    if (show in this.modes) this.panes[0].mode = show;
+    this.model.setHidden(hidden);
+    if (words) await this.ask(words);
+    if (words) this.model.setGamma(gamma);
+    this.model.past = [];
+    this.refreshPanes();
   }
 
   // the elements
@@ -482,7 +493,8 @@ class App {
     for (const label of model.hidden) hidden[label < 0 ? model.names.length : label] = 1;
     renderer.setLook({
       mode: pane.mode, question: answer ? this.question(answer) : null, gamma: model.gamma ?? 0, lambda: model.lambda,
-      low, high, hidden, dim: model.selecting, mixing: 1,
+      low, high, hidden, mixing: 1,
+      dim: model.selecting && pane.mode !== "score", // the colours of the rest say where gamma should be
     });
   }
 

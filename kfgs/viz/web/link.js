@@ -8,7 +8,7 @@ const NEEDS_PYTHON = "Searching for any words needs Python: open the scene with 
 export class OfflineLink {
   constructor(packed) {
     this.packed = packed;
-    this.names = packed.header.classes.map((one) => one.name);
+    this.names = Object.keys(packed.header.query); // the classes, and phrases that were asked before the file was written
     this.phrases = false; // whether it answers any words
   }
 

@@ -110,12 +110,8 @@ export class Model extends EventTarget {
 
   /** Scores of the question, or of the labels without a question; NaN where unknown. */
   scores(side) {
-    const own = this.answer ? this.answer.scores : this.labelScores();
+    const own = this.answer ? this.answer.scores : this.ownScores;
     return side === "semantic" ? own : this.carry(own, NaN, Float32Array);
-  }
-
-  labelScores() {
-    return this.cached("label scores", () => this.ownScores.map((score, i) => (this.own[i] < 0 ? NaN : score)));
   }
 
   /** What the question selects on a side, hidden, removed or not; the comparison is Python's, in float32. */
@@ -277,14 +273,15 @@ export class Model extends EventTarget {
     this.changed();
   }
 
-  /** What is known about the picked Gaussian; null without one. `distance` is that to the nearest labelled one. */
+  /** What is known about the picked Gaussian; null if there is none, or it is hidden or removed. `distance` is that to the nearest labelled one. */
   describe() {
     if (!this.picked) return null;
     const { side, index } = this.picked;
     const label = this.labels(side)[index];
+    if (this.hidden.has(label) || this.now.removed[side]?.[index]) return null;
     const source = side === "color" ? this.source[index] : index;
     const reached = side === "semantic" || this.far[index] < this.lambda;
-    const own = this.answer ? this.answer.scores : this.labelScores();
+    const own = this.answer ? this.answer.scores : this.ownScores;
     const score = reached && source >= 0 ? own[source] : NaN;
     const distance = side === "color" && source >= 0 ? this.far[index] : null;
     return { side, index, label, name: this.names[label] ?? "no class", score, source, distance, reached };
