@@ -12,6 +12,7 @@ import { Tools } from "./tools.js";
 const MODES = { color: "Colour", labels: "Classes", score: "Score", latents: "Latents" };
 const TOOLS = { move: ["Move the view", "1"], box: ["Box selection", "2"], lasso: ["Lasso selection", "3"], brush: ["Brush selection", "4"] };
 const BACKGROUND = { light: [0.957, 0.961, 0.969], dark: [0.094, 0.102, 0.118] };
+const MIXING = 0.7; // of the class colour over the Gaussian's own
 const REST = 160; // milliseconds without a move, after which the picture is drawn in full
 const GLIDE = 350; // milliseconds of a move to another view
 const BRUSH = [6, 24, 120]; // pixels: smallest, first, largest radius
@@ -157,10 +158,10 @@ class App {
       if (sides.length < 2) return null;
       return select("Cloud", sides.map((side) => [side, cloudName(side)]), pane.side, (side) => ((pane.side = side), this.refreshPanes()));
     });
-    const handle = h("input", { type: "range", class: "divider", min: 0, max: 1, step: 0.005, value: this.slider, "aria-label": "Border between the two pictures", oninput: (event) => this.setSlider(Number(event.target.value)) });
+    this.divider = h("input", { type: "range", class: "divider", min: 0, max: 1, step: 0.005, value: this.slider, "aria-label": "Border between the two pictures", oninput: (event) => this.setSlider(Number(event.target.value)) });
     this.line = h("span", { class: "line", hidden: this.layout === "one" });
     this.captions.className = `captions ${this.layout}`;
-    this.captions.replaceChildren(...captions.filter(Boolean), this.line, ...(this.layout === "slider" ? [handle] : []));
+    this.captions.replaceChildren(...captions.filter(Boolean), this.line, ...(this.layout === "slider" ? [this.divider] : []));
     this.line.style.left = `${100 * (this.layout === "slider" ? this.slider : 0.5)}%`;
   }
 
@@ -241,7 +242,7 @@ class App {
   }
 
   setSlider(place) {
-    this.slider = place;
+    this.slider = this.divider.value = place;
     this.line.style.left = `${100 * place}%`;
     this.camera = null; // the renderer forgets the old borders
     this.redraw();
@@ -493,7 +494,7 @@ class App {
     for (const label of model.hidden) hidden[label < 0 ? model.names.length : label] = 1;
     renderer.setLook({
       mode: pane.mode, question: answer ? this.question(answer) : null, gamma: model.gamma ?? 0, lambda: model.lambda,
-      low, high, hidden, mixing: 1,
+      low, high, hidden, mixing: pane.mode === "labels" ? MIXING : 1,
       dim: model.selecting && pane.mode !== "score", // the colours of the rest say where gamma should be
     });
   }
