@@ -14,9 +14,10 @@ const LEVELS = [
   {scale: 1, least: 1 / 255, enough: 0.9999, share: 1},
   {scale: 0.7, least: 1 / 100, enough: 0.98, share: 1},
   {scale: 0.5, least: 1 / 64, enough: 0.97, share: 1},
-  {scale: 0.4, least: 1 / 40, enough: 0.95, share: 1},
+  {scale: 0.4, least: 1 / 40, enough: 0.95, share: 0.6},
+  {scale: 0.4, least: 1 / 40, enough: 0.95, share: 0.3},
 ];
-const SLOW = 90; // ms for a moving frame: then the next ones are smaller
+const SLOW = 120; // ms for a moving frame: then the next ones are smaller
 const PIECES = 8; // parts of the order, between which covered pixels are found
 const MARGIN = 1.1; // of the picture whose Gaussians are sorted, so that a turn shows no empty border
 const LOOK = {
@@ -161,7 +162,7 @@ export class Renderer {
     fill(this.gl, textures.splats, this.gl.RGBA32UI, cloud.splats);
     const moved = {indices: Uint32Array.from(indices), means: Float32Array.from(means)};
     this.sorter.send({kind: "move", side: cloud.side, ...moved});
-    this.#current().asked = null;
+    this.#current().asked = null; // sort again
   }
 
   /** The centres of a side's Gaussians, [N * 3]; not to be changed. */
@@ -180,14 +181,16 @@ export class Renderer {
     const clip = view.clip ?? view;
     this.views.set(`${clip.x},${clip.y},${clip.width},${clip.height}`, view);
     const state = this.#current();
-    this.#ask(state);
+    this.#ask(state, view.moving ? LEVELS[this.level].share : 1);
     this.#render(state, view);
     this.#time(view.moving);
   }
 
   /** Wait until frames with an up-to-date order have been drawn. */
   async settled() {
+    this.redraw();
     const stale = () => [...this.views.values()].some(({side}) => this.sides[side].fresh !== this.sides[side].asked);
+    if (!stale()) return;
     while (stale()) await new Promise((resolve) => this.waiting.push(resolve));
     this.redraw();
   }
@@ -270,7 +273,7 @@ export class Renderer {
     };
     const prepared = frame(gl, [shape, paint]);
     this.sides[cloud.side] = {
-      cloud, textures, rows, planes, shape, paint, prepared, length: 0, asked: null, fresh: undefined, busy: false,
+      cloud, textures, rows, planes, shape, paint, prepared, length: 0, asked: null, fresh: null, busy: false,
     };
     this.sorter.send({kind: "load", side: cloud.side, means: cloud.means, radii: cloud.radii()});
     this.side = cloud.side;
@@ -298,15 +301,14 @@ export class Renderer {
   }
 
   /** Ask for an order that fits the camera, unless the last request was for it; one request at a time. */
-  #ask(state) {
-    const {camera} = this;
-    if (state.asked === camera) return;
-    state.asked = camera;
+  #ask(state, share) {
+    if (state.asked?.camera === this.camera && state.asked.share === share) return;
+    state.asked = {camera: this.camera, share};
     if (!state.busy) this.#send(state);
   }
 
   #send(state) {
-    const camera = state.asked;
+    const {camera, share} = state.asked;
     const {fx, fy, cx, cy, width, height, near, viewmat} = camera;
     const grow = (low, high) => {
       const [middle, half] = [(low + high) / 2, (MARGIN * (high - low)) / 2];
@@ -314,8 +316,8 @@ export class Renderer {
     };
     const limits = [...grow(-cx / fx, (width - cx) / fx), ...grow(-cy / fy, (height - cy) / fy), 2 / Math.min(fx, fy)];
     state.busy = true;
-    state.sent = camera;
-    this.sorter.send({kind: "sort", side: state.cloud.side, id: 0, view: viewmat, limits, near});
+    state.sent = state.asked;
+    this.sorter.send({kind: "sort", side: state.cloud.side, share, view: viewmat, limits, near});
   }
 
   #sorted({side, order, ms}) {
@@ -326,7 +328,7 @@ export class Renderer {
     state.fresh = state.sent;
     fill(this.gl, state.textures.order, this.gl.R32UI, order);
     this.stats.sortMs = ms;
-    if (state.asked !== state.fresh) this.#send(state);
+    if (state.asked && state.asked !== state.fresh) this.#send(state);
     this.waiting.splice(0).forEach((resolve) => resolve());
     this.onorder?.(side);
   }
@@ -402,6 +404,7 @@ export class Renderer {
     gl.uniform1f(at.gamma, look.gamma);
     gl.uniform1f(at.mixing, look.mixing);
     gl.uniform1f(at.near, camera.near);
+    gl.uniform1f(at.share, state.fresh?.share ?? 1);
     const bits = new Uint32Array(new Float64Array([look.lambda]).buffer);
     gl.uniform2ui(at.lambda, bits[1], bits[0]);
     gl.uniformMatrix4fv(at.view, true, m);
@@ -491,10 +494,10 @@ export class Renderer {
       this.timing = false;
       this.stats.frameMs = performance.now() - start;
       if (!moving) {
-        if (this.level === 0 && this.stats.frameMs > 2 * SLOW) this.level = 2;
+        if (this.level === 0 && this.stats.frameMs > 2 * SLOW) this.level = this.stats.frameMs > 4 * SLOW ? 3 : 2;
       } else if (this.stats.frameMs > SLOW) {
         this.level = Math.min(this.level + 1, LEVELS.length - 1);
-      } else if (this.stats.frameMs < SLOW / 4) {
+      } else if (this.stats.frameMs < 0.45 * SLOW) {
         this.level = Math.max(this.level - 1, 0);
       }
     };

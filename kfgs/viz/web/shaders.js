@@ -31,7 +31,7 @@ uniform int count, rows, degree, mode;          // count: in view; mode: 0 color
 uniform bool carried, asked, masked, dim;       // carried: labels come from the source; masked: selection is a mask
 uniform vec3 center, spread;                    // of the box of the means
 uniform vec2 scaling, dcScale, scoreRange;      // lowest log and step
-uniform float shStep, gamma, mixing, near;
+uniform float shStep, gamma, mixing, near, share;   // share: of the Gaussians that are drawn
 uniform uvec2 lambda;                           // the bits of a float64: high, low
 uniform mat4 view;
 uniform vec4 pinhole;                           // fx, fy, cx, cy in pixels of the target
@@ -170,6 +170,11 @@ void main() {
   axis = dot(axis, axis) > 1e-20 ? normalize(axis) : vec2(1.0, 0.0);
   vec2 xy = focal * p.xy / p.z + pinhole.zw;
   if (!(large < 1e8)) return;
+  if (share < 1.0) {                            // the others are left out: larger and denser ones fill their places
+    large *= inversesqrt(share);
+    small *= inversesqrt(share);
+    opacity = 1.0 - pow(1.0 - opacity, inversesqrt(share));
+  }
   shape = uvec4(floatBitsToUint(xy), packHalf2x16(axis * sqrt(large)), packHalf2x16(vec2(-axis.y, axis.x) * sqrt(small)));
   paint = uvec4(packHalf2x16(color.rg), packHalf2x16(vec2(color.b, opacity)), chosen ? 1u : 0u, 0u);
 }`;
