@@ -72,7 +72,7 @@ class App {
     this.renderer.load(this.packed);
     this.renderer.onorder = () => this.redraw();
     for (const side of this.model.sides) this.model.positions[side] = this.renderer.means(side);
-    this.eye = new Eye(this.header, this.renderer.means(this.model.side));
+    this.eye = new Eye(this.header, this.model.extent(this.model.side));
     this.tools = new Tools(this.stage, this.eye, this);
     this.firstView();
     this.model.addEventListener("change", () => this.refresh());
