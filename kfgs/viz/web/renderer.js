@@ -63,6 +63,7 @@ export class Renderer {
     this.target = null;
     this.views = new Map(); // what was drawn since the camera was set
     this.level = 0;
+    this.loads = 0;
     this.waiting = [];
     this.sorter = startSorter((answer) => this.#sorted(answer));
     this.onlost = (event) => {
@@ -75,6 +76,7 @@ export class Renderer {
   /** Load a pack: {header, data: ArrayBuffer}. What was loaded before is dropped. */
   load(packed) {
     this.#forget();
+    this.loads++;
     const {gl} = this;
     const {header} = packed;
     this.names = header.classes;
@@ -317,12 +319,12 @@ export class Renderer {
     const limits = [...grow(-cx / fx, (width - cx) / fx), ...grow(-cy / fy, (height - cy) / fy), 2 / Math.min(fx, fy)];
     state.busy = true;
     state.sent = state.asked;
-    this.sorter.send({kind: "sort", side: state.cloud.side, share, view: viewmat, limits, near});
+    this.sorter.send({kind: "sort", side: state.cloud.side, load: this.loads, share, view: viewmat, limits, near});
   }
 
-  #sorted({side, order, ms}) {
+  #sorted({side, load, order, ms}) {
     const state = this.sides[side];
-    if (!state) return;
+    if (!state || load !== this.loads) return; // of what was loaded before
     state.busy = false;
     state.length = order.length;
     state.fresh = state.sent;
@@ -339,7 +341,7 @@ export class Renderer {
     const {scale} = level;
     const width = Math.max(1, Math.round(view.width * scale));
     const height = Math.max(1, Math.round(view.height * scale));
-    const chosen = look.question !== null || Boolean(state.cloud.selected);
+    const chosen = Boolean(look.outline) && (look.question !== null || Boolean(state.cloud.selected));
     this.#fitTarget(width, height, chosen);
     this.#prepare(state, width, height);
     const {target} = this;
@@ -363,7 +365,7 @@ export class Renderer {
     bind(gl, finish, {picture: target.picture, outline: target.outline});
     gl.uniform4f(finish.at.viewport, view.x, bottom, view.width, view.height);
     gl.uniform3fv(finish.at.paper, this.background);
-    gl.uniform3fv(finish.at.rim, look.outline);
+    gl.uniform3fv(finish.at.rim, look.outline ?? [0, 0, 0]);
     gl.uniform1f(finish.at.width, chosen ? 1.5 : 0);
     gl.bindVertexArray(this.empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);

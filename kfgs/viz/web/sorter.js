@@ -6,8 +6,8 @@
  */
 
 /**
- * Answer messages. "load" gives {side, means, radii}; "move" {side, indices, means}; "sort" {side, share, view, limits, near}
- * is answered by {side, order, ms}; with a share below 1 always the same Gaussians are left out, chosen at random.
+ * Answer messages. "load" gives {side, means, radii}; "move" {side, indices, means}; "sort" {side, load, share, view, limits,
+ * near} is answered by {side, load, order, ms}; with a share below 1 always the same Gaussians are left out, chosen at random.
  * @param {{onmessage: ?function, postMessage: function}} scope the worker, or an object like it
  */
 export function sorterMain(scope) {
@@ -73,11 +73,11 @@ export function sorterMain(scope) {
     move({side, indices, means}) {
       for (let k = 0; k < indices.length; k++) clouds[side].means.set(means.subarray(3 * k, 3 * k + 3), 3 * indices[k]);
     },
-    sort({side, share, view, limits, near}) {
+    sort({side, load, share, view, limits, near}) {
       const start = performance.now();
       const cloud = clouds[side];
       const order = sort(cloud, look(cloud, share, view, limits, near));
-      scope.postMessage({side, order, ms: performance.now() - start}, [order.buffer]);
+      scope.postMessage({side, load, order, ms: performance.now() - start}, [order.buffer]);
     },
   };
   scope.onmessage = ({data}) => answers[data.kind](data);
@@ -85,7 +85,7 @@ export function sorterMain(scope) {
 
 /**
  * Start the sorter in a worker; where the browser forbids that, in this thread.
- * @param {function} answer called with each {side, order, ms}
+ * @param {function} answer called with each {side, load, order, ms}
  * @returns {{send: function(object, Array=): void, close: function(): void}}
  */
 export function startSorter(answer) {
