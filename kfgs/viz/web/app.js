@@ -400,10 +400,15 @@ class App {
     this.moves();
   }
 
-  /** The camera moves: frames may be coarse until it rests. */
+  /** The camera moves. */
   moves() {
-    this.moving = true;
     this.camera = null;
+    this.hurry();
+  }
+
+  /** Draw soon, if need be coarsely, and in full when nothing changes any more. */
+  hurry() {
+    this.moving = true;
     clearTimeout(this.resting);
     this.resting = setTimeout(() => ((this.moving = false), this.redraw()), REST);
     this.redraw();
@@ -415,12 +420,17 @@ class App {
     const sizes = new ResizeObserver(() => this.resize());
     sizes.observe(this.stage);
     this.resize();
-    this.root.addEventListener("keydown", (event) => this.key(event));
-    this.root.addEventListener("keyup", (event) => this.tools.release(event));
-    this.root.addEventListener("focusout", () => this.tools.releaseAll());
+    const until = new AbortController();
+    const listen = (target, name, act) => target.addEventListener(name, act, { signal: until.signal });
+    const alone = this.root.parentElement === document.body; // a page of its own: keys work wherever the focus is
+    listen(alone ? document : this.root, "keydown", (event) => this.key(event));
+    listen(alone ? document : this.root, "keyup", (event) => this.tools.release(event));
+    listen(window, "blur", () => this.tools.releaseAll());
     this.started = true;
     this.dispose = () => {
+      until.abort();
       sizes.disconnect();
+      clearTimeout(this.resting);
       this.urls?.forEach((url) => URL.revokeObjectURL(url));
       this.renderer.dispose();
       this.root.replaceChildren();
@@ -556,13 +566,13 @@ class App {
     this.said.replaceChildren(...model.sentences().map((line) => h("p", {}, line)));
     this.undoButton.disabled = !model.past.length;
     this.redoButton.disabled = !model.future.length;
-    this.redraw();
+    this.hurry();
   }
 
   // keys
 
   key(event) {
-    if (event.target.matches("input[type=text], input[type=search], select, dialog *")) return;
+    if (this.help.open || event.target.matches("input[type=text], input[type=search], select")) return;
     const { model } = this;
     if (event.ctrlKey || event.metaKey) {
       const keys = { z: () => (event.shiftKey ? model.redo() : model.undo()), y: () => model.redo(), i: () => model.invert() };

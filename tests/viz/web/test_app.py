@@ -12,6 +12,7 @@ import pytest
 from cases_browser import CHROMIUM, SECONDS, has_playwright
 from PIL import Image
 
+from kfgs.viz import available
 from kfgs.viz.explorer import Exploration, FieldMeaning, save_html
 
 pytestmark = [
@@ -337,6 +338,18 @@ def test_every_control_has_a_name(page):
           .map((one) => one.outerHTML)"""
     )
     assert nameless == []
+
+
+def test_an_explorer_writes_what_it_shows(browser, tmp_path):
+    if not available():
+        pytest.skip("needs a driver that draws")
+    with cases_page.explorer(tmp_path) as opened:
+        opened.ask("table")
+        path = opened.save_html(tmp_path / "made" / "page.html", title="Heaps")
+    for page in show(browser, path):
+        agree(page, opened.state)
+        assert page.title() == "Heaps"
+        assert page.locator("#query").input_value() == "table"
 
 
 def test_other_names_are_refused(state, tmp_path):
