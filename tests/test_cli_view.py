@@ -110,6 +110,20 @@ def test_clouds_in_different_frames_are_noted(files, tmp_path, capsys):
     assert "another frame? `kfgs attach` checks and aligns" in said
 
 
+def test_a_file_to_share_needs_no_driver(room, files, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(headless, "probe", lambda: headless.Probe(False, "the trial picture crashed"))
+    words = ["--scene", room, "--text", files / "text.safetensors", *LETTERS]
+    arguments = [files / "field", *words, "--color", files / "color.ply", "--ask", "zebra crossing", "--where", "html"]
+    assert main(["view", *map(str, arguments), "--out", str(tmp_path / "out")]) == 0
+    assert "view.html" in capsys.readouterr().out
+    page = (tmp_path / "out" / "view.html").read_text()
+    header = json.loads(page.split('id="header">')[1].split("</script>")[0])
+    assert list(header["query"]) == [*json.loads((room / "classes.json").read_text()), "zebra crossing"]
+    assert header["start"]["words"] == "zebra crossing"
+    assert header["title"] == "field"
+    assert header["cameras"][0]["thumbnail"] == "thumbnails/0"
+
+
 def test_no_driver_is_told_before_anything_is_read(files, monkeypatch, capsys):
     monkeypatch.setattr(headless, "probe", lambda: headless.Probe(False, "the trial picture crashed"))
     assert main(["view", str(files / "field"), "--where", "picture"]) == 1

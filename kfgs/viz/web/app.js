@@ -12,6 +12,7 @@ import { Tools } from "./tools.js";
 const MODES = { color: "Colour", labels: "Classes", score: "Score", latents: "Latents" };
 const TOOLS = { move: ["Move the view", "1"], box: ["Box selection", "2"], lasso: ["Lasso selection", "3"], brush: ["Brush selection", "4"] };
 const BACKGROUND = { light: [0.957, 0.961, 0.969], dark: [0.094, 0.102, 0.118] };
+const MIXING = 0.7; // of the class colour over the Gaussian's own
 const REST = 160; // milliseconds without a move, after which the picture is drawn in full
 const GLIDE = 350; // milliseconds of a move to another view
 const BRUSH = [6, 24, 120]; // pixels: smallest, first, largest radius
@@ -71,7 +72,7 @@ class App {
     this.renderer.load(this.packed);
     this.renderer.onorder = () => this.redraw();
     for (const side of this.model.sides) this.model.positions[side] = this.renderer.means(side);
-    this.eye = new Eye(this.header, this.renderer.means(this.model.side));
+    this.eye = new Eye(this.header, this.model.extent(this.model.side));
     this.tools = new Tools(this.stage, this.eye, this);
     this.firstView();
     this.model.addEventListener("change", () => this.refresh());
@@ -157,10 +158,10 @@ class App {
       if (sides.length < 2) return null;
       return select("Cloud", sides.map((side) => [side, cloudName(side)]), pane.side, (side) => ((pane.side = side), this.refreshPanes()));
     });
-    const handle = h("input", { type: "range", class: "divider", min: 0, max: 1, step: 0.005, value: this.slider, "aria-label": "Border between the two pictures", oninput: (event) => this.setSlider(Number(event.target.value)) });
+    this.divider = h("input", { type: "range", class: "divider", min: 0, max: 1, step: 0.005, value: this.slider, "aria-label": "Border between the two pictures", oninput: (event) => this.setSlider(Number(event.target.value)) });
     this.line = h("span", { class: "line", hidden: this.layout === "one" });
     this.captions.className = `captions ${this.layout}`;
-    this.captions.replaceChildren(...captions.filter(Boolean), this.line, ...(this.layout === "slider" ? [handle] : []));
+    this.captions.replaceChildren(...captions.filter(Boolean), this.line, ...(this.layout === "slider" ? [this.divider] : []));
     this.line.style.left = `${100 * (this.layout === "slider" ? this.slider : 0.5)}%`;
   }
 
@@ -241,7 +242,7 @@ class App {
   }
 
   setSlider(place) {
-    this.slider = place;
+    this.slider = this.divider.value = place;
     this.line.style.left = `${100 * place}%`;
     this.camera = null; // the renderer forgets the old borders
     this.redraw();
@@ -399,10 +400,15 @@ class App {
     this.moves();
   }
 
-  /** The camera moves: frames may be coarse until it rests. */
+  /** The camera moves. */
   moves() {
-    this.moving = true;
     this.camera = null;
+    this.hurry();
+  }
+
+  /** Draw soon, if need be coarsely, and in full when nothing changes any more. */
+  hurry() {
+    this.moving = true;
     clearTimeout(this.resting);
     this.resting = setTimeout(() => ((this.moving = false), this.redraw()), REST);
     this.redraw();
@@ -414,12 +420,17 @@ class App {
     const sizes = new ResizeObserver(() => this.resize());
     sizes.observe(this.stage);
     this.resize();
-    this.root.addEventListener("keydown", (event) => this.key(event));
-    this.root.addEventListener("keyup", (event) => this.tools.release(event));
-    this.root.addEventListener("focusout", () => this.tools.releaseAll());
+    const until = new AbortController();
+    const listen = (target, name, act) => target.addEventListener(name, act, { signal: until.signal });
+    const alone = this.root.parentElement === document.body; // a page of its own: keys work wherever the focus is
+    listen(alone ? document : this.root, "keydown", (event) => this.key(event));
+    listen(alone ? document : this.root, "keyup", (event) => this.tools.release(event));
+    listen(window, "blur", () => this.tools.releaseAll());
     this.started = true;
     this.dispose = () => {
+      until.abort();
       sizes.disconnect();
+      clearTimeout(this.resting);
       this.urls?.forEach((url) => URL.revokeObjectURL(url));
       this.renderer.dispose();
       this.root.replaceChildren();
@@ -493,7 +504,7 @@ class App {
     for (const label of model.hidden) hidden[label < 0 ? model.names.length : label] = 1;
     renderer.setLook({
       mode: pane.mode, question: answer ? this.question(answer) : null, gamma: model.gamma ?? 0, lambda: model.lambda,
-      low, high, hidden, mixing: 1,
+      low, high, hidden, mixing: pane.mode === "labels" ? MIXING : 1,
       dim: model.selecting && pane.mode !== "score", // the colours of the rest say where gamma should be
     });
   }
@@ -555,13 +566,13 @@ class App {
     this.said.replaceChildren(...model.sentences().map((line) => h("p", {}, line)));
     this.undoButton.disabled = !model.past.length;
     this.redoButton.disabled = !model.future.length;
-    this.redraw();
+    this.hurry();
   }
 
   // keys
 
   key(event) {
-    if (event.target.matches("input[type=text], input[type=search], select, dialog *")) return;
+    if (this.help.open || event.target.matches("input[type=text], input[type=search], select")) return;
     const { model } = this;
     if (event.ctrlKey || event.metaKey) {
       const keys = { z: () => (event.shiftKey ? model.redo() : model.undo()), y: () => model.redo(), i: () => model.invert() };

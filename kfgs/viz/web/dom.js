@@ -49,7 +49,7 @@ export function iconButton(name, label, onclick, { key = "", ...props } = {}) {
 
 export const textButton = (text, onclick, props = {}) => h("button", { type: "button", onclick, ...props }, text);
 
-/** Buttons of which one is pressed. `choices`: [value, text, tooltip]. Returns {element, set(value), enable(value, on)}. */
+/** Buttons of which one is pressed. `choices`: [value, text, tooltip]. Returns {element, set(value)}. */
 export function choice(label, choices, onpick) {
   const buttons = new Map();
   for (const [value, text, title = ""] of choices)
@@ -57,7 +57,6 @@ export function choice(label, choices, onpick) {
   return {
     element: h("div", { class: "choice", role: "group", "aria-label": label }, ...buttons.values()),
     set: (value) => buttons.forEach((made, own) => made.setAttribute("aria-pressed", String(own === value))),
-    enable: (value, on) => void (buttons.get(value) && (buttons.get(value).disabled = !on)),
   };
 }
 

@@ -1,6 +1,6 @@
 /** The camera that a person moves: a view (camera.js) with its lens and its upward direction. */
 
-import { ballOf, between, cameraOf, fit, fly, letterboxed, lookAround, lookAt, orbit, pan, pivot, viewOf, viewmatOf, zoom } from "./camera.js";
+import { between, cameraOf, fit, fly, letterboxed, lookAround, lookAt, orbit, pan, pivot, viewOf, viewmatOf, zoom } from "./camera.js";
 
 const FOV = 0.9; // radians, if the scene has no cameras
 const TURN = 0.006; // radians for a pixel
@@ -9,18 +9,18 @@ const FLY = 0.4; // of the scene's radius for a second
 export class Eye {
   /**
    * @param {{up: number[], cameras: object[]}} header of the pack
-   * @param {Float32Array} means positions of the scene
+   * @param {{center: number[], radius: number}} ball where the scene is
    */
-  constructor({ up, cameras }, means) {
+  constructor({ up, cameras }, ball) {
     this.up = up;
-    this.ball = ballOf(means);
+    this.ball = ball;
     this.lens = cameras[0] ?? null;
     this.focal = 1; // CSS pixels, of the last picture
     this.loose = true; // whether the pivot's distance is only a guess
     const aside = Math.abs(up[0]) < 0.9 ? [1, 0.6, 0.6] : [0.6, 1, 0.6];
-    const away = aside.map((value, axis) => this.ball.center[axis] + this.ball.radius * (value + up[axis]));
-    this.view = lookAt(away, this.ball.center, up);
-    this.fit(this.ball);
+    const away = aside.map((value, axis) => ball.center[axis] + ball.radius * (value + up[axis]));
+    this.view = lookAt(away, ball.center, up);
+    this.fit(ball);
   }
 
   /** What Renderer.setCamera takes. */

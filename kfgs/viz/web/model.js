@@ -452,7 +452,7 @@ function bins(values, place) {
 /** The median distance to the nearest other Gaussian, from a sample. */
 function spacing(points) {
   const count = points.length / 3;
-  const step = Math.max(1, Math.floor(count / 200));
+  const step = Math.max(1, Math.floor(count / 60));
   const found = [];
   for (let i = 0; i < count; i += step) {
     let least = Infinity;
@@ -467,33 +467,31 @@ function spacing(points) {
 }
 
 function squared(points, i, j) {
-  const [x, y, z] = [points[3 * i] - points[3 * j], points[3 * i + 1] - points[3 * j + 1], points[3 * i + 2] - points[3 * j + 2]];
-  return x * x + y * y + z * z;
+  let all = 0;
+  for (let axis = 0; axis < 3; axis++) all += (points[3 * i + axis] - points[3 * j + axis]) ** 2;
+  return all;
 }
 
 /** Which points lie within a distance of one that the mask has; with a grid of cells of that size. */
-export function within(points, mask, reach) {
-  const cell = (i, axis) => Math.floor(points[3 * i + axis] / reach);
-  const key = (x, y, z) => `${x},${y},${z}`;
-  const cells = new Map();
-  const count = points.length / 3;
-  for (let i = 0; i < count; i++) {
+function within(points, mask, reach) {
+  const cells = new Map(); // of hashes: a cell may hold points of others, whose distances tell
+  const hash = (x, y, z) => (x * 73856093) ^ (y * 19349663) ^ (z * 83492791);
+  const cell = (i) => [0, 1, 2].map((axis) => Math.floor(points[3 * i + axis] / reach));
+  const near = mask.slice();
+  for (let i = 0; i < mask.length; i++) {
     if (!mask[i]) continue;
-    const name = key(cell(i, 0), cell(i, 1), cell(i, 2));
-    if (cells.has(name)) cells.get(name).push(i);
-    else cells.set(name, [i]);
+    const key = hash(...cell(i));
+    if (!cells.has(key)) cells.set(key, []);
+    cells.get(key).push(i);
   }
-  const near = new Uint8Array(count);
-  for (let i = 0; i < count; i++) near[i] = mask[i] || closeTo(i) ? 1 : 0;
-  return near;
-
-  function closeTo(i) {
-    for (let x = -1; x <= 1; x++)
-      for (let y = -1; y <= 1; y++)
-        for (let z = -1; z <= 1; z++) {
-          const others = cells.get(key(cell(i, 0) + x, cell(i, 1) + y, cell(i, 2) + z));
-          if (others?.some((j) => squared(points, i, j) <= reach * reach)) return true;
-        }
+  const close = (i) => {
+    const [x, y, z] = cell(i);
+    for (let k = 0; k < 27; k++) {
+      const others = cells.get(hash(x + (k % 3) - 1, y + (Math.floor(k / 3) % 3) - 1, z + Math.floor(k / 9) - 1));
+      if (others?.some((j) => squared(points, i, j) <= reach * reach)) return true;
+    }
     return false;
-  }
+  };
+  for (let i = 0; i < mask.length; i++) if (!mask[i] && close(i)) near[i] = 1;
+  return near;
 }

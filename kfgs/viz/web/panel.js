@@ -20,7 +20,7 @@ const section = (title, ...children) => h("section", {}, h("h2", {}, title), ...
 
 function scorePart(model) {
   const slider = histogramSlider({
-    label: "Gamma: the score to exceed", id: "gamma", above: true,
+    label: "Gamma (score to exceed)", id: "gamma", above: true,
     toFraction: (value) => (value - model.answer.low) / (model.answer.high - model.answer.low),
     toValue: (place) => model.answer.low + place * (model.answer.high - model.answer.low),
     onvalue: (value, dragging) => model.setGamma(value, dragging),
@@ -42,7 +42,7 @@ function scorePart(model) {
 function lambdaPart(model) {
   const [low, span] = model.lambdaSpan();
   const slider = histogramSlider({
-    label: "Lambda: how far labels reach", id: "lambda", above: false,
+    label: "Lambda (reach of labels)", id: "lambda", above: false,
     toFraction: (value) => (Math.log(value) - low) / span,
     toValue: (place) => Math.exp(low + place * span),
     onvalue: (value) => model.setLambda(value),

@@ -4,12 +4,20 @@
  */
 import {Cloud, UNKNOWN, bufferOf} from "./clouds.js";
 import {gaussianAt, gaussiansIn} from "./pick.js";
-import {COVERED, FINISH, PREPARE, SPLAT_FRAGMENT, SPLAT_VERTEX, WHOLE, WIDTH} from "./shaders.js";
+import {BATCH, COVERED, FINISH, PREPARE, SPLAT_FRAGMENT, SPLAT_VERTEX, WHOLE, WIDTH} from "./shaders.js";
 import {startSorter} from "./sorter.js";
 
 const MODES = ["color", "labels", "score", "latents"];
-const LEVELS = [1, 0.7, 0.5, 0.35]; // sizes of the picture while the camera moves
-const SLOW = 90; // ms for a moving frame: then the next ones are smaller
+/** What a frame may leave out while the camera moves: size of the picture, alpha below which nothing is drawn (the
+ * rasteriser's is 1/255), alpha at which a pixel is covered (1 - 1e-4), share of the Gaussians. */
+const LEVELS = [
+  {scale: 1, least: 1 / 255, enough: 0.9999, share: 1},
+  {scale: 0.7, least: 1 / 100, enough: 0.98, share: 1},
+  {scale: 0.5, least: 1 / 64, enough: 0.97, share: 1},
+  {scale: 0.4, least: 1 / 40, enough: 0.95, share: 0.6},
+  {scale: 0.4, least: 1 / 40, enough: 0.95, share: 0.3},
+];
+const SLOW = 120; // ms for a moving frame: then the next ones are smaller
 const PIECES = 8; // parts of the order, between which covered pixels are found
 const MARGIN = 1.1; // of the picture whose Gaussians are sorted, so that a turn shows no empty border
 const LOOK = {
@@ -47,6 +55,7 @@ export class Renderer {
       finish: program(gl, WHOLE.replace("DEPTH", "0.0"), FINISH),
     };
     this.empty = gl.createVertexArray();
+    this.rectangles = rectangles(gl);
     this.look = {...LOOK};
     this.sides = {};
     this.side = null;
@@ -54,6 +63,7 @@ export class Renderer {
     this.target = null;
     this.views = new Map(); // what was drawn since the camera was set
     this.level = 0;
+    this.loads = 0;
     this.waiting = [];
     this.sorter = startSorter((answer) => this.#sorted(answer));
     this.onlost = (event) => {
@@ -66,6 +76,7 @@ export class Renderer {
   /** Load a pack: {header, data: ArrayBuffer}. What was loaded before is dropped. */
   load(packed) {
     this.#forget();
+    this.loads++;
     const {gl} = this;
     const {header} = packed;
     this.names = header.classes;
@@ -153,7 +164,7 @@ export class Renderer {
     fill(this.gl, textures.splats, this.gl.RGBA32UI, cloud.splats);
     const moved = {indices: Uint32Array.from(indices), means: Float32Array.from(means)};
     this.sorter.send({kind: "move", side: cloud.side, ...moved});
-    this.#current().asked = null;
+    this.#current().asked = null; // sort again
   }
 
   /** The centres of a side's Gaussians, [N * 3]; not to be changed. */
@@ -172,14 +183,16 @@ export class Renderer {
     const clip = view.clip ?? view;
     this.views.set(`${clip.x},${clip.y},${clip.width},${clip.height}`, view);
     const state = this.#current();
-    this.#ask(state);
+    this.#ask(state, view.moving ? LEVELS[this.level].share : 1);
     this.#render(state, view);
     this.#time(view.moving);
   }
 
   /** Wait until frames with an up-to-date order have been drawn. */
   async settled() {
+    this.redraw();
     const stale = () => [...this.views.values()].some(({side}) => this.sides[side].fresh !== this.sides[side].asked);
+    if (!stale()) return;
     while (stale()) await new Promise((resolve) => this.waiting.push(resolve));
     this.redraw();
   }
@@ -258,18 +271,11 @@ export class Renderer {
       fars: sheet(gl, gl.RG32UI, cloud.far ? count : 1, cloud.far && new Uint32Array(cloud.far.slice().buffer)),
       sources: sheet(gl, gl.R32I, cloud.far ? count : 1, cloud.source),
       paints: sheet(gl, gl.RGBA8, count, new Uint8Array(4 * count)),
+      order: sheet(gl, gl.R32UI, count, null),
     };
-    const order = gl.createBuffer();
-    const array = gl.createVertexArray();
-    gl.bindVertexArray(array);
-    gl.bindBuffer(gl.ARRAY_BUFFER, order);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(0, 1);
-    gl.bindVertexArray(null);
     const prepared = frame(gl, [shape, paint]);
     this.sides[cloud.side] = {
-      cloud, textures, rows, planes, shape, paint, prepared, order, array, length: 0, asked: null, fresh: undefined, busy: false,
+      cloud, textures, rows, planes, shape, paint, prepared, length: 0, asked: null, fresh: null, busy: false,
     };
     this.sorter.send({kind: "load", side: cloud.side, means: cloud.means, radii: cloud.radii()});
     this.side = cloud.side;
@@ -297,15 +303,14 @@ export class Renderer {
   }
 
   /** Ask for an order that fits the camera, unless the last request was for it; one request at a time. */
-  #ask(state) {
-    const {camera} = this;
-    if (state.asked === camera) return;
-    state.asked = camera;
+  #ask(state, share) {
+    if (state.asked?.camera === this.camera && state.asked.share === share) return;
+    state.asked = {camera: this.camera, share};
     if (!state.busy) this.#send(state);
   }
 
   #send(state) {
-    const camera = state.asked;
+    const {camera, share} = state.asked;
     const {fx, fy, cx, cy, width, height, near, viewmat} = camera;
     const grow = (low, high) => {
       const [middle, half] = [(low + high) / 2, (MARGIN * (high - low)) / 2];
@@ -313,32 +318,30 @@ export class Renderer {
     };
     const limits = [...grow(-cx / fx, (width - cx) / fx), ...grow(-cy / fy, (height - cy) / fy), 2 / Math.min(fx, fy)];
     state.busy = true;
-    state.sent = camera;
-    this.sorter.send({kind: "sort", side: state.cloud.side, id: 0, view: viewmat, limits, near});
+    state.sent = state.asked;
+    this.sorter.send({kind: "sort", side: state.cloud.side, load: this.loads, share, view: viewmat, limits, near});
   }
 
-  #sorted({side, order, ms}) {
+  #sorted({side, load, order, ms}) {
     const state = this.sides[side];
-    if (!state) return;
-    const {gl} = this;
+    if (!state || load !== this.loads) return; // of what was loaded before
     state.busy = false;
     state.length = order.length;
     state.fresh = state.sent;
-    gl.bindVertexArray(null);
-    gl.bindBuffer(gl.ARRAY_BUFFER, state.order);
-    gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
+    fill(this.gl, state.textures.order, this.gl.R32UI, order);
     this.stats.sortMs = ms;
-    if (state.asked !== state.fresh) this.#send(state);
+    if (state.asked && state.asked !== state.fresh) this.#send(state);
     this.waiting.splice(0).forEach((resolve) => resolve());
     this.onorder?.(side);
   }
 
   #render(state, view) {
     const {gl, look} = this;
-    const scale = view.moving ? LEVELS[this.level] : 1;
+    const level = LEVELS[view.moving ? this.level : 0];
+    const {scale} = level;
     const width = Math.max(1, Math.round(view.width * scale));
     const height = Math.max(1, Math.round(view.height * scale));
-    const chosen = look.question !== null || Boolean(state.cloud.selected);
+    const chosen = Boolean(look.outline) && (look.question !== null || Boolean(state.cloud.selected));
     this.#fitTarget(width, height, chosen);
     this.#prepare(state, width, height);
     const {target} = this;
@@ -352,7 +355,7 @@ export class Renderer {
     gl.clearDepth(1);
     gl.depthMask(true);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    this.#splat(state, width, height, chosen);
+    this.#splat(state, level, chosen);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     const bottom = this.canvas.height - view.y - view.height;
     gl.viewport(view.x, bottom, view.width, view.height);
@@ -362,7 +365,7 @@ export class Renderer {
     bind(gl, finish, {picture: target.picture, outline: target.outline});
     gl.uniform4f(finish.at.viewport, view.x, bottom, view.width, view.height);
     gl.uniform3fv(finish.at.paper, this.background);
-    gl.uniform3fv(finish.at.rim, look.outline);
+    gl.uniform3fv(finish.at.rim, look.outline ?? [0, 0, 0]);
     gl.uniform1f(finish.at.width, chosen ? 1.5 : 0);
     gl.bindVertexArray(this.empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
@@ -371,7 +374,7 @@ export class Renderer {
     this.stats.scale = scale;
   }
 
-  /** Compute the ellipse and the colour of every Gaussian. */
+  /** Compute the ellipse and the colour of every Gaussian in view. */
   #prepare(state, width, height) {
     const {gl, camera, look, shared} = this;
     const {prepare} = this.programs;
@@ -381,12 +384,12 @@ export class Renderer {
     const [sx, sy] = [width / camera.width, height / camera.height];
     const m = camera.viewmat;
     gl.bindFramebuffer(gl.FRAMEBUFFER, state.prepared);
-    gl.viewport(0, 0, WIDTH, state.rows);
+    gl.viewport(0, 0, WIDTH, Math.ceil(state.length / WIDTH));
     gl.disable(gl.BLEND);
     gl.disable(gl.DEPTH_TEST);
     gl.useProgram(prepare.program);
     bind(gl, prepare, {...textures, ...shared});
-    gl.uniform1i(at.count, cloud.count);
+    gl.uniform1i(at.count, state.length);
     gl.uniform1i(at.rows, state.rows);
     gl.uniform1i(at.degree, state.planes ? meta.sh_degree : 0);
     gl.uniform1i(at.mode, MODES.indexOf(look.mode));
@@ -403,6 +406,7 @@ export class Renderer {
     gl.uniform1f(at.gamma, look.gamma);
     gl.uniform1f(at.mixing, look.mixing);
     gl.uniform1f(at.near, camera.near);
+    gl.uniform1f(at.share, state.fresh?.share ?? 1);
     const bits = new Uint32Array(new Float64Array([look.lambda]).buffer);
     gl.uniform2ui(at.lambda, bits[1], bits[0]);
     gl.uniformMatrix4fv(at.view, true, m);
@@ -415,7 +419,7 @@ export class Renderer {
   }
 
   /** Blend the ellipses, nearest first, leaving out pixels that are covered already. */
-  #splat(state, width, height, chosen) {
+  #splat(state, {least, enough}, chosen) {
     const {gl, target} = this;
     const used = chosen ? this.programs.outlined : this.programs.splat;
     const {covered} = this.programs;
@@ -428,6 +432,7 @@ export class Renderer {
         gl.bindFramebuffer(gl.FRAMEBUFFER, target.depthOnly);
         gl.useProgram(covered.program);
         bind(gl, covered, {picture: target.picture});
+        gl.uniform1f(covered.at.enough, enough);
         gl.disable(gl.BLEND);
         gl.depthMask(true);
         gl.bindVertexArray(this.empty);
@@ -436,13 +441,15 @@ export class Renderer {
       }
       gl.useProgram(used.program);
       bind(gl, used, {shapes: state.shape, paints: state.paint});
-      gl.uniform2f(used.at.size, width, height);
+      gl.uniform2f(used.at.size, target.width, target.height);
+      gl.uniform1f(used.at.least, least);
       gl.enable(gl.BLEND);
       gl.depthMask(false);
-      gl.bindVertexArray(state.array);
-      gl.bindBuffer(gl.ARRAY_BUFFER, state.order);
-      gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 4 * from);
-      gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, Math.min(piece, state.length - from));
+      const end = Math.min(from + piece, state.length);
+      gl.uniform1i(used.at.first, from);
+      gl.uniform1i(used.at.end, end);
+      gl.bindVertexArray(this.rectangles);
+      gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil((end - from) / BATCH));
     }
     gl.disable(gl.BLEND);
     gl.disable(gl.DEPTH_TEST);
@@ -489,10 +496,10 @@ export class Renderer {
       this.timing = false;
       this.stats.frameMs = performance.now() - start;
       if (!moving) {
-        if (this.level === 0 && this.stats.frameMs > 2 * SLOW) this.level = 2;
+        if (this.level === 0 && this.stats.frameMs > 2 * SLOW) this.level = this.stats.frameMs > 4 * SLOW ? 3 : 2;
       } else if (this.stats.frameMs > SLOW) {
         this.level = Math.min(this.level + 1, LEVELS.length - 1);
-      } else if (this.stats.frameMs < SLOW / 4) {
+      } else if (this.stats.frameMs < 0.45 * SLOW) {
         this.level = Math.max(this.level - 1, 0);
       }
     };
@@ -526,11 +533,9 @@ export class Renderer {
 
   #forget() {
     const {gl} = this;
-    for (const {textures, shape, paint, prepared, order, array} of Object.values(this.sides)) {
+    for (const {textures, shape, paint, prepared} of Object.values(this.sides)) {
       [...Object.values(textures), shape, paint].forEach((made) => gl.deleteTexture(made));
       gl.deleteFramebuffer(prepared);
-      gl.deleteBuffer(order);
-      gl.deleteVertexArray(array);
     }
     Object.values(this.shared ?? {}).forEach((made) => gl.deleteTexture(made));
     this.#dropTarget();
@@ -549,7 +554,6 @@ function program(gl, vertex, fragment) {
     gl.compileShader(shader);
     gl.attachShader(made, shader);
   }
-  gl.bindAttribLocation(made, 0, "index");
   gl.linkProgram(made);
   if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) {
     const logs = gl.getAttachedShaders(made).map((shader) => gl.getShaderInfoLog(shader));
@@ -572,6 +576,17 @@ function bind(gl, {at}, textures) {
     gl.bindTexture(gl.TEXTURE_2D, made);
     gl.uniform1i(at[name], unit++);
   }
+}
+
+/** The corners of `BATCH` rectangles as triangles. */
+function rectangles(gl) {
+  const made = gl.createVertexArray();
+  gl.bindVertexArray(made);
+  const corners = Uint16Array.from({length: 6 * BATCH}, (_, k) => 4 * Math.floor(k / 6) + [0, 1, 2, 2, 1, 3][k % 6]);
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+  gl.bindVertexArray(null);
+  return made;
 }
 
 function texture(gl, format, width, height, filter = gl.NEAREST) {

@@ -1,11 +1,14 @@
 /**
- * The three programs. "prepare" runs once for each Gaussian and writes its ellipse and its colour into textures; "splat"
+ * The three programs. "prepare" runs once for each Gaussian in view and writes its ellipse and its colour into textures; "splat"
  * draws a rectangle around each ellipse, nearest first; "finish" puts the picture over the background and draws the outline
  * of the selection. The numbers are those of kfgs/splat/project.py and kfgs/splat/engines/contract.py.
  */
 
 /** Width of every texture with one texel per Gaussian; a power of two. */
 export const WIDTH = 2048;
+
+/** Rectangles drawn as one instance: with one each, drivers that work on the CPU need 30 microseconds for every one. */
+export const BATCH = 1024;
 
 const HEAD = `#version 300 es
 precision highp float;
@@ -21,14 +24,14 @@ void main() {
 }`;
 
 export const PREPARE = `${HEAD}
-uniform usampler2D splats, dcs, shs, marks, fars;
+uniform usampler2D order, splats, dcs, shs, marks, fars;
 uniform isampler2D labels, sources;
 uniform sampler2D scores, latents, colormap, classes, paints;
-uniform int count, rows, degree, mode;          // mode: 0 color, 1 labels, 2 score, 3 latents
+uniform int count, rows, degree, mode;          // count: in view; mode: 0 color, 1 labels, 2 score, 3 latents
 uniform bool carried, asked, masked, dim;       // carried: labels come from the source; masked: selection is a mask
 uniform vec3 center, spread;                    // of the box of the means
 uniform vec2 scaling, dcScale, scoreRange;      // lowest log and step
-uniform float shStep, gamma, mixing, near;
+uniform float shStep, gamma, mixing, near, share;   // share: of the Gaussians that are drawn
 uniform uvec2 lambda;                           // the bits of a float64: high, low
 uniform mat4 view;
 uniform vec4 pinhole;                           // fx, fy, cx, cy in pixels of the target
@@ -70,33 +73,32 @@ vec4 bytesOf(uint word) {  // signed
   return vec4(ivec4(int(word) << 24, int(word) << 16, int(word) << 8, int(word)) >> 24);
 }
 
-vec3 harmonics(int i, vec3 d) {
-  vec3 c[16];
+vec4 word(int i, int t) {                       // bytes 4 t to 4 t + 3 of the harmonics of Gaussian i
   ivec2 at = place(i);
-  int planes = degree == 1 ? 2 : degree == 2 ? 3 : 6;
-  float v[48];
-  for (int t = 0; t < planes; t++) {
-    uvec2 two = texelFetch(shs, ivec2(at.x, at.y + t * rows), 0).xy;
-    vec4 a = bytesOf(two.x), b = bytesOf(two.y);
-    for (int k = 0; k < 4; k++) {
-      v[8 * t + k] = a[k];
-      v[8 * t + 4 + k] = b[k];
-    }
-  }
-  for (int k = 0; k < 15; k++) c[k + 1] = vec3(v[3 * k], v[3 * k + 1], v[3 * k + 2]);
-  float x = d.x, y = d.y, z = d.z;
-  vec3 sum = 0.4886025119 * (-y * c[1] + z * c[2] - x * c[3]);
+  uvec2 two = texelFetch(shs, ivec2(at.x, at.y + (t >> 1) * rows), 0).xy;
+  return bytesOf((t & 1) == 0 ? two.x : two.y);
+}
+
+vec3 four(vec4 y, vec4 a, vec4 b, vec4 c) {     // the harmonics y times four coefficients, which are twelve bytes
+  return y.x * a.xyz + y.y * vec3(a.w, b.xy) + y.z * vec3(b.zw, c.x) + y.w * c.yzw;
+}
+
+vec3 harmonics(int i, vec3 d) {
+  float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
+  vec4 first = vec4(0.4886025119 * vec3(-y, z, -x), 1.0925484306 * x * y);
+  vec4 third = word(i, 2);
+  if (degree == 1) third.yzw = vec3(0.0);
+  vec3 sum = four(first, word(i, 0), word(i, 1), third);
   if (degree > 1) {
-    float xx = x * x, yy = y * y, zz = z * z;
-    sum += 1.0925484306 * (x * y * c[4] - y * z * c[5] - x * z * c[7])
-      + 0.3153915653 * (2.0 * zz - xx - yy) * c[6] + 0.5462742153 * (xx - yy) * c[8];
-    if (degree > 2) {
-      sum += -0.5900435899 * (y * (3.0 * xx - yy) * c[9] + x * (xx - 3.0 * yy) * c[15])
-        + 2.8906114426 * x * y * z * c[10]
-        - 0.4570457995 * (4.0 * zz - xx - yy) * (y * c[11] + x * c[13])
-        + 0.3731763326 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * c[12]
-        + 1.4453057213 * z * (xx - yy) * c[14];
-    }
+    vec4 second = vec4(-1.0925484306 * y * z, 0.3153915653 * (2.0 * zz - xx - yy), -1.0925484306 * x * z, 0.5462742153 * (xx - yy));
+    sum += four(second, word(i, 3), word(i, 4), word(i, 5));
+  }
+  if (degree > 2) {
+    float ring = 0.4570457995 * (4.0 * zz - xx - yy);
+    vec4 next = vec4(-0.5900435899 * y * (3.0 * xx - yy), 2.8906114426 * x * y * z, -ring * y, 0.3731763326 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy));
+    sum += four(next, word(i, 6), word(i, 7), word(i, 8));
+    vec4 last = vec4(-ring * x, 1.4453057213 * z * (xx - yy), -0.5900435899 * x * (xx - 3.0 * yy), 0.0);
+    sum += four(last, word(i, 9), word(i, 10), word(i, 11));
   }
   return sum * shStep;
 }
@@ -110,11 +112,12 @@ vec3 colorOf(int i, vec3 direction) {
 }
 
 void main() {
-  ivec2 at = ivec2(gl_FragCoord.xy);
-  int i = at.y * ${WIDTH} + at.x;
+  ivec2 slot = ivec2(gl_FragCoord.xy);
   shape = uvec4(0u);
   paint = uvec4(0u);
-  if (i >= count) return;
+  if (slot.y * ${WIDTH} + slot.x >= count) return;
+  int i = int(texelFetch(order, slot, 0).x);
+  ivec2 at = place(i);
 
   uvec4 s = texelFetch(splats, at, 0);
   uvec2 mark = texelFetch(marks, at, 0).xy;     // flags, factor of the opacity
@@ -167,6 +170,11 @@ void main() {
   axis = dot(axis, axis) > 1e-20 ? normalize(axis) : vec2(1.0, 0.0);
   vec2 xy = focal * p.xy / p.z + pinhole.zw;
   if (!(large < 1e8)) return;
+  if (share < 1.0) {                            // the others are left out: larger and denser ones fill their places
+    large *= inversesqrt(share);
+    small *= inversesqrt(share);
+    opacity = 1.0 - pow(1.0 - opacity, inversesqrt(share));
+  }
   shape = uvec4(floatBitsToUint(xy), packHalf2x16(axis * sqrt(large)), packHalf2x16(vec2(-axis.y, axis.x) * sqrt(small)));
   paint = uvec4(packHalf2x16(color.rg), packHalf2x16(vec2(color.b, opacity)), chosen ? 1u : 0u, 0u);
 }`;
@@ -174,21 +182,24 @@ void main() {
 export const SPLAT_VERTEX = `${HEAD}
 uniform usampler2D shapes, paints;
 uniform vec2 size;
-in uint index;
+uniform float least;                            // alpha that is drawn
+uniform int first, end;                         // slots
 out vec2 at;
 flat out vec4 color;
 flat out float chosen;
 
 void main() {
-  ivec2 texel = ivec2(int(index) & ${WIDTH - 1}, int(index) >> ${Math.log2(WIDTH)});
+  int slot = first + gl_InstanceID * ${BATCH} + (gl_VertexID >> 2);
+  gl_Position = vec4(2.0, 2.0, 0.0, 1.0);       // outside
+  if (slot >= end) return;
+  ivec2 texel = ivec2(slot & ${WIDTH - 1}, slot >> ${Math.log2(WIDTH)});
   uvec4 paint = texelFetch(paints, texel, 0);
   vec2 last = unpackHalf2x16(paint.y);
-  gl_Position = vec4(2.0, 2.0, 0.0, 1.0);       // outside
-  if (last.y <= 0.0) return;
+  if (last.y <= least) return;
   uvec4 shape = texelFetch(shapes, texel, 0);
   color = vec4(unpackHalf2x16(paint.x), last);
   chosen = float(paint.z);
-  at = (vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0) * sqrt(2.0 * log(255.0 * color.a));
+  at = (vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0) * sqrt(2.0 * log(color.a / least));
   vec2 pixel = uintBitsToFloat(shape.xy) + at.x * unpackHalf2x16(shape.z) + at.y * unpackHalf2x16(shape.w);
   gl_Position = vec4(pixel.x / size.x * 2.0 - 1.0, 1.0 - pixel.y / size.y * 2.0, 0.0, 1.0);
 }`;
@@ -197,6 +208,7 @@ export const SPLAT_FRAGMENT = `${HEAD}
 in vec2 at;
 flat in vec4 color;
 flat in float chosen;
+uniform float least;
 layout(location = 0) out vec4 picture;
 #ifdef OUTLINE
 layout(location = 1) out vec4 outline;
@@ -204,7 +216,7 @@ layout(location = 1) out vec4 outline;
 
 void main() {
   float alpha = min(0.99, color.a * exp(-0.5 * dot(at, at)));
-  if (alpha < 1.0 / 255.0) discard;
+  if (alpha < least) discard;
   picture = vec4(color.rgb * alpha, alpha);
 #ifdef OUTLINE
   outline = vec4(chosen * alpha, 0.0, 0.0, alpha);
@@ -214,9 +226,10 @@ void main() {
 /** Marks pixels that are covered completely, so that nothing behind is drawn there. */
 export const COVERED = `${HEAD}
 uniform sampler2D picture;
+uniform float enough;                           // alpha
 out vec4 nothing;
 void main() {
-  if (texelFetch(picture, ivec2(gl_FragCoord.xy), 0).a < 0.9999) discard;
+  if (texelFetch(picture, ivec2(gl_FragCoord.xy), 0).a < enough) discard;
   nothing = vec4(0.0);
 }`;
 

@@ -6,8 +6,8 @@
  */
 
 /**
- * Answer messages. "load" gives {side, means, radii}; "move" {side, indices, means}; "sort" {side, id, view, limits, near}
- * is answered by {side, id, order, ms}.
+ * Answer messages. "load" gives {side, means, radii}; "move" {side, indices, means}; "sort" {side, load, share, view, limits,
+ * near} is answered by {side, load, order, ms}; with a share below 1 always the same Gaussians are left out, chosen at random.
  * @param {{onmessage: ?function, postMessage: function}} scope the worker, or an object like it
  */
 export function sorterMain(scope) {
@@ -15,17 +15,18 @@ export function sorterMain(scope) {
   const buckets = [new Uint32Array(65536), new Uint32Array(65536)];
 
   /** Find the Gaussians in view and their depths; fills cloud.seen and cloud.keys, returns how many. */
-  function look(cloud, view, limits, near) {
+  function look(cloud, share, view, limits, near) {
     const {means, radii, seen, depths} = cloud;
     const [x0, x1, y0, y1, slack] = limits; // tangents of the borders; slack: tangent of two pixels
     const wide = Math.max(x1, -x0) * 1.3;
     const high = Math.max(y1, -y0) * 1.3;
+    const most = share * 4294967296;
     let count = 0;
     for (let i = 0, j = 0; i < radii.length; i++, j += 3) {
       const a = means[j], b = means[j + 1], c = means[j + 2];
       const z = view[8] * a + view[9] * b + view[10] * c + view[11];
       const radius = radii[i];
-      if (!(z > near) || radius < 0) continue;
+      if (!(z > near) || radius < 0 || Math.imul(i, 2654435761) >>> 0 >= most) continue; // Knuth's hash
       const x = (view[0] * a + view[1] * b + view[2] * c + view[3]) / z;
       const y = (view[4] * a + view[5] * b + view[6] * c + view[7]) / z;
       const tx = Math.min(Math.abs(x), wide), ty = Math.min(Math.abs(y), high);
@@ -72,11 +73,11 @@ export function sorterMain(scope) {
     move({side, indices, means}) {
       for (let k = 0; k < indices.length; k++) clouds[side].means.set(means.subarray(3 * k, 3 * k + 3), 3 * indices[k]);
     },
-    sort({side, id, view, limits, near}) {
+    sort({side, load, share, view, limits, near}) {
       const start = performance.now();
       const cloud = clouds[side];
-      const order = sort(cloud, look(cloud, view, limits, near));
-      scope.postMessage({side, id, order, ms: performance.now() - start}, [order.buffer]);
+      const order = sort(cloud, look(cloud, share, view, limits, near));
+      scope.postMessage({side, load, order, ms: performance.now() - start}, [order.buffer]);
     },
   };
   scope.onmessage = ({data}) => answers[data.kind](data);
@@ -84,7 +85,7 @@ export function sorterMain(scope) {
 
 /**
  * Start the sorter in a worker; where the browser forbids that, in this thread.
- * @param {function} answer called with each {side, id, order, ms}
+ * @param {function} answer called with each {side, load, order, ms}
  * @returns {{send: function(object, Array=): void, close: function(): void}}
  */
 export function startSorter(answer) {

@@ -1,0 +1,358 @@
+"""The exported file in a browser without a network: what it counts and selects is what Python counts and selects."""
+
+import io
+import itertools
+import json
+import re
+
+import cases_explorer
+import cases_page
+import numpy as np
+import pytest
+from cases_browser import CHROMIUM, SECONDS, has_playwright
+from PIL import Image
+
+from kfgs.viz import available
+from kfgs.viz.explorer import Exploration, FieldMeaning, save_html
+
+pytestmark = [
+    pytest.mark.skipif(not has_playwright(), reason="needs playwright"),
+    pytest.mark.skipif(CHROMIUM is None, reason="needs chromium"),
+]
+SOFTWARE = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+SIDES = "color", "semantic"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(scope="module")
+def state():
+    """A fresh state for each test would be the same: tests only read it or set what they compare."""
+    return cases_page.exploration()
+
+
+@pytest.fixture(scope="module")
+def file(state, tmp_path_factory):
+    return save_html(state, tmp_path_factory.mktemp("page") / "heaps.html", title="Three <heaps>")
+
+
+@pytest.fixture
+def page(browser, file):
+    yield from show(browser, file)
+
+
+def show(browser, file, **options):
+    """The file in a tab that may load nothing else; at the end nothing was asked for, and nothing went wrong."""
+    context = browser.new_context(viewport={"width": 800, "height": 600}, **options)
+    page = context.new_page()
+    page.set_default_timeout(1000 * SECONDS)
+    asked, errors = [], []
+
+    def guard(route):
+        if route.request.url == file.as_uri():
+            return route.continue_()
+        asked.append(route.request.url)
+        return route.abort()
+
+    page.route("**/*", guard)
+    page.on("websocket", lambda socket: asked.append(socket.url))
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
+    page.goto(file.as_uri())
+    page.wait_for_selector(".kfgs:not([aria-busy])")
+    yield page
+    context.close()
+    assert (asked, errors) == ([], [])
+
+
+def ask(page, words):
+    page.fill("#query", words)
+    page.press("#query", "Enter")
+    page.evaluate("viewer.settled()")
+
+
+def mask(page, side, kind="selected"):
+    return np.array(page.evaluate(f"[...viewer.model.{kind}('{side}')]"), bool)
+
+
+def set_slider(page, name, value):
+    """Type the value beside a slider."""
+    field = page.locator(f".slider:has(#{name}) input.number")
+    field.fill(repr(value))
+    field.press("Enter")
+
+
+def place_of(page, side, index):
+    """Where a Gaussian lies in the window."""
+    x, y = page.evaluate(
+        """([side, i]) => {
+          const { viewmat: m, fx, fy, cx, cy } = viewer.camera, p = viewer.model.position(side, i);
+          const [x, y, z] = [0, 4, 8].map((r) => m[r] * p[0] + m[r + 1] * p[1] + m[r + 2] * p[2] + m[r + 3]);
+          const box = viewer.stage.getBoundingClientRect();
+          return [box.left + (fx * x / z + cx) / viewer.ratio, box.top + (fy * y / z + cy) / viewer.ratio];
+        }""",
+        [side, index],
+    )
+    return x, y
+
+
+def agree(page, state):
+    """Gaussian by Gaussian, and in the counts of the class list."""
+    details = state.details()
+    for side in state.sides:
+        np.testing.assert_array_equal(mask(page, side), state.selected(side))
+        np.testing.assert_array_equal(
+            np.array(page.evaluate(f"[...viewer.model.labels('{side}')]")), state.labels(side)
+        )
+        counts = page.evaluate(f"viewer.model.counts('{side}')")
+        assert counts["classes"] == [count for _, count in details[side]["classes"]]
+        assert [counts[key] for key in ("total", "selected", "none")] == [
+            details[side][key] for key in ("total", "selected", "none")
+        ]
+
+
+def scenes():
+    """Distances that tie; scores of a field, compared in float32; a splat with scores; a field alone."""
+    semantic, _ = cases_explorer.grid_clouds()
+    field = cases_explorer.field("fused")
+    near = cases_explorer.cloud(field.gaussians.means[:40] + 0.05)
+    yield cases_explorer.grid()
+    yield cases_explorer.grid(score=np.linspace(-1, 1, len(semantic), dtype=np.float32))
+    yield Exploration(FieldMeaning(field, cases_explorer.classes()), near)
+    yield Exploration(FieldMeaning(field, cases_explorer.classes()))
+
+
+@pytest.mark.parametrize("scene", range(4))
+def test_every_class_gamma_and_lambda_selects_what_python_selects(browser, tmp_path, scene):
+    state = list(scenes())[scene]
+    for page in show(browser, save_html(state, tmp_path / "scene.html")):
+        agree(page, state)
+        for name in state.meaning.names:
+            asked = state.ask(name)
+            page.evaluate("(words) => viewer.ask(words)", name)
+            scores = asked.selection.scores
+            for gamma in (state.gamma, float(scores.median()), float(np.float64(scores.max()) * 0.7)):
+                state.set_gamma(min(max(gamma, asked.low), asked.high))
+                page.evaluate("(gamma) => viewer.model.setGamma(gamma)", state.gamma)
+                for distance in (1.0, 2**0.5, 0.3) if len(state.sides) > 1 else ():
+                    state.set_distance(distance)
+                    page.evaluate("(lambda) => viewer.model.setLambda(lambda)", distance)
+                    agree(page, state)
+                agree(page, state)
+
+
+def test_a_person_searches_and_moves_gamma_and_lambda(page, state):
+    ask(page, "CHAIR")
+    state.ask("chair")
+    agree(page, state)
+    for gamma in (0.5, 0.55):
+        set_slider(page, "gamma", gamma)
+        state.set_gamma(gamma)
+        agree(page, state)
+    for distance in (0.35, 0.32, 1.0):
+        set_slider(page, "lambda", distance)
+        state.set_distance(distance)
+        agree(page, state)
+    said = page.locator(".said").inner_text()
+    assert said == f"{state.selected('color').sum()} of 450 colour Gaussians score above 0.55 for “chair”."
+    set_slider(page, "lambda", 0.4)
+    state.set_distance(0.4)
+    none = int((state.labels("color") < 0).sum())
+    assert page.locator("#lambda-said").inner_text().startswith(f"{none} of 450 Gaussians are farther than 0.4 from")
+    state.ask(None)
+
+
+def test_suggestions_show_names_as_words_and_arrow_keys_choose(page):
+    page.click("#query")
+    assert page.locator("[role=option] span").all_inner_texts() == list(cases_page.NAMES)
+    page.keyboard.type("ch")
+    assert page.locator("[role=option] span").all_inner_texts() == ["chair"]
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("h2:has-text('Search: chair')")
+    page.keyboard.press("Escape")
+    page.wait_for_selector("h2:has-text('Search: chair')", state="hidden")
+
+
+def test_other_words_need_python_and_the_page_says_so(page):
+    ask(page, "chairs in the corner")
+    page.wait_for_selector("[role=alert]:visible")
+    said = page.locator("[role=alert]:visible").inner_text()
+    assert "is none of the classes" in said
+    assert "needs Python" in said
+    assert page.evaluate("viewer.model.answer") is None
+
+
+def test_hidden_classes_are_not_drawn_picked_or_selected_by_hand(page, state):
+    page.click("button[aria-label='Hide chair']")
+    state.set_hidden(["chair"])
+    for side in SIDES:
+        np.testing.assert_array_equal(mask(page, side, "drawn"), state.drawn(side))
+    page.evaluate("viewer.shape([[0, 0], [5000, 0], [5000, 5000], [0, 5000]], 'replace')")
+    assert not (mask(page, "color") & ~state.drawn("color")).any()
+    state.set_hidden([])
+    page.hover("li[data-label='0']")
+    page.click("button[aria-label='Show only table']")
+    assert (page.evaluate("viewer.model.counts('color').classes[0]"), mask(page, "color", "drawn").sum()) == (150, 150)
+    page.click("text=Show all")
+    assert mask(page, "color", "drawn").all()
+
+
+def test_a_click_picks_what_is_under_it(page, state):
+    x, y = np.mean([place_of(page, "color", i) for i in range(150, 300)], axis=0)  # the middle of the chairs' heap
+    page.mouse.click(x, y)
+    page.wait_for_selector(".picked p")
+    said = page.locator(".picked").inner_text()
+    found = int(re.search(r"colour Gaussian (\d+)", said).group(1))
+    picked = state.pick("color", found)
+    assert picked.name == "chair"
+    assert f"chair, score {picked.score:.3f}" in said
+    assert f"semantic Gaussian {picked.source}, {float(f'{picked.distance:.3g}')}" in said
+    assert np.hypot(*(np.array(place_of(page, "color", found)) - (x, y))) < 30
+
+
+def test_lasso_selects_remove_removes_and_undo_brings_back(page, state):
+    page.keyboard.press("3")
+    box = page.locator(".stage").bounding_box()
+    corners = [(0.15, 0.2), (0.5, 0.2), (0.5, 0.75), (0.15, 0.75)]
+    path = [(box["x"] + x * box["width"], box["y"] + y * box["height"]) for x, y in corners]
+    places = np.array([place_of(page, "color", i) for i in range(450)])
+    page.mouse.move(*path[0])
+    page.mouse.down()
+    for place in path[1:]:
+        page.mouse.move(*place, steps=4)
+    page.mouse.up()
+    (left, top), (right, bottom) = path[0], path[2]
+    inside = (places > (left, top)).all(1) & (places < (right, bottom)).all(1)
+    edge = (np.abs(places - (left, top)).min(1) < 1) | (np.abs(places - (right, bottom)).min(1) < 1)
+    selected = mask(page, "color")
+    assert 0 < selected.sum() < 450
+    np.testing.assert_array_equal(selected[~edge], inside[~edge])
+    page.keyboard.press("Delete")
+    labels = state.labels("color")[~selected]
+    counts = page.evaluate("viewer.model.counts('color')")
+    assert counts["classes"] == [int((labels == k).sum()) for k in range(3)]
+    assert (counts["total"], counts["removed"], counts["selected"]) == (450 - selected.sum(), selected.sum(), 0)
+    page.keyboard.press("Control+z")
+    assert page.evaluate("viewer.model.counts('color').total") == 450
+    np.testing.assert_array_equal(mask(page, "color"), selected)
+    page.keyboard.press("Control+z")
+    assert not mask(page, "color").any()
+    page.keyboard.press("Control+Shift+Z")
+    page.keyboard.press("Control+Shift+Z")
+    assert page.evaluate("viewer.model.counts('color').removed") == selected.sum()
+
+
+def test_grow_adds_and_shrink_drops_neighbours_and_invert_is_the_rest(page):
+    ask(page, "chair")
+    before = mask(page, "color")
+    page.click("text=Shrink")
+    small = mask(page, "color")
+    assert not (small & ~before).any()
+    ask(page, "table")
+    before = mask(page, "color")
+    page.click("text=Invert")
+    np.testing.assert_array_equal(mask(page, "color"), ~before)
+    page.evaluate("viewer.model.select('color', new Uint8Array(450).fill(1, 0, 1))")
+    page.click("text=Grow")
+    grown = mask(page, "color")
+    assert 1 < grown.sum() <= 150  # one heap of three
+    assert grown[:150].sum() == grown.sum()
+
+
+def test_recolour_and_fade_change_the_picture_and_the_json(page):
+    ask(page, "table")
+    chosen = mask(page, "color")
+    page.evaluate("viewer.model.recolor([10, 200, 30])")
+    page.evaluate("viewer.model.fade(0.5)")
+    saved = json.loads(page.evaluate("JSON.stringify(viewer.model)"))
+    assert saved["words"] == "table"
+    assert saved["color"]["selected"] == np.flatnonzero(chosen).tolist()
+    assert saved["color"]["recolored"] == {"10,200,30": np.flatnonzero(chosen).tolist()}
+    assert saved["color"]["opacity"] == {"0.502": np.flatnonzero(chosen).tolist()}
+    page.click("text=Restore all")
+    assert not page.evaluate("viewer.model.edited")
+
+
+def test_keys_fly_and_turn_and_help_lists_them(page):
+    before = page.evaluate("viewer.eye.view.position")
+    page.locator(".stage").focus()
+    page.keyboard.down("w")
+    page.wait_for_timeout(300)
+    page.keyboard.up("w")
+    after = page.evaluate("viewer.eye.view.position")
+    assert before != after
+    page.keyboard.press("ArrowLeft")
+    assert page.evaluate("viewer.eye.view.position") != after
+    page.keyboard.press("?")
+    assert page.locator("dialog dt").count() > 10
+    page.keyboard.press("Escape")
+    assert not page.locator("dialog").is_visible()
+
+
+def test_split_slider_and_modes_draw(page):
+    def picture():
+        page.evaluate("viewer.settled()")
+        with Image.open(io.BytesIO(page.locator("canvas").screenshot())) as opened:
+            return np.asarray(opened.convert("RGB"))
+
+    pictures = [picture()]
+    for mode in ("Score", "Colour"):
+        page.click(f".choice >> text={mode}")
+        pictures.append(picture())
+    for layout in ("split", "slider"):
+        page.select_option("select[aria-label=Views]", layout)
+        pictures.append(picture())
+    for one, other in itertools.pairwise(pictures):
+        assert (one != other).any(2).sum() > 500
+    assert page.locator(".captions select").count() == 2
+
+
+def test_the_page_opens_as_python_left_it(browser, tmp_path):
+    state = cases_page.exploration()
+    state.ask("chair")
+    state.set_gamma(0.5)
+    state.set_hidden([-1, "table"])
+    state.set_show("rgb")
+    for page in show(browser, save_html(state, tmp_path / "page.html"), color_scheme="dark"):
+        agree(page, state)
+        np.testing.assert_array_equal(mask(page, "color", "drawn"), state.drawn("color"))
+        assert page.get_attribute(".kfgs", "data-theme") == "dark"
+        assert page.locator(".choice [aria-pressed=true]").inner_text() == "Colour"
+        assert page.locator("button[aria-label='Undo']").is_disabled()
+
+
+def test_every_control_has_a_name(page):
+    ask(page, "chair")
+    nameless = page.evaluate(
+        """[...document.querySelectorAll("button, input, select, [role=listbox]")]
+          .filter((one) => !(one.getAttribute("aria-label") || one.textContent.trim() || one.labels?.length))
+          .map((one) => one.outerHTML)"""
+    )
+    assert nameless == []
+
+
+def test_an_explorer_writes_what_it_shows(browser, tmp_path):
+    if not available():
+        pytest.skip("needs a driver that draws")
+    with cases_page.explorer(tmp_path) as opened:
+        opened.ask("table")
+        path = opened.save_html(tmp_path / "made" / "page.html", title="Heaps")
+    for page in show(browser, path):
+        agree(page, opened.state)
+        assert page.title() == "Heaps"
+        assert page.locator("#query").input_value() == "table"
+
+
+def test_other_names_are_refused(state, tmp_path):
+    with pytest.raises(ValueError, match=r"path: expected a name that ends in .html, got 'scene.ply'"):
+        save_html(state, tmp_path / "scene.ply")
+    assert list(tmp_path.iterdir()) == []
