@@ -9,7 +9,6 @@ import cases_color
 import numpy as np
 import pytest
 import torch
-from cases_browser import CHROMIUM, SECONDS, has_playwright
 
 from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
@@ -19,7 +18,18 @@ from kfgs.viz import palette
 from kfgs.viz.explorer import Exploration, SplatMeaning
 from kfgs.viz.web import inline_script
 
+CHROMIUM = next((path for path in ("/usr/bin/chromium", "/usr/bin/chromium-browser") if Path(path).exists()), None)
+SECONDS = 300  # of patience with a busy machine, for each thing that is waited for
 SOFTWARE = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+
+
+def has_playwright():
+    try:
+        import playwright.sync_api  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
 
 needs_chromium = [
     pytest.mark.skipif(not has_playwright(), reason="needs playwright"),

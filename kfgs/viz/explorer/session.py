@@ -52,7 +52,7 @@ class Session:
         Args:
             name: `ask` {words}: scores of the semantic Gaussians as float32, NaN where nothing is known.
                 `describe` {side, index}: neighbours and views. `save_selection` {words, gamma, lambda, sides}: a mask of each
-                side is attached. `save_edits` {sides: {side: {removed, recolored, opacity}}}: Gaussians by number.
+                side is attached. `save_edits` {lambda, sides: {side: {removed, recolored, opacity}}}: Gaussians by number.
                 `save_picture` {}: a PNG file is attached.
             args: its arguments.
             attached: bytes that belong to them.
@@ -125,6 +125,8 @@ class Session:
         made = {side: edits for side, edits in made.items() if len(edits)}
         if not made:
             raise ValueError("edits: expected at least one, got none; remove or recolour something first")
+        if args.get("lambda") is not None:
+            self.state.set_distance(args["lambda"])
         results = {side: edits.apply(self._splats(_side(side))) for side, edits in made.items()}
         paths = []
         with numbered_path(self.out, "edited") as folder:

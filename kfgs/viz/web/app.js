@@ -33,7 +33,7 @@ const HELP = [
  * @returns {Promise<App>} has `model`, `renderer`, `eye`, `ask(words)`, `settled()`, `dispose()`
  */
 export async function mount(root, packed, link) {
-  const app = new App(root, packed, link);
+  const app = (root.viewer = new App(root, packed, link));
   try {
     await app.start();
   } catch (error) {
@@ -106,7 +106,7 @@ class App {
     this.loading = h("p", { class: "loading", role: "status" }, "Loading the scene…");
     this.said = h("div", { class: "said card", role: "status", "aria-live": "polite" });
     this.toast = h("p", { class: "toast", role: "alert", hidden: true });
-    this.panel = makePanel(this.model, { ask: (words) => this.ask(words), fit: () => this.fit(), saveJson: () => this.saveJson() });
+    this.panel = makePanel(this.model, { ask: (words) => this.ask(words), fit: () => this.fit(), saveJson: () => this.saveJson(), ...this.files() });
     this.help = h("dialog", { class: "help", "aria-label": "Keys" }, h("h2", {}, "Keys and mouse"), helpList(), textButton("Close", () => this.help.close()));
     this.stage.append(this.loading, this.makeRail(), this.makeCaptions(), ...this.makePhoto(), h("div", { class: "foot" }, this.said, this.makeViews()), this.toast);
     this.root.replaceChildren(this.makeTop(), this.stage, this.panel.element, this.help);
@@ -360,6 +360,28 @@ class App {
     await this.settled();
     const blob = await new Promise((done) => this.canvas.toBlob(done));
     download("kfgs.png", blob);
+  }
+
+  /** What only Python can do; nothing in an exported file. */
+  files() {
+    const { link, model } = this;
+    if (!link.python) return {};
+    const masks = () => Object.fromEntries(model.sides.map((side) => [side, model.selected(side)]));
+    const sides = (all) => Object.fromEntries(model.sides.map((side) => [side, all[side]]));
+    const lambda = () => (model.source ? model.lambda : null);
+    return {
+      describe: (side, index) => link.describe(side, index),
+      saveSelection: () => this.save(() => link.saveSelection({ words: model.answer?.words ?? null, gamma: model.gamma, lambda: lambda(), masks: masks() })),
+      saveEdits: () => this.save(() => link.saveEdits(sides(model.toJSON()), lambda())),
+    };
+  }
+
+  async save(write) {
+    try {
+      this.say(`Saved: ${(await write()).join(", ")}`);
+    } catch (error) {
+      this.say(error.message);
+    }
   }
 
   saveJson() {

@@ -6,9 +6,12 @@ import { SIDE_WORDS, short, whole } from "./model.js";
 const MANY = 12; // classes from which on the list has a filter
 const css = (rgb) => `rgb(${rgb.join(",")})`;
 
-/** Build the panel. `act`: {ask(words), fit(), saveJson()}. Returns {element, refresh()}. */
+/**
+ * Build the panel. `act`: {ask(words), fit(), saveJson()}, and with Python {saveSelection(), saveEdits(), describe(side, index)}.
+ * Returns {element, refresh()}.
+ */
 export function makePanel(model, act) {
-  const parts = [scorePart(model), pickPart(model), selectionPart(model, act), model.source ? lambdaPart(model) : null, classesPart(model, act)];
+  const parts = [scorePart(model), pickPart(model, act), selectionPart(model, act), model.source ? lambdaPart(model) : null, classesPart(model, act)];
   const shown = parts.filter(Boolean);
   return {
     element: h("aside", { class: "panel", "aria-label": "Search, classes and selection" }, ...shown.map((one) => one.element)),
@@ -119,13 +122,18 @@ function selectionPart(model, act) {
   ];
   const restore = button("Restore all", "Undo all removals, colours and opacities", () => model.restore(), { class: "link" });
   const save = button("Save as JSON", "Save the question, the selection and the edits, with the numbers of the Gaussians", act.saveJson);
+  const files = act.saveSelection ? [
+    button("Save Gaussians", "Write the selected Gaussians as PLY files, and their parts", act.saveSelection),
+    button("Save edited scene", "Write the scene with its edits, and the edits as JSON", act.saveEdits),
+  ] : [];
   const boxes = h("div", {}, h("div", { class: "buttons" }, ...change), h("div", { class: "buttons" }, ...edits));
-  const element = section("Selection", restore, said, boxes, save);
+  const element = section("Selection", restore, said, boxes, h("div", { class: "buttons" }, ...files, save));
   const refresh = () => {
     const count = model.counts(model.side).selected;
     const other = model.sides.find((side) => side !== model.side && model.counts(side).selected > 0);
     boxes.hidden = !count && !other;
     save.hidden = boxes.hidden && !model.edited;
+    if (files.length) [files[0].hidden, files[1].hidden] = [boxes.hidden, !model.edited];
     restore.hidden = !model.edited;
     const more = other ? `, and ${whole(model.counts(other).selected)} ${SIDE_WORDS[other]} ones` : "";
     said.textContent = boxes.hidden
@@ -135,13 +143,25 @@ function selectionPart(model, act) {
   return { element, refresh };
 }
 
-function pickPart(model) {
+function pickPart(model, act) {
   const body = h("div", { class: "picked", "aria-live": "polite" });
+  let views = {};
   const element = section("Picked Gaussian", iconButton("close", "Unpick", () => model.pick(model.side, -1)), body);
   const refresh = () => {
     const found = model.describe();
     element.hidden = !found;
-    if (found) body.replaceChildren(...pickLines(model, found));
+    if (!found) return;
+    body.replaceChildren(...pickLines(model, found));
+    if (act.describe) seenBy(found);
+  };
+  const seenBy = async ({ side, index }) => {
+    const key = `${side} ${index}`;
+    if (views.key !== key) views = { key, found: act.describe(side, index) };
+    const { views: sights } = await views.found.catch(() => ({ views: [] }));
+    const now = model.picked;
+    if (!sights.length || !now || `${now.side} ${now.index}` !== key || body.querySelector(".seen")) return;
+    const names = sights.slice(0, 4).map(({ name, weight }) => `${name} (${Math.round(100 * weight)} %)`);
+    body.append(h("p", { class: "note seen" }, `Seen by ${names.join(", ")}`));
   };
   return { element, refresh };
 }

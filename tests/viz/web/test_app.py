@@ -9,28 +9,20 @@ import cases_explorer
 import cases_page
 import numpy as np
 import pytest
-from cases_browser import CHROMIUM, SECONDS, has_playwright
+from cases_web import SECONDS, needs_chromium, software_chromium
 from PIL import Image
 
 from kfgs.viz import available
 from kfgs.viz.explorer import Exploration, FieldMeaning, save_html
 
-pytestmark = [
-    pytest.mark.skipif(not has_playwright(), reason="needs playwright"),
-    pytest.mark.skipif(CHROMIUM is None, reason="needs chromium"),
-]
-SOFTWARE = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+pytestmark = needs_chromium
 SIDES = "color", "semantic"
 
 
 @pytest.fixture(scope="module")
 def browser():
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+    with software_chromium() as opened:
         yield opened
-        opened.close()
 
 
 @pytest.fixture(scope="module")
