@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from importlib.resources import files
 
-RENDERER = ("sorter.js", "camera.js", "clouds.js", "shaders.js", "pick.js", "renderer.js")
+RENDERER = ("sorter.js", "camera.js", "clouds.js", "shaders.js", "gl.js", "pick.js", "renderer.js")
 """The modules of the renderer; a module comes after those that it imports."""
 
 _IMPORT = re.compile(r"""^import\s*\{([^}]*)\}\s*from\s*["']\./([\w.]+)["'];?[ \t]*$""", re.M)
