@@ -27,7 +27,8 @@ OFFLINE_START = """\
     const text = (id) => document.getElementById(id).textContent;
     const bytes = Uint8Array.from(atob(text("data")), (letter) => letter.charCodeAt(0));
     document.getElementById("data").remove();
-    const packed = { header: JSON.parse(text("header")), data: await kfgs.inflate(bytes) };
+    const header = JSON.parse(text("header"));
+    const packed = { header, data: await kfgs.inflate(bytes, header) };
     window.viewer = await kfgs.mount(root, packed, new kfgs.OfflineLink(packed));"""
 PYTHON_START = """\
     const loaded = await fetch("pack");

@@ -31,7 +31,8 @@ export default {
     el.append(root);
     const raw = model.get("data");
     const bytes = new Uint8Array(raw.buffer, raw.byteOffset, raw.byteLength);
-    const packed = { header: model.get("header"), data: await kfgs.inflate(bytes) };
+    const header = model.get("header");
+    const packed = { header, data: await kfgs.inflate(bytes, header) };
     const link = new kfgs.PythonLink(kfgs.callWidget(model), model.get("phrases"));
     const app = await kfgs.mount(root, packed, link);
     model.on("change:question", () => app.ask(model.get("question")));
