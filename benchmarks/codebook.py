@@ -1,6 +1,6 @@
 """What each way to fit the codebook keeps of a teacher's classes, without training a field (about a minute a variant).
 
-    python benchmarks/codebook.py SCENE MAPS [--splat SPLAT.ply] [--variants paper adaptive ...] [--seeds 0 1]
+    python benchmarks/codebook.py SCENE MAPS [--splat SPLAT.ply] [--variants paper adaptive ...] [--seeds 0 1] [--device cuda]
 
 MAPS holds one teacher map per view (test views too, for the scores in 2-D). For each variant: size K, alpha, coverage, mean
 similarity, seconds to fit and to quantise; mIoU of the quantised test maps (2-D); and, with a colour splat of the scene,
@@ -17,6 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from devices import MapsOn, add_device, device_name, wait
 from torch import Tensor
 from torch.nn.functional import one_hot
 
@@ -50,22 +51,24 @@ def main() -> None:
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=["paper-10-epochs", "adaptive"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--truth", default="labels_scored")
+    add_device(parser)
     args = parser.parse_args()
 
     scene = load_scene(args.scene).undistorted()
     classes = load_label_set(args.scene / "classes.json", args.scene / "text.npy")
+    rows = classes.embeddings.to(args.device)
     train, test = scene.views("train"), scene.views("test")
     cameras, stems = {scene.stem(i): scene.cameras[i] for i in test}, [scene.stem(i) for i in test]
-    maps = FeatureFolder(args.maps).of(scene, "train")
+    maps = MapsOn(FeatureFolder(args.maps).of(scene, "train"), args.device)
     truth = true_labels(scene, args.scene / args.truth, "test")
-    splat = None if args.splat is None else read_splats(args.splat).gaussians
+    splat = None if args.splat is None else read_splats(args.splat).gaussians.to(args.device)
     seen_in_2d = all(any(args.maps.glob(f"{stem}[._]*")) for stem in stems)
-    test_maps = FeatureFolder(args.maps).of(scene, "test") if seen_in_2d else None
+    test_maps = MapsOn(FeatureFolder(args.maps).of(scene, "test"), args.device) if seen_in_2d else None
 
     def score_2d(change: Callable[[Tensor], Tensor]) -> float:
         assert test_maps is not None
         size = scene.cameras[test[0]].size
-        return score_teacher(lambda stem: change(test_maps[stems.index(stem)]), truth, classes, size).miou.value
+        return score_teacher(lambda stem: change(test_maps[stems.index(stem)]).cpu(), truth, classes, size).miou.value
 
     def average(features: Callable[[int], Tensor]) -> Tensor:  # [N, D]; 0 where no view shows the Gaussian
         def views() -> object:
@@ -78,7 +81,7 @@ def main() -> None:
 
     def score_3d(labels: Tensor) -> float:  # [N]
         each = dataclasses.replace(splat, sh=None, features=one_hot(labels.clamp_min(0), len(classes.names)).float())
-        found = {stem: rasterize(each, camera).map.argmax(dim=-1) for stem, camera in cameras.items()}
+        found = {stem: rasterize(each, camera).map.argmax(dim=-1).cpu() for stem, camera in cameras.items()}
         return score_scene(found, truth, classes).miou.value
 
     def say(*cells: object) -> None:
@@ -87,20 +90,23 @@ def main() -> None:
             flush=True,
         )
 
+    print(f"{device_name(args.device)}, {torch.get_num_threads()} threads\n")
     say("variant", "seed", "K", "alpha", "coverage", "similarity", "fit s", "quantise s", "2-D", "direct", "codeword")
     say(*["---"] * 11)
     raw_2d = score_2d(lambda features: features.float()) if test_maps is not None else "-"
     raw_3d = "-"
     if splat is not None:
-        raw_3d = score_3d(classify(average(lambda k: maps[k].float()), classes.embeddings).labels)
+        raw_3d = score_3d(classify(average(lambda k: maps[k].float()), rows).labels)
     say("not quantised", *["-"] * 7, raw_2d, raw_3d, "-")
     for name in args.variants:
         for seed in args.seeds:
+            wait()
             start = time.perf_counter()
             fit = fit_codebook(maps, VARIANTS[name], generator=torch.Generator().manual_seed(seed))
+            wait()
             fitted = time.perf_counter()
             book = fit.codebook
-            index_maps = quantize_maps(maps, book)
+            index_maps = quantize_maps(maps, book)  # on the CPU when it returns
             seconds = fitted - start, time.perf_counter() - fitted
             flat: float | str = "-"
             if test_maps is not None:
@@ -110,8 +116,8 @@ def main() -> None:
             if splat is not None:
                 targets = LatentMaps(index_maps, book.codewords)
                 carried = average(lambda k, targets=targets: targets[k].nan_to_num())
-                direct = score_3d(classify(carried, classes.embeddings).labels)
-                coded = score_3d(_by_codeword(book, carried, classes.embeddings))
+                direct = score_3d(classify(carried, rows).labels)
+                coded = score_3d(_by_codeword(book, carried, rows))
             say(name, seed, book.size, fit.alpha, fit.coverage, fit.mean_similarity, *seconds, flat, direct, coded)
             if fit.note:
                 print(f"  {fit.note}")

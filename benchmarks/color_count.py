@@ -1,6 +1,6 @@
 """How many Gaussians does colour need? Fit red, green and blue as three channels and watch the count grow.
 
-    python benchmarks/color_count.py SCENE [--size 240 320] [--steps 3000]
+    python benchmarks/color_count.py SCENE [--size 240 320] [--steps 3000] [--device cuda]
 
 This is a lower bound for a colour field of the scene: fewer steps, smaller pictures and no harmonics, through the same
 `fit_field` and with the published densification threshold that the semantic field is compared at.
@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 
 import torch
+from devices import add_device
 
 from kfgs.cameras import resize_map
 from kfgs.fields import FieldConfig, GaussianParams, fit_field
@@ -23,11 +24,13 @@ def main() -> None:
     parser.add_argument("scene")
     parser.add_argument("--size", type=int, nargs=2, default=(240, 320), metavar=("H", "W"))
     parser.add_argument("--steps", type=int, default=3000)
+    add_device(parser)
     args = parser.parse_args()
     scene = load_scene(args.scene).undistorted()
     views = scene.views("train")
     pictures = [resize_map(scene.image(i), tuple(args.size), antialias=True) for i in views]
     start = GaussianParams.from_points(scene.points, 3, generator=torch.Generator().manual_seed(0))
+    start = start.map(lambda value: value.to(args.device))
     config = FieldConfig(
         steps=args.steps,
         extent=scene.extent,

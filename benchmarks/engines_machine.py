@@ -6,13 +6,13 @@ import os
 import platform
 import re
 import resource
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numba
 import torch
+from devices import CPU, clock
 
 
 class Times(NamedTuple):
@@ -37,31 +37,27 @@ def measure(calls: dict[str, Callable[[], Any]], repeats: int, *, slow: float = 
     return {name: Times(sorted(s)[len(s) // 2], min(s), len(s)) for name, s in seconds.items()}
 
 
-def clock(call: Callable[[], Any]) -> float:
-    """Seconds of one call; what it returns is let go within that time."""
-    start = time.perf_counter()
-    call()
-    return time.perf_counter() - start
-
-
 class Peak(NamedTuple):
-    """What the machine reaches with this many threads."""
+    """What the processor reaches with this many threads, or the GPU."""
 
     flops: float  # multiply and add counted as two, per second
     bandwidth: float  # bytes per second, read and written
 
 
-def measure_peak(repeats: int = 5) -> Peak:
-    """The rate of a float32 matrix product of 1536 x 1536 (torch's BLAS), and of copying 256 MiB; the best of a few."""
-    n = 1536
-    a, b, out = torch.randn(n, n), torch.randn(n, n), torch.empty(n, n)
-    source, target = torch.zeros(1 << 26), torch.zeros(1 << 26)
+def measure_peak(device: torch.device = CPU, repeats: int = 5) -> Peak:
+    """The rate of a float32 matrix product (torch's BLAS), and of copying 256 MiB; the best of a few.
+
+    The matrices are 1536 x 1536, on a GPU 8192 x 8192.
+    """
+    n = 1536 if device.type == "cpu" else 8192
+    a, b, out = torch.randn(n, n, device=device), torch.randn(n, n, device=device), torch.empty(n, n, device=device)
+    source, target = torch.zeros(1 << 26, device=device), torch.zeros(1 << 26, device=device)
     times = measure({"product": lambda: torch.mm(a, b, out=out), "copy": lambda: target.copy_(source)}, repeats)
     return Peak(2 * n**3 / times["product"].least, 2 * 4 * (1 << 26) / times["copy"].least)
 
 
-def describe() -> dict[str, Any]:
-    """The processor, its vector units and the versions, without names of hosts or users."""
+def describe(device: torch.device = CPU) -> dict[str, Any]:
+    """The processor, its vector units, the GPU that is used (or None) and the versions, without names of hosts or users."""
     flags: list[str] = []
     model = platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
@@ -76,6 +72,7 @@ def describe() -> dict[str, Any]:
         "processor": model,
         "cores": os.cpu_count(),
         "flags": flags,
+        "gpu": torch.cuda.get_device_name(device) if device.type == "cuda" else None,
         "python": platform.python_version(),
         "torch": torch.__version__,
         "numba": numba.__version__,
@@ -83,11 +80,16 @@ def describe() -> dict[str, Any]:
     }
 
 
-def peak_memory(call: Callable[[], Any]) -> int:
-    """Bytes by which the process's resident memory rose at most during the call.
+def peak_memory(call: Callable[[], Any], device: torch.device = CPU) -> int:
+    """Bytes by which memory rose at most during the call: the process's resident memory, or what torch allocates on a GPU.
 
     Linux can forget the highest mark so far; elsewhere, memory that was used and freed before the call hides a rise.
     """
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+        held = torch.cuda.memory_allocated(device)
+        call()
+        return torch.cuda.max_memory_allocated(device) - held
     before = _status("VmRSS")
     if before is None:
         highest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

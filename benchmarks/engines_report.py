@@ -21,10 +21,11 @@ Entry = dict[str, Any]
 def write_tables(report: Report) -> str:
     """The whole report as markdown."""
     machine = report["machine"]
+    gpu = "" if machine.get("gpu") is None else f"{machine['gpu']}; "
     lines = [
         "# Engines side by side",
         "",
-        f"{machine['processor']}, {machine['cores']} cores, {', '.join(machine['flags'])}; {machine['system']}; Python "
+        f"{gpu}{machine['processor']}, {machine['cores']} cores, {', '.join(machine['flags'])}; {machine['system']}; Python "
         f"{machine['python']}, torch {machine['torch']}, numba {machine['numba']}. Wall-clock milliseconds, median and "
         f"(least) of {report['repeats']} rounds in turn (at most 3 of what takes longer than a second).",
     ]
@@ -32,20 +33,29 @@ def write_tables(report: Report) -> str:
         lines += ["", "**A quick run: it shows that everything works, and says little about speed.**"]
     for threads, peak in report["peak"].items():
         lines.append(
-            f"\nPeak with {_threads(int(threads))}: {peak['flops'] / 1e9:.0f} GFLOP/s (float32 matrix product), "
+            f"\nPeak with {_where(report, int(threads))}: {peak['flops'] / 1e9:.0f} GFLOP/s (float32 matrix product), "
             f"{peak['bandwidth'] / 1e9:.1f} GB/s (copy, read and written)."
         )
-    off = [(value, entry["case"]) for entry in report["cases"] for value in entry["difference"].values()]
+    lines += [f"\nNot measured: {line}." for line in report.get("missing", [])]
+    off = [value for entry in report["cases"] for value in entry["difference"].values()]
     if off:
         lines.append(
-            f"\nNo engine's map is further than {max(off)[0]:.1g} from the first one's, features being normal: that is a pixel "
+            f"\nNo engine's map is further than {max(off):.1g} from the first one's, features being normal: that is a pixel "
             "where an alpha lies on 1/255 or T on 1e-4, and rounding decides."
+        )
+    off = [value for entry in report["cases"] for value in entry.get("frame_difference", {}).values()]
+    if off:
+        lines.append(
+            f"\ngsplat's maps differ from kfgs's by at most {max(off):.1g}, as a mean over pixels and channels, features being "
+            "normal: its thresholds are its own."
         )
     lines += _steps(report)
     for threads in report["peak"]:
         for name, cases in report["slices"].items():
             lines += _slice(report, name, cases, int(threads))
-    lines += _frames(report) + _throughput(report) + _ratios(report) + _growth(report) + _memory(report)
+    for part in WHOLE:
+        lines += _whole(report, part)
+    lines += _throughput(report) + _ratios(report) + _growth(report) + _memory(report)
     return "\n".join(lines) + "\n"
 
 
@@ -58,6 +68,11 @@ def _threads(count: int) -> str:
     return "1 thread" if count == 1 else f"{count} threads"
 
 
+def _where(report: Report, threads: int) -> str:
+    """The GPU if one was used, else the threads."""
+    return report["machine"].get("gpu") or _threads(threads)
+
+
 def _case(case: list[int]) -> str:
     count, channels, width, height = case
     return f"{count / 1000:g}k, {width}x{height}, {channels}"
@@ -66,13 +81,18 @@ def _case(case: list[int]) -> str:
 def _ms(times: dict[str, float] | None) -> str:
     if times is None:
         return "-"
-    digits = 1 if times["median"] < 1 else 0
+    digits = 2 if times["median"] < 1e-3 else 1 if times["median"] < 1 else 0
     return f"{1e3 * times['median']:.{digits}f} ({1e3 * times['least']:.{digits}f})"
 
 
 def _engines(report: Report) -> list[str]:
     entries = report["cases"] + report["memory"]
     return list(dict.fromkeys(e for entry in entries for e in [*entry.get("seconds", {}), *entry.get("left_out", {})]))
+
+
+def _compositors(report: Report) -> list[str]:
+    """The engines that composite given lists of tiles."""
+    return [engine for engine in _engines(report) if not engine.startswith("gsplat")]
 
 
 def _find(report: Report, case: list[int], threads: int) -> Entry | None:
@@ -105,8 +125,8 @@ def _steps(report: Report) -> list[str]:
 
 
 def _slice(report: Report, name: str, cases: list[list[int]], threads: int) -> list[str]:
-    engines = _engines(report)
-    lines = ["", f"## Compositing against {name}, {_threads(threads)}", "", "Forward / backward."]
+    engines = _compositors(report)
+    lines = ["", f"## Compositing against {name}, {_where(report, threads)}", "", "Forward / backward."]
     rows = []
     for case in cases:
         entry = _find(report, case, threads)
@@ -121,18 +141,36 @@ def _slice(report: Report, name: str, cases: list[list[int]], threads: int) -> l
     return lines + _table(["N, size, channels", "tile pairs", "pixel pairs", *engines], rows)
 
 
-def _frames(report: Report) -> list[str]:
-    engines = [e for e in _engines(report) if any(_times(entry, e, "frame") for entry in report["cases"])]
+WHOLE = {
+    "frame": ("A whole frame", "Project, bin and composite, without gradients."),
+    "step": ("Forward and backward of a whole frame", "The same, and the gradients of all tensors; no loss, no Adam."),
+    "labels": ("A label map", "The best of so many classes at each pixel, from scores of the Gaussians."),
+    "uplift": (
+        "Uplift of a map",
+        "Its pixels summed into the Gaussians by rendering weight, without projection and binning.",
+    ),
+}
+
+
+def _whole(report: Report, part: str) -> list[str]:
+    engines = [e for e in _engines(report) if any(_times(entry, e, part) for entry in report["cases"])]
+    peers = [engine for engine in engines if engine.startswith("gsplat")]
     rows = []
     for entry in report["cases"]:
-        cells = [_ms(_times(entry, engine, "frame")) for engine in engines]
+        times = {engine: _times(entry, engine, part) for engine in engines}
+        cells = [_ms(found) for found in times.values()]
+        if peers:
+            quickest = min((times[peer]["median"] for peer in peers if times[peer]), default=0)
+            own = times[engines[0]]
+            cells.append(f"{quickest / own['median']:.2f}" if own and quickest else "-")
         rows.append([_case(entry["case"]), str(entry["threads"]), *cells])
-    lines = ["", "## A whole frame", "", "Project, bin and composite, without gradients."]
-    return lines + _table(["N, size, channels", "threads", *engines], rows)
+    title, about = WHOLE[part]
+    ratio = [f"quicker gsplat's time / {engines[0]}'s"] if peers else []
+    return ["", f"## {title}", "", about, *_table(["N, size, channels", "threads", *engines, *ratio], rows)]
 
 
 def _throughput(report: Report) -> list[str]:
-    engines = [engine for engine in _engines(report) if engine in ("kfgs numba", "prototype")]
+    engines = [engine for engine in _engines(report) if engine in ("kfgs numba", "kfgs triton", "prototype")]
     rows = []
     for entry in report["cases"]:
         channels, peak = entry["case"][1], report["peak"][str(entry["threads"])]["flops"]
@@ -156,8 +194,8 @@ def _throughput(report: Report) -> list[str]:
 
 
 def _ratios(report: Report) -> list[str]:
-    engines = _engines(report)
-    if not engines:
+    engines = _compositors(report)
+    if len(engines) < 2:
         return []
     rows = []
     for entry in report["cases"]:
@@ -227,7 +265,8 @@ def _memory(report: Report) -> list[str]:
     cases = list(dict.fromkeys(tuple(entry["case"]) for entry in report["memory"]))
     mebibytes = {(e["engine"], tuple(e["case"])): f"{e['bytes'] / 2**20:.0f}" for e in report["memory"]}
     rows = [[_case(list(case)), *(mebibytes.get((engine, case), "-") for engine in engines)] for case in cases]
-    lines = ["", "## Peak memory", "", "MiB above the input, of one forward and one backward pass, in a fresh process."]
+    what = "one forward and one backward pass" if report["machine"].get("gpu") is None else "one step, on the GPU"
+    lines = ["", "## Peak memory", "", f"MiB above the input, of {what}, in a fresh process."]
     return lines + _table(["N, size, channels", *engines], rows)
 
 
@@ -235,16 +274,17 @@ def _memory(report: Report) -> list[str]:
 
 
 def write_curves(report: Report, out: Path) -> None:
-    """One picture for each axis: forward and backward time of compositing, with as many threads as were tried."""
+    """One picture for each axis, with most threads: forward and backward of compositing, or on a GPU frame and step."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    threads = max(map(int, report["peak"]))
+    threads, gpu = max(map(int, report["peak"])), report["machine"].get("gpu") is not None
+    parts, what = (("frame", "step"), "A view") if gpu else (("forward", "backward"), "Compositing")
     for axis, cases in report["slices"].items():
         figure, panels = plt.subplots(1, 2, figsize=(10, 4.2), sharey=True, layout="constrained")
-        for part, panel in zip(("forward", "backward"), panels, strict=True):
+        for part, panel in zip(parts, panels, strict=True):
             for number, engine in enumerate(_engines(report)):
                 sizes, seconds = _series(report, axis, engine, part, threads)
                 style = {"color": COLORS[number % len(COLORS)], "marker": MARKERS[number % len(MARKERS)]}
@@ -252,7 +292,7 @@ def write_curves(report: Report, out: Path) -> None:
             _decorate(panel, axis, cases, part)
         panels[0].set_ylabel("median time (ms)")
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-        figure.suptitle(f"Compositing, {_fixed(axis, cases[0])}, {_threads(threads)}")
+        figure.suptitle(f"{what}, {_fixed(axis, cases[0])}, {_where(report, threads)}")
         figure.savefig(out / f"engines_{axis.split(',')[0].lower()}{_suffix(axis)}.png", dpi=120)
         plt.close(figure)
 

@@ -10,15 +10,27 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import engines_gsplat
 import numba
 import numpy as np
 import torch
+from devices import CPU
 from engines_room import room, view
 from torch import Tensor
 
 from kfgs import Gaussians
 from kfgs.cameras import Camera
-from kfgs.splat import Projected, Tiles, available_engines, bin_tiles, composite, project, rasterize
+from kfgs.splat import (
+    Projected,
+    Tiles,
+    accumulate_pixels,
+    available_engines,
+    bin_tiles,
+    composite,
+    project,
+    rasterize,
+    rasterize_labels,
+)
 
 PROTOTYPE = Path(__file__).resolve().parents[2] / "shared" / "reference" / "engine_prototype"
 """The numba SIMD prototype and the pure-torch engine that it was compared with; not part of kfgs."""
@@ -50,30 +62,51 @@ class Inputs(NamedTuple):
     grad_alphas: Tensor  # [H, W]
 
 
-def prepare(case: Case) -> Inputs:
+def prepare(case: Case, device: torch.device = CPU) -> Inputs:
     """Make the room, project it and bin it."""
-    gaussians, camera = room(case.count, case.channels), view(case.width, case.height)
+    gaussians, camera = room(case.count, case.channels).to(device), view(case.width, case.height).to(device)
     with torch.no_grad():
         projected = project(gaussians, camera)
         tiles = bin_tiles(projected, case.width, case.height)
     g = torch.Generator().manual_seed(1)
     grad_maps = torch.randn(case.height, case.width, case.channels, generator=g)
-    return Inputs(case, gaussians, camera, projected, tiles, grad_maps, torch.randn(grad_maps.shape[:2], generator=g))
+    grad_alphas = torch.randn(grad_maps.shape[:2], generator=g)
+    return Inputs(case, gaussians, camera, projected, tiles, grad_maps.to(device), grad_alphas.to(device))
 
 
-def engine_names() -> list[str]:
-    """Kfgs's engines that run on a CPU, then the peers that are there."""
-    mine = [f"kfgs {name}" for name in available_engines("cpu")]
+def engine_names(device: torch.device = CPU) -> list[str]:
+    """Kfgs's engines that run on the device (on a GPU without the slow reference), then the peers that are there."""
+    mine = [f"kfgs {name}" for name in available_engines(device.type)]
+    if device.type == "cuda":
+        peers = engines_gsplat.NAMES if engines_gsplat.fault() is None else ()
+        return [name for name in mine if name != "kfgs reference"] + [*peers]
     return mine + (["prototype", "torch tile-batched"] if PROTOTYPE.is_dir() else [])
 
 
-def calls(name: str, inputs: Inputs) -> Calls:
-    """`forward` and `backward` of compositing, and `frame` (project, bin, composite) where the engine has one.
+def missing(device: torch.device = CPU) -> list[str]:
+    """What could be measured on the device, but is not there, one line each."""
+    if device.type == "cpu":
+        return [] if PROTOTYPE.is_dir() else [f"the prototype and its torch engine: no folder {PROTOTYPE}"]
+    triton = "kfgs triton: pip install triton"
+    found = [] if "triton" in available_engines("cuda") else [triton]
+    fault = engines_gsplat.fault()
+    return found if fault is None else [*found, f"gsplat: {fault}"]
 
-    `forward` returns the maps, [H, W, D] without a copy, so that engines can be compared with each other.
+
+def calls(name: str, inputs: Inputs) -> Calls:
+    """What an engine has of these calls; `forward` and `frame` return the maps [H, W, D], so that engines can be compared.
+
+    - `forward` and `backward` of compositing alone
+    - `frame`: project, bin and composite, without gradients
+    - `step`: a frame, and the gradients of all tensors of the Gaussians
+    - `labels`: the best of D classes at each pixel, from scores of the Gaussians (`rasterize_labels`)
+    - `uplift`: a map [H, W, D] summed into the Gaussians (`accumulate_pixels`), without projection and binning
     """
     if name.startswith("kfgs "):
-        return _kfgs(name.removeprefix("kfgs "), inputs)
+        engine = name.removeprefix("kfgs ")
+        return _compositing(engine, inputs) | _whole(engine, inputs)
+    if name in engines_gsplat.NAMES:
+        return engines_gsplat.calls(name, inputs)
     if name == "torch tile-batched":
         return _torch_tile(inputs)
     return _prototype_wide(inputs) if inputs.case.channels % 64 == 0 else _prototype_narrow(inputs)
@@ -90,7 +123,7 @@ def composite_projected(
     return composite(*splats, features, tiles, index=projected.index, engine=engine)
 
 
-def _kfgs(engine: str, inputs: Inputs) -> Calls:
+def _compositing(engine: str, inputs: Inputs) -> Calls:
     names = "means2d", "conics", "opacities"
     floats = {name: getattr(inputs.projected, name).detach().requires_grad_() for name in names}
     features = inputs.gaussians.features.detach().requires_grad_()
@@ -107,11 +140,31 @@ def _kfgs(engine: str, inputs: Inputs) -> Calls:
         upstream = inputs.grad_maps, inputs.grad_alphas
         return torch.autograd.grad(graph[0], [*floats.values(), features], upstream, retain_graph=True)
 
-    def frame() -> Any:
-        with torch.no_grad():
-            return rasterize(inputs.gaussians, inputs.camera, engine=engine)
+    return {"forward": forward, "backward": backward}
 
-    return {"forward": forward, "backward": backward, "frame": frame}
+
+def _whole(engine: str, inputs: Inputs) -> Calls:
+    names = "means", "quats", "scales", "opacities", "features"
+    leaves = {name: getattr(inputs.gaussians, name).detach().clone().requires_grad_() for name in names}
+    cloud, camera, projected = inputs.gaussians.replace(**leaves), inputs.camera, inputs.projected
+
+    def frame() -> Tensor:
+        with torch.no_grad():
+            return rasterize(inputs.gaussians, camera, engine=engine).map
+
+    def step() -> Any:
+        rendering = rasterize(cloud, camera, engine=engine)
+        outputs, upstream = (rendering.map, rendering.alpha), (inputs.grad_maps, inputs.grad_alphas)
+        return torch.autograd.grad(outputs, list(leaves.values()), upstream)
+
+    def labels() -> Any:
+        return rasterize_labels(inputs.gaussians, camera, engine=engine)
+
+    def uplift() -> Any:
+        splats = projected.means2d, projected.conics, projected.opacities
+        return accumulate_pixels(*splats, inputs.grad_maps, inputs.tiles, engine=engine)
+
+    return {"frame": frame, "step": step, "labels": labels, "uplift": uplift}
 
 
 # the prototypes -------------------------------------------------------------------------------------------------------
@@ -288,10 +341,10 @@ class Pairs(NamedTuple):
 
 
 def count_pairs(inputs: Inputs) -> Pairs:
-    """Count by trying every listed pair at every pixel."""
+    """Count by trying every listed pair at every pixel, on the CPU."""
     p, tiles = inputs.projected, inputs.tiles
-    splats = (v.detach().numpy() for v in (p.means2d, p.conics, p.opacities))
-    composited = _count(*splats, tiles.rows.numpy(), tiles.offsets.numpy(), tiles.width, tiles.height, tiles.tile_size)
+    arrays = (v.detach().cpu().numpy() for v in (p.means2d, p.conics, p.opacities, tiles.rows, tiles.offsets))
+    composited = _count(*arrays, tiles.width, tiles.height, tiles.tile_size)
     return Pairs(len(p.index), len(tiles.rows), int(composited))
 
 

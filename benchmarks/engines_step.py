@@ -27,7 +27,7 @@ RATE = 1e-6  # learning rate: the scene stays what it is while it is being measu
 def target_of(inputs: Inputs) -> Tensor:
     """A map to compare with, as large as the rendered one: noise, so that every gradient is as large as any."""
     g = torch.Generator().manual_seed(2)
-    return torch.randn(inputs.grad_maps.shape, generator=g)
+    return torch.randn(inputs.grad_maps.shape, generator=g).to(inputs.grad_maps)
 
 
 def kfgs_step(engine: str, inputs: Inputs) -> tuple[Calls, Calls]:

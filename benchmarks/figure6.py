@@ -1,6 +1,6 @@
 """Figure 6: the number of codewords over training, for one scene or several, by the paper's rule and by the default one.
 
-    python benchmarks/figure6.py OUT SCENE FEATURES [SCENE FEATURES ...] [--epochs 28]
+    python benchmarks/figure6.py OUT SCENE FEATURES [SCENE FEATURES ...] [--epochs 28] [--device cuda]
 
 Writes OUT/figure6.png and OUT/figure6.json. The paper's rule starts from 8 codewords, lets badly represented features join
 (alpha = 0.9) and drops those that became too similar (beta = 0.99); the default splits cells as long as that pays.
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from devices import MapsOn, add_device
 
 from kfgs._files import write_json
 from kfgs.features import FeatureFolder
@@ -21,9 +22,9 @@ from kfgs.scenes import load_scene
 from kfgs.viz.figures import new_figure, save_figure
 
 
-def history_of(scene: Path, features: Path, epochs: int | None) -> dict[str, Any]:
+def history_of(scene: Path, features: Path, epochs: int | None, device: torch.device) -> dict[str, Any]:
     """Codewords after each epoch of the paper's rule, and after each round of the default one."""
-    maps = FeatureFolder(features).of(load_scene(scene).undistorted(), "train")
+    maps = MapsOn(FeatureFolder(features).of(load_scene(scene).undistorted(), "train"), device)
     paper = CodebookConfig.paper() if epochs is None else CodebookConfig.paper(epochs=epochs)
     found = {}
     for name, config in (("paper", paper), ("default", CodebookConfig())):
@@ -54,12 +55,13 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("pairs", type=Path, nargs="+", metavar="SCENE FEATURES")
     parser.add_argument("--epochs", type=int, help="of the paper's rule; 28 if not given")
+    add_device(parser)
     args = parser.parse_args()
     if len(args.pairs) % 2:
         parser.error("expected a folder of features after each scene")
     args.out.mkdir(parents=True, exist_ok=True)
     pairs = zip(args.pairs[::2], args.pairs[1::2], strict=True)
-    scenes = [history_of(scene, features, args.epochs) for scene, features in pairs]
+    scenes = [history_of(scene, features, args.epochs, args.device) for scene, features in pairs]
     write_json(args.out / "figure6.json", scenes)
     draw(args.out / "figure6.png", scenes)
 

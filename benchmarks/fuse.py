@@ -1,39 +1,44 @@
 """The default method on one scene: quality, size and time, over several seeds.
 
     python benchmarks/fuse.py SCENE MAPS OUT [--splat FILE] [--seeds 0 1 2] [--words COCO.npy] [--truth labels_scored] [--uplift]
+        [--device cuda]
 
 SCENE holds classes.json, text.npy and label pictures; MAPS a teacher map for every training view (and for every test view if the
 teacher is to be scored). Without --splat the geometry is trained from the pictures, its time counted. --words are text embeddings
 of the teacher's space [C, D] with which open vocabulary is checked; --uplift adds rows that keep every Gaussian of the splat.
+
+--device is where the geometry is trained and where the rows of --uplift fuse. The default method itself fuses on the CPU, and all
+fields are scored there. Name a new OUT for another device: finished stages are kept.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import statistics
 import time
 from pathlib import Path
 
 import numpy as np
 import torch
+from devices import add_device, device_name, wait
 
 from kfgs import (
     FeatureFolder,
     FitConfig,
+    Gaussians,
     SemanticField,
     UpliftConfig,
     fit_scene,
     load_label_set,
     load_scene,
     read_splats,
-    uplift,
 )
 from kfgs._files import write_json
 from kfgs.evaluation import load_label_map
-from kfgs.fields import pack_field, unpack_field
+from kfgs.fields import Seen, pack_field, unpack_field, uplift_maps
 from kfgs.labels import vote_labels
 from kfgs.pipeline import score_scene, score_teacher, true_labels
+from kfgs.pipeline.fuse import without_lens
 
 
 class Room:
@@ -68,6 +73,21 @@ class Room:
         return statistics.mean(ious)
 
 
+def uplifted(room: Room, splat: Gaussians, corrections: int) -> tuple[SemanticField, float]:
+    """The field of `kfgs.uplift`, on the CPU, and the seconds that fusing took on the splat's device."""
+    scene = room.scene
+    cameras = [scene.cameras[i] for i in scene.views("train")]
+    maps = without_lens(scene, room.maps, FitConfig())
+    wait()
+    start = time.perf_counter()
+    found = uplift_maps(splat, cameras, maps, UpliftConfig(corrections=corrections))
+    wait()
+    seconds = time.perf_counter() - start
+    seen = Seen(found.pixels, found.agreement)
+    field = SemanticField(found.gaussians, linear=found.latents, seen=seen, cameras=tuple(cameras))
+    return field.to("cpu"), seconds
+
+
 def open_vocabulary(room: Room, field: SemanticField, words: Path) -> dict[str, float]:
     """The latents of a packed field against the average of all channels on its Gaussians, weighted by the pixels they fill."""
     rows = torch.nn.functional.normalize(torch.from_numpy(np.load(words)).float(), dim=1)
@@ -82,7 +102,6 @@ def open_vocabulary(room: Room, field: SemanticField, words: Path) -> dict[str, 
 
 def _average_all(room: Room, field: SemanticField) -> torch.Tensor:
     """Every channel fused by the same passes onto the field's own Gaussians: 64 channels at a time, so no basis is lost."""
-    from kfgs.fields.uplift import uplift_maps
 
     class Part:
         def __init__(self, start: int) -> None:
@@ -115,8 +134,10 @@ def main() -> None:
     parser.add_argument("--words", type=Path)
     parser.add_argument("--truth", default="labels_scored")
     parser.add_argument("--uplift", action="store_true")
+    add_device(parser)
     args = parser.parse_args()
     room, rows = Room(args.scene, args.maps, args.truth), []
+    print(f"{device_name(args.device)}, {torch.get_num_threads()} threads")
     stems = list(room.truth)
     try:
         test_maps = FeatureFolder(args.maps, stems)
@@ -126,18 +147,16 @@ def main() -> None:
     except (FileNotFoundError, ValueError) as error:
         print(f"teacher: not scored ({str(error).splitlines()[0][:80]})")
     if args.uplift and args.splat is not None:
-        splat = read_splats(args.splat).gaussians
+        splat = read_splats(args.splat).gaussians.to(args.device)
         for corrections in (0, 1):
-            start = time.perf_counter()
-            field = uplift(room.scene, room.maps, splat, FitConfig(uplift=UpliftConfig(corrections=corrections)))
-            seconds = time.perf_counter() - start
+            field, seconds = uplifted(room, splat, corrections)
             miou, accuracy = room.score(field)
             print(
                 f"uplift, {corrections} corrections: {len(field)} Gaussians, {field.channels} latents, {seconds:.1f} s, "
                 f"mIoU {miou:.2f}, accuracy {accuracy:.2f}, queries {room.queries(field):.3f}"
             )
     for seed in args.seeds:
-        config = dataclasses.replace(FitConfig(), seed=seed)
+        config = FitConfig(seed=seed, device=str(args.device))
         result = fit_scene(room.scene, room.maps, args.out / str(seed), config, splat=args.splat, report=print)
         field, data = result.field, pack_field(result.field)
         packed = unpack_field(data)

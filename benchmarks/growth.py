@@ -14,13 +14,13 @@ import argparse
 import math
 import os
 import statistics
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from devices import add_device, clock, device_name
 from engines_room import room, view
 
 from kfgs import Camera, Gaussians
@@ -61,15 +61,15 @@ def main() -> None:
     """Measure every size, print tables, write numbers and curves."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path)
-    parser.add_argument("--device", default="cpu")
+    add_device(parser)
     parser.add_argument("--threads", type=int)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--quick", action="store_true", help="tiny cases, which only prove that it runs")
     args = parser.parse_args()
     if args.threads:
         torch.set_num_threads(args.threads)
-    device, repeats = torch.device(args.device), 1 if args.quick else args.repeats
-    print(f"{device}, {torch.get_num_threads()} threads, load {os.getloadavg()[0]:.1f} at the start")
+    device, repeats = args.device, 1 if args.quick else args.repeats
+    print(f"{device_name(device)}, {torch.get_num_threads()} threads, load {os.getloadavg()[0]:.1f} at the start")
     found: dict[str, list[dict[str, Any]]] = {}
     for name, cases in (QUICK_AXES if args.quick else AXES).items():
         found[name] = [{"size": size} | rendering(case, device, repeats) for size, case in cases]
@@ -96,7 +96,7 @@ def rendering(case: Case, device: torch.device, repeats: int) -> dict[str, float
     seconds: list[list[float]] = [[] for _ in jobs]
     for turn in range(repeats + 1):  # the first round compiles and is not counted
         for job, kept in zip(jobs, seconds, strict=True):
-            taken = clock(job, device)
+            taken = clock(job)
             if turn > 0:
                 kept.append(taken)
     return {name: statistics.median(kept) for name, kept in zip(CALLS, seconds, strict=True)}
@@ -114,17 +114,7 @@ def uplift_seconds(views: int, device: torch.device) -> float:
     cloud, camera = room(5_000, 1).replace(features=None).to(device), view(160, 120).to(device)
     map = torch.randn(30, 40, 32, generator=torch.Generator().manual_seed(0)).to(device)
     config = UpliftConfig.field(max_gaussians=2_000)
-    return clock(lambda: uplift_maps(cloud, [camera] * views, [map] * views, config), device)
-
-
-def clock(job: Callable[[], Any], device: torch.device) -> float:
-    """Seconds of a call, until the device has finished it."""
-    wait: Callable[[], None] = torch.cuda.synchronize if device.type == "cuda" else lambda: None
-    wait()
-    start = time.perf_counter()
-    job()
-    wait()
-    return time.perf_counter() - start
+    return clock(lambda: uplift_maps(cloud, [camera] * views, [map] * views, config))
 
 
 def table(name: str, calls: Sequence[str], rows: list[dict[str, Any]]) -> str:

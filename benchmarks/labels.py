@@ -13,13 +13,13 @@ from __future__ import annotations
 import argparse
 import os
 import statistics
-import time
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
+from devices import add_device, clock, device_name
 from engines_room import room, view
 from torch import Tensor
 
@@ -62,7 +62,7 @@ def main() -> None:
     parser.add_argument("--classes", type=int, default=18)
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--threads", type=int)
-    parser.add_argument("--device", default="cpu")
+    add_device(parser)
     parser.add_argument("--quick", action="store_true", help="a tiny case, which only proves that it runs")
     args = parser.parse_args()
     if args.classes < 5:
@@ -89,7 +89,9 @@ def main() -> None:
         )
     fields, camera, rows = [field.to(args.device) for field in fields], camera.to(args.device), rows.to(args.device)
     print(f"{width} x {height} pixels, {len(fields[0])} Gaussians, {len(rows)} classes")
-    print(f"{args.device}, {torch.get_num_threads()} threads, load {os.getloadavg()[0]:.1f} at the start\n")
+    print(
+        f"{device_name(args.device)}, {torch.get_num_threads()} threads, load {os.getloadavg()[0]:.1f} at the start\n"
+    )
     print("| what | old, ms | new, ms | ratio | of the quickest | per second | at best | equal |\n" + "|---" * 8 + "|")
     for field in fields:
         for row in compare(field, camera, rows, args.repeats):
@@ -191,18 +193,8 @@ def measure(
     seconds: tuple[list[float], list[float]] = ([], [])
     for _ in range(repeats):
         for call, times in zip((old, new), seconds, strict=True):
-            wait()
-            began = time.perf_counter()
-            call()
-            wait()
-            times.append(time.perf_counter() - began)
+            times.append(clock(call))
     return Row(name, *seconds, equal)
-
-
-def wait() -> None:
-    """Until the GPU has finished, if one is used."""
-    if torch.cuda.is_initialized():
-        torch.cuda.synchronize()
 
 
 def blended(field: SemanticField, camera: Camera, rows: Tensor, top: int = 1) -> Tensor:

@@ -154,6 +154,7 @@ def command(request: dict[str, Any]) -> str:
     words += ["--splat COLOR/color.ply"] if request["given"] else []
     words += ["--quick"] if request["preset"] == "quick" else [f"--preset {request['preset']}"]
     words += [f"--steps {request['steps']}"] if request.get("steps") is not None else []
+    words += [f"--device {request['device']}"] if request.get("device", "cpu") != "cpu" else []
     usual = 3 if request["preset"] == "quick" else 1
     words += [f"--every {request['every']}"] if request.get("every", usual) != usual else []
     words += [f"--truth {request['truth']}"] if request.get("truth", "labels_scored") != "labels_scored" else []

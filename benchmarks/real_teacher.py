@@ -13,6 +13,8 @@ The teacher's errors are those of a network: alike in neighbouring pixels and fr
 second teacher, on tokens that are first whitened within classes; its maps scatter no more evenly, since the head is free
 to stretch them again. With HEAD in WEIGHTS/head.safetensors, kfgs's own command makes the same maps:
 `kfgs features SCENE --teacher benchmarks.real_teacher:RealTeacher --weights WEIGHTS`.
+
+`head` and `maps` take --device cuda: the backbone runs there. The head is fitted on the CPU.
 """
 
 from __future__ import annotations
@@ -213,7 +215,7 @@ def labelled_tokens(backbone: Teacher, scene: Scene, labels: Path) -> tuple[Tens
             features = backbone.encode_image(picture.read().permute(2, 0, 1))  # [C, h, w]
             target = resize_labels(load_label_map(path), (features.shape[1], features.shape[2]))
             known = target >= 0
-            tokens.append(features.permute(1, 2, 0)[known])
+            tokens.append(features.permute(1, 2, 0).cpu()[known])
             targets.append(target[known])
     if sum(map(len, targets)) == 0:
         raise ValueError(
@@ -311,7 +313,8 @@ def main() -> None:
         return
     scene, classes = load_scene(args.scene), load_label_set(args.scene / "classes.json", args.scene / "text.npy")
     if args.command == "head":
-        backbone = load_teacher("dinov2", args.weights, size=args.size)
+        backbone: Any = load_teacher("dinov2", args.weights, size=args.size)
+        backbone.to(args.device)
         tokens, labels = labelled_tokens(backbone, scene, args.scene / args.labels)
         generator = torch.Generator().manual_seed(args.seed)
         weight, bias = fit_head(tokens, labels, classes.embeddings, whiten=args.whiten, generator=generator)
@@ -319,9 +322,8 @@ def main() -> None:
         right = float((classify(linear(tokens, weight, bias), classes.embeddings).labels == labels).float().mean())
         print(f"{args.head}: {len(tokens):,} tokens, {right:.1%} right; {time.perf_counter() - start:.0f} s")
         return
-    extract_features(
-        RealTeacher(args.weights, args.head), scene, args.out, "all", report=print, progress=sys.stderr.isatty()
-    )
+    teacher = RealTeacher(args.weights, args.head).to(args.device)
+    extract_features(teacher, scene, args.out, "all", report=print, progress=sys.stderr.isatty())
     print(f"{args.out}: {len(scene)} maps; {time.perf_counter() - start:.0f} s")
     report = score_maps(scene, args.out, args.scene / args.truth, classes)
     print(f"{args.scene / args.truth}: no label of a test view, nothing to score" if report is None else report)
@@ -329,6 +331,8 @@ def main() -> None:
 
 def parse_arguments() -> argparse.Namespace:
     """Read the command line."""
+    from devices import add_device  # not at the top: kfgs imports RealTeacher from here without benchmarks/ on the path
+
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     fetch_, head, maps = (commands.add_parser(name) for name in ("fetch", "head", "maps"))
@@ -340,6 +344,8 @@ def parse_arguments() -> argparse.Namespace:
     head.add_argument("--whiten", action="store_true", help="whiten the tokens within classes before the fit")
     head.add_argument("--labels", default="labels", help="folder in SCENE with the labels that are learnt")
     head.add_argument("--seed", type=int, default=0)
+    for command in (head, maps):
+        add_device(command)
     maps.add_argument("--truth", default="labels_scored", help="folder in SCENE with the labels that are scored")
     return parser.parse_args()
 

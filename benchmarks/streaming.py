@@ -1,15 +1,16 @@
 """How much memory and time do 90 maps of 360 x 480 x 512 take, from pictures to index maps, or to a field?
 
     python benchmarks/streaming.py SCENE [--images 90] [--size 360 480] [--channels 512] [--epochs 28] [--folder DIR]
-        [--splat PLY]
+        [--splat PLY] [--device cuda]
 
 With --epochs, the codebook is fitted as in the paper, in so many epochs. With --splat, the maps are also fused onto that file's
 Gaussians, merged and compressed, as `kfgs fit --splat` does by default.
 
 Each stage runs in a process of its own, whose highest resident memory is what Linux says (VmHWM): writing the maps with
-`extract_features`, fitting the codebook, making the index maps. The teacher is a seeded random matrix on smoothed
-pictures, which takes next to nothing, so what is measured is all that surrounds a teacher. The maps (15.9 GB as they
-stand) are deleted at the end, unless --folder names a place to keep them.
+`extract_features`, fitting the codebook, making the index maps. With --device cuda the stages compute on the GPU, and the table
+also has the most memory that torch held there; `kfgs fit` does these stages on the CPU. The teacher is a seeded random matrix
+on smoothed pictures, which takes next to nothing, so what is measured is all that surrounds a teacher. The maps (15.9 GB as
+they stand) are deleted at the end, unless --folder names a place to keep them.
 """
 
 from __future__ import annotations
@@ -25,10 +26,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from devices import CPU, MapsOn, add_device, wait
 
 from kfgs.cameras import resize_map
 from kfgs.features import FeatureFolder, Picture, extract_features, pictures_of
-from kfgs.fields import UpliftConfig
+from kfgs.fields import UpliftConfig, uplift_maps
 from kfgs.formats import read_splats
 from kfgs.pipeline.fuse import uplift_stage
 from kfgs.pipeline.maps import map_digests
@@ -44,14 +46,14 @@ class RandomTeacher:
 
     name = "random"
 
-    def __init__(self, size: tuple[int, int], channels: int) -> None:
+    def __init__(self, size: tuple[int, int], channels: int, device: torch.device = CPU) -> None:
         self.size = size
         self.identity = {"name": self.name, "size": list(size), "channels": channels}
-        self.matrix = torch.randn(channels, 3, generator=torch.Generator().manual_seed(0))
+        self.matrix = torch.randn(channels, 3, generator=torch.Generator().manual_seed(0)).to(device)
 
     def encode_image(self, image: torch.Tensor) -> torch.Tensor:  # [3, H, W] -> [D, h, w]
         """Smooth, mix, bend."""
-        cells = resize_map(image.permute(1, 2, 0), self.size, antialias=True) - 0.5
+        cells = resize_map(image.to(self.matrix).permute(1, 2, 0), self.size, antialias=True) - 0.5
         return torch.tanh((cells @ self.matrix.T).mul_(4)).mul_(0.5).permute(2, 0, 1)
 
     def encode_text(self, prompts: object) -> torch.Tensor:
@@ -72,6 +74,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="where the maps go, and stay; a temporary folder if not given")
     parser.add_argument("--splat", type=Path, help="also fuse the maps onto these Gaussians")
     parser.add_argument("--json", type=Path, help="also write the numbers here")
+    add_device(parser)
     parser.add_argument("--stage", choices=STAGES, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.stage:
@@ -84,16 +87,18 @@ def main() -> None:
     print(
         f"{args.images} maps of {args.size[0]} x {args.size[1]} x {args.channels}: {dense / 1e9:.2f} GB in half precision"
     )
-    print("| stage | seconds | peak memory, GB | |\n| --- | --- | --- | --- |")
+    print(f"on {args.device}\n")
+    print("| stage | seconds | peak memory, GB | on the GPU, GB | |\n| --- | --- | --- | --- | --- |")
     for row in rows:
-        print(f"| {row['stage']} | {row['seconds']:.1f} | {row['peak'] / 1e9:.2f} | {row['note']} |")
+        on_gpu = "-" if row["peak_gpu"] is None else f"{row['peak_gpu'] / 1e9:.2f}"
+        print(f"| {row['stage']} | {row['seconds']:.1f} | {row['peak'] / 1e9:.2f} | {on_gpu} | {row['note']} |")
     if args.json:
         args.json.write_text(json.dumps({"dense_bytes": dense, "stages": rows}, indent=2) + "\n")
 
 
 def run_apart(args: argparse.Namespace, stage: str) -> dict[str, Any]:
     """One stage in a fresh process."""
-    size, options = map(str, args.size), ("images", "channels", "epochs", "folder", "splat")
+    size, options = map(str, args.size), ("images", "channels", "epochs", "folder", "splat", "device")
     command = [sys.executable, __file__, str(args.scene), "--stage", stage, "--size", *size]
     given = [name for name in options if getattr(args, name) is not None]
     command += [text for name in given for text in (f"--{name}", str(getattr(args, name)))]
@@ -103,14 +108,16 @@ def run_apart(args: argparse.Namespace, stage: str) -> dict[str, Any]:
 
 
 def run_stage(args: argparse.Namespace) -> dict[str, Any]:
-    """One stage in this process: its name, seconds, peak memory in bytes, and a word about the result."""
+    """One stage in this process: its name, seconds, peaks of memory in bytes, and a word about the result."""
     start = time.perf_counter()
     work = {
         "start": lambda args: "imports alone", "extract": extract, "codebook": codebook, "index maps": index_maps,
         "uplift": uplift,
     }  # fmt: skip
     note = work[args.stage](args)
-    return {"stage": args.stage, "seconds": time.perf_counter() - start, "peak": highest_memory(), "note": note}
+    wait()
+    found = {"stage": args.stage, "seconds": time.perf_counter() - start, "peak": highest_memory(), "note": note}
+    return found | {"peak_gpu": torch.cuda.max_memory_allocated(args.device) if args.device.type == "cuda" else None}
 
 
 def extract(args: argparse.Namespace) -> str:
@@ -118,22 +125,23 @@ def extract(args: argparse.Namespace) -> str:
     pictures = pictures_of(load_scene(args.scene))
     turns = [pictures[i % len(pictures)] for i in range(args.images)]
     named = [Picture(f"{i:04d}", picture.path) for i, picture in enumerate(turns)]
-    made = extract_features(RandomTeacher(tuple(args.size), args.channels), named, args.folder / "maps", progress=True)
+    teacher = RandomTeacher(tuple(args.size), args.channels, args.device)
+    made = extract_features(teacher, named, args.folder / "maps", progress=True)
     return f"{sum(record.bytes for record in made.maps.values()) / 1e9:.2f} GB written"
 
 
 def codebook(args: argparse.Namespace) -> str:
     """Maps to a codebook."""
     config = CodebookConfig() if args.epochs is None else CodebookConfig.paper(epochs=args.epochs)
-    fit = fit_codebook(FeatureFolder(args.folder / "maps"), config, progress=True)
+    fit = fit_codebook(MapsOn(FeatureFolder(args.folder / "maps"), args.device), config, progress=True)
     fit.codebook.save(args.folder / "codebook.safetensors")
     return f"K = {fit.codebook.size}, coverage {fit.coverage:.3f}, maps looked at: {config.passes} x"
 
 
 def index_maps(args: argparse.Namespace) -> str:
     """Maps and codebook to index maps."""
-    book = Codebook.load(args.folder / "codebook.safetensors")
-    found = quantize_maps(FeatureFolder(args.folder / "maps"), book, progress=True)
+    book = Codebook.load(args.folder / "codebook.safetensors").to(args.device)
+    found = quantize_maps(MapsOn(FeatureFolder(args.folder / "maps"), args.device), book, progress=True)
     found.save(args.folder / "index_maps.safetensors")
     return f"{found.nbytes / 1e6:.1f} MB"
 
@@ -142,11 +150,17 @@ def uplift(args: argparse.Namespace) -> str:
     """Maps and Gaussians to a field."""
     scene, maps = load_scene(args.scene).undistorted(), FeatureFolder(args.folder / "maps")
     cameras = [scene.cameras[i % len(scene.cameras)] for i in range(len(maps))]
-    with tempfile.TemporaryDirectory(prefix="kfgs_streaming_") as folder:  # a finished stage would be found again
-        run, config = Run(Path(folder), print_line), UpliftConfig.field()
-        inputs = {"features": {"files": map_digests(run, maps)}, "config": {}, "seed": 0}
-        field = uplift_stage(run, read_splats(args.splat).gaussians, cameras, maps, config, inputs, True)
-    return f"{len(field.gaussians)} Gaussians, {field.gaussians.features.shape[1]} latents"
+    splat, config = read_splats(args.splat).gaussians, UpliftConfig.field()
+    if args.device.type == "cuda":  # the stage of `kfgs fit` fuses on the CPU
+        gaussians = uplift_maps(
+            splat.to(args.device), cameras, maps, config, progress=True, report=print_line
+        ).gaussians
+    else:
+        with tempfile.TemporaryDirectory(prefix="kfgs_streaming_") as folder:  # a finished stage would be found again
+            run = Run(Path(folder), print_line)
+            inputs = {"features": {"files": map_digests(run, maps)}, "config": {}, "seed": 0}
+            gaussians = uplift_stage(run, splat, cameras, maps, config, inputs, True).gaussians
+    return f"{len(gaussians)} Gaussians, {gaussians.features.shape[1]} latents"
 
 
 def print_line(text: str) -> None:

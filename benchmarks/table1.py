@@ -1,6 +1,7 @@
 """Table 1, side by side: every row fitted on one scene with one teacher, scored on unseen views, beside the paper's figures.
 
     python benchmarks/table1.py SCENE FEATURES OUT [--splat PLY] [--rows ROW ...] [--quick] [--seeds 0 1 2] [--preset cpu|paper]
+        [--device cuda]
 
 FEATURES holds a teacher map for every training view, and for every test view too if the teacher is to be scored. All methods
 that put features on coloured Gaussians share one cloud, which no semantic loss moves: --splat, or that of `kfgs color`, trained
@@ -8,6 +9,9 @@ first. Each row runs in a process of its own; a row that is finished is read bac
 
 --quick: `short()` of every baseline, few steps of the paper's rows, and every third test view: under 20 minutes for room_0 on two
 idle cores. Without it `medium()` of every baseline, and all test views: an hour or two. --preset paper: the published schedules.
+
+--device cuda: the shared cloud and the fields of the paper's rows are trained on the GPU, and frames per second are measured
+there. Baselines are fitted on the CPU, kfgs's default fuses there, and all rows are scored there.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from devices import add_device, device_name
 from table1_report import draw_plots, print_table, save_report
 from table1_rows import REQUEST, RESULT, ROWS, config_of
 
@@ -54,7 +59,7 @@ def main() -> None:
                 flush=True,
             )
     about = {
-        "machine": this_machine(),
+        "machine": this_machine(), "device": device_name(args.device),
         "command": "python benchmarks/table1.py " + " ".join(sys.argv[1:]), "preset": preset_of(args),
         "geometry_seconds": geometry_seconds, "seconds": time.perf_counter() - start, "teacher": teacher,
     }  # fmt: skip
@@ -79,7 +84,9 @@ def find_splat(args: argparse.Namespace) -> tuple[Path, float | None]:
     config = (
         ColorConfig.geometry() if args.quick else ColorConfig.paper() if args.preset == "paper" else ColorConfig.cpu()
     )
-    result = fit_color(load_scene(args.scene).undistorted(), args.out / "color", config, report=print)
+    result = fit_color(
+        load_scene(args.scene).undistorted(), args.out / "color", config, report=print, device=args.device
+    )
     return result.path, result.seconds
 
 
@@ -128,7 +135,8 @@ def row_result(
     preset, mode = preset_of(args), ROWS[key].mode
     facts = {
         "row": key, "seed": seed, "preset": preset, "steps": args.steps, "truth": args.truth, "every": every(args),
-        "config": config_of(key, preset, args.steps, seed), "digests": digests | ({} if mode is None else {"splat": ""}),
+        "config": config_of(key, preset, args.steps, seed, str(args.device)), "device": str(args.device),
+        "digests": digests | ({} if mode is None else {"splat": ""}),
         "given": args.splat is not None and mode is None,
     }  # fmt: skip
     paths = {"scene": str(args.scene), "features": str(args.features), "splat": str(splat) if mode is None else None}
@@ -161,6 +169,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--every", type=int, help="score every so many test views")
     parser.add_argument("--truth", default="labels_scored")
     parser.add_argument("--seeds", "--seed", type=int, nargs="+", default=[0])
+    add_device(parser)
     args = parser.parse_args()
     if args.splat is not None and not args.splat.is_file():
         parser.error(f"--splat: expected a file, got {args.splat}, which does not exist")

@@ -46,6 +46,11 @@ def print_table(path: Path, about: dict[str, Any], results: list[dict[str, Any]]
 def table_text(about: dict[str, Any], results: list[dict[str, Any]]) -> str:
     """The table with what has to be said about it."""
     lines = [f"{about['command']}", "", f"Preset {about['preset']}: {PRESETS[about['preset']]}."]
+    if about.get("device", "cpu") != "cpu":
+        lines.append(
+            f"On {about['device']}: the shared Gaussians, the fields of the paper's rows, frames per second. On the CPU: the "
+            "fits of the baselines, the fusion of kfgs's default, and the scores."
+        )
     lines.append(f"{about['machine']}; {about['seconds'] / 60:.1f} minutes in all (rows read back take none).")
     if about["geometry_seconds"] is not None:
         lines.append(

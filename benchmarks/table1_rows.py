@@ -19,6 +19,7 @@ import torch
 from baselines import cf3, feature_3dgs, langsplat, langsplatv2, legaussians, occam, plain_uplift
 from baselines.common import FLOAT, Fitted, Task, sample_rows
 from baselines.methods import LabelMaps
+from devices import clock
 from safetensors.torch import save_file
 
 from kfgs._files import read_json, write_json
@@ -96,26 +97,25 @@ def baseline_config(row: Row, preset: str) -> Any:
     return make(*row.options)
 
 
-def kfgs_config(row: Row, key: str, preset: str, steps: int | None, seed: int) -> FitConfig:
+def kfgs_config(row: Row, key: str, preset: str, steps: int | None, seed: int, device: str = "cpu") -> FitConfig:
     """The configuration of one of kfgs's own rows.
 
     Codebook and autoencoder of the paper's rows are the paper's; only `--preset paper` has its schedule of the field, too.
     """
     if row.mode is None:
-        return FitConfig(seed=seed)
-    config = (
-        FitConfig(method="paper", mode=row.mode, seed=seed) if row.own else FitConfig.paper(mode=row.mode, seed=seed)
-    )
+        return FitConfig(seed=seed)  # nothing is trained
+    options: dict[str, Any] = {"mode": row.mode, "seed": seed, "device": device}
+    config = FitConfig(method="paper", **options) if row.own else FitConfig.paper(**options)
     if preset != "paper":
         config = replace(config, field=FieldConfig.cpu())
     steps = QUICK_STEPS[key] if preset == "quick" and steps is None else steps
     return config if steps is None else replace(config, field=config.field.with_steps(steps))
 
 
-def config_of(key: str, preset: str, steps: int | None, seed: int) -> dict[str, Any]:
+def config_of(key: str, preset: str, steps: int | None, seed: int, device: str = "cpu") -> dict[str, Any]:
     """What decides a row, as JSON."""
     row = ROWS[key]
-    config = baseline_config(row, preset) if row.module else kfgs_config(row, key, preset, steps, seed)
+    config = baseline_config(row, preset) if row.module else kfgs_config(row, key, preset, steps, seed, device)
     return asdict(config)
 
 
@@ -124,12 +124,13 @@ class Made:
     """A fitted row, before it is scored."""
 
     method: Method
-    render: Callable[[Camera], Any]
     facts: dict[str, Any]
     nearest: Method
     """The same, labelled by the text nearest to each pixel's feature."""
     codec: Callable[[torch.Tensor], torch.Tensor] | None
     """See `Fitted.codec`."""
+    on: Callable[[torch.device], tuple[Method, Callable[[Camera], Any]]]
+    """The method on a device, and what renders its map there."""
 
 
 class Room:
@@ -203,11 +204,7 @@ def fitting_seconds(stages: dict[str, float]) -> float:
 def frames_per_second(work: Callable[[Any], object], items: Sequence[Any]) -> float:
     """Median over the items of 1 / seconds, after one warm-up."""
     work(items[0])
-    times = []
-    for item in items:
-        start = time.perf_counter()
-        work(item)
-        times.append(time.perf_counter() - start)
+    times = [clock(partial(work, item)) for item in items]
     return 1 / sorted(times)[len(times) // 2]
 
 
@@ -233,12 +230,17 @@ def make_baseline(row: Row, room: Room, request: dict[str, Any], folder: Path) -
         "dim": fitted.dim, "gaussians": len(fitted.method.gaussians), "storage": fitted.storage,
         "disk": file.stat().st_size + shape, "stages": fitted.seconds, "history": fitted.history,
     }  # fmt: skip
-    return Made(fitted.method, fitted.method.render, facts, fitted.method, fitted.codec)
+
+    def on(device: torch.device) -> tuple[Method, Callable[[Camera], Any]]:
+        moved = fitted.method.to(device)
+        return moved, moved.render
+
+    return Made(fitted.method, facts, fitted.method, fitted.codec, on)
 
 
 def make_kfgs(row: Row, room: Room, request: dict[str, Any], folder: Path) -> Made:
     """Fit one of kfgs's own rows."""
-    config = kfgs_config(row, request["row"], request["preset"], request["steps"], request["seed"])
+    config = kfgs_config(row, *(request[name] for name in ("row", "preset", "steps", "seed", "device")))
     splat = request["splat"] if row.mode is None else None
     shutil.rmtree(folder / "run", ignore_errors=True)  # stages of a killed run would count too few seconds
     result = fit_scene(room.scene, room.maps, folder / "run", config, splat=splat, report=print)
@@ -252,8 +254,12 @@ def make_kfgs(row: Row, room: Room, request: dict[str, Any], folder: Path) -> Ma
     }  # fmt: skip
     if row.mode is None:
         facts["packed"] = len(pack_field(field))
-    method, nearest = FieldMethod(field), FieldMethod(field, own_labels=False)
-    return Made(method, partial(_render, field), facts, nearest, field_codec(field))
+
+    def on(device: torch.device) -> tuple[Method, Callable[[Camera], Any]]:
+        moved = field.to(device)
+        return FieldMethod(moved), moved.render
+
+    return Made(FieldMethod(field), facts, FieldMethod(field, own_labels=False), field_codec(field), on)
 
 
 def field_codec(field: SemanticField) -> Callable[[torch.Tensor], torch.Tensor] | None:
@@ -267,8 +273,9 @@ def field_codec(field: SemanticField) -> Callable[[torch.Tensor], torch.Tensor] 
     return lambda rows: book.codewords[book.quantize(decoded)][book.quantize(rows)]
 
 
-def _render(field: SemanticField, camera: Camera) -> None:
-    field.render(camera)
+def views_on(views: Sequence[View], device: torch.device) -> list[View]:
+    """Views whose cameras are on a device."""
+    return [view._replace(camera=view.camera.to(device)) for view in views]
 
 
 def run_row(folder: Path) -> dict[str, Any]:
@@ -278,14 +285,16 @@ def run_row(folder: Path) -> dict[str, Any]:
     room = Room(Path(request["scene"]), Path(request["features"]), request["truth"], request["every"])
     made = (make_baseline if row.module else make_kfgs)(row, room, request, folder)
     fit_peak = peak_memory()
-    shown, text = room.views[:FPS_VIEWS], room.text
+    device = torch.device(request["device"])
+    shown, text = views_on(room.views[:FPS_VIEWS], device), room.text.to(device)
+    method, render = made.on(device)
     with torch.no_grad():
-        fps = frames_per_second(lambda view: made.render(view.camera), shown)
-        label_fps = frames_per_second(lambda view: label_view(made.method, view, text), shown)
+        fps = frames_per_second(lambda view: render(view.camera), shown)
+        label_fps = frames_per_second(lambda view: label_view(method, view, text), shown)
     fitted = time.perf_counter()
     scores = room.score(made.method, made.nearest) | room.codec_scores(made.codec, request["seed"])
     middle = room.views[len(room.views) // 2]
-    save_label_map(folder / "labels.png", label_view(made.method, middle, text))
+    save_label_map(folder / "labels.png", label_view(made.method, middle, room.text))
     return {
         "request": request, "folder": folder.name,
         **made.facts, **scores, "fps_maps": fps, "fps_labels": label_fps, "peak_fit": fit_peak,

@@ -1,9 +1,11 @@
 """Table 2: the paper's method with latents of 3, 6, 9, 12 and 15 numbers, and without compression of channels (512).
 
     python benchmarks/table2.py SCENE FEATURES OUT [--dims 3 6 9 12 15 512] [--quick] [--steps N] [--preset cpu|paper]
+        [--device cuda]
 
 All rows share the codebook and the index maps, which are made once and counted in each. A row that is finished is read back.
---quick: 800 steps (512 channels: 350), and every third test view is scored.
+--quick: 800 steps (512 channels: 350), and every third test view is scored. --device is where the fields are trained and where
+frames per second are measured; the other stages run on the CPU. Name a new OUT for another device: finished stages are kept.
 """
 
 from __future__ import annotations
@@ -14,8 +16,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from devices import add_device
 from table1 import data_digests
-from table1_rows import FPS_VIEWS, QUICK_STEPS, Room, field_codec, fitting_seconds, frames_per_second
+from table1_rows import FPS_VIEWS, QUICK_STEPS, Room, field_codec, fitting_seconds, frames_per_second, views_on
 
 from kfgs._files import atomic_path, digest_value, read_json, write_json
 from kfgs.evaluation import FieldMethod
@@ -33,7 +36,7 @@ PAPER = {  # mIoU, minutes, thousand Gaussians, MB, FPS
 
 def config_of(dim: int, args: argparse.Namespace) -> FitConfig:
     """Of one row: `adc+sc` with so many latents, or `adc`."""
-    config = FitConfig.paper(mode="adc" if dim == FULL else "adc+sc", seed=args.seed)
+    config = FitConfig.paper(mode="adc" if dim == FULL else "adc+sc", seed=args.seed, device=str(args.device))
     if args.preset != "paper":
         config = replace(config, field=FieldConfig.cpu())
     if dim != FULL:
@@ -50,6 +53,7 @@ def run(dim: int, room: Room, args: argparse.Namespace) -> dict[str, Any]:
         "stages": [stage.key for stage in result.stages],
         "views": [view.stem for view in room.views],
         "truth": args.truth,
+        "device": str(args.device),
         "digests": data_digests(args, args.out / "none"),
     }
     file = args.out / "rows" / f"{dim}-{digest_value(asked)[:12]}.json"
@@ -58,11 +62,12 @@ def run(dim: int, room: Room, args: argparse.Namespace) -> dict[str, Any]:
     field = result.field
     method, nearest = FieldMethod(field), FieldMethod(field, own_labels=False)
     seconds = {stage.name: stage.seconds for stage in result.stages}
+    moved, shown = field.to(args.device), views_on(room.views[:FPS_VIEWS], args.device)
     row = {
         "dim": dim, **room.score(method, nearest), **room.codec_scores(field_codec(field), args.seed), "stages": seconds,
         "gaussians": len(field), "storage": field.storage(),
-        "fps_maps": frames_per_second(lambda view: field.render(view.camera), room.views[:FPS_VIEWS]),
-        "steps": config.field.steps,
+        "fps_maps": frames_per_second(lambda view: moved.render(view.camera), shown),
+        "device": str(args.device), "steps": config.field.steps,
     }  # fmt: skip
     write_json(file, row)
     return row
@@ -117,6 +122,7 @@ def main() -> None:
     parser.add_argument("--every", type=int, help="score every so many test views")
     parser.add_argument("--truth", default="labels_scored")
     parser.add_argument("--seed", type=int, default=0)
+    add_device(parser)
     args = parser.parse_args()
     room = Room(args.scene, args.features, args.truth, args.every or (3 if args.quick else 1))
     rows = []

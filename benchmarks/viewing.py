@@ -5,6 +5,9 @@
 Synthetic rooms as in benchmarks/transfer.py: 20,000 semantic Gaussians on the left, as many colour Gaussians as the row says
 on the right, 1200 x 600 pixels without a display. Each size is opened by a process of its own, so that imports count.
 Writes OUT/viewing.md, a table, and a picture of each row.
+
+There is no --device: VTK draws with the machine's OpenGL, on a GPU if its driver offers that without a display, else in software
+(Mesa's llvmpipe). The table says which. Labels are carried and colours made on the CPU.
 """
 
 from __future__ import annotations
@@ -49,14 +52,24 @@ def main() -> None:
     for size in args.sizes.split(","):
         command = [sys.executable, __file__, str(args.out), "--one", size, "--turns", str(args.turns)]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
-        lines += json.loads(done.stdout.splitlines()[-1])
-    lines += ["", f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} of others and this at the end"]
+        rows, drawn_by = json.loads(done.stdout.splitlines()[-1])
+        lines += rows
+    lines += [
+        "",
+        f"OpenGL: {drawn_by}; {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} of others and this at the end",
+    ]
     (args.out / "viewing.md").write_text("\n".join(lines) + "\n")
     print("\n".join(lines))
 
 
-def measure(size: int, turns: int, out: Path) -> list[str]:
-    """The table's rows of one size."""
+def renderer(explorer: Explorer) -> str:
+    """What draws, in OpenGL's words."""
+    said = explorer.plotter.render_window.ReportCapabilities()
+    return next((line.split(":", 1)[1].strip() for line in said.splitlines() if "renderer string" in line), "unknown")
+
+
+def measure(size: int, turns: int, out: Path) -> tuple[list[str], str]:
+    """The table's rows of one size, and what drew them."""
     loaded = time.perf_counter() - BEGAN
     semantic, color = room(SEMANTIC, 0.04, 0), room(size, 0.08 * (SEMANTIC / size) ** 0.5, 1)
     patches = ((semantic.means + 0.25) * 2).floor().long() @ torch.tensor([1, 5, 7])
@@ -84,8 +97,9 @@ def measure(size: int, turns: int, out: Path) -> list[str]:
             f"| {size:,} | {style}{mark} | {opened:.1f} s | {loaded + opened:.1f} s | {quick:.1f} | {whole:.1f} "
             f"| {distance:.2f} s | {gamma:.2f} s |"
         )
+    drawn_by = renderer(explorer)
     explorer.close()
-    return rows
+    return rows, drawn_by
 
 
 def turning(explorer: Explorer, rate: float, turns: int) -> float:

@@ -19,12 +19,13 @@ def test_quick_run(monkeypatch, capsys):
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("| ")][1:]
     assert [row[0] for row in rows] == [
         "| label map",
+        "| label map by rendered features",
         "| label map, another text each time",
         "| text query, score of each pixel",
         "| 5 best classes",
         "| exact decode",
     ]
-    assert [row[-1] for row in rows if "query" not in row[0]] == ["yes |"] * 4
+    assert [row[-1] for row in rows if "query" not in row[0]] == ["yes |"] * 5
 
 
 def test_too_few_classes_for_its_rows_are_an_error_in_one_line(monkeypatch, capsys):

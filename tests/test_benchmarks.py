@@ -12,6 +12,7 @@ if not (BENCHMARKS / "engines.py").is_file():  # a source distribution comes wit
     pytest.skip(f"no folder {BENCHMARKS}", allow_module_level=True)
 pytest.importorskip("numba", reason="the benchmark counts pairs with numba: `pip install numba`")
 
+GSPLAT = {"gsplat": 3e-3, "gsplat packed": 4e-3}  # seconds
 SIZES = [[1_000, 9, 40, 30], [4_000, 9, 40, 30], [16_000, 9, 40, 30]]
 
 
@@ -97,6 +98,26 @@ def test_tables_hold_what_the_numbers_say(report_module):
     assert _rows(text, "Peak memory") == [["1k, 40x30, 9", "5"]]
 
 
+def test_on_a_gpu_gsplat_stands_beside_with_frames_and_steps(report_module):
+    """In every case gsplat needs 1.5 times, packed twice as long as kfgs; it has no compositing by itself."""
+    report = _report()
+    report["machine"]["gpu"], report["missing"] = "NVIDIA H100", ["something: pip install something"]
+    for entry in report["cases"]:
+        parts = {part: _times(2e-3) for part in ("forward", "backward", "frame", "step", "labels", "uplift")}
+        peers = {name: {part: _times(time) for part in ("frame", "step")} for name, time in GSPLAT.items()}
+        entry |= {"seconds": {"kfgs triton": parts, **peers}, "left_out": {}, "frame_difference": {"gsplat": 2e-3}}
+    text = report_module.write_tables(report)
+    assert "NVIDIA H100; any, 2 cores" in text
+    assert "Not measured: something: pip install something." in text
+    assert "differ from kfgs's by at most 0.002" in text
+    assert _rows(text, "Compositing against Gaussians, NVIDIA H100")[0][3:] == ["2.0 (1.0) / 2.0 (1.0)"]
+    for title in ("A whole frame", "Forward and backward of a whole frame"):
+        assert _rows(text, title)[0][2:] == ["2.0 (1.0)", "3.0 (1.5)", "4.0 (2.0)", "1.50"]
+    for title in ("A label map", "Uplift of a map"):
+        assert _rows(text, title)[0][2:] == ["2.0 (1.0)"]
+    assert "## Times as long as" not in text
+
+
 def test_curves_are_drawn(report_module, tmp_path):
     pytest.importorskip("matplotlib", reason="curves need `pip install matplotlib`")
     report_module.write_curves(_report(), tmp_path)
@@ -129,7 +150,7 @@ def test_smallest_run_measures_every_engine(smallest_run):
     (step,), (case, _) = report["steps"], report["cases"]
     assert list(case["seconds"]) == list(case["difference"]) == list(step["step"]) == ["kfgs numba", "kfgs reference"]
     for parts in case["seconds"].values():
-        assert list(parts) == ["forward", "backward", "frame"]
+        assert list(parts) == ["forward", "backward", "frame", "step", "labels", "uplift"]
         assert all(0 < times["least"] <= times["median"] for times in parts.values())
     assert max(case["difference"].values()) < 1e-2
     assert all(0 < times["least"] <= times["median"] for times in step["step"].values())

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -29,6 +30,10 @@ class Decoder(Protocol):
         """Their products with unit rows: the cosines, up to a positive factor for each latent."""
         ...
 
+    def to(self, device: torch.device) -> Decoder:
+        """The decoder on a device."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class LinearDecoder:
@@ -48,6 +53,10 @@ class LinearDecoder:
         found = latents @ rows.T
         return found if self.bias is None else found + text @ self.bias
 
+    def to(self, device: torch.device) -> LinearDecoder:
+        """Matrix and bias on a device."""
+        return LinearDecoder(*(None if value is None else value.to(device) for value in (self.matrix, self.bias)))
+
 
 @dataclass(frozen=True, eq=False)
 class RenderedMethod:
@@ -59,6 +68,12 @@ class RenderedMethod:
     decoder: Decoder
     known: Tensor | None = None  # [N] bool, which Gaussians have learnt something; None = all that are not zero
     levels: int = 1
+
+    def to(self, device: torch.device) -> RenderedMethod:
+        """A copy on a device."""
+        known = None if self.known is None else self.known.to(device)
+        decoder = deepcopy(self.decoder).to(device)  # a module moves itself
+        return replace(self, gaussians=self.gaussians.to(device), decoder=decoder, known=known)
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:

@@ -20,7 +20,7 @@ def test_table_puts_the_paper_beside(tmp_path):
 
 
 def test_512_is_the_row_without_an_autoencoder():
-    args = argparse.Namespace(preset="cpu", quick=True, steps=None, seed=3)
+    args = argparse.Namespace(preset="cpu", quick=True, steps=None, seed=3, device="cpu")
     config = table2.config_of(512, args)
     assert (config.mode, config.method, config.field.steps, config.seed) == ("adc", "paper", 350, 3)
     config = table2.config_of(6, args)
