@@ -266,13 +266,13 @@ Image.fromarray(view.screenshot())
 # %% [markdown]
 # ### Live
 #
-# The same explorer, with sliders, checkboxes and a line to type in:
+# The viewer draws in the browser, with everything to click, select, edit and undo:
 #
 # ```python
 # everything = {"classes": classes, "cameras": cameras}
-# viz.explore(field, color, **everything)                     # here, in the notebook
+# viz.explore(field, color, **everything)                     # here, as a widget: the last value of a cell
 # viz.explore(field, color, **everything, where="browser")    # a page that only this machine opens; interrupt the kernel to go on
-# viz.explore(field, color, **everything, where="window")     # a desktop window; the cell waits until it is closed
+# viz.explore(field, color, **everything, where="window")     # both clouds in a pyvista window; the cell waits until it is closed
 # ```
 #
 # or, from a shell, `kfgs view data/run/field --color data/run/color.ply --scene data/room`. To ask for words that are no
@@ -284,23 +284,19 @@ Image.fromarray(view.screenshot())
 # A turntable (GIF; MP4 with the extra `video`), drawn by kfgs's rasteriser without OpenGL, of what stands in the room.
 
 # %%
-view.close()
 orbit = Orbit(frames=8, size=(165, 220), elevation_degrees=40, zoom=1.5)
 film = viz.save_turntable(out / "turntable.gif", inside, orbit=orbit, up=up, fps=5)
 print(f"{film.stat().st_size / 1000:.0f} kB")
 display.Image(film)
 
 # %% [markdown]
-# And a page that turns in any browser, without a server or a connection. Browsers have no Gaussians, so they become points
-# (or ellipsoids), and the page says so.
+# And the viewer with the scene in one file, which any browser opens without a server or a connection.
 
 # %%
-plotter = viz.make_plotter(480, 640, off_screen=True)
-viz.add_cloud(plotter, inside, style="gaussians")
-viz.look_through(plotter, outside)
-page = viz.save_page(out / "room.html", plotter, labels=inside.labels, names=classes.names, title=folder.name)
-print(f"{page.path.name}: {page.path.stat().st_size / 1e6:.1f} MB; {page.note}")
-display.FileLink(page.path)
+page = view.save_html(out / "room.html", title=folder.name)
+print(f"{page.name}: {page.stat().st_size / 1e6:.1f} MB")
+view.close()
+display.FileLink(page)
 
 # %% [markdown]
 # Next: [7_your_own_images](7_your_own_images.py) starts from photographs, with a teacher of your own.
