@@ -34,7 +34,8 @@ ALIGN = 16  # bytes: an offset at which JavaScript may start an array of any typ
 MEAN_STEPS = (1 << 21) - 1  # 21 bits for each coordinate
 SCALE_RANGE = 12.0  # in log units: smaller scales are far below a pixel and become the smallest one
 DC_STEPS = (1 << 10) - 1
-SH_STEP = 1 / 32  # of the harmonics above degree 0: an error of 0.01 in a colour, less than a 40 dB picture shows
+# Of the harmonics above degree 0. 1/32 is 2 dB better (room_0: 50 instead of 48 dB), with 2 to 3 bytes a Gaussian more.
+SH_STEP = 1 / 20
 SH_PLANES = {0: 0, 1: 2, 2: 3, 3: 6}  # texels of 8 bytes that hold the coefficients above degree 0
 
 
@@ -48,8 +49,24 @@ class Packed(NamedTuple):
         return short_repr(self)
 
     def compressed(self, level: int = 6) -> bytes:
-        """The data as a zlib stream, which browsers read with `DecompressionStream("deflate")`."""
-        return zlib.compress(self.data, level)
+        """The data as a zlib stream, which JavaScript's `inflate` reads.
+
+        The bytes of each buffer are sorted by their place in a row first, because the last bytes of all rows are more alike
+        than the bytes of one row.
+        """
+        parts, end = [], 0
+        for entry in self.header["buffers"].values():
+            parts.append(self.data[end : entry["offset"]])  # padding
+            end = entry["offset"] + entry["length"]
+            rows = np.frombuffer(self.data[entry["offset"] : end], np.uint8).reshape(-1, _row_bytes(entry))
+            parts.append(np.ascontiguousarray(rows.T).tobytes())
+        return zlib.compress(b"".join([*parts, self.data[end:]]), level)
+
+
+def _row_bytes(entry: dict[str, Any]) -> int:
+    """Bytes of the last axis, or of one number if there is only one axis."""
+    shape: list[int] = entry["shape"]
+    return np.dtype(entry["type"]).itemsize * (shape[-1] if len(shape) > 1 else 1)
 
 
 class _Buffers:

@@ -22,12 +22,24 @@ export function bufferOf(packed, name) {
 
 /**
  * The data of a pack from its compressed form.
- * @param {Uint8Array} bytes a zlib stream (Packed.compressed)
+ * @param {Uint8Array} bytes a zlib stream (Packed.compressed), in which the bytes of a buffer are sorted by their place in a row
+ * @param {object} header of the pack
  * @returns {Promise<ArrayBuffer>}
  */
-export function inflate(bytes) {
+export async function inflate(bytes, header) {
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-  return new Response(stream).arrayBuffer();
+  const sorted = new Uint8Array(await new Response(stream).arrayBuffer());
+  const data = sorted.slice();
+  for (const {offset, length, type, shape} of Object.values(header.buffers)) {
+    const width = ARRAYS[type].BYTES_PER_ELEMENT * (shape.length > 1 ? shape.at(-1) : 1);
+    const rows = length / width;
+    if (width === 1) continue;
+    for (let place = 0; place < width; place++) {
+      const from = offset + place * rows;
+      for (let row = 0, to = offset + place; row < rows; row++, to += width) data[to] = sorted[from + row];
+    }
+  }
+  return data.buffer;
 }
 
 /** One cloud of the pack. Arrays are indexed by Gaussian, as in Python. */

@@ -3,6 +3,7 @@
  * are textures, so that gamma, lambda, hidden classes and modes change with a uniform and without Python.
  */
 import {Cloud, UNKNOWN, bufferOf} from "./clouds.js";
+import {bind, fill, frame, program, rectangles, row, sheet, texture, withAlpha} from "./gl.js";
 import {gaussianAt, gaussiansIn} from "./pick.js";
 import {BATCH, COVERED, FINISH, PREPARE, SPLAT_FRAGMENT, SPLAT_VERTEX, WHOLE, WIDTH} from "./shaders.js";
 import {startSorter} from "./sorter.js";
@@ -257,8 +258,8 @@ export class Renderer {
     const {count} = cloud;
     const planes = cloud.sh ? cloud.sh.length / 2 / count : 0;
     const rows = Math.ceil(count / WIDTH);
-    const shape = target(gl, gl.RGBA32UI, WIDTH, rows);
-    const paint = target(gl, gl.RGBA32UI, WIDTH, rows);
+    const shape = texture(gl, gl.RGBA32UI, WIDTH, rows);
+    const paint = texture(gl, gl.RGBA32UI, WIDTH, rows);
     const shs = texture(gl, gl.RG32UI, planes ? WIDTH : 1, Math.max(1, planes * rows));
     for (let t = 0; t < planes; t++) {
       fill(gl, shs, gl.RG32UI, cloud.sh.subarray(2 * t * count, 2 * (t + 1) * count), t * rows);
@@ -461,8 +462,8 @@ export class Renderer {
     const had = this.target;
     if (had && had.width === width && had.height === height && (had.both || !chosen)) return;
     this.#dropTarget();
-    const picture = target(gl, this.format, width, height, gl.LINEAR);
-    const outline = target(gl, gl.RGBA8, chosen ? width : 1, chosen ? height : 1, gl.LINEAR);
+    const picture = texture(gl, this.format, width, height, gl.LINEAR);
+    const outline = texture(gl, gl.RGBA8, chosen ? width : 1, chosen ? height : 1, gl.LINEAR);
     const depth = gl.createRenderbuffer();
     gl.bindRenderbuffer(gl.RENDERBUFFER, depth);
     gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, width, height);
@@ -490,6 +491,7 @@ export class Renderer {
     gl.flush();
     this.timing = true;
     const look = () => {
+      if (gl.isContextLost()) return void (this.timing = false);
       const status = gl.clientWaitSync(fence, 0, 0);
       if (status === gl.TIMEOUT_EXPIRED) return void setTimeout(look, 2);
       gl.deleteSync(fence);
@@ -543,116 +545,4 @@ export class Renderer {
     this.shared = null;
     this.views.clear();
   }
-}
-
-/** Compile a program; `at` has the places of its uniforms. */
-function program(gl, vertex, fragment) {
-  const made = gl.createProgram();
-  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
-    const shader = gl.createShader(kind);
-    gl.shaderSource(shader, text);
-    gl.compileShader(shader);
-    gl.attachShader(made, shader);
-  }
-  gl.linkProgram(made);
-  if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) {
-    const logs = gl.getAttachedShaders(made).map((shader) => gl.getShaderInfoLog(shader));
-    throw new Error(`The graphics driver refused a shader: ${[gl.getProgramInfoLog(made), ...logs].join(" ")}`);
-  }
-  const at = {};
-  for (let k = 0; k < gl.getProgramParameter(made, gl.ACTIVE_UNIFORMS); k++) {
-    const {name} = gl.getActiveUniform(made, k);
-    at[name] = gl.getUniformLocation(made, name);
-  }
-  return {program: made, at};
-}
-
-/** Give a program its textures; those that it does not use are left out. */
-function bind(gl, {at}, textures) {
-  let unit = 0;
-  for (const [name, made] of Object.entries(textures)) {
-    if (!(name in at)) continue;
-    gl.activeTexture(gl.TEXTURE0 + unit);
-    gl.bindTexture(gl.TEXTURE_2D, made);
-    gl.uniform1i(at[name], unit++);
-  }
-}
-
-/** The corners of `BATCH` rectangles as triangles. */
-function rectangles(gl) {
-  const made = gl.createVertexArray();
-  gl.bindVertexArray(made);
-  const corners = Uint16Array.from({length: 6 * BATCH}, (_, k) => 4 * Math.floor(k / 6) + [0, 1, 2, 2, 1, 3][k % 6]);
-  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
-  gl.bindVertexArray(null);
-  return made;
-}
-
-function texture(gl, format, width, height, filter = gl.NEAREST) {
-  const made = gl.createTexture();
-  gl.bindTexture(gl.TEXTURE_2D, made);
-  gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, filter);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, filter);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
-  return made;
-}
-
-const target = texture;
-
-/** A texture with one texel for each Gaussian. */
-function sheet(gl, format, count, values) {
-  const made = texture(gl, format, WIDTH, Math.ceil(count / WIDTH));
-  if (values) fill(gl, made, format, values);
-  return made;
-}
-
-/** A texture of one row of colours. */
-function row(gl, values) {
-  const made = texture(gl, gl.RGBA8, values.length / 4, 1);
-  gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, values.length / 4, 1, gl.RGBA, gl.UNSIGNED_BYTE, values);
-  return made;
-}
-
-/** Write values into a sheet: the full rows, then the rest. */
-function fill(gl, made, format, values, top = 0) {
-  const [layout, type, channels] = {
-    [gl.RGBA32UI]: [gl.RGBA_INTEGER, gl.UNSIGNED_INT, 4],
-    [gl.RG32UI]: [gl.RG_INTEGER, gl.UNSIGNED_INT, 2],
-    [gl.R32UI]: [gl.RED_INTEGER, gl.UNSIGNED_INT, 1],
-    [gl.R32I]: [gl.RED_INTEGER, gl.INT, 1],
-    [gl.R16I]: [gl.RED_INTEGER, gl.SHORT, 1],
-    [gl.RG8UI]: [gl.RG_INTEGER, gl.UNSIGNED_BYTE, 2],
-    [gl.R32F]: [gl.RED, gl.FLOAT, 1],
-    [gl.RGBA8]: [gl.RGBA, gl.UNSIGNED_BYTE, 4],
-  }[format];
-  const full = Math.floor(values.length / channels / WIDTH);
-  const rest = values.length / channels - full * WIDTH;
-  gl.bindTexture(gl.TEXTURE_2D, made);
-  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
-  if (full) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, top, WIDTH, full, layout, type, values);
-  if (rest) {
-    const last = values.subarray(full * WIDTH * channels);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, top + full, rest, 1, layout, type, last);
-  }
-}
-
-/** A framebuffer of textures and, if there is one, a depth buffer. */
-function frame(gl, textures, depth = null) {
-  const made = gl.createFramebuffer();
-  gl.bindFramebuffer(gl.FRAMEBUFFER, made);
-  const places = textures.map((_, k) => gl.COLOR_ATTACHMENT0 + k);
-  places.forEach((place, k) => gl.framebufferTexture2D(gl.FRAMEBUFFER, place, gl.TEXTURE_2D, textures[k], 0));
-  if (depth) gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, depth);
-  gl.drawBuffers(places.length ? places : [gl.NONE]);
-  return made;
-}
-
-/** Bytes of red, green, blue with an opaque alpha. */
-function withAlpha(rgb) {
-  const made = new Uint8Array((rgb.length / 3) * 4).fill(255);
-  for (let i = 0; i < rgb.length / 3; i++) made.set(rgb.subarray(3 * i, 3 * i + 3), 4 * i);
-  return made;
 }

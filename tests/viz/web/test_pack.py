@@ -1,5 +1,4 @@
 import json
-import zlib
 
 import numpy as np
 import pytest
@@ -106,7 +105,6 @@ def test_every_buffer_is_aligned_and_inside(room):
         end = entry["offset"] + entry["length"]
         assert entry["length"] == np.prod(entry["shape"]) * np.dtype(entry["type"]).itemsize
     assert end <= len(packed.data)
-    assert zlib.decompress(packed.compressed()) == packed.data
     json.dumps(packed.header, allow_nan=False)
 
 

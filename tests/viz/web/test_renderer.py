@@ -1,3 +1,5 @@
+import base64
+
 import cases_web
 import numpy as np
 import pytest
@@ -120,6 +122,21 @@ def test_the_semantic_side(viewer, state):
     state.set_show("rgb")
     truth = drawn(state, camera, "semantic", state.colors("semantic"))
     assert psnr(viewer.picture(camera, "semantic", mode="color"), truth) > ENOUGH
+
+
+INFLATED = """async (text) => {
+  const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  const data = new Uint8Array(await kfgs.inflate(bytes, packed.header));
+  const wanted = new Uint8Array(packed.data);
+  return data.length === wanted.length && data.every((value, k) => value === wanted[k]);
+}"""
+
+
+def test_compressed_data_come_back(viewer, state):
+    packed = pack_scene(state)
+    text = base64.b64encode(packed.compressed()).decode()
+    assert len(text) < len(packed.data)
+    assert viewer.run(INFLATED, text)
 
 
 CHOSEN = """([question, gamma, lambda]) => {
