@@ -44,7 +44,8 @@ export const icon = (name) =>
 
 /** A button with an icon; the label is the tooltip and what a screen reader says. `key`: the shortcut to name. */
 export function iconButton(name, label, onclick, { key = "", ...props } = {}) {
-  return h("button", { type: "button", class: "tool", title: key ? `${label} (${key})` : label, "aria-label": label, onclick, ...props }, icon(name));
+  const title = key ? `${label} (${key})` : label;
+  return h("button", { type: "button", class: "tool", title, "aria-label": label, onclick, ...props }, icon(name));
 }
 
 export const textButton = (text, onclick, props = {}) => h("button", { type: "button", onclick, ...props }, text);
@@ -149,12 +150,11 @@ export function searchBox({ label, placeholder, suggest, describe, onchoose, onc
     input.setAttribute("aria-expanded", String(found.length > 0));
     at = -1;
   };
-  const option = (text, i) =>
-    h(
-      "li",
-      { role: "option", id: `kfgs-option-${i}`, "aria-selected": "false", onpointerdown: (event) => (event.preventDefault(), choose(text)) },
-      ...describe(text),
-    );
+  const option = (text, i) => {
+    const press = (event) => (event.preventDefault(), choose(text));
+    const props = { role: "option", id: `kfgs-option-${i}`, "aria-selected": "false", onpointerdown: press };
+    return h("li", props, ...describe(text));
+  };
   const move = (step) => {
     if (list.hidden) open();
     const count = list.children.length;

@@ -1,6 +1,7 @@
 /** The camera that a person moves: a view (camera.js) with its lens and its upward direction. */
 
-import { between, cameraOf, fit, fly, letterboxed, lookAround, lookAt, orbit, pan, pivot, viewOf, viewmatOf, zoom } from "./camera.js";
+import { between, cameraOf, fit, fly, letterboxed, lookAround, lookAt } from "./camera.js";
+import { orbit, pan, viewOf, viewmatOf, zoom } from "./camera.js";
 
 const FOV = 0.9; // radians, if the scene has no cameras
 const TURN = 0.006; // radians for a pixel
@@ -33,8 +34,7 @@ export class Eye {
   /** Look through a camera of the pack. */
   lookThrough(camera) {
     const view = viewOf(camera.viewmat, 1);
-    const ahead = this.ball.center.reduce((all, value, axis) => all + (value - view.position[axis]) * view.R[6 + axis], 0);
-    this.view = { ...view, distance: Math.max(ahead, 0.3 * this.ball.radius) };
+    this.view = { ...view, distance: Math.max(ahead(view, this.ball.center), 0.3 * this.ball.radius) };
     this.lens = camera;
     this.loose = true;
   }
@@ -47,14 +47,9 @@ export class Eye {
 
   /** Turn about a point from now on; with `turned`, look at it. */
   setPivot(point, turned = false) {
-    const { position, R } = this.view;
-    if (turned) this.view = lookAt(position, point, this.up);
-    else this.view = { ...this.view, distance: Math.max(point.reduce((all, value, axis) => all + (value - position[axis]) * R[6 + axis], 0), 1e-3) };
+    if (turned) this.view = lookAt(this.view.position, point, this.up);
+    else this.view = { ...this.view, distance: Math.max(ahead(this.view, point), 1e-3) };
     this.loose = false;
-  }
-
-  get pivot() {
-    return pivot(this.view);
   }
 
   orbit(dx, dy) {
@@ -85,3 +80,6 @@ export class Eye {
     this.view = between(from, to, t);
   }
 }
+
+/** How far a point lies in front of a view. */
+const ahead = ({ position, R }, point) => point.reduce((all, value, axis) => all + (value - position[axis]) * R[6 + axis], 0);

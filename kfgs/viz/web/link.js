@@ -2,7 +2,8 @@
 
 import { bufferOf } from "./clouds.js";
 
-const NEEDS_PYTHON = "Searching for any words needs Python: open the scene with “kfgs view” or in a notebook. This file knows its classes only";
+const NEEDS_PYTHON =
+  "Searching for any words needs Python: open the scene with “kfgs view” or in a notebook. This file knows its classes only";
 
 /** Answers questions about classes from the scores in the pack. */
 export class OfflineLink {
@@ -44,7 +45,8 @@ export function suggestions(typed, names) {
 
 function explain(words, names) {
   const near = nearest(words.trim(), names);
-  return `“${words.trim()}” is none of the classes. ${near ? `Did you mean “${near}”? ` : ""}${NEEDS_PYTHON}: ${listed(names)}.`;
+  const hint = near ? `Did you mean “${near}”? ` : "";
+  return `“${words.trim()}” is none of the classes. ${hint}${NEEDS_PYTHON}: ${listed(names)}.`;
 }
 
 function listed(names) {

@@ -181,8 +181,8 @@ export class Model extends EventTarget {
   /** A mask of the Gaussians whose centres lie in a ball. */
   ball(side, [x, y, z], radius) {
     const points = this.positions[side];
-    const inside = (i) => (points[3 * i] - x) ** 2 + (points[3 * i + 1] - y) ** 2 + (points[3 * i + 2] - z) ** 2 <= radius * radius;
-    return new Uint8Array(this.total(side)).map((_, i) => (inside(i) ? 1 : 0));
+    const far = (i) => Math.hypot(points[3 * i] - x, points[3 * i + 1] - y, points[3 * i + 2] - z);
+    return new Uint8Array(this.total(side)).map((_, i) => (far(i) <= radius ? 1 : 0));
   }
 
   /** Select everything that is not selected now, on the side shown. */
@@ -273,7 +273,10 @@ export class Model extends EventTarget {
     this.changed();
   }
 
-  /** What is known about the picked Gaussian; null if there is none, or it is hidden or removed. `distance` is that to the nearest labelled one. */
+  /**
+   * What is known about the picked Gaussian; null if there is none, or it is hidden or removed. `distance` is that to the
+   * nearest labelled one.
+   */
   describe() {
     if (!this.picked) return null;
     const { side, index } = this.picked;
@@ -348,7 +351,8 @@ export class Model extends EventTarget {
         opacity: by(opacity[side], (value) => (value / 255).toFixed(3)), // factor -> Gaussians
       },
     ]);
-    return { words: this.answer?.words ?? null, gamma: this.gamma, lambda: this.source ? this.lambda : null, ...Object.fromEntries(sides) };
+    const asked = { words: this.answer?.words ?? null, gamma: this.gamma, lambda: this.source ? this.lambda : null };
+    return { ...asked, ...Object.fromEntries(sides) };
   }
 
   /** Counts of the question's scores in bins from `low` to `high`. */
@@ -374,9 +378,9 @@ export class Model extends EventTarget {
     const lines = [];
     const counts = this.counts(this.side);
     const kind = `${SIDE_WORDS[this.side]} Gaussians`;
-    if (this.byHand) lines.push(`${whole(counts.selected)} of ${whole(counts.total)} ${kind} are selected by hand.`);
-    else if (this.answer)
-      lines.push(`${whole(counts.selected)} of ${whole(counts.total)} ${kind} score above ${short(this.gamma)} for “${this.answer.words}”.`);
+    const some = `${whole(counts.selected)} of ${whole(counts.total)} ${kind}`;
+    if (this.byHand) lines.push(`${some} are selected by hand.`);
+    else if (this.answer) lines.push(`${some} score above ${short(this.gamma)} for “${this.answer.words}”.`);
     else lines.push(`${whole(counts.total)} ${kind}.`);
     if (counts.removed) lines.push(`${whole(counts.removed)} are removed.`);
     return lines;
@@ -385,7 +389,8 @@ export class Model extends EventTarget {
   /** How many colour Gaussians have no label at this lambda, in a sentence. */
   lambdaSentence() {
     const { none, total } = this.counts("color");
-    return `${whole(none)} of ${whole(total)} Gaussians are farther than ${short(this.lambda)} from any labelled one, so they have no class.`;
+    const far = `farther than ${short(this.lambda)} from any labelled one`;
+    return `${whole(none)} of ${whole(total)} Gaussians are ${far}, so they have no class.`;
   }
 
   // private

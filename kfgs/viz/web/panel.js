@@ -11,8 +11,8 @@ const css = (rgb) => `rgb(${rgb.join(",")})`;
  * Returns {element, refresh()}.
  */
 export function makePanel(model, act) {
-  const parts = [scorePart(model), pickPart(model, act), selectionPart(model, act), model.source ? lambdaPart(model) : null, classesPart(model, act)];
-  const shown = parts.filter(Boolean);
+  const carried = model.source ? [lambdaPart(model)] : [];
+  const shown = [scorePart(model), pickPart(model, act), selectionPart(model, act), ...carried, classesPart(model, act)];
   return {
     element: h("aside", { class: "panel", "aria-label": "Search, classes and selection" }, ...shown.map((one) => one.element)),
     refresh: () => shown.forEach((one) => one.refresh()),
@@ -68,8 +68,9 @@ function classesPart(model, act) {
   const all = textButton("Show all", () => model.setHidden([]), { class: "link" });
   const filter = h("input", {
     type: "search", class: "filter", placeholder: "Filter classes", "aria-label": "Filter classes", hidden: labels.length <= MANY,
-    oninput: () => rows.forEach((row) => (row.element.hidden = !row.name.toLowerCase().includes(filter.value.trim().toLowerCase()))),
+    oninput: () => rows.forEach((row) => (row.element.hidden = !fits(row.name))),
   });
+  const fits = (name) => name.toLowerCase().includes(filter.value.trim().toLowerCase());
   const element = section("Classes", all, filter, list);
   const refresh = () => {
     const counts = model.counts(model.side);
@@ -86,7 +87,8 @@ function classRow(model, label, act) {
   const solo = iconButton("solo", `Show only ${name}`, () => model.solo(label));
   const eye = h("button", { type: "button", class: "tool eye", onclick: () => model.toggleHidden(label) });
   const [open, shut] = [iconButton("eye", "").firstChild, iconButton("hidden", "").firstChild];
-  const words = label >= 0 ? textButton(name, () => act.ask(name), { class: "name", title: `Search for ${name}` }) : h("span", { class: "name" }, name);
+  const search = () => textButton(name, () => act.ask(name), { class: "name", title: `Search for ${name}` });
+  const words = label >= 0 ? search() : h("span", { class: "name" }, name);
   const swatch = h("span", { class: "swatch", style: `background:${css(color)}` });
   const element = h("li", { "data-label": label }, swatch, words, count, solo, eye);
   const refresh = (counts) => {
@@ -113,15 +115,17 @@ function selectionPart(model, act) {
     button("Fit", "Move the camera to the selection (F)", act.fit),
     button("Clear", "Select nothing (Escape)", () => model.clear()),
   ];
-  const color = h("input", { type: "color", value: "#c04040", "aria-label": "New colour", onchange: () => model.recolor(hex(color.value)) });
-  const opacity = h("input", { type: "range", min: 0, max: 100, value: 100, "aria-label": "Opacity", onchange: () => model.fade(opacity.value / 100) });
+  const paint = () => model.recolor(hex(color.value));
+  const color = h("input", { type: "color", value: "#c04040", "aria-label": "New colour", onchange: paint });
+  const fade = () => model.fade(opacity.value / 100);
+  const opacity = h("input", { type: "range", min: 0, max: 100, value: 100, "aria-label": "Opacity", onchange: fade });
   const edits = [
     button("Remove", "Remove the selected Gaussians (Delete)", () => model.remove(), { class: "danger" }),
     h("label", { class: "pair", title: "Give the selection a colour" }, "Recolour", color),
     h("label", { class: "pair", title: "Make the selection transparent" }, "Opacity", opacity),
   ];
   const restore = button("Restore all", "Undo all removals, colours and opacities", () => model.restore(), { class: "link" });
-  const save = button("Save as JSON", "Save the question, the selection and the edits, with the numbers of the Gaussians", act.saveJson);
+  const save = button("Save as JSON", "Save question, selection and edits, with the numbers of the Gaussians", act.saveJson);
   const files = act.saveSelection ? [
     button("Save Gaussians", "Write the selected Gaussians as PLY files, and their parts", act.saveSelection),
     button("Save edited scene", "Write the scene with its edits, and the edits as JSON", act.saveEdits),
@@ -172,7 +176,7 @@ function pickLines(model, found) {
   const score = Number.isFinite(found.score) ? `, score ${found.score.toFixed(3)}` : "";
   const lines = [
     h("p", {}, h("span", { class: "swatch", style: `background:${css(color)}` }), h("strong", {}, found.name), score),
-    h("p", { class: "note" }, `${SIDE_WORDS[found.side]} Gaussian ${found.index}${place ? ` at ${place.map(short).join(", ")}` : ""}`),
+    h("p", { class: "note" }, `${SIDE_WORDS[found.side]} Gaussian ${found.index} at ${place.map(short).join(", ")}`),
   ];
   if (found.distance !== null) {
     const reach = found.reached ? "Its label is from" : "Out of reach: the nearest labelled one is";

@@ -86,10 +86,10 @@ def place_of(page, side, index):
     """Where a Gaussian lies in the window."""
     x, y = page.evaluate(
         """([side, i]) => {
-          const { viewmat: m, fx, fy, cx, cy } = viewer.camera, p = viewer.model.position(side, i);
+          const { viewmat: m, fx, fy, cx, cy } = viewer.panes.camera, p = viewer.model.position(side, i);
           const [x, y, z] = [0, 4, 8].map((r) => m[r] * p[0] + m[r + 1] * p[1] + m[r + 2] * p[2] + m[r + 3]);
           const box = viewer.stage.getBoundingClientRect();
-          return [box.left + (fx * x / z + cx) / viewer.ratio, box.top + (fy * y / z + cy) / viewer.ratio];
+          return [box.left + (fx * x / z + cx) / viewer.panes.ratio, box.top + (fy * y / z + cy) / viewer.panes.ratio];
         }""",
         [side, index],
     )

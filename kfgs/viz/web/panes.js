@@ -1,0 +1,178 @@
+/** What is on the canvas: one picture, two side by side, or two with a border that moves. Owns the renderer. */
+
+import { Renderer } from "./renderer.js";
+
+const MIXING = 0.7; // of the class colour over the Gaussian's own
+const REST = 160; // milliseconds without a change, after which the picture is drawn in full
+
+export class Panes {
+  /** @param {object} model see model.js */
+  constructor(canvas, model) {
+    Object.assign(this, { canvas, model, layout: "one", slider: 0.5, sent: {} });
+    this.list = [{ mode: "labels", side: model.side }]; // what each pane shows
+    this.active = this.list[0];
+    this.ratio = 1; // device pixels in a CSS pixel
+    this.ondraw = () => {};
+  }
+
+  /** Start WebGL; throws an Error with a sentence for people. */
+  async start(options) {
+    const { model } = this;
+    this.renderer = await Renderer.create(this.canvas, options);
+    this.renderer.load(model.packed);
+    this.renderer.onorder = () => this.redraw();
+    for (const side of model.sides) model.positions[side] = this.renderer.means(side);
+  }
+
+  dispose() {
+    clearTimeout(this.resting);
+    cancelAnimationFrame(this.frame);
+    this.renderer?.dispose();
+  }
+
+  /** Arrange the panes: "one", "split" or "slider"; new ones show what the first does not. */
+  arrange(layout, modes) {
+    const [first] = this.list;
+    const { sides } = this.model;
+    const side = layout === "split" ? sides.find((one) => one !== first.side) ?? first.side : first.side;
+    const mode = first.mode === "labels" && modes.color ? "color" : "labels";
+    this.list = layout === "one" ? [first] : [first, { mode, side }];
+    this.layout = layout;
+  }
+
+  /** The pane at a place (CSS pixels) becomes the active one: counts are of its side. */
+  activate(x) {
+    this.active = this.list[this.list.length > 1 && x * this.ratio >= this.border() ? 1 : 0];
+    this.model.side = this.active.side;
+    return this.active;
+  }
+
+  /** The Gaussian at a place (CSS pixels) in a pane; -1 if there is none. `evenly`: faint ones are as good as bright ones. */
+  under(x, y, pane = this.active, evenly = false) {
+    this.prepare(pane);
+    if (evenly) this.renderer.setLook({ dim: false });
+    return this.renderer.pick(x * this.ratio, y * this.ratio);
+  }
+
+  /** A mask of the Gaussians in a polygon (CSS pixels) in the active pane. */
+  inside(polygon) {
+    this.prepare(this.active);
+    return this.renderer.within({ polygon: polygon.map((place) => place.map((value) => value * this.ratio)) });
+  }
+
+  /** How far a point lies in front of the camera. */
+  depth([x, y, z]) {
+    const m = this.camera.viewmat;
+    return m[8] * x + m[9] * y + m[10] * z + m[11];
+  }
+
+  resize(width, height) {
+    this.ratio = Math.min(devicePixelRatio || 1, 2);
+    this.canvas.width = Math.max(1, Math.round(width * this.ratio));
+    this.canvas.height = Math.max(1, Math.round(height * this.ratio));
+    this.forgetCamera();
+    this.draw();
+  }
+
+  /** The camera or the arrangement changed. */
+  forgetCamera() {
+    this.camera = null;
+  }
+
+  redraw() {
+    this.frame ??= requestAnimationFrame(() => this.draw());
+  }
+
+  /** Draw soon, if need be coarsely, and in full when nothing changes any more. */
+  hurry() {
+    this.moving = true;
+    clearTimeout(this.resting);
+    this.resting = setTimeout(() => ((this.moving = false), this.redraw()), REST);
+    this.redraw();
+  }
+
+  /** Resolves when the picture is that of the state. */
+  async settled() {
+    this.moving = false;
+    this.draw();
+    await this.renderer.settled();
+    this.draw();
+  }
+
+  draw() {
+    cancelAnimationFrame(this.frame);
+    this.frame = null;
+    this.placeCamera();
+    for (const pane of this.list) {
+      this.prepare(pane);
+      this.renderer.draw({ ...this.viewport(pane), moving: this.moving });
+    }
+    this.ondraw();
+  }
+
+  /** Give the renderer the camera, if it moved: both panes have the same one. */
+  placeCamera() {
+    if (this.camera) return;
+    const { width, height } = this.canvas;
+    this.camera = this.eye.at(this.layout === "split" ? Math.floor(width / 2) : width, height);
+    this.eye.focal = this.camera.fx / this.ratio;
+    this.renderer.setCamera(this.camera);
+  }
+
+  /** Where a pane is, device pixels from the top left of the canvas. Both sides of the slider are parts of one picture. */
+  viewport(pane) {
+    const { width, height } = this.canvas;
+    const whole = { x: 0, y: 0, width, height };
+    if (this.layout === "one") return whole;
+    const border = this.border();
+    const second = pane === this.list[1];
+    const part = { x: second ? border : 0, y: 0, width: second ? width - border : border, height };
+    return this.layout === "slider" ? { ...whole, clip: part } : { ...part, width: Math.floor(width / 2) };
+  }
+
+  /** Where the second pane begins, device pixels. */
+  border() {
+    return Math.round(this.canvas.width * (this.layout === "slider" ? this.slider : 0.5));
+  }
+
+  /** Give the renderer a pane's side, masks and look. */
+  prepare(pane) {
+    const { model, renderer } = this;
+    const { answer } = model;
+    renderer.setSide(pane.side);
+    this.sendMasks(pane.side);
+    const [low, high] = answer ? [answer.low, answer.high] : model.packed.header.clim;
+    const hidden = new Uint8Array(model.names.length + 1);
+    for (const label of model.hidden) hidden[label < 0 ? model.names.length : label] = 1;
+    renderer.setLook({
+      mode: pane.mode, question: answer ? this.question(answer) : null, gamma: model.gamma ?? 0, lambda: model.lambda,
+      low, high, hidden, mixing: pane.mode === "labels" ? MIXING : 1,
+      dim: model.selecting && pane.mode !== "score", // the colours of the rest say where gamma should be
+    });
+  }
+
+  /** What the renderer calls a question; scores that came from Python are sent once. */
+  question(answer) {
+    if (answer.number === undefined) {
+      answer.number = answer.words;
+      this.renderer.setScores(answer.words, answer.scores);
+    }
+    return answer.number;
+  }
+
+  /** Send the masks that changed since the last time. */
+  sendMasks(side) {
+    const { renderer, model } = this;
+    const { now, byHand } = model;
+    const sent = (this.sent[side] ??= { selected: null, removed: null, opacity: null, colors: null });
+    const send = (name, key, set) => {
+      if (sent[name] !== key) set();
+      sent[name] = key;
+    };
+    const [removed, opacity, colors] = [now.removed, now.opacity, now.colors].map((one) => one[side] ?? null);
+    send("selected", byHand ? now.id : null, () => renderer.setMask("selected", byHand ? model.selected(side) : null));
+    send("removed", removed, () => renderer.setMask("removed", removed));
+    send("opacity", opacity, () => renderer.setFade(opacity));
+    send("colors", colors, () => renderer.setColors(colors));
+  }
+}
