@@ -30,7 +30,8 @@ addEventListener("DOMContentLoaded", async () => {
     const text = (id) => document.getElementById(id).textContent;
     const bytes = Uint8Array.from(atob(text("data")), (letter) => letter.charCodeAt(0));
     document.getElementById("data").remove();
-    const packed = { header: JSON.parse(text("header")), data: await kfgs.inflate(bytes) };
+    const header = JSON.parse(text("header"));
+    const packed = { header, data: await kfgs.inflate(bytes, header) };
     window.viewer = await kfgs.mount(root, packed, new kfgs.OfflineLink(packed));
   } catch (error) {
     if (!root.childElementCount) root.textContent = `This scene cannot be shown: ${error.message}`;
