@@ -247,7 +247,9 @@ class App {
   twice(x, y) {
     const { side } = this.panes.activate(x);
     const index = this.panes.under(x, y);
-    if (index >= 0) this.glide(() => this.eye.setPivot(this.model.position(side, index), true));
+    if (index < 0) return;
+    this.leaveView();
+    this.glide(() => this.eye.setPivot(this.model.position(side, index), true));
   }
 
   /** A drag begins: turn about what is in the middle of the picture. */
@@ -287,10 +289,15 @@ class App {
   /** A person moved the camera. */
   moved() {
     cancelAnimationFrame(this.gliding);
+    this.leaveView();
+    this.moves();
+  }
+
+  /** The camera is no longer at one of the scene's views. */
+  leaveView() {
     if (this.view !== null) this.views.set(null);
     this.view = null;
     this.hidePhoto();
-    this.moves();
   }
 
   moves() {
@@ -319,7 +326,9 @@ class App {
   /** Move the camera so that the selection, or everything, fills the view. */
   fit() {
     const found = this.model.extent(this.model.side);
-    if (found) this.glide(() => this.eye.fit(found));
+    if (!found) return;
+    this.leaveView();
+    this.glide(() => this.eye.fit(found));
   }
 
   /** Go to a camera of the scene. */

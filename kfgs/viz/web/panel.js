@@ -179,8 +179,9 @@ function pickLines(model, found) {
     h("p", { class: "note" }, `${SIDE_WORDS[found.side]} Gaussian ${found.index} at ${place.map(short).join(", ")}`),
   ];
   if (found.distance !== null) {
+    const away = found.distance > 0 ? `${short(found.distance)} away` : "in the same place";
     const reach = found.reached ? "Its label is from" : "Out of reach: the nearest labelled one is";
-    lines.push(h("p", { class: "note" }, `${reach} semantic Gaussian ${found.source}, ${short(found.distance)} away`));
+    lines.push(h("p", { class: "note" }, `${reach} semantic Gaussian ${found.source}, ${away}`));
   }
   const others = model.nearest(found.side, found.index, 4).map(([name, far]) => `${name} ${far.toPrecision(2)}`);
   if (others.length) lines.push(h("p", { class: "note" }, `Nearest: ${others.join(", ")}`));

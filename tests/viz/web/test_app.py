@@ -290,6 +290,21 @@ def test_keys_fly_and_turn_and_help_lists_them(page):
     assert not page.locator("dialog").is_visible()
 
 
+def test_buttons_go_to_the_scenes_views(browser, tmp_path):
+    views = cases_explorer.cameras()
+    for page in show(browser, save_html(cases_explorer.line(cameras=views), tmp_path / "page.html")):
+        current = page.locator(".views [aria-current=true]")
+        assert current.get_attribute("aria-label") == "Go to view_0"
+        page.keyboard.press("]")
+        page.wait_for_timeout(800)
+        assert current.get_attribute("aria-label") == "Go to view_1"
+        page.evaluate("viewer.settled()")
+        viewmat = page.evaluate("[...viewer.panes.camera.viewmat]")
+        np.testing.assert_allclose(viewmat, views[1].viewmat.flatten(), atol=1e-6)
+        page.keyboard.press("f")
+        assert current.count() == 0
+
+
 def test_split_slider_and_modes_draw(page):
     def picture():
         page.evaluate("viewer.settled()")
