@@ -39,6 +39,9 @@ class FieldConfig:
     """Learning rate of the colours (coefficients of degree 0)."""
     sh_rest_lr: float = 0.0025 / 20
     """Learning rate of the higher harmonics."""
+    rates_final: float = 1.0
+    """Factor on all other rates at the last step. They fall exponentially from the middle of the steps on; 1: constant, as in
+    3DGS. Short schedules with high rates need it."""
     sh_degree_every: int = 1_000
     """Raise the SH degree by one every so many steps, starting at the degree that the input uses: 0 for points, its degree for
     a loaded splat. 0 = all degrees from the start."""
@@ -91,7 +94,7 @@ class FieldConfig:
                     f"extent: expected a number in world units, got {self.extent!r:.60}; pass a float, or None"
                 )
             check_range("extent", self.extent, 0, closed=_POSITIVE)
-        for name in ("means_lr", "means_lr_final", "adam_eps"):
+        for name in ("means_lr", "means_lr_final", "adam_eps", "rates_final"):
             check_range(name, getattr(self, name), 0, closed=_POSITIVE)
         rates = ("quats_lr", "scales_lr", "opacities_lr", "features_lr", "sh0_lr", "sh_rest_lr")
         for name in (*rates, "densify_gradient", "percent_dense"):

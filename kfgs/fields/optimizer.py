@@ -36,6 +36,7 @@ class FieldOptimizer:
         ]
         self._adam = torch.optim.Adam(groups, eps=config.adam_eps, fused=True)
         self._groups = {group["name"]: group for group in self._adam.param_groups}
+        self._rates = rates
 
     def means_lr(self, step: int) -> float:
         """Learning rate of the means: from `means_lr` to `means_lr_final` times the extent, exponentially in the step."""
@@ -44,7 +45,10 @@ class FieldOptimizer:
 
     def step_(self, step: int) -> None:
         """Apply the gradients of step number `step`, then forget them."""
-        self._groups["means"]["lr"] = self.means_lr(step)
+        config = self._config
+        factor = config.rates_final ** max(0.0, 2 * step / config.steps - 1)
+        for name, group in self._groups.items():
+            group["lr"] = self.means_lr(step) if name == "means" else self._rates[name] * factor
         self._adam.step()
         self.forget_()
 

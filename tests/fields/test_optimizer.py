@@ -125,3 +125,16 @@ def test_state_round_trip_continues_bit_for_bit():
         advance(one, step)
         advance(other, step)
     assert all(torch.equal(getattr(one.params, name), value) for name, value in other.params.to_tensors().items())
+
+
+def test_rates_fall_in_the_second_half_to_their_final_share():
+    config = FieldConfig(steps=100, rates_final=0.1)
+    optimizer = FieldOptimizer(params(), config, extent=1.0)
+    found = {}
+    for step in (1, 50, 75, 100):
+        optimizer.step_(step)
+        found[step] = {group["name"]: group["lr"] for group in optimizer._adam.param_groups}
+    assert found[1] | {"means": None} == found[50] | {"means": None}
+    assert found[75]["quats"] == pytest.approx(0.1**0.5 * config.quats_lr)
+    assert found[100]["log_scales"] == pytest.approx(0.1 * config.scales_lr)
+    assert found[100]["means"] == pytest.approx(config.means_lr_final)

@@ -16,11 +16,11 @@ from torch import Tensor
 
 from ..._check import as_array, check_choice, check_whole
 from ...formats import SplatFile, write_splats
-from ...labels import EditList, Opacity, Recolor, Remove, Selection
+from ...labels import EditList, Opacity, Recolor, Remove, Selection, connected_parts
 from ...labels.where import OfIndex
 from .numbered_files import numbered_path
 from .picked import Side
-from .saved import SelectedSide, save_sides
+from .saved import MOST_PARTS, SelectedSide, save_sides
 from .state import Exploration, check_number
 
 Answer = tuple[dict[str, Any], bytes]
@@ -41,6 +41,7 @@ class Session:
         self._calls = {
             "ask": self._ask,
             "describe": self._describe,
+            "parts": self._parts,
             "save_selection": self._save_selection,
             "save_edits": self._save_edits,
             "save_picture": self._save_picture,
@@ -50,10 +51,15 @@ class Session:
         """Answer one call.
 
         Args:
-            name: `ask` {words}: scores of the semantic Gaussians as float32, NaN where nothing is known.
-                `describe` {side, index}: neighbours and views. `save_selection` {words, gamma, lambda, sides}: a mask of each
-                side is attached. `save_edits` {lambda, sides: {side: {removed, recolored, opacity}}}: Gaussians by number.
-                `save_picture` {}: a PNG file is attached.
+            name: one of
+
+                - `ask` {words}: attaches the scores of the semantic Gaussians, float32, NaN where nothing is known
+                - `describe` {side, index}: neighbours and views
+                - `parts` {side}, with a mask of it: connected parts, largest first; attaches the part of each Gaussian, int16,
+                  -1 for none
+                - `save_selection` {words, gamma, lambda, sides}, with a mask of each side
+                - `save_edits` {lambda, sides: {side: {removed, recolored, opacity}}}: Gaussians by number
+                - `save_picture` {}, with a PNG file
             args: its arguments.
             attached: bytes that belong to them.
 
@@ -93,6 +99,14 @@ class Session:
         neighbours = [{"index": i, "distance": far} for i, far, _ in picked.neighbours]
         views = [{"index": sight.index, "name": sight.name, "weight": sight.weight} for sight in picked.views]
         return {"neighbours": neighbours, "views": views}, b""
+
+    def _parts(self, args: dict[str, Any], attached: bytes) -> Answer:
+        ((side, mask),) = self._masks([args["side"]], attached).items()
+        found = connected_parts(self.state.cloud(side), Selection.of(mask, "in the viewer"), most=MOST_PARTS)
+        numbers = np.full(len(mask), -1, "<i2")
+        for number, part in enumerate(found):
+            numbers[part.indices.cpu().numpy()] = number
+        return {"parts": [{"count": part.count, "volume": part.volume} for part in found]}, numbers.tobytes()
 
     def _save_selection(self, args: dict[str, Any], attached: bytes) -> Answer:
         state = self.state

@@ -219,9 +219,20 @@ class App {
     const lambda = () => (model.source ? model.lambda : null);
     return {
       describe: (side, index) => link.describe(side, index),
+      split: () => this.split(),
       saveSelection: () => this.save(() => link.saveSelection({ words: model.answer?.words ?? null, gamma: model.gamma, lambda: lambda(), masks: masks() })),
       saveEdits: () => this.save(() => link.saveEdits(sides(model.toJSON()), lambda())),
     };
+  }
+
+  async split() {
+    const { model } = this;
+    const [side, name] = [model.side, model.answer?.words ?? "part"];
+    try {
+      model.setParts({ side, name, ...(await this.link.parts(side, model.selected(side))) });
+    } catch (error) {
+      this.say(error.message);
+    }
   }
 
   async save(write) {

@@ -72,7 +72,8 @@ export function select(label, choices, value, onpick) {
  * @param {{label, id, toFraction(value), toValue(fraction), onvalue(value, dragging), above}} options `above`: the part
  *   of the histogram above the value is lit, else the part below
  */
-export function histogramSlider({ label, id, toFraction, toValue, onvalue, above }) {
+export function histogramSlider({ label, id: name, toFraction, toValue, onvalue, above }) {
+  const id = freeId(name);
   const [faint, lit] = [svg("path", {}), svg("path", {})];
   const frame = (path, name) => svg("svg", { viewBox: "0 0 64 1", preserveAspectRatio: "none", class: name }, path);
   const top = frame(lit, "lit");
@@ -117,10 +118,10 @@ function bars(bins) {
  * @param {{label, placeholder, suggest(text): string[], onchoose(text), onclear()}} options
  */
 export function searchBox({ label, placeholder, suggest, describe, onchoose, onclear }) {
-  const list = h("ul", { role: "listbox", id: "kfgs-suggestions", hidden: true, "aria-label": "Suggestions" });
+  const list = h("ul", { role: "listbox", id: freeId("kfgs-suggestions"), hidden: true, "aria-label": "Suggestions" });
   const input = h("input", {
-    type: "text", id: "query", placeholder, autocomplete: "off", spellcheck: false, role: "combobox", maxLength: 200,
-    "aria-label": label, "aria-autocomplete": "list", "aria-expanded": "false", "aria-controls": "kfgs-suggestions",
+    type: "text", id: freeId("query"), placeholder, autocomplete: "off", spellcheck: false, role: "combobox", maxLength: 200,
+    "aria-label": label, "aria-autocomplete": "list", "aria-expanded": "false", "aria-controls": list.id,
   });
   const drop = iconButton("close", "Clear the search", () => clear(), { class: "tool drop", hidden: true });
   let at = -1;
@@ -152,7 +153,7 @@ export function searchBox({ label, placeholder, suggest, describe, onchoose, onc
   };
   const option = (text, i) => {
     const press = (event) => (event.preventDefault(), choose(text));
-    const props = { role: "option", id: `kfgs-option-${i}`, "aria-selected": "false", onpointerdown: press };
+    const props = { role: "option", id: `${list.id}-${i}`, "aria-selected": "false", onpointerdown: press };
     return h("li", props, ...describe(text));
   };
   const move = (step) => {
@@ -197,4 +198,11 @@ export function download(name, blob) {
   const link = h("a", { href: URL.createObjectURL(blob), download: name });
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+}
+
+let taken = 0;
+
+/** An id that no element has: two widgets may stand in one notebook. */
+export function freeId(name) {
+  return document.getElementById(name) ? `${name}-${++taken}` : name;
 }

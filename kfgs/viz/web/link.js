@@ -87,6 +87,12 @@ export class PythonLink {
     return (await this.call("describe", { side, index }))[0];
   }
 
+  /** Connected parts of a mask: {parts: [{count, volume}], numbers: Int16Array}, the largest first; -1: of no part. */
+  async parts(side, mask) {
+    const [answer, numbers] = await this.call("parts", { side }, bitsOf(mask));
+    return { ...answer, numbers: new Int16Array(numbers) };
+  }
+
   /** Write the selected Gaussians of some sides into Python's folder; returns the paths. */
   async saveSelection({ words, gamma, lambda, masks }) {
     const bits = Object.values(masks).map(bitsOf);

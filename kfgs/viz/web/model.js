@@ -31,6 +31,7 @@ export class Model extends EventTarget {
     this.lambda = header.lambda ? header.lambda.value : Infinity;
     this.hidden = new Set();
     this.picked = null; // {side, index}
+    this.parts = null; // {side, name, parts, numbers}
     this.now = { answer: null, gamma: null, gammaHow: "", hand: {}, removed: {}, colors: {}, opacity: {}, what: "" };
     this.past = [];
     this.future = [];
@@ -60,8 +61,21 @@ export class Model extends EventTarget {
     return Object.keys(this.now.hand).length > 0;
   }
 
+  /** Show connected parts of the selection of a side, see `PythonLink.parts`; null hides them. */
+  setParts(found) {
+    this.parts = found;
+    this.changed();
+  }
+
+  /** Select one connected part alone. */
+  selectPart(number) {
+    const { side, numbers } = this.parts;
+    this.select(side, Uint8Array.from(numbers, (own) => (own === number ? 1 : 0)));
+  }
+
   /** Show the answer to a question (see link.js); null clears it. The selection is then the question's. */
   ask(answer) {
+    this.parts = null;
     const { gamma = null, how = "" } = answer ?? {};
     this.step(answer ? `search for ${answer.words}` : "clear the search", { answer, gamma, gammaHow: how, hand: {} });
   }

@@ -1,6 +1,6 @@
 /** The panel beside the view: search result, lambda, classes, selection and edits, the picked Gaussian. */
 
-import { h, histogramSlider, iconButton, textButton } from "./dom.js";
+import { freeId, h, histogramSlider, iconButton, textButton } from "./dom.js";
 import { SIDE_WORDS, short, whole } from "./model.js";
 
 const MANY = 12; // classes from which on the list has a filter
@@ -12,7 +12,7 @@ const css = (rgb) => `rgb(${rgb.join(",")})`;
  */
 export function makePanel(model, act) {
   const carried = model.source ? [lambdaPart(model)] : [];
-  const shown = [scorePart(model), pickPart(model, act), selectionPart(model, act), ...carried, classesPart(model, act)];
+  const shown = [scorePart(model), pickPart(model, act), selectionPart(model, act), partsPart(model, act), ...carried, classesPart(model, act)];
   return {
     element: h("aside", { class: "panel", "aria-label": "Search, classes and selection" }, ...shown.map((one) => one.element)),
     refresh: () => shown.forEach((one) => one.refresh()),
@@ -50,7 +50,7 @@ function lambdaPart(model) {
     toValue: (place) => Math.exp(low + place * span),
     onvalue: (value) => model.setLambda(value),
   });
-  const said = h("p", { id: "lambda-said" });
+  const said = h("p", { id: freeId("lambda-said") });
   const element = section("Labels of the colour cloud", slider.element, said);
   const refresh = () => {
     slider.set(model.lambda, model.lambdaHistogram());
@@ -106,7 +106,7 @@ function classRow(model, label, act) {
 }
 
 function selectionPart(model, act) {
-  const said = h("p", { id: "selection-said" });
+  const said = h("p", { id: freeId("selection-said") });
   const button = (text, title, run, props = {}) => textButton(text, run, { title, ...props });
   const change = [
     button("Grow", "Add the neighbours of the selected Gaussians", () => model.grow()),
@@ -130,6 +130,8 @@ function selectionPart(model, act) {
     button("Save Gaussians", "Write the selected Gaussians as PLY files, and their parts", act.saveSelection),
     button("Save edited scene", "Write the scene with its edits, and the edits as JSON", act.saveEdits),
   ] : [];
+  const split = act.split ? [button("Parts", "List the connected parts of the selection: chair 1, chair 2", act.split)] : [];
+  change.push(...split);
   const boxes = h("div", {}, h("div", { class: "buttons" }, ...change), h("div", { class: "buttons" }, ...edits));
   const element = section("Selection", restore, said, boxes, h("div", { class: "buttons" }, ...files, save));
   const refresh = () => {
@@ -143,6 +145,23 @@ function selectionPart(model, act) {
     said.textContent = boxes.hidden
       ? "Search for a class, or select with the box, the lasso or the brush."
       : `${whole(count)} ${SIDE_WORDS[model.side]} Gaussians${more}`;
+  };
+  return { element, refresh };
+}
+
+function partsPart(model, act) {
+  const list = h("ul", { class: "classes" });
+  const element = section("Connected parts", textButton("Close", () => model.setParts(null), { class: "link" }), list);
+  let shown = null;
+  const refresh = () => {
+    element.hidden = !model.parts;
+    if (!model.parts || model.parts === shown) return;
+    shown = model.parts;
+    const { name, parts } = shown;
+    const choose = (number) => () => (model.selectPart(number), act.fit());
+    const row = ({ count }, at) =>
+      h("li", {}, textButton(`${name} ${at + 1}`, choose(at), { class: "name", title: "Select this part" }), h("span", { class: "count" }, whole(count)));
+    list.replaceChildren(...parts.map(row));
   };
   return { element, refresh };
 }

@@ -9,7 +9,7 @@ import torch
 from messages import tells
 
 from kfgs.formats import read_splats
-from kfgs.labels import EditList
+from kfgs.labels import EditList, Selection, connected_parts
 from kfgs.splat import rgb_to_sh0
 from kfgs.viz.explorer import Exploration, FieldMeaning
 from kfgs.viz.explorer.session import PNG, Session, bits_of
@@ -43,6 +43,17 @@ def test_what_surrounds_a_gaussian(session):
     picked = session.state.pick("semantic", 5)
     assert [one["index"] for one in found["neighbours"]] == [i for i, _, _ in picked.neighbours]
     assert len(found["views"]) == len(picked.views)
+
+
+def test_connected_parts_of_a_selection(session):
+    mask = torch.arange(60) % 2 == 0
+    answer, attached = session.call("parts", {"side": "color"}, bits_of(mask))
+    numbers = torch.from_numpy(np.frombuffer(attached, "<i2").copy())
+    expected = connected_parts(session.state.cloud("color"), Selection.of(mask, ""), most=16)
+    assert [part["count"] for part in answer["parts"]] == [part.count for part in expected]
+    for number, part in enumerate(expected):
+        assert (numbers == number).nonzero()[:, 0].equal(part.indices)
+    assert (numbers[~mask] == -1).all()
 
 
 def test_a_selection_by_hand_is_written(session):

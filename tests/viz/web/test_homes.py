@@ -133,6 +133,13 @@ def test_one_person_everywhere(browser, tmp_path, home):
                 == np.flatnonzero(selected).tolist()
             )
         else:
+            page.click("text=Parts")
+            page.click("li:has-text('chair 1') button, li:has-text('part 1') button")
+            part = mask(page, "color")
+            assert 0 < part.sum() <= selected.sum()
+            assert not (part & ~selected).any()
+            page.locator(".stage").focus()
+            page.keyboard.press("Control+z")
             page.click("text=Save Gaussians")
             page.wait_for_selector("[role=alert]:has-text('Saved:')")
             written = read_splats(out / "selection_001" / "selection_color.ply").gaussians
