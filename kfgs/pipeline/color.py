@@ -65,11 +65,11 @@ class ColorConfig:
         detail, with rates that fall to a tenth (without that, 1 dB less on room_0). Growing ends early, is limited, and
         has a higher threshold. Opacities are not reset: there are too few steps to recover.
         """
-        rates = {"means_lr": 5e-4, "means_lr_final": 5e-6, "quats_lr": 0.003, "scales_lr": 0.015, "sh0_lr": 0.008}
-        growth = {"densify_from": 80, "densify_until": 1_800, "densify_every": 50, "densify_gradient": 3e-4}
-        schedule: dict[str, Any] = {"steps": 3_600, "coarse": ((1_800, 2),), "sh_degree_every": 720, "rates_final": 0.1}
-        schedule |= {"sh_rest_lr": 4e-4}
-        return ColorConfig(sh_degree=2, field=replace(_CPU_FIELD, **rates, **growth, **schedule))
+        schedule: dict[str, Any] = {"steps": 3_600, "coarse": ((1_800, 2),), "sh_degree_every": 720}
+        schedule |= {"densify_from": 80, "densify_until": 1_800, "densify_every": 50, "densify_gradient": 3e-4}
+        schedule |= {"means_lr": 5e-4, "means_lr_final": 5e-6, "quats_lr": 0.003, "scales_lr": 0.015}
+        schedule |= {"sh0_lr": 0.008, "sh_rest_lr": 4e-4, "rates_final": 0.1}
+        return ColorConfig(sh_degree=2, field=replace(_CPU_FIELD, **schedule))
 
     @staticmethod
     def geometry() -> ColorConfig:
