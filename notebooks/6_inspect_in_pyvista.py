@@ -92,7 +92,7 @@ Image.fromarray(plotter.screenshot(return_img=True))  # with a display: plotter.
 # %% [markdown]
 # ## Points, Gaussians, ellipsoids
 #
-# Points are quick and go into web pages. Ellipsoids are closed surfaces (half axes of one standard deviation; faint ones
+# Points are quick. Ellipsoids are closed surfaces (half axes of one standard deviation; faint ones
 # are left out). Only Gaussians are the field. `shot` is the cell above, for short.
 
 
@@ -289,18 +289,6 @@ orbit = Orbit(frames=8, size=(165, 220), elevation_degrees=40, zoom=1.5)
 film = viz.save_turntable(out / "turntable.gif", inside, orbit=orbit, up=up, fps=5)
 print(f"{film.stat().st_size / 1000:.0f} kB")
 display.Image(film)
-
-# %% [markdown]
-# And a page that turns in any browser, without a server or a connection. Browsers have no Gaussians, so they become points
-# (or ellipsoids), and the page says so.
-
-# %%
-plotter = viz.make_plotter(480, 640, off_screen=True)
-viz.add_cloud(plotter, inside, style="gaussians")
-viz.look_through(plotter, outside)
-page = viz.save_page(out / "room.html", plotter, labels=inside.labels, names=classes.names, title=folder.name)
-print(f"{page.path.name}: {page.path.stat().st_size / 1e6:.1f} MB; {page.note}")
-display.FileLink(page.path)
 
 # %% [markdown]
 # Next: [7_your_own_images](7_your_own_images.py) starts from photographs, with a teacher of your own.
