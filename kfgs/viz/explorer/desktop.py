@@ -160,7 +160,7 @@ class Desktop:
             self.plotter.add_key_event(key, lambda action=action: self.call(action))
         interactor = self.plotter.iren.interactor
         stop = lambda *_: interactor.GetCommand(tag).SetAbortFlag(interactor.GetKeySym() != "q")  # noqa: E731
-        tag: int = interactor.AddObserver("CharEvent", stop, 1.0)  # VTK's keys, for instance 3 for stereo and w for wires
+        tag: int = interactor.AddObserver("CharEvent", stop, 1.0)  # VTK's own keys, for instance w for wires
 
     def _ask_next(self, step: int) -> None:
         """Ask for the next or the previous class of this scene."""
