@@ -92,7 +92,7 @@ Image.fromarray(plotter.screenshot(return_img=True))  # with a display: plotter.
 # %% [markdown]
 # ## Points, Gaussians, ellipsoids
 #
-# Points are quick and go into web pages. Ellipsoids are closed surfaces (half axes of one standard deviation; faint ones
+# Points are quick. Ellipsoids are closed surfaces (half axes of one standard deviation; faint ones
 # are left out). Only Gaussians are the field. `shot` is the cell above, for short.
 
 

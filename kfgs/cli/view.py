@@ -94,8 +94,7 @@ def view(
     cloud = None if color is None else open_splats("color", color).gaussians
     state = Exploration(meaning, cloud, cameras=cameras, distance=distance)
     _note(state)
-    height, width = (680, 980) if place == "window" else (600, 1200)  # a window has a panel next to the clouds
-    options = ExploreOptions(height=height, width=width, style=display.style, out=out)
+    options = ExploreOptions(style=display.style, out=out)
     if ask is not None:
         state.ask(ask)
     for line in state.lines():

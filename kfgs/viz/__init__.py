@@ -1,4 +1,4 @@
-"""Pictures: label overlays, plots, 3-D clouds (pyvista), films, standalone pages and the explorer, all in one palette."""
+"""Pictures: label overlays, plots, 3-D clouds (pyvista), films and the explorer, all in one palette."""
 
 from .animation import save_animation
 from .boxes import add_boxes, add_names, add_selections
@@ -14,7 +14,6 @@ from .histograms import plot_distances, plot_scores
 from .legends import add_legend, add_scalar_bar
 from .linked import linked_clouds
 from .matches import Matches, add_matches, add_transfer, match_states
-from .page import save_page
 from .palette import palette
 from .pictures import legend_strip, overlay_labels, picture_grid, save_picture
 from .plots import plot_codebook_history, plot_confusion, plot_iou, plot_quality_storage, plot_training
@@ -59,7 +58,6 @@ __all__ = [
     "recolor_cloud",
     "save_animation",
     "save_flythrough",
-    "save_page",
     "save_picture",
     "save_turntable",
     "show_cloud",

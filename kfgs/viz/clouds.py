@@ -17,10 +17,11 @@ from .._check import as_array, check_choice, check_range, check_shapes
 from ..cameras.camera import NEAR
 from ..gaussians import Gaussians
 from .cloud_colors import CloudColors, ColorBy, cloud_colors, seen_from
+from .ellipsoids import ellipsoids
 from .field_colors import FeatureColors
+from .framing import frame_middle, middle_box
 from .gaussian_actor import Moving, as_gaussians
 from .meshes import draw_mesh
-from .points_and_ellipsoids import ellipsoids
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -72,7 +73,8 @@ def add_cloud(
 
     The mesh carries `index` (which Gaussian), `opacity`, `rgb` (the colours drawn, uint8) and, if present, `label` and the
     values of `color_by` (`score`); with `style="gaussians"` also `scale` and `quat`. If colours mean numbers, its field
-    data carry `clim`, which `add_scalar_bar` reads. `recolor_cloud` changes the colours.
+    data carry `clim`, which `add_scalar_bar` reads. `recolor_cloud` changes the colours. A view of everything shows the
+    middle 98 % of the points in each axis, with a margin: floaters do not set the camera.
 
     Args:
         plotter: where to draw, in the active subplot.
@@ -106,6 +108,8 @@ def add_cloud(
     colors = cloud_colors(gaussians, color_by, feature_colors, clim)
     cloud = _surfaces(gaussians, options) if style == "ellipsoids" else _points(gaussians)
     _fill(cloud, gaussians, colors)
+    cloud.field_data["box"] = middle_box(np.asarray(cloud.points))
+    frame_middle(plotter.renderer)
     if style == "points":
         return draw_mesh(
         plotter,

@@ -13,7 +13,6 @@ from ..splat.engines import ALPHA_MAX, ALPHA_MIN
 from ..splat.project import FIELD_OF_VIEW_MARGIN
 from .frusta import evenly
 from .meshes import draw_mesh
-from .points_and_ellipsoids import FAINT
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -22,6 +21,7 @@ Array = np.ndarray[Any, Any]
 Moving = Literal["auto", "points", "gaussians"]
 LOW_PASS = 0.3  # pixels squared, added to each projected covariance as 3DGS does
 BOUND = 3.0  # standard deviations at which VTK stops drawing; 3.3, where ALPHA_MIN stops, agrees no better
+FAINT = 0.1  # opacity up to which points are left out or pale: they are opaque and would hide what is behind
 MOVING_FAINT = 10_000  # faint points drawn while the camera moves: few enough to see the others
 FAINT_ALPHA = 0.12
 MOVING_POINTS = 50_000  # 0.14 s a frame of 1024 x 768 in software on two busy cores; 100,000 took 0.25 s
@@ -170,7 +170,7 @@ class _Frame:
         if self.moving_actors:
             return
         opacity = np.asarray(self.cloud.point_data["opacity"])
-        clear, faint = opacity > FAINT["points"], (opacity <= FAINT["points"]) & (opacity >= ALPHA_MIN)
+        clear, faint = opacity > FAINT, (opacity <= FAINT) & (opacity >= ALPHA_MIN)
         for kept, most, alpha in ((faint, MOVING_FAINT, FAINT_ALPHA), (clear, MOVING_POINTS, 1.0)):
             rows = np.flatnonzero(kept)
             if len(rows):

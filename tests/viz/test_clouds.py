@@ -139,7 +139,7 @@ def test_ellipsoids_are_the_gaussians_surfaces(plotter):
 def test_too_many_or_too_faint_ellipsoids_are_refused(plotter, monkeypatch):
     with pytest.raises(ValueError, match=tells("gaussians:", "0.95", "got none", "options.faint")):
         add_cloud(plotter, some_gaussians(), style="ellipsoids", options=CloudOptions(faint=0.95))
-    monkeypatch.setattr("kfgs.viz.points_and_ellipsoids.MOST", 10)
+    monkeypatch.setattr("kfgs.viz.ellipsoids.MOST", 10)
     with pytest.raises(ValueError, match=tells("gaussians:", "10", "got 29")):
         add_cloud(plotter, some_gaussians(), style="ellipsoids")
 

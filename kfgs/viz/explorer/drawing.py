@@ -15,11 +15,10 @@ from ...gaussians import Gaussians
 from ...splat import ALPHA_MIN
 from ..clouds import CloudOptions, add_cloud, recolor_cloud
 from ..frusta import evenly
-from ..gaussian_actor import MOVING_POINTS, STILL
+from ..gaussian_actor import FAINT, MOVING_POINTS, STILL
 from ..legends import add_legend, add_scalar_bar
 from ..linked import add_title
 from ..meshes import draw_mesh
-from ..points_and_ellipsoids import FAINT
 from .hit_test import gaussian_at
 from .ring import Ring
 from .state import check_number
@@ -82,7 +81,7 @@ class Pane:
             self.visible, self.faint = strong, others
             self._draw_gaussians(colors, strong, drawn, rest)
         else:
-            opaque = self._opacities > FAINT["points"]
+            opaque = self._opacities > FAINT
             self.visible, self.faint = strong & opaque, np.zeros_like(others)
             self.faint[_sample(np.flatnonzero(others & opaque), REST_POINTS)] = True
             self._draw_points(colors)

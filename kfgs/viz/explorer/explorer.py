@@ -309,10 +309,10 @@ class Explorer:
         self._notify()
 
     def _notify(self) -> None:
-        if not self.plotter.off_screen:  # off-screen, a frame is drawn only when a picture is needed
-            self.plotter.render()  # does nothing before the window is shown
         for callback in self._listeners:
             callback()
+        if not self.plotter.off_screen:  # off-screen, a frame is drawn only when a picture is needed
+            self.plotter.render()  # does nothing before the window is shown
 
     def _draw(self) -> None:
         """Update the actors from the state, without rendering: pyvista would render after each actor added."""

@@ -5,105 +5,136 @@ import sys
 
 import numpy as np
 import pytest
-from cases_desktop import CLOUDS, HEIGHT, changed, clouds, press, shot
+from cases_desktop import HEIGHT, WIDTH, clouds, drag, press, seen, shot
 from cases_explorer import splat_file
 from messages import tells
+from PIL import Image
 
 from kfgs.viz import available, headless
 from kfgs.viz.explorer import ExploreOptions, Explorer
 from kfgs.viz.explorer.desktop import Desktop, open_window
 from kfgs.viz.explorer.meaning import SplatMeaning
-from kfgs.viz.explorer.panel import WIDTH
 from kfgs.viz.explorer.state import Exploration
 
 pytestmark = pytest.mark.skipif(not available(), reason=headless.probe().reason)
 
 
-def test_opening_asks_nothing_and_the_panel_lies_beside_the_clouds(desktop):
-    state = desktop.explorer.state
-    assert (state.asked, state.gamma, state.hidden, state.picked, state.show) == (
-        None,
-        None,
-        frozenset(),
-        None,
-        "labels",
-    )
-    picture = shot(desktop)
-    assert picture.shape == (HEIGHT, CLOUDS + WIDTH, 3)
-    assert np.array_equal(picture[:, CLOUDS:], desktop.pane.panel.picture)
-    for left in (0, CLOUDS // 2):  # both clouds are there, away from the edges
-        middle = picture[HEIGHT // 4 : -HEIGHT // 4, left + 30 : left + CLOUDS // 2 - 30]
-        assert (middle != 255).any(-1).mean() > 0.01
+def test_keys_go_through_the_classes(desktop):
+    state, asked = desktop.explorer.state, []
+    for key in ("n", "n", "N", "N", "N", "n", "Escape", "N"):
+        press(desktop, key)
+        asked.append(state.asked and state.asked.words)
+    assert asked == ["wall", "chair", "wall", "office chair", "table", "office chair", None, "office chair"]
+    assert desktop.text.input.startswith("'office chair': score >")
 
 
-def test_a_question_is_typed_completed_and_asked(desktop):
-    before = shot(desktop)
-    press(desktop, "slash", "c", "h")
-    assert desktop.line.text == "ch"
-    assert desktop.view().hint == "air"
-    typing = shot(desktop)
-    assert changed(before, typing) == (False, True)
-    press(desktop, "Tab", "Return")
-    assert desktop.line is None
-    assert desktop.explorer.state.asked.words == "chair"
-    assert changed(typing, shot(desktop)) == (True, True)
-    press(desktop, "Escape")
-    assert desktop.explorer.state.asked is None
-    assert np.array_equal(shot(desktop), before)
+def test_keys_hide_and_show_classes(desktop):
+    state, before = desktop.explorer.state, shot(desktop)
+    press(desktop, "h")
+    assert state.hidden == frozenset()  # there is no question
+    press(desktop, "n", "h", "n", "h")
+    assert state.hidden == {0, 1}
+    assert (shot(desktop) != before).any()
+    press(desktop, "H", "Escape")
+    np.testing.assert_allclose(shot(desktop), before, atol=1)  # a pixel may round otherwise
 
 
-def test_while_typing_no_key_of_vtk_or_pyvista_acts(desktop):
-    plotter, heard = desktop.explorer.plotter, []
-    for key in ("q", "w", "v", "Up", "plus"):
-        plotter.add_key_event(key, lambda key=key: heard.append(key))
-    plotter.iren.interactor.AddObserver("CharEvent", lambda *_: heard.append("character"), -1.0)
-    camera = plotter.camera.position
-    press(desktop, "slash", "q", "e", "w", "s", "p", "r", "v", "3", "Up", "plus")
-    assert desktop.line.text == "qewsprv3"
-    assert heard == []
-    assert plotter.camera.position == camera
-    assert not list(desktop.explorer.options.out.iterdir())  # p and s would have saved
-    press(desktop, "BackSpace", "BackSpace", "Escape", "w", "v", "e")
-    assert desktop.line is None
-    assert heard == []  # nor later, but for q, which closes
-    press(desktop, "q")
-    assert heard == ["q", "character"]
-
-
-def test_an_unknown_word_is_said_and_nothing_is_raised(desktop, capfd):
-    press(desktop, "slash", "c", "h", "a", "i", "r", "Return", "slash", "z", "o", "o", "Return")
-    assert desktop.explorer.state.asked.words == "chair"
-    assert "expected one of" in desktop.error
-    assert "zoo" in desktop.error
-    press(desktop, "2")
-    assert desktop.error == ""
-    assert capfd.readouterr() == ("", "")
-
-
-def test_keys_choose_what_colours_stand_for(desktop):
+def test_keys_choose_colours_and_style(desktop):
     state = desktop.explorer.state
     for number, show in enumerate(state.show_choices, start=1):
         press(desktop, str(number))
         assert state.show == show
     press(desktop, str(len(state.show_choices) + 1))
     assert state.show == state.show_choices[-1]
+    press(desktop, "g")
+    assert desktop.explorer.style == "gaussians"
 
 
-def test_a_verb_from_outside_is_shown(desktop):
+def test_keys_of_vtk_do_nothing_but_q(desktop):
+    heard, camera = [], desktop.plotter.camera.position
+    desktop.plotter.iren.interactor.AddObserver("CharEvent", lambda *_: heard.append("character"), -1.0)
+    press(desktop, "w", "3", "e", "v", "C", "b")
+    assert heard == []
+    assert desktop.plotter.camera.position == camera
+    press(desktop, "q")
+    assert heard == ["character"]
+
+
+def test_the_list_of_keys_comes_and_goes(desktop):
+    before = shot(desktop)
+    press(desktop, "k")
+    assert "n, N  next, previous class" in desktop.text.input
+    assert "1  labels    2  rgb" in desktop.text.input
+    assert (shot(desktop) != before).any()
+    press(desktop, "k")
+    assert np.array_equal(shot(desktop), before)
+
+
+def test_the_lambda_slider_is_logarithmic(desktop):
+    state = desktop.explorer.state
+    low, high = state.distance_range
+    drag(desktop, "lambda", 0.0)
+    assert state.distance == pytest.approx(low)
+    assert (state.labels("color") < 0).any()
+    drag(desktop, "lambda", 0.5)
+    assert state.distance == pytest.approx((low * high) ** 0.5, rel=0.1)  # within a pixel of 135
+    assert desktop.sliders["lambda"].GetRepresentation().GetTitleText() == f"lambda {state.distance:.3g}"
+
+
+def test_the_gamma_slider_selects_and_needs_a_question(desktop):
+    state, slider = desktop.explorer.state, desktop.sliders["gamma"]
+    assert not slider.GetRepresentation().GetVisibility()
+    press(desktop, "n", "n")
+    assert slider.GetRepresentation().GetVisibility()
+    low, high = state.gamma_range
+    counts = []
+    for share in (0.0, 0.5, 1.0):
+        drag(desktop, "gamma", share)
+        assert state.gamma == pytest.approx(low + share * (high - low), abs=0.02 * (high - low))
+        counts.append(int(state.selected("semantic").sum()))
+    assert counts[0] > counts[1] > counts[2] == 0
+
+
+def test_a_click_picks_and_a_drag_turns(desktop):
+    mouse, state, camera = desktop.plotter.iren, desktop.explorer.state, desktop.plotter.camera.position
+    x, y = seen(desktop, 5)
+    mouse._mouse_left_button_press(x, y)
+    mouse._mouse_move(x + 40, y + 15)
+    mouse._mouse_left_button_release()
+    assert state.picked is None
+    assert desktop.plotter.camera.position != camera
+    press(desktop, "r")
+    assert desktop.plotter.camera.position == pytest.approx(camera)
+    mouse._mouse_left_button_click(*seen(desktop, 5))
+    assert (state.picked.side, state.picked.label) == ("semantic", int(state.labels("semantic")[5]))
+    assert state.picked.lines()[0] in desktop.text.input
+    mouse._mouse_left_button_click(5, HEIGHT - 5)
+    assert state.picked is None
+    assert "nothing there to pick" in desktop.text.input
+
+
+def test_keys_save_the_picture_without_controls_and_the_selection(desktop, capfd):
+    out = desktop.explorer.options.out
+    press(desktop, "s")
+    assert "ValueError" in desktop.note  # nothing is selected yet
+    press(desktop, "n", "p")
+    assert desktop.note == f"saved {out / 'picture_001.png'}"
+    saved = np.asarray(Image.open(out / "picture_001.png"))
+    assert saved.shape == (HEIGHT, WIDTH, 3)
+    assert (saved != shot(desktop)).any()
+    press(desktop, "s")
+    assert desktop.note == f"saved {out / 'selection_001'}"
+    assert (out / "selection_001" / "selection.json").is_file()
+    desktop.leave()
+    np.testing.assert_allclose(desktop.explorer.screenshot(), saved, atol=1)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_a_program_changes_is_shown(desktop):
     before = shot(desktop)
     desktop.explorer.ask("table")
-    assert changed(before, shot(desktop)) == (True, True)
-    assert desktop.view().question == "table"
-
-
-def test_after_the_window_the_explorer_draws_off_screen_without_a_panel(desktop):
-    explorer = desktop.explorer
-    desktop.leave()
-    explorer.ask("chair")
-    picture = explorer.screenshot()
-    assert picture.shape == (HEIGHT, CLOUDS, 3)
-    assert explorer.plotter.renderers[1].GetViewport() == (0.5, 0.0, 1.0, 1.0)
-    assert (picture[:, CLOUDS // 2 :] != 255).any()
+    assert desktop.text.input.startswith("'table'")
+    assert (shot(desktop) != before).any()
 
 
 def test_a_window_needs_a_display(desktop, monkeypatch):
@@ -117,25 +148,9 @@ def test_a_window_needs_a_display(desktop, monkeypatch):
 
 def test_one_cloud_alone_has_no_lambda(tmp_path):
     semantic, _ = clouds()
-    options = ExploreOptions(height=HEIGHT, width=CLOUDS, style="points", out=tmp_path)
+    options = ExploreOptions(height=HEIGHT, width=WIDTH, style="points", out=tmp_path)
     with Explorer(Exploration(SplatMeaning(splat_file(semantic))), options, off_screen=True) as explorer:
-        desktop = Desktop(explorer)
-        explorer.plotter.show(interactive=False, auto_close=False)
-        press(desktop, "slash", *"chair", "Return")
-        assert [one.value for one in desktop.pane.panel.spots if one.kind == "slider"] == ["gamma"]
-        assert shot(desktop).shape == (HEIGHT, CLOUDS // 2 + WIDTH, 3)
-
-
-def test_with_its_panel_a_window_is_no_larger_than_the_screen(tmp_path):
-    semantic, _ = clouds()
-    state = Exploration(SplatMeaning(splat_file(semantic)))
-    with Explorer(
-        state, ExploreOptions(height=90, width=200, style="points", out=tmp_path), off_screen=True
-    ) as explorer:
-        wide, high = explorer.plotter.render_window.GetScreenSize()
-        explorer.plotter.window_size = [wide - 50, high + 80]
-        Desktop(explorer)
-        assert explorer.plotter.window_size == [wide, high]
+        assert list(Desktop(explorer).sliders) == ["gamma"]
 
 
 WINDOW = """
@@ -148,17 +163,15 @@ semantic, color = clouds()
 explorer = Explorer(Exploration(SplatMeaning(splat_file(semantic)), color), ExploreOptions(height=420, width=600))
 interactor, seen = explorer.plotter.iren.interactor, []
 
-def press(*keys):
-    for key in keys:
-        code = {"slash": "/", "Return": chr(13)}.get(key, key)
-        interactor.SetKeyEventInformation(0, 0, code, 0, key)
-        interactor.InvokeEvent("KeyPressEvent")
-        interactor.InvokeEvent("CharEvent")
+def press(key):
+    interactor.SetKeyEventInformation(0, 0, key, 0, key)
+    interactor.InvokeEvent("KeyPressEvent")
+    interactor.InvokeEvent("CharEvent")
 
 def work(*_):
     if not seen:
         seen.append(explorer.screenshot())
-        press("slash", *"chair", "Return")
+        press("n")
         seen.append(explorer.screenshot())
     press("q")  # again and again: it closes nothing before the window's loop runs
 
@@ -168,8 +181,8 @@ timer = interactor.CreateRepeatingTimer(300)
 open_window(explorer)
 interactor.DestroyTimer(timer)
 first, asked = seen
-assert explorer.state.asked.words == "chair"
-assert (first[:, :600] != asked[:, :600]).any() and (first[:, 600:] != asked[:, 600:]).any()
+assert explorer.state.asked.words == "wall"
+assert (first[:, :300] != asked[:, :300]).any() and (first[:, 300:] != asked[:, 300:]).any()
 explorer.ask("table")
 after = explorer.screenshot()
 assert after.shape == (420, 600, 3) and after.std() > 0
