@@ -96,6 +96,7 @@ def segment(
     *,
     split: str = "test",
     labels: Given[Path] = None,
+    features: Given[Path] = None,
     rule: Rule = "fused",
     pictures: int = 4,
     classes: Classes,
@@ -108,11 +109,12 @@ def segment(
 
     Args:
         field: The folder that `kfgs fit` wrote (RUN/field).
-        out: Folder for label maps, pictures and scores.json.
+        out: Folder for label maps (predicted/ has class numbers, colored/ shows them in colours), pictures and scores.json.
         split: Which views: train, test, or another split that SCENE/split.json names.
         labels: Folder of true label pictures; SCENE/labels_scored or SCENE/labels when not given.
+        features: Folder of the teacher's maps, for the sheets; SCENE/features when not given, if it exists.
         rule: fused: the classes of the field's Gaussians; paper: decode every pixel (Sec. 3.4), seconds a view.
-        pictures: How many views get pictures.
+        pictures: How many views get pictures: a sheet (photo, truth, teacher, field, errors), an overlay and features.
     """
     from .._files import read_json
     from ..fields import recall_scene
@@ -137,10 +139,23 @@ def segment(
     seen = set(loaded_field.info.get("views", ())) & {loaded.cameras[i].name for i in loaded.views(split)}
     if seen:
         say(f"note: the field was trained on {len(seen)} of these views")
+    if features is not None and not features.is_dir():
+        raise ValueError(f"features: expected a folder of feature maps, got {features}, which is none; name another")
+    maps = features or (scene / "features" if (scene / "features").is_dir() else None)
     found = segment_scene(
-        loaded_field, loaded, label_set, out, split=split, rule=rule, pictures=pictures, progress=True
+        loaded_field,
+        loaded,
+        label_set,
+        out,
+        split=split,
+        rule=rule,
+        pictures=pictures,
+        truth=truth,
+        maps=maps,
+        progress=True,
     )
-    written = [out / name for name in ("predicted", "overlay", "features") if (out / name).is_dir()]
+    names = ("predicted", "colored", "sheets", "overlay", "features")
+    written = [out / name for name in names if (out / name).is_dir()]
     if truth:
         scores = score_scene(found, truth, label_set)
         say(str(scores))

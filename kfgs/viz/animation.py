@@ -46,8 +46,8 @@ def save_animation(
             from `show_cloud`), or several of these by title, shown side by side.
         cameras: one per frame, all of one size (`kfgs.cameras.orbit_cameras`, `path_cameras`).
         fps: frames per second, at most 50 in a GIF, which counts hundredths of a second.
-        names: class names, for a legend of the labelled Gaussians below every frame. Gaussians inside functions are not
-            listed.
+        names: class names, for a legend of the labelled Gaussians below every frame, and their colours. Gaussians inside
+            functions are not listed.
         progress: called after each frame with (done, all).
 
     Returns:
@@ -63,7 +63,7 @@ def save_animation(
     if len(sizes) > 1:
         raise ValueError(f"cameras: expected one size for all frames, got {sizes}; make them equal with resized()")
     _check_target(path, fps)
-    drawn = as_shows(shows)
+    drawn = as_shows(shows, names)
     strip = None
     if names is not None:
         strip = legend_under(shows, names, draw_frame({title: _blank for title in drawn}, cameras[0]).shape[1])

@@ -171,8 +171,7 @@ def _legend(labels: Tensor | Array | None, names: Sequence[str] | None) -> str:
     present = [int(label) for label in np.unique(as_array(labels, "labels"))]
     check_names(present, names)
     lines = []
-    for label in present:
-        red, green, blue = (int(v) for v in palette(np.array(label)))
+    for label, (red, green, blue) in zip(present, palette(np.array(present), names).tolist(), strict=True):
         name = html.escape("no class" if label < 0 else names[label])
         lines.append(f'<div><span style="{SWATCH}({red},{green},{blue})"></span>{name}</div>')
     return "\n".join(lines)

@@ -156,7 +156,7 @@ def plot_iou(
         raise ValueError(f"iou: expected a class that occurs, got {len(values)} NaN; was anything scored?")
     shown = shown[np.argsort(-values[shown], kind="stable")]
     axes, rows = axes_for(ax, 7.2, 0.3 * len(shown) + 1.5), np.arange(len(shown))
-    axes.barh(rows, values[shown], color=palette(shown) / 255, edgecolor=INK, linewidth=0.6, height=0.75)
+    axes.barh(rows, values[shown], color=palette(shown, names) / 255, edgecolor=INK, linewidth=0.6, height=0.75)
     for row, value in enumerate(values[shown]):
         axes.text(101, row, f"{value:.1f}", va="center", fontsize=9)
     mean = float(values[shown].mean())

@@ -125,7 +125,7 @@ def test_the_box_holds_legend_and_note_and_nothing_that_is_read_as_html():
         ("no class", -1, True),
         ("wall", 0, False),
     ):
-        red, green, blue = palette(np.array(label))
+        red, green, blue = palette(np.array(label), names)
         assert (f"rgb({red},{green},{blue})" in box) == there
         assert (f">{name}<" in box.replace("</span>", ">")) == there
     assert 'id=\\"kfgs' not in _furnish(EMPTY, "t", "", "")
@@ -134,9 +134,10 @@ def test_the_box_holds_legend_and_note_and_nothing_that_is_read_as_html():
 @pytest.mark.skipif(BROWSER is None, reason="needs chromium")
 @pytest.mark.skipif(importlib.util.find_spec("trame_vtk") is None, reason="needs trame-vtk")
 def test_a_browser_shows_scene_legend_and_note(plotter, tmp_path):
-    add_cloud(plotter, some_gaussians(), style="gaussians")
+    names, gaussians = ["wall", "sofa", "rug", "lamp"], some_gaussians()
+    add_cloud(plotter, gaussians, color_by=palette(gaussians.labels, names), style="gaussians")
     plotter.camera_position = "xy"
-    page = save_page(tmp_path / "room.html", plotter, labels=torch.arange(4), names=["wall", "sofa", "rug", "lamp"])
+    page = save_page(tmp_path / "room.html", plotter, labels=torch.arange(4), names=names)
     picture = tmp_path / "seen.png"
     flags = "--headless --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --disable-gpu-sandbox"
     look = [BROWSER, *flags.split(), f"--user-data-dir={tmp_path}/profile", "--window-size=400,300"]
@@ -146,7 +147,7 @@ def test_a_browser_shows_scene_legend_and_note(plotter, tmp_path):
     colors = {tuple(color) for color in seen}
     assert len(colors) > 20  # letters and edges, beside the flat ones
     for label in range(4):
-        exact = (seen == palette(np.array(label))).all(axis=1)
+        exact = (seen == palette(np.array(label), names)).all(axis=1)
         assert exact.sum() > 100  # the legend's square has about 100 pixels, a point of the cloud more
 
 

@@ -98,7 +98,7 @@ def test_iou_bars_are_sorted_and_coloured_by_class(tmp_path):
     np.testing.assert_allclose([bar.get_width() for bar in axes.patches], [90, 50, 25])
     assert [tick.get_text() for tick in axes.get_yticklabels()] == ["c", "a", "d"]
     assert axes.get_ylim()[0] > axes.get_ylim()[1]  # the best on top
-    colors = palette(np.array([2, 0, 3])) / 255
+    colors = palette(np.array([2, 0, 3]), list("abcd")) / 255
     np.testing.assert_allclose([bar.get_facecolor()[:3] for bar in axes.patches], colors)
     np.testing.assert_allclose(axes.lines[-1].get_xdata(), 55, rtol=1e-6)  # (90 + 50 + 25) / 3
     np.testing.assert_allclose(np.ma.getdata(axes.collections[0].get_offsets()), [(np.nan, 0), (40, 1), (60, 2)])

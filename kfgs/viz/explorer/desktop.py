@@ -115,6 +115,7 @@ class Desktop:
             choices=(("show", state.show_choices, state.show), ("style", STYLES, self.explorer.style)),
             actions=ACTIONS,
             classes=self._classes,
+            names=state.meaning.names,
             hidden=state.hidden,
             scroll=self.scroll,
             lines=self.explorer.lines(),

@@ -74,6 +74,8 @@ class PanelView:
     actions: Sequence[str] = ()
     classes: Sequence[tuple[int, str]] = ()
     """(label, name)."""
+    names: Sequence[str] | None = None
+    """Of all classes, in label order: they decide the colours."""
     hidden: frozenset[int] = frozenset()
     scroll: int = 0
     """Number of class rows scrolled past."""
@@ -234,9 +236,11 @@ def _draw_classes(pen: _Pen, view: PanelView, bottom: int) -> int:
     last = max(-(-len(view.classes) // columns) - rows, 0)
     first = min(view.scroll, last) * columns
     step = (pen.width - 2 * MARGIN) // columns
+    colors = palette(np.array([label for label, _ in view.classes]), view.names).tolist()
     for place, (label, name) in enumerate(view.classes[first : first + rows * columns]):
         column, row = (place // rows, place % rows) if last == 0 else (place % columns, place // columns)
-        _draw_class(pen, label, name, (MARGIN + column * step, pen.y + row * LINE), step, label not in view.hidden)
+        corner, color = (MARGIN + column * step, pen.y + row * LINE), tuple(colors[first + place])
+        _draw_class(pen, label, name, color, corner, step, label not in view.hidden)
     if last:  # a scroll bar
         x, top, tall = pen.width - 6, pen.y, rows * LINE
         all_rows = last + rows
@@ -246,9 +250,16 @@ def _draw_classes(pen: _Pen, view: PanelView, bottom: int) -> int:
     return last
 
 
-def _draw_class(pen: _Pen, label: int, name: str, corner: tuple[int, int], step: int, shown: bool) -> None:
-    x, y = corner
-    red, green, blue = (int(v) for v in palette(np.array(label)))
+def _draw_class(
+    pen: _Pen,
+    label: int,
+    name: str,
+    color: tuple[int, int, int],
+    corner: tuple[int, int],
+    step: int,
+    shown: bool,
+) -> None:
+    (x, y), (red, green, blue) = corner, color
     box = (x, y + 3, x + 14, y + 17)
     pen.draw.rectangle((box[0], box[1], box[2] - 1, box[3] - 1), (red, green, blue) if shown else FIELD, LEGEND_INK)
     if shown:

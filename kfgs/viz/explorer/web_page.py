@@ -251,7 +251,7 @@ class ExplorerPage:
     def _classes(self) -> list[dict[str, Any]]:
         state = self.explorer.state
         rows, labels = class_list(state), state.labels("semantic")
-        colors = palette(np.array([label for label, _ in rows], dtype=np.int64))
+        colors = palette(np.array([label for label, _ in rows], dtype=np.int64), state.meaning.names)
         counts = [int((labels == label).sum()) for label, _ in rows]
         return [
             {
