@@ -25,7 +25,14 @@ def run(room, tmp_path_factory):
 
 
 def test_fit_names_what_it_wrote(run):
-    for name in ("field/field.json", "field/field.safetensors", "codebook.png", "field.png"):
+    for name in (
+        "field/field.json",
+        "field/field.safetensors",
+        "codebook.png",
+        "field.png",
+        "preview.png",
+        "report.html",
+    ):
         assert (run / name).is_file(), name
 
 

@@ -23,7 +23,7 @@ import tyro
 from .evaluate import compare, evaluate
 from .features import features, plan
 from .fit import color, demo, fit, sfm, uplift
-from .output import say, warnings_as_notes
+from .output import called, say, warnings_as_notes
 from .pack import pack
 from .query import info, label, segment, select
 from .splats import attach, convert, edit
@@ -68,6 +68,7 @@ def main(arguments: list[str] | None = None) -> int:
         _fail(_unknown(name))
         raise SystemExit(2)
     command = COMMANDS[name]
+    called[:] = ["kfgs", name, *given]
     names = _shown_names(command)
 
     def spoken(message: str) -> str:

@@ -27,13 +27,13 @@ from .apply import (
     segment_scene,
     true_labels,
     write_report,
-    write_training_pictures,
 )
 from .attach import attach
 from .color import ColorConfig, fit_color
 from .compare import views_of_change, write_comparison
 from .config import FitConfig
 from .fit import FitResult, fit_scene
+from .run_report import write_run_report
 
 REMOVED, PAINTED, PAINT = "chair", "plant", "#c04040"  # the edits of the paper's Figures 5 and 4
 TITLES = ("before", "after")
@@ -109,7 +109,7 @@ def run(
         *(segmentation / name for name in ("predicted", "colored", "sheets", "overlay", "features")),
         *written,
         out / "surface.ply",
-        *write_training_pictures(fitted),
+        *write_run_report(fitted, scene, config, command="kfgs demo"),
         *edited,
         out / "scores.json",
     ]
