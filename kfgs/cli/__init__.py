@@ -26,6 +26,7 @@ from .fit import color, demo, fit, sfm, uplift
 from .output import called, say, warnings_as_notes
 from .pack import pack
 from .query import info, label, segment, select
+from .render import render
 from .splats import attach, convert, edit
 from .text import text
 from .view import view
@@ -33,7 +34,7 @@ from .view import view
 GROUPS: dict[str, tuple[Any, ...]] = {
     "Start here": (demo, info),
     "Make a semantic field": (sfm, plan, features, text, fit, uplift),
-    "Ask it": (select, segment, label, view),
+    "Ask it": (select, segment, label, view, render),
     "Store it": (pack,),
     "Score it": (evaluate, compare),
     "Colour splats": (color, attach, edit, convert),

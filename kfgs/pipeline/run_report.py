@@ -46,7 +46,9 @@ def write_preview(
     if not views:
         return None
     count = min(count, len(views))
-    chosen = [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]  # not the ends, which often are alike
+    chosen = [
+        views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)
+    ]  # not the ends, which often are alike
     classes, colors = _classes(field), feature_colors(field)
     titles = ["photograph", "features as colours"] + ([] if classes is None else ["labels"])
     rows, seen = [], []
