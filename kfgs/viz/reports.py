@@ -241,6 +241,7 @@ def _draw_growth(axes: Sequence[Axes], histories: Mapping[str, Sequence[Row]]) -
                 draw_curve(axes[panel], x, y, i, color=color, linestyle=style, label=label)
                 drawn[panel] += y
     for panel, title in enumerate(("size K", "codewords added and pruned (dashed)", "coverage")):
+        axes[panel].set_visible(bool(drawn[panel]))
         axes[panel].set(title=title, xlabel="epoch")
         axes[panel].title.set_fontsize(10)
         if panel < 2:
