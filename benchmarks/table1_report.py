@@ -148,7 +148,7 @@ def draw_labels(out: Path, folder: Path, truth: str, results: list[dict[str, Any
         labels = out / "rows" / result["folder"] / "labels.png"
         if result["picture"] == stem and request["seed"] == seed and labels.is_file():
             maps[ROWS[request["row"]].title.strip("*")] = load_label_map(labels)
-    pictures = [photo, *(overlay_labels(photo, labels) for labels in maps.values())]
+    pictures = [photo, *(overlay_labels(photo, labels, names, legend=False) for labels in maps.values())]
     titles = [f"photo {stem}", *maps]
     pictures += [photo * 0 + 1] * (-len(pictures) % COLUMNS)
     titles += [""] * (len(pictures) - len(titles))

@@ -88,8 +88,9 @@ def as_colors(features):  # [h, w, D] -> [h, w, 3] uint8
 rows = []
 for k in (0, 10):
     image, size = scene.image(train[k]), scene.cameras[train[k]].size
-    said = viz.overlay_labels(image, teacher_labels(maps[k], size))
-    rows.append([image, as_colors(maps[k]), said, viz.overlay_labels(image, truth[scene.stem(train[k])])])
+    said, real = teacher_labels(maps[k], size), truth[scene.stem(train[k])]
+    drawn = (viz.overlay_labels(image, labels, classes.names, legend=False) for labels in (said, real))
+    rows.append([image, as_colors(maps[k]), *drawn])
 sheet = viz.picture_grid(rows, ("photograph", "teacher's features", "teacher's labels", "truth"), width=256)
 Image.fromarray(np.concatenate([sheet, viz.legend_strip(torch.arange(len(classes)), classes.names, sheet.shape[1])]))
 
@@ -154,7 +155,9 @@ rows = []
 for k in (2, 5):
     photograph, stem, size = scene.image(test[k]), scene.stem(test[k]), scene.cameras[test[k]].size
     columns = truth[stem], teacher_labels(test_maps[k], size), found[stem]
-    rows.append([photograph, *(viz.overlay_labels(photograph, label) for label in columns)])
+    rows.append(
+        [photograph, *(viz.overlay_labels(photograph, label, classes.names, legend=False) for label in columns)]
+    )
 sheet = viz.picture_grid(rows, ("photograph", "truth", "teacher", "field"), width=256)
 present = torch.cat([target.unique() for target in truth.values()])
 Image.fromarray(np.concatenate([sheet, viz.legend_strip(present, classes.names, sheet.shape[1])]))
@@ -215,7 +218,10 @@ trained_found = segment_scene(trained, scene, classes, data / "run_paper" / "seg
 trained_scores = score_scene(trained_found, truth, classes)
 print(f"paper's method, short schedule: {trained_scores.miou.value:.3f} mIoU; fused: {scores.miou.value:.3f}")
 stem = scene.stem(test[2])
-row = [viz.overlay_labels(image, label) for label in (truth[stem], trained_found[stem], found[stem])]
+row = [
+    viz.overlay_labels(image, label, classes.names, legend=False)
+    for label in (truth[stem], trained_found[stem], found[stem])
+]
 Image.fromarray(viz.picture_grid([row], ("truth", "paper's method, short", "fused"), width=256))
 
 # %% [markdown]

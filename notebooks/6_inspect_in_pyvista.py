@@ -83,7 +83,8 @@ print(transfer)
 camera = scene.cameras[scene.views("test")[shown_view]]
 camera = camera.resized(round(256 * camera.height / camera.width), 256)  # small pictures
 plotter = viz.make_plotter(480, 640, off_screen=True)
-actor = viz.add_cloud(plotter, semantic, color_by="label", style="gaussians")
+colors = viz.palette(semantic.labels, classes.names)
+actor = viz.add_cloud(plotter, semantic, color_by=colors, style="gaussians")
 viz.add_legend(plotter, semantic.labels, classes.names)
 viz.look_through(plotter, camera)
 print(actor.mapper.dataset.array_names)  # what the actor carries, one row per Gaussian

@@ -202,7 +202,7 @@ classes = make_label_set(teacher, phrases, negatives=None)
 rows = []
 for i in test[:2]:
     photo, labels = scene.image(i), semantic.segment(scene.cameras[i], classes)
-    rows.append([photo, viz.overlay_labels(photo, labels, alpha=0.8)])
+    rows.append([photo, viz.overlay_labels(photo, labels, phrases, alpha=0.8, legend=False)])
 sheet = viz.picture_grid(rows, ["unseen picture", "segmented"], width=320)
 legend = viz.legend_strip(torch.arange(len(phrases)), phrases, sheet.shape[1])
 Image.fromarray(np.concatenate([sheet, legend]))
@@ -254,7 +254,7 @@ for shown in clicks.values():
     for x, y in shown.points:
         marked[shown.view][max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3] = torch.tensor([1.0, 1.0, 0.0])
 row = [*(marked[view] for view in sorted({shown.view for shown in clicks.values()})), photo]
-row.append(viz.overlay_labels(photo, labels, alpha=0.8))
+row.append(viz.overlay_labels(photo, labels, pointed.names, alpha=0.8, legend=False))
 sheet = viz.picture_grid([row], [*["clicks"] * (len(row) - 2), "unseen picture", "segmented"], width=240)
 Image.fromarray(np.concatenate([sheet, viz.legend_strip(torch.arange(len(pointed)), pointed.names, sheet.shape[1])]))
 

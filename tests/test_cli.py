@@ -25,7 +25,14 @@ def run(room, tmp_path_factory):
 
 
 def test_fit_names_what_it_wrote(run):
-    for name in ("field/field.json", "field/field.safetensors", "codebook.png", "field.png"):
+    for name in (
+        "field/field.json",
+        "field/field.safetensors",
+        "codebook.png",
+        "field.png",
+        "preview.png",
+        "report.html",
+    ):
         assert (run / name).is_file(), name
 
 
@@ -53,7 +60,7 @@ def test_segment_scores_where_truth_is_known(run, room, tmp_path, capsys):
     scores = json.loads((out / "scores.json").read_text())
     assert scores["segmentation"]["views"] == 3
     assert 0 < scores["segmentation"]["miou"] < 1
-    for name in ("predicted", "overlay", "features", "confusion.png", "iou.png", "scores.json"):
+    for name in ("predicted", "colored", "sheets", "overlay", "features", "confusion.png", "iou.png", "scores.json"):
         assert str(out / name) in said
 
 
@@ -173,6 +180,10 @@ def test_a_single_query_reports_its_threshold(run, room, tmp_path, capsys):
         (
             ["label", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--cloud", "{room}/no.ply"],
             ("{room}/no.ply:", "no such file"),
+        ),
+        (
+            ["segment", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--features", "{tmp}/none"],
+            "--features: expected a folder of feature maps",
         ),
         (
             ["segment", "{run}/field", "--scene", "{room}", "--out", "{tmp}/o", "--labels", "{tmp}"],

@@ -180,6 +180,7 @@ def test_select_counts_places_and_saves(labelled, room, tmp_path, capsys):
     np.testing.assert_allclose(largest["extent"][0], cloud.gaussians.means[largest["indices"]].amin(0), atol=1e-6)
     assert largest["best_view"]["camera"] in {camera.name for camera in load_scene(room).cameras}
     assert largest["best_view"]["camera"] in said
+    assert (out / "parts.png").is_file()
     saved = read_splats(out / "selection.ply")
     assert torch.equal(saved.gaussians.means, cloud.gaussians.means[mask])
     assert set(saved.gaussians.labels.tolist()) == {index}

@@ -18,7 +18,7 @@ from kfgs.evaluation import LerfOvs2D, MaskAndBoxes, MaskTruth, OVS3DClosed
 from kfgs.labels import load_label_set
 from kfgs.pipeline import open_question
 from kfgs.pipeline.evaluate import open_result
-from kfgs.pipeline.side_by_side import VOID, WRONG, _errors, _show_labels, show_views
+from kfgs.pipeline.side_by_side import VOID, WRONG, _show_labels, draw_errors, show_views
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +147,7 @@ def test_void_is_plain_grey():
     photo = torch.rand(4, 5, 3)
     wrong, void = torch.zeros(4, 5), torch.zeros(4, 5, dtype=torch.bool)
     wrong[1], void[2] = 1, True
-    found = _errors(photo, wrong, void)
+    found = draw_errors(photo, wrong, void)
     assert bool((found[2] == VOID).all())
     assert float((found[1] - torch.tensor(WRONG)).abs().max()) < 0.15
 

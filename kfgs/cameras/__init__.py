@@ -7,6 +7,7 @@ from .paths import path_cameras
 from .projection import camera_to_pixel, project_points, projection_jacobian, unproject_depth, world_to_camera
 from .resample import resize_labels, resize_map
 from .similarity import Similarity, fit_similarity
+from .spiral import spiral_cameras
 from .undistort import undistort, undistort_labels
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "projection_jacobian",
     "resize_labels",
     "resize_map",
+    "spiral_cameras",
     "to_kornia",
     "undistort",
     "undistort_labels",

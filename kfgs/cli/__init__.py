@@ -23,9 +23,10 @@ import tyro
 from .evaluate import compare, evaluate
 from .features import features, plan
 from .fit import color, demo, fit, sfm, uplift
-from .output import say, warnings_as_notes
+from .output import called, say, warnings_as_notes
 from .pack import pack
 from .query import info, label, segment, select
+from .render import render
 from .splats import attach, convert, edit
 from .text import text
 from .view import view
@@ -33,7 +34,7 @@ from .view import view
 GROUPS: dict[str, tuple[Any, ...]] = {
     "Start here": (demo, info),
     "Make a semantic field": (sfm, plan, features, text, fit, uplift),
-    "Ask it": (select, segment, label, view),
+    "Ask it": (select, segment, label, view, render),
     "Store it": (pack,),
     "Score it": (evaluate, compare),
     "Colour splats": (color, attach, edit, convert),
@@ -68,6 +69,7 @@ def main(arguments: list[str] | None = None) -> int:
         _fail(_unknown(name))
         raise SystemExit(2)
     command = COMMANDS[name]
+    called[:] = ["kfgs", name, *given]
     names = _shown_names(command)
 
     def spoken(message: str) -> str:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shlex
 from pathlib import Path
 from typing import Any, Literal
 
 from .features import check_discard, choose_teacher, stored_maps
 from .files import check_alone, check_folder, is_field, open_field, open_splats
 from .options import FieldMethod, Flag, Given, Maps, MapTeacher, Positional, SceneFolder, Training, Views, fit_config
-from .output import say, wrote
+from .output import called, say, wrote
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
@@ -104,14 +105,14 @@ def fit(
         kfgs fit scene/ --out run/ --method paper --preset paper
 
     Args:
-        out: Run folder; OUT/field receives the field. Running again continues where it stopped.
+        out: Run folder; OUT/field receives the field, OUT/report.html what was made. Running again continues where it stopped.
         splat: Any splat file of the scene, in its frame: the Gaussians to average onto.
         discard_features: Delete the feature maps when the stages made of them are done. Later runs with the same options
             do not need them; runs with other options (another --splat, for example) do.
     """
     from .._files import bytes_in_words
     from ..features import RecomputedMaps, discard_maps
-    from ..pipeline import fit_scene, write_training_pictures
+    from ..pipeline import fit_scene, write_run_report
     from ..pipeline.train import check_scene
 
     config = fit_config(
@@ -147,7 +148,8 @@ def fit(
     if teacher.teacher is not None:
         found.clear()  # the samples; the stages made of them are found without
     say(result.field.summary())
-    written = [result.field_path, *write_training_pictures(result)]
+    command = f"cd {shlex.quote(os.getcwd())}\n{shlex.join(called)}"
+    written = [result.field_path, *write_run_report(result, loaded, config, command=command)]
     if discard_features:
         freed = discard_maps(found.path, found.stems)
         say(

@@ -8,6 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+called: list[str] = []
+"""The words of the command that runs, for its report."""
+
 
 def say(text: str) -> None:
     """Print a line at once."""

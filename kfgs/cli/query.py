@@ -42,7 +42,8 @@ def select(
     Args:
         query: A class name, "chair"; with --teacher any phrase.
         source: A field folder (RUN/field), or a splat with classes.
-        out: Folder for selection.json (with the indices) and selection.ply (the Gaussians).
+        out: Folder for selection.json (with the indices), selection.ply (the Gaussians) and parts.png (each part in its best
+            view, if the cameras are known).
         threshold: Scores must be above it. For a field it is the paper's gamma; by default 0.5 for a relevancy, else derived
             from the scores. For a splat the default takes every Gaussian of the class.
         negatives: Compare the query with all other classes, LERF's canonical words (object, things, stuff, texture), or
@@ -71,13 +72,15 @@ def select(
         how = None if score == "auto" else score
         found = field.query(target, label_set, threshold, negatives=_negatives(negatives, score), score=how)
         cloud, cameras = SplatFile(field.gaussians, {"score": found.scores.numpy()}), field.cameras or None
+        scene = _scene_of(field, classes) if out is not None else None
     else:
         given = {"classes": classes.classes, "text": classes.text, "negatives": negatives, "score": score}
         for name, value in (given | dataclasses.asdict(teacher)).items():
             check_alone(name, None if value == "auto" else value, "with a splat, which has its own classes")
         cloud = open_splats("source", source, labelled=True)
         found = select_labelled(cloud, query, threshold)
-        cameras = None if classes.scene is None else classes.load_scene().undistorted().cameras
+        scene = None if classes.scene is None else classes.load_scene().undistorted()
+        cameras = None if scene is None else scene.cameras
     say(f"{query}: {len(found)} of {len(cloud)} Gaussians, {found.summary}")
     things = connected_parts(cloud.gaussians, found, cameras)
     for number, thing in enumerate(things, start=1):
@@ -87,7 +90,8 @@ def select(
             raise ValueError(
                 f"query: expected Gaussians to save, got none of {query!r}; lower the threshold or drop --out"
             )
-        wrote(_save(out, query, cloud, found, things))
+        written = _save(out, query, cloud, found, things)
+        wrote([*written, *_draw(out / "parts.png", query, cloud.gaussians, things, cameras, scene)])
 
 
 def segment(
@@ -96,6 +100,7 @@ def segment(
     *,
     split: str = "test",
     labels: Given[Path] = None,
+    features: Given[Path] = None,
     rule: Rule = "fused",
     pictures: int = 4,
     classes: Classes,
@@ -108,16 +113,17 @@ def segment(
 
     Args:
         field: The folder that `kfgs fit` wrote (RUN/field).
-        out: Folder for label maps, pictures and scores.json.
+        out: Folder for label maps (predicted/ has class numbers, colored/ shows them in colours), pictures and scores.json.
         split: Which views: train, test, or another split that SCENE/split.json names.
         labels: Folder of true label pictures; SCENE/labels_scored or SCENE/labels when not given.
+        features: Folder of the teacher's maps, for the sheets; SCENE/features when not given, if it exists.
         rule: fused: the classes of the field's Gaussians; paper: decode every pixel (Sec. 3.4), seconds a view.
-        pictures: How many views get pictures.
+        pictures: How many views get pictures: a sheet (photo, truth, teacher, field, errors), an overlay and features.
     """
     from .._files import read_json
     from ..fields import recall_scene
     from ..pipeline import score_scene, segment_scene, true_labels, write_report
-    from ..viz import plot_confusion, plot_iou
+    from ..viz import plot_iou, plot_largest_confusions
 
     loaded_field = open_field("field", field)
     scene = recall_scene(loaded_field.info, loaded_field.folder) if classes.scene is None else classes.scene
@@ -137,15 +143,29 @@ def segment(
     seen = set(loaded_field.info.get("views", ())) & {loaded.cameras[i].name for i in loaded.views(split)}
     if seen:
         say(f"note: the field was trained on {len(seen)} of these views")
+    if features is not None and not features.is_dir():
+        raise ValueError(f"features: expected a folder of feature maps, got {features}, which is none; name another")
+    maps = features or (scene / "features" if (scene / "features").is_dir() else None)
     found = segment_scene(
-        loaded_field, loaded, label_set, out, split=split, rule=rule, pictures=pictures, progress=True
+        loaded_field,
+        loaded,
+        label_set,
+        out,
+        split=split,
+        rule=rule,
+        pictures=pictures,
+        truth=truth,
+        maps=maps,
+        progress=True,
     )
-    written = [out / name for name in ("predicted", "overlay", "features") if (out / name).is_dir()]
+    names = ("predicted", "colored", "sheets", "overlay", "features")
+    written = [out / name for name in names if (out / name).is_dir()]
     if truth:
         scores = score_scene(found, truth, label_set)
         say(str(scores))
         write_report(out / "scores.json", segmentation=scores, truth=str(folder), field=str(field), rule=rule)
-        plot_confusion(scores.confusion, list(label_set.names), out / "confusion.png", misses=scores.misses)
+        picture = out / "confusion.png"
+        plot_largest_confusions(scores.confusion, list(label_set.names), picture, misses=scores.misses)
         plot_iou(scores.iou, list(label_set.names), out / "iou.png")
         written += [out / name for name in ("scores.json", "confusion.png", "iou.png")]
     else:
@@ -240,6 +260,30 @@ def _save(out: Path, query: str, cloud: Any, found: Any, things: list[Any]) -> l
     facts = {"query": query, "threshold": found.threshold, "how": found.how, "count": len(found), "parts": parts}
     write_json(out / "selection.json", facts)
     return [out / "selection.json", *write_splats(out / "selection.ply", cloud.select(found.mask)).paths]
+
+
+def _scene_of(field: Any, classes: Classes) -> Any:
+    """The scene of --scene or of the field, for its photographs; None if it is not there any more."""
+    from ..fields import recall_scene
+    from ..scenes import load_scene
+
+    if classes.scene is not None:
+        return classes.load_scene().undistorted()
+    try:
+        return load_scene(recall_scene(field.info, field.folder)).undistorted()
+    except (OSError, ValueError):
+        return None
+
+
+def _draw(path: Path, query: str, gaussians: Any, things: list[Any], cameras: Any, scene: Any) -> list[Path]:
+    """Draw the parts over photographs; without them over the cloud's own colours, if it has some."""
+    from ..pipeline.part_pictures import photos_of, write_parts
+    from ..viz import show_cloud
+
+    under = None if gaussians.sh is None else show_cloud(gaussians, color_by="rgb")
+    under = under if scene is None else photos_of(scene)
+    drawn = write_parts(path, gaussians, things, cameras or (), under, query)
+    return [] if drawn is None else [drawn]
 
 
 def _negatives(negatives: Negatives, score: Score) -> Negatives:

@@ -90,7 +90,7 @@ def view(
     except RuntimeError as error:  # nothing to open, or nothing draws here
         raise ValueError(str(error)) from error
     say("reading")
-    meaning, cameras = _meaning(source, classes, teacher)
+    meaning, cameras = open_meaning(source, classes, teacher)
     cloud = None if color is None else open_splats("color", color).gaussians
     state = Exploration(meaning, cloud, cameras=cameras, distance=distance)
     _note(state)
@@ -133,7 +133,7 @@ def _draw(state: Any, options: Any, place: Where, show: Any) -> None:
             wrote([options.out / "view.png"])
 
 
-def _meaning(source: Path, classes: Classes, teacher: Teacher) -> tuple[Any, list[Any]]:
+def open_meaning(source: Path, classes: Classes, teacher: Teacher) -> tuple[Any, list[Any]]:
     """The answers to questions, and the cameras of the scene (those that a field was trained on)."""
     from ..viz.explorer import FieldMeaning, SplatMeaning
 

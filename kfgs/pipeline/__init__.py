@@ -24,6 +24,7 @@ from .fuse import uplift
 from .plan import Plan, plan_scene
 from .plan_maps import NamedTeacher
 from .question import Question, open_question
+from .run_report import write_run_report
 from .stages import Run
 
 __all__ = [
@@ -53,5 +54,6 @@ __all__ = [
     "views_of_change",
     "write_comparison",
     "write_report",
+    "write_run_report",
     "write_training_pictures",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +28,31 @@ from ..labels.questions import class_rows
 from ..scenes import Scene
 from ..viz import overlay_labels, palette, plot_codebook_history, plot_training, save_picture
 from ..viz.field_colors import feature_colors
+from ..viz.palette import UNLABELLED
+from ..viz.pictures import Array
 from .fit import FitResult, load_history
+from .sheets import segmentation_sheet, teacher_labels
 
 
 def save_label_map(path: Path, labels: Tensor) -> None:  # [H, W] int64
     """Write labels as an 8-bit picture, -1 as 255."""
-    values = torch.where(labels < 0, VOID, labels).to(torch.uint8).cpu().numpy()
+    _save_bytes(path, labels)
+
+
+def save_colored_labels(path: Path, labels: Tensor, names: Sequence[str]) -> None:  # [H, W] int64
+    """Write labels as an indexed PNG: pixel values as in `save_label_map`, shown in the classes' colours."""
+    colors = np.vstack(
+        [palette(np.arange(len(names)), names), np.zeros((VOID - len(names), 3), np.uint8), [UNLABELLED]]
+    )
+    _save_bytes(path, labels, colors.astype(np.uint8))
+
+
+def _save_bytes(path: Path, labels: Tensor, colors: Array | None = None) -> None:
+    picture = Image.fromarray(torch.where(labels < 0, VOID, labels).to(torch.uint8).cpu().numpy())
+    if colors is not None:
+        picture.putpalette(colors.tobytes())  # mode P
     with atomic_path(path) as temporary:
-        Image.fromarray(values).save(temporary, format="PNG")
+        picture.save(temporary, format="PNG")
 
 
 def segment_scene(
@@ -47,6 +64,8 @@ def segment_scene(
     split: str = "test",
     rule: Rule = "fused",
     pictures: int = 4,
+    truth: Mapping[str, Tensor] | None = None,
+    maps: Path | None = None,
     progress: bool = False,
 ) -> dict[str, Tensor]:
     """Segment every view of a split (Sec. 3.4) and write the label maps and some pictures.
@@ -55,10 +74,13 @@ def segment_scene(
         field: a finished field in the frame of `scene`.
         scene: posed views without distortion.
         classes: names and embeddings in the teacher's space.
-        out: receives `predicted/<stem>.png` and, for `pictures` evenly spread views, `overlay/` and `features/`.
+        out: receives `predicted/<stem>.png` (class numbers, 255 = none), `colored/<stem>.png` (the same in the classes'
+            colours) and, for `pictures` evenly spread views, `sheets/`, `overlay/` and `features/`.
         split: which views.
         rule: as in `SemanticField.segment`; `paper` decodes every pixel, which takes seconds a view.
-        pictures: how many views get an overlay and a feature picture.
+        pictures: how many views get a sheet, an overlay and a feature picture.
+        truth: from `true_labels`, for the sheets.
+        maps: folder of the teacher's maps, for the sheets; views without a map have no teacher there.
         progress: show a progress bar.
 
     Returns:
@@ -80,11 +102,20 @@ def segment_scene(
         camera, stem = scene.cameras[i], scene.stem(i)
         labels = field.segment(camera, classes, rule=rule)
         save_label_map(out / "predicted" / f"{stem}.png", labels)
+        save_colored_labels(out / "colored" / f"{stem}.png", labels, classes.names)
         if i in shown:
-            picture = overlay_labels(scene.image(i), labels, list(classes.names))
-            save_picture(out / "overlay" / f"{stem}.png", picture)
+            photo = scene.image(i)
             with torch.no_grad():
-                save_picture(out / "features" / f"{stem}.png", colors(field.render(camera).map))
+                features = colors(field.render(camera).map)
+            teacher = None if maps is None else teacher_labels(scene, i, maps, classes)
+            target = None if truth is None else truth.get(stem)
+            sheet = segmentation_sheet(photo, labels, classes.names, truth=target, teacher=teacher, features=features)
+            for name, picture in (
+                ("sheets", sheet),
+                ("overlay", overlay_labels(photo, labels, classes.names)),
+                ("features", features),
+            ):
+                save_picture(out / name / f"{stem}.png", picture)
         results[stem] = labels
     return results
 
@@ -168,14 +199,18 @@ def save_labelled(
     """
     path = Path(path)
     assert gaussians.labels is not None
-    columns = columns_from_gaussians(gaussians) | label_columns(gaussians.labels, scores)
+    columns = columns_from_gaussians(gaussians) | label_columns(gaussians.labels, classes.names, scores)
     write_ply(path, columns, comments=("kfgs labelled Gaussians",))
     return [path, write_names(path, classes.names, **{"labelled by": rule})]
 
 
-def label_columns(labels: Tensor, scores: Tensor | None = None) -> Columns:  # labels [N], scores [N]
+def label_columns(
+    labels: Tensor,  # [N]
+    names: Sequence[str],
+    scores: Tensor | None = None,  # [N]
+) -> Columns:
     """PLY columns of labels: class_id (int, -1 = none), label colours, and scores if given."""
-    rgb = palette(labels)
+    rgb = palette(labels, names)
     columns: Columns = {"class_id": labels.to(torch.int32).numpy()}
     columns |= {name: np.ascontiguousarray(rgb[:, i]) for i, name in enumerate(("red", "green", "blue"))}
     if scores is not None:
@@ -219,7 +254,7 @@ def label_cloud(
     """
     assert gaussians.labels is not None
     moved = transfer_labels(gaussians.means, gaussians.labels, points_from_columns(cloud), distance)
-    added = label_columns(moved.labels)
+    added = label_columns(moved.labels, classes.names)
     if {"red", "green", "blue"} & set(cloud):
         added = {"class_id": added["class_id"]}
     write_ply(out, cloud | added, comments=("labels carried by kfgs",))

@@ -27,13 +27,13 @@ from .apply import (
     segment_scene,
     true_labels,
     write_report,
-    write_training_pictures,
 )
 from .attach import attach
 from .color import ColorConfig, fit_color
 from .compare import views_of_change, write_comparison
 from .config import FitConfig
 from .fit import FitResult, fit_scene
+from .run_report import write_run_report
 
 REMOVED, PAINTED, PAINT = "chair", "plant", "#c04040"  # the edits of the paper's Figures 5 and 4
 TITLES = ("before", "after")
@@ -71,8 +71,16 @@ def run(
     fitted = fit_scene(scene, maps, out / "run", config, splat=colored.gaussians, report=say, progress=progress)
     say(fitted.field.summary())
 
-    found = segment_scene(fitted.field, scene, classes, out / "segmentation", progress=progress)
     truth = true_labels(scene, folder / "labels", "test")
+    found = segment_scene(
+        fitted.field,
+        scene,
+        classes,
+        out / "segmentation",
+        truth=truth,
+        maps=folder / "features",
+        progress=progress,
+    )
     scores = score_scene(found, truth, classes)
     test_maps = FeatureFolder(folder / "features", list(found))
     size = scene.cameras[scene.views("test")[0]].size
@@ -83,7 +91,7 @@ def run(
     labels, cosines = fitted.field.classify(classes)
     gaussians = fitted.field.gaussians.replace(labels=labels)
     written = save_labelled(out / "gaussians.ply", gaussians, cosines, classes, rule="fused features; score = cosine")
-    surface = _label_surface(gaussians, folder, out / "surface.ply")
+    surface = _label_surface(gaussians, folder, out / "surface.ply", classes)
     say(f"surface points: {surface}")
     edited, edit_scores = _edit_colors(out, scene, folder, fitted, colored.gaussians, classes, say)
     write_report(
@@ -98,12 +106,10 @@ def run(
     segmentation = out / "segmentation"
     return [
         fitted.field_path,
-        segmentation / "predicted",
-        segmentation / "overlay",
-        segmentation / "features",
+        *(segmentation / name for name in ("predicted", "colored", "sheets", "overlay", "features")),
         *written,
         out / "surface.ply",
-        *write_training_pictures(fitted),
+        *write_run_report(fitted, scene, config, command="kfgs demo"),
         *edited,
         out / "scores.json",
     ]
@@ -140,12 +146,12 @@ def _edit_colors(
     return written, {"removal": removal, "recolor": recolored}
 
 
-def _label_surface(gaussians: Gaussians, folder: Path, out: Path) -> SurfaceReport:
+def _label_surface(gaussians: Gaussians, folder: Path, out: Path, classes: LabelSet) -> SurfaceReport:
     """Carry the Gaussians' labels to the room's true surface points and score them (protocol `kfgs-surface/1`)."""
     assert gaussians.labels is not None
     with np.load(folder / "surface.npz") as surface:
         points, true = torch.from_numpy(surface["points"]).float(), torch.from_numpy(surface["labels"]).long()
     report = score_surface(gaussians.means, gaussians.labels, points, true)
     columns = {name: points[:, i].contiguous().numpy() for i, name in enumerate("xyz")}
-    write_ply(out, columns | label_columns(report.transfer.labels), comments=("labels carried by kfgs",))
+    write_ply(out, columns | label_columns(report.transfer.labels, classes.names), comments=("labels carried by kfgs",))
     return report

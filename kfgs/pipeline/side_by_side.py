@@ -145,7 +145,7 @@ def _show_colors(photo: Tensor, view: View, methods: Mapping[str, Any], name: st
         with torch.no_grad():
             rendered = rasterize(colors_of(method, name).replace(features=None), view.camera).map.clamp(0, 1)
         error = (rendered - photo).abs().amax(-1)
-        answers[title] = (rendered, _errors(photo, error / LOUDEST), float(error.mean()))
+        answers[title] = (rendered, draw_errors(photo, error / LOUDEST), float(error.mean()))
     return Shown(photo, photo, answers, np.empty(0, np.int64), ())
 
 
@@ -166,9 +166,13 @@ def _show_labels(question: Question, photo: Tensor, view: View, methods: Mapping
         labels = places[found.clamp_min(0)].where(found >= 0, -1)
         wrong = (labels != truth) & (truth >= 0)
         share = float(wrong.sum() / (truth >= 0).sum().clamp_min(1))
-        answers[title] = (overlay_labels(photo, labels), _errors(photo, wrong.float(), truth < 0), share)
+        answers[title] = (
+            overlay_labels(photo, labels, names, legend=False),
+            draw_errors(photo, wrong.float(), truth < 0),
+            share,
+        )
         seen.append(labels)
-    return Shown(photo, overlay_labels(photo, truth), answers, torch.stack(seen), names)
+    return Shown(photo, overlay_labels(photo, truth, names, legend=False), answers, torch.stack(seen), names)
 
 
 def _truth_of(question: Question, view: View, encode: Encode) -> tuple[Tensor, Sequence[str], list[int]]:
@@ -191,7 +195,7 @@ def _truth_of(question: Question, view: View, encode: Encode) -> tuple[Tensor, S
     return label_view(truth, view, encode_unit(encode, names)).cpu(), names, list(range(len(names)))
 
 
-def _errors(photo: Tensor, wrong: Tensor, void: Tensor | None = None) -> Tensor:  # [H, W, 3], [H, W] -> [H, W, 3]
+def draw_errors(photo: Tensor, wrong: Tensor, void: Tensor | None = None) -> Tensor:  # [H, W, 3], [H, W] -> [H, W, 3]
     """The photograph in light grey, errors in vermilion, what is not scored in plain grey."""
     grey = (0.5 + 0.5 * photo.mean(-1, keepdim=True)).expand_as(photo)
     share = 0.85 * wrong.clamp(0, 1)[..., None]

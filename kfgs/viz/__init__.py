@@ -16,7 +16,14 @@ from .linked import linked_clouds
 from .matches import Matches, add_matches, add_transfer, match_states
 from .palette import palette
 from .pictures import legend_strip, overlay_labels, picture_grid, save_picture
-from .plots import plot_codebook_history, plot_confusion, plot_iou, plot_quality_storage, plot_training
+from .plots import (
+    plot_codebook_history,
+    plot_confusion,
+    plot_iou,
+    plot_largest_confusions,
+    plot_quality_storage,
+    plot_training,
+)
 from .reports import plot_codebook_growth, plot_codebook_report
 
 __all__ = [
@@ -52,6 +59,7 @@ __all__ = [
     "plot_confusion",
     "plot_distances",
     "plot_iou",
+    "plot_largest_confusions",
     "plot_quality_storage",
     "plot_scores",
     "plot_training",

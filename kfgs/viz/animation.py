@@ -17,7 +17,7 @@ from .._files import atomic_path
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from .film_frames import Show, as_shows, draw_frame, legend_under
-from .pictures import as_bytes
+from .pictures import as_bytes, legend_strip
 
 Array = np.ndarray[Any, Any]
 Progress = Callable[[int, int], object]
@@ -36,6 +36,7 @@ def save_animation(
     *,
     fps: float = 15.0,
     names: Sequence[str] | None = None,
+    listed: Tensor | Array | None = None,  # any shape, int
     progress: Progress | None = None,
 ) -> Path:
     """Draw a cloud, or several side by side, from each camera, and write the frames as a GIF or an MP4 video.
@@ -46,8 +47,9 @@ def save_animation(
             from `show_cloud`), or several of these by title, shown side by side.
         cameras: one per frame, all of one size (`kfgs.cameras.orbit_cameras`, `path_cameras`).
         fps: frames per second, at most 50 in a GIF, which counts hundredths of a second.
-        names: class names, for a legend of the labelled Gaussians below every frame. Gaussians inside functions are not
-            listed.
+        names: class names, for a legend of the labelled Gaussians below every frame, and their colours. Gaussians inside
+            functions are not listed.
+        listed: the labels in the legend; None: those of the labelled Gaussians.
         progress: called after each frame with (done, all).
 
     Returns:
@@ -62,11 +64,12 @@ def save_animation(
     sizes = sorted({camera.size for camera in cameras})
     if len(sizes) > 1:
         raise ValueError(f"cameras: expected one size for all frames, got {sizes}; make them equal with resized()")
-    _check_target(path, fps)
-    drawn = as_shows(shows)
+    check_target(path, fps)
+    drawn = as_shows(shows, names)
     strip = None
     if names is not None:
-        strip = legend_under(shows, names, draw_frame({title: _blank for title in drawn}, cameras[0]).shape[1])
+        width = draw_frame({title: _blank for title in drawn}, cameras[0]).shape[1]
+        strip = legend_under(shows, names, width) if listed is None else legend_strip(listed, names, width)
 
     def frames() -> Iterator[Array]:
         for done, camera in enumerate(cameras, start=1):
@@ -98,7 +101,7 @@ def save_frames(
 
 def _write(path: str | Path, frames: Iterable[Tensor | Array], fps: float, strip: Array | None) -> Path:
     """Write a film. A GIF keeps the colours of `strip`, the legend below every frame, exactly."""
-    target = _check_target(path, fps)
+    target = check_target(path, fps)
     with atomic_path(target) as temporary:
         if target.suffix.lower() == ".gif":
             _write_gif(temporary, _checked(frames), fps, strip)
@@ -107,7 +110,7 @@ def _write(path: str | Path, frames: Iterable[Tensor | Array], fps: float, strip
     return target
 
 
-def _check_target(path: str | Path, fps: float) -> Path:
+def check_target(path: str | Path, fps: float) -> Path:
     """Check the target before the first frame is drawn."""
     target = Path(path)
     suffix = target.suffix.lower()
@@ -156,11 +159,15 @@ def _few_colors(strip: Array) -> tuple[Array, Array]:  # [h, w, 3] -> [h, w] int
 
 
 def _indexed(frame: Array, legend: tuple[Array, Array] | None) -> Image.Image:
-    """A frame in 256 colours of its own, including the legend's. No dithering: its dots would flicker."""
+    """A frame in 256 colours of its own, including the legend's. No dithering: its dots would flicker.
+
+    An octree keeps the hue of small areas; a median cut, whose mean error is a little lower, paints them like their
+    neighbours.
+    """
     index, colors = legend if legend is not None else (np.zeros((0, frame.shape[1]), np.int64), frame[:0, 0])
     picture = Image.fromarray(np.ascontiguousarray(frame[: len(frame) - len(index)]))
     free = 256 - len(colors)
-    reduced = picture.quantize(free, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    reduced = picture.quantize(free, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     if legend is None:
         return reduced
     whole = Image.fromarray(np.concatenate([np.asarray(reduced), index + free]).astype(np.uint8))

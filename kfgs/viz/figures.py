@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .._files import atomic_path
-from .palette import PALETTE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,7 +17,8 @@ if TYPE_CHECKING:
 Array = np.ndarray[Any, Any]
 Row = Mapping[str, Any]
 """One row of a recorded history: numbers by name."""
-LINES = PALETTE[[4, 5, 2, 6, 1, 0]] / 255  # Okabe and Ito's darker colours, which are readable as lines
+LINES = np.array([[0, 114, 178], [213, 94, 0], [0, 158, 115], [204, 121, 167], [86, 180, 233], [230, 159, 0]]) / 255
+"""Okabe and Ito's darker colours, which are readable as lines."""
 INK = (0.08, 0.08, 0.08)
 DPI = 110
 

@@ -18,6 +18,7 @@ from ..labels.color import parse_color
 from ..splat import rasterize
 from .cloud_colors import cloud_colors, color_by_default
 from .field_colors import FeatureColors
+from .palette import palette
 from .pictures import as_bytes, legend_strip, picture_grid
 
 Array = np.ndarray[Any, Any]
@@ -33,6 +34,7 @@ def show_cloud(
     color_by: ColorBy | None = None,
     feature_colors: FeatureColors | None = None,
     background: str | Sequence[float] = "white",
+    names: Sequence[str] | None = None,
 ) -> Show:
     """Make a function camera -> picture [H, W, 3] uint8 that draws a cloud with `rasterize`.
 
@@ -44,6 +46,7 @@ def show_cloud(
         color_by: `label` (the palette), `rgb`, `feature` (through `feature_colors`) or `opacity`; None: as `add_cloud`.
         feature_colors: the scene's projection of features to colours.
         background: a colour by name or three numbers in [0, 1].
+        names: class names: they decide the colours of labels, as in `palette`.
 
     Raises:
         ValueError: if the cloud is empty or lacks what to colour by.
@@ -54,7 +57,7 @@ def show_cloud(
     check_choice("color_by", color_by, get_args(ColorBy))
     if len(gaussians) == 0:
         raise ValueError("gaussians: expected at least one Gaussian to draw, got none; widen the selection")
-    painted = _paint(gaussians.detach(), color_by, feature_colors)
+    painted = _paint(gaussians.detach(), color_by, feature_colors, names)
     paper = torch.tensor(parse_color(background, "background")).to(gaussians.means)
 
     def show(camera: Camera) -> Array:
@@ -65,9 +68,13 @@ def show_cloud(
     return show
 
 
-def _paint(gaussians: Gaussians, color_by: ColorBy, feature_colors: FeatureColors | None) -> Gaussians:
+def _paint(
+    gaussians: Gaussians, color_by: ColorBy, feature_colors: FeatureColors | None, names: Sequence[str] | None
+) -> Gaussians:
     """The cloud with the colours as features; for `rgb`, with its harmonics only."""
     colors = cloud_colors(gaussians, color_by, feature_colors).rgb
+    if color_by == "label" and gaussians.labels is not None:
+        colors = palette(gaussians.labels, names)
     if color_by == "rgb":
         return gaussians.replace(features=None)
     return gaussians.replace(features=torch.from_numpy(colors).to(gaussians.means) / 255, sh=None)
@@ -92,7 +99,9 @@ def draw_frame(
     return frame if strip is None else np.concatenate([frame, strip[:, : frame.shape[1]]])
 
 
-def as_shows(shows: Gaussians | Show | Mapping[str, Gaussians | Show]) -> dict[str, Show]:
+def as_shows(
+    shows: Gaussians | Show | Mapping[str, Gaussians | Show], names: Sequence[str] | None = None
+) -> dict[str, Show]:
     """Bring the `shows` argument into one form: a drawing function for each title. A single one has the title ""."""
     named = shows if isinstance(shows, Mapping) else {"": shows}
     if not named:
@@ -100,7 +109,7 @@ def as_shows(shows: Gaussians | Show | Mapping[str, Gaussians | Show]) -> dict[s
     made: dict[str, Show] = {}
     for title, thing in named.items():
         if isinstance(thing, Gaussians):
-            made[title] = show_cloud(thing)
+            made[title] = show_cloud(thing, names=names)
         elif callable(thing):
             made[title] = thing
         else:

@@ -11,15 +11,15 @@ from torch import Tensor
 
 from .._check import as_array, check_range, check_shapes
 from ..labels import Selection
-from .figures import INK, Array, axes_for, finish
-from .palette import PALETTE, palette
+from .figures import INK, LINES, Array, axes_for, finish
+from .palette import palette
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 BINS = 80
-TAKEN, REST = tuple(PALETTE[4] / 255), (0.75, 0.75, 0.75)  # bar colours: selected or within lambda, and the rest
+TAKEN, REST = tuple(LINES[0]), (0.75, 0.75, 0.75)  # bar colours: selected or within lambda, and the rest
 STEEP = 5.0  # counts are logarithmic if the highest bin of the rest is so many times that of the selected
 CLASSES = 5  # the most classes with a line: more cannot be told apart
 WIDE = 88  # letters per line of the title

@@ -28,11 +28,16 @@ def add_legend(
     plotter: pv.Plotter,
     labels: Tensor | Array,  # any shape, int
     names: Sequence[str],
+    *,
+    colors: Array | None = None,  # [C, 3] uint8
 ) -> Any:
     """List the classes present, by name and colour, in the lower left corner of the active subplot.
 
     It is a small picture. pyvista's own legend writes each name in its colour, for instance yellow on white. If the
     subplot is too low for all classes, the letters shrink to at least 9 pixels, then the list gets several columns.
+
+    Colours are those of `palette(labels, names)`: draw the cloud with `color_by=palette(labels, names)`, or pass the `colors`
+    of each class.
 
     Raises:
         ValueError: if there is no label, or one has no name.
@@ -46,10 +51,10 @@ def add_legend(
     def draw(height: int, width: int) -> Array:
         room = height - 2 * MARGIN
         for size in range(letter_size(height), SMALLEST, -1):
-            picture = legend_column(present, names, size)
+            picture = legend_column(present, names, size, colors=colors)
             if len(picture) <= room:
                 return picture
-        return legend_column(present, names, SMALLEST, height=room)
+        return legend_column(present, names, SMALLEST, height=room, colors=colors)
 
     return pin_picture(plotter, draw)
 

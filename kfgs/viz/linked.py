@@ -15,6 +15,7 @@ from .cloud_colors import ColorBy
 from .clouds import Style, add_cloud
 from .headless import make_plotter
 from .legends import add_legend, letters
+from .palette import palette
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -59,11 +60,13 @@ def linked_clouds(
     try:
         for column, (cloud, by) in enumerate(zip((semantic, color), color_by, strict=True)):
             plotter.subplot(0, column)
-            add_cloud(plotter, cloud, color_by=by, style=style)
             title = f"{('semantic', 'colour')[column]} field: {TITLES.get(by, by)}"
             add_title(plotter, title)
             if names is not None and by == "label" and cloud.labels is not None:
+                add_cloud(plotter, cloud, color_by=palette(cloud.labels, names), style=style)
                 add_legend(plotter, cloud.labels, names)
+            else:
+                add_cloud(plotter, cloud, color_by=by, style=style)
         plotter.subplot(0, 0)
         plotter.link_views()
         if camera is not None:

@@ -22,7 +22,7 @@ Array = np.ndarray[Any, Any]
 LINES = 500  # more lines than this hide the clouds
 MATCHED, AMBIGUOUS, ORPHANED = 0, 1, 2
 STATE_NAMES = ("matched", "ambiguous", "orphaned")
-STATE_COLORS = (1, 5, 7)  # in `PALETTE`: sky blue, vermillion and deep blue, which every eye can tell apart
+STATE_COLORS = np.array([[86, 180, 233], [213, 94, 0], [0, 0, 255]], np.uint8)  # every eye can tell them apart
 
 
 class Matches(NamedTuple):
@@ -84,7 +84,8 @@ def add_matches(
     lines = None
     if (states != ORPHANED).any():
         lines = add_transfer(plotter, src, moved, transfer, color_by="state", sample=sample, line_width=line_width)
-    return Matches(dots, lines, add_legend(plotter, *_state_legend(states, sample)))
+    legend = add_legend(plotter, np.unique(states), _state_names(states, sample), colors=STATE_COLORS)
+    return Matches(dots, lines, legend)
 
 
 def add_transfer(
@@ -141,17 +142,15 @@ def add_transfer(
 
 
 def _state_colors(states: Array) -> Array:  # [N] -> [N, 3] uint8
-    return palette(np.array(STATE_COLORS)[states])
+    return STATE_COLORS[states]
 
 
-def _state_legend(states: Array, sample: int) -> tuple[Array, list[str]]:
-    """Labels and names for `add_legend`: each state borrows the colour of a label."""
+def _state_names(states: Array, sample: int) -> list[str]:
+    """Each state with its count, for the legend."""
     counts = np.bincount(states, minlength=len(STATE_NAMES))
-    names = [""] * (max(STATE_COLORS) + 1)
-    for color, name, count in zip(STATE_COLORS, STATE_NAMES, counts, strict=True):
-        names[color] = f"{name} {count:,}"
+    names = [f"{name} {count:,}" for name, count in zip(STATE_NAMES, counts, strict=True)]
     labelled = int(counts[MATCHED] + counts[AMBIGUOUS])
     if labelled > sample:
         for state in (MATCHED, AMBIGUOUS):
-            names[STATE_COLORS[state]] += f" (1 line in {labelled / sample:.3g})"
-    return np.array(STATE_COLORS)[counts > 0], names
+            names[state] += f" (1 line in {labelled / sample:.3g})"
+    return names

@@ -1,8 +1,11 @@
-"""The palette of every picture, 2-D and 3-D: label k always has colour k, and -1 is grey."""
+"""The palette of every picture, 2-D and 3-D: a class has its colour, and -1 is grey."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 from torch import Tensor
@@ -11,47 +14,86 @@ from .._check import as_array
 
 UNLABELLED = (128, 128, 128)  # grey: label -1
 
-# Okabe and Ito's seven colours without black. Each next colour is the farthest (CIE76) from all earlier ones, grey, black
-# and white, for the worst of three kinds of eyes: normal, protanopia, deuteranopia (Machado 2009). Smallest distance among
-# the first 20: 17; of 64: 9; of 256: 4. tests/oracles_palette.py computes this table.
+# The first 20: found by search, so that any two of them and grey differ as much as possible (CIEDE2000), seen with normal
+# eyes (21 at least), with protanopia and deuteranopia (9; Machado 2009), and half mixed with grey (12; 6). Each next colour is
+# the farthest (CIE76) from all earlier ones, grey, black and white for the worst of these eyes. tests/oracles_palette.py
+# measures the first and computes the others.
 _HEX = """
-e69f00 56b4e9 009e73 f0e442 0072b2 d55e00 cc79a7 0000ff 781e00 a5f096 6969ff 3c3c5a 3c1ea5 3c4b3c 4bb45a a5d2b4
-6996ff a5e1ff 4b783c 003c87 d2e169 2d3ce1 3c5ac3 b42d00 785a87 96d2d2 2dd287 96b4d2 695a69 d2f0c3 2d5a2d c3b44b
-3c4bd2 9687c3 4b4b87 1e785a 87962d 0000d2 a569d2 f09669 a5a596 1e963c 0f4b4b a53ca5 69691e ff96ff b4d23c 69ffe1
-1e3c69 5a2dff 697887 f05aff 782d1e a5e178 e196b4 3c3ca5 00965a a569a5 2d2dc3 3c5aff 00f0a5 96f0f0 d27878 69d278
-965ae1 2d784b f0e15a f078e1 e10f3c a5ff00 690f87 0fd296 e1001e 4b4b78 87d2e1 f04b96 ffd2d2 2d0fc3 96ff87 e11e5a
-5a4b69 ff5a3c a50f00 e1962d f087c3 960fb4 00d2ff a569e1 873c5a e11e96 ffa596 f04b69 960f4b 00a5d2 004b1e e1c369
-a54b78 3c4be1 a51e2d 962dff d2874b 6996a5 f0b42d ffa5c3 69870f d21eb4 e1d200 f05ac3 2da5e1 0078c3 002de1 a5d24b
-a50f3c 3cb44b 78d2f0 5a5ae1 78d25a 873cc3 b4a578 962da5 f0d2a5 2d3c78 78005a 5aa5ff a5f0ff d278b4 00f0d2 3cc3ff
-3c8769 b48787 96a587 96a5a5 4bc33c 78690f 007878 87e187 2d2d96 b4b4a5 00872d 965ac3 2d1ef0 0f5a4b 00693c 870f5a
-d28700 780078 e18787 2d3cc3 004b96 96d2a5 f02d5a 870f3c a5ff69 a5b469 2d875a 87ff78 e15a2d f02d78 c31e96 b478f0
-2d6996 0f874b 96e1f0 a54bf0 e169d2 ff004b 5a5a0f 4b00b4 691e69 6978b4 a58796 690fb4 871e96 4b69d2 b40069 f00fb4
-e13c87 b41eb4 4bf0c3 784b78 a55aa5 f0a578 78d2c3 00a53c 3c5a87 a55a2d ffe1b4 780f1e 698796 960fd2 f0875a 0000e1
-780fa5 96ff96 1ee196 96f01e 4be169 a569ff f0d2b4 c3a5f0 c32dd2 873c2d 690fd2 a5a5c3 f096d2 ffa5e1 873cf0 96f087
-e1d25a c33c4b 961e0f c387f0 78c3e1 e1a587 f0d2c3 a5e1e1 e1a5b4 00ffd2 c3e14b 8787e1 ff963c d287d2 5a0f96 ffe1e1
-006969 4b3c2d 2d4b00 786996 96f078 780f4b 961e87 c36969 872d78 b4d2ff ff7878 ff5ab4 b42d3c 785aa5 69b4e1 a54bd2
-e1b4f0 5a87c3 d2f0a5 2d3cf0 87a500 694b1e ffb4b4 69c3a5 5ac35a 4b96b4 6969f0 a5ff4b 8778f0 a53c5a a5e15a 5aa54b
+f1ea0b 8000d7 6c3200 9be5ff ed6a31 0088ff eee1e4 ff22c1 573852 c2a2ff 766800 62a271 084682 1c5b33 f5a40a ad4f58
+dceac8 f0989f 027280 00ff8f 2d2d96 0087b4 00c35a 69ff69 0000ff b42dd2 f096c3 5a692d 3c5aff 2da52d 002db4 ff875a
+3c4ba5 3c5a87 78d287 781e1e 4b3c3c b4694b 87d22d 96c3f0 c378d2 00d2d2 784b5a 0f3cff c378a5 0069a5 7896ff 1e69d2
+3c3c69 d2f0b4 b4d2c3 ff5a00 d2d278 e187a5 ffd25a d21e00 d27869 a55af0 4b3cb4 964b78 ffe14b 4ba5e1 f0a578 0000d2
+787869 9678e1 ffe196 c3d2a5 966996 4b694b 5aa587 a50f1e 003c87 ffb4e1 5a965a d2c35a b4963c 783c69 004be1 b4b43c
+c32da5 b4d2b4 c31e4b a5b487 780f69 3c00c3 b42dc3 a54b2d b4f0ff ff1e1e 96b4f0 1e2da5 a51ef0 78b4b4 963c3c 4b3cc3
+e1e1d2 b4e100 96a5d2 e18796 872d4b b4964b c37896 690f78 692d96 5a0ff0 4b5a1e a5874b 96e14b a5e196 2d4b00 69ff78
+2dc369 780f4b 4b6996 004b2d ffb43c 875a69 3c96c3 78781e 4b5ab4 2d4b1e 783c96 96c3b4 87c3a5 a5ff1e c34b3c 8796f0
+96c300 968778 5ae1e1 3c87c3 009600 691e5a a5a50f 2d3c5a e15a2d 5a1ec3 c3a55a 2d69ff 2dffe1 ff1eb4 4b1ee1 3c69e1
+2d78e1 c35a69 784b69 871e2d b4c396 78b4c3 3c3ca5 a5d2ff b469ff ff3c78 c3f0a5 2d785a d2e1b4 a5c3ff 783c78 ff78e1
+4b4bb4 69d278 a5e169 87693c c3d2d2 781e78 b44b87 a569b4 c35ad2 96d269 0000e1 2d9696 f00fc3 d28787 c31ee1 c3785a
+a54b96 b4a53c f069e1 ffb487 5ac378 a569a5 780f87 7869a5 c36996 4bfff0 96000f 5ad2e1 2db4e1 693cd2 e12d00 5aff5a
+69874b 003cd2 87a5a5 f0a5d2 6996b4 0f5a96 a5d2f0 5af0f0 8778d2 964b4b c3e187 f078d2 ffe15a 5a00a5 1ea5d2 69c3c3
+a5c34b b4a54b 783c5a 4b962d a50f78 8787f0 c33ce1 b42d87 5a0f96 b45a5a c3695a 0f1ed2 2d8778 780f2d a5e1c3 d2a569
+783cc3 d296b4 3cb487 5ae187 f0c34b 3cb496 c3e1a5 5a00b4 ffe169 a54b5a a5000f 87d23c 00b4f0 2da51e 008769 870fa5
+964bf0 4bffc3 2d5a3c 1e78c3 b4d296 784b1e 2d9669 f0d23c 69a5ff 4be1b4 4b9678 695aa5 b4b4ff 781e3c 875ab4 5a6969
 """
 PALETTE = np.frombuffer(bytes.fromhex("".join(_HEX.split())), dtype=np.uint8).reshape(-1, 3)  # [256, 3], read-only
 
+TIERS = (20, 64, 256)  # of PALETTE: the first colours differ most
+_WORDS = """
+cushion, pillow
+desk, counter, countertop, stool, bench
+floor
+ceiling
+chair, armchair, swivel chair
+sofa, couch
+window, windowpane, glass
+picture, painting, poster, mirror
+door
+curtain, blind, blinds, window blind, shower curtain
+cabinet, wardrobe, dresser, chest of drawers
+sink, basin, toilet, bathtub, vase, bottle
+television, tv, monitor, screen, computer
+plant, flower, tree
+table, coffee table, dining table, night table
+rug, carpet, mat
+wall
+bed, blanket, bedding
+shelf, bookshelf, bookcase, book, books
+lamp, light, ceiling light
+"""
+"""Words of indoor scenes, one row for each of the first 20 colours."""
+_ROWS = [row.split(", ") for row in _WORDS.split("\n")[1:-1]]
+_HOMES = {word: slot for slot, row in enumerate(_ROWS) for word in row}
+_RANKS = {word: rank for row in _ROWS for rank, word in enumerate(row)}
 
-def palette(labels: Tensor | np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:  # [...] int -> [..., 3] uint8
+
+def palette(
+    labels: Tensor | np.ndarray[Any, Any],  # [...] int
+    names: Sequence[str] | None = None,
+) -> np.ndarray[Any, Any]:  # [..., 3] uint8
     """The colour of each label, safe for colour-blind eyes; -1 is grey.
+
+    With names, a class has the same colour in every scene: `name_slots` chooses it. Without names, label k has the k-th
+    colour.
 
     Args:
         labels: class indices of any shape. From 256 on the colours repeat.
+        names: all class names by index.
 
     Returns:
         RGB, 8 bit, one more axis than `labels`.
 
     Raises:
         TypeError: if the labels are not integers.
-        ValueError: if one is below -1.
+        ValueError: if one is below -1, or has no name.
 
     Example:
         >>> import torch
         >>> palette(torch.tensor([0, -1])).tolist()
-        [[230, 159, 0], [128, 128, 128]]
+        [[241, 234, 11], [128, 128, 128]]
+        >>> one, other = palette(torch.tensor([0]), ["chair", "wall"]), palette(torch.tensor([2]), ["rug", "wall", "chair"])
+        >>> bool((one == other).all())
+        True
     """
     values = as_array(labels, "labels")
     if not np.issubdtype(values.dtype, np.integer):
@@ -59,4 +101,45 @@ def palette(labels: Tensor | np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:  # [
     values = values.astype(np.int64)
     if values.size and values.min() < -1:
         raise ValueError(f"labels: expected class indices or -1, got {values.min()}; map other codes to -1 first")
-    return np.where((values < 0)[..., None], np.array(UNLABELLED, dtype=np.uint8), PALETTE[values % len(PALETTE)])
+    if names is not None and values.size and values.max() >= len(names):
+        raise ValueError(
+            f"names: expected a name for every label up to {values.max()}, got {len(names)} names; pass all class names"
+        )
+    slots = values if names is None or not len(names) else np.array(name_slots(names))[values]
+    return np.where((values < 0)[..., None], np.array(UNLABELLED, dtype=np.uint8), PALETTE[slots % len(PALETTE)])
+
+
+def name_slots(names: Sequence[str]) -> list[int]:
+    """The place in `PALETTE` of each class; the order of the names has no influence.
+
+    Words of indoor scenes have a home among the first 20 colours, and words of one meaning share it (sofa, couch). Other
+    words get a home from their CRC-32. If two names of a list share a home, the first word of the row stays there, of
+    other words the first in the alphabet. The others move to the next free colour: of the first 20, then of 64, then of 256.
+    """
+    words = [" ".join(name.lower().replace("_", " ").replace("-", " ").split()) for name in names]
+    slots, taken = [0] * len(names), set[int]()
+    order = sorted(range(len(names)), key=lambda i: (_RANKS.get(words[i], 0), words[i], i))
+    moving = []
+    for i in order:
+        home = _HOMES.get(words[i])
+        if home is None or home in taken:
+            moving.append(i)
+        else:
+            slots[i] = home
+            taken.add(home)
+    for i in moving:
+        slots[i] = _free_slot(words[i], taken)
+        taken.add(slots[i])
+    return slots
+
+
+def _free_slot(word: str, taken: set[int]) -> int:
+    """The first free colour from a word's home on; its home if all are taken."""
+    code = crc32(word.encode())
+    homes = [(_HOMES.get(word, code % TIERS[0]), 0, TIERS[0])]
+    homes += [(low + code % (high - low), low, high) for low, high in pairwise(TIERS)]
+    for home, low, high in homes:
+        for slot in (*range(home, high), *range(low, home)):
+            if slot not in taken:
+                return slot
+    return homes[0][0]

@@ -28,18 +28,21 @@ def overlay_labels(
     *,
     alpha: float = 0.55,
     boundaries: bool = True,
+    legend: bool = True,
 ) -> Array:  # [H + legend, W, 3] uint8
     """Blend label colours over a photograph, draw the borders between labels, and add a legend below.
 
-    Colours come from `palette`, so a class has the same colour in every view. (skimage's `label2rgb` colours by the order
-    of the labels present, which changes between views.) Pixels without a label are blended with grey.
+    Colours come from `palette`, so a class has the same colour in every view, and with `names` in every scene. (skimage's
+    `label2rgb` colours by the order of the labels present, which changes between views.) Pixels without a label are blended
+    with grey.
 
     Args:
         image: the photograph or a rendering; values outside [0, 1] are clipped.
         labels: one per pixel of the image.
-        names: class names by index; when given, the classes present are listed under the picture.
+        names: class names by index: they decide the colours, and the classes present are listed under the picture.
         alpha: weight of the label colours, in [0, 1].
         boundaries: darken the pixels on both sides of a border.
+        legend: False: names decide the colours only.
 
     Raises:
         ValueError: if sizes disagree, `alpha` is out of range, or a label has no name.
@@ -47,13 +50,13 @@ def overlay_labels(
     check_shapes(("image", image, "H W 3"), ("labels", labels, "H W"))
     check_range("alpha", alpha, 0, 1)
     photo, classes = np.clip(as_array(image, "image").astype(np.float64), 0, 1), as_array(labels, "labels")
-    blended = (1 - alpha) * photo + alpha * palette(classes) / 255
+    blended = (1 - alpha) * photo + alpha * palette(classes, names) / 255
     if boundaries:
         from skimage.segmentation import find_boundaries
 
         blended[find_boundaries(classes, mode="thick")] *= 0.35
     picture = _to_bytes(blended)
-    if names is None:
+    if names is None or not legend:
         return picture
     return np.concatenate([picture, legend_strip(classes, names, picture.shape[1])], axis=0)
 
@@ -77,6 +80,7 @@ def legend_column(
     size: int = 14,
     *,
     height: int | None = None,
+    colors: Array | None = None,  # [C, 3] uint8
 ) -> Array:  # [h, w, 3] uint8
     """A legend of the classes present, one per line.
 
@@ -85,24 +89,31 @@ def legend_column(
         names: class names by index.
         size: of the letters, pixels.
         height: the largest height of a column in pixels, before another begins; None: no limit.
+        colors: of each class; None: `palette` with these names.
 
     Raises:
         ValueError: if a label has no name.
     """
-    return _draw_legend(labels, names, None, size, height)
+    return _draw_legend(labels, names, None, size, height, colors)
 
 
 def _draw_legend(
-    labels: Tensor | Array, names: Sequence[str], width: int | None, size: int, height: int | None = None
+    labels: Tensor | Array,
+    names: Sequence[str],
+    width: int | None,
+    size: int,
+    height: int | None = None,
+    colors: Array | None = None,
 ) -> Array:
     """With a width: entries from left to right, wrapped. Without: one per line, in columns up to `height`."""
     present = [int(label) for label in np.unique(as_array(labels, "labels"))]
     check_names(present, names)
+    swatches = palette(np.array(present), names) if colors is None else colors[present]
     font = ImageFont.load_default(size=size)
     gap, line = size // 2, round(size * 1.6)
     x, y, right, bottom, left = gap, gap, gap, gap, gap
-    places: list[tuple[int, int, int, str]] = []
-    for label in present:
+    places: list[tuple[int, int, tuple[int, ...], str]] = []
+    for label, swatch in zip(present, swatches.tolist(), strict=True):
         text = "no class" if label < 0 else names[label]
         length = size + gap + round(font.getlength(text)) + 2 * gap
         if places and width is None and height is not None and y + line + gap // 2 > height:
@@ -110,15 +121,14 @@ def _draw_legend(
             x = left
         if x > left and (width is None or x + length > width):
             x, y = left, y + line
-        places.append((x, y, label, text))
+        places.append((x, y, tuple(swatch), text))
         x += length
         right, bottom = max(right, x), max(bottom, y)
         if width is None:
             x, y = left, y + line
     strip = Image.new("RGB", (width or right, bottom + line + gap // 2), LEGEND_PAPER)
     draw = ImageDraw.Draw(strip)
-    for x, y, label, text in places:
-        color = tuple(int(v) for v in palette(np.array(label)))
+    for x, y, color, text in places:
         draw.rectangle((x, y, x + size - 1, y + size - 1), fill=color, outline=LEGEND_INK)
         draw.text((x + size + gap, y + size / 2), text, fill=LEGEND_INK, font=font, anchor="lm")
     return np.asarray(strip)

@@ -41,7 +41,7 @@ COUNTS = {"size", "added", "pruned", "count", "gaussians"}  # whole numbers, dra
 def plot_codebook_history(
     history: Sequence[Row], path: str | Path | None = None, *, ax: Sequence[Axes] | Array | None = None
 ) -> Figure:
-    """Draw how the codebook grew (Sec. 3.3.1): its size and all other recorded numbers.
+    """Draw how the codebook grew (Sec. 3.3.1): its size and all other recorded numbers that are not always 0.
 
     Args:
         history: `CodebookFit.history`: one row per round of growth, or per epoch of the paper's method (with a loss).
@@ -62,6 +62,8 @@ def plot_training(
     ax: Sequence[Axes] | Array | None = None,
 ) -> Figure:
     """Draw every number that a training recorded over its steps, one panel each, the loss first.
+
+    Numbers that are always 0 are named in the title only.
 
     Args:
         history: rows with `step` (or `iteration`, or `epoch`) and numbers, for instance `FieldFit.history`.
@@ -121,6 +123,61 @@ def plot_confusion(
     return finish(axes, path)
 
 
+def plot_largest_confusions(
+    matrix: Tensor | Array,  # [C, C] counts
+    names: Sequence[str],  # C
+    path: str | Path | None = None,
+    *,
+    misses: Tensor | Array | None = None,  # [C] counts
+    most: int = 10,
+    ax: Axes | None = None,
+) -> Figure:
+    """Draw the pairs of classes that are confused most, as shares of all pixels, largest first.
+
+    A bar has the colour of the true class, and the square at its end that of the predicted one.
+
+    Args:
+        matrix: counts of (truth, prediction), for instance `ConfusionMatrix.matrix`.
+        names: class names.
+        path: a .png file to write; None writes none.
+        misses: pixels of each class predicted as "no class".
+        most: how many pairs; pairs that never occur are left out.
+        ax: axes to draw into; None makes a figure.
+
+    Raises:
+        ValueError: if the matrix is not square, names or misses are not one per class, or nothing was counted.
+    """
+    check_shapes(("matrix", matrix, "C C"), ("misses", misses, "C"))
+    counts = as_array(matrix, "matrix").astype(np.float64)
+    check_class_names(names, len(counts), "matrix")
+    missed = np.zeros(len(counts)) if misses is None else as_array(misses, "misses").astype(np.float64)
+    counts = np.column_stack([counts, missed])  # the last column: no class
+    of_class = counts.sum(axis=1)
+    if not (total := counts.sum()):
+        raise ValueError("matrix: expected pixels that were counted, got zeros only; was anything scored?")
+    wrong = counts - np.pad(np.diag(np.diag(counts)), ((0, 0), (0, 1)))
+    order = [divmod(int(i), counts.shape[1]) for i in np.argsort(-wrong.ravel(), kind="stable")[:most]]
+    pairs = [(i, j) for i, j in order if wrong[i, j]]
+    axes, rows = axes_for(ax, 7.2, 0.36 * max(len(pairs), 1) + 1.3), np.arange(len(pairs))
+    share = np.array([100 * wrong[pair] / total for pair in pairs])
+    if pairs:
+        true, seen = np.array(pairs).T
+        colors = palette(np.where(seen < len(names), seen, -1), names) / 255
+        axes.barh(rows, share, color=palette(true, names) / 255, edgecolor=INK, linewidth=0.6, height=0.7)
+        axes.scatter(share, rows, marker="s", s=90, color=colors, edgecolor=INK, linewidth=0.6, zorder=3)
+    for row, (i, j) in enumerate(pairs):
+        text = f"{share[row]:.2f} %, {100 * wrong[i, j] / of_class[i]:.0f} % of {names[i]}"
+        axes.annotate(text, (share[row], row), (9, 0), textcoords="offset points", va="center", fontsize=8.5)
+    axes.set_yticks(rows, [f"{names[i]} \N{RIGHTWARDS ARROW} {[*names, 'no class'][j]}" for i, j in pairs])
+    title = f"Largest confusions: {share.sum():.1f} of {100 * wrong.sum() / total:.1f} % wrong pixels"
+    axes.set(title=title, xlabel="% of all pixels (truth \N{RIGHTWARDS ARROW} prediction)")
+    axes.set_xlim(0, 1.55 * max([1e-9, *share]))  # room for the texts
+    axes.set_ylim(len(pairs) - 0.4, -0.6)
+    axes.grid(axis="x", alpha=0.3)
+    axes.set_axisbelow(True)
+    return finish(axes, path)
+
+
 def plot_iou(
     iou: Tensor | Array,  # [C] in [0, 1], NaN where a class does not occur
     names: Sequence[str],  # C
@@ -156,7 +213,7 @@ def plot_iou(
         raise ValueError(f"iou: expected a class that occurs, got {len(values)} NaN; was anything scored?")
     shown = shown[np.argsort(-values[shown], kind="stable")]
     axes, rows = axes_for(ax, 7.2, 0.3 * len(shown) + 1.5), np.arange(len(shown))
-    axes.barh(rows, values[shown], color=palette(shown) / 255, edgecolor=INK, linewidth=0.6, height=0.75)
+    axes.barh(rows, values[shown], color=palette(shown, names) / 255, edgecolor=INK, linewidth=0.6, height=0.75)
     for row, value in enumerate(values[shown]):
         axes.text(101, row, f"{value:.1f}", va="center", fontsize=9)
     mean = float(values[shown].mean())
@@ -225,7 +282,7 @@ def plot_quality_storage(
 def _plot_rows(
     history: Sequence[Row], path: str | Path | None, ax: Sequence[Axes] | Array | None, *, first: str, title: str
 ) -> Figure:
-    """One panel per recorded number; the axes of counts start at zero."""
+    """One panel per recorded number that is not always 0; the axes of counts start at zero."""
     if not history:
         raise ValueError("history: expected at least one row, got none; was anything trained?")
     step = next((name for name in STEPS if name in history[0]), None)
@@ -233,8 +290,11 @@ def _plot_rows(
     keys = [key for key in keys if any(is_number(row.get(key)) for row in history)]
     if not keys:
         raise ValueError(f"history: expected rows with numbers to draw, got keys {sorted(history[0])}")
+    living = [key for key in keys if any(is_number(row.get(key)) and row[key] for row in history)]
+    dead = [f"{key} is always 0" for key in keys if living and key not in living]
+    keys = living or keys
     keys.sort(key=lambda key: key != first)  # stable: the others keep their order
-    columns = min(3, len(keys))
+    columns = 2 if len(keys) == 4 else min(3, len(keys))
     lines = -(-len(keys) // columns)
     panels, own = panels_for(ax, len(keys), columns, 4.2 * columns, 2.9 * lines + 0.4)
     for panel, (axes, key) in enumerate(zip(panels, keys, strict=True)):
@@ -245,7 +305,7 @@ def _plot_rows(
         if key in COUNTS:
             count_from_zero(axes, y)
     if own:
-        panels[0].figure.suptitle(title)
+        panels[0].figure.suptitle("; ".join([title, *dead]))
     return finish(panels[0], path)
 
 

@@ -128,7 +128,7 @@ def plot_codebook_report(
     first, *others = upper.subplots(1, len(panels), width_ratios=panels, sharey=True)
     _draw_similarity(first, rows, names)
     if usage is not None:
-        _draw_usage(others[0], usage.detach().cpu()[rows.codewords].numpy(), rows)
+        _draw_usage(others[0], usage.detach().cpu()[rows.codewords].numpy(), rows, names)
     _draw_words(others[-1], rows, names)
     count = f"{len(codewords)} codewords"
     if len(rows.codewords) < len(codewords):
@@ -179,7 +179,7 @@ def _draw_similarity(axes: Axes, rows: CodebookRows, names: Sequence[str]) -> No
     image = axes.imshow(similarity, cmap="cividis", vmin=low, vmax=1, aspect="auto", interpolation="nearest")
     axes.figure.colorbar(image, ax=axes, location="left", fraction=0.03, pad=0.02, label="cosine similarity")
     stripe = axes.inset_axes((-0.025, 0, 0.018, 1))
-    stripe.imshow(palette(labels)[:, None], aspect="auto", interpolation="nearest")
+    stripe.imshow(palette(labels, names)[:, None], aspect="auto", interpolation="nearest")
     stripe.set_axis_off()
     starts = np.flatnonzero(np.diff(labels, prepend=labels[0] - 1))
     for start in starts[1:]:
@@ -191,8 +191,8 @@ def _draw_similarity(axes: Axes, rows: CodebookRows, names: Sequence[str]) -> No
     axes.set_title("similarity of codewords, by class", fontsize=10)
 
 
-def _draw_usage(axes: Axes, used: np.ndarray[Any, Any], rows: CodebookRows) -> None:
-    colors = palette(rows.labels) / 255
+def _draw_usage(axes: Axes, used: np.ndarray[Any, Any], rows: CodebookRows, names: Sequence[str]) -> None:
+    colors = palette(rows.labels, names) / 255
     length = np.maximum(used - 0.5, 0)  # bars start at 0.5 and end at their count, so that a count of 1 can be seen
     axes.barh(range(len(used)), length, left=0.5, color=colors, edgecolor=INK, linewidth=0.4, height=0.8)
     axes.set_xscale("log")
@@ -209,7 +209,7 @@ def _draw_words(axes: Axes, rows: CodebookRows, names: Sequence[str]) -> None:
     """One line per codeword: its number, a patch of its class's colour, and the nearest classes with their cosines."""
     axes.set_axis_off()
     axes.set_title("codeword: nearest words (cosine)", fontsize=10, loc="left")
-    colors = palette(rows.labels) / 255
+    colors = palette(rows.labels, names) / 255
     beside: dict[str, Any] = {
         "xycoords": axes.get_yaxis_transform(),
         "textcoords": "offset points",
@@ -241,6 +241,7 @@ def _draw_growth(axes: Sequence[Axes], histories: Mapping[str, Sequence[Row]]) -
                 draw_curve(axes[panel], x, y, i, color=color, linestyle=style, label=label)
                 drawn[panel] += y
     for panel, title in enumerate(("size K", "codewords added and pruned (dashed)", "coverage")):
+        axes[panel].set_visible(bool(drawn[panel]))
         axes[panel].set(title=title, xlabel="epoch")
         axes[panel].title.set_fontsize(10)
         if panel < 2:

@@ -48,11 +48,12 @@ def test_a_gif_holds_the_frames_their_time_and_repeats(tmp_path):
 
 def test_legend_colours_stay_exact_where_a_frame_has_thousands_of_others():
     labels = torch.arange(18)
-    strip = legend_strip(labels, [f"class {i}" for i in range(18)], 300)
+    names = [f"class {i}" for i in range(18)]
+    strip = legend_strip(labels, names, 300)
     rng = np.random.default_rng(0)
     picture = rng.integers(0, 256, (60, 300, 3)).astype(np.uint8)
     seen = np.asarray(_indexed(np.concatenate([picture, strip]), _few_colors(strip)).convert("RGB"))
-    for color in palette(labels):
+    for color in palette(labels, names):
         there = (strip == color).all(-1)
         assert there.sum() > 20
         assert (seen[60:][there] == color).all()
@@ -62,13 +63,16 @@ def test_legend_colours_stay_exact_where_a_frame_has_thousands_of_others():
     assert plain.shape == strip.shape
 
 
+NAMES = ["a", "b", "c", "chair"]
+
+
 def test_a_legend_reaches_the_file(tmp_path):
     cloud = Gaussians(
         torch.tensor([[0.0, 0, 2]]), torch.eye(4)[:1], torch.ones(1, 3), torch.ones(1) / 2, labels=torch.tensor([3])
     )
-    path = save_animation(tmp_path / "a.gif", {"field": cloud}, cameras(2, 30, 100), names=["a", "b", "c", "chair"])
+    path = save_animation(tmp_path / "a.gif", {"field": cloud}, cameras(2, 30, 100), names=NAMES)
     frames, _ = frames_of(path)
-    assert all((frame[-20:] == palette(np.array(3))).all(-1).sum() > 20 for frame in frames)
+    assert all((frame[-20:] == palette(np.array(3), NAMES)).all(-1).sum() > 20 for frame in frames)
 
 
 def test_a_failure_leaves_what_was_there(tmp_path):

@@ -102,6 +102,6 @@ def test_the_legend_lists_every_class_of_the_clouds():
     strip = legend_under({"a": wall(3), "b": wall(5)}, names, 200)
     assert strip.shape[1] == 200
     for label, there in ((3, True), (5, True), (1, False)):
-        assert ((strip == palette(np.array(label))).all(-1).sum() > 20) == there
+        assert ((strip == palette(np.array(label), names)).all(-1).sum() > 20) == there
     with pytest.raises(ValueError, match=tells("names:", "got none")):
         legend_under(wall().replace(labels=None), names, 200)

@@ -30,7 +30,7 @@ def paper(plotter):  # rows and columns that a picture covers, over a black back
 
 
 def colors_in(picture, labels):
-    return [bool((picture.reshape(-1, 3) == palette(np.array(label))).all(axis=1).any()) for label in labels]
+    return [bool((picture.reshape(-1, 3) == palette(np.array(label), NAMES)).all(axis=1).any()) for label in labels]
 
 
 def test_legend_is_drawn_as_it_is_in_the_lower_left_corner(plotter):

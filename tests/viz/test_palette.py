@@ -2,26 +2,39 @@ import numpy as np
 import pytest
 import torch
 from messages import tells
-from oracles_palette import OKABE_ITO, make_palette, worst_distance
+from oracles_palette import FIRST, distances, make_palette, worst_distance
 
 from kfgs.viz import palette
-from kfgs.viz.palette import PALETTE
+from kfgs.viz.palette import PALETTE, name_slots
+
+ROOM = ["wall", "ceiling", "floor", "rug", "window blind", "sofa", "cushion", "blanket", "table", "chair", "stool"]
 
 
 def test_table_follows_its_recipe():
+    assert [bytes(row).hex() for row in PALETTE[:20]] == FIRST
     np.testing.assert_array_equal(PALETTE, make_palette())
 
 
-def test_first_colours_are_okabe_and_ito():
-    assert [bytes(row).hex() for row in PALETTE[:7]] == OKABE_ITO
+@pytest.mark.parametrize(
+    ("share", "over", "least", "color_blind"),
+    [
+        (1, 128, 21, 9.5),
+        (0.5, 128, 12.5, 6),
+        (0.5, 40, 11.5, 5.5),
+        (0.5, 220, 9.5, 4.8),
+    ],  # alone; half of it over greys
+)
+def test_twenty_classes_can_be_told_apart(share, over, least, color_blind):
+    for eye, found in distances(PALETTE[:20], share, [over] * 3).items():
+        assert found.min() >= (least if eye == "normal" else color_blind), eye
 
 
-@pytest.mark.parametrize(("size", "least"), [(20, 17), (64, 9), (256, 3.9)])
+@pytest.mark.parametrize(("size", "least"), [(64, 8.9), (256, 3.8)])
 def test_colours_differ_for_normal_and_colour_blind_eyes(size, least):
-    distances = worst_distance(PALETTE[:size], PALETTE[:size])
-    np.fill_diagonal(distances, np.inf)
-    assert distances.min() >= least
-    assert worst_distance(PALETTE[7:size], np.array([[128, 128, 128]])).min() >= 3.9  # grey means "none"
+    found = worst_distance(PALETTE[:size], PALETTE[:size])
+    np.fill_diagonal(found, np.inf)
+    assert found.min() >= least
+    assert worst_distance(PALETTE[:size], np.array([[128, 128, 128]])).min() >= 3.8  # grey means "none"
 
 
 def test_labels_of_any_shape_and_kind():
@@ -35,8 +48,36 @@ def test_labels_of_any_shape_and_kind():
     assert palette(np.empty((0,), dtype=np.int64)).shape == (0, 3)
 
 
+def test_a_name_has_one_colour_in_every_scene():
+    other = ["sky", "chair", "floor", "wall", "sofa"]
+    for name in ("chair", "floor", "wall", "sofa"):
+        both = [palette(torch.tensor([names.index(name)]), names).tolist() for names in (ROOM, other)]
+        assert both[0] == both[1]
+    assert palette(torch.tensor([-1]), ROOM).tolist() == [[128, 128, 128]]
+    assert name_slots(["Sofa", "window-blind"]) == [name_slots([name])[0] for name in ("couch", "curtain")]
+
+
+def test_names_that_share_a_home():
+    home, moved = name_slots(["sofa", "couch"])
+    assert home == name_slots(["couch"])[0] != moved  # "sofa" is the first word of the row
+    assert name_slots(["couch", "sofa"]) == [moved, home]
+    crowd = [f"thing {i}" for i in range(300)]
+    assert sorted(name_slots(crowd[:20])) == list(range(20))  # no colour twice, the best ones first
+    assert set(name_slots(crowd[:64])) == set(range(64))
+    assert set(name_slots(crowd)) == set(range(256))
+    assert max(name_slots([*ROOM, "a word of its own"])) < 20
+
+
+def test_the_order_of_names_does_not_matter():
+    names = [*ROOM, "thing", "sky", "couch", "vase"]
+    slots = dict(zip(names, name_slots(names), strict=True))
+    assert dict(zip(names[::-1], name_slots(names[::-1]), strict=True)) == slots
+
+
 def test_wrong_labels_are_named():
     with pytest.raises(TypeError, match=tells("labels:", "got float32")):
         palette(torch.zeros(3))
     with pytest.raises(ValueError, match=tells("labels:", "-1", "got -2")):
         palette(torch.tensor([0, -2]))
+    with pytest.raises(ValueError, match=tells("names:", "up to 2", "got 2 names")):
+        palette(torch.tensor([2]), ["a", "b"])

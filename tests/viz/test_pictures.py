@@ -38,7 +38,7 @@ def test_legend_shows_each_present_class_once_in_its_colour():
     names = [f"class {i}" for i in range(6)]
     strip = legend_strip(labels, names, 200)
     for label, there in ((-1, True), (0, True), (3, True), (1, False), (2, False)):
-        matches = (strip == palette(np.array(label))).all(axis=-1).sum()
+        matches = (strip == palette(np.array(label), names)).all(axis=-1).sum()
         assert (matches > 20) == there, label
     image, labels = two_halves(width=200)
     picture = overlay_labels(image, labels, names)

@@ -16,6 +16,7 @@ from kfgs.viz import (
     plot_confusion,
     plot_distances,
     plot_iou,
+    plot_largest_confusions,
     plot_quality_storage,
     plot_scores,
     plot_training,
@@ -43,7 +44,8 @@ def test_codebook_panels_of_an_adaptive_fit_have_no_loss(tmp_path):
     directions = torch.nn.functional.normalize(torch.randn(5, 16, generator=generator), dim=1)
     history = fit_codebook([directions[torch.randint(0, 5, (20, 30), generator=generator)]]).history
     panels = plot_codebook_history(history, tmp_path / "codebook.png").axes
-    assert [axes.get_title() for axes in panels] == ["size", "added", "mean_similarity", "pruned", "coverage"]
+    assert [axes.get_title() for axes in panels] == ["size", "added", "mean_similarity", "coverage"]
+    assert panels[0].figure.get_suptitle() == "Codebook; pruned is always 0"
     np.testing.assert_array_equal(panels[0].lines[0].get_xydata(), [(row["epoch"], row["size"]) for row in history])
     assert len(history) > 2
     assert history[-1]["size"] == 5
@@ -75,6 +77,24 @@ def test_confusion_is_in_per_cent_of_the_true_class(tmp_path):
     np.testing.assert_allclose(small.axes[0].images[0].get_array(), [[100, 0], [50, 50]])
 
 
+def test_largest_confusions_are_shares_of_all_pixels(tmp_path):
+    matrix, names = torch.tensor([[50, 6, 0], [1, 30, 0], [0, 9, 0]]), ["wall", "rug", "lamp"]
+    axes = plot_largest_confusions(matrix, names, tmp_path / "a.png", misses=torch.tensor([4, 0, 0]), most=3).axes[0]
+    assert [tick.get_text() for tick in axes.get_yticklabels()] == ["lamp → rug", "wall → rug", "wall → no class"]
+    np.testing.assert_allclose([bar.get_width() for bar in axes.patches], [9, 6, 4])
+    colors = palette(np.array([2, 0, 0]), names) / 255
+    np.testing.assert_allclose([bar.get_facecolor()[:3] for bar in axes.patches], colors)
+    np.testing.assert_allclose(
+        axes.collections[0].get_facecolor()[:, :3], palette(np.array([1, 1, -1]), names) / 255, atol=1e-6
+    )
+    assert [text.get_text() for text in axes.texts][1] == "6.00 %, 10 % of wall"
+    assert axes.get_title() == "Largest confusions: 19.0 of 20.0 % wrong pixels"
+    perfect = plot_largest_confusions(torch.eye(2), ["a", "b"], tmp_path / "b.png").axes[0]
+    assert not perfect.patches
+    with pytest.raises(ValueError, match=tells("matrix:", "zeros")):
+        plot_largest_confusions(torch.zeros(2, 2), ["a", "b"])
+
+
 def test_classes_that_never_occur_are_left_out(tmp_path):
     matrix = torch.zeros(4, 4, dtype=torch.int64)
     matrix[1, 1], matrix[3, 1] = 4, 6
@@ -98,7 +118,7 @@ def test_iou_bars_are_sorted_and_coloured_by_class(tmp_path):
     np.testing.assert_allclose([bar.get_width() for bar in axes.patches], [90, 50, 25])
     assert [tick.get_text() for tick in axes.get_yticklabels()] == ["c", "a", "d"]
     assert axes.get_ylim()[0] > axes.get_ylim()[1]  # the best on top
-    colors = palette(np.array([2, 0, 3])) / 255
+    colors = palette(np.array([2, 0, 3]), list("abcd")) / 255
     np.testing.assert_allclose([bar.get_facecolor()[:3] for bar in axes.patches], colors)
     np.testing.assert_allclose(axes.lines[-1].get_xdata(), 55, rtol=1e-6)  # (90 + 50 + 25) / 3
     np.testing.assert_allclose(np.ma.getdata(axes.collections[0].get_offsets()), [(np.nan, 0), (40, 1), (60, 2)])
@@ -110,8 +130,9 @@ def test_iou_bars_are_sorted_and_coloured_by_class(tmp_path):
 
 def test_counts_start_at_zero_with_room_above(tmp_path):
     rows = [{"step": i, "loss": 1.0, "count": 18_000 + i, "pruned": 0} for i in range(5)]
-    _, count, pruned = plot_training(rows, tmp_path / "a.png").axes
+    _, count = plot_training(rows, tmp_path / "a.png").axes
     assert count.get_ylim() == (0, pytest.approx(1.06 * 18_004))
+    (pruned,) = plot_training([{"step": i, "pruned": 0} for i in range(5)], tmp_path / "b.png").axes
     assert pruned.get_ylim() == (0, pytest.approx(1.06))  # not from -0.05 to 0.05
     assert all(float(tick).is_integer() for tick in pruned.get_yticks())
 

@@ -57,7 +57,7 @@ def test_report_draws_what_the_rows_hold(tmp_path):
     ends = [bar.get_x() + bar.get_width() for bar in usage.patches]
     assert ends == [90, 1000, 40, 0.5, 8, 7]
     assert [text.get_text() for text in usage.texts] == ["unused"]
-    np.testing.assert_allclose([bar.get_facecolor()[:3] for bar in usage.patches], palette(rows.labels) / 255)
+    np.testing.assert_allclose([bar.get_facecolor()[:3] for bar in usage.patches], palette(rows.labels, NAMES) / 255)
     texts = [text.get_text() for text in words.texts]
     assert texts[0::3] == ["1", "4", "3", "2", "5", "0"]
     assert texts[2::3][-1] == "lamp 0.80, chair 0.60"

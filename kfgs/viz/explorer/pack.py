@@ -256,7 +256,8 @@ def _add_scores(buffers: _Buffers, state: Exploration, questions: Iterable[str])
 
 
 def _classes(state: Exploration) -> list[dict[str, Any]]:
-    colors = palette(torch.arange(len(state.meaning.names)))
+    names = state.meaning.names
+    colors = palette(torch.arange(len(names)), names)
     return [{"name": name, "color": color.tolist()} for name, color in zip(state.meaning.names, colors, strict=True)]
 
 

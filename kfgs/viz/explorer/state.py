@@ -218,7 +218,7 @@ class Exploration:
         """The colours of a side under the current `show`; grey if unknown."""
         self.cloud(side)
         if self.show == "labels":
-            return palette(self.labels(side))
+            return palette(self.labels(side), self.meaning.names)
         if self.show == "score":
             return self._colors.of_scores(side, self.scores(side), self.clim)
         if self.show == "rgb":

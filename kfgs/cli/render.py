@@ -1,0 +1,176 @@
+"""The command render: a film of a field or a labelled splat."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from .files import check_file, is_field, open_splats
+from .options import Classes, Given, Positional, Teacher
+from .output import say, wrote
+from .view import open_meaning
+
+# Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
+
+Walk = Literal["orbit", "spiral", "cameras"]
+WORDS = "photo, labels, features or query=TEXT"
+OVERHEAD = "ceiling"  # left out of an orbit, which looks in from above
+
+
+def render(
+    source: Positional[Path],
+    out: Path,
+    *,
+    path: Walk = "orbit",
+    show: Given[str] = None,
+    color: Given[Path] = None,
+    frames: int = 72,
+    fps: float = 15.0,
+    width: int = 480,
+    teacher: Teacher,
+    classes: Classes,
+) -> None:
+    """Make a film of a field or a labelled splat: an orbit around it, a spiral at one view, or a flight along its cameras.
+
+    Examples:
+        kfgs render run/ --out tour.gif
+        kfgs render run/ --path cameras --show photo,labels,query=chair --out tour.mp4
+        kfgs render labelled.ply --path spiral --scene scene/ --out spiral.gif
+
+    Args:
+        source: A run folder, a field (RUN/field), or a splat with classes.
+        out: The film, .gif or .mp4 (which needs imageio-ffmpeg).
+        path: orbit goes around the scene and looks in from above: what is in front is cut away, and a class "ceiling" is left
+            out. spiral sways at the camera in the middle. cameras flies along the scene's cameras.
+        show: What stands side by side, with commas between: photo (the colours), labels, features, query=TEXT. By default
+            photo,labels, or labels if there are no colours.
+        color: Colour splat in the same frame; by default that of the run, or that which the field was made on.
+        frames: Number of pictures.
+        fps: Pictures a second.
+        width: Width of each picture in pixels.
+    """
+    from tqdm import tqdm
+
+    from .._check import check_whole
+    from ..fields.store import find_field
+    from ..viz import save_animation
+    from ..viz.animation import SUFFIXES, check_target
+
+    check_file("out", out)
+    if out.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"out: expected a name that ends in .gif or .mp4, got {out.name!r}; rename it")
+    check_target(out, fps)
+    check_whole("frames", frames, 2)
+    check_whole("width", width, 16)
+    classes.check_images()
+    found = find_field(source)
+    meaning, cameras = open_meaning(source if found is None else found, classes, teacher)
+    if classes.scene is not None:
+        cameras = classes.load_scene().undistorted().cameras
+    colors = _colors(found, color, meaning)
+    semantic = meaning.gaussians
+    if path == "orbit":
+        semantic, colors = _opened(meaning.names, semantic, colors)
+    words = [word.strip() for word in (show or ("labels" if colors is None else "photo,labels")).split(",")]
+    shows = {_title(word): _show(word, meaning, semantic, colors) for word in words}
+    walk = _walk(path, (semantic if colors is None else colors).means, cameras, frames, width)
+    listed = semantic.labels.unique() if "labels" in words else None
+    with tqdm(total=frames, desc="render", unit="frame") as bar:
+        save_animation(
+            out,
+            shows,
+            walk,
+            fps=fps,
+            names=None if listed is None else meaning.names,
+            listed=listed,
+            progress=lambda *_: bar.update(),
+        )
+    wrote([out])
+
+
+def _colors(field: Path | None, color: Path | None, meaning: Any) -> Any:
+    """The colour cloud: the given one, the source's own, or that of the run; None if there is none."""
+    from .._files import read_json
+
+    if color is not None:
+        return open_splats("color", color).gaussians
+    if meaning.gaussians.sh is not None:
+        return meaning.gaussians
+    if field is None or field.is_file():
+        return None
+    geometry = read_json(field / "field.json").get("info", {}).get("geometry")
+    for place in (field.parent / "color.ply", Path(str(geometry))):
+        if place.is_file() and not is_field(place):
+            say(f"colours: {place}")
+            return open_splats("color", place).gaussians
+    return None
+
+
+def _opened(names: Any, semantic: Any, colors: Any) -> tuple[Any, Any]:
+    """Both clouds without the ceiling (of the colours, what is near it) and without what lies far outside."""
+    from ..cameras.bounds import robust_bounds
+    from ..labels import transfer_labels
+
+    box = robust_bounds(semantic.means.double(), margin=0.02)
+    label = names.index(OVERHEAD) if OVERHEAD in names else None
+
+    def kept(cloud: Any) -> Any:
+        inside = ((cloud.means >= box.low) & (cloud.means <= box.high)).all(dim=1)
+        if label is None:
+            return cloud.select(inside)
+        own = cloud is semantic
+        labels = semantic.labels if own else transfer_labels(semantic.means, semantic.labels, cloud.means).labels
+        return cloud.select(inside & (labels != label))
+
+    shown = kept(semantic)
+    return shown, None if colors is None else shown if colors is semantic else kept(colors)
+
+
+def _walk(path: Walk, points: Any, cameras: list[Any], frames: int, width: int) -> list[Any]:
+    """The cameras of the film."""
+    from ..cameras import Orbit, orbit_cameras, path_cameras, spiral_cameras
+    from ..viz.films import KEYS
+    from ..viz.linked import upwards
+
+    if path == "orbit":
+        size = (round(width * 3 / 4), width)
+        orbit = Orbit(frames=frames, size=size, elevation_degrees=45, zoom=1.5, cut=0.6)
+        return orbit_cameras(points, orbit, up=upwards(cameras))
+    if not cameras:
+        raise ValueError(
+            f"scene: expected --scene for --path {path}, whose cameras it needs, got none; or take an orbit"
+        )
+    size = (max(1, round(width * cameras[0].height / cameras[0].width)), width)
+    if path == "cameras":
+        return path_cameras(cameras, frames, every=max(1, round(len(cameras) / KEYS)), size=size)
+    import torch
+
+    centers = torch.stack([-camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3] for camera in cameras]).double()
+    middle = int((centers - centers.mean(dim=0)).norm(dim=1).argmin())
+    return spiral_cameras(cameras[middle], points, frames, size=size)
+
+
+def _title(word: str) -> str:
+    return {"photo": "colours", "labels": "classes"}.get(word, word.removeprefix("query="))
+
+
+def _show(word: str, meaning: Any, semantic: Any, colors: Any) -> Any:
+    from ..viz import show_cloud
+    from ..viz.shows import show_classes, show_selection
+
+    under = None if colors is None else show_cloud(colors, color_by="rgb")
+    if word == "photo":
+        if under is None:
+            raise ValueError("show: expected --color for photo, got none; name the colour splat of the scene")
+        return under
+    if word == "labels":
+        return show_classes(semantic, meaning.names, under)
+    if word == "features":
+        if semantic.features is None:
+            raise ValueError("show: expected a field for features, got a splat without; leave it out")
+        return show_cloud(semantic, color_by="feature", feature_colors=meaning.feature_colors())
+    if word.startswith("query="):
+        asked = meaning.ask(word.removeprefix("query="))
+        say(f"{asked.words}: {len(asked.selection)} of {len(meaning.gaussians)} Gaussians, {asked.selection.summary}")
+        return show_selection(meaning.gaussians, asked.selection.mask, under)
+    raise ValueError(f"show: expected {WORDS}, got {word!r}; separate them with commas")

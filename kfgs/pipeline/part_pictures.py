@@ -1,0 +1,72 @@
+"""Each part of a selection in the view that shows it best."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..cameras import Camera
+from ..gaussians import Gaussians
+from ..labels.parts import Part
+from ..scenes import Scene
+from ..viz import save_picture
+from ..viz.film_frames import Show
+from ..viz.pictures import Array, as_bytes, picture_grid
+from ..viz.shows import show_selection
+
+WIDTH = 360  # pixels of a picture
+MOST = 12  # parts in one sheet
+
+
+def write_parts(
+    path: Path, gaussians: Gaussians, parts: Sequence[Part], cameras: Sequence[Camera], under: Show | None, name: str
+) -> Path | None:
+    """Draw the largest parts, each in its best view with an outline, while the rest fades; None if no view shows one.
+
+    Args:
+        path: the PNG file.
+        gaussians: the cloud that was selected in.
+        parts: from `connected_parts`, with these cameras.
+        cameras: the views.
+        under: draws the picture below, for instance `photos_of(scene)`.
+        name: of the selection; parts are named name/1, name/2.
+    """
+    pictures, titles = [], []
+    for number, part in enumerate(parts[:MOST], start=1):
+        if part.best_view is None:
+            continue
+        camera = cameras[part.best_view.index]
+        camera = camera.resized(max(1, round(WIDTH * camera.height / camera.width)), WIDTH)
+        mask = part.selection(len(gaussians)).mask
+        pictures.append(show_selection(gaussians, mask, under)(camera))
+        titles.append(f"{name}/{number} in {camera.name}" if camera.name else f"{name}/{number}")
+    if not pictures:
+        return None
+    columns = min(3, len(pictures))
+    titles += [""] * (-len(pictures) % columns)
+    pictures += [np.full_like(pictures[0], 255)] * (-len(pictures) % columns)
+    rows = [
+        picture_grid([pictures[i : i + columns]], titles[i : i + columns], width=WIDTH)
+        for i in range(0, len(pictures), columns)
+    ]
+    save_picture(path, np.concatenate(rows))
+    return path
+
+
+def photos_of(scene: Scene) -> Show:
+    """Make a function camera -> photograph of the view with its name, at the camera's size; grey without a photograph.
+
+    The scene must be undistorted like the cameras.
+    """
+    places = {camera.name: i for i, camera in enumerate(scene.cameras) if scene.image_paths[i].is_file()}
+
+    def show(camera: Camera) -> Array:
+        if camera.name not in places:
+            return np.full((camera.height, camera.width, 3), 200, np.uint8)
+        photo = scene.image(places[camera.name]).permute(2, 0, 1)[None]
+        return as_bytes(torch.nn.functional.interpolate(photo, camera.size, mode="area")[0].permute(1, 2, 0))
+
+    return show

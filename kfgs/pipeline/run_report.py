@@ -1,0 +1,168 @@
+"""What a run leaves to look at: a preview of three views, and one page with what was fitted, its numbers and its times."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import shlex
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from .._files import atomic_path, bytes_in_words, seconds_in_words
+from ..fields import SemanticField
+from ..labels import LabelSet
+from ..scenes import Scene
+from ..viz import overlay_labels, save_picture
+from ..viz.field_colors import feature_colors
+from ..viz.pictures import as_bytes, legend_strip, picture_grid
+from ..viz.region_names import write_region_names
+from .apply import write_training_pictures
+from .config import FitConfig
+from .fit import FitResult
+
+WIDTH = 400  # pixels of a picture
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 1240px; margin: 2em auto; padding: 0 1em; color: #1b1b1b }
+img { max-width: 100%; height: auto } h2 { margin-top: 2em } code, pre { background: #f3f3f5; border-radius: 4px }
+pre { padding: .8em; overflow-x: auto; white-space: pre-wrap } table { border-collapse: collapse }
+th, td { text-align: left; padding: .2em 1.2em .2em 0; border-bottom: 1px solid #ddd; vertical-align: top }
+td.number { text-align: right; font-variant-numeric: tabular-nums }
+"""
+
+
+def write_preview(
+    path: Path, field: SemanticField, scene: Scene, split: str = "train", *, count: int = 3
+) -> Path | None:
+    """Draw some views, evenly spread: photograph, features as colours, and labels if the field has classes.
+
+    Views held out (split `test`) are preferred to those of `split`. Without any photograph nothing is drawn.
+    """
+    views = [i for i in scene.views("test" if scene.splits.get("test") else split) if scene.image_paths[i].is_file()]
+    if not views:
+        return None
+    count = min(count, len(views))
+    chosen = [
+        views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)
+    ]  # not the ends, which often are alike
+    classes, colors = _classes(field), feature_colors(field)
+    titles = ["photograph", "features as colours"] + ([] if classes is None else ["labels"])
+    rows, seen = [], []
+    for view in chosen:
+        camera = scene.cameras[view]
+        camera = camera.resized(max(1, round(WIDTH * camera.height / camera.width)), WIDTH)
+        photo = scene.image(view).permute(2, 0, 1)[None]
+        photo = torch.nn.functional.interpolate(photo, camera.size, mode="area")[0].permute(1, 2, 0)
+        with torch.no_grad():
+            row = [as_bytes(photo), colors(field.render(camera).map)]
+        if classes is not None:
+            labels = field.segment(camera, classes).cpu()
+            drawn = overlay_labels(photo, labels, classes.names, legend=False)
+            row.append(write_region_names(drawn, labels, classes.names))
+            seen.append(labels.unique())
+        rows.append(row)
+    sheet = picture_grid(rows, titles, width=WIDTH)
+    if classes is not None:
+        sheet = np.concatenate([sheet, legend_strip(torch.cat(seen), classes.names, sheet.shape[1])])
+    save_picture(path, sheet)
+    return path
+
+
+def write_run_report(
+    result: FitResult,
+    scene: Scene,
+    config: FitConfig,
+    *,
+    command: str | None = None,
+) -> list[Path]:
+    """Write pictures of a run and `report.html` into its folder: one file without scripts, which loads nothing.
+
+    Args:
+        result: the run.
+        scene: its scene.
+        config: its options.
+        command: the command that made it; None: the page shows the call of `fit_scene`.
+
+    Returns:
+        The pictures (`preview.png`, and of trained stages `<stage>.png`) and the page.
+    """
+    preview = write_preview(result.folder / "preview.png", result.field, scene, config.split)
+    training = write_training_pictures(result)
+    field, info = result.field, result.field.info
+    size = sum(file.stat().st_size for file in result.field_path.iterdir())
+    teacher = info.get("teacher") or {}
+    facts = {
+        "scene": f"{scene.folder or 'in memory'}: {len(scene)} views, {len(info.get('views', ()))} of them used",
+        "teacher": teacher.get("name", "not known"),
+        "teacher's maps": " x ".join(map(str, info.get("teacher_map", ()))),
+        "method": field.method,
+        "geometry": info.get("geometry", "trained with the field"),
+        "Gaussians": f"{len(field):,}",
+        "numbers for each Gaussian's meaning": f"{field.channels}, for {field.dim} channels of the teacher",
+        "codewords": None if field.codebook is None else field.codebook.size,
+        "size on disk": bytes_in_words(size),
+        "size as the paper's Table 1 counts it": bytes_in_words(field.storage()),
+        "seed": info.get("seed"),
+        "kfgs, torch, device": f"{info.get('kfgs')}, {torch.__version__}, {config.device}",
+    }
+    stages = [(one.name, seconds_in_words(one.seconds), "found" if one.reused else "made") for one in result.stages]
+    stages.append(("all", seconds_in_words(result.seconds), ""))
+    repeat = command or f"kfgs.pipeline.fit_scene(scene, maps, {str(result.folder)!r}, config)"
+    title = f"kfgs: {result.folder.resolve().name}"
+    unused = ("codebook", "autoencoder", "field", "mode") if config.method == "fuse" else ("uplift", "color")
+    options = json.dumps({name: value for name, value in asdict(config).items() if name not in unused}, indent=1)
+    parts = [
+        f"<h1>{_text(title)}</h1>",
+        *([] if preview is None else [_image(preview, "three views of the field")]),
+        "<h2>What was fitted</h2>",
+        _table((name, value) for name, value in facts.items() if value not in (None, "")),
+        "<h2>Time of each stage</h2>",
+        _table(stages, numbers=1),
+        "<p>A stage that was found had been made by an earlier run with the same inputs; its time is that of the run that made "
+        "it.</p>",
+        *(f"<h2>Training: {_text(file.stem)}</h2>\n{_image(file, file.stem)}" for file in training),
+        "<h2>How to repeat it</h2>",
+        f"<pre>{_text(repeat)}</pre>",
+        f"<details><summary>All options</summary><pre>{_text(options)}</pre></details>",
+        "<h2>What to do next</h2>",
+        f"<pre>{_text(_next(result.field_path, field))}</pre>",
+    ]
+    head = f'<meta charset="utf-8"><title>{_text(title)}</title><style>{STYLE}</style>'
+    page = f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n' + "\n".join(parts) + "\n</body></html>\n"
+    path = result.folder / "report.html"
+    with atomic_path(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    return [*([] if preview is None else [preview]), *training, path]
+
+
+def _classes(field: SemanticField) -> LabelSet | None:
+    return field.label_set() if field.has_classes else None
+
+
+def _next(path: Path, field: SemanticField) -> str:
+    classes = _classes(field)
+    asked = "" if classes is None else shlex.join(["kfgs", "select", classes.names[-1], str(path)]) + "\n"
+    return f"kfgs view {path}\n{asked}kfgs segment {path} --out segmented/"
+
+
+def _text(value: object) -> str:
+    return html.escape(str(value))
+
+
+def _table(rows: Iterable[Sequence[object]], numbers: int | None = None) -> str:
+    lines = []
+    for row in rows:
+        cells = [
+            f'<td class="number">{_text(v)}</td>' if i == numbers else f"<td>{_text(v)}</td>" for i, v in enumerate(row)
+        ]
+        lines.append(f"<tr>{''.join(cells)}</tr>")
+    return "<table>\n" + "\n".join(lines) + "\n</table>"
+
+
+def _image(file: Path, name: str) -> str:
+    data = base64.b64encode(file.read_bytes()).decode("ascii")
+    return f'<img alt="{_text(name)}" src="data:image/png;base64,{data}">'

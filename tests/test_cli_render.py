@@ -1,0 +1,86 @@
+"""`kfgs render`: films of a run, of a field and of a labelled splat."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+from small_room import make_room
+
+from kfgs.cli import main
+from kfgs.features import FeatureFolder
+from kfgs.formats import SplatFile, read_splats, write_splats
+from kfgs.pipeline import FitConfig, fit_color, fit_scene
+from kfgs.pipeline.color import ColorConfig
+from kfgs.scenes import load_scene
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("render")
+    scene = load_scene(make_room(folder / "scene"))
+    config = ColorConfig.quick()
+    config = dataclasses.replace(config, field=config.field.with_steps(60))
+    colors = fit_color(scene, folder / "run", config)
+    maps = FeatureFolder(scene.folder / "features").of(scene, "train")
+    fit_scene(scene, maps, folder / "run", FitConfig.cpu(), splat=colors.gaussians)
+    return folder / "run"
+
+
+def frames(path):
+    with Image.open(path) as film:
+        return [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]
+
+
+def film(*arguments):
+    return main(["render", *map(str, arguments), "--frames", "3", "--width", "80"])
+
+
+@pytest.mark.parametrize("path", ["orbit", "spiral", "cameras"])
+def test_each_path_makes_a_film(run, tmp_path, path, capsys):
+    out = tmp_path / "a.gif"
+    assert film(run, "--out", out, "--path", path) == 0
+    said = capsys.readouterr().out
+    assert f"colours: {run / 'color.ply'}" in said
+    assert str(out) in said
+    made = frames(out)
+    assert len(made) == 3
+    assert made[0].shape[1] > 2 * 80  # colours and classes
+    assert all(len(np.unique(frame.reshape(-1, 3), axis=0)) > 50 for frame in made)
+    assert (made[0] != made[1]).any()
+
+
+def test_four_things_side_by_side(run, tmp_path, capsys):
+    out = tmp_path / "a.gif"
+    show = "photo,labels,features,query=chair"
+    assert film(run / "field", "--out", out, "--path", "cameras", "--show", show) == 0
+    assert "chair: " in capsys.readouterr().out
+    assert frames(out)[0].shape[1] > 4 * 80
+
+
+def test_a_labelled_splat(run, tmp_path):
+    scene = load_scene(run.parent / "scene")
+    colors = read_splats(run / "color.ply")
+    labels = (colors.gaussians.means[:, 2] > 1).long()
+    labelled = SplatFile(colors.gaussians.replace(labels=labels), classes=("low", "high"))
+    write_splats(tmp_path / "l.ply", labelled)
+    assert film(tmp_path / "l.ply", "--out", tmp_path / "a.gif", "--show", "photo,labels,query=high") == 0
+    assert film(tmp_path / "l.ply", "--out", tmp_path / "b.gif", "--path", "spiral", "--scene", scene.folder) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{run}", "--out", "{tmp}/a.avi"], ("--out:", "ends in .gif or .mp4", "a.avi")),
+        (["{run}", "--out", "{tmp}/a.gif", "--show", "labels,colour"], ("--show:", "'colour'", "query=TEXT")),
+        (["{run}", "--out", "{tmp}/a.gif", "--show", "query=unicorn"], ("unicorn",)),
+        (["{run}", "--out", "{tmp}/a.gif", "--frames", "1"], ("--frames:",)),
+        (["{run}/color.ply", "--out", "{tmp}/a.gif"], ("expected a splat with classes",)),
+    ],
+)
+def test_bad_input_is_named_and_writes_nothing(run, tmp_path, capsys, arguments, message):
+    fill = {"run": str(run), "tmp": str(tmp_path)}
+    assert main(["render", *(word.format(**fill) for word in arguments)]) == 1
+    said = capsys.readouterr().err
+    assert all(part in said for part in message), said
+    assert not list(tmp_path.iterdir())
