@@ -63,14 +63,15 @@ def count(folder, truth, name):
 
 def test_a_question_lights_up_on_both_sides(room, files, tmp_path, capsys):
     truth = surface(room)[1]
-    name = json.loads((room / "classes.json").read_text())[int(truth.mode().values)]
+    names = json.loads((room / "classes.json").read_text())
+    name = names[int(truth.mode().values)]
     words = ["--text", files / "text.safetensors", "--color", files / "color.ply", "--distance", 1e-3]
     said = drawn([files / "field", *words, "--ask", name, "--where", "picture", "--out", tmp_path / "out"], capsys)
     n, total = count(room, truth, name), len(truth)
     assert f"semantic: {n} of {total} Gaussians" in said.replace(",", "")
     assert f"colour: {n} of {total} Gaussians" in said.replace(",", "")  # every colour Gaussian lies on its source
     picture = np.asarray(Image.open(tmp_path / "out" / "view.png").convert("RGB")).astype(int)
-    color = palette(truth.mode().values[None])[0].astype(int)
+    color = palette(truth.mode().values[None], names)[0].astype(int)
     near = np.abs(picture - color).max(axis=2) < 12
     half = picture.shape[1] // 2
     assert near[:, :half].sum() > 200

@@ -127,7 +127,7 @@ class Desktop:
 
     def _slider(self, height: float, action: Callable[[float], None]) -> Any:
         widget = self.plotter.add_slider_widget(
-            None, (0.0, 1.0), pointa=(0.35, height), pointb=(0.8, height), color=letters(self.plotter), style="modern",
+            None, (0.0, 1.0), pointa=(0.45, height), pointb=(0.9, height), color=letters(self.plotter), style="modern",
             title_height=0.02, slider_width=0.02, tube_width=0.004,
         )  # fmt: skip
         slider = widget.GetRepresentation()

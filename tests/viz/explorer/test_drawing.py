@@ -66,8 +66,8 @@ def test_points_show_the_same_selection(explorer):
     picture = explorer.screenshot()
     for half in panes(picture).values():
         pixels = half[TITLE:, LEGEND:].reshape(-1, 3)
-        assert (pixels == palette(np.array(1))).all(axis=1).sum() > 20
-        assert not (pixels == palette(np.array(4))).all(axis=1).any()
+        assert (pixels == palette(np.array(1), explorer.state.meaning.names)).all(axis=1).sum() > 20
+        assert not (pixels == palette(np.array(4), explorer.state.meaning.names)).all(axis=1).any()
     explorer.set_style("gaussians")
     assert agreement(explorer, "color", explorer.options.rest) > 45
 

@@ -14,8 +14,8 @@ GREY = [128, 128, 128]
 
 def test_colours_of_labels_and_scores():
     made = line()
-    assert made.colors("semantic").tolist() == palette(np.array([1, 2, -1])).tolist()
-    assert made.colors("color").tolist() == palette(np.array([1, -1, 2, -1, -1])).tolist()
+    assert made.colors("semantic").tolist() == palette(np.array([1, 2, -1]), made.meaning.names).tolist()
+    assert made.colors("color").tolist() == palette(np.array([1, -1, 2, -1, -1]), made.meaning.names).tolist()
     made.set_show("score")
     np.testing.assert_allclose(made.scores("semantic"), [0.8, 0.6, np.nan], rtol=1e-6)  # of the labels
     assert made.clim == (pytest.approx(0.6), pytest.approx(0.8))
