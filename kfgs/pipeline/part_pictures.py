@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from ..cameras import Camera
 from ..gaussians import Gaussians
@@ -14,7 +13,7 @@ from ..labels.parts import Part
 from ..scenes import Scene
 from ..viz import save_picture
 from ..viz.film_frames import Show
-from ..viz.pictures import Array, as_bytes, picture_grid
+from ..viz.pictures import Array, as_bytes, picture_grid, resize_photo
 from ..viz.shows import show_selection
 
 WIDTH = 360  # pixels of a picture
@@ -66,7 +65,6 @@ def photos_of(scene: Scene) -> Show:
     def show(camera: Camera) -> Array:
         if camera.name not in places:
             return np.full((camera.height, camera.width, 3), 200, np.uint8)
-        photo = scene.image(places[camera.name]).permute(2, 0, 1)[None]
-        return as_bytes(torch.nn.functional.interpolate(photo, camera.size, mode="area")[0].permute(1, 2, 0))
+        return as_bytes(resize_photo(scene.image(places[camera.name]), camera.size))
 
     return show

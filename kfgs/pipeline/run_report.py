@@ -19,7 +19,7 @@ from ..labels import LabelSet
 from ..scenes import Scene
 from ..viz import overlay_labels, save_picture
 from ..viz.field_colors import feature_colors
-from ..viz.pictures import as_bytes, legend_strip, picture_grid
+from ..viz.pictures import as_bytes, legend_strip, picture_grid, resize_photo
 from ..viz.region_names import write_region_names
 from .apply import write_training_pictures
 from .config import FitConfig
@@ -55,8 +55,7 @@ def write_preview(
     for view in chosen:
         camera = scene.cameras[view]
         camera = camera.resized(max(1, round(WIDTH * camera.height / camera.width)), WIDTH)
-        photo = scene.image(view).permute(2, 0, 1)[None]
-        photo = torch.nn.functional.interpolate(photo, camera.size, mode="area")[0].permute(1, 2, 0)
+        photo = resize_photo(scene.image(view), camera.size)
         with torch.no_grad():
             row = [as_bytes(photo), colors(field.render(camera).map)]
         if classes is not None:

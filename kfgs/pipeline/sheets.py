@@ -14,7 +14,7 @@ from ..features import FeatureFolder
 from ..labels import LabelSet, classify
 from ..scenes import Scene
 from ..viz import overlay_labels
-from ..viz.pictures import Array, legend_strip, picture_grid
+from ..viz.pictures import Array, legend_strip, picture_grid, resize_photo
 from ..viz.region_names import write_region_names
 from .maps import Maps, UndistortedMaps
 from .side_by_side import draw_errors
@@ -37,9 +37,7 @@ def segmentation_sheet(
     out where they would not fill a row.
     """
     high = max(1, round(photo.shape[0] * WIDTH / photo.shape[1]))
-    small = torch.nn.functional.interpolate(photo.permute(2, 0, 1)[None], (high, WIDTH), mode="area")[0].permute(
-        1, 2, 0
-    )
+    small = resize_photo(photo, (high, WIDTH))
     found = {"truth": truth, "teacher": teacher, "field": labels}
     maps = {title: resize_labels(one, (high, WIDTH)) for title, one in found.items() if one is not None}
     panels: dict[str, Tensor | Array] = {"photo": small}
@@ -53,6 +51,8 @@ def segmentation_sheet(
     if features is not None and len(panels) % 2:
         panels["field's features"] = features
     columns = 3 if len(panels) > 4 else 2
+    if len(panels) % columns:
+        panels[""] = torch.ones_like(small)
     titles, pictures = list(panels), list(panels.values())
     rows = [
         picture_grid([pictures[i : i + columns]], titles[i : i + columns], width=WIDTH)

@@ -17,7 +17,7 @@ from ..evaluation.relevancy import encode_unit
 from ..evaluation.segmentation import load_label_map
 from ..splat import rasterize
 from ..viz import overlay_labels, save_picture
-from ..viz.pictures import legend_strip, picture_grid
+from ..viz.pictures import legend_strip, picture_grid, resize_photo
 from .question import LABELLED, OF_COLORS, Question, colors_of
 
 WRONG = (0.835, 0.369, 0.0)  # vermilion of Okabe and Ito, over a grey photograph
@@ -151,7 +151,7 @@ def _show_colors(photo: Tensor, view: View, methods: Mapping[str, Any], name: st
 
 def _show_labels(question: Question, photo: Tensor, view: View, methods: Mapping[str, Method], encode: Encode) -> Shown:
     size = view.camera.size
-    photo = torch.nn.functional.interpolate(photo.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0)
+    photo = resize_photo(photo, size)
     truth, names, asked = _truth_of(question, view, encode)
     text = encode_unit(encode, [names[i] for i in asked])
     level = getattr(question.protocol, "level", 0)

@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from PIL.Image import Resampling
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from .._check import as_array, check_range, check_shapes
 from .._files import atomic_path
@@ -213,6 +214,11 @@ def picture_grid(
     for j, title in enumerate(titles):
         draw.text((GAP + j * (width + GAP) + width / 2, head / 2), title, fill=LEGEND_INK, font=font, anchor="mm")
     return np.asarray(canvas)
+
+
+def resize_photo(photo: Tensor, size: tuple[int, int]) -> Tensor:  # [H, W, 3] -> [h, w, 3]
+    """Resize a photograph to (height, width): each new pixel is the mean of the old ones it covers."""
+    return interpolate(photo.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0)
 
 
 def as_bytes(picture: Tensor | Array) -> Array:

@@ -28,6 +28,7 @@ def test_a_sheet_has_the_panels_that_there_are():
     features = np.zeros((60, 80, 3), np.uint8)
     alone = segmentation_sheet(photo, labels, NAMES)
     full = segmentation_sheet(photo, labels, NAMES, truth=truth, teacher=teacher, features=features)
+    assert segmentation_sheet(photo, labels, NAMES, teacher=teacher).shape[1] == alone.shape[1]  # an empty place
     four = segmentation_sheet(photo, labels, NAMES, truth=truth, features=features)
     assert alone.shape[1] == four.shape[1] < full.shape[1]  # two, two and three in a row
     assert abs(full.shape[1] - 3 * WIDTH) < 30
