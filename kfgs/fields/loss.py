@@ -155,7 +155,10 @@ class _Absolute(torch.autograd.Function):
 
 
 def _scaled(slope: Tensor, grad: Tensor) -> Tensor:
-    """The gradient of what is mostly the loss itself, whose gradient is 1."""
+    """The slope times the loss's gradient, which is 1 if nothing follows the loss: then the slope itself, without a copy.
+
+    A slope that is saved for another pass has two owners, so torch adds to a copy.
+    """
     return slope if slope.device.type == "cpu" and float(grad) == 1 else grad * slope
 
 
