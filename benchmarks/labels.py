@@ -80,8 +80,12 @@ def main() -> None:
         fields, camera = [field], cameras[0].resized(height, width)
         try:
             rows = field.label_set().embeddings  # the field's own classes, whatever --classes says
-        except ValueError:
+        except (ValueError, FileNotFoundError):  # it has none, or their files are elsewhere
             rows = torch.randn(args.classes, field.dim, generator=g)
+        if len(rows) < 5:
+            parser.error(
+                f"--field: expected a field of at least 5 classes, of which a row takes the best, got {len(rows)}"
+            )
     else:
         fields, camera = (
             [random_linear(args.gaussians, rows, g), random_decoded(args.gaussians, g)],

@@ -3,8 +3,10 @@
 import importlib
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 if not (BENCHMARKS / "labels.py").is_file():  # a source distribution comes without them
@@ -34,3 +36,27 @@ def test_too_few_classes_for_its_rows_are_an_error_in_one_line(monkeypatch, caps
     with pytest.raises(SystemExit):
         importlib.import_module("labels").main()
     assert "--classes: expected at least 5" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("classes", [3, FileNotFoundError("text.npy")])
+def test_a_field_with_too_few_classes_or_without_their_files(classes, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    labels = importlib.import_module("labels")
+
+    def label_set():
+        if isinstance(classes, Exception):
+            raise classes
+        return SimpleNamespace(embeddings=torch.ones(classes, 8))
+
+    camera = SimpleNamespace(resized=lambda height, width: None)
+    field = SimpleNamespace(
+        cameras=[camera], dim=8, label_set=label_set, to=lambda device: exit("as many as asked for")
+    )
+    monkeypatch.setattr(labels.SemanticField, "load", lambda path: field)
+    monkeypatch.setattr(sys, "argv", ["labels.py", "--quick", "--field", "F"])
+    with pytest.raises(SystemExit) as end:
+        labels.main()
+    if classes == 3:
+        assert "--field: expected a field of at least 5 classes" in capsys.readouterr().err
+    else:
+        assert end.value.code == "as many as asked for"

@@ -36,13 +36,16 @@ def l1_loss(
     the mean, and learning rates and densification threshold of 3DGS are made for a mean. Pixels with NaN in any channel of
     the target are unknown and do not count.
 
+    Raises:
+        ValueError: if the numbers of channels disagree.
+
     Note:
-        The engine's, if it has an `absolute`, which has no gradient of the gradient.
+        The engine's, if it has an `absolute`, which has no gradient of the gradient. torch's, if the target needs a gradient.
     """
-    height, width, channels = target.shape
-    rendered = resize_map(rendered, (height, width))
-    chosen = choose("auto", rendered.device.type, rendered.dtype)
-    if offers(chosen, "absolute") and rendered.dtype == target.dtype:
+    rendered = _resized(rendered, target)
+    channels = target.shape[2]
+    chosen = _engine_with("absolute", rendered, target)
+    if chosen is not None:
         return _Absolute.apply(rendered, target, chosen)
     known = _known(target)
     difference = torch.where(known[..., None], rendered - target, 0)
@@ -74,13 +77,16 @@ class ColorLoss:
         alpha: Tensor,  # [H, W], not used
         target: Tensor,  # [h, w, D]
     ) -> Tensor:  # []
-        """Compare a rendered picture with the photograph."""
-        height, width, _ = target.shape
-        if self.ssim_weight == 0 or min(height, width) < SSIM_WINDOW:
+        """Compare a rendered picture with the photograph.
+
+        Raises:
+            ValueError: if the numbers of channels disagree.
+        """
+        if self.ssim_weight == 0 or min(target.shape[:2]) < SSIM_WINDOW:
             return l1_loss(rendered, alpha, target)
-        picture = resize_map(rendered, (height, width))
-        chosen = choose(self.engine, picture.device.type, picture.dtype)
-        if offers(chosen, "similarity") and not bool(target.sum().isnan()):  # no unknown pixel: one walk for both parts
+        picture = _resized(rendered, target)
+        chosen = _engine_with("similarity", picture, target, self.engine)
+        if chosen is not None and not bool(target.sum().isnan()):  # no unknown pixel: one walk for both parts
             return self.ssim_weight + _Compared.apply(
                 picture, target, None, chosen, (-self.ssim_weight, 1 - self.ssim_weight)
             )
@@ -96,8 +102,8 @@ def mean_similarity(
     """Mean SSIM over the windows without a NaN (Gaussian, 11x11, sigma 1.5); 1 if there is none. Differentiable in `picture`.
 
     Note:
-        The engine's, if it has a `similarity`, else kornia's. numba's compiled code takes 1.2 ms instead of 37 (240x320, two
-        threads). It has no gradient of the gradient.
+        The engine's, if it has a `similarity`, else kornia's, as for a target that needs a gradient. numba's compiled code
+        takes 1.2 ms instead of 37 (240x320, two threads). It has no gradient of the gradient.
     """
     known = _known(target)
     counted = None
@@ -107,11 +113,25 @@ def mean_similarity(
         counted = torch.nn.functional.max_pool2d(holes, SSIM_WINDOW, stride=1)[0, 0] == 0  # [H - 10, W - 10]
         if not bool(counted.any()):
             return picture.new_ones(())
-    chosen = choose(engine, picture.device.type, picture.dtype)
-    if offers(chosen, "similarity"):
+    chosen = _engine_with("similarity", picture, target, engine)
+    if chosen is not None:
         return _Compared.apply(picture, target, counted, chosen, (1.0, 0.0))
     similarity = from_bchw(ssim(to_bchw(picture), to_bchw(target), SSIM_WINDOW, eps=0.0, padding="valid"))
     return similarity.mean() if counted is None else similarity[counted].mean()
+
+
+def _resized(rendered: Tensor, target: Tensor) -> Tensor:  # [H, W, D], [h, w, D] -> [h, w, D]
+    height, width, channels = target.shape
+    if rendered.ndim != 3 or rendered.shape[2] != channels:  # compiled code would read beyond the smaller one
+        raise ValueError(f"rendered: expected [H, W, D] with D = {channels} (from target), got {tuple(rendered.shape)}")
+    return resize_map(rendered, (height, width))
+
+
+def _engine_with(name: str, picture: Tensor, target: Tensor, engine: str = "auto") -> str | None:
+    """The engine whose compiled function compares the two; None if torch must: these give no gradient in the target."""
+    chosen = choose(engine, picture.device.type, picture.dtype)
+    alike = (picture.dtype, picture.device) == (target.dtype, target.device)
+    return chosen if offers(chosen, name) and alike and not target.requires_grad else None
 
 
 def _known(target: Tensor) -> Tensor:  # [H, W, D] -> [H, W] bool
@@ -135,7 +155,10 @@ class _Absolute(torch.autograd.Function):
 
 
 def _scaled(slope: Tensor, grad: Tensor) -> Tensor:
-    """The gradient of what is mostly the loss itself, whose gradient is 1."""
+    """The slope times the loss's gradient, which is 1 if nothing follows the loss: then the slope itself, without a copy.
+
+    A slope that is saved for another pass has two owners, so torch adds to a copy.
+    """
     return slope if slope.device.type == "cpu" and float(grad) == 1 else grad * slope
 
 

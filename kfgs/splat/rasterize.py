@@ -119,8 +119,8 @@ def rasterize_labels(
         gaussians: with finite scores as `features`.
         camera: as in `rasterize`.
         top: how many classes are kept, from 1 to C.
-        early: for labels alone, in about half of the time: with `top` 1 a pixel is left as soon as its label is certain. Its
-            score and its opacity are then those reached until there. The CPU engine does so for up to 26 classes.
+        early: for labels alone, in about two thirds of the time: with `top` 1 an engine may stop at a pixel as soon as its
+            label is certain. Its score and opacity are then those reached so far. The CPU engine does so for up to 26 classes.
         engine: as in `composite`.
         near: as in `rasterize`.
 

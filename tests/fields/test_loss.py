@@ -113,3 +113,45 @@ def test_color_loss_mixes_l1_and_dissimilarity():
 def test_a_weight_outside_0_and_1_is_refused():
     with pytest.raises(ValueError, match=tells("ssim_weight:", "[0, 1]", "got 1.5")):
         ColorLoss(1.5)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 4])
+@pytest.mark.parametrize("measure", [l1_loss, ColorLoss()])
+def test_maps_of_other_channels_are_refused(measure, channels):
+    a, _ = pictures()
+    with pytest.raises(ValueError, match=rf"rendered: expected \[H, W, D\] with D = {channels}"):
+        measure(a, a[..., 0], torch.zeros(23, 31, channels, dtype=a.dtype))
+
+
+@pytest.mark.parametrize("measure", [l1_loss, ColorLoss()])
+def test_a_target_that_needs_a_gradient_gets_one(measure):
+    """Both parts are symmetric, so the target's gradient is that of the picture with the two exchanged."""
+    a, b = (picture.requires_grad_() for picture in pictures())
+    (found,) = torch.autograd.grad(measure(a, a[..., 0], b), b)
+    (expected,) = torch.autograd.grad(measure(b, b[..., 0], a), b)
+    torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.parametrize("measure", [l1_loss, ColorLoss()])
+def test_a_target_of_another_dtype(measure):
+    a, b = pictures()
+    assert float(measure(a.float(), a[..., 0], b)) == pytest.approx(float(measure(a, a[..., 0], b)), abs=1e-6)
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+@pytest.mark.parametrize("measure", [l1_loss, ColorLoss()])
+def test_a_picture_that_is_not_finite_has_no_finite_loss(measure, value):
+    a, b = pictures()
+    a[5, 6, 1] = value
+    assert not measure(a, a[..., 0], b).isfinite()
+
+
+@pytest.mark.parametrize("measure", [l1_loss, ColorLoss()])
+def test_gradients_of_two_passes_are_added(measure):
+    a, b = pictures(400, 330)  # as large as memory that is used again
+    a.requires_grad_()
+    (once,) = torch.autograd.grad(measure(a, a[..., 0], b), a)
+    once, value = once.clone(), measure(a, a[..., 0], b)
+    value.backward(retain_graph=True)
+    value.backward()
+    assert a.grad.equal(2 * once)

@@ -146,6 +146,27 @@ def test_ties_are_never_certain(engine):
     assert_early(footprints, features - 0.5, tiles, engine)  # negative ones among them
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("offset", "spread"), [(1.0, 1e-6), (10.0, 1e-4), (1000.0, 1e-3), (0.0, 1e-44)])
+@every_engine
+def test_rounding_may_decide_scores_that_hardly_differ(engine, offset, spread, dtype):
+    """The last digit of a sum is then as large as a lead, and the label is that of the rounded sums."""
+    footprints, features, tiles = scene(7, size=(70, 50), count=2000, dtype=dtype)
+    for seed in range(3):
+        g = torch.Generator().manual_seed(seed)
+        share = torch.rand(features.shape, generator=g, dtype=dtype)
+        assert_early(footprints, offset + spread * share, tiles, engine)
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+@every_engine
+def test_a_score_that_is_no_number_is_not_overlooked(engine, value):
+    footprints, features, tiles = scene(5, size=(70, 50), count=800)
+    some = votes(features, 10.0)
+    some[::50, 2] = value
+    assert_early(footprints, some, tiles, engine)
+
+
 @every_engine
 def test_gaussians_that_share_a_row_of_scores(engine):
     footprints, features, tiles = scene(30)

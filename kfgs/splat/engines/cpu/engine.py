@@ -147,7 +147,7 @@ def rank(splats: Splats, tiles: Tiles, top: int, early: bool) -> Ranked:
     images = _flat(labels), _flat(scores), _flat(alphas)
     if channels <= NARROW_CHANNELS:
         some = len(means2d) if top == 1 else 0
-        contest = np.empty(some, np.uint64), _flat(features.new_empty(some))
+        contest = np.empty(some, np.uint64), _flat(features.new_empty(2 * some))
         run_bands(find_candidates, bands, bands, _flat(features), channels, _index(index), *contest)
         shared = (view, packed, length, plan_passes(channels), channels, contest, early, images)
         run_bands(rank_narrow, bands, *shared)

@@ -7,12 +7,13 @@ first channels are done in the same pass as the weights; a wider map goes on wit
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from numba import njit
 
-from ..contract import ALPHA_MAX, TRANSMITTANCE_MIN
+from ..contract import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from .simd import (
     LANES,
     add_dot,
@@ -63,8 +64,8 @@ CONTEST_CHUNK, CHECK_EVERY = 32, 8
 """Where only the largest channel is wanted: as CHUNK, because half of the blocks are decided after so many; and after how many
 Gaussians of a block it is asked."""
 
-SLACK = 1e-3
-"""Added to the light that is left: sums of up to 8,000 Gaussians do not round by more."""
+MOST_DRAWN = math.ceil(math.log(TRANSMITTANCE_MIN) / math.log1p(-ALPHA_MIN))
+"""The most Gaussians that a pixel draws, 2,345: each takes at least ALPHA_MIN of its light."""
 
 BEHIND, SHARE, GRADS = 0, PIXELS, 2 * PIXELS
 """Planes of the backward pass: the part of the loss that comes from Gaussians behind; the slope of the loss in a weight apart
@@ -102,9 +103,9 @@ def composite_square(
         scratch: corners; sums, one plane per channel; weights [CHUNK * LANES]; hits [BLOCKS * CHUNK]; counts [BLOCKS].
         trace: written: the blocks in which each Gaussian changed the light, as bits; None: there is no backward pass.
         columns: four channels to composite in place of the first four; None: all.
-        contest: None, or, where the largest channel may be all that is wanted: how many planes of the sums compete, and the
-            most by which a Gaussian of weight 1 favours one channel over another. A block is done when no channel can
-            overtake. Infinite: the sums are wanted, too.
+        contest: None, or, where the largest channel may be all that is wanted: how many planes of the sums compete; the most
+            by which a Gaussian of weight 1 favours one channel over another; and the most by which rounding does
+            (`round_off`). A block is done when no channel can overtake. An infinite favour: the sums are wanted, too.
     """
     rows, length, order = packed
     start, end, into = span
@@ -171,15 +172,26 @@ def _composite_block(
 
 
 @njit(**INLINE)
-def _undecided(sums: Any, p: int, light: Any, contest: tuple[int, Any]) -> Any:
+def _undecided(sums: Any, p: int, light: Any, contest: tuple[int, Any, Any]) -> Any:
     """Pixels of a block where another channel may still become the largest, or where the best is not positive yet."""
-    count, favour = contest
+    count, favour, rounding = contest
     best, second = load(sums, p), spread(sums, -np.inf)
     for k in range(1, count):
         value = load(sums, k * PIXELS + p)
         second = maximum(second, minimum(best, value))
         best = maximum(best, value)
-    return minimum(best - second - (light + SLACK) * favour, best) <= 0
+    return minimum(best - second - light * favour - rounding, best) <= 0
+
+
+@njit(**INLINE)
+def round_off(count: int, peak: Any, like: Any) -> Any:
+    """The most by which rounding changes the difference of two sums of `count` weighted features, none larger than `peak`.
+
+    Each step rounds a sum by half of a unit of its last digit, and the light by less than three halves: at most 4 units with
+    two sums. 4 more steps are for the comparison itself. What is below `tiny` has a fixed last digit.
+    """
+    kind = np.finfo(like.dtype)
+    return like.dtype.type(4 * (min(count, MOST_DRAWN) + 4) * float(kind.eps) * max(float(peak), float(kind.tiny)))
 
 
 @njit(**INLINE)

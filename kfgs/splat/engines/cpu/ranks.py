@@ -100,7 +100,8 @@ def find_candidates(band: int, bands: int, features: Any, channels: int, index: 
         channels: D, at most 64.
         index: [M], the features' row of each Gaussian; empty if row m belongs to Gaussian m.
         masks: [M] uint64, written.
-        favours: [M], written: the largest feature minus the smallest.
+        favours: [M * 2], written: the largest feature minus the smallest (infinite if one is not finite), and the largest
+            absolute value.
     """
     count = len(masks)
     for m in range(count * band // bands, count * (band + 1) // bands):
@@ -110,7 +111,8 @@ def find_candidates(band: int, bands: int, features: Any, channels: int, index: 
             value = float(fetch(features, at + channel))
             total += value
             least, most = min(least, value), max(most, value)
-        put(favours, m, most - least)
+        put(favours, 2 * m, most - least if abs(total) < np.inf else np.inf)
+        put(favours, 2 * m + 1, max(most, -least))
         share, mask = 0.999 * total / channels, np.uint64(0)
         for channel in range(channels):
             if fetch(features, at + channel) >= share:
@@ -120,19 +122,25 @@ def find_candidates(band: int, bands: int, features: Any, channels: int, index: 
 
 
 @njit(**INLINE)
-def _gather_columns(contest: Any, order: Any, start: int, end: int, channels: int, columns: Any) -> tuple[int, float]:
-    """Write the channels that may win among some Gaussians, in order; returns how many there are, and the largest favour."""
+def _gather_columns(
+    contest: Any, order: Any, start: int, end: int, channels: int, columns: Any
+) -> tuple[int, float, float]:
+    """Write the channels that may win among some Gaussians, in order.
+
+    Returns:
+        How many there are, the largest favour and the largest feature, without its sign.
+    """
     masks, favours = contest
-    mask, favour = np.uint64(0), 0.0
+    mask, favour, peak = np.uint64(0), 0.0, 0.0
     for j in range(start, end):
         m = np.int64(fetch(order, j))
         mask |= fetch(masks, m)
-        favour = max(favour, fetch(favours, m))
+        favour, peak = max(favour, fetch(favours, 2 * m)), max(peak, fetch(favours, 2 * m + 1))
     count = 0
     for channel in range(channels):
         columns[count] = channel
         count += np.int64((mask >> np.uint64(channel)) & np.uint64(1))  # type: ignore[assignment]
-    return count, favour
+    return count, favour, peak
 
 
 @cached_njit(**OPTIONS)
@@ -160,10 +168,10 @@ def rank_narrow(
     every, some = np.arange(channels), np.zeros(channels + len(FEW), np.int64)
     for tile in range(view.bounds[band], view.bounds[band + 1]):
         start, end = view.offsets[tile], view.offsets[tile + 1]
-        few, favour = channels, np.inf
+        few, favour, peak = channels, np.inf, 0.0
         if len(contest[0]):
-            few, favour = _gather_columns(contest, view.order, start, end, channels, some)
-        favour = rows.dtype.type(favour if early else np.inf)
+            few, favour, peak = _gather_columns(contest, view.order, start, end, channels, some)
+        favour, rounding = rows.dtype.type(favour if early else np.inf), narrow.round_off(end - start, peak, rows)
         for square in range(view.across**2):
             box = square_box(view, tile, square)
             if box[0] >= box[2] or box[1] >= box[3]:
@@ -178,11 +186,13 @@ def rank_narrow(
                 count, names = few, some
                 sums[: len(FEW) * PIXELS] = 0
                 four, plan = (some[0], some[1], some[2], some[3]), (FEW, (), len(FEW))
-                narrow.composite_square(packed, span, state, dark, plan, scratch, None, four, (few, favour))
+                narrow.composite_square(packed, span, state, dark, plan, scratch, None, four, (few, favour, rounding))
             else:
                 count, names = channels, every
                 sums[:] = 0
-                narrow.composite_square(packed, span, state, dark, passes, scratch, None, None, (channels, favour))
+                narrow.composite_square(
+                    packed, span, state, dark, passes, scratch, None, None, (channels, favour, rounding)
+                )
             for block in range(BLOCKS):
                 p = block * LANES
                 _rank_block(sums, p, PIXELS, count, load(state, FINAL + p), ranked, names)
