@@ -41,7 +41,7 @@ def open_window(explorer: Explorer) -> None:
     if not has_display():
         raise RuntimeError(
             "explorer: expected a display to open a window on, got none (neither DISPLAY nor WAYLAND_DISPLAY is set); use "
-            "serve(explorer) for the browser, or explorer.screenshot(path)"
+            "where='browser', or explorer.screenshot(path)"
         )
     if explorer.plotter.off_screen:
         raise RuntimeError(

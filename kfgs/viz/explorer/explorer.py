@@ -72,7 +72,7 @@ class Explorer:
         self.lock = RLock()
         self._listeners: list[Callable[[], None]] = []
         self._at_close: list[Callable[[], None]] = []
-        self._closed, self._legend_shown = False, True
+        self._closed = False
         count = len(exploration.sides)
         self.plotter: pv.Plotter = make_plotter(
             options.height, options.width * count // 2, shape=(1, count), off_screen=off_screen,
@@ -205,13 +205,8 @@ class Explorer:
     @while_open
     def screenshot(self, path: str | Path | None = None) -> Array:  # [H, W, 3] uint8
         """Take a picture of the current view, with a legend; with a path, also write it as a PNG file."""
-        legend_shown = self._legend_shown
-        self.set_legend(True)
-        try:
-            self.plotter.render()  # pyvista takes its pictures from the last frame
-            picture: Array = np.array(self.plotter.screenshot(return_img=True))[..., :3]
-        finally:
-            self.set_legend(legend_shown)
+        self.plotter.render()  # pyvista takes its pictures from the last frame
+        picture: Array = np.array(self.plotter.screenshot(return_img=True))[..., :3]
         if path is not None:
             save_picture(path, picture)
         return picture
@@ -246,15 +241,6 @@ class Explorer:
         """The status as lines of text: question, gamma, lambda, counts, picked Gaussian."""
         picked = self.state.picked
         return self.state.lines() + ([] if picked is None else picked.lines())
-
-    def set_legend(self, shown: bool) -> None:
-        """Show or hide the legend in the panes. Windows and pages hide it and list the classes themselves.
-
-        Screenshots always have a legend. Does nothing on a closed explorer.
-        """
-        if shown != self._legend_shown and not self.closed:
-            self._legend_shown = shown
-            self._draw()
 
     def listen(self, callback: Callable[[], None]) -> None:
         """Call a function after each change. It may call the explorer's methods, but must not wait for other threads."""
@@ -334,7 +320,7 @@ class Explorer:
             pane.draw(self._style, colors, state.drawn(side), selected, self.options.rest)
             pane.ring.move(None if picked is None else picked.position)
             question = "" if state.asked is None else f"{state.asked.words!r}, "
-            has_legend = self._legend_shown and state.show == "labels" and pane is self.panes[0]
+            has_legend = state.show == "labels" and pane is self.panes[0]
             labels = sorted(state.present - state.hidden) if has_legend else []
             clim = state.clim if state.show == "score" and pane is self.panes[-1] else None
             pane.annotate(f"{SIDE_NAMES[side]}: {question}{SHOW_NAMES[state.show]}", labels, state.meaning.names, clim)

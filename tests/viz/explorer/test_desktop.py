@@ -140,7 +140,7 @@ def test_what_a_program_changes_is_shown(desktop):
 
 def test_a_window_needs_a_display(desktop, monkeypatch):
     monkeypatch.setattr("kfgs.viz.explorer.desktop.has_display", lambda: False)
-    with pytest.raises(RuntimeError, match=tells("explorer:", "got none", "serve(explorer)")):
+    with pytest.raises(RuntimeError, match=tells("explorer:", "got none", "browser")):
         open_window(desktop.explorer)
     monkeypatch.setattr("kfgs.viz.explorer.desktop.has_display", lambda: True)
     with pytest.raises(RuntimeError, match=tells("explorer:", "window", "off_screen=False")):

@@ -179,7 +179,6 @@ def test_a_closed_explorer_refuses_all_verbs_alike(tmp_path):
             getattr(explorer, name)(*arguments)
     assert explorer.state.details() == before
     assert not (tmp_path / "view").exists()
-    explorer.set_legend(False)  # what a page does when it ends
     assert explorer.lines()[0].startswith("'chair': score >")
 
 
