@@ -76,10 +76,10 @@ export class PythonLink {
     Object.assign(this, { call, phrases, python: true });
   }
 
-  /** As `OfflineLink.ask`; `number` is null for words that are no class. */
+  /** As `OfflineLink.ask`; there is no `number` for words that are no class. */
   async ask(words) {
     const [answer, scores] = await this.call("ask", { words });
-    return { ...answer, scores: new Float32Array(scores) };
+    return { ...answer, number: answer.number ?? undefined, scores: new Float32Array(scores) };
   }
 
   /** Neighbours and views of a Gaussian: {neighbours: [{index, distance}], views: [{index, name, weight}]}. */

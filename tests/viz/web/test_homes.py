@@ -4,13 +4,14 @@ import base64
 import json
 from contextlib import contextmanager
 
+import cases_explorer
 import cases_page
 import numpy as np
 import pytest
 from cases_web import SECONDS, needs_chromium, software_chromium
 
 from kfgs.formats import read_splats
-from kfgs.viz.explorer import Viewer, save_html
+from kfgs.viz.explorer import Exploration, FieldMeaning, Viewer, save_html
 from kfgs.viz.explorer.serving import open_page
 
 pytestmark = needs_chromium
@@ -151,3 +152,23 @@ def test_one_person_everywhere(browser, tmp_path, home):
             assert len(read_splats(out / "edited_001" / "color.ply").gaussians) == int((~selected).sum())
     page.close()
     assert errors == []
+
+
+def test_a_phrase_that_only_python_can_answer(browser, tmp_path):
+    field = cases_explorer.field("fused")
+    words = {"a soft seat": field.linear.decode(field.features[20])}
+    meaning = FieldMeaning(field, cases_explorer.classes(), embed=words.__getitem__)
+    state = Exploration(meaning, cases_explorer.cloud(field.gaussians.means[:40] + 0.05), distance=1.0)
+    page = browser.new_page(viewport={"width": 800, "height": 600})
+    page.set_default_timeout(1000 * SECONDS)
+    with in_page(page, state, tmp_path / "out"):
+        page.wait_for_selector(".kfgs:not([aria-busy])")
+        page.fill("#query", "a soft seat")
+        page.press("#query", "Enter")
+        page.wait_for_selector("h2:has-text('Search: a soft seat')")
+        state.ask("a soft seat")
+        agree(page, state)
+        assert state.selected("semantic").any()
+        assert page.evaluate("viewer.panes.question(viewer.model.answer)") == "a soft seat"
+        assert page.evaluate("viewer.panes.renderer.look.question") == "a soft seat"
+    page.close()

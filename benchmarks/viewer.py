@@ -1,0 +1,103 @@
+"""How quick is the viewer? Headless Chromium with software WebGL: the first picture, changes, orbiting.
+
+    python benchmarks/viewer.py FIELD COLOR [--scene SCENE] [--size 800x600] [--turns 10] [--chromium /usr/bin/chromium]
+
+"First picture": from starting `kfgs view` to a picture that is read back, browser started before. A change is timed in the
+page until its picture is read back: the quick one that a person sees first, and the full one. Frames per second while the
+camera turns are of quick pictures, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+SOFTWARE = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+CHANGES = {
+    "mode": "v.setMode(turn % 2 ? 'labels' : 'color')",
+    "lambda": "m.setLambda(lambda * (1 + 0.1 * (turn % 2)))",
+    "hidden class": "m.toggleHidden(0)",
+    "query (answered by Python)": "await v.ask(words[turn % words.length])",
+    "gamma": "m.setGamma(0.4 + 0.02 * turn, true)",
+    "undo": "m.undo()",
+}
+TIME = """async ([change, turns]) => {
+  const v = document.querySelector(".kfgs").viewer, m = v.model, lambda = m.lambda;
+  const words = m.names.filter((_, label) => m.own.includes(label)).slice(0, 6);
+  const run = new Function("v", "m", "turn", "words", "lambda", `return (async () => {${change}})()`);
+  const drawn = (moving) => { v.panes.moving = moving; v.panes.draw(); v.panes.renderer.toImage(); };
+  const quick = [], full = [];
+  for (let turn = 0; turn < turns; turn++) {
+    let began = performance.now();
+    await run(v, m, turn, words, lambda);
+    drawn(true);
+    quick.push(performance.now() - began);
+    began = performance.now();
+    drawn(false);
+    full.push(performance.now() - began);
+  }
+  return [quick, full];
+}"""
+TURN = """async (frames) => {
+  const v = document.querySelector(".kfgs").viewer;
+  const began = performance.now();
+  for (let i = 0; i < frames; i++) {
+    v.eye.orbit(6, 1);
+    v.panes.forgetCamera();
+    v.panes.moving = true;
+    v.panes.draw();
+    v.panes.renderer.toImage();
+    await new Promise((resolve) => setTimeout(resolve));
+  }
+  return (1000 * frames) / (performance.now() - began);
+}"""
+
+
+def main() -> None:
+    """Print a table."""
+    from playwright.sync_api import sync_playwright
+
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("field", type=Path)
+    parser.add_argument("color", type=Path)
+    parser.add_argument("--scene", type=Path)
+    parser.add_argument("--size", default="800x600")
+    parser.add_argument("--turns", type=int, default=10)
+    parser.add_argument("--chromium", default="/usr/bin/chromium")
+    args = parser.parse_args()
+    width, height = map(int, args.size.split("x"))
+    command = [sys.executable, "-m", "kfgs", "view", str(args.field), "--color", str(args.color), "--where", "browser"]
+    command += ["--scene", str(args.scene)] if args.scene else []
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=args.chromium, args=SOFTWARE)
+        page = browser.new_page(viewport={"width": width, "height": height})
+        page.set_default_timeout(300_000)
+        began = time.perf_counter()
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as served:
+            assert served.stdout is not None
+            said = next(line for line in served.stdout if "http://" in line)
+            served_after = time.perf_counter() - began
+            page.goto(re.search(r"http://\S+", said)[0])  # type: ignore[index]
+            page.wait_for_selector(".kfgs:not([aria-busy])")
+            page.evaluate("document.querySelector('.kfgs').viewer.panes.renderer.toImage() && 0")
+            print(f"first picture {time.perf_counter() - began:.1f} s, of which the server {served_after:.1f} s\n")
+            print("| change | quick picture, ms | full picture, ms |\n|---|---|---|")
+            for name, change in CHANGES.items():
+                quick, full = page.evaluate(TIME, [change, args.turns])
+                print(f"| {name} | {statistics.median(quick):.0f} | {statistics.median(full):.0f} |")
+            frames = page.evaluate(TURN, args.turns)
+            page.evaluate("document.querySelector('.kfgs').viewer.model.ask(null)")
+            print(
+                f"\n{frames:.1f} frames a second while turning with a selection, {page.evaluate(TURN, args.turns):.1f} without"
+            )
+            served.terminate()
+        browser.close()
+
+
+if __name__ == "__main__":
+    main()
