@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
@@ -49,6 +48,8 @@ def path_cameras(
     Raises:
         ValueError: if there are fewer than two different views, or a number is out of range.
     """
+    from scipy.interpolate import CubicSpline  # takes a third of a second, which every command would wait
+
     check_whole("frames", frames, 2)
     check_whole("every", every, 1)
     if size is not None:
