@@ -28,6 +28,7 @@ export default {
   async render({ model, el }) {
     const root = document.createElement("div");
     root.style.height = `${model.get("height")}px`;
+    root.dataset.lmSuppressShortcuts = "true"; // JupyterLab's keys would act on cells
     el.append(root);
     const raw = model.get("data");
     const bytes = new Uint8Array(raw.buffer, raw.byteOffset, raw.byteLength);
