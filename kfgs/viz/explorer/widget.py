@@ -36,8 +36,12 @@ export default {
     const packed = { header, data: await kfgs.inflate(bytes, header) };
     const link = new kfgs.PythonLink(kfgs.callWidget(model), model.get("phrases"));
     const app = await kfgs.mount(root, packed, link);
-    model.on("change:question", () => app.ask(model.get("question")));
-    return () => app.dispose();
+    const ask = () => app.ask(model.get("question"));
+    model.on("change:question", ask);
+    return () => {
+      model.off("change:question", ask);
+      app.dispose();
+    };
   },
 };
 """

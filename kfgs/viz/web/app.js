@@ -155,17 +155,23 @@ class App {
 
   // what a person does
 
-  /** Search; a message says why there is no answer. */
+  /** Search; a message says why there is no answer. No words clear the search. Only the last search is answered. */
   async ask(words) {
-    this.say("");
+    const turn = (this.asking = {});
+    const before = this.model.answer;
+    const wanted = () => this.asking === turn && this.model.answer === before;
     const { element } = this.top.search;
+    this.say("");
+    element.removeAttribute("aria-busy");
+    if (!words?.trim()) return this.model.ask(null);
     element.setAttribute("aria-busy", "true");
     try {
-      this.model.ask(await this.link.ask(words));
+      const answer = await this.link.ask(words);
+      if (wanted()) this.model.ask(answer);
     } catch (error) {
-      this.say(error.message);
+      if (wanted()) this.say(error.message);
     } finally {
-      element.removeAttribute("aria-busy");
+      if (this.asking === turn) element.removeAttribute("aria-busy");
     }
   }
 

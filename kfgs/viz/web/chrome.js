@@ -26,7 +26,7 @@ export function makeTop(app) {
   const count = (name) => whole(model.counts(model.side).classes[model.names.indexOf(name)]);
   const what = link.phrases ? "Search for anything" : "Search for a class";
   const search = searchBox({
-    label: what, placeholder: what, onchoose: (words) => app.ask(words), onclear: () => model.ask(null),
+    label: what, placeholder: what, onchoose: (words) => app.ask(words), onclear: () => app.ask(null),
     suggest: (text) => suggestions(text === model.answer?.words ? "" : text, names),
     describe: (name) => [h("span", {}, name), h("small", {}, count(name))],
   });

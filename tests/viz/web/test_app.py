@@ -183,6 +183,24 @@ def test_other_words_need_python_and_the_page_says_so(page):
     assert page.evaluate("viewer.model.answer") is None
 
 
+def test_a_late_answer_does_not_replace_a_later_search(page):
+    said = page.evaluate("""async () => {
+      const [now, late, said] = [viewer.link.ask.bind(viewer.link), [], []];
+      viewer.link.ask = async (words) => (words === "table" && await new Promise((go) => late.push(go)), now(words));
+      const slow = viewer.ask("table");
+      await viewer.ask("chair");
+      late.pop()();
+      await slow;
+      said.push(viewer.model.answer.words);
+      const given_up = viewer.ask("table");
+      await viewer.ask("");
+      late.pop()();
+      await given_up;
+      return [...said, viewer.model.answer, viewer.toast.hidden, viewer.top.search.element.hasAttribute("aria-busy")];
+    }""")
+    assert said == ["chair", None, True, False]
+
+
 def test_hidden_classes_are_not_drawn_picked_or_selected_by_hand(page, state):
     page.click("button[aria-label='Hide chair']")
     state.set_hidden(["chair"])
