@@ -330,12 +330,14 @@ export class Model extends EventTarget {
 
   /** Middle and radius of the selected Gaussians of a side, or of all that are drawn; outliers do not count. */
   extent(side) {
-    const mask = sum(this.selected(side)) ? this.selected(side) : this.drawn(side);
+    const chosen = this.selected(side);
+    const mask = sum(chosen) ? chosen : this.drawn(side);
+    const count = sum(mask);
     const points = this.positions[side];
     const axes = [0, 1, 2].map((axis) => {
-      const own = [];
-      for (let i = 0; i < mask.length; i++) if (mask[i]) own.push(points[3 * i + axis]);
-      own.sort((a, b) => a - b);
+      const own = new Float32Array(count);
+      for (let i = 0, k = 0; i < mask.length; i++) if (mask[i]) own[k++] = points[3 * i + axis];
+      own.sort(); // as numbers: it is a typed array
       return [own[Math.floor(0.02 * own.length)], own[Math.floor(0.98 * (own.length - 1))]];
     });
     if (axes[0][0] === undefined) return null;
