@@ -381,11 +381,14 @@ class App {
     this.showPhoto(at);
   }
 
+  /** The view with a photo that sees most nearly what is seen now; 60 degrees count as the radius of the scene. */
   nearestView() {
-    const { position } = this.eye.view;
+    const { position, R } = this.eye.view;
     let [best, least] = [null, Infinity];
     this.header.cameras.forEach(({ viewmat, thumbnail }, at) => {
-      const far = Math.hypot(...viewOf(viewmat, 1).position.map((value, axis) => value - position[axis]));
+      const own = viewOf(viewmat, 1);
+      const away = Math.hypot(...own.position.map((value, axis) => value - position[axis])) / this.eye.ball.radius;
+      const far = away + 2 * (1 - [6, 7, 8].reduce((all, k) => all + R[k] * own.R[k], 0));
       if (thumbnail && far < least) [best, least] = [at, far];
     });
     return best;

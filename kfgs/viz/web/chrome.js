@@ -104,7 +104,8 @@ const cloudName = (side) => (side === "color" ? "Colour cloud" : "Semantic field
 export function makeViews(app) {
   const buttons = app.header.cameras.map((camera, at) => {
     const [url, label] = [app.thumbnail(at), `Go to ${camera.name || `view ${at + 1}`}`];
-    const content = url ? h("img", { src: url, alt: "", loading: "lazy" }) : String(at + 1);
+    const width = Math.round((48 * camera.width) / camera.height); // known before the picture is loaded: see `set`
+    const content = url ? h("img", { src: url, alt: "", loading: "lazy", width }) : String(at + 1);
     return h("button", { type: "button", title: label, "aria-label": label, onclick: () => app.goTo(at) }, content);
   });
   const scroll = (event) => (event.currentTarget.scrollLeft += event.deltaY);

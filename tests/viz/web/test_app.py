@@ -13,7 +13,7 @@ from cases_web import SECONDS, needs_chromium, software_chromium
 from PIL import Image
 
 from kfgs.viz import available
-from kfgs.viz.explorer import Exploration, FieldMeaning, save_html
+from kfgs.viz.explorer import Exploration, FieldMeaning, html, save_html
 
 pytestmark = needs_chromium
 SIDES = "color", "semantic"
@@ -321,6 +321,42 @@ def test_buttons_go_to_the_scenes_views(browser, tmp_path):
         np.testing.assert_allclose(viewmat, views[1].viewmat.flatten(), atol=1e-6)
         page.keyboard.press("f")
         assert current.count() == 0
+
+
+def test_the_photo_is_of_the_view_that_looks_the_same_way(browser, tmp_path):
+    """Of two views, one is in the same place but looks back."""
+    for page in show(browser, save_html(cases_explorer.line(cameras=cases_explorer.cameras()), tmp_path / "page.html")):
+        found = page.evaluate("""() => {
+          const { cameras } = viewer.header;
+          const own = { ...cameras[0], thumbnail: "a photo" };
+          const back = own.viewmat.map((value, i) => (Math.floor(i / 4) % 2 ? value : -value));
+          const beside = own.viewmat.map((value, i) => value + (i === 3 ? 0.2 * viewer.eye.ball.radius : 0));
+          cameras.splice(0, cameras.length, { ...own, viewmat: back }, { ...own, viewmat: beside });
+          return viewer.nearestView();
+        }""")
+        assert found == 1
+
+
+def test_the_list_of_views_scrolls_to_the_current_one(browser, tmp_path, monkeypatch):
+    """Photos are loaded when they come into sight; their places must not move then."""
+    monkeypatch.setattr(html, "_photo", lambda _, camera: np.zeros((camera.height, camera.width, 3), np.uint8))
+    state = cases_explorer.line(cameras=cases_explorer.cameras(90))
+    for page in show(browser, save_html(state, tmp_path / "page.html", scene=object())):
+        page.keyboard.press("[")
+        page.wait_for_timeout(500)
+        box, last = page.locator(".views").bounding_box(), page.locator(".views button").last.bounding_box()
+        assert page.locator(".views [aria-current=true]").count() == 1
+        assert page.evaluate("viewer.view") == page.locator(".views button").count() - 1
+        assert last["x"] + last["width"] <= box["x"] + box["width"]
+
+
+@pytest.mark.parametrize("size", [(300, 300), (360, 640), (640, 360)])
+def test_a_small_tab_still_has_every_button_and_some_view(page, size):
+    page.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
+    for button in page.locator(".top button:visible").all():
+        box = button.bounding_box()
+        assert 0 <= box["x"] <= size[0] - box["width"]
+    assert page.locator(".stage").bounding_box()["height"] >= 0.3 * size[1]
 
 
 def test_split_slider_and_modes_draw(page):
