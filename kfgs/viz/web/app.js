@@ -91,7 +91,7 @@ class App {
     if (show in this.modes) this.panes.list[0].mode = show;
     this.model.setHidden(hidden);
     if (words) await this.ask(words);
-    if (words) this.model.setGamma(gamma);
+    if (words && gamma !== this.model.gamma) this.model.setGamma(gamma);
     this.model.past = [];
     this.refreshPanes();
   }

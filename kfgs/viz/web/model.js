@@ -195,8 +195,12 @@ export class Model extends EventTarget {
   /** A mask of the Gaussians whose centres lie in a ball. */
   ball(side, [x, y, z], radius) {
     const points = this.positions[side];
-    const far = (i) => Math.hypot(points[3 * i] - x, points[3 * i + 1] - y, points[3 * i + 2] - z);
-    return new Uint8Array(this.total(side)).map((_, i) => (far(i) <= radius ? 1 : 0));
+    const made = new Uint8Array(this.total(side));
+    for (let i = 0, j = 0; i < made.length; i++, j += 3) {
+      const [a, b, c] = [points[j] - x, points[j + 1] - y, points[j + 2] - z];
+      if (a * a + b * b + c * c <= radius * radius) made[i] = 1;
+    }
+    return made;
   }
 
   /** Select everything that is not selected now, on the side shown. */

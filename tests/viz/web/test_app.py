@@ -78,7 +78,7 @@ def mask(page, side, kind="selected"):
 def set_slider(page, name, value):
     """Type the value beside a slider."""
     field = page.locator(f".slider:has(#{name}) input.number")
-    field.fill(repr(value))
+    field.fill(value if isinstance(value, str) else repr(value))
     field.press("Enter")
 
 
@@ -160,6 +160,18 @@ def test_a_person_searches_and_moves_gamma_and_lambda(page, state):
     none = int((state.labels("color") < 0).sum())
     assert page.locator("#lambda-said").inner_text().startswith(f"{none} of 450 Gaussians are farther than 0.4 from")
     state.ask(None)
+
+
+def test_a_typed_value_that_is_not_possible_is_replaced_by_the_one_that_counts(page):
+    ask(page, "chair")
+    suggested = page.evaluate("[viewer.model.gamma, viewer.model.lambda]")
+    assert page.locator("section:has(#gamma) .note").inner_text().startswith("Suggested: ")
+    for name, typed in (("gamma", ""), ("gamma", "half"), ("lambda", "-1"), ("lambda", "0")):
+        set_slider(page, name, typed)
+    assert page.evaluate("[viewer.model.gamma, viewer.model.lambda]") == suggested
+    assert float(page.locator(".slider:has(#lambda) input.number").input_value()) == pytest.approx(suggested[1])
+    set_slider(page, "gamma", "7")
+    assert page.locator(".slider:has(#gamma) input.number").input_value() == "1"
 
 
 def test_suggestions_show_names_as_words_and_arrow_keys_choose(page):
@@ -389,6 +401,13 @@ def test_the_page_opens_as_python_left_it(browser, tmp_path):
         assert page.get_attribute(".kfgs", "data-theme") == "dark"
         assert page.locator(".choice [aria-pressed=true]").inner_text() == "Colour"
         assert page.locator("button[aria-label='Undo']").is_disabled()
+
+
+def test_a_page_that_opens_with_a_question_has_the_suggested_gamma(browser, tmp_path):
+    state = cases_page.exploration()
+    state.ask("chair")
+    for page in show(browser, save_html(state, tmp_path / "page.html")):
+        assert page.locator("section:has(#gamma) .note").inner_text().startswith("Suggested: ")
 
 
 def test_every_control_has_a_name(page):

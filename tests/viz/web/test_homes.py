@@ -186,6 +186,7 @@ def test_a_phrase_that_only_python_can_answer(browser, tmp_path, phrase):
         page.fill("#query", phrase)
         page.press("#query", "Enter")
         page.wait_for_selector(f"h2:has-text('Search: {phrase}')")
+        page.evaluate("viewer.settled()")  # the renderer hears of it with the next frame
         state.ask(phrase)
         agree(page, state)
         assert state.selected("semantic").any()
