@@ -30,11 +30,11 @@ def _cloud(count, spread, seed, labels=None):
     )
 
 
-def exploration():
+def exploration(names=NAMES):
     """Semantic Gaussians on spheres of radius 0.3, colour ones on spheres of 0.6: some are within 0.32, all within 1."""
     semantic = _cloud(60, 0.3, 1, labels=True)
     score = np.linspace(0.05, 0.95, len(semantic), dtype=np.float32)
-    file = SplatFile(semantic, extra={"score": score}, classes=NAMES)
+    file = SplatFile(semantic, extra={"score": score}, classes=names)
     return Exploration(SplatMeaning(file), _cloud(150, 0.6, 2), distance=0.4)
 
 

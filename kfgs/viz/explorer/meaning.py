@@ -113,7 +113,7 @@ class FieldMeaning:
         Raises:
             ValueError: if it is no class and there is no encoder, or the encoder belongs to another teacher.
         """
-        words = words.strip()
+        words = words if words in self.names else words.strip()
         known = self._classes.knows(words)
         if known:
             words = self.names[class_index(words, self.names)]
@@ -182,7 +182,7 @@ class SplatMeaning:
         Raises:
             ValueError: if there is no such class; the message offers similar names.
         """
-        words = self.names[class_indices(words.strip(), self.names)[0]]
+        words = self.names[class_indices(words if words in self.names else words.strip(), self.names)[0]]
         if words not in self._answers:
             member = OfClass(words).mask(self.gaussians, self.names)
             scores = torch.where(member, self.scores, 0)

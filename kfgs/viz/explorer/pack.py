@@ -106,6 +106,9 @@ def pack_scene(
         title: of the page.
         questions: class names whose scores are packed; None: all classes.
         thumbnails: pictures of the cameras, in their order; fewer are allowed, None leaves one out.
+
+    Raises:
+        ValueError: if a number of a Gaussian is not finite.
     """
     buffers = _Buffers()
     sides = {side: _add_side(buffers, state, side) for side in state.sides}
@@ -138,6 +141,7 @@ def pack_scene(
 def _add_side(buffers: _Buffers, state: Exploration, side: Side) -> dict[str, Any]:
     """Add the splats of a side; returns what is needed to decode them."""
     cloud = state.cloud(side)
+    _check_finite(side, cloud)
     places = as_array(cloud.means).astype(np.float64)
     center, half = core_box(places)
     log_scales = np.log(np.maximum(as_array(cloud.scales).astype(np.float64), 1e-30))
@@ -162,6 +166,18 @@ def _add_side(buffers: _Buffers, state: Exploration, side: Side) -> dict[str, An
         "dc": [dc_low, dc_step],
         "sh_step": SH_STEP,
     }
+
+
+def _check_finite(side: Side, cloud: Gaussians) -> None:
+    """JSON has no NaN, and one such number would spoil the steps of all others."""
+    for name in ("quats", "scales", "opacities", "sh"):
+        values = getattr(cloud, name)
+        if values is None or bool(torch.isfinite(values).all()):
+            continue
+        row = int((~torch.isfinite(values.reshape(len(cloud), -1))).any(1).nonzero()[0])
+        raise ValueError(
+            f"{side}.{name}: expected finite numbers, got {values[row].flatten()[:4].tolist()} at {row}; remove this Gaussian"
+        )
 
 
 def core_box(means: Array) -> tuple[Array, Array]:  # [N, 3] -> [3], [3]

@@ -12,6 +12,7 @@ import json
 import secrets
 import socket
 import struct
+import sys
 from collections.abc import Callable, Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_address
@@ -135,11 +136,26 @@ def read_message(message: bytes) -> tuple[dict[str, Any], bytes]:
     return answer, message[4 + length :]
 
 
+def error_answer(error: Exception) -> tuple[dict[str, Any], bytes]:
+    """What the page is told instead of an answer. The type is named only if the error is not about the arguments."""
+    about_arguments = isinstance(error, ValueError | TypeError | OSError) and str(error)
+    return {"error": str(error) if about_arguments else error_line(error)}, b""
+
+
 def _server_class(host: str) -> type[ThreadingHTTPServer]:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    return type(
-        "Server", (ThreadingHTTPServer,), {"address_family": family, "daemon_threads": True, "block_on_close": False}
-    )
+    return type("Server", (_Server,), {"address_family": family})
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """One line for a bug of ours; nothing if the browser hung up."""
+        error = sys.exception()
+        if isinstance(error, Exception) and not isinstance(error, OSError):
+            sys.stderr.write(f"kfgs: a request of the page failed: {error_line(error)}\n")
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -162,19 +178,19 @@ class _Handler(BaseHTTPRequestHandler):
         if name is None:
             return
         length = self.headers.get("Content-Length", "")
-        if name != "call" or not length.isdecimal() or int(length) > LONGEST_CALL:
+        if name != "call" or not length.isdecimal() or len(length) > 20 or int(length) > LONGEST_CALL:
             self._answer(400, "text/plain", b"This address is the page's own.\n")
             return
         try:
             asked, attached = read_message(self.rfile.read(int(length)))
             answer, more = self.call(str(asked.get("name")), dict(asked.get("args") or {}), attached)
-        except (ValueError, TypeError, OSError) as error:
-            answer, more = {"error": str(error) or type(error).__name__}, b""
+        except Exception as error:  # the page says it, and the server goes on
+            answer, more = error_answer(error)
         self._answer(200, "application/octet-stream", pack_message(answer, more))
 
     def _name(self) -> str | None:
         """The file asked for; None if the request was refused."""
-        parts = urlsplit(self.path).path.split("/", 2)
+        parts = _path_of(self.path).split("/", 2)
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
         allowed = len(parts) == 3 and hmac.compare_digest(parts[1].encode(), self.page.secret.encode())
         if self.page.local and not is_loopback(_host_name(host)):
@@ -206,6 +222,13 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, *_: Any) -> None:
         """Say nothing: addresses hold the secret."""
+
+
+def _path_of(address: str) -> str:
+    try:
+        return urlsplit(address).path
+    except ValueError:  # http://[
+        return ""
 
 
 def _host_name(host: str) -> str:

@@ -83,10 +83,10 @@ class Session:
         asked = self.state.meaning.ask(words)
         known = asked.selection
         scores = torch.where(asked.valid, known.scores, torch.nan).cpu().numpy().astype("<f4")
-        names = self.state.meaning.names
+        packed = list(dict.fromkeys(self.state.meaning.names))  # classes of one name are one question
         answer = {
             "words": asked.words,
-            "number": names.index(asked.words) if asked.words in names else None,
+            "number": packed.index(asked.words) if asked.words in packed else None,
             "gamma": known.threshold,
             "how": known.how,
             "low": asked.low,

@@ -14,6 +14,7 @@ from PIL import Image
 from ..web import APP, inline_script, read_text
 from .carried import Array
 from .html import pack_view
+from .page_server import error_answer
 from .session import Session
 from .state import Exploration
 
@@ -36,8 +37,12 @@ export default {
     const packed = { header, data: await kfgs.inflate(bytes, header) };
     const link = new kfgs.PythonLink(kfgs.callWidget(model), model.get("phrases"));
     const app = await kfgs.mount(root, packed, link);
-    model.on("change:question", () => app.ask(model.get("question")));
-    return () => app.dispose();
+    const ask = () => app.ask(model.get("question"));
+    model.on("change:question", ask);
+    return () => {
+      model.off("change:question", ask);
+      app.dispose();
+    };
   },
 };
 """
@@ -119,8 +124,8 @@ def make_widget(
         attached = bytes(buffers[0]) if buffers else b""
         try:
             found, more = session.call(str(message.get("name")), dict(message.get("args") or {}), attached)
-        except (ValueError, TypeError, OSError) as error:
-            found, more = {"error": str(error) or type(error).__name__}, b""
+        except Exception as error:  # the widget says it
+            found, more = error_answer(error)
         widget.send({"id": message.get("id"), "answer": found}, [more])
 
     widget.on_msg(answer)

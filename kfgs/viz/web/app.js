@@ -91,7 +91,7 @@ class App {
     if (show in this.modes) this.panes.list[0].mode = show;
     this.model.setHidden(hidden);
     if (words) await this.ask(words);
-    if (words) this.model.setGamma(gamma);
+    if (words && gamma !== this.model.gamma) this.model.setGamma(gamma);
     this.model.past = [];
     this.refreshPanes();
   }
@@ -155,17 +155,23 @@ class App {
 
   // what a person does
 
-  /** Search; a message says why there is no answer. */
+  /** Search; a message says why there is no answer. No words clear the search. Only the last search is answered. */
   async ask(words) {
-    this.say("");
+    const turn = (this.asking = {});
+    const before = this.model.answer;
+    const wanted = () => this.asking === turn && this.model.answer === before;
     const { element } = this.top.search;
+    this.say("");
+    element.removeAttribute("aria-busy");
+    if (!words?.trim()) return this.model.ask(null);
     element.setAttribute("aria-busy", "true");
     try {
-      this.model.ask(await this.link.ask(words));
+      const answer = await this.link.ask(words);
+      if (wanted()) this.model.ask(answer);
     } catch (error) {
-      this.say(error.message);
+      if (wanted()) this.say(error.message);
     } finally {
-      element.removeAttribute("aria-busy");
+      if (this.asking === turn) element.removeAttribute("aria-busy");
     }
   }
 
@@ -375,11 +381,14 @@ class App {
     this.showPhoto(at);
   }
 
+  /** The view with a photo that sees most nearly what is seen now; 60 degrees count as the radius of the scene. */
   nearestView() {
-    const { position } = this.eye.view;
+    const { position, R } = this.eye.view;
     let [best, least] = [null, Infinity];
     this.header.cameras.forEach(({ viewmat, thumbnail }, at) => {
-      const far = Math.hypot(...viewOf(viewmat, 1).position.map((value, axis) => value - position[axis]));
+      const own = viewOf(viewmat, 1);
+      const away = Math.hypot(...own.position.map((value, axis) => value - position[axis])) / this.eye.ball.radius;
+      const far = away + 2 * (1 - [6, 7, 8].reduce((all, k) => all + R[k] * own.R[k], 0));
       if (thumbnail && far < least) [best, least] = [at, far];
     });
     return best;

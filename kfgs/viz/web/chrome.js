@@ -26,7 +26,7 @@ export function makeTop(app) {
   const count = (name) => whole(model.counts(model.side).classes[model.names.indexOf(name)]);
   const what = link.phrases ? "Search for anything" : "Search for a class";
   const search = searchBox({
-    label: what, placeholder: what, onchoose: (words) => app.ask(words), onclear: () => model.ask(null),
+    label: what, placeholder: what, onchoose: (words) => app.ask(words), onclear: () => app.ask(null),
     suggest: (text) => suggestions(text === model.answer?.words ? "" : text, names),
     describe: (name) => [h("span", {}, name), h("small", {}, count(name))],
   });
@@ -104,7 +104,8 @@ const cloudName = (side) => (side === "color" ? "Colour cloud" : "Semantic field
 export function makeViews(app) {
   const buttons = app.header.cameras.map((camera, at) => {
     const [url, label] = [app.thumbnail(at), `Go to ${camera.name || `view ${at + 1}`}`];
-    const content = url ? h("img", { src: url, alt: "", loading: "lazy" }) : String(at + 1);
+    const width = Math.round((48 * camera.width) / camera.height); // known before the picture is loaded: see `set`
+    const content = url ? h("img", { src: url, alt: "", loading: "lazy", width }) : String(at + 1);
     return h("button", { type: "button", title: label, "aria-label": label, onclick: () => app.goTo(at) }, content);
   });
   const scroll = (event) => (event.currentTarget.scrollLeft += event.deltaY);

@@ -80,12 +80,16 @@ export function histogramSlider({ label, id: name, toFraction, toValue, onvalue,
   const range = h("input", { type: "range", id, min: 0, max: 1, step: "any", "aria-label": label });
   const field = h("input", { type: "text", inputMode: "decimal", "aria-label": `${label}, typed`, class: "number" });
   let dragging = false;
+  let shown = ""; // in the field, unless somebody types
   range.addEventListener("input", () => {
     onvalue(toValue(Number(range.value)), dragging);
     dragging = true;
   });
   range.addEventListener("change", () => (dragging = false));
-  field.addEventListener("change", () => onvalue(Number(field.value.replace(",", ".")), false));
+  field.addEventListener("change", () => {
+    onvalue(parseFloat(field.value.replace(",", ".")), false);
+    field.value = shown; // what was typed may be out of range, or no number
+  });
   return {
     element: h(
       "div",
@@ -98,7 +102,8 @@ export function histogramSlider({ label, id: name, toFraction, toValue, onvalue,
       const place = Math.min(Math.max(toFraction(value), 0), 1);
       range.value = place;
       range.setAttribute("aria-valuetext", value.toPrecision(3));
-      if (document.activeElement !== field) field.value = Number(value.toPrecision(4));
+      shown = Number(value.toPrecision(4));
+      if (document.activeElement !== field) field.value = shown;
       const path = bars(bins);
       for (const one of [faint, lit]) one.setAttribute("d", path);
       top.style.clipPath = above ? `inset(0 0 0 ${100 * place}%)` : `inset(0 ${100 - 100 * place}% 0 0)`;

@@ -1,6 +1,6 @@
 /** Who answers what the page cannot: in an exported file the packed scores; later the server or the notebook. */
 
-import { bufferOf } from "./clouds.js";
+import { bufferOf, questionNumber } from "./clouds.js";
 
 const NEEDS_PYTHON =
   "Searching for any words needs Python: open the scene with “kfgs view” or in a notebook. This file knows its classes only";
@@ -22,8 +22,7 @@ export class OfflineLink {
     const name = className(words, this.names);
     const found = this.packed.header.query[name];
     if (!found) throw new Error(explain(words, this.names));
-    const number = Number(found.buffer.split("/")[1]);
-    return { ...found, words: name, number, scores: bufferOf(this.packed, found.buffer) };
+    return { ...found, words: name, number: questionNumber(found.buffer), scores: bufferOf(this.packed, found.buffer) };
   }
 }
 
@@ -114,13 +113,15 @@ export class PythonLink {
 /** Call Python over the page's own address; see page_server.py for the form of a message. */
 export async function callPage(name, args, attached) {
   const sent = await fetch("call", { method: "POST", body: packMessage({ name, args }, attached) }).catch(() => null);
-  if (!sent?.ok) throw new Error("Python does not answer: has “kfgs view” ended?");
+  if (!sent) throw new Error("Python does not answer: has “kfgs view” ended?");
+  if (!sent.ok) throw new Error(`Python refused this (${sent.status}). Reload the page, or select fewer Gaussians.`);
   return checked(readMessage(await sent.arrayBuffer()));
 }
 
 /** What `callPage` is, for a widget of a notebook: `model` is anywidget's. */
 export function callWidget(model) {
   const waiting = new Map();
+  const view = Math.random(); // a widget that is shown twice hears the answers of both
   let last = 0;
   model.on("msg:custom", (message, buffers) => {
     const answered = waiting.get(message.id);
@@ -128,7 +129,7 @@ export function callWidget(model) {
     answered?.([message.answer, buffers[0] ? plain(buffers[0]) : new ArrayBuffer(0)]);
   });
   return async (name, args, attached = new Uint8Array(0)) => {
-    const id = ++last;
+    const id = `${view} ${++last}`;
     const answered = new Promise((resolve) => waiting.set(id, resolve));
     model.send({ id, name, args }, undefined, [attached]);
     return checked(await answered);

@@ -195,8 +195,12 @@ export class Model extends EventTarget {
   /** A mask of the Gaussians whose centres lie in a ball. */
   ball(side, [x, y, z], radius) {
     const points = this.positions[side];
-    const far = (i) => Math.hypot(points[3 * i] - x, points[3 * i + 1] - y, points[3 * i + 2] - z);
-    return new Uint8Array(this.total(side)).map((_, i) => (far(i) <= radius ? 1 : 0));
+    const made = new Uint8Array(this.total(side));
+    for (let i = 0, j = 0; i < made.length; i++, j += 3) {
+      const [a, b, c] = [points[j] - x, points[j + 1] - y, points[j + 2] - z];
+      if (a * a + b * b + c * c <= radius * radius) made[i] = 1;
+    }
+    return made;
   }
 
   /** Select everything that is not selected now, on the side shown. */
@@ -330,12 +334,14 @@ export class Model extends EventTarget {
 
   /** Middle and radius of the selected Gaussians of a side, or of all that are drawn; outliers do not count. */
   extent(side) {
-    const mask = sum(this.selected(side)) ? this.selected(side) : this.drawn(side);
+    const chosen = this.selected(side);
+    const mask = sum(chosen) ? chosen : this.drawn(side);
+    const count = sum(mask);
     const points = this.positions[side];
     const axes = [0, 1, 2].map((axis) => {
-      const own = [];
-      for (let i = 0; i < mask.length; i++) if (mask[i]) own.push(points[3 * i + axis]);
-      own.sort((a, b) => a - b);
+      const own = new Float32Array(count);
+      for (let i = 0, k = 0; i < mask.length; i++) if (mask[i]) own[k++] = points[3 * i + axis];
+      own.sort(); // as numbers: it is a typed array
       return [own[Math.floor(0.02 * own.length)], own[Math.floor(0.98 * (own.length - 1))]];
     });
     if (axes[0][0] === undefined) return null;

@@ -183,7 +183,7 @@ function pickPart(model, act) {
     const { views: sights } = await views.found.catch(() => ({ views: [] }));
     const now = model.picked;
     if (!sights.length || !now || `${now.side} ${now.index}` !== key || body.querySelector(".seen")) return;
-    const names = sights.slice(0, 4).map(({ name, weight }) => `${name} (${Math.round(100 * weight)} %)`);
+    const names = sights.slice(0, 4).map(({ index, name, weight }) => `${name || `view ${index + 1}`} (${Math.round(100 * weight)} %)`);
     body.append(h("p", { class: "note seen" }, `Seen by ${names.join(", ")}`));
   };
   return { element, refresh };

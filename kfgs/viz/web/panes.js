@@ -154,8 +154,8 @@ export class Panes {
   /** What the renderer calls a question; scores that came from Python are sent once. */
   question(answer) {
     if (answer.number === undefined) {
-      answer.number = answer.words;
-      this.renderer.setScores(answer.words, answer.scores);
+      answer.number = `words ${answer.words}`; // no number of a class, whatever the words
+      this.renderer.setScores(answer.number, answer.scores);
     }
     return answer.number;
   }

@@ -2,7 +2,7 @@
  * Draws clouds of Gaussians with WebGL 2 by the rules of kfgs's rasteriser. Class, score and distance to the semantic cloud
  * are textures, so that gamma, lambda, hidden classes and modes change with a uniform and without Python.
  */
-import {Cloud, UNKNOWN, bufferOf} from "./clouds.js";
+import {Cloud, UNKNOWN, bufferOf, questionNumber} from "./clouds.js";
 import {bind, fill, frame, program, rectangles, row, sheet, texture, withAlpha} from "./gl.js";
 import {gaussianAt, gaussiansIn} from "./pick.js";
 import {BATCH, COVERED, FINISH, PREPARE, SPLAT_FRAGMENT, SPLAT_VERTEX, WHOLE, WIDTH} from "./shaders.js";
@@ -82,7 +82,7 @@ export class Renderer {
     const {header} = packed;
     this.names = header.classes;
     this.scores = {null: bufferOf(packed, "semantic/label_scores")};
-    Object.values(header.query).forEach(({buffer}, k) => (this.scores[k] = bufferOf(packed, buffer)));
+    for (const {buffer} of Object.values(header.query)) this.scores[questionNumber(buffer)] = bufferOf(packed, buffer);
     const semantic = new Cloud(packed, "semantic");
     const latents = bufferOf(packed, "semantic/latents");
     this.shared = {

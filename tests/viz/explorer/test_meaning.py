@@ -312,6 +312,12 @@ def test_classes_of_one_name_are_one():
     assert made.ask("chair").selection.indices.tolist() == [0, 1, 2]
 
 
+def test_a_name_may_begin_with_a_space():
+    made = SplatMeaning(splat_file(cloud(LINE, LABELS)).replace(classes=("wall", " chair", "rug", "lamp")))
+    assert made.ask(" chair").words == " chair"
+    assert made.ask(" lamp ").words == "lamp"
+
+
 @pytest.mark.parametrize("score", [0.0, 1.0, 100.0, 300.0, 65536.0, 1e30, -5e6])
 def test_all_of_a_class_answer_where_their_scores_are_equal(score):
     """float32 has no number between 300 and 300 - 1e-5."""

@@ -1,6 +1,8 @@
 """The page's server: who is answered, what calls look like, and that nothing is left behind."""
 
 import http.client
+import socket
+import struct
 import threading
 import time
 from urllib.parse import urlsplit
@@ -16,6 +18,8 @@ FILES = {"": Served("text/html", b"<p>page</p>"), "pack": Served("application/oc
 def answer(name, args, attached):
     if name == "fail":
         raise ValueError(f"words: expected {args['wanted']}")
+    if name == "break":
+        raise RuntimeError("out of memory\nin a kernel")
     if name == "wait":
         time.sleep(float(args["seconds"]))
     return {"name": name, "args": args}, attached[::-1]
@@ -83,6 +87,35 @@ def test_an_error_of_a_call_is_told(server):
     assert read_message(ask(server, secret(server) + "call", "POST", body)[1])[0] == {
         "error": "words: expected a class"
     }
+
+
+def test_a_failure_of_any_kind_is_told_and_prints_nothing(server, capfd):
+    body = pack_message({"name": "break", "args": {}})
+    told = read_message(ask(server, secret(server) + "call", "POST", body)[1])[0]["error"]
+    assert told == "RuntimeError: out of memory"
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    "request_line", ["GET http://[/ HTTP/1.1", "POST {secret}call HTTP/1.1\r\nContent-Length: " + "9" * 5000]
+)
+def test_requests_that_no_browser_sends_print_nothing(server, capfd, request_line):
+    with socket.create_connection(("127.0.0.1", urlsplit(server.url).port)) as connection:
+        text = request_line.format(secret=secret(server)) + "\r\nHost: 127.0.0.1\r\n\r\n"
+        connection.sendall(text.encode())
+        assert connection.makefile("rb").readline().split()[1] in (b"400", b"403")
+    assert capfd.readouterr().err == ""
+
+
+def test_a_tab_that_hangs_up_prints_nothing(server, capfd):
+    connection = socket.create_connection(("127.0.0.1", urlsplit(server.url).port))
+    connection.sendall(b"GET /")
+    time.sleep(0.3)  # so that a thread waits for the rest
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # close with a reset
+    connection.close()
+    assert ask(server, secret(server))[0] == 200
+    time.sleep(0.3)
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize(

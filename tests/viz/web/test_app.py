@@ -13,7 +13,7 @@ from cases_web import SECONDS, needs_chromium, software_chromium
 from PIL import Image
 
 from kfgs.viz import available
-from kfgs.viz.explorer import Exploration, FieldMeaning, save_html
+from kfgs.viz.explorer import Exploration, FieldMeaning, html, save_html
 
 pytestmark = needs_chromium
 SIDES = "color", "semantic"
@@ -78,7 +78,7 @@ def mask(page, side, kind="selected"):
 def set_slider(page, name, value):
     """Type the value beside a slider."""
     field = page.locator(f".slider:has(#{name}) input.number")
-    field.fill(repr(value))
+    field.fill(value if isinstance(value, str) else repr(value))
     field.press("Enter")
 
 
@@ -162,6 +162,18 @@ def test_a_person_searches_and_moves_gamma_and_lambda(page, state):
     state.ask(None)
 
 
+def test_a_typed_value_that_is_not_possible_is_replaced_by_the_one_that_counts(page):
+    ask(page, "chair")
+    suggested = page.evaluate("[viewer.model.gamma, viewer.model.lambda]")
+    assert page.locator("section:has(#gamma) .note").inner_text().startswith("Suggested: ")
+    for name, typed in (("gamma", ""), ("gamma", "half"), ("lambda", "-1"), ("lambda", "0")):
+        set_slider(page, name, typed)
+    assert page.evaluate("[viewer.model.gamma, viewer.model.lambda]") == suggested
+    assert float(page.locator(".slider:has(#lambda) input.number").input_value()) == pytest.approx(suggested[1])
+    set_slider(page, "gamma", "7")
+    assert page.locator(".slider:has(#gamma) input.number").input_value() == "1"
+
+
 def test_suggestions_show_names_as_words_and_arrow_keys_choose(page):
     page.click("#query")
     assert page.locator("[role=option] span").all_inner_texts() == list(cases_page.NAMES)
@@ -181,6 +193,24 @@ def test_other_words_need_python_and_the_page_says_so(page):
     assert "is none of the classes" in said
     assert "needs Python" in said
     assert page.evaluate("viewer.model.answer") is None
+
+
+def test_a_late_answer_does_not_replace_a_later_search(page):
+    said = page.evaluate("""async () => {
+      const [now, late, said] = [viewer.link.ask.bind(viewer.link), [], []];
+      viewer.link.ask = async (words) => (words === "table" && await new Promise((go) => late.push(go)), now(words));
+      const slow = viewer.ask("table");
+      await viewer.ask("chair");
+      late.pop()();
+      await slow;
+      said.push(viewer.model.answer.words);
+      const given_up = viewer.ask("table");
+      await viewer.ask("");
+      late.pop()();
+      await given_up;
+      return [...said, viewer.model.answer, viewer.toast.hidden, viewer.top.search.element.hasAttribute("aria-busy")];
+    }""")
+    assert said == ["chair", None, True, False]
 
 
 def test_hidden_classes_are_not_drawn_picked_or_selected_by_hand(page, state):
@@ -305,6 +335,42 @@ def test_buttons_go_to_the_scenes_views(browser, tmp_path):
         assert current.count() == 0
 
 
+def test_the_photo_is_of_the_view_that_looks_the_same_way(browser, tmp_path):
+    """Of two views, one is in the same place but looks back."""
+    for page in show(browser, save_html(cases_explorer.line(cameras=cases_explorer.cameras()), tmp_path / "page.html")):
+        found = page.evaluate("""() => {
+          const { cameras } = viewer.header;
+          const own = { ...cameras[0], thumbnail: "a photo" };
+          const back = own.viewmat.map((value, i) => (Math.floor(i / 4) % 2 ? value : -value));
+          const beside = own.viewmat.map((value, i) => value + (i === 3 ? 0.2 * viewer.eye.ball.radius : 0));
+          cameras.splice(0, cameras.length, { ...own, viewmat: back }, { ...own, viewmat: beside });
+          return viewer.nearestView();
+        }""")
+        assert found == 1
+
+
+def test_the_list_of_views_scrolls_to_the_current_one(browser, tmp_path, monkeypatch):
+    """Photos are loaded when they come into sight; their places must not move then."""
+    monkeypatch.setattr(html, "_photo", lambda _, camera: np.zeros((camera.height, camera.width, 3), np.uint8))
+    state = cases_explorer.line(cameras=cases_explorer.cameras(90))
+    for page in show(browser, save_html(state, tmp_path / "page.html", scene=object())):
+        page.keyboard.press("[")
+        page.wait_for_timeout(500)
+        box, last = page.locator(".views").bounding_box(), page.locator(".views button").last.bounding_box()
+        assert page.locator(".views [aria-current=true]").count() == 1
+        assert page.evaluate("viewer.view") == page.locator(".views button").count() - 1
+        assert last["x"] + last["width"] <= box["x"] + box["width"]
+
+
+@pytest.mark.parametrize("size", [(300, 300), (360, 640), (640, 360)])
+def test_a_small_tab_still_has_every_button_and_some_view(page, size):
+    page.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
+    for button in page.locator(".top button:visible").all():
+        box = button.bounding_box()
+        assert 0 <= box["x"] <= size[0] - box["width"]
+    assert page.locator(".stage").bounding_box()["height"] >= 0.3 * size[1]
+
+
 def test_split_slider_and_modes_draw(page):
     def picture():
         page.evaluate("viewer.settled()")
@@ -335,6 +401,13 @@ def test_the_page_opens_as_python_left_it(browser, tmp_path):
         assert page.get_attribute(".kfgs", "data-theme") == "dark"
         assert page.locator(".choice [aria-pressed=true]").inner_text() == "Colour"
         assert page.locator("button[aria-label='Undo']").is_disabled()
+
+
+def test_a_page_that_opens_with_a_question_has_the_suggested_gamma(browser, tmp_path):
+    state = cases_page.exploration()
+    state.ask("chair")
+    for page in show(browser, save_html(state, tmp_path / "page.html")):
+        assert page.locator("section:has(#gamma) .note").inner_text().startswith("Suggested: ")
 
 
 def test_every_control_has_a_name(page):

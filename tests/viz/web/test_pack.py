@@ -6,6 +6,7 @@ import torch
 from cases_explorer import classes as few_classes
 from cases_explorer import cloud, field, grid, line
 from cases_web import room_state
+from messages import tells
 from small_room import make_room
 
 from kfgs.formats import SplatFile
@@ -169,3 +170,15 @@ def test_the_script_has_no_module_syntax_left():
 def test_modules_in_the_wrong_order():
     with pytest.raises(ValueError, match=r"expected clouds\.js before renderer\.js"):
         inline_script(("renderer.js", "clouds.js"))
+
+
+@pytest.mark.parametrize("name", ["quats", "scales", "opacities", "sh"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_numbers_that_are_not_finite_are_refused(name, value):
+    own = cloud([[0.0, 0, 5], [1, 0, 5], [2, 0, 5]], [0, 0, 0])
+    own = own.replace(sh=torch.zeros(3, 1, 3))
+    values = getattr(own, name).clone()
+    values[1].fill_(value)
+    state = Exploration(SplatMeaning(SplatFile(own.replace(**{name: values}), {}, ("wall",))))
+    with pytest.raises(ValueError, match=tells(f"semantic.{name}", "finite", "at 1")):
+        pack_scene(state)
