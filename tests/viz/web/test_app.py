@@ -17,6 +17,7 @@ from kfgs.viz.explorer import Exploration, FieldMeaning, html, save_html
 
 pytestmark = needs_chromium
 SIDES = "color", "semantic"
+VIEWMAT = "[...(viewer.panes.camera?.viewmat ?? new Float32Array(16))]"  # zeros while a new frame is to come
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +70,15 @@ def ask(page, words):
     page.fill("#query", words)
     page.press("#query", "Enter")
     page.evaluate("viewer.settled()")
+
+
+def until(page, condition):
+    """Wait for something: a busy machine draws its next frame late."""
+    for _ in range(20 * SECONDS):
+        if condition(page):
+            return
+        page.wait_for_timeout(50)
+    raise AssertionError("it did not happen")
 
 
 def mask(page, side, kind="selected"):
@@ -308,10 +318,7 @@ def test_keys_fly_and_turn_and_help_lists_them(page):
     before = page.evaluate("viewer.eye.view.position")
     page.locator(".stage").focus()
     page.keyboard.down("w")
-    for _ in range(20 * SECONDS):  # a busy machine draws its next frame late
-        if page.evaluate("viewer.eye.view.position") != before:
-            break
-        page.wait_for_timeout(50)
+    until(page, lambda tab: tab.evaluate("viewer.eye.view.position") != before)
     page.keyboard.up("w")
     page.evaluate("new Promise(requestAnimationFrame)")
     after = page.evaluate("viewer.eye.view.position")
@@ -330,11 +337,8 @@ def test_buttons_go_to_the_scenes_views(browser, tmp_path):
         current = page.locator(".views [aria-current=true]")
         assert current.get_attribute("aria-label") == "Go to view_0"
         page.keyboard.press("]")
-        page.wait_for_timeout(800)
-        assert current.get_attribute("aria-label") == "Go to view_1"
-        page.evaluate("viewer.settled()")
-        viewmat = page.evaluate("[...viewer.panes.camera.viewmat]")
-        np.testing.assert_allclose(viewmat, views[1].viewmat.flatten(), atol=1e-6)
+        until(page, lambda tab: tab.locator("[aria-current=true][aria-label='Go to view_1']").count())
+        until(page, lambda tab: np.allclose(tab.evaluate(VIEWMAT), views[1].viewmat.flatten(), atol=1e-6))
         page.keyboard.press("f")
         assert current.count() == 0
 
@@ -359,7 +363,8 @@ def test_the_list_of_views_scrolls_to_the_current_one(browser, tmp_path, monkeyp
     state = cases_explorer.line(cameras=cases_explorer.cameras(90))
     for page in show(browser, save_html(state, tmp_path / "page.html", scene=object())):
         page.keyboard.press("[")
-        page.wait_for_timeout(500)
+        until(page, lambda tab: tab.evaluate("viewer.view") == tab.locator(".views button").count() - 1)
+        page.wait_for_timeout(500)  # the list scrolls
         box, last = page.locator(".views").bounding_box(), page.locator(".views button").last.bounding_box()
         assert page.locator(".views [aria-current=true]").count() == 1
         assert page.evaluate("viewer.view") == page.locator(".views button").count() - 1
