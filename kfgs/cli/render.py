@@ -145,7 +145,7 @@ def _walk(path: Walk, points: Any, cameras: list[Any], frames: int, width: int) 
         return path_cameras(cameras, frames, every=max(1, round(len(cameras) / KEYS)), size=size)
     import torch
 
-    centers = torch.stack([-camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3] for camera in cameras]).double()
+    centers = torch.stack([camera.center for camera in cameras]).double()
     middle = int((centers - centers.mean(dim=0)).norm(dim=1).argmin())
     return spiral_cameras(cameras[middle], points, frames, size=size)
 

@@ -110,8 +110,7 @@ def _page(state: Any, options: Any, title: str, scene: Any, place: Where, displa
     """Serve the page until Ctrl-C, or write it as a file."""
     from ..viz.explorer import Viewer
 
-    show = display.show or ("rgb" if "rgb" in state.show_choices else "labels")
-    state.set_show(show)
+    state.set_show(display.show or state.first_show)
     viewer = Viewer(state, options, title=title, scene=scene)
     if place == "html":
         options.out.mkdir(parents=True, exist_ok=True)

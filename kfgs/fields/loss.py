@@ -46,7 +46,7 @@ def l1_loss(
     channels = target.shape[2]
     chosen = _engine_with("absolute", rendered, target)
     if chosen is not None:
-        return _Absolute.apply(rendered, target, chosen)
+        return _Compiled.apply(rendered, target, load(chosen).absolute)
     known = _known(target)
     difference = torch.where(known[..., None], rendered - target, 0)
     return difference.abs().sum() / (known.sum() * channels).clamp_min(1)
@@ -87,9 +87,8 @@ class ColorLoss:
         picture = _resized(rendered, target)
         chosen = _engine_with("similarity", picture, target, self.engine)
         if chosen is not None and not bool(target.sum().isnan()):  # no unknown pixel: one walk for both parts
-            return self.ssim_weight + _Compared.apply(
-                picture, target, None, chosen, (-self.ssim_weight, 1 - self.ssim_weight)
-            )
+            mixture = _mixture(chosen, (-self.ssim_weight, 1 - self.ssim_weight))
+            return self.ssim_weight + _Compiled.apply(picture, target, mixture)
         dissimilar = 1 - mean_similarity(picture, target, self.engine)
         return (1 - self.ssim_weight) * l1_loss(picture, alpha, target) + self.ssim_weight * dissimilar
 
@@ -115,7 +114,7 @@ def mean_similarity(
             return picture.new_ones(())
     chosen = _engine_with("similarity", picture, target, engine)
     if chosen is not None:
-        return _Compared.apply(picture, target, counted, chosen, (1.0, 0.0))
+        return _Compiled.apply(picture, target, _mixture(chosen, (1.0, 0.0), counted))
     similarity = from_bchw(ssim(to_bchw(picture), to_bchw(target), SSIM_WINDOW, eps=0.0, padding="valid"))
     return similarity.mean() if counted is None else similarity[counted].mean()
 
@@ -138,46 +137,32 @@ def _known(target: Tensor) -> Tensor:  # [H, W, D] -> [H, W] bool
     return ~target.amax(dim=2).isnan()  # amax returns NaN; 9 times faster than isnan().any(dim=2) of 64 channels
 
 
-class _Absolute(torch.autograd.Function):
-    """The mean absolute difference over the known pixels, with its gradient."""
+class _Compiled(torch.autograd.Function):
+    """A comparison of a picture with its target, whose value and slope are computed together."""
 
     @staticmethod
-    def forward(ctx: Any, rendered: Tensor, target: Tensor, engine: str) -> Tensor:
-        value, slope = load(engine).absolute(rendered.contiguous(), target.contiguous())
+    def forward(ctx: Any, picture: Tensor, target: Tensor, compare: Callable[..., tuple[Tensor, Tensor]]) -> Tensor:
+        value, slope = compare(picture.contiguous(), target.contiguous())
         ctx.save_for_backward(slope)
         return value
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        """The slope times the loss's gradient, which is 1 if nothing follows the loss: then the slope itself, without a copy.
+
+        A slope that is saved for another pass has two owners, so torch adds to a copy.
+        """
         (slope,) = ctx.saved_tensors
-        return _scaled(slope, grad), None, None
+        return slope if slope.device.type == "cpu" and float(grad) == 1 else grad * slope, None, None
 
 
-def _scaled(slope: Tensor, grad: Tensor) -> Tensor:
-    """The slope times the loss's gradient, which is 1 if nothing follows the loss: then the slope itself, without a copy.
+def _mixture(engine: str, mix: tuple[float, float], counted: Tensor | None = None) -> Callable[..., Any]:
+    """Compares as mix[0] SSIM + mix[1] mean absolute difference."""
 
-    A slope that is saved for another pass has two owners, so torch adds to a copy.
-    """
-    return slope if slope.device.type == "cpu" and float(grad) == 1 else grad * slope
-
-
-class _Compared(torch.autograd.Function):
-    """mix[0] SSIM + mix[1] mean absolute difference, with its gradient."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, picture: Tensor, target: Tensor, counted: Tensor | None, engine: str, mix: tuple[float, float]
-    ) -> Tensor:
+    def compare(picture: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         window = get_gaussian_kernel1d(SSIM_WINDOW, SSIM_SIGMA, dtype=torch.float64)[0].to(picture.dtype)
-        similar, absolute, slope = load(engine).similarity(
-            picture.contiguous(), target.contiguous(), counted, window, SSIM_CONSTANTS, mix
-        )
-        ctx.save_for_backward(slope)
-        return mix[0] * similar + mix[1] * absolute
+        similar, absolute, slope = load(engine).similarity(picture, target, counted, window, SSIM_CONSTANTS, mix)
+        return mix[0] * similar + mix[1] * absolute, slope
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None]:
-        (slope,) = ctx.saved_tensors
-        return _scaled(slope, grad), None, None, None, None
+    return compare

@@ -117,10 +117,7 @@ def rank_channels(
         if offers(name, "rank"):
             splats = _splats(means2d.detach(), conics.detach(), opacities.detach(), features.detach(), None, index)
             return Ranked(*ops.rank(*splats, *_contiguous(tiles), top, early, name))
-        maps, alphas = composite(means2d, conics, opacities, features, tiles, index=index, engine=name)
-        scores, labels = maps.sort(dim=-1, descending=True, stable=True)
-        empty = (alphas <= 0)[..., None]
-        return Ranked(labels[..., :top].masked_fill(empty, -1), scores[..., :top].masked_fill(empty, 0), alphas)
+        return Ranked.of_map(*composite(means2d, conics, opacities, features, tiles, index=index, engine=name), top)
 
 
 def accumulate_pixels(

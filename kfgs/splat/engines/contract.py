@@ -145,6 +145,13 @@ class Ranked(NamedTuple):
     def __repr__(self) -> str:
         return short_repr(self)
 
+    @staticmethod
+    def of_map(maps: Tensor, alphas: Tensor, top: int) -> Ranked:  # [H, W, D], [H, W]
+        """The best channels of a finished map."""
+        scores, labels = (value[..., :top] for value in maps.sort(dim=-1, descending=True, stable=True))
+        empty = (alphas <= 0)[..., None]
+        return Ranked(labels.masked_fill(empty, -1), scores.masked_fill(empty, 0), alphas)
+
 
 class Composited(NamedTuple):
     """The results of `forward`."""

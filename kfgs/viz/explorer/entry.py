@@ -73,8 +73,7 @@ def explore(
     cloud = color.gaussians if isinstance(color, SplatFile) else color
     state = Exploration(meaning, cloud, cameras=cameras, distance=distance)
     if place in ("browser", "notebook"):
-        if "rgb" in state.show_choices:
-            state.set_show("rgb")
+        state.set_show(state.first_show)
         viewer = Viewer(state, options)
         if place == "browser":
             viewer.serve()

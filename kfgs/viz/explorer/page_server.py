@@ -18,7 +18,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_address
 from threading import Thread
 from typing import Any, NamedTuple
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 from ..._check import check_whole, error_line
 
@@ -136,7 +136,16 @@ def read_message(message: bytes) -> tuple[dict[str, Any], bytes]:
     return answer, message[4 + length :]
 
 
-def error_answer(error: Exception) -> tuple[dict[str, Any], bytes]:
+def answer_call(call: Call, read: Callable[[], tuple[Mapping[str, Any], bytes]]) -> tuple[dict[str, Any], bytes]:
+    """Read a call, {"name", "args"} and attached bytes, and answer it; whatever fails is told to the page, and Python goes on."""
+    try:
+        asked, attached = read()
+        return call(str(asked.get("name")), dict(asked.get("args") or {}), attached)
+    except Exception as error:
+        return _error_answer(error)
+
+
+def _error_answer(error: Exception) -> tuple[dict[str, Any], bytes]:
     """What the page is told instead of an answer. The type is named only if the error is not about the arguments."""
     about_arguments = isinstance(error, ValueError | TypeError | OSError) and str(error)
     return {"error": str(error) if about_arguments else error_line(error)}, b""
@@ -181,21 +190,17 @@ class _Handler(BaseHTTPRequestHandler):
         if name != "call" or not length.isdecimal() or len(length) > 20 or int(length) > LONGEST_CALL:
             self._answer(400, "text/plain", b"This address is the page's own.\n")
             return
-        try:
-            asked, attached = read_message(self.rfile.read(int(length)))
-            answer, more = self.call(str(asked.get("name")), dict(asked.get("args") or {}), attached)
-        except Exception as error:  # the page says it, and the server goes on
-            answer, more = error_answer(error)
-        self._answer(200, "application/octet-stream", pack_message(answer, more))
+        answer = answer_call(self.call, lambda: read_message(self.rfile.read(int(length))))
+        self._answer(200, "application/octet-stream", pack_message(*answer))
 
     def _name(self) -> str | None:
         """The file asked for; None if the request was refused."""
-        parts = _path_of(self.path).split("/", 2)
+        parts = _split(self.path).path.split("/", 2)
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
         allowed = len(parts) == 3 and hmac.compare_digest(parts[1].encode(), self.page.secret.encode())
-        if self.page.local and not is_loopback(_host_name(host)):
+        if self.page.local and not is_loopback(_split(f"//{host}").hostname or ""):
             allowed = False
-        if origin is not None and _host_of(origin) != host.lower():
+        if origin is not None and _split(origin).netloc.lower() != host.lower():
             allowed = False
         if not allowed:
             self._answer(403, "text/plain", REFUSED.encode())
@@ -224,22 +229,8 @@ class _Handler(BaseHTTPRequestHandler):
         """Say nothing: addresses hold the secret."""
 
 
-def _path_of(address: str) -> str:
+def _split(address: str) -> SplitResult:
     try:
-        return urlsplit(address).path
-    except ValueError:  # http://[
-        return ""
-
-
-def _host_name(host: str) -> str:
-    try:
-        return urlsplit(f"//{host}").hostname or ""
-    except ValueError:  # brackets that do not match
-        return ""
-
-
-def _host_of(origin: str) -> str:
-    try:
-        return urlsplit(origin).netloc.lower()
-    except ValueError:
-        return ""
+        return urlsplit(address)
+    except ValueError:  # brackets that do not match, as in http://[
+        return urlsplit("")

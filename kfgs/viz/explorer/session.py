@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..._check import as_array, check_choice, check_whole
+from ..._check import check_choice, check_whole
 from ...formats import SplatFile, write_splats
 from ...labels import EditList, Opacity, Recolor, Remove, Selection, connected_parts
 from ...labels.where import OfIndex
@@ -174,11 +174,6 @@ class Session:
                 )
             masks[side] = torch.from_numpy(np.unpackbits(own, bitorder="little")[:count].astype(bool))
         return masks
-
-
-def bits_of(mask: Tensor) -> bytes:
-    """A mask as the viewer sends it."""
-    return np.packbits(as_array(mask), bitorder="little").tobytes()
 
 
 def _side(name: str) -> Side:

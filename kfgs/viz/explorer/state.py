@@ -89,6 +89,11 @@ class Exploration:
         self._describe = Describe(meaning, clouds, self._carried, self.cameras)
 
     @property
+    def first_show(self) -> Show:
+        """The meaning of the colours that the viewer opens with: the clouds' own if they have some, else classes."""
+        return "rgb" if "rgb" in self.show_choices else "labels"
+
+    @property
     def gamma_range(self) -> tuple[float, float]:
         """The smallest and the largest useful gamma; 0 and 1 without a question."""
         return (0.0, 1.0) if self.asked is None else (self.asked.low, self.asked.high)

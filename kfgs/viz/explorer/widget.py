@@ -14,7 +14,7 @@ from PIL import Image
 from ..web import APP, inline_script, read_text
 from .carried import Array
 from .html import pack_view
-from .page_server import error_answer
+from .page_server import answer_call
 from .session import Session
 from .state import Exploration
 
@@ -121,11 +121,7 @@ def make_widget(
     )
 
     def answer(_: Any, message: Any, buffers: list[Any]) -> None:
-        attached = bytes(buffers[0]) if buffers else b""
-        try:
-            found, more = session.call(str(message.get("name")), dict(message.get("args") or {}), attached)
-        except Exception as error:  # the widget says it
-            found, more = error_answer(error)
+        found, more = answer_call(session.call, lambda: (message, bytes(buffers[0]) if buffers else b""))
         widget.send({"id": message.get("id"), "answer": found}, [more])
 
     widget.on_msg(answer)

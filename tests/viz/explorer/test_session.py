@@ -12,7 +12,12 @@ from kfgs.formats import read_splats
 from kfgs.labels import EditList, Selection, connected_parts
 from kfgs.splat import rgb_to_sh0
 from kfgs.viz.explorer import Exploration, FieldMeaning
-from kfgs.viz.explorer.session import PNG, Session, bits_of
+from kfgs.viz.explorer.session import PNG, Session
+
+
+def bits_of(mask):
+    """A mask as the viewer sends it."""
+    return np.packbits(mask.numpy(), bitorder="little").tobytes()
 
 
 @pytest.fixture

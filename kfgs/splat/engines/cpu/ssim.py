@@ -15,7 +15,21 @@ from torch import Tensor
 
 from .cache import cached_njit
 from .memory import take_memory
-from .simd import LANES, fetch, fma, lanes_below, load, load_part, maximum, put, select, spread, store, store_part
+from .simd import (
+    LANES,
+    fetch,
+    fma,
+    lanes_below,
+    load,
+    load_part,
+    maximum,
+    put,
+    select,
+    spread,
+    store,
+    store_part,
+    sum_lanes,
+)
 from .square import INLINE, OPTIONS, aligned
 from .threads import run_bands
 
@@ -104,12 +118,8 @@ def compare_band(
     rows, across = height - 10, length - 10 * channels
     w = (window[0], window[1], window[2], window[3], window[4], window[5])
     room = length + 10 * channels + 2 * LANES
-    v_a, v_b, v_square, v_ab = (
-        aligned(room, window),
-        aligned(room, window),
-        aligned(room, window),
-        aligned(room, window),
-    )
+    v_a, v_b = aligned(room, window), aligned(room, window)
+    v_square, v_ab = aligned(room, window), aligned(room, window)
     for values in (v_a, v_b, v_square, v_ab):
         values[:] = 0
     found = aligned(padded, window)
@@ -191,7 +201,6 @@ def spread_band(
     v_a, v_square, v_ab = aligned(room, window), aligned(room, window), aligned(room, window)
     for values in (v_a, v_square, v_ab):
         values[:] = 0
-    far = aligned(LANES, window)
     total = 0.0
     for i in range(height * band // bands, height * (band + 1) // bands):
         for j in range(0, padded, LANES):
@@ -215,7 +224,5 @@ def spread_band(
             apart = apart + maximum(difference, b - a)
             sign = select(difference > 0, factors[1], select(difference < 0, -factors[1], spread(window, 0)))
             store_part(out, at, inside, slope + sign)
-        store(far, 0, apart)
-        for lane in range(LANES):
-            total += far[lane]
+        total += float(sum_lanes(apart))
     sums[band] = total

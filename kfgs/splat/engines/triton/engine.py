@@ -165,10 +165,7 @@ def rank(splats: Splats, tiles: Tiles, top: int, early: bool) -> Ranked:
     rows, offsets, width, height, tile_size = tiles
     _check(means2d=means2d, conics=conics, opacities=opacities, features=features)
     if top > MOST_RANKED:
-        maps, alphas, _ = forward(splats, tiles)
-        scores, labels = (value[..., :top] for value in maps.sort(dim=-1, descending=True, stable=True))
-        empty = (alphas <= 0)[..., None]
-        return Ranked(labels.masked_fill(empty, -1), scores.masked_fill(empty, 0), alphas)
+        return Ranked.of_map(*forward(splats, tiles)[:2], top)
     labels = torch.full((height, width, top), -1, dtype=torch.int64, device=features.device)
     scores, alphas = features.new_zeros(height, width, top), features.new_zeros(height, width)
     if len(rows):
