@@ -23,6 +23,7 @@ from ...formats.smallest_three import pack_smallest_three
 from ...gaussians import Gaussians
 from ...splat import SH_C0
 from ..cloud_colors import COLORMAP
+from ..linked import upwards
 from ..palette import palette
 from .carried import Array
 from .picked import Side
@@ -130,7 +131,7 @@ def pack_scene(
         "phrases": state.meaning.phrases,
         "clim": list(state.clim) if state.asked is None else [0.0, 1.0],
         "cameras": _cameras(buffers, state.cameras, thumbnails),
-        "up": _up(state.cameras),
+        "up": upwards(state.cameras),
         "default_view": 0 if state.cameras else None,
         "query": _add_scores(buffers, state, state.meaning.names if questions is None else questions),
         "buffers": buffers.table,
@@ -304,11 +305,3 @@ def _jpeg(picture: Array) -> Array:  # [h, w, 3] uint8 -> [bytes] uint8
     stream = io.BytesIO()
     Image.fromarray(picture).save(stream, "JPEG", quality=80)
     return np.frombuffer(stream.getvalue(), dtype=np.uint8)
-
-
-def _up(cameras: Iterable[Camera]) -> list[float]:
-    """The mean of the cameras' upward directions; z if there are none, or they cancel."""
-    ups = [-camera.viewmat[1, :3].detach().double().cpu().numpy() for camera in cameras]
-    mean = np.sum(ups, axis=0) if ups else np.zeros(3)
-    length = float(np.linalg.norm(mean))
-    return [0.0, 0.0, 1.0] if length < 1e-6 else (mean / length).tolist()
