@@ -99,3 +99,9 @@ def cut(text: str, longest: int = LONGEST) -> str:
         return line
     head = line[: longest - 2].rpartition(" ")[0]  # whole words
     return (head if len(head) >= longest // 2 else line[: longest - 3]).rstrip(",;:") + "..."
+
+
+def error_line(error: BaseException) -> str:
+    """The first line of an error, with its type before it and at most 200 characters of its own."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0][:200] if lines else ''}".rstrip(": ")

@@ -204,9 +204,3 @@ def one_line(text: object, length: int = 60) -> str:
     """Shorten a name from an untrusted file for a message: one line, no control characters."""
     shown = ascii(str(text))[1:-1]
     return shown if len(shown) <= length else shown[:length] + "..."
-
-
-def error_line(error: BaseException) -> str:
-    """The first line of an error, with its type before it and at most 200 characters of its own."""
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0][:200] if lines else ''}".rstrip(": ")

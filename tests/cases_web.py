@@ -12,11 +12,11 @@ import torch
 
 from kfgs.formats import SplatFile
 from kfgs.gaussians import Gaussians
+from kfgs.page import inline_script
 from kfgs.scenes import load_scene
 from kfgs.splat import rgb_to_sh0
 from kfgs.viz import palette
 from kfgs.viz.explorer import Exploration, SplatMeaning
-from kfgs.viz.web import inline_script
 
 CHROMIUM = next((path for path in ("/usr/bin/chromium", "/usr/bin/chromium-browser") if Path(path).exists()), None)
 SECONDS = 300  # of patience with a busy machine, for each thing that is waited for

@@ -139,7 +139,7 @@ def test_no_driver_is_told_before_anything_is_read(files, monkeypatch, capsys):
         (["FIELD", "--where", "window"], "--where: expected a display for 'window', got none"),
         (["FIELD", "--where", "picture", "--host", "0.0.0.0"], "--host: expected none without --where browser"),
         (["FIELD", "--where", "picture", "--port", "80"], "--port: expected none without --where browser"),
-        (["FIELD", "--port", "70000"], "--port: expected a number in [0, 65535], got 70000"),
+        (["FIELD", "--port", "70000"], "--host, --port: expected an address of this machine and a port that is free"),
         (["FIELD", "--where", "picture"], "--classes, --text: expected class names"),
         (["FIELD", "--where", "picture", "--distance", "0"], "--distance: expected"),
         (["FIELD", "--where", "picture", "--images", "x"], "--images: expected none without --scene"),

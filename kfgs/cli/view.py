@@ -68,68 +68,92 @@ def view(
             show small photos, too.
         out: Folder for saved pictures and selections.
     """
-    from .._check import check_range, check_whole
-    from ..viz.explorer import Exploration, ExploreOptions
+    place = "browser" if where == "auto" else where
+    check_folder("out", out)
+    read = functools.partial(_read, source, color, ask, distance, classes, teacher)
+    if place == "browser":
+        _serve(read, source, out, classes, display)
+        return
+    for name, given, usual in (("host", display.host, "127.0.0.1"), ("port", display.port, 0)):
+        check_alone(name, None if given == usual else given, "without --where browser, whose page listens there")
+    _check_drawing(place)
+    state = read()
+    if place == "html":
+        out.mkdir(parents=True, exist_ok=True)
+        wrote([_viewer(state, source, out, classes, display).save_html(out / "view.html")])
+    else:
+        _draw(state, place, out, display)
+
+
+def _serve(read: Callable[[], Any], source: Path, out: Path, classes: Classes, display: Display) -> None:
+    """Serve the page until Ctrl-C; the browser starts while Python loads."""
+    from ..page.document import PYTHON_START, document
+    from ..page.server import PageServer
+    from ..page.serving import announce, wait
+
+    if not source.exists():
+        read()  # says what is wrong
+    with PageServer(document(source.resolve().stem, PYTHON_START), display.host, display.port) as page:
+        announce(page, out, say)
+        _viewer(read(), source, out, classes, display).show_in(page)
+        wait()
+
+
+def _check_drawing(place: Where) -> None:
+    """Raise a ValueError if a window or a picture is impossible here."""
     from ..viz.explorer.entry import check_place
     from ..viz.headless import require
 
-    check_folder("out", out)
-    check_whole("port", display.port, 0, 65535)
-    if distance is not None:
-        check_range("distance", distance, 0, closed=(False, False))
-    classes.check_images()
-    place = "browser" if where == "auto" else where
-    if place != "browser":
-        for name, given, usual in (("host", display.host, "127.0.0.1"), ("port", display.port, 0)):
-            check_alone(name, None if given == usual else given, "without --where browser, whose page listens there")
     try:
-        if place != "html":
-            check_place(place)
         if place in ("window", "picture"):
+            check_place(place)
             require()
     except RuntimeError as error:  # nothing to open, or nothing draws here
         raise ValueError(str(error)) from error
+
+
+def _read(
+    source: Path, color: Path | None, ask: str | None, distance: float | None, classes: Classes, teacher: Teacher
+) -> Any:
+    """The exploration."""
+    from .._check import check_range
+    from ..viz.explorer import Exploration
+
+    if distance is not None:
+        check_range("distance", distance, 0, closed=(False, False))
+    classes.check_images()
     say("reading")
     meaning, cameras = open_meaning(source, classes, teacher)
     cloud = None if color is None else open_splats("color", color).gaussians
     state = Exploration(meaning, cloud, cameras=cameras, distance=distance)
     _note(state)
-    options = ExploreOptions(style=display.style, out=out)
     if ask is not None:
         state.ask(ask)
     for line in state.lines():
         say(line)
-    if place in ("window", "picture"):
-        _draw(state, options, place, display.show)
-    else:
-        scene = None if classes.scene is None else classes.load_scene().undistorted()
-        _page(state, options, source.resolve().stem, scene, place, display)
+    return state
 
 
-def _page(state: Any, options: Any, title: str, scene: Any, place: Where, display: Display) -> None:
-    """Serve the page until Ctrl-C, or write it as a file."""
-    from ..viz.explorer import Viewer
+def _viewer(state: Any, source: Path, out: Path, classes: Classes, display: Display) -> Any:
+    from ..viz.explorer import ExploreOptions, Viewer
 
     state.set_show(display.show or state.first_show)
-    viewer = Viewer(state, options, title=title, scene=scene)
-    if place == "html":
-        options.out.mkdir(parents=True, exist_ok=True)
-        wrote([viewer.save_html(options.out / "view.html")])
-    else:
-        viewer.serve(display.host, display.port, report=say)
+    scene = None if classes.scene is None else classes.load_scene().undistorted()
+    return Viewer(state, ExploreOptions(out=out), title=source.resolve().stem, scene=scene)
 
 
-def _draw(state: Any, options: Any, place: Where, show: Any) -> None:
+def _draw(state: Any, place: Where, out: Path, display: Display) -> None:
     """Open a window until the user closes it, or write its picture."""
-    from ..viz.explorer import Explorer, open_window
+    from ..viz.explorer import ExploreOptions, Explorer, open_window
 
+    options = ExploreOptions(style=display.style, out=out)
     with Explorer(state, options, off_screen=place != "window") as explorer:
-        explorer.set_show(show or "labels")
+        explorer.set_show(display.show or "labels")
         if place == "window":
             open_window(explorer)
         else:
-            explorer.screenshot(options.out / "view.png")
-            wrote([options.out / "view.png"])
+            explorer.screenshot(out / "view.png")
+            wrote([out / "view.png"])
 
 
 def open_meaning(source: Path, classes: Classes, teacher: Teacher) -> tuple[Any, list[Any]]:

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._check import error_line
+from .._card import error_line
 from .identity import code_identity, plain_options, weights_identity
 from .protocol import Teacher, as_teacher
 from .transformers_table import TRANSFORMERS

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._check import error_line
+from .._card import error_line
 from .._files import read_json
 from .transformers_source import explained, find_class, quiet, refuse_gaps, require_transformers
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from .._check import error_line
+from .._card import error_line
 from .._files import digest_file, digest_value, read_json
 from .transformers_table import TRANSFORMERS
 

@@ -10,6 +10,7 @@ import sys
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from .._check import check_whole
+from ..page.serving import has_display
 from ..splat.engines import available_engines
 
 if TYPE_CHECKING:
@@ -60,13 +61,6 @@ def prepare() -> None:
         pyvista.OFF_SCREEN = False  # read from the variable when it was imported
     while _ours:
         os.environ.pop(_ours.pop(), None)
-
-
-def has_display() -> bool:
-    """Whether windows can be opened (Windows and macOS: always)."""
-    if not sys.platform.startswith("linux"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 @functools.cache

@@ -18,7 +18,7 @@ from safetensors.torch import load_file, save_file  # noqa: E402
 from tiny_transformers import write_teacher  # noqa: E402
 
 import kfgs  # noqa: E402
-from kfgs._check import error_line as first_line  # noqa: E402
+from kfgs._card import error_line as first_line  # noqa: E402
 from kfgs.teachers.transformers_patches import last_patches  # noqa: E402
 from kfgs.teachers.transformers_table import TRANSFORMERS  # noqa: E402
 from kfgs.teachers.transformers_teacher import load_transformers_teacher  # noqa: E402

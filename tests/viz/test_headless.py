@@ -9,6 +9,7 @@ import pytest
 from cases_window import an_explorer
 from messages import tells
 
+from kfgs.page.serving import has_display
 from kfgs.viz import available, headless, make_plotter
 
 VARIABLES = ("DISPLAY", "WAYLAND_DISPLAY", *headless.WITHOUT_DISPLAY)
@@ -73,7 +74,7 @@ def test_other_systems_are_left_alone(bare):
     bare.setattr(sys, "platform", "darwin")
     headless.prepare()
     assert headless.WINDOW_VARIABLE not in os.environ
-    assert headless.has_display()
+    assert has_display()
 
 
 def test_probe_runs_once_in_another_process(bare):

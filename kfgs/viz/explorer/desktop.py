@@ -8,8 +8,8 @@ from collections.abc import Callable
 from math import log10
 from typing import TYPE_CHECKING, Any
 
-from ..._check import error_line
-from ..headless import has_display
+from ..._card import error_line
+from ...page.serving import has_display
 from ..legends import letters
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from ...cameras import Camera
 from ...formats import SplatFile
 from ...gaussians import Gaussians
 from ...labels import LabelSet
-from ..headless import has_display
+from ...page.serving import has_display
 from .desktop import open_window
 from .explorer import Explorer
 from .meaning import FieldMeaning, Meaning, SplatMeaning

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import html
 import json
 from pathlib import Path
 from typing import Any
@@ -13,60 +12,15 @@ from PIL import Image
 
 from ..._files import atomic_path
 from ...cameras import Camera
+from ...page.document import OFFLINE_START, POLICY, document
+from ...page.server import pack_message
 from ...scenes import Scene
 from ..pictures import as_bytes
-from ..web import APP, inline_script, read_text
 from .carried import Array
 from .pack import Packed, pack_scene
 from .state import Exploration
 
-# Nothing may be loaded: pictures and the worker are made in the page.
-POLICY = "default-src 'none'; script-src 'unsafe-inline' blob:; worker-src blob:; style-src 'unsafe-inline'; img-src blob: data:"
 PHOTO = 400  # pixels: the longer edge of a photo in the page, about 20 KB
-OFFLINE_START = """\
-    const text = (id) => document.getElementById(id).textContent;
-    const bytes = Uint8Array.from(atob(text("data")), (letter) => letter.charCodeAt(0));
-    document.getElementById("data").remove();
-    const header = JSON.parse(text("header"));
-    const packed = { header, data: await kfgs.inflate(bytes, header) };
-    window.viewer = await kfgs.mount(root, packed, new kfgs.OfflineLink(packed));"""
-PYTHON_START = """\
-    const loaded = await fetch("pack");
-    if (!loaded.ok) throw new Error("Python does not answer.");
-    const [header, data] = kfgs.readMessage(await loaded.arrayBuffer());
-    const link = new kfgs.PythonLink(kfgs.callPage, header.phrases);
-    window.viewer = await kfgs.mount(root, { header, data }, link);"""
-PAGE = """\
-<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<link rel="icon" href="data:,">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-{policy}
-<title>{title}</title>
-<style>
-html, body {{ height: 100%; margin: 0; }}
-{style}
-</style>
-</head>
-<body>
-<div id="kfgs"></div>
-{data}
-<script>
-{script}
-addEventListener("DOMContentLoaded", async () => {{
-  const root = document.getElementById("kfgs");
-  try {{
-{start}
-  }} catch (error) {{
-    if (!root.childElementCount) root.textContent = `This scene cannot be shown: ${{error.message}}`;
-  }}
-}});
-</script>
-</body>
-</html>
-"""
 
 
 def save_html(
@@ -106,17 +60,9 @@ def save_html(
     return target
 
 
-def document(title: str, start: str, data: str = "", policy: str = "") -> str:
-    """The page: the viewer's script and style, and what starts it.
-
-    Args:
-        title: of the page.
-        start: JavaScript that loads a scene and mounts the viewer in `root`.
-        data: elements that it reads.
-        policy: an element that says what may be loaded, where no server does.
-    """
-    parts = {"title": html.escape(title), "style": read_text("app.css"), "script": inline_script(APP)}
-    return PAGE.format(start=start, data=data, policy=policy, **parts)
+def scene_for_page(exploration: Exploration, *, title: str = "kfgs", scene: Scene | None = None) -> bytes:
+    """What `PageServer.show` takes; arguments as in `save_html`."""
+    return pack_message(*pack_view(exploration, title=title, scene=scene))
 
 
 def pack_view(exploration: Exploration, *, title: str = "kfgs", scene: Scene | None = None) -> Packed:

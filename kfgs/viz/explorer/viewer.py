@@ -6,9 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .html import save_html
+from ...page.document import PYTHON_START, document
+from ...page.server import PageServer
+from ...page.serving import announce, wait
+from .html import save_html, scene_for_page
 from .options import ExploreOptions
-from .serving import open_page, serve_page
+from .session import Session
 from .state import Exploration
 from .widget import make_widget
 
@@ -66,7 +69,7 @@ class Viewer:
         return self._widget
 
     def serve(self, host: str = "127.0.0.1", port: int = 0, *, report: Callable[[str], object] | None = None) -> None:
-        """Serve the page until Ctrl-C; see `serve_page`.
+        """Open the page in the browser, and serve it until Ctrl-C.
 
         Args:
             host: address to listen on. With one that other machines can reach, everyone who has the link can look and save.
@@ -76,9 +79,20 @@ class Viewer:
         Raises:
             ValueError: if the address is not one of this machine, or the port is taken.
         """
-        out = self.options.out
-        page = open_page(self.state, title=self.title, scene=self.scene, out=out, host=host, port=port)
-        serve_page(page, out=out, report=report)
+        with self.open_page(host, port) as page:
+            announce(page, self.options.out, report)
+            wait()
+
+    def open_page(self, host: str = "127.0.0.1", port: int = 0) -> PageServer:
+        """Serve the page from a thread: `url` of the result is its link, `close()` ends it. Otherwise as `serve`."""
+        page = PageServer(document(self.title, PYTHON_START), host, port)
+        self.show_in(page)
+        return page
+
+    def show_in(self, page: PageServer) -> None:
+        """Give a page its scene."""
+        scene = scene_for_page(self.state, title=self.title, scene=self.scene)
+        page.show(scene, Session(self.state, self.options.out).call)
 
     def save_html(self, path: str | Path) -> Path:
         """Write one file that works offline, from a double click; see `kfgs.viz.explorer.save_html`."""

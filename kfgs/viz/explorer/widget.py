@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from PIL import Image
 
-from ..web import APP, inline_script, read_text
+from ...page import APP, inline_script, read_text
+from ...page.server import answer_call
 from .carried import Array
 from .html import pack_view
-from .page_server import answer_call
 from .session import Session
 from .state import Exploration
 

@@ -1,4 +1,4 @@
-"""The notebook widget: what is sent to the browser, and how calls are answered. Its JavaScript: tests/viz/web."""
+"""The notebook widget: what is sent to the browser, and how calls are answered. Its JavaScript: tests/page."""
 
 import subprocess
 import sys

@@ -3,16 +3,19 @@
 import http.client
 import socket
 import struct
+import subprocess
+import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from urllib.parse import urlsplit
 
 import pytest
 from messages import tells
 
-from kfgs.viz.explorer.page_server import LONGEST_CALL, PageServer, Served, pack_message, read_message
+from kfgs.page.server import LONGEST_CALL, PageServer, pack_message, read_message
 
-FILES = {"": Served("text/html", b"<p>page</p>"), "pack": Served("application/octet-stream", bytes(range(256)))}
+PAGE, PACK = "<p>page</p>", bytes(range(256))
 
 
 def answer(name, args, attached):
@@ -27,7 +30,8 @@ def answer(name, args, attached):
 
 @pytest.fixture
 def server():
-    with PageServer(FILES, answer) as made:
+    with PageServer(PAGE) as made:
+        made.show(PACK, answer)
         yield made
 
 
@@ -47,10 +51,10 @@ def secret(server):
 
 def test_the_link_opens_the_page(server):
     status, text, headers = ask(server, secret(server))
-    assert (status, text) == (200, FILES[""].content)
+    assert (status, text) == (200, PAGE.encode())
     assert headers["Content-Security-Policy"].startswith("default-src 'none'")
     assert headers["Referrer-Policy"] == "no-referrer"
-    assert ask(server, secret(server) + "pack")[1] == FILES["pack"].content
+    assert ask(server, secret(server) + "pack")[1] == PACK
     assert ask(server, secret(server) + "other")[0] == 404
 
 
@@ -147,7 +151,7 @@ def test_a_slow_call_holds_up_no_other(server):
 
 def test_closing_leaves_no_thread_behind():
     before = threading.active_count()
-    server = PageServer(FILES, answer)
+    server = PageServer(PAGE)
     for _ in range(5):
         ask(server, secret(server))
     server.close()
@@ -160,12 +164,45 @@ def test_closing_leaves_no_thread_behind():
         ask(server, "/")
 
 
+def test_the_page_is_there_before_its_scene():
+    with PageServer(PAGE) as server, ThreadPoolExecutor() as pool:
+        body = pack_message({"name": "ask", "args": {}})
+        waiting = [
+            pool.submit(ask, server, secret(server) + "pack"),
+            pool.submit(ask, server, secret(server) + "call", "POST", body),
+        ]
+        assert ask(server, secret(server))[1] == PAGE.encode()
+        time.sleep(0.2)
+        assert not any(one.done() for one in waiting)
+        server.show(PACK, answer)
+        assert waiting[0].result(10)[1] == PACK
+        assert read_message(waiting[1].result(10)[1])[0]["name"] == "ask"
+
+
+def test_a_page_whose_scene_never_came_is_told_so():
+    server = PageServer(PAGE)
+    with ThreadPoolExecutor() as pool:
+        waiting = pool.submit(ask, server, secret(server) + "pack")
+        time.sleep(0.2)
+        server.close()
+        assert waiting.result(10)[0] == 404
+
+
 def test_wrong_addresses():
     with pytest.raises(ValueError, match=tells("host", "127.0.0.1")):
-        PageServer(FILES, answer, host=" ")
+        PageServer(PAGE, host=" ")
     with pytest.raises(ValueError, match=tells("port", "70000")):
-        PageServer(FILES, answer, port=70000)
-    with PageServer(FILES, answer) as server, pytest.raises(ValueError, match=tells("host, port", "free")):
-        PageServer(FILES, answer, port=urlsplit(server.url).port)
-    with PageServer(FILES, answer, host="::1") as server:
+        PageServer(PAGE, port=70000)
+    with PageServer(PAGE) as server, pytest.raises(ValueError, match=tells("host, port", "free")):
+        PageServer(PAGE, port=urlsplit(server.url).port)
+    with PageServer(PAGE, host="::1") as server:
         assert ask(server, secret(server))[0] == 200
+
+
+def test_the_page_needs_no_torch():
+    """`kfgs view` opens it while Python loads."""
+    program = (
+        "import sys\nfrom kfgs.page import document, serving, server\n"
+        "server.PageServer(document.document('t', document.PYTHON_START)).close()\nassert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)

@@ -10,9 +10,9 @@ from messages import tells
 from small_room import make_room
 
 from kfgs.formats import SplatFile
+from kfgs.page import inline_script, read_text
 from kfgs.viz.explorer import Exploration, FieldMeaning, SplatMeaning
 from kfgs.viz.explorer.pack import pack_scene
-from kfgs.viz.web import inline_script, read_text
 
 
 @pytest.fixture(scope="module")

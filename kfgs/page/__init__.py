@@ -1,4 +1,7 @@
-"""The viewer's JavaScript: modules that become one plain script for the page, the notebook and the exported file."""
+"""The viewer in the browser: its JavaScript, which becomes one plain script for the page, the notebook and the exported file.
+
+Nothing here imports torch, so that `kfgs view` shows its page at once.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small web server on this machine for one page: its files, and the calls that its script makes.
+"""A small web server on this machine for one page: the page, the scene that it shows, and the calls that its script makes.
 
 Only who has the link is answered: the path begins with a secret, a request from another page (Origin) or with another
 machine's name (Host) is refused before anything is read, and the browser may load nothing from elsewhere. Every request
@@ -16,11 +16,11 @@ import sys
 from collections.abc import Callable, Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_address
-from threading import Thread
-from typing import Any, NamedTuple
+from threading import Event, Thread
+from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
-from ..._check import check_whole, error_line
+from .._card import error_line
 
 REFUSED = "This page opens with the whole link that kfgs gave.\n"
 LONGEST_CALL = 16 << 20
@@ -36,32 +36,23 @@ Call = Callable[[str, dict[str, Any], bytes], tuple[dict[str, Any], bytes]]
 """(name, arguments, attached bytes) -> answer and attached bytes. A ValueError or TypeError is told to the page."""
 
 
-class Served(NamedTuple):
-    """A file of the page, in memory."""
-
-    kind: str
-    """Media type, `text/html` for instance."""
-    content: bytes
-
-
 class PageServer:
     """Serves a page from a thread of its own, until `close` or the end of a `with` block.
 
+    The page is there at once; who asks for the scene, or calls, waits until `show`. So the browser starts while Python loads.
     A call is a POST to `call`: 4 bytes with the length of a JSON text (little-endian), the JSON {"name", "args"}, and
     attached bytes; the answer has the same form.
 
     Args:
-        files: by name; the one without a name is the page.
-        call: answers calls, in several threads at once.
+        document: the page, HTML.
         host: address to listen on. With one that other machines can reach, everyone who has the link can look and save.
-        port: 0: a free one.
+        port: 0 to 65535; 0: a free one.
 
     Raises:
         ValueError: if the address is not one of this machine, or the port is taken.
     """
 
-    def __init__(self, files: Mapping[str, Served], call: Call, host: str = "127.0.0.1", port: int = 0) -> None:
-        check_whole("port", port, 0, 65535)
+    def __init__(self, document: str, host: str = "127.0.0.1", port: int = 0) -> None:
         if not host.strip():
             raise ValueError(
                 f"host: expected an address of this machine, got {host!r}; 127.0.0.1 is for this machine alone, 0.0.0.0 "
@@ -69,16 +60,47 @@ class PageServer:
             )
         self.secret = secrets.token_urlsafe(24)
         self._host = host
-        handler = type("Handler", (_Handler,), {"files": files, "call": staticmethod(call), "page": self})
+        self._document = document.encode()
+        self._pack = b""
+        self._call: Call = _no_answer
+        self._shown, self._closed = Event(), Event()
+        handler = type("Handler", (_Handler,), {"page": self})
         try:
             self._server = _server_class(host)((host.strip("[]"), port), handler)
-        except OSError as error:
+        except (OSError, OverflowError) as error:  # OverflowError: a port above 65535
             raise ValueError(
                 f"host, port: expected an address of this machine and a port that is free, got {host!r} and {port} "
                 f"({error_line(error)}); choose another, or port 0"
             ) from error
         self._thread = Thread(target=self._server.serve_forever, name="kfgs-page", daemon=True)
         self._thread.start()
+
+    def show(self, pack: bytes, call: Call) -> None:
+        """Give the page its scene, and what answers its calls.
+
+        Args:
+            pack: the scene, for `readMessage` of link.js.
+            call: answers calls, in several threads at once.
+        """
+        self._pack, self._call = pack, call
+        self._shown.set()
+
+    def file(self, name: str) -> tuple[str, bytes] | None:
+        """Media type and content of "" (the page) or "pack" (the scene: waits for it); None for others, and after the end."""
+        if name == "":
+            return "text/html; charset=utf-8", self._document
+        return ("application/octet-stream", self._pack) if name == "pack" and self._wait() else None
+
+    def answer(self, read: Callable[[], tuple[Mapping[str, Any], bytes]]) -> tuple[dict[str, Any], bytes]:
+        """Answer a call of the page when there is a scene; see `answer_call`."""
+        self._wait()
+        return answer_call(self._call, read)
+
+    def _wait(self) -> bool:
+        """Whether there is a scene, sooner or later."""
+        while not self._shown.wait(0.05) and not self._closed.is_set():
+            pass
+        return self._shown.is_set()
 
     @property
     def url(self) -> str:
@@ -94,6 +116,7 @@ class PageServer:
 
     def close(self) -> None:
         """Stop listening; a second call does nothing."""
+        self._closed.set()
         if self._thread.is_alive():
             self._server.shutdown()
             self._thread.join()
@@ -151,6 +174,10 @@ def _error_answer(error: Exception) -> tuple[dict[str, Any], bytes]:
     return {"error": str(error) if about_arguments else error_line(error)}, b""
 
 
+def _no_answer(*_: object) -> tuple[dict[str, Any], bytes]:
+    raise ValueError("Python ended before it had loaded the scene; its terminal says why")
+
+
 def _server_class(host: str) -> type[ThreadingHTTPServer]:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     return type("Server", (_Server,), {"address_family": family})
@@ -168,8 +195,6 @@ class _Server(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    files: Mapping[str, Served]
-    call: Call
     page: PageServer
     timeout = PATIENCE
 
@@ -177,10 +202,11 @@ class _Handler(BaseHTTPRequestHandler):
         name = self._name()
         if name is None:
             return
-        if name not in self.files:
+        found = self.page.file(name)
+        if found is None:
             self._answer(404, "text/plain", b"There is no such file.\n")
-            return
-        self._answer(200, *self.files[name])
+        else:
+            self._answer(200, *found)
 
     def do_POST(self) -> None:
         name = self._name()
@@ -190,7 +216,7 @@ class _Handler(BaseHTTPRequestHandler):
         if name != "call" or not length.isdecimal() or len(length) > 20 or int(length) > LONGEST_CALL:
             self._answer(400, "text/plain", b"This address is the page's own.\n")
             return
-        answer = answer_call(self.call, lambda: read_message(self.rfile.read(int(length))))
+        answer = self.page.answer(lambda: read_message(self.rfile.read(int(length))))
         self._answer(200, "application/octet-stream", pack_message(*answer))
 
     def _name(self) -> str | None:

@@ -11,8 +11,7 @@ import pytest
 from cases_web import SECONDS, needs_chromium, software_chromium
 
 from kfgs.formats import read_splats
-from kfgs.viz.explorer import Exploration, FieldMeaning, Viewer, save_html
-from kfgs.viz.explorer.serving import open_page
+from kfgs.viz.explorer import Exploration, ExploreOptions, FieldMeaning, Viewer, save_html
 
 pytestmark = needs_chromium
 
@@ -43,7 +42,7 @@ def browser():
 
 @contextmanager
 def in_page(page, state, out):
-    with open_page(state, out=out) as served:
+    with Viewer(state, ExploreOptions(out=out)).open_page() as served:
         page.goto(served.url)
         yield
 
@@ -57,8 +56,6 @@ def in_file(page, state, out):
 @contextmanager
 def in_widget(page, state, out):
     pytest.importorskip("anywidget")
-    from kfgs.viz.explorer import ExploreOptions
-
     widget = Viewer(state, ExploreOptions(out=out)).widget
 
     def python(message, attached):

@@ -91,6 +91,15 @@ export class Panes {
     this.redraw();
   }
 
+  /** Resolves when there is a picture, perhaps a coarse one that is drawn in full soon. */
+  async first() {
+    this.moving = true;
+    this.draw();
+    await this.renderer.ordered();
+    this.draw();
+    this.hurry();
+  }
+
   /** Resolves when the picture is that of the state. */
   async settled() {
     this.moving = false;

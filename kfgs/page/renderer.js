@@ -18,6 +18,7 @@ const LEVELS = [
   {scale: 0.4, least: 1 / 40, enough: 0.95, share: 0.6},
   {scale: 0.4, least: 1 / 40, enough: 0.95, share: 0.3},
 ];
+const FIRST = 2; // level of the first moving frame: a picture soon, on any machine
 const SLOW = 120; // ms for a moving frame: then the next ones are smaller
 const PIECES = 8; // parts of the order, between which covered pixels are found
 const MARGIN = 1.1; // of the picture whose Gaussians are sorted, so that a turn shows no empty border
@@ -63,7 +64,7 @@ export class Renderer {
     this.camera = null;
     this.target = null;
     this.views = new Map(); // what was drawn since the camera was set
-    this.level = 0;
+    this.level = FIRST;
     this.loads = 0;
     this.waiting = [];
     this.sorter = startSorter((answer) => this.#sorted(answer));
@@ -189,13 +190,18 @@ export class Renderer {
     this.#time(view.moving);
   }
 
-  /** Wait until frames with an up-to-date order have been drawn. */
+  /** Wait until frames with an up-to-date order have been drawn in full. */
   async settled() {
     this.redraw();
+    if (await this.ordered()) this.redraw();
+  }
+
+  /** Wait until the order fits what was drawn last. Returns whether that was necessary. */
+  async ordered() {
     const stale = () => [...this.views.values()].some(({side}) => this.sides[side].fresh !== this.sides[side].asked);
-    if (!stale()) return;
+    if (!stale()) return false;
     while (stale()) await new Promise((resolve) => this.waiting.push(resolve));
-    this.redraw();
+    return true;
   }
 
   /** Draw again, in full, what was drawn since the camera was set. */
@@ -498,7 +504,7 @@ export class Renderer {
       this.timing = false;
       this.stats.frameMs = performance.now() - start;
       if (!moving) {
-        if (this.level === 0 && this.stats.frameMs > 2 * SLOW) this.level = this.stats.frameMs > 4 * SLOW ? 3 : 2;
+        if (this.level < 3 && this.stats.frameMs > 4 * SLOW) this.level = 3;
       } else if (this.stats.frameMs > SLOW) {
         this.level = Math.min(this.level + 1, LEVELS.length - 1);
       } else if (this.stats.frameMs < 0.45 * SLOW) {

@@ -4,8 +4,8 @@ import pytest
 from cases_web import needs_chromium
 
 from kfgs.cameras import Camera
+from kfgs.page import inline_script
 from kfgs.viz.camera_view import letterboxed
-from kfgs.viz.web import inline_script
 
 pytestmark = needs_chromium
 UP = [0.0, -0.6, 0.8]

@@ -79,7 +79,7 @@ class App {
     model.addEventListener("change", () => this.refresh());
     this.watch();
     await this.begin();
-    await this.settled();
+    await this.panes.first();
     this.loading.remove();
     this.root.removeAttribute("aria-busy");
     this.stage.focus({ preventScroll: true });
