@@ -9,9 +9,10 @@ import re
 from collections.abc import Sequence
 from importlib.resources import files
 
-RENDERER = ("sorter.js", "camera.js", "clouds.js", "shaders.js", "gl.js", "pick.js", "renderer.js")
+RENDERER = ("sorter.js", "camera.js", "tint.js", "clouds.js", "shaders.js", "gl.js", "pick.js", "renderer.js")
 """The modules of the renderer; a module comes after those that it imports."""
-APP = (*RENDERER, "eye.js", "link.js", "model.js", "dom.js", "panel.js", "tools.js", "panes.js", "chrome.js", "app.js")
+INTERFACE = ("eye.js", "link.js", "model.js", "dom.js", "boxes.js", "panel.js", "tools.js", "panes.js", "chrome.js", "app.js")
+APP = (*RENDERER, *INTERFACE)
 """The renderer and the interface."""
 
 _IMPORT = re.compile(r"""^import\s*\{([^}]*)\}\s*from\s*["']\./([\w.]+)["'];?[ \t]*$""", re.M)

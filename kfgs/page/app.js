@@ -1,8 +1,9 @@
 /** The viewer's interface: `mount` puts it into an element. Data come from a pack, answers from a link. */
 
+import { drawBoxes } from "./boxes.js";
 import { viewOf } from "./camera.js";
 import { TOOLS, makeCaptions, makeHelp, makePhoto, makeRail, makeTop, makeViews } from "./chrome.js";
-import { download, h } from "./dom.js";
+import { download, h, keep, kept, svg } from "./dom.js";
 import { Eye } from "./eye.js";
 import { Model } from "./model.js";
 import { makePanel } from "./panel.js";
@@ -14,6 +15,9 @@ const BACKGROUND = { light: [0.957, 0.961, 0.969], dark: [0.094, 0.102, 0.118] }
 const GLIDE = 350; // milliseconds of a move to another view
 const SAID = 9000; // milliseconds that a message stays
 const BRUSH = [6, 24, 120]; // pixels: smallest, first, largest radius
+const HOVER = 120; // milliseconds that the pointer rests before a tooltip
+const REMEMBER = 500; // milliseconds after the last change
+const ASIDE = 0.7; // how far beside the originals copies appear, of their radius
 
 /**
  * Show a scene in an element.
@@ -41,6 +45,7 @@ class App {
     this.photo = null; // number of the view whose photo is shown
     this.view = null; // number of the view that the camera is at
     this.urls = new Map();
+    this.place = `kfgs ${location.pathname}`;
     this.build();
   }
 
@@ -52,16 +57,19 @@ class App {
     this.loading = h("p", { class: "loading", role: "status" }, "Loading the scene…");
     this.said = h("div", { class: "said card", role: "status", "aria-live": "polite" });
     this.toast = h("p", { class: "toast", role: "alert", hidden: true });
+    this.tip = h("p", { class: "tip card", role: "tooltip", hidden: true });
+    this.boxes = svg("svg", { class: "overlay boxes", "aria-hidden": "true" });
     this.help = makeHelp();
     this.top = makeTop(this);
     this.rail = makeRail(this);
     this.captions = makeCaptions(this);
     this.views = makeViews(this);
     this.photoOver = makePhoto();
-    const act = { ask: (words) => this.ask(words), fit: () => this.fit(), saveJson: () => this.saveJson(), ...this.files() };
-    this.panel = makePanel(model, act);
+    const act = { ask: (words) => this.ask(words), fit: () => this.fit(), duplicate: () => this.duplicate() };
+    this.panel = makePanel(model, { ...act, save: () => this.saveState(), open: (file) => this.openFile(file), ...this.files() });
     const foot = h("div", { class: "foot" }, this.said, this.views.element);
-    this.stage.append(this.canvas, this.loading, ...this.photoOver.elements, this.rail.element, this.captions.element, foot, this.toast);
+    const over = [...this.photoOver.elements, this.boxes, this.rail.element, this.captions.element, foot, this.tip, this.toast];
+    this.stage.append(this.canvas, this.loading, ...over);
     root.classList.add("kfgs");
     root.setAttribute("aria-busy", "true");
     root.replaceChildren(this.top.element, this.stage, this.panel.element, this.help);
@@ -73,12 +81,13 @@ class App {
     const onlost = () => this.fail("The graphics card stopped drawing. Reload the page.");
     await panes.start({ background: BACKGROUND[this.theme], onlost });
     this.eye = panes.eye = new Eye(this.header, model.extent(model.side));
-    panes.ondraw = () => this.placePhoto();
+    panes.ondraw = () => (this.placePhoto(), this.drawBoxes());
     this.tools = new Tools(this.stage, this.eye, this);
     if (Number.isInteger(this.header.default_view)) this.goTo(this.header.default_view);
-    model.addEventListener("change", () => this.refresh());
+    model.addEventListener("change", () => (this.refresh(), this.remember()));
     this.watch();
     await this.begin();
+    await this.remembered();
     await this.panes.first();
     this.loading.remove();
     this.root.removeAttribute("aria-busy");
@@ -103,10 +112,11 @@ class App {
     resize();
     const until = new AbortController();
     const listen = (target, name, act) => target.addEventListener(name, act, { signal: until.signal });
-    const keys = this.root.parentElement === document.body ? document : this.root; // a page of its own: wherever the focus is
+    const keys = this.alone ? document : this.root; // on a page of its own: wherever the focus is
     listen(keys, "keydown", (event) => this.key(event));
     listen(keys, "keyup", (event) => this.tools.release(event));
     listen(window, "blur", () => this.tools.releaseAll());
+    listen(window, "beforeunload", (event) => this.alone && this.model.edited && event.preventDefault()); // the tab may close
     this.dispose = () => {
       until.abort();
       sizes.disconnect();
@@ -114,6 +124,11 @@ class App {
       this.panes.dispose();
       this.root.replaceChildren();
     };
+  }
+
+  /** Whether the page is the viewer's own. */
+  get alone() {
+    return this.root.parentElement === document.body;
   }
 
   /** Resolves when the picture is that of the state. */
@@ -220,37 +235,82 @@ class App {
   files() {
     const { link, model } = this;
     if (!link.python) return {};
-    const masks = () => Object.fromEntries(model.sides.map((side) => [side, model.selected(side)]));
-    const sides = (all) => Object.fromEntries(model.sides.map((side) => [side, all[side]]));
-    const lambda = () => (model.source ? model.lambda : null);
+    const sides = (of) => Object.fromEntries(model.sides.map((side) => [side, of(side)]));
+    const edits = () => sides((side) => model.editsOf(side));
+    const lambda = () => (model.carried ? model.lambda : null);
+    const asked = () => ({ words: this.inPython ? model.answer.words : null, gamma: model.gamma, lambda: lambda() });
+    const wrote = (paths) => this.say(`Saved: ${paths.join(", ")}`);
     return {
       describe: (side, index) => link.describe(side, index),
-      split: () => this.split(),
-      saveSelection: () => this.save(() => link.saveSelection({ words: model.answer?.words ?? null, gamma: model.gamma, lambda: lambda(), masks: masks() })),
-      saveEdits: () => this.save(() => link.saveEdits(sides(model.toJSON()), lambda())),
+      similar: () => this.attempt(async () => model.ask(await link.similar(model.meant()))),
+      split: () => this.attempt(() => this.split()),
+      saveSelection: () => this.attempt(async () =>
+        wrote(await link.saveSelection({ ...asked(), edits: edits(), masks: sides((side) => model.selected(side)) }))),
+      saveEdits: () => this.attempt(async () => wrote(await link.saveEdits(edits(), lambda()))),
     };
+  }
+
+  /** Whether the question is one of words: not "like the selection". */
+  get inPython() {
+    return this.model.answer !== null && !this.model.answer.example;
+  }
+
+  /** Do something, or say why it cannot be done. */
+  async attempt(act) {
+    try {
+      return await act();
+    } catch (error) {
+      this.say(error.message);
+    }
   }
 
   async split() {
     const { model } = this;
-    const [side, name] = [model.side, model.answer?.words ?? "part"];
-    try {
-      model.setParts({ side, name, ...(await this.link.parts(side, model.selected(side))) });
-    } catch (error) {
-      this.say(error.message);
-    }
+    const [side, name] = [model.side, this.inPython ? model.answer.words : "part"];
+    model.setParts({ side, name, ...(await this.link.parts(side, model.selected(side), model.editsOf(side))) });
   }
 
-  async save(write) {
-    try {
-      this.say(`Saved: ${(await write()).join(", ")}`);
-    } catch (error) {
-      this.say(error.message);
-    }
+  /** Copy the selection, to the right in the picture. */
+  duplicate() {
+    const { model, eye } = this;
+    const found = model.extent(model.side);
+    if (found) model.duplicate([0, 1, 2].map((axis) => ASIDE * found.radius * eye.view.R[axis]));
   }
 
-  saveJson() {
-    download("kfgs_selection.json", new Blob([JSON.stringify(this.model)], { type: "application/json" }));
+  // the state: saved, opened, remembered when the tab is reloaded
+
+  saveState() {
+    download("kfgs_view.json", new Blob([JSON.stringify(this.model)], { type: "application/json" }));
+  }
+
+  openFile(file) {
+    return file && this.attempt(async () => this.open(JSON.parse(await file.text().catch(() => "null"))));
+  }
+
+  /** Show a state that `Model.toJSON` gave. */
+  async open(saved) {
+    this.model.fromJSON(saved);
+    if (!saved.words) return;
+    const { now } = this.model;
+    this.model.ask(await this.link.ask(saved.words));
+    this.model.setGamma(saved.gamma);
+    if (Object.keys(now.hand).length) this.model.step("open", { hand: now.hand });
+  }
+
+  /** Keep edits and selection for a reload of the tab. */
+  remember() {
+    if (!this.alone || this.root.hasAttribute("aria-busy")) return;
+    clearTimeout(this.remembering);
+    const { model } = this;
+    const wanted = () => (model.edited || model.selecting ? JSON.stringify(model) : null);
+    this.remembering = setTimeout(() => keep(this.place, wanted()), REMEMBER);
+  }
+
+  async remembered() {
+    const text = this.alone && kept(this.place);
+    if (!text) return;
+    await this.open(JSON.parse(text)).catch(() => keep(this.place, null)); // of another scene at this address
+    this.model.past = [];
   }
 
   // what the tools ask for (see tools.js); places are CSS pixels of the stage
@@ -291,6 +351,42 @@ class App {
     const center = this.model.position(side, index);
     const radius = (this.brushRadius * this.panes.depth(center)) / this.eye.focal;
     this.model.paint(side, this.model.ball(side, center, radius), how, first);
+  }
+
+  /** Select what lies in a ball around the Gaussian under the pointer, as wide as was dragged. */
+  ball(x, y, radius, how) {
+    const { side } = this.panes.activate(x);
+    const index = this.panes.under(x, y, this.panes.active, true);
+    if (index < 0) return;
+    const center = this.model.position(side, index);
+    this.model.select(side, this.model.ball(side, center, (radius * this.panes.depth(center)) / this.eye.focal), how);
+  }
+
+  /** Move the selected Gaussians with the pointer, parallel to the picture; `upward`: along the scene's upward direction. */
+  shift(dx, dy, upward, first) {
+    const { model, eye } = this;
+    const found = model.extent(model.side);
+    if (!found || !model.counts(model.side).selected) return this.say("Select something first, to move it.");
+    const step = this.panes.depth(found.center) / eye.focal;
+    const [right, down, up] = [eye.view.R.slice(0, 3), eye.view.R.slice(3, 6), eye.up];
+    const by = [0, 1, 2].map((axis) => step * (upward ? -dy * up[axis] : dx * right[axis] + dy * down[axis]));
+    model.move(by, !first);
+  }
+
+  /** A tooltip for the Gaussian under the pointer, when it rests; null hides it. */
+  hover(place) {
+    clearTimeout(this.hovering);
+    this.tip.hidden = true;
+    if (place) this.hovering = setTimeout(() => this.showTip(...place), HOVER);
+  }
+
+  showTip(x, y) {
+    const pane = this.panes.at(x);
+    const found = this.model.describe({ side: pane.side, index: this.panes.under(x, y, pane) });
+    if (!found) return;
+    this.tip.textContent = Number.isFinite(found.score) ? `${found.name}, ${found.score.toFixed(2)}` : found.name;
+    Object.assign(this.tip.style, { left: `${x + 14}px`, top: `${y + 14}px` });
+    this.tip.hidden = false;
   }
 
   brushSize() {
@@ -414,6 +510,14 @@ class App {
     const scale = Math.min(clientWidth / camera.width, clientHeight / camera.height);
     const [width, height] = [camera.width * scale, camera.height * scale];
     this.photoOver.place({ width, height, left: (clientWidth - width) / 2, top: (clientHeight - height) / 2 });
+  }
+
+  /** Boxes around connected parts. */
+  drawBoxes() {
+    const { parts, name = "" } = this.model.parts ?? { parts: [] };
+    const [pane] = this.panes.list.filter(({ side }) => side === this.model.parts?.side);
+    const found = pane ? parts.map(({ corners }, at) => ({ corners, name: `${name} ${at + 1}` })) : [];
+    drawBoxes(this.boxes, found, (point) => this.panes.project(point, pane));
   }
 
   // keys

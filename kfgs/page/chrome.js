@@ -6,13 +6,14 @@ import { whole } from "./model.js";
 
 export const TOOLS = {
   move: ["Move the view", "1"], box: ["Box selection", "2"], lasso: ["Lasso selection", "3"], brush: ["Brush selection", "4"],
+  ball: ["Ball selection: drag from its middle", "5"], shift: ["Move the selected Gaussians (Shift: up and down)", "6"],
 };
 const LAYOUTS = [["one", "One view"], ["split", "Side by side"], ["slider", "Slider"]];
 const HELP = [
   ["Drag", "turn the view"], ["Right drag, Shift + drag", "move it sideways"], ["Wheel, two fingers, + −", "zoom"],
   ["W A S D, Q E", "fly (Shift: faster)"], ["Click", "pick a Gaussian"], ["Double click", "turn about this point"],
   ["F", "fit the selection, or everything"], ["[ ]", "previous and next photo view"], ["P", "photo over the view"],
-  ["/", "search"], ["M", "next colour mode"], ["1 2 3 4", "move, box, lasso, brush"], [", .", "smaller and larger brush"],
+  ["/", "search"], ["M", "next colour mode"], ["1 2 3 4 5", "move, box, lasso, brush, ball"], ["6", "drag the selection (Shift: up and down)"], [", .", "smaller and larger brush"],
   ["Shift or Alt + tool", "add to or subtract from the selection"], ["Delete", "remove the selection"],
   ["Ctrl + I", "invert the selection"], ["Ctrl + Z, Ctrl + Shift + Z", "undo, redo"],
   ["Escape", "move tool, then clear the selection"],

@@ -1,4 +1,6 @@
-/** Reads the pack: buffers, positions, shapes, classes and scores of the Gaussians, with the rules that Python has. */
+/** Reads the pack: buffers, positions, shapes, classes and scores of the Gaussians, with the rules that Python has; edits them. */
+
+import { luminance, tint, weightedMedian } from "./tint.js";
 
 const MEAN_STEPS = 2 ** 21 - 1;
 const ARRAYS = {
@@ -45,22 +47,115 @@ export async function inflate(bytes, header) {
   return data.buffer;
 }
 
-/** One cloud of the pack. Arrays are indexed by Gaussian, as in Python. */
+let made = 0;
+
+/** The clouds of a pack by side. */
+export const cloudsOf = (packed) => Object.fromEntries(Object.keys(packed.header.sides).map((side) => [side, new Cloud(packed, side)]));
+
+/**
+ * One cloud of the pack, and what became of it. Arrays are indexed by Gaussian, as in Python; copies come after the originals.
+ * `stamps` count the changes of its arrays.
+ */
 export class Cloud {
   constructor(packed, side) {
+    const own = (name) => bufferOf(packed, `${side}/${name}`)?.slice() ?? null;
+    this.id = ++made; // another one after an undo
     this.side = side;
     this.meta = packed.header.sides[side];
     this.count = this.meta.count;
-    this.splats = bufferOf(packed, `${side}/splats`).slice(); // moves change it
-    this.dc = bufferOf(packed, `${side}/dc`);
-    this.sh = bufferOf(packed, `${side}/sh`);
-    this.source = side === "color" ? bufferOf(packed, "color/source") : null;
-    this.far = side === "color" ? bufferOf(packed, "color/far") : null;
+    this.splats = own("splats");
+    this.dc = own("dc");
+    this.sh = own("sh");
+    this.planes = this.sh ? this.sh.length / 2 / this.count : 0;
+    this.source = side === "color" ? own("source") : null; // the semantic Gaussian that gives the class; null: itself
+    this.far = side === "color" ? own("far") : null; // its distance
+    this.origin = null; // the Gaussian of the pack that each one is, or is a copy of; null: itself
     this.labels = bufferOf(packed, "semantic/labels");
     this.means = this.#decodeMeans();
-    this.removed = null; // masks, Uint8Array or null
-    this.selected = null;
-    this.fade = null;
+    this.removed = new Uint8Array(this.count);
+    this.selected = null; // a mask, or null: what the question selects
+    this.reach = null; // of pick.js
+    this.stamps = { splats: 0, colors: 0, marks: 0 };
+  }
+
+  /** Whether its colours can be changed: it has its own. */
+  get colored() {
+    return this.meta.sh_degree !== null;
+  }
+
+  /** Do an edit: {op, rows: {side: Uint32Array}, rgb?, factor?, translation?}; see Model.edit. */
+  apply({ op, rows, rgb, factor, translation }) {
+    const own = rows[this.side];
+    if (!own) return;
+    if (op === "remove") this.#remove(own);
+    if (op === "opacity") this.#fade(own, factor);
+    if (op === "recolor") this.#paint(own, rgb);
+    if (op === "move") this.move(own, translation);
+    if (op === "duplicate") this.move(this.#copy(own), translation);
+  }
+
+  #remove(rows) {
+    for (const i of rows) this.removed[i] = 1;
+    this.stamps.marks++;
+  }
+
+  #fade(rows, factor) {
+    for (const i of rows) {
+      const word = this.splats[4 * i + 3];
+      this.splats[4 * i + 3] = (word & 0xffffff) | (Math.round((word >>> 24) * factor) << 24);
+    }
+    this.reach = null; // see pick.js
+    this.stamps.splats++;
+  }
+
+  /** Move Gaussians by a vector. */
+  move(rows, translation) {
+    const means = new Float32Array(3 * rows.length);
+    rows.forEach((i, k) => translation.forEach((shift, axis) => (means[3 * k + axis] = this.means[3 * i + axis] + shift)));
+    this.#setMeans(rows, means);
+    this.stamps.splats++;
+  }
+
+  /** Append copies; returns their numbers. */
+  #copy(rows) {
+    const { count, planes, sh } = this;
+    this.origin ??= Uint32Array.from({ length: count }, (_, i) => i);
+    this.source ??= Int32Array.from({ length: count }, (_, i) => i);
+    this.far ??= new Float64Array(count); // its own class, at any lambda
+    for (const [name, width] of [["splats", 4], ["dc", 1], ["means", 3], ["removed", 1], ["source", 1], ["far", 1], ["origin", 1]])
+      this[name] = withRows(this[name], rows, width);
+    this.count += rows.length;
+    if (sh) {
+      this.sh = new sh.constructor(2 * planes * this.count);
+      for (let t = 0; t < planes; t++)
+        this.sh.set(withRows(sh.subarray(2 * t * count, 2 * (t + 1) * count), rows, 2), 2 * t * this.count);
+    }
+    this.selected = this.reach = null;
+    return Uint32Array.from(rows, (_, k) => count + k);
+  }
+
+  /** Give Gaussians one hue and keep their shading: `Recolor` of kfgs, in its mode "tint". */
+  #paint(rows, rgb) {
+    const [low, step] = this.meta.dc;
+    const colors = Array.from(rows, (i) => [0, 10, 20].map((shift) => low + step * ((this.dc[i] >>> shift) & 1023)));
+    const lights = Float64Array.from(colors, luminance);
+    const sizes = Float64Array.from(rows, (i) => {
+      const sides = this.scalesOf(i).sort((a, b) => b - a);
+      return this.opacityOf(i) * sides[0] * sides[1];
+    });
+    const shade = tint(rgb, weightedMedian(lights, sizes));
+    const bytes = this.sh && new Int8Array(this.sh.buffer);
+    rows.forEach((i, k) => {
+      const [color, slopes] = shade(lights[k]);
+      const [r, g, b] = color.map((value) => Math.min(Math.max(Math.round((value - low) / step), 0), 1023));
+      this.dc[i] = r | (g << 10) | (b << 20);
+      for (let first = 0; first < 8 * this.planes - 2; first += 3) {
+        const at = [first, first + 1, first + 2].map((j) => 8 * ((j >> 3) * this.count + i) + (j & 7));
+        const light = luminance(at.map((place) => bytes[place]));
+        at.forEach((place, axis) => (bytes[place] = Math.min(Math.max(Math.round(slopes[axis] * light), -127), 127)));
+      }
+    });
+    this.stamps.colors++;
   }
 
   /** The label of Gaussian i, -1 = none, when labels reach as far as lambda. */
@@ -79,7 +174,7 @@ export class Cloud {
 
   /** The opacity of Gaussian i. */
   opacityOf(i) {
-    return ((this.splats[4 * i + 3] >>> 24) / 255) * (this.fade ? this.fade[i] / 255 : 1);
+    return (this.splats[4 * i + 3] >>> 24) / 255;
   }
 
   /** The three standard deviations of Gaussian i. */
@@ -111,8 +206,7 @@ export class Cloud {
     return radii;
   }
 
-  /** Give Gaussians new positions. */
-  setMeans(indices, means) {
+  #setMeans(indices, means) {
     const {center, half} = this.meta;
     for (let k = 0; k < indices.length; k++) {
       const whole = [0, 1, 2].map((axis) => {
@@ -142,4 +236,12 @@ export class Cloud {
     }
     return means;
   }
+}
+
+/** Rows of an array, with some of them once more at its end. */
+function withRows(values, rows, width) {
+  const made = new values.constructor(values.length + width * rows.length);
+  made.set(values);
+  rows.forEach((row, k) => made.set(values.subarray(width * row, width * (row + 1)), values.length + width * k));
+  return made;
 }

@@ -79,7 +79,7 @@ export function fill(gl, made, format, values, top = 0) {
     [gl.R32UI]: [gl.RED_INTEGER, gl.UNSIGNED_INT, 1],
     [gl.R32I]: [gl.RED_INTEGER, gl.INT, 1],
     [gl.R16I]: [gl.RED_INTEGER, gl.SHORT, 1],
-    [gl.RG8UI]: [gl.RG_INTEGER, gl.UNSIGNED_BYTE, 2],
+    [gl.R8UI]: [gl.RED_INTEGER, gl.UNSIGNED_BYTE, 1],
     [gl.R32F]: [gl.RED, gl.FLOAT, 1],
     [gl.RGBA8]: [gl.RGBA, gl.UNSIGNED_BYTE, 4],
   }[format];

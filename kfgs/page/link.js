@@ -2,6 +2,7 @@
 
 import { bufferOf, questionNumber } from "./clouds.js";
 
+const PATIENCE = 60_000; // milliseconds for an answer of a kernel
 const NEEDS_PYTHON =
   "Searching for any words needs Python: open the scene with “kfgs view” or in a notebook. This file knows its classes only";
 
@@ -86,27 +87,28 @@ export class PythonLink {
     return (await this.call("describe", { side, index }))[0];
   }
 
-  /** Connected parts of a mask: {parts: [{count, volume}], numbers: Int16Array}, the largest first; -1: of no part. */
-  async parts(side, mask) {
-    const [answer, numbers] = await this.call("parts", { side }, bitsOf(mask));
+  /** An answer for what is like some semantic Gaussians, a mask; as `ask`. */
+  async similar(mask) {
+    const [answer, scores] = await this.call("similar", {}, bitsOf(mask));
+    return { ...answer, number: undefined, example: true, scores: new Float32Array(scores) };
+  }
+
+  /** Connected parts of a mask: {parts: [{count, volume, low, high}], numbers: Int16Array}, the largest first; -1: of no part. */
+  async parts(side, mask, edits) {
+    const [answer, numbers] = await this.call("parts", { side, edits: { [side]: edits } }, bitsOf(mask));
     return { ...answer, numbers: new Int16Array(numbers) };
   }
 
-  /** Write the selected Gaussians of some sides into Python's folder; returns the paths. */
-  async saveSelection({ words, gamma, lambda, masks }) {
+  /** Write the selected Gaussians of some sides into Python's folder; returns the paths. `edits`: of each side, see Model.editsOf. */
+  async saveSelection({ words, gamma, lambda, edits, masks }) {
     const bits = Object.values(masks).map(bitsOf);
-    const [answer] = await this.call("save_selection", { words, gamma, lambda, sides: Object.keys(masks) }, joined(bits));
+    const [answer] = await this.call("save_selection", { words, gamma, lambda, edits, sides: Object.keys(masks) }, joined(bits));
     return answer.paths;
   }
 
-  /** Write the edited splats, and the edits as JSON; `sides` as in `Model.toJSON`. */
-  async saveEdits(sides, lambda) {
-    return (await this.call("save_edits", { sides, lambda }))[0].paths;
-  }
-
-  /** Write a picture, a PNG file as a Blob. */
-  async savePicture(blob) {
-    return (await this.call("save_picture", {}, new Uint8Array(await blob.arrayBuffer())))[0].paths;
+  /** Write the edited splats, and the edits as JSON. */
+  async saveEdits(edits, lambda) {
+    return (await this.call("save_edits", { edits, lambda }))[0].paths;
   }
 }
 
@@ -130,7 +132,10 @@ export function callWidget(model) {
   });
   return async (name, args, attached = new Uint8Array(0)) => {
     const id = `${view} ${++last}`;
-    const answered = new Promise((resolve) => waiting.set(id, resolve));
+    const answered = new Promise((resolve, reject) => {
+      waiting.set(id, resolve);
+      setTimeout(() => waiting.delete(id) && reject(new Error("Python does not answer: is the kernel busy, or has it ended?")), PATIENCE);
+    });
     model.send({ id, name, args }, undefined, [attached]);
     return checked(await answered);
   };

@@ -1,6 +1,6 @@
 /** The viewer's state and rules: question, gamma, lambda, hidden classes, selection, edits, undo. Uses no DOM. */
 
-import { bufferOf } from "./clouds.js";
+import { Cloud, bufferOf, cloudsOf } from "./clouds.js";
 
 const MOST_UNDONE = 50; // steps; a step holds at most the masks that it changed
 const BINS = 64; // of the histograms
@@ -24,24 +24,29 @@ export class Model extends EventTarget {
     this.names = header.classes.map((one) => one.name);
     this.sides = ["color", "semantic"].filter((side) => header.sides[side]);
     this.side = this.sides[0];
+    this.clouds = cloudsOf(packed); // as the edits left them
+    this.applied = []; // edits
+    this.answers = 0; // so far
     this.own = bufferOf(packed, "semantic/labels");
     this.ownScores = bufferOf(packed, "semantic/label_scores");
-    this.source = bufferOf(packed, "color/source");
-    this.far = bufferOf(packed, "color/far");
     this.lambda = header.lambda ? header.lambda.value : Infinity;
     this.hidden = new Set();
     this.picked = null; // {side, index}
     this.parts = null; // {side, name, parts, numbers}
-    this.now = { answer: null, gamma: null, gammaHow: "", hand: {}, removed: {}, colors: {}, opacity: {}, what: "" };
+    this.now = { answer: null, gamma: null, gammaHow: "", hand: {}, edits: [], what: "", id: 0 };
     this.past = [];
     this.future = [];
     this.cache = new Map();
-    this.positions = {}; // side -> Float32Array [3 N], given by the renderer
   }
 
-  /** Number of Gaussians of a side, removed ones included. */
+  /** Number of Gaussians of a side, removed ones and copies included. */
   total(side) {
-    return this.packed.header.sides[side].count;
+    return this.clouds[side].count;
+  }
+
+  /** Whether labels reach the colour cloud from the semantic one. */
+  get carried() {
+    return this.packed.header.buffers["color/source"] !== undefined;
   }
 
   get answer() {
@@ -76,6 +81,7 @@ export class Model extends EventTarget {
   /** Show the answer to a question (see link.js); null clears it. The selection is then the question's. */
   ask(answer) {
     this.parts = null;
+    if (answer) answer.id ??= ++this.answers;
     const { gamma = null, how = "" } = answer ?? {};
     this.step(answer ? `search for ${answer.words}` : "clear the search", { answer, gamma, gammaHow: how, hand: {} });
   }
@@ -118,14 +124,12 @@ export class Model extends EventTarget {
 
   /** Labels of a side, -1 = none. A colour Gaussian takes its source's label if that is closer than lambda. */
   labels(side) {
-    if (side === "semantic") return this.own;
-    return this.cached(`labels ${this.lambda}`, () => this.carry(this.own, -1, Int16Array));
+    return this.cached(`labels ${this.key(side)}`, () => this.carry(side, this.own, -1, Int16Array));
   }
 
   /** Scores of the question, or of the labels without a question; NaN where unknown. */
   scores(side) {
-    const own = this.answer ? this.answer.scores : this.ownScores;
-    return side === "semantic" ? own : this.carry(own, NaN, Float32Array);
+    return this.carry(side, this.answer ? this.answer.scores : this.ownScores, NaN, Float32Array);
   }
 
   /** What the question selects on a side, hidden, removed or not; the comparison is Python's, in float32. */
@@ -134,23 +138,23 @@ export class Model extends EventTarget {
     const gamma = Math.fround(this.gamma);
     const make = () => {
       const own = Uint8Array.from(this.answer.scores, (score) => (score > gamma ? 1 : 0));
-      return side === "semantic" ? own : this.carry(own, 0, Uint8Array);
+      return this.carry(side, own, 0, Uint8Array);
     };
-    return this.cached(`selected ${side} ${this.answer.words} ${gamma} ${side === "color" ? this.lambda : ""}`, make);
+    return this.cached(`selected ${this.answer.id} ${gamma} ${this.key(side)}`, make);
   }
 
   /** Selected Gaussians that are not removed, Uint8Array. */
   selected(side) {
     const mask = this.byHand ? this.now.hand[side] ?? new Uint8Array(this.total(side)) : this.questioned(side);
-    const removed = this.now.removed[side];
-    return removed ? mask.map((on, i) => on & ~removed[i] & 1) : mask;
+    const { removed } = this.clouds[side];
+    return mask.map((on, i) => on & ~removed[i] & 1);
   }
 
   /** Gaussians that are neither hidden nor removed. */
   drawn(side) {
     const labels = this.labels(side);
-    const removed = this.now.removed[side];
-    return Uint8Array.from(labels, (label, i) => (this.hidden.has(label) || removed?.[i] ? 0 : 1));
+    const { removed } = this.clouds[side];
+    return Uint8Array.from(labels, (label, i) => (this.hidden.has(label) || removed[i] ? 0 : 1));
   }
 
   /** Counts of a side, without removed Gaussians: {total, selected, removed, classes: [..], none}. */
@@ -158,11 +162,11 @@ export class Model extends EventTarget {
     const key = `counts ${side} ${this.lambda} ${this.now.id}`;
     return this.cached(key, () => {
       const labels = this.labels(side);
-      const removed = this.now.removed[side];
+      const { removed } = this.clouds[side];
       const classes = new Array(this.names.length).fill(0);
-      const found = { total: 0, selected: sum(this.selected(side)), removed: removed ? sum(removed) : 0, none: 0, classes };
+      const found = { total: 0, selected: sum(this.selected(side)), removed: sum(removed), none: 0, classes };
       for (let i = 0; i < labels.length; i++) {
-        if (removed?.[i]) continue;
+        if (removed[i]) continue;
         found.total += 1;
         if (labels[i] < 0) found.none += 1;
         else classes[labels[i]] += 1;
@@ -194,11 +198,21 @@ export class Model extends EventTarget {
 
   /** A mask of the Gaussians whose centres lie in a ball. */
   ball(side, [x, y, z], radius) {
-    const points = this.positions[side];
+    const points = this.clouds[side].means;
     const made = new Uint8Array(this.total(side));
     for (let i = 0, j = 0; i < made.length; i++, j += 3) {
       const [a, b, c] = [points[j] - x, points[j + 1] - y, points[j + 2] - z];
       if (a * a + b * b + c * c <= radius * radius) made[i] = 1;
+    }
+    return made;
+  }
+
+  /** The semantic Gaussians that are selected, or that give the selected colour Gaussians their class: a mask of the pack's. */
+  meant() {
+    const made = new Uint8Array(this.own.length);
+    for (const side of this.sides) {
+      const { source, far } = this.clouds[side];
+      for (const i of indices(this.selected(side))) if (!source || far[i] < this.lambda) made[source ? source[i] : i] = 1;
     }
     return made;
   }
@@ -218,57 +232,76 @@ export class Model extends EventTarget {
   grow(side = this.side, shrink = false) {
     const [mask, drawn] = [this.selected(side), this.drawn(side)];
     const from = shrink ? mask.map((on, i) => (on ? 0 : drawn[i])) : mask;
-    const near = within(this.positions[side], from, this.reach(side));
+    const near = within(this.clouds[side].means, from, this.reach(side));
     const made = mask.map((on, i) => (shrink ? (on && !near[i] ? 1 : 0) : on || (near[i] && drawn[i]) ? 1 : 0));
     this.step(shrink ? "shrink selection" : "grow selection", { hand: { ...this.bySides(), [side]: made } });
   }
 
   reach(side) {
-    return this.cached(`reach ${side}`, () => REACH * spacing(this.positions[side]));
+    return this.cached(`reach ${side}`, () => REACH * spacing(this.clouds[side].means));
   }
 
   /** Remove the selected Gaussians of both sides; the selection ends. Returns how many. */
   remove() {
-    const removed = { ...this.now.removed };
-    let count = 0;
-    for (const side of this.sides) {
-      const mask = this.selected(side);
-      if (!sum(mask)) continue;
-      count += sum(mask);
-      removed[side] = removed[side] ? mask.map((on, i) => on | removed[side][i]) : mask;
-    }
-    if (count) this.step("remove", { removed, answer: null, gamma: null, gammaHow: "", hand: {} });
+    return this.edit("remove", {}, { answer: null, gamma: null, gammaHow: "", hand: {} });
+  }
+
+  /** Give the selected Gaussians a colour, [r, g, b] in 0..1, and keep their shading. Returns how many. */
+  recolor(rgb) {
+    return this.edit("recolor", { rgb, mode: "tint" });
+  }
+
+  /** Multiply the opacity of the selected Gaussians by a factor, 0..1; again, while they are selected, replaces it. */
+  fade(factor) {
+    return this.edit("opacity", { factor }, {}, (last) => ({ ...last, factor }));
+  }
+
+  /** Move the selected Gaussians by a vector; with `joins`, further parts of one drag are one step of undo. */
+  move(translation, joins = false) {
+    const add = (last) => ({ ...last, translation: last.translation.map((value, axis) => value + translation[axis]) });
+    return this.edit("move", { translation }, {}, joins ? add : null);
+  }
+
+  /** Add copies of the selected Gaussians, moved by a vector; the copies are selected then. */
+  duplicate(translation) {
+    const rows = this.chosen();
+    const hand = Object.entries(rows).map(([side, { length }]) => {
+      const count = this.total(side);
+      return [side, new Uint8Array(count + length).fill(1, count)];
+    });
+    return this.edit("duplicate", { translation }, { answer: null, gamma: null, gammaHow: "", hand: Object.fromEntries(hand) });
+  }
+
+  /**
+   * An edit of the selected Gaussians, as kfgs.labels.edits has it: the clouds are what all edits in order make of the pack.
+   * @param {function?} join makes one of the last edit and this one, if that was of the same Gaussians
+   */
+  edit(op, values, change = {}, join = null) {
+    const rows = this.chosen((cloud) => op !== "recolor" || cloud.colored);
+    const count = Object.values(rows).reduce((all, own) => all + own.length, 0);
+    if (!count) return 0;
+    const { edits, what } = this.now;
+    const last = edits.at(-1);
+    const joins = join !== null && what === op && sameRows(last.rows, rows);
+    const made = joins ? [...edits.slice(0, -1), join(last)] : [...edits, { op, rows, ...values }];
+    this.step(op, { edits: made, ...change }, joins);
     return count;
   }
 
-  /** Give the selected Gaussians a colour, [r, g, b] 0-255. */
-  recolor(rgb) {
-    const colors = { ...this.now.colors };
-    this.eachSelected((side, mask) => {
-      const made = colors[side]?.slice() ?? new Uint8Array(4 * mask.length);
-      for (let i = 0; i < mask.length; i++) if (mask[i]) made.set([...rgb, 255], 4 * i);
-      colors[side] = made;
-    });
-    this.step("recolour", { colors });
-  }
-
-  /** Set the opacity factor (0-1) of the selected Gaussians. */
-  fade(factor) {
-    const opacity = { ...this.now.opacity };
-    this.eachSelected((side, mask) => {
-      const old = opacity[side] ?? new Uint8Array(mask.length).fill(255);
-      opacity[side] = old.map((value, i) => (mask[i] ? Math.round(255 * factor) : value));
-    });
-    this.step("fade", { opacity });
+  /** The numbers of the selected Gaussians of each side that has some. */
+  chosen(allowed = () => true) {
+    const sides = this.sides.filter((side) => allowed(this.clouds[side]));
+    const found = sides.map((side) => [side, indices(this.selected(side))]);
+    return Object.fromEntries(found.filter(([, rows]) => rows.length));
   }
 
   /** Undo everything that changed the Gaussians; a step of its own. */
   restore() {
-    this.step("restore all", { removed: {}, colors: {}, opacity: {} });
+    this.step("restore all", { edits: [], hand: {} });
   }
 
   get edited() {
-    return ["removed", "colors", "opacity"].some((kind) => Object.keys(this.now[kind]).length);
+    return this.now.edits.length > 0;
   }
 
   undo() {
@@ -292,35 +325,33 @@ export class Model extends EventTarget {
   }
 
   /**
-   * What is known about the picked Gaussian; null if there is none, or it is hidden or removed. `distance` is that to the
+   * What is known about a Gaussian, the picked one by default; null if there is none, or it is hidden or removed. `distance` is that to the
    * nearest labelled one.
    */
-  describe() {
-    if (!this.picked) return null;
-    const { side, index } = this.picked;
+  describe({ side, index } = this.picked ?? { index: -1 }) {
+    if (index < 0) return null;
     const label = this.labels(side)[index];
-    if (this.hidden.has(label) || this.now.removed[side]?.[index]) return null;
-    const source = side === "color" ? this.source[index] : index;
-    const reached = side === "semantic" || this.far[index] < this.lambda;
+    const { source: sources, far, removed } = this.clouds[side];
+    if (label === undefined || this.hidden.has(label) || removed[index]) return null;
+    const source = sources ? sources[index] : index;
+    const reached = !far || far[index] < this.lambda;
     const own = this.answer ? this.answer.scores : this.ownScores;
     const score = reached && source >= 0 ? own[source] : NaN;
-    const distance = side === "color" && source >= 0 ? this.far[index] : null;
+    const distance = side === "color" && source >= 0 ? far[index] : null;
     return { side, index, label, name: this.names[label] ?? "no class", score, source, distance, reached };
   }
 
-  /** Where the position of a Gaussian is, [x, y, z]; null while the renderer has not said it. */
+  /** Where a Gaussian is, [x, y, z]. */
   position(side, index) {
-    const found = this.positions[side];
-    return found ? [...found.subarray(3 * index, 3 * index + 3)] : null;
+    return [...this.clouds[side].means.subarray(3 * index, 3 * index + 3)];
   }
 
   /** The nearest Gaussians of the same side that are not removed: [class name, distance], nearest first. */
   nearest(side, index, count) {
-    const points = this.positions[side];
-    if (!points) return [];
+    const { means: points, removed } = this.clouds[side];
     const found = [];
     for (let i = 0; i < points.length / 3; i++) {
-      if (i === index || this.now.removed[side]?.[i]) continue;
+      if (i === index || removed[i]) continue;
       const far = squared(points, index, i);
       if (found.length < count || far < found[count - 1][1]) {
         found.push([i, far]);
@@ -337,7 +368,7 @@ export class Model extends EventTarget {
     const chosen = this.selected(side);
     const mask = sum(chosen) ? chosen : this.drawn(side);
     const count = sum(mask);
-    const points = this.positions[side];
+    const points = this.clouds[side].means;
     const axes = [0, 1, 2].map((axis) => {
       const own = new Float32Array(count);
       for (let i = 0, k = 0; i < mask.length; i++) if (mask[i]) own[k++] = points[3 * i + axis];
@@ -349,42 +380,62 @@ export class Model extends EventTarget {
     return { center: axes.map(([low, high]) => (low + high) / 2), radius: Math.max(radius, 1e-3) };
   }
 
-  /** The state as JSON: question, gamma, lambda, selection and edits by the numbers of Gaussians. */
+  /** The state as JSON. Edits have the form of kfgs.labels.EditList; their order is kept, but removals come last. */
   toJSON() {
-    const { removed, colors, opacity } = this.now;
-    const by = (values, key) => {
-      const groups = {};
-      values?.forEach((value, i) => value !== 255 && (groups[key(value)] ??= []).push(i));
-      return groups;
-    };
-    const colored = (rgba) => {
-      const groups = {};
-      for (let i = 0; rgba && i < rgba.length; i += 4) if (rgba[i + 3]) (groups[`${rgba.subarray(i, i + 3)}`] ??= []).push(i / 4);
-      return groups;
-    };
-    const sides = this.sides.map((side) => [
-      side,
-      {
-        selected: indices(this.selected(side)),
-        removed: indices(removed[side] ?? []),
-        recolored: colored(colors[side]), // "r,g,b" -> Gaussians
-        opacity: by(opacity[side], (value) => (value / 255).toFixed(3)), // factor -> Gaussians
-      },
-    ]);
-    const asked = { words: this.answer?.words ?? null, gamma: this.gamma, lambda: this.source ? this.lambda : null };
-    return { ...asked, ...Object.fromEntries(sides) };
+    const asked = { words: this.answer?.words ?? null, gamma: this.gamma, lambda: this.carried ? this.lambda : null };
+    const sides = this.sides.map((side) => {
+      const count = this.packed.header.sides[side].count;
+      const selected = this.byHand ? [...indices(this.selected(side))] : null;
+      return [side, { count, selected, edits: this.editsOf(side) }];
+    });
+    return { format: "kfgs.view", version: 1, ...asked, hidden: [...this.hidden], sides: Object.fromEntries(sides) };
+  }
+
+  /** The edits of one side as JSON. Removals come last, so that the numbers in all others are those of the viewer. */
+  editsOf(side) {
+    const own = this.now.edits.filter(({ rows }) => side in rows);
+    const gone = own.filter(({ op }) => op === "remove").flatMap(({ rows }) => [...rows[side]]);
+    const where = (numbers) => ({ kind: "index", indices: numbers });
+    const kept = own.filter(({ op }) => op !== "remove").map(({ rows, ...edit }) => ({ ...edit, where: where([...rows[side]]) }));
+    return gone.length ? [...kept, { op: "remove", where: where(gone) }] : kept;
+  }
+
+  /**
+   * Become what `toJSON` gave, except for the question; one step of undo.
+   * @throws {Error} a sentence for people, if it was of another scene
+   */
+  fromJSON(saved) {
+    if (saved?.format !== "kfgs.view" || saved.version !== 1) throw new Error("This file is no state of the viewer (“Save state”).");
+    const other = this.sides.find((side) => saved.sides[side]?.count !== this.packed.header.sides[side].count);
+    if (other) {
+      const [count, own] = [saved.sides[other]?.count ?? 0, this.packed.header.sides[other].count];
+      throw new Error(`This state is of another scene, with ${whole(count)} ${SIDE_WORDS[other]} Gaussians; here are ${whole(own)}.`);
+    }
+    const edits = this.sides.flatMap((side) =>
+      saved.sides[side].edits.map(({ where, ...edit }) => ({ ...edit, rows: { [side]: Uint32Array.from(where.indices) } })));
+    const hand = {};
+    for (const side of this.sides) {
+      const { selected, count } = saved.sides[side];
+      const copies = edits.filter(({ op, rows }) => op === "duplicate" && side in rows);
+      if (!selected) continue;
+      hand[side] = new Uint8Array(copies.reduce((all, { rows }) => all + rows[side].length, count));
+      for (const i of selected) hand[side][i] = 1;
+    }
+    this.step("open", { edits, hand });
+    if (saved.lambda !== null) this.lambda = saved.lambda;
+    this.setHidden(saved.hidden);
   }
 
   /** Counts of the question's scores in bins from `low` to `high`. */
   gammaHistogram() {
-    const { words, scores, low, high } = this.answer;
-    return this.cached(`gamma bins ${words}`, () => bins(scores, (score) => (score - low) / (high - low)));
+    const { id, scores, low, high } = this.answer;
+    return this.cached(`gamma bins ${id}`, () => bins(scores, (score) => (score - low) / (high - low)));
   }
 
   /** Counts of the distances to the nearest labelled Gaussian, in bins of the logarithm. */
   lambdaHistogram() {
     const [low, span] = this.lambdaSpan();
-    return this.cached("lambda bins", () => bins(this.far, (far) => (Math.log(Math.max(far, 1e-30)) - low) / span));
+    return this.cached("lambda bins", () => bins(bufferOf(this.packed, "color/far"), (far) => (Math.log(Math.max(far, 1e-30)) - low) / span));
   }
 
   /** Logarithm of the smallest lambda, and the width of its range. */
@@ -427,23 +478,40 @@ export class Model extends EventTarget {
   }
 
   changed() {
+    this.apply();
     this.dispatchEvent(new Event("change"));
+  }
+
+  /** Make the clouds what the edits make of them. */
+  apply() {
+    const [had, wanted] = [this.applied, this.now.edits];
+    let same = 0;
+    while (same < had.length && had[same] === wanted[same]) same++;
+    const changed = new Set(had.slice(same).flatMap(({ rows }) => Object.keys(rows)));
+    for (const side of changed) {
+      this.clouds[side] = new Cloud(this.packed, side);
+      for (const edit of wanted.slice(0, same)) this.clouds[side].apply(edit);
+    }
+    for (const edit of wanted.slice(same)) for (const side of this.sides) this.clouds[side].apply(edit);
+    this.applied = wanted;
   }
 
   bySides() {
     return Object.fromEntries(this.sides.map((side) => [side, this.selected(side)]));
   }
 
-  eachSelected(visit) {
-    for (const side of this.sides) {
-      const mask = this.selected(side);
-      if (sum(mask)) visit(side, mask);
-    }
+  /** What labels and masks of a side depend on. */
+  key(side) {
+    const { id, count } = this.clouds[side];
+    return `${id} ${count} ${side === "color" ? this.lambda : ""}`;
   }
 
-  carry(values, nothing, Kind) {
-    const made = new Kind(this.source.length).fill(nothing);
-    for (let i = 0; i < made.length; i++) if (this.far[i] < this.lambda) made[i] = values[this.source[i]];
+  /** Values of the semantic Gaussians for all Gaussians of a side. */
+  carry(side, values, nothing, Kind) {
+    const { source, far, count } = this.clouds[side];
+    if (!source) return values;
+    const made = new Kind(count).fill(nothing);
+    for (let i = 0; i < count; i++) if (far[i] < this.lambda) made[i] = values[source[i]];
     return made;
   }
 
@@ -463,7 +531,13 @@ export function sum(mask) {
   return count;
 }
 
-const indices = (mask) => [...mask.keys()].filter((i) => mask[i]);
+/** The numbers of what a mask has, Uint32Array. */
+const indices = (mask) => Uint32Array.from(mask.keys()).filter((i) => mask[i]);
+
+function sameRows(a, b) {
+  const same = (p, q) => p?.length === q.length && p.every((row, k) => row === q[k]);
+  return Object.keys(a).length === Object.keys(b).length && Object.keys(b).every((side) => same(a[side], b[side]));
+}
 
 function bins(values, place) {
   const made = new Float64Array(BINS);

@@ -7,11 +7,12 @@ const MANY = 12; // classes from which on the list has a filter
 const css = (rgb) => `rgb(${rgb.join(",")})`;
 
 /**
- * Build the panel. `act`: {ask(words), fit(), saveJson()}, and with Python {saveSelection(), saveEdits(), describe(side, index)}.
+ * Build the panel. `act`: {ask(words), fit(), duplicate(), save(), open(file)}, and with Python {similar(), split(), saveSelection(), saveEdits(),
+ * describe(side, index)}.
  * Returns {element, refresh()}.
  */
 export function makePanel(model, act) {
-  const carried = model.source ? [lambdaPart(model)] : [];
+  const carried = model.carried ? [lambdaPart(model)] : [];
   const shown = [scorePart(model), pickPart(model, act), selectionPart(model, act), partsPart(model, act), ...carried, classesPart(model, act)];
   return {
     element: h("aside", { class: "panel", "aria-label": "Search, classes and selection" }, ...shown.map((one) => one.element)),
@@ -62,7 +63,7 @@ function lambdaPart(model) {
 function classesPart(model, act) {
   const present = new Set(model.own);
   const labels = [...model.names.keys()].filter((label) => present.has(label));
-  if (model.source || present.has(-1)) labels.push(-1);
+  if (model.carried || present.has(-1)) labels.push(-1);
   const rows = labels.map((label) => classRow(model, label, act));
   const list = h("ul", { class: "classes" }, ...rows.map((row) => row.element));
   const all = textButton("Show all", () => model.setHidden([]), { class: "link" });
@@ -115,25 +116,30 @@ function selectionPart(model, act) {
     button("Fit", "Move the camera to the selection (F)", act.fit),
     button("Clear", "Select nothing (Escape)", () => model.clear()),
   ];
-  const paint = () => model.recolor(hex(color.value));
+  const paint = () => model.recolor(hex(color.value).map((value) => value / 255));
   const color = h("input", { type: "color", value: "#c04040", "aria-label": "New colour", onchange: paint });
   const fade = () => model.fade(opacity.value / 100);
   const opacity = h("input", { type: "range", min: 0, max: 100, value: 100, "aria-label": "Opacity", onchange: fade });
   const edits = [
     button("Remove", "Remove the selected Gaussians (Delete)", () => model.remove(), { class: "danger" }),
-    h("label", { class: "pair", title: "Give the selection a colour" }, "Recolour", color),
+    button("Duplicate", "Add a copy of the selected Gaussians beside them; move it with tool 6", act.duplicate),
+    h("label", { class: "pair", title: "Give the selection a colour, and keep its shading" }, "Recolour", color),
     h("label", { class: "pair", title: "Make the selection transparent" }, "Opacity", opacity),
   ];
-  const restore = button("Restore all", "Undo all removals, colours and opacities", () => model.restore(), { class: "link" });
-  const save = button("Save as JSON", "Save question, selection and edits, with the numbers of the Gaussians", act.saveJson);
+  const restore = button("Restore all", "Undo all edits", () => model.restore(), { class: "link" });
+  const save = button("Save state", "Save question, selection and edits as JSON, to open again", act.save);
+  const file = h("input", { type: "file", accept: ".json,application/json", hidden: true, "aria-label": "State to open" });
+  file.addEventListener("change", () => (act.open(file.files[0]), (file.value = "")));
+  const open = button("Open state", "Open a state that was saved", () => file.click());
   const files = act.saveSelection ? [
     button("Save Gaussians", "Write the selected Gaussians as PLY files, and their parts", act.saveSelection),
     button("Save edited scene", "Write the scene with its edits, and the edits as JSON", act.saveEdits),
   ] : [];
+  if (act.similar) change.push(button("Similar", "Search for what is like the selection", act.similar));
   const split = act.split ? [button("Parts", "List the connected parts of the selection: chair 1, chair 2", act.split)] : [];
   change.push(...split);
   const boxes = h("div", {}, h("div", { class: "buttons" }, ...change), h("div", { class: "buttons" }, ...edits));
-  const element = section("Selection", restore, said, boxes, h("div", { class: "buttons" }, ...files, save));
+  const element = section("Selection", restore, said, boxes, h("div", { class: "buttons" }, ...files, save, open, file));
   const refresh = () => {
     const count = model.counts(model.side).selected;
     const other = model.sides.find((side) => side !== model.side && model.counts(side).selected > 0);
@@ -141,9 +147,10 @@ function selectionPart(model, act) {
     save.hidden = boxes.hidden && !model.edited;
     if (files.length) [files[0].hidden, files[1].hidden] = [boxes.hidden, !model.edited];
     restore.hidden = !model.edited;
+    if (model.now.what !== "opacity") opacity.value = 100;
     const more = other ? `, and ${whole(model.counts(other).selected)} ${SIDE_WORDS[other]} ones` : "";
     said.textContent = boxes.hidden
-      ? "Search for a class, or select with the box, the lasso or the brush."
+      ? "Search for a class, or select with the box, the lasso, the brush or the ball."
       : `${whole(count)} ${SIDE_WORDS[model.side]} Gaussians${more}`;
   };
   return { element, refresh };
@@ -179,7 +186,7 @@ function pickPart(model, act) {
   };
   const seenBy = async ({ side, index }) => {
     const key = `${side} ${index}`;
-    if (views.key !== key) views = { key, found: act.describe(side, index) };
+    if (views.key !== key) views = { key, found: act.describe(side, model.clouds[side].origin?.[index] ?? index) };
     const { views: sights } = await views.found.catch(() => ({ views: [] }));
     const now = model.picked;
     if (!sights.length || !now || `${now.side} ${now.index}` !== key || body.querySelector(".seen")) return;

@@ -19,9 +19,8 @@ export class Panes {
   async start(options) {
     const { model } = this;
     this.renderer = await Renderer.create(this.canvas, options);
-    this.renderer.load(model.packed);
+    this.renderer.load(model.packed, model.clouds);
     this.renderer.onorder = () => this.redraw();
-    for (const side of model.sides) model.positions[side] = this.renderer.means(side);
   }
 
   dispose() {
@@ -40,9 +39,14 @@ export class Panes {
     this.layout = layout;
   }
 
-  /** The pane at a place (CSS pixels) becomes the active one: counts are of its side. */
+  /** The pane at a place (CSS pixels). */
+  at(x) {
+    return this.list[this.list.length > 1 && x * this.ratio >= this.border() ? 1 : 0];
+  }
+
+  /** The pane at a place becomes the active one: counts are of its side. */
   activate(x) {
-    this.active = this.list[this.list.length > 1 && x * this.ratio >= this.border() ? 1 : 0];
+    this.active = this.at(x);
     this.model.side = this.active.side;
     return this.active;
   }
@@ -64,6 +68,14 @@ export class Panes {
   depth([x, y, z]) {
     const m = this.camera.viewmat;
     return m[8] * x + m[9] * y + m[10] * z + m[11];
+  }
+
+  /** Where a point is seen in a pane, CSS pixels; null behind the camera. */
+  project(point, pane) {
+    const { viewmat: m, fx, fy, cx, cy, near } = this.camera;
+    const [x, y, z] = [0, 4, 8].map((row) => m[row] * point[0] + m[row + 1] * point[1] + m[row + 2] * point[2] + m[row + 3]);
+    if (!(z > near)) return null;
+    return [this.viewport(pane).x + (fx * x) / z + cx, (fy * y) / z + cy].map((value) => value / this.ratio);
   }
 
   resize(width, height) {
@@ -144,12 +156,12 @@ export class Panes {
     return Math.round(this.canvas.width * (this.layout === "slider" ? this.slider : 0.5));
   }
 
-  /** Give the renderer a pane's side, masks and look. */
+  /** Give the renderer a pane's side, cloud and look. */
   prepare(pane) {
     const { model, renderer } = this;
     const { answer } = model;
     renderer.setSide(pane.side);
-    this.sendMasks(pane.side);
+    this.sendCloud(pane.side);
     const [low, high] = answer ? [answer.low, answer.high] : model.packed.header.clim;
     const hidden = new Uint8Array(model.names.length + 1);
     for (const label of model.hidden) hidden[label < 0 ? model.names.length : label] = 1;
@@ -163,25 +175,20 @@ export class Panes {
   /** What the renderer calls a question; scores that came from Python are sent once. */
   question(answer) {
     if (answer.number === undefined) {
-      answer.number = `words ${answer.words}`; // no number of a class, whatever the words
+      answer.number = `words ${answer.id} ${answer.words}`; // no number of a class, whatever the words
       this.renderer.setScores(answer.number, answer.scores);
     }
     return answer.number;
   }
 
-  /** Send the masks that changed since the last time. */
-  sendMasks(side) {
+  /** Give the renderer the cloud of a side, if it changed, and the selection by hand. */
+  sendCloud(side) {
     const { renderer, model } = this;
-    const { now, byHand } = model;
-    const sent = (this.sent[side] ??= { selected: null, removed: null, opacity: null, colors: null });
-    const send = (name, key, set) => {
-      if (sent[name] !== key) set();
-      sent[name] = key;
-    };
-    const [removed, opacity, colors] = [now.removed, now.opacity, now.colors].map((one) => one[side] ?? null);
-    send("selected", byHand ? now.id : null, () => renderer.setMask("selected", byHand ? model.selected(side) : null));
-    send("removed", removed, () => renderer.setMask("removed", removed));
-    send("opacity", opacity, () => renderer.setFade(opacity));
-    send("colors", colors, () => renderer.setColors(colors));
+    const cloud = model.clouds[side];
+    renderer.update(cloud);
+    const wanted = model.byHand ? `${model.now.id} ${cloud.id} ${cloud.count}` : null;
+    if (this.sent[side] === wanted && (wanted === null) === (cloud.selected === null)) return;
+    renderer.setSelected(model.byHand ? model.selected(side) : null);
+    this.sent[side] = wanted;
   }
 }

@@ -2,7 +2,7 @@
  * Draws clouds of Gaussians with WebGL 2 by the rules of kfgs's rasteriser. Class, score and distance to the semantic cloud
  * are textures, so that gamma, lambda, hidden classes and modes change with a uniform and without Python.
  */
-import {Cloud, UNKNOWN, bufferOf, questionNumber} from "./clouds.js";
+import {UNKNOWN, bufferOf, cloudsOf, questionNumber} from "./clouds.js";
 import {bind, fill, frame, program, rectangles, row, sheet, texture, withAlpha} from "./gl.js";
 import {gaussianAt, gaussiansIn} from "./pick.js";
 import {BATCH, COVERED, FINISH, PREPARE, SPLAT_FRAGMENT, SPLAT_VERTEX, WHOLE, WIDTH} from "./shaders.js";
@@ -75,28 +75,25 @@ export class Renderer {
     canvas.addEventListener("webglcontextlost", this.onlost);
   }
 
-  /** Load a pack: {header, data: ArrayBuffer}. What was loaded before is dropped. */
-  load(packed) {
+  /** Load a pack: {header, data: ArrayBuffer}, and its clouds by side. What was loaded before is dropped. */
+  load(packed, clouds = cloudsOf(packed)) {
     this.#forget();
-    this.loads++;
     const {gl} = this;
     const {header} = packed;
     this.names = header.classes;
     this.scores = {null: bufferOf(packed, "semantic/label_scores")};
     for (const {buffer} of Object.values(header.query)) this.scores[questionNumber(buffer)] = bufferOf(packed, buffer);
-    const semantic = new Cloud(packed, "semantic");
+    const {labels} = clouds.semantic;
     const latents = bufferOf(packed, "semantic/latents");
     this.shared = {
-      labels: sheet(gl, gl.R16I, semantic.count, semantic.labels),
-      scores: sheet(gl, gl.R32F, semantic.count, null),
-      latents: sheet(gl, gl.RGBA8, semantic.count, latents ? withAlpha(latents) : null),
+      labels: sheet(gl, gl.R16I, labels.length, labels),
+      scores: sheet(gl, gl.R32F, labels.length, null),
+      latents: sheet(gl, gl.RGBA8, labels.length, latents ? withAlpha(latents) : null),
       colormap: row(gl, withAlpha(bufferOf(packed, "colormap"))),
       classes: row(gl, new Uint8Array(4 * (this.names.length + 1))),
     };
     this.inTexture = undefined;
-    for (const side of Object.keys(header.sides)) {
-      this.#addSide(side === "semantic" ? semantic : new Cloud(packed, side));
-    }
+    Object.values(clouds).forEach((cloud) => this.#addSide(cloud));
     this.side = "color" in this.sides ? "color" : "semantic";
     this.setLook({});
   }
@@ -141,37 +138,32 @@ export class Renderer {
     this.#showScores();
   }
 
-  /** Mark Gaussians of the current side: "selected" (instead of the question's) or "removed"; null takes the marks away. */
-  setMask(kind, mask) {
-    this.#current().cloud[kind] = mask;
-    this.#showMarks();
+  /** Mark Gaussians of the current side as selected, instead of what the question selects; null takes the marks away. */
+  setSelected(mask) {
+    const {cloud} = this.#current();
+    cloud.selected = mask;
+    cloud.stamps.marks++;
+    this.update(cloud);
   }
 
-  /** Factors of the opacity of the current side's Gaussians, 0..255; null: none. */
-  setFade(factors) {
-    this.#current().cloud.fade = factors;
-    this.#showMarks();
-  }
-
-  /** Colours of the current side's Gaussians, [N * 4] bytes, alpha 255 where they replace the own ones; null: none. */
-  setColors(colors) {
-    const {cloud, textures} = this.#current();
-    fill(this.gl, textures.paints, this.gl.RGBA8, colors ?? new Uint8Array(4 * cloud.count));
-  }
-
-  /** Move Gaussians of the current side: indices and their new means, [n * 3]. */
-  setMeans(indices, means) {
-    const {cloud, textures} = this.#current();
-    cloud.setMeans(indices, means);
-    fill(this.gl, textures.splats, this.gl.RGBA32UI, cloud.splats);
-    const moved = {indices: Uint32Array.from(indices), means: Float32Array.from(means)};
-    this.sorter.send({kind: "move", side: cloud.side, ...moved});
-    this.#current().asked = null; // sort again
-  }
-
-  /** The centres of a side's Gaussians, [N * 3]; not to be changed. */
-  means(side = this.side) {
-    return this.sides[side].cloud.means;
+  /** Show a cloud in place of the one of its side, or what was changed in it. */
+  update(cloud) {
+    const had = this.sides[cloud.side];
+    const {stamps} = cloud;
+    if (had.cloud !== cloud || had.count !== cloud.count) {
+      const {side} = this;
+      this.#dropSide(had);
+      this.#addSide(cloud);
+      this.side = side;
+      return;
+    }
+    if (had.stamps.splats !== stamps.splats) {
+      fill(this.gl, had.textures.splats, this.gl.RGBA32UI, cloud.splats);
+      this.#sendMeans(had);
+    }
+    if (had.stamps.colors !== stamps.colors) this.#showColors(had);
+    if (had.stamps.marks !== stamps.marks) this.#showMarks(had);
+    had.stamps = {...stamps};
   }
 
   /**
@@ -261,43 +253,47 @@ export class Renderer {
 
   #addSide(cloud) {
     const {gl} = this;
-    const {count} = cloud;
-    const planes = cloud.sh ? cloud.sh.length / 2 / count : 0;
+    const {count, planes} = cloud;
     const rows = Math.ceil(count / WIDTH);
     const shape = texture(gl, gl.RGBA32UI, WIDTH, rows);
     const paint = texture(gl, gl.RGBA32UI, WIDTH, rows);
-    const shs = texture(gl, gl.RG32UI, planes ? WIDTH : 1, Math.max(1, planes * rows));
-    for (let t = 0; t < planes; t++) {
-      fill(gl, shs, gl.RG32UI, cloud.sh.subarray(2 * t * count, 2 * (t + 1) * count), t * rows);
-    }
     const textures = {
       splats: sheet(gl, gl.RGBA32UI, count, cloud.splats),
-      dcs: sheet(gl, gl.R32UI, count, cloud.dc),
-      shs,
-      marks: sheet(gl, gl.RG8UI, count, null),
+      dcs: sheet(gl, gl.R32UI, count, null),
+      shs: texture(gl, gl.RG32UI, planes ? WIDTH : 1, Math.max(1, planes * rows)),
+      marks: sheet(gl, gl.R8UI, count, null),
       fars: sheet(gl, gl.RG32UI, cloud.far ? count : 1, cloud.far && new Uint32Array(cloud.far.slice().buffer)),
       sources: sheet(gl, gl.R32I, cloud.far ? count : 1, cloud.source),
-      paints: sheet(gl, gl.RGBA8, count, new Uint8Array(4 * count)),
       order: sheet(gl, gl.R32UI, count, null),
     };
     const prepared = frame(gl, [shape, paint]);
-    this.sides[cloud.side] = {
-      cloud, textures, rows, planes, shape, paint, prepared, length: 0, asked: null, fresh: null, busy: false,
+    const state = {
+      cloud, count, textures, rows, shape, paint, prepared, id: ++this.loads, stamps: {...cloud.stamps},
+      length: 0, asked: null, fresh: null, busy: false,
     };
-    this.sorter.send({kind: "load", side: cloud.side, means: cloud.means, radii: cloud.radii()});
+    this.sides[cloud.side] = state;
     this.side = cloud.side;
-    this.#showMarks();
+    this.#sendMeans(state);
+    this.#showColors(state);
+    this.#showMarks(state);
   }
 
-  #showMarks() {
-    const {cloud, textures} = this.#current();
-    const {selected, removed, fade, count} = cloud;
-    const marks = new Uint8Array(2 * count);
-    for (let i = 0; i < count; i++) {
-      marks[2 * i] = (selected?.[i] ? 1 : 0) | (removed?.[i] ? 2 : 0);
-      marks[2 * i + 1] = fade ? fade[i] : 255;
-    }
-    fill(this.gl, textures.marks, this.gl.RG8UI, marks);
+  #sendMeans(state) {
+    const {side, means} = state.cloud;
+    this.sorter.send({kind: "load", side, means, radii: state.cloud.radii()});
+    state.asked = null; // sort again
+  }
+
+  #showColors({cloud, textures, rows}) {
+    const {gl} = this;
+    const {count, planes, dc, sh} = cloud;
+    fill(gl, textures.dcs, gl.R32UI, dc);
+    for (let t = 0; t < planes; t++) fill(gl, textures.shs, gl.RG32UI, sh.subarray(2 * t * count, 2 * (t + 1) * count), t * rows);
+  }
+
+  #showMarks({cloud, textures}) {
+    const {selected, removed} = cloud;
+    fill(this.gl, textures.marks, this.gl.R8UI, removed.map((gone, i) => (selected?.[i] ? 1 : 0) | (gone << 1)));
   }
 
   #showScores() {
@@ -326,12 +322,12 @@ export class Renderer {
     const limits = [...grow(-cx / fx, (width - cx) / fx), ...grow(-cy / fy, (height - cy) / fy), 2 / Math.min(fx, fy)];
     state.busy = true;
     state.sent = state.asked;
-    this.sorter.send({kind: "sort", side: state.cloud.side, load: this.loads, share, view: viewmat, limits, near});
+    this.sorter.send({kind: "sort", side: state.cloud.side, load: state.id, share, view: viewmat, limits, near});
   }
 
   #sorted({side, load, order, ms}) {
     const state = this.sides[side];
-    if (!state || load !== this.loads) return; // of what was loaded before
+    if (!state || load !== state.id) return; // of what was loaded before
     state.busy = false;
     state.length = order.length;
     state.fresh = state.sent;
@@ -398,7 +394,7 @@ export class Renderer {
     bind(gl, prepare, {...textures, ...shared});
     gl.uniform1i(at.count, state.length);
     gl.uniform1i(at.rows, state.rows);
-    gl.uniform1i(at.degree, state.planes ? meta.sh_degree : 0);
+    gl.uniform1i(at.degree, cloud.planes ? meta.sh_degree : 0);
     gl.uniform1i(at.mode, MODES.indexOf(look.mode));
     gl.uniform1i(at.carried, cloud.source ? 1 : 0);
     gl.uniform1i(at.asked, look.question === null ? 0 : 1);
@@ -529,7 +525,7 @@ export class Renderer {
     };
     const {hidden, lambda} = look;
     const drawn = (i) => {
-      if (cloud.removed?.[i]) return false;
+      if (cloud.removed[i]) return false;
       if (!hidden) return true;
       const label = cloud.labelOf(i, lambda);
       return !hidden[label < 0 ? this.names.length : label];
@@ -539,12 +535,15 @@ export class Renderer {
     return {cloud, camera: stretched, left: view.x, top: view.y, drawn, chosen};
   }
 
+  #dropSide({textures, shape, paint, prepared}) {
+    const {gl} = this;
+    [...Object.values(textures), shape, paint].forEach((made) => gl.deleteTexture(made));
+    gl.deleteFramebuffer(prepared);
+  }
+
   #forget() {
     const {gl} = this;
-    for (const {textures, shape, paint, prepared} of Object.values(this.sides)) {
-      [...Object.values(textures), shape, paint].forEach((made) => gl.deleteTexture(made));
-      gl.deleteFramebuffer(prepared);
-    }
+    Object.values(this.sides).forEach((state) => this.#dropSide(state));
     Object.values(this.shared ?? {}).forEach((made) => gl.deleteTexture(made));
     this.#dropTarget();
     this.sides = {};

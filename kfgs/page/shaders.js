@@ -26,7 +26,7 @@ void main() {
 export const PREPARE = `${HEAD}
 uniform usampler2D order, splats, dcs, shs, marks, fars;
 uniform isampler2D labels, sources;
-uniform sampler2D scores, latents, colormap, classes, paints;
+uniform sampler2D scores, latents, colormap, classes;
 uniform int count, rows, degree, mode;          // count: in view; mode: 0 color, 1 labels, 2 score, 3 latents
 uniform bool carried, asked, masked, dim;       // carried: labels come from the source; masked: selection is a mask
 uniform vec3 center, spread;                    // of the box of the means
@@ -107,8 +107,7 @@ vec3 colorOf(int i, vec3 direction) {
   uint word = texelFetch(dcs, place(i), 0).x;
   vec3 base = vec3(word & 1023u, (word >> 10) & 1023u, (word >> 20) & 1023u) * dcScale.y + dcScale.x;
   if (degree > 0) base += harmonics(i, direction);
-  vec4 painted = texelFetch(paints, place(i), 0);
-  return mix(max(base, 0.0), painted.rgb, painted.a);
+  return max(base, 0.0);
 }
 
 void main() {
@@ -120,11 +119,11 @@ void main() {
   ivec2 at = place(i);
 
   uvec4 s = texelFetch(splats, at, 0);
-  uvec2 mark = texelFetch(marks, at, 0).xy;     // flags, factor of the opacity
-  float opacity = float(s.w >> 24) / 255.0 * float(mark.y) / 255.0;
+  uint mark = texelFetch(marks, at, 0).x;       // selected: 1, removed: 2
+  float opacity = float(s.w >> 24) / 255.0;
   vec3 mean = meanOf(s);
   vec3 p = (view * vec4(mean, 1.0)).xyz;
-  if (!(p.z > near) || opacity <= 1.0 / 255.0 || (mark.x & 2u) != 0u) return;
+  if (!(p.z > near) || opacity <= 1.0 / 255.0 || (mark & 2u) != 0u) return;
 
   int source = i;                               // the semantic Gaussian that gives label and score
   if (carried) {
@@ -136,7 +135,7 @@ void main() {
   vec4 group = texelFetch(classes, ivec2(label + 1, 0), 0);
   if (group.a == 0.0) return;                   // hidden
   float score = source < 0 ? -3e38 : texelFetch(scores, place(source), 0).x;
-  bool chosen = masked ? (mark.x & 1u) != 0u : asked && score > UNKNOWN && score > gamma;
+  bool chosen = masked ? (mark & 1u) != 0u : asked && score > UNKNOWN && score > gamma;
 
   vec3 color = mode == 0 || mixing < 1.0 ? colorOf(i, normalize(mean - eye)) : vec3(0.0);
   if (mode > 0) {

@@ -6,7 +6,7 @@
  */
 
 /**
- * Answer messages. "load" gives {side, means, radii}; "move" {side, indices, means}; "sort" {side, load, share, view, limits,
+ * Answer messages. "load" gives {side, means, radii}; "sort" {side, load, share, view, limits,
  * near} is answered by {side, load, order, ms}; with a share below 1 always the same Gaussians are left out, chosen at random.
  * @param {{onmessage: ?function, postMessage: function}} scope the worker, or an object like it
  */
@@ -69,9 +69,6 @@ export function sorterMain(scope) {
     load({side, means, radii}) {
       const n = radii.length;
       clouds[side] = {means, radii, seen: new Uint32Array(n), other: new Uint32Array(n), depths: new Float32Array(n)};
-    },
-    move({side, indices, means}) {
-      for (let k = 0; k < indices.length; k++) clouds[side].means.set(means.subarray(3 * k, 3 * k + 3), 3 * indices[k]);
     },
     sort({side, load, share, view, limits, near}) {
       const start = performance.now();

@@ -1,4 +1,4 @@
-/** Pointer and keys over the view: orbit, pan, zoom, fly, click; box, lasso and brush. */
+/** Pointer and keys over the view: orbit, pan, zoom, fly, click; box, lasso, brush, ball; moving the selection. */
 
 import { svg } from "./dom.js";
 
@@ -11,8 +11,9 @@ export class Tools {
   /**
    * @param {HTMLElement} stage what the pointer works on
    * @param {Eye} eye the camera
-   * @param {{moved(), grab(), click(x, y, event), twice(x, y), shape(polygon, how), brush(x, y, how, first), brushSize()}} on
-   *   places are CSS pixels of the stage; `how`: replace, add, subtract
+   * @param {{moved(), grab(), click(x, y), twice(x, y), hover(x, y), shape(polygon, how), ball(x, y, radius, how),
+   *   brush(x, y, how, first), brushSize(), shift(dx, dy, first, upward)}} on places are CSS pixels of the stage; `how`:
+   *   replace, add, subtract
    */
   constructor(stage, eye, on) {
     Object.assign(this, { stage, eye, on, tool: "move", points: new Map(), keys: new Set(), drag: null });
@@ -23,7 +24,10 @@ export class Tools {
     listen("pointermove", this.move);
     listen("pointerup", this.up);
     listen("pointercancel", this.cancel);
-    listen("pointerleave", () => this.drag || this.overlay.replaceChildren());
+    listen("pointerleave", () => {
+      this.on.hover(null);
+      if (!this.drag) this.overlay.replaceChildren();
+    });
     listen("wheel", this.wheel);
     listen("dblclick", (event) => this.tool === "move" && this.on.twice(...this.place(event)));
     listen("contextmenu", (event) => event.preventDefault());
@@ -43,6 +47,7 @@ export class Tools {
   down(event) {
     if (event.target.closest("button, input, select, .card")) return;
     this.stage.focus({ preventScroll: true });
+    this.on.hover(null);
     this.stage.setPointerCapture(event.pointerId);
     const place = this.place(event);
     this.points.set(event.pointerId, place);
@@ -57,7 +62,8 @@ export class Tools {
 
   move(event) {
     const place = this.place(event);
-    if (this.tool === "brush" && !this.points.size) this.circle(place);
+    if (this.tool === "brush" && !this.points.size) this.circle(place, this.on.brushSize());
+    if (this.tool === "move" && !this.points.size && event.pointerType === "mouse") this.on.hover(place);
     if (!this.points.has(event.pointerId)) return;
     if (this.points.size === 2) return this.pinch(event.pointerId, place);
     this.points.set(event.pointerId, place);
@@ -76,6 +82,10 @@ export class Tools {
       else eye.orbit(dx, dy);
       this.on.moved();
     } else if (drag.kind === "brush") this.paint(place, false);
+    else if (drag.kind === "shift") {
+      this.on.shift(dx, dy, drag.how === "add", !drag.begun);
+      drag.begun = true;
+    } else if (drag.kind === "ball") this.circle(drag.start, drag.far);
     else {
       drag.path = drag.kind === "box" ? corners(drag.start, place) : [...drag.path, place];
       this.outline(drag.path);
@@ -87,7 +97,8 @@ export class Tools {
     const { drag } = this;
     if (!drag || this.points.size) return;
     this.drag = null;
-    if (drag.kind !== "brush" && drag.far < CLICK) this.on.click(...drag.start, event);
+    if (drag.kind !== "brush" && drag.far < CLICK) this.on.click(...drag.start);
+    else if (drag.kind === "ball") this.on.ball(...drag.start, drag.far, drag.how);
     else if (drag.kind === "box" || drag.kind === "lasso") this.on.shape(drag.path, drag.how);
     if (drag.kind !== "brush") this.overlay.replaceChildren();
   }
@@ -123,12 +134,12 @@ export class Tools {
   }
 
   paint(place, first) {
-    this.circle(place);
+    this.circle(place, this.on.brushSize());
     this.on.brush(...place, this.drag.how, first);
   }
 
-  circle([cx, cy]) {
-    this.overlay.replaceChildren(svg("circle", { cx, cy, r: this.on.brushSize() }));
+  circle([cx, cy], r) {
+    this.overlay.replaceChildren(svg("circle", { cx, cy, r }));
   }
 
   outline(path) {

@@ -9,9 +9,12 @@ import cases_explorer
 import cases_page
 import numpy as np
 import pytest
+import torch
 from cases_web import SECONDS, needs_chromium, software_chromium
 from PIL import Image
 
+from kfgs.formats import SplatFile
+from kfgs.labels import EditList
 from kfgs.viz import available
 from kfgs.viz.explorer import Exploration, FieldMeaning, html, save_html
 
@@ -300,18 +303,108 @@ def test_grow_adds_and_shrink_drops_neighbours_and_invert_is_the_rest(page):
     assert grown[:150].sum() == grown.sum()
 
 
-def test_recolour_and_fade_change_the_picture_and_the_json(page):
+def test_edits_are_those_of_python(page, state, tmp_path):
+    """What a person does becomes an EditList, whose result has the Gaussians that the page shows."""
     ask(page, "table")
-    chosen = mask(page, "color")
-    page.evaluate("viewer.model.recolor([10, 200, 30])")
-    page.evaluate("viewer.model.fade(0.5)")
-    saved = json.loads(page.evaluate("JSON.stringify(viewer.model)"))
-    assert saved["words"] == "table"
-    assert saved["color"]["selected"] == np.flatnonzero(chosen).tolist()
-    assert saved["color"]["recolored"] == {"10,200,30": np.flatnonzero(chosen).tolist()}
-    assert saved["color"]["opacity"] == {"0.502": np.flatnonzero(chosen).tolist()}
+    chosen = np.flatnonzero(mask(page, "color")).tolist()
+    page.evaluate("viewer.model.recolor([0.1, 0.8, 0.3])")
+    page.evaluate("viewer.model.fade(0.3)")
+    page.evaluate("viewer.model.fade(0.5)")  # of the same selection: in place of the other
+    page.click("text=Duplicate")
+    copies = np.flatnonzero(mask(page, "color")).tolist()
+    assert copies == list(range(450, 450 + len(chosen)))
+    page.evaluate("viewer.model.move([0, 0, 1])")
+    page.evaluate("viewer.model.move([0, 0.5, 1], true)")  # of one drag
+    page.evaluate(
+        "viewer.model.select('color', Uint8Array.from({length: viewer.model.total('color')}, (_, i) => i < 5))"
+    )
+    page.locator(".stage").focus()
+    page.keyboard.press("Delete")
+    saved = json.loads(page.evaluate("JSON.stringify(viewer.model)"))["sides"]["color"]
+    assert [edit["op"] for edit in saved["edits"]] == ["recolor", "opacity", "duplicate", "move", "remove"]
+    assert (saved["edits"][1]["factor"], saved["edits"][3]["translation"]) == (0.5, [0, 0.5, 2])
+    made = EditList.from_json({"format": "kfgs.edits", "version": 1, "edits": saved["edits"]}, "saved")
+    cloud = state.cloud("color").replace(labels=torch.from_numpy(state.labels("color")))
+    edited = made.apply(SplatFile(cloud, {}, cases_page.NAMES)).gaussians
+    kept = np.flatnonzero(mask(page, "color", "drawn"))
+    here = np.array(page.evaluate("[...viewer.model.clouds.color.means]")).reshape(-1, 3)[kept]
+    np.testing.assert_allclose(here, edited.means, atol=1e-4)
+    np.testing.assert_array_equal(np.array(page.evaluate("[...viewer.model.labels('color')]"))[kept], edited.labels)
+    opacities = np.array(
+        page.evaluate(
+            "Array.from({length: viewer.model.total('color')}, (_, i) => viewer.model.clouds.color.opacityOf(i))"
+        )
+    )
+    np.testing.assert_allclose(opacities[kept], edited.opacities, atol=1 / 255)
+    for _ in range(5):
+        page.keyboard.press("Control+z")
+    assert page.evaluate("[viewer.model.total('color'), viewer.model.now.edits.length]") == [450, 1]
+    for _ in range(5):
+        page.keyboard.press("Control+Shift+Z")
+    assert json.loads(page.evaluate("JSON.stringify(viewer.model)"))["sides"]["color"]["edits"] == saved["edits"]
     page.click("text=Restore all")
     assert not page.evaluate("viewer.model.edited")
+    assert page.evaluate("viewer.model.total('color')") == 450
+
+
+def test_a_reload_keeps_the_work_and_a_saved_state_opens_again(page, tmp_path):
+    ask(page, "chair")
+    set_slider(page, "gamma", 0.5)
+    page.evaluate("viewer.model.recolor([0.1, 0.8, 0.3])")
+    page.click("button[aria-label='Hide table']")
+    with page.expect_download() as download:
+        page.click("text=Save state")
+    download.value.save_as(tmp_path / "state.json")
+    before = page.evaluate("JSON.stringify(viewer.model)")
+    assert json.loads((tmp_path / "state.json").read_text()) == json.loads(before)
+    until(page, lambda tab: tab.evaluate("sessionStorage.getItem(viewer.place)") == before)
+    page.on("dialog", lambda dialog: dialog.accept())  # "changes may not be saved"
+    page.reload()
+    page.wait_for_selector(".kfgs:not([aria-busy])")
+    assert page.evaluate("JSON.stringify(viewer.model)") == before
+    page.click("text=Restore all")
+    page.evaluate("viewer.ask('table')")
+    page.evaluate("viewer.model.invert()")
+    page.set_input_files("input[type=file]", tmp_path / "state.json")
+    until(page, lambda tab: tab.evaluate("JSON.stringify(viewer.model)") == before)
+    for wrong in ("{}", "no JSON", '{"format": "kfgs.view", "version": 1, "sides": {"color": {"count": 3}}}'):
+        (tmp_path / "wrong.json").write_text(wrong)
+        page.evaluate("viewer.say('')")
+        page.set_input_files("input[type=file]", tmp_path / "wrong.json")
+        page.wait_for_selector("[role=alert]:visible")
+        assert page.evaluate("JSON.stringify(viewer.model)") == before
+
+
+def test_a_ball_selects_what_lies_in_it_and_a_drag_moves_it(page):
+    middle = np.mean([place_of(page, "color", i) for i in range(150, 300)], axis=0)
+    page.keyboard.press("5")
+    page.mouse.move(*middle)
+    page.mouse.down()
+    page.mouse.move(middle[0] + 30, middle[1], steps=3)
+    page.mouse.up()
+    selected = np.flatnonzero(mask(page, "color"))
+    assert 0 < len(selected) <= 150
+    assert set(selected) <= set(range(150, 300))
+    before = np.array(place_of(page, "color", int(selected[0])))
+    page.keyboard.press("6")
+    page.mouse.move(*middle)
+    page.mouse.down()
+    page.mouse.move(middle[0] + 40, middle[1] - 20, steps=4)
+    page.mouse.up()
+    assert np.array(place_of(page, "color", int(selected[0]))) - before == pytest.approx([40, -20], abs=8)
+    page.keyboard.press("Control+z")
+    assert place_of(page, "color", int(selected[0])) == pytest.approx(before)
+
+
+def test_a_tooltip_names_what_the_pointer_rests_on(page):
+    middle = np.mean([place_of(page, "color", i) for i in range(150, 300)], axis=0)
+    page.mouse.move(*middle)
+    page.wait_for_selector(".tip:visible")
+    assert page.locator(".tip").inner_text().startswith("chair, 0.")
+    page.mouse.move(middle[0] + 3, middle[1])
+    page.mouse.down()
+    assert not page.locator(".tip").is_visible()
+    page.mouse.up()
 
 
 def test_keys_fly_and_turn_and_help_lists_them(page):

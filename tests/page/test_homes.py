@@ -127,7 +127,7 @@ def test_one_person_everywhere(browser, tmp_path, home):
         if home is in_file:  # export
             assert not page.locator("text=Save Gaussians").is_visible()
             assert (
-                json.loads(page.evaluate("JSON.stringify(viewer.model)"))["color"]["selected"]
+                json.loads(page.evaluate("JSON.stringify(viewer.model)"))["sides"]["color"]["selected"]
                 == np.flatnonzero(selected).tolist()
             )
         else:
@@ -187,7 +187,7 @@ def test_a_phrase_that_only_python_can_answer(browser, tmp_path, phrase):
         state.ask(phrase)
         agree(page, state)
         assert state.selected("semantic").any()
-        assert page.evaluate("viewer.panes.question(viewer.model.answer)") == f"words {phrase}"
-        assert page.evaluate("viewer.panes.renderer.look.question") == f"words {phrase}"
+        assert page.evaluate("viewer.panes.question(viewer.model.answer)") == f"words 1 {phrase}"
+        assert page.evaluate("viewer.panes.renderer.look.question") == f"words 1 {phrase}"
         assert page.evaluate(packed) == before
     page.close()

@@ -9,6 +9,8 @@ from small_room import make_room
 
 from kfgs.cameras import Camera
 from kfgs.formats import SplatFile, read_splats
+from kfgs.labels import EditList, OfIndex, Opacity, Recolor, Remove
+from kfgs.labels.edits import Duplicate, Move
 from kfgs.splat import rasterize
 from kfgs.viz.explorer import Exploration, SplatMeaning, gaussian_at
 from kfgs.viz.explorer.pack import pack_scene
@@ -166,31 +168,63 @@ def test_a_selection_is_that_of_python_and_the_rest_dims(viewer, state):
     state.ask(None)
 
 
-MASKS = """([kind, mask]) => {
-  renderer.setSide("color");
-  renderer.setMask(kind, mask && Uint8Array.from(mask));
+EDIT = """(edits) => {
+  const cloud = new kfgs.Cloud(packed, "color");
+  for (const {rows, ...edit} of edits) cloud.apply({...edit, rows: {color: Uint32Array.from(rows)}});
+  renderer.update(cloud);
 }"""
 
 
-def test_removed_and_recoloured_and_moved(viewer, state):
-    camera = state.cameras[0]
-    n = len(state.cloud("color"))
-    removed = np.arange(n) % 2 == 0
-    viewer.run(MASKS, ["removed", removed.astype(int).tolist()])
-    assert psnr(viewer.picture(camera), drawn(state, camera, keep=~removed)) > ENOUGH
-    viewer.run(MASKS, ["removed", None])
-    viewer.run("(n) => renderer.setColors(new Uint8Array(4 * n).fill(255))", n)
-    white = np.full((n, 3), 255, np.uint8)
-    assert psnr(viewer.picture(camera), drawn(state, camera, colors=white)) > ENOUGH
-    viewer.run("() => renderer.setColors(null)")
-    cloud = state.cloud("color")
-    there = torch.where((torch.arange(n) % 3 == 0)[:, None], cloud.means + torch.tensor([0.3, -0.2, 0.1]), cloud.means)
-    move = "([indices, means]) => renderer.setMeans(indices, Float32Array.from(means))"
-    viewer.run(move, [list(range(0, n, 3)), there[::3].flatten().tolist()])
-    truth = rasterize(cloud.replace(means=there), camera, background=PAPER).map.clamp(0, 1).numpy()
+def every(n, third):
+    return list(range(0, n, third))
+
+
+@pytest.mark.parametrize(
+    "edits",
+    [
+        (Remove, {}),
+        (Opacity, {"factor": 0.3}),
+        (Move, {"translation": [0.3, -0.2, 0.1]}),
+        (Duplicate, {"translation": [0.3, -0.2, 0.1]}),
+        (Recolor, {"rgb": [0.75, 0.25, 0.1]}),
+        (Recolor, {"rgb": [1.0, 1.0, 1.0]}),
+        (Recolor, {"rgb": [0.02, 0.02, 0.1]}),
+    ],
+    ids=["remove", "opacity", "move", "duplicate", "recolor", "white", "dark"],
+)
+def test_an_edit_is_that_of_python(viewer, state, edits):
+    kind, values = edits
+    camera, cloud = state.cameras[0], state.cloud("color")
+    rows = every(len(cloud), 3)
+    viewer.run(EDIT, [{"op": kind.op, "rows": rows, **values}])
+    edited = kind(OfIndex(tuple(rows)), **values).apply(SplatFile(cloud)).gaussians
+    truth = rasterize(edited, camera, background=PAPER).map.clamp(0, 1).numpy()
+    before = rasterize(cloud, camera, background=PAPER).map.clamp(0, 1).numpy()
+    picture = viewer.picture(camera)
+    assert psnr(picture, truth) > ENOUGH
+    assert psnr(picture, truth) > psnr(picture, before) + 3
+    viewer.run(EDIT, [])
+    assert psnr(viewer.picture(camera), before) > ENOUGH
+
+
+def test_edits_follow_each_other(viewer, state):
+    """Copies are recoloured, moved and removed by their own numbers."""
+    camera, cloud = state.cameras[0], state.cloud("color")
+    n = len(cloud)
+    rows = every(n, 4)
+    copies = list(range(n, n + len(rows)))
+    steps = [
+        (Duplicate, rows, {"translation": [0.0, -0.4, 0.0]}),
+        (Recolor, copies + rows[:50], {"rgb": [0.1, 0.6, 0.9]}),
+        (Move, copies[::2], {"translation": [0.2, 0.0, 0.0]}),
+        (Recolor, copies[::3], {"rgb": [0.9, 0.6, 0.1]}),
+        (Remove, copies[1::2] + rows[::2], {}),
+    ]
+    viewer.run(EDIT, [{"op": kind.op, "rows": own, **values} for kind, own, values in steps])
+    edited = EditList(tuple(kind(OfIndex(tuple(own)), **values) for kind, own, values in steps)).apply(SplatFile(cloud))
+    truth = rasterize(edited.gaussians, camera, background=PAPER).map.clamp(0, 1).numpy()
     assert psnr(viewer.picture(camera), truth) > ENOUGH
-    viewer.run(move, [list(range(n)), cloud.means.flatten().tolist()])
-    assert psnr(viewer.picture(camera), drawn(state, camera)) > ENOUGH
+    viewer.run(EDIT, [])
 
 
 @pytest.mark.parametrize("side", ["color", "semantic"])

@@ -140,27 +140,43 @@ class EditList:
             content = read_json(path)
         except RecursionError as error:
             raise ValueError(f"{path}: expected saved edits, got JSON that nests too deep; write it again") from error
+        return EditList.from_json(content, str(path), path.parent, anywhere=anywhere)
+
+    @staticmethod
+    def from_json(content: Any, name: str, folder: str | Path = ".", *, anywhere: bool = False) -> EditList:
+        """The list from what `save` wrote, already parsed.
+
+        Args:
+            content: the JSON object.
+            name: of its file or argument, for messages.
+            folder: paths of files to insert are relative to it.
+            anywhere: as in `load`.
+
+        Raises:
+            FileNotFoundError: if a file to insert is missing.
+            ValueError: as in `load`.
+        """
         if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise ValueError(f"{path}: expected edits that kfgs saved ('format': {FORMAT!r}), got something else")
+            raise ValueError(f"{name}: expected edits that kfgs saved ('format': {FORMAT!r}), got something else")
         if type(content.get("version")) is not int or content["version"] != VERSION:  # True and 1.0 equal 1
             raise ValueError(
-                f"{path}: expected version {VERSION} of {FORMAT}, got {content.get('version')!r:.80}; install the kfgs "
+                f"{name}: expected version {VERSION} of {FORMAT}, got {content.get('version')!r:.80}; install the kfgs "
                 "that wrote it"
             )
         unknown = sorted(set(content) - {"format", "version", "edits", "undone"})
         if unknown:
-            raise ValueError(f"{path}: expected 'edits' and 'undone', got {unknown[0]!r:.80}; correct or delete it")
+            raise ValueError(f"{name}: expected 'edits' and 'undone', got {unknown[0]!r:.80}; correct or delete it")
         lists = {}
-        for name in ("edits", "undone"):
-            values = content.get(name, [])
-            if not isinstance(values, list) or (name == "edits" and name not in content):
-                raise ValueError(f"{path}: {name}: expected a list of edits, got {values!r:.80}; write it as [...]")
+        for key in ("edits", "undone"):
+            values = content.get(key, [])
+            if not isinstance(values, list) or (key == "edits" and key not in content):
+                raise ValueError(f"{name}: {key}: expected a list of edits, got {values!r:.80}; write it as [...]")
             try:
-                lists[name] = tuple(_read(v, f"{name}[{i}]", path.parent, anywhere) for i, v in enumerate(values))
+                lists[key] = tuple(_read(v, f"{key}[{i}]", Path(folder), anywhere) for i, v in enumerate(values))
             except FileNotFoundError as error:
-                raise FileNotFoundError(f"{path}: {error}") from error
+                raise FileNotFoundError(f"{name}: {error}") from error
             except ValueError as error:
-                raise ValueError(f"{path}: {error}") from error
+                raise ValueError(f"{name}: {error}") from error
         return EditList(**lists)
 
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..._card import short_repr
+from ..._check import as_tensor
 from ...cameras import Camera
 from ...formats import SplatFile
 from ...formats.splat_file import SCORE
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from ...fields import SemanticField
 
 UNIT = (0.0, 1.0)
+MOST_COMPARED = 2000  # features of a selection whose mean is taken
 
 
 class Asked(NamedTuple):
@@ -58,6 +60,14 @@ class Meaning(Protocol):
 
         Raises:
             ValueError: if there is no answer; the message offers similar names.
+        """
+        ...
+
+    def similar(self, mask: Tensor) -> Asked:  # [N] bool
+        """Answer "what is like these Gaussians?".
+
+        Raises:
+            ValueError: if nothing is known about any of them, or there is nothing to compare.
         """
         ...
 
@@ -120,6 +130,24 @@ class FieldMeaning:
         if words not in self._answers:
             self._answers[words] = self._answer(words, words if known else self._phrase(words))
         return self._answers[words]
+
+    def similar(self, mask: Tensor) -> Asked:  # [N] bool
+        """Compare with the mean direction of some Gaussians' features, by cosine; the suggested gamma selects half of them.
+
+        Raises:
+            ValueError: if nothing is known about any of them.
+        """
+        field = self._field
+        chosen = as_tensor("mask", mask).to(field.known.device) & field.known
+        if not bool(chosen.any()):
+            raise ValueError("selection: expected Gaussians with features, got none; select others, or raise lambda")
+        rows = chosen.nonzero()[:, 0]
+        features = field.own_features(rows[:: max(1, len(rows) // MOST_COMPARED)])
+        target = torch.nn.functional.normalize(features, dim=1).mean(0)
+        scores = field.query(target, self._classes, score="cosine").scores
+        gamma = float(scores[chosen].median())
+        found = Selection(field.known & (scores > gamma), scores, gamma, "half of the selection is more like it")
+        return _asked("like the selection", found, field.known, False, False)
 
     def feature_colors(self) -> FeatureColors:
         """The field's projection, so latents have the same colours as in its rendered views."""
@@ -196,6 +224,10 @@ class SplatMeaning:
             found = Selection(member & (scores > low), scores, low, "all of the class")
             self._answers[words] = Asked(words, found, low, high, True, member)
         return self._answers[words]
+
+    def similar(self, mask: Tensor) -> Asked:  # [N] bool
+        """Raises a ValueError: a splat has classes only."""
+        raise ValueError("selection: expected a field, whose features can be compared, got a splat; search for a class")
 
     def feature_colors(self) -> FeatureColors:
         """A projection fitted to the features of the Gaussians that have some."""

@@ -152,7 +152,7 @@ def _add_side(buffers: _Buffers, state: Exploration, side: Side) -> dict[str, An
     buffers.add(f"{side}/splats", pack_splats(cloud, center, half, lowest, step))
     degree = 0 if cloud.sh is None else int(cloud.sh.shape[1] ** 0.5) - 1
     base = _base_colors(state, side)
-    dc_low, dc_high = float(base.min()), float(base.max())
+    dc_low, dc_high = min(float(base.min()), 0.0), max(float(base.max()), 1.0)  # room for new colours
     dc_step = max(dc_high - dc_low, 1e-6) / DC_STEPS
     buffers.add(f"{side}/dc", pack_dc(base, dc_low, dc_step))
     if degree:

@@ -14,17 +14,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..._check import check_choice, check_whole
+from ..._check import check_choice
 from ...formats import SplatFile, write_splats
-from ...labels import EditList, Opacity, Recolor, Remove, Selection, connected_parts
-from ...labels.where import OfIndex
+from ...formats.splat_file import SCORE
+from ...labels import EditList, Selection, connected_parts
+from ...labels.edits.edit_list import FORMAT, VERSION
+from .meaning import Asked
 from .numbered_files import numbered_path
 from .picked import Side
 from .saved import MOST_PARTS, SelectedSide, save_sides
-from .state import Exploration, check_number
+from .state import Exploration
 
 Answer = tuple[dict[str, Any], bytes]
-PNG = b"\x89PNG\r\n\x1a\n"
+EDITS = ("recolor", "opacity", "move", "duplicate", "remove")
+"""What the viewer can do to a cloud. `Insert` is not among them: it would read files of this machine for who has the link."""
 
 
 class Session:
@@ -40,11 +43,11 @@ class Session:
         self._lock = Lock()
         self._calls = {
             "ask": self._ask,
+            "similar": self._similar,
             "describe": self._describe,
             "parts": self._parts,
             "save_selection": self._save_selection,
             "save_edits": self._save_edits,
-            "save_picture": self._save_picture,
         }
 
     def call(self, name: str, args: dict[str, Any], attached: bytes = b"") -> Answer:
@@ -54,12 +57,15 @@ class Session:
             name: one of
 
                 - `ask` {words}: attaches the scores of the semantic Gaussians, float32, NaN where nothing is known
-                - `describe` {side, index}: neighbours and views
-                - `parts` {side}, with a mask of it: connected parts, largest first; attaches the part of each Gaussian, int16,
-                  -1 for none
-                - `save_selection` {words, gamma, lambda, sides}, with a mask of each side
-                - `save_edits` {lambda, sides: {side: {removed, recolored, opacity}}}: Gaussians by number
-                - `save_picture` {}, with a PNG file
+                - `similar` {}, with a mask of the semantic side: as `ask`, for what is like these Gaussians
+                - `describe` {side, index}: the views that see a Gaussian
+                - `parts` {side, edits}, with a mask of it: connected parts, largest first; attaches the part of each Gaussian,
+                  int16, -1 for none
+                - `save_selection` {words, gamma, lambda, sides, edits}, with a mask of each side
+                - `save_edits` {lambda, edits}
+
+                `edits` has a list for each side that was edited, in the form of `EditList.save`. Masks are of the cloud with
+                its copies, before Gaussians are removed.
             args: its arguments.
             attached: bytes that belong to them.
 
@@ -81,32 +87,28 @@ class Session:
         if not isinstance(words, str) or not words.strip():
             raise ValueError(f"words: expected text, got {words!r:.80}; ask for a class or a phrase")
         asked = self.state.meaning.ask(words)
-        known = asked.selection
-        scores = torch.where(asked.valid, known.scores, torch.nan).cpu().numpy().astype("<f4")
         packed = list(dict.fromkeys(self.state.meaning.names))  # classes of one name are one question
-        answer = {
-            "words": asked.words,
-            "number": packed.index(asked.words) if asked.words in packed else None,
-            "gamma": known.threshold,
-            "how": known.how,
-            "low": asked.low,
-            "high": asked.high,
-        }
-        return answer, scores.tobytes()
+        number = packed.index(asked.words) if asked.words in packed else None
+        return _answer(asked, number)
+
+    def _similar(self, _: dict[str, Any], attached: bytes) -> Answer:
+        (mask,) = self._masks({"semantic": len(self.state.cloud("semantic"))}, attached).values()
+        return _answer(self.state.meaning.similar(mask), None)
 
     def _describe(self, args: dict[str, Any], _: bytes) -> Answer:
         picked = self.state.pick(args["side"], args["index"])
-        neighbours = [{"index": i, "distance": far} for i, far, _ in picked.neighbours]
-        views = [{"index": sight.index, "name": sight.name, "weight": sight.weight} for sight in picked.views]
-        return {"neighbours": neighbours, "views": views}, b""
+        return {"views": [{"index": one.index, "name": one.name, "weight": one.weight} for one in picked.views]}, b""
 
     def _parts(self, args: dict[str, Any], attached: bytes) -> Answer:
-        ((side, mask),) = self._masks([args["side"]], attached).items()
-        found = connected_parts(self.state.cloud(side), Selection.of(mask, "in the viewer"), most=MOST_PARTS)
+        side = _side(args["side"])
+        cloud = self._edited(side, args).gaussians
+        (mask,) = self._masks({side: len(cloud)}, attached).values()
+        found = connected_parts(cloud, Selection.of(mask, "in the viewer"), most=MOST_PARTS)
         numbers = np.full(len(mask), -1, "<i2")
         for number, part in enumerate(found):
             numbers[part.indices.cpu().numpy()] = number
-        return {"parts": [{"count": part.count, "volume": part.volume} for part in found]}, numbers.tobytes()
+        parts = [{"count": one.count, "volume": one.volume, "corners": one.box.corners.tolist()} for one in found]
+        return {"parts": parts}, numbers.tobytes()
 
     def _save_selection(self, args: dict[str, Any], attached: bytes) -> Answer:
         state = self.state
@@ -115,17 +117,9 @@ class Session:
             state.set_gamma(args["gamma"])
         if args.get("lambda") is not None:
             state.set_distance(args["lambda"])
-        masks = self._masks(args["sides"], attached)
-        sides = {
-            side: SelectedSide(
-                state.cloud(side),
-                Selection(mask, torch.from_numpy(np.nan_to_num(state.scores(side))), state.gamma, "in the viewer"),
-                torch.from_numpy(state.labels(side)),
-                torch.from_numpy(state.scores(side)),
-            )
-            for side, mask in masks.items()
-            if bool(mask.any())
-        }
+        edited = {side: self._edited(side, args) for side in map(_side, args["sides"])}
+        masks = self._masks({side: len(splats.gaussians) for side, splats in edited.items()}, attached)
+        sides = {side: _selected(edited[side], mask, state.gamma) for side, mask in masks.items() if bool(mask.any())}
         if not sides:
             raise ValueError("selection: expected at least one Gaussian, got none; select some first")
         details = state.details()
@@ -135,37 +129,34 @@ class Session:
             return _wrote(save_sides(sides, details, state.meaning.names, state.cameras, folder))
 
     def _save_edits(self, args: dict[str, Any], _: bytes) -> Answer:
-        made = {side: _edit_list(found) for side, found in args["sides"].items()}
-        made = {side: edits for side, edits in made.items() if len(edits)}
+        made = {_side(side): edits for side in args["edits"] if len(edits := _edit_list(args, side))}
         if not made:
             raise ValueError("edits: expected at least one, got none; remove or recolour something first")
         if args.get("lambda") is not None:
             self.state.set_distance(args["lambda"])
-        results = {side: edits.apply(self._splats(_side(side))) for side, edits in made.items()}
+        results = {side: edits.apply(self._splats(side)) for side, edits in made.items()}
         paths = []
         with numbered_path(self.out, "edited") as folder:
             for side, edits in made.items():
                 paths += [edits.save(folder / f"{side}.json"), folder / f"{side}.ply"]
-                write_splats(paths[-1], results[side])
+                write_splats(paths[-1], results[side].replace(extra={}))
         return _wrote(paths)
 
     def _splats(self, side: Side) -> SplatFile:
-        """A side with its labels at the present lambda."""
+        """A side with its labels and scores at the present lambda."""
         cloud = self.state.cloud(side).replace(labels=torch.from_numpy(self.state.labels(side)))
-        return SplatFile(cloud.detach().to("cpu"), {}, tuple(self.state.meaning.names))
+        scores = self.state.scores(side).astype(np.float32)
+        return SplatFile(cloud.detach().to("cpu"), {SCORE: scores}, tuple(self.state.meaning.names))
 
-    def _save_picture(self, _: dict[str, Any], attached: bytes) -> Answer:
-        if not attached.startswith(PNG):
-            raise ValueError(f"picture: expected a PNG file, got {len(attached)} other bytes; send what the page makes")
-        with numbered_path(self.out, "picture", ".png") as path:
-            path.write_bytes(attached)
-            return _wrote([path])
+    def _edited(self, side: Side, args: dict[str, Any]) -> SplatFile:
+        """A side with what was done to it, but nothing removed: masks are of these Gaussians."""
+        kept = tuple(edit for edit in _edit_list(args, side) if edit.op != "remove")
+        return EditList(kept).apply(self._splats(side))
 
-    def _masks(self, sides: list[str], attached: bytes) -> dict[Side, Tensor]:
+    def _masks(self, counts: dict[Side, int], attached: bytes) -> dict[Side, Tensor]:
         masks: dict[Side, Tensor] = {}
         begin = 0
-        for side in map(_side, sides):
-            count = len(self.state.cloud(side))
+        for side, count in counts.items():
             own = np.frombuffer(attached[begin : begin + -(-count // 8)], np.uint8)
             begin += -(-count // 8)
             if len(own) < -(-count // 8):
@@ -176,28 +167,32 @@ class Session:
         return masks
 
 
+def _answer(asked: Asked, number: int | None) -> Answer:
+    known = asked.selection
+    scores = torch.where(asked.valid, known.scores, torch.nan).cpu().numpy().astype("<f4")
+    answer = {"words": asked.words, "number": number, "gamma": known.threshold, "how": known.how}
+    return answer | {"low": asked.low, "high": asked.high}, scores.tobytes()
+
+
 def _side(name: str) -> Side:
     check_choice("side", name, get_args(Side))
     return name  # type: ignore[return-value]
 
 
-def _edit_list(found: dict[str, Any]) -> EditList:
-    """The edits of one side, from the state of the viewer: colours and opacities first, so that numbers stay valid."""
-    edits = EditList()
-    for color, indices in found.get("recolored", {}).items():
-        red, green, blue = (_part(part) for part in color.split(","))
-        edits = edits.then(Recolor(OfIndex(tuple(indices)), (red, green, blue)))
-    for factor, indices in found.get("opacity", {}).items():
-        check_number("opacity", float(factor))
-        edits = edits.then(Opacity(OfIndex(tuple(indices)), float(factor)))
-    if found.get("removed"):
-        edits = edits.then(Remove(OfIndex(tuple(found["removed"]))))
-    return edits
+def _edit_list(args: dict[str, Any], side: str) -> EditList:
+    """The edits of one side, as the viewer sends them."""
+    given = args.get("edits", {}).get(_side(side), [])
+    for edit in given:
+        check_choice("edits: op", edit["op"], EDITS)
+        check_choice("edits: where", edit["where"]["kind"], ("index",))
+    return EditList.from_json({"format": FORMAT, "version": VERSION, "edits": given}, "edits")
 
 
-def _part(text: str) -> float:
-    check_whole("recolored", int(text), 0, 255)
-    return int(text) / 255
+def _selected(splats: SplatFile, mask: Tensor, gamma: float | None) -> SelectedSide:
+    cloud, scores = splats.gaussians, torch.from_numpy(splats.extra[SCORE])
+    assert cloud.labels is not None
+    known = Selection(mask, torch.nan_to_num(scores), gamma, "in the viewer")
+    return SelectedSide(cloud, known, cloud.labels, scores)
 
 
 def _wrote(paths: list[Path]) -> Answer:

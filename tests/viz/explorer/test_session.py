@@ -12,7 +12,11 @@ from kfgs.formats import read_splats
 from kfgs.labels import EditList, Selection, connected_parts
 from kfgs.splat import rgb_to_sh0
 from kfgs.viz.explorer import Exploration, FieldMeaning
-from kfgs.viz.explorer.session import PNG, Session
+from kfgs.viz.explorer.session import Session
+
+
+def index(*numbers):
+    return {"kind": "index", "indices": numbers}
 
 
 def bits_of(mask):
@@ -46,7 +50,6 @@ def test_an_answer_is_that_of_the_state(session):
 def test_what_surrounds_a_gaussian(session):
     found, _ = session.call("describe", {"side": "semantic", "index": 5})
     picked = session.state.pick("semantic", 5)
-    assert [one["index"] for one in found["neighbours"]] == [i for i, _, _ in picked.neighbours]
     assert len(found["views"]) == len(picked.views)
 
 
@@ -76,8 +79,12 @@ def test_a_selection_by_hand_is_written(session):
 
 
 def test_edits_are_written_and_can_be_replayed(session):
-    edits = {"removed": [3, 4], "recolored": {"255,0,0": [0, 1]}, "opacity": {"0.500": [1, 2]}}
-    session.call("save_edits", {"sides": {"color": edits, "semantic": {"removed": []}}})
+    edits = [
+        {"op": "recolor", "where": index(0, 1), "rgb": [1, 0, 0], "mode": "tint"},
+        {"op": "opacity", "where": index(1, 2), "factor": 0.5},
+        {"op": "remove", "where": index(3, 4)},
+    ]
+    session.call("save_edits", {"edits": {"color": edits, "semantic": []}})
     folder = session.out / "edited_001"
     made, before = read_splats(folder / "color.ply").gaussians, session.state.cloud("color")
     assert len(made) == len(before) - 2
@@ -86,10 +93,40 @@ def test_edits_are_written_and_can_be_replayed(session):
     assert not (folder / "semantic.ply").exists()
 
 
-def test_a_picture_is_written(session):
-    answer, _ = session.call("save_picture", {}, PNG + b"rest")
-    assert answer["paths"] == [str(session.out / "picture_001.png")]
-    assert (session.out / "picture_001.png").read_bytes() == PNG + b"rest"
+def test_copies_are_saved_and_split_as_they_are_in_the_viewer(session):
+    copied = [0, 1, 2, 3]
+    edits = {"color": [
+        {"op": "duplicate", "where": index(*copied), "translation": [100, 0, 0]},
+        {"op": "opacity", "where": index(60, 61), "factor": 0.5},
+        {"op": "remove", "where": index(0, 1)},
+    ]}  # fmt: skip
+    mask = torch.arange(64) >= 60
+    args = {"words": "chair", "gamma": 0.4, "lambda": 0.5, "sides": ["color"], "edits": edits}
+    session.call("save_selection", args, bits_of(mask))
+    made = read_splats(session.out / "selection_001" / "selection_color.ply").gaussians
+    cloud = session.state.cloud("color")
+    torch.testing.assert_close(made.means, cloud.means[copied] + torch.tensor([100.0, 0, 0]))
+    torch.testing.assert_close(made.opacities, cloud.opacities[copied] * torch.tensor([0.5, 0.5, 1, 1]))
+    answer, attached = session.call(
+        "parts", {"side": "color", "edits": edits}, bits_of(torch.ones(64, dtype=torch.bool))
+    )
+    numbers = np.frombuffer(attached, "<i2")
+    assert len(numbers) == 64
+    assert not set(numbers[:60]) & set(numbers[60:]) - {-1}
+    assert np.array(answer["parts"][0]["corners"]).shape == (8, 3)
+
+
+def test_what_is_like_a_selection(session):
+    state = session.state
+    labels = torch.from_numpy(state.labels("semantic"))
+    label = int(labels[labels >= 0].mode().values)
+    chosen = labels == label
+    answer, attached = session.call("similar", {}, bits_of(chosen))
+    scores = torch.from_numpy(np.frombuffer(attached, "<f4").copy())
+    found = scores > answer["gamma"]
+    assert (answer["words"], answer["number"]) == ("like the selection", None)
+    assert (found & chosen).sum() == pytest.approx(int(chosen.sum()) / 2, abs=1)
+    assert scores[chosen].mean() > scores[~chosen & ~scores.isnan()].mean()
 
 
 @pytest.mark.parametrize(
@@ -102,10 +139,18 @@ def test_a_picture_is_written(session):
         ("describe", {"side": "color", "index": 10**9}, b"", ["index"]),
         ("save_selection", {"sides": ["color"]}, b"\0", ["attached"]),
         ("save_selection", {"sides": []}, b"", ["selection"]),
-        ("save_edits", {"sides": {"color": {"removed": [10**9]}}}, b"", ["indices"]),
-        ("save_edits", {"sides": {}}, b"", ["edits"]),
-        ("save_edits", {"sides": {"color": {"recolored": {"300,0,0": [1]}}}}, b"", ["recolored"]),
-        ("save_picture", {}, b"GIF", ["PNG"]),
+        ("save_edits", {"edits": {"color": [{"op": "remove", "where": index(10**9)}]}}, b"", ["indices"]),
+        ("save_edits", {"edits": {"color": [{"op": "recolor", "where": index(1), "rgb": [300, 0, 0]}]}}, b"", ["rgb"]),
+        ("save_edits", {"edits": {"color": [{"op": "insert", "source": "/etc/passwd"}]}}, b"", ["op"]),
+        (
+            "save_edits",
+            {"edits": {"color": [{"op": "remove", "where": {"kind": "class", "name": "chair"}}]}},
+            b"",
+            ["where"],
+        ),
+        ("save_edits", {"edits": {"left": []}}, b"", ["side"]),
+        ("save_edits", {"edits": {}}, b"", ["edits"]),
+        ("similar", {}, bytes(10), ["selection"]),
         ("delete", {}, b"", ["name"]),
     ],
 )
