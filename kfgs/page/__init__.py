@@ -11,7 +11,18 @@ from importlib.resources import files
 
 RENDERER = ("sorter.js", "camera.js", "tint.js", "clouds.js", "shaders.js", "gl.js", "pick.js", "renderer.js")
 """The modules of the renderer; a module comes after those that it imports."""
-INTERFACE = ("eye.js", "link.js", "model.js", "dom.js", "boxes.js", "panel.js", "tools.js", "panes.js", "chrome.js", "app.js")
+INTERFACE = (
+    "eye.js",
+    "link.js",
+    "model.js",
+    "dom.js",
+    "boxes.js",
+    "panel.js",
+    "tools.js",
+    "panes.js",
+    "chrome.js",
+    "app.js",
+)
 APP = (*RENDERER, *INTERFACE)
 """The renderer and the interface."""
 

@@ -15,6 +15,8 @@ const BACKGROUND = { light: [0.957, 0.961, 0.969], dark: [0.094, 0.102, 0.118] }
 const GLIDE = 350; // milliseconds of a move to another view
 const SAID = 9000; // milliseconds that a message stays
 const BRUSH = [6, 24, 120]; // pixels: smallest, first, largest radius
+const NARROW = { narrow: 900, slim: 640, thin: 480 }; // CSS pixels of the width
+const LOW = 420; // of the height
 const HOVER = 120; // milliseconds that the pointer rests before a tooltip
 const REMEMBER = 500; // milliseconds after the last change
 const ASIDE = 0.7; // how far beside the originals copies appear, of their radius
@@ -106,9 +108,14 @@ class App {
   }
 
   watch() {
-    const resize = () => this.panes.resize(this.stage.clientWidth, this.stage.clientHeight);
+    const resize = () => {
+      const { clientWidth: width, clientHeight: height } = this.root;
+      for (const [name, most] of Object.entries(NARROW)) this.root.classList.toggle(name, width <= most);
+      this.root.classList.toggle("low", height <= LOW);
+      this.panes.resize(this.stage.clientWidth, this.stage.clientHeight);
+    };
     const sizes = new ResizeObserver(resize);
-    sizes.observe(this.stage);
+    for (const one of [this.root, this.stage]) sizes.observe(one);
     resize();
     const until = new AbortController();
     const listen = (target, name, act) => target.addEventListener(name, act, { signal: until.signal });

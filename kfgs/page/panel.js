@@ -13,7 +13,7 @@ const css = (rgb) => `rgb(${rgb.join(",")})`;
  */
 export function makePanel(model, act) {
   const carried = model.carried ? [lambdaPart(model)] : [];
-  const shown = [scorePart(model), pickPart(model, act), selectionPart(model, act), partsPart(model, act), ...carried, classesPart(model, act)];
+  const shown = [scorePart(model), pickPart(model, act), selectionPart(model, act), partsPart(model, act), classesPart(model, act), ...carried];
   return {
     element: h("aside", { class: "panel", "aria-label": "Search, classes and selection" }, ...shown.map((one) => one.element)),
     refresh: () => shown.forEach((one) => one.refresh()),

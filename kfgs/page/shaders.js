@@ -149,7 +149,7 @@ void main() {
   }
   if (dim && !chosen && (asked || masked)) {
     float light = dot(color, vec3(0.3, 0.6, 0.1));
-    color = mix(paper, mix(vec3(light), color, 0.3), 0.4);
+    color = mix(paper, mix(vec3(light), color, 0.3), 0.6);
   }
 
   vec2 focal = pinhole.xy;

@@ -56,7 +56,7 @@ def explore(
         distance: lambda, world units; None: from the clouds' spacing.
         where: `window` (blocks until you close it), `browser` (a page that only this machine can open; blocks until
             Ctrl-C), `notebook` (a widget, as the last value of a cell), or `picture` (opens nothing). `auto`: the notebook if
-            there is one, else a window if there is a display, else a picture.
+            there is one, else the browser if there is a display, else a picture.
         options: size, style, where files are saved.
 
     Raises:
@@ -114,7 +114,7 @@ def find_place() -> Where:
     """Choose the value of `where` for "auto"."""
     if in_notebook():
         return "notebook"
-    return "window" if has_display() else "picture"
+    return "browser" if has_display() else "picture"
 
 
 def check_place(place: Where) -> None:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ...fields import SemanticField
 
 UNIT = (0.0, 1.0)
+KEPT = 0.9  # of a selection, by the suggested gamma of what is like it
 MOST_COMPARED = 2000  # features of a selection whose mean is taken
 
 
@@ -132,7 +133,7 @@ class FieldMeaning:
         return self._answers[words]
 
     def similar(self, mask: Tensor) -> Asked:  # [N] bool
-        """Compare with the mean direction of some Gaussians' features, by cosine; the suggested gamma selects half of them.
+        """Compare with the mean direction of some Gaussians' features, by cosine; the suggested gamma keeps nine of ten.
 
         Raises:
             ValueError: if nothing is known about any of them.
@@ -145,8 +146,10 @@ class FieldMeaning:
         features = field.own_features(rows[:: max(1, len(rows) // MOST_COMPARED)])
         target = torch.nn.functional.normalize(features, dim=1).mean(0)
         scores = field.query(target, self._classes, score="cosine").scores
-        gamma = float(scores[chosen].median())
-        found = Selection(field.known & (scores > gamma), scores, gamma, "half of the selection is more like it")
+        gamma = float(scores[chosen].quantile(1 - KEPT))
+        found = Selection(
+            field.known & (scores > gamma), scores, gamma, f"{KEPT:.0%} of the selection are more like it"
+        )
         return _asked("like the selection", found, field.known, False, False)
 
     def feature_colors(self) -> FeatureColors:

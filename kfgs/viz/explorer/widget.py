@@ -9,10 +9,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
 from PIL import Image
 
 from ...page import APP, inline_script, read_text
 from ...page.server import answer_call
+from ...splat import rasterize
+from ..pictures import as_bytes
 from .carried import Array
 from .html import pack_view
 from .session import Session
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
     from ...scenes import Scene
 
 HEIGHT = 640  # CSS pixels
+STILL = 800  # pixels: the longer edge of the picture where widgets cannot run
 START = """
 export default {
   async render({ model, el }) {
@@ -72,9 +76,10 @@ def make_widget(
     scene: Scene | None = None,
     out: str | Path = "kfgs_view",
     height: int = HEIGHT,
-    still: Array | None = None,  # [h, w, 3] uint8
 ) -> AnyWidget:
     """The viewer of an exploration as a widget for Jupyter, VS Code and Colab; display it as a cell's last value.
+
+    Where widgets cannot run, on a page of GitHub for instance, a picture from the first camera is shown.
 
     Args:
         exploration: the widget opens with its question, gamma, lambda and hidden classes; set `widget.question` to ask another.
@@ -82,7 +87,6 @@ def make_widget(
         scene: as in `save_html`.
         out: folder for files that are saved from the widget, on the kernel's machine.
         height: CSS pixels.
-        still: a picture shown where widgets cannot run, on a page of GitHub for instance.
 
     Raises:
         ImportError: if anywidget is missing.
@@ -108,8 +112,8 @@ def make_widget(
         def _repr_mimebundle_(self, **options: Any) -> Any:
             found = super()._repr_mimebundle_(**options)
             bundle = found[0] if isinstance(found, tuple) else found
-            if bundle is not None and still is not None:
-                bundle["text/html"] = picture_html(still)
+            if bundle is not None and exploration.cameras:
+                bundle["text/html"] = picture_html(still(exploration))
             return found
 
     widget = Viewer(
@@ -126,6 +130,20 @@ def make_widget(
 
     widget.on_msg(answer)
     return widget
+
+
+def still(exploration: Exploration) -> Array:  # [h, w, 3] uint8
+    """What the first camera sees, in the colours that the viewer opens with."""
+    side = exploration.sides[-1]
+    camera = exploration.cameras[0]
+    scale = min(1.0, STILL / max(camera.size))
+    camera = camera.resized(round(scale * camera.height), round(scale * camera.width))
+    cloud = exploration.cloud(side)
+    if exploration.show != "rgb" or cloud.sh is None:
+        colors = torch.from_numpy(exploration.colors(side)).to(cloud.means) / 255
+        cloud = cloud.replace(features=colors, sh=None)
+    with torch.no_grad():
+        return as_bytes(rasterize(cloud.replace(labels=None), camera, background=cloud.means.new_ones(3)).map)
 
 
 def picture_html(picture: Array) -> str:

@@ -1,5 +1,8 @@
 """The notebook widget: what is sent to the browser, and how calls are answered. Its JavaScript: tests/page."""
 
+import base64
+import io
+import re
 import subprocess
 import sys
 
@@ -7,10 +10,11 @@ import cases_explorer
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 pytest.importorskip("anywidget")
 
-from kfgs.splat import rgb_to_sh0
+from kfgs.splat import rasterize, rgb_to_sh0
 from kfgs.viz import explore
 from kfgs.viz.explorer import Exploration, FieldMeaning, Viewer, pack
 from kfgs.viz.explorer.widget import make_widget
@@ -72,10 +76,20 @@ def test_explore_in_a_notebook_gives_a_viewer():
     viewer.close()
 
 
-def test_a_picture_stands_in_where_widgets_cannot_run():
-    still = np.zeros((6, 8, 3), np.uint8)
-    bundle = make_widget(exploration(), still=still)._repr_mimebundle_()
-    assert (bundle[0] if isinstance(bundle, tuple) else bundle)["text/html"].startswith("<img alt=")
+@pytest.mark.parametrize("show", ["rgb", "labels"])
+def test_a_picture_stands_in_where_widgets_cannot_run(show):
+    state = exploration()
+    state.set_show(show)
+    bundle = make_widget(state)._repr_mimebundle_()
+    text = (bundle[0] if isinstance(bundle, tuple) else bundle)["text/html"]
+    assert text.startswith("<img alt=")
+    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(re.search(r"base64,([^\"]+)", text)[1]))))
+    assert picture.shape[:2] == (state.cameras[0].height, state.cameras[0].width)
+    cloud = state.cloud("color")
+    if show == "labels":
+        cloud = cloud.replace(features=torch.from_numpy(state.colors("color")) / 255, sh=None)
+    truth = rasterize(cloud, state.cameras[0], background=torch.ones(3)).map.clamp(0, 1)
+    assert np.abs(picture / 255 - truth.numpy()).mean() < 0.03
 
 
 def test_without_anywidget_the_install_line_is_told():
