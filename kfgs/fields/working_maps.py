@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._arrays import read_arrays
 from .._check import as_tensor, check_shapes
 from .._files import atomic_path
 from .._rows import EPS, row_norms, unit_rows
@@ -100,9 +101,9 @@ class WorkingMaps:
             with atomic_path(file) as path, path.open("wb") as opened:
                 np.savez(opened, rows=rows.to(torch.float16).cpu().numpy(), shape=np.asarray(shape))
             return rows, torch.tensor(shape, dtype=torch.float64)
-        with np.load(file, allow_pickle=False) as found:
-            rows = torch.from_numpy(found["rows"].astype(np.float32)).to(self._directions)
-            return rows, torch.from_numpy(found["shape"]).double()
+        found = read_arrays(file)
+        rows = torch.from_numpy(found["rows"].astype(np.float32)).to(self._directions)
+        return rows, torch.from_numpy(found["shape"]).double()
 
     def _make(self, i: int) -> tuple[Tensor, tuple[int, int]]:  # [h, w, d']
         """Read a map in the working directions, and shrink it to its working size."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from .._arrays import read_arrays
 from .._files import atomic_path, digest_file, read_json, write_json
 from .splat_file import SCORE, SplatFile
 
@@ -121,18 +120,10 @@ def _with_labels(beside: Path, path: Path, splats: SplatFile) -> SplatFile:
 
 def _load_labels(beside: Path, path: Path, count: int) -> tuple[NDArray[Any], NDArray[Any] | None, str]:
     """Read `class_id`, `score` and the digest of their splat file; sizes are checked before unpacking."""
-    try:
-        with zipfile.ZipFile(beside) as archive:
-            sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
-        if sum(sizes.values()) > 16 * count + _NPZ_HEADERS:
-            raise ValueError(f"{sum(sizes.values())} bytes for {count} Gaussians")
-        with np.load(beside, allow_pickle=False) as file:
-            labels, of = file["class_id"], str(file["of"])
-            score = file.get(SCORE)
-    except (ValueError, KeyError, OSError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(
-            f"{beside}: expected labels of {path.name}, but it cannot be read ({error}); delete it"
-        ) from error
+    found = read_arrays(beside, f"labels of the {count} Gaussians of {path.name}", "delete it", most=16 * count + _NPZ_HEADERS)
+    if not {"class_id", "of"} <= set(found):
+        raise ValueError(f"{beside}: expected the arrays class_id and of, got {', '.join(found) or 'none'}; delete it")
+    labels, of, score = found["class_id"], str(found["of"]), found.get(SCORE)
     if labels.dtype.kind not in "iu" or (score is not None and score.dtype.kind != "f"):
         raise ValueError(f"{beside}: expected whole numbers as class_id, got {labels.dtype}; delete it")
     return labels, score, of

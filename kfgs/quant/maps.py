@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
+from .._arrays import read_array
 from .._check import as_tensor, check_shapes
 from .._files import atomic_path
 from .._rows import EPS
@@ -170,7 +171,7 @@ def quantize_maps(
     for i in tqdm(range(len(maps)), desc="quantise", disable=not progress):
         kept = None if scratch is None else scratch / f"{i}.npy"
         if kept is not None and kept.is_file():
-            quantised.append(np.load(kept, allow_pickle=False))
+            quantised.append(read_array(kept))
             continue
         quantised.append(_quantize_map(maps, i, codebook))
         if kept is not None:

@@ -105,5 +105,3 @@ def read_scene_json(path: str | Path, advice: str) -> Any:
         return read_json(path)
     except ValueError as error:
         raise SceneError(f"{error}; {advice}") from error
-    except RecursionError as error:
-        raise SceneError(f"{path}: expected a JSON file, got brackets nested too deep; {advice}") from error

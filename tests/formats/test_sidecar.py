@@ -80,12 +80,12 @@ def test_labels_of_another_version_are_refused(path):
         ({"class_id": np.zeros(6, np.float32)}, ("class_id", "got float32")),
         ({"class_id": np.full(6, "a")}, ("class_id", "got <U1")),
         ({"class_id": np.full(6, -2)}, ("class_id", "-1")),
-        ({"class_id": None}, ("read", "class_id", "delete")),
-        ({"of": None}, ("read", "'of is", "delete")),
+        ({"class_id": None}, ("class_id and of", "got of, score", "delete")),
+        ({"of": None}, ("class_id and of", "got class_id, score", "delete")),
         ({"of": np.array("other")}, ("a.splat", "another version")),
         ({"score": np.full(6, np.nan)}, ("finite", "scores")),
         ({"score": np.zeros(7)}, ("finite", "scores", "as many")),
-        ({"score": np.zeros(100_000)}, ("(800", "6 Gaussians")),
+        ({"score": np.zeros(100_000)}, ("800664 bytes", "6 Gaussians")),
         ({"class_id": np.array([None] * 6)}, ("read", "a.splat")),  # pickled objects are never loaded
     ],
 )
@@ -115,6 +115,21 @@ def test_an_archive_that_unpacks_to_gigabytes_is_not_unpacked(path):
         archive.writestr("class_id.npy", b"\0" * (64 << 20))
     assert labels_path(path).stat().st_size < 100_000
     with pytest.raises(ValueError, match=tells("a.splat.labels.npz:", "67108864", "6 Gaussians")):
+        read_splats(path)
+
+
+def test_labels_that_state_gigabytes_in_a_small_array_are_named(path):
+    content = io.BytesIO()
+    np.lib.format.write_array_header_1_0(content, {"descr": "<i4", "fortran_order": False, "shape": (1 << 32,)})
+    with zipfile.ZipFile(labels_path(path), "w") as archive:
+        archive.writestr("class_id.npy", content.getvalue())
+    with pytest.raises(ValueError, match=tells("a.splat.labels.npz:", "17179869184 bytes", "delete")):
+        read_splats(path)
+
+
+def test_names_that_nest_too_deep_are_named(path):
+    names_path(path).write_text('{"class_id": ' + "[" * 100_000 + "]" * 100_000 + "}")
+    with pytest.raises(ValueError, match=tells("a.splat.classes.json:", "nest more than 200 deep")):
         read_splats(path)
 
 

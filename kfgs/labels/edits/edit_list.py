@@ -136,10 +136,7 @@ class EditList:
                 message names the place in the file.
         """
         path = Path(path)
-        try:
-            content = read_json(path)
-        except RecursionError as error:
-            raise ValueError(f"{path}: expected saved edits, got JSON that nests too deep; write it again") from error
+        content = read_json(path)
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise ValueError(f"{path}: expected edits that kfgs saved ('format': {FORMAT!r}), got something else")
         if type(content.get("version")) is not int or content["version"] != VERSION:  # True and 1.0 equal 1
