@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
+from .._arrays import read_safetensors
 from .._files import write_json
 from ..fields import FieldConfig, FieldFit, GaussianParams
 from ..fields.config import check_extent
@@ -83,4 +84,4 @@ def field_stage(
 
     stage = run.stage(name, inputs, make)
     scratch.unlink(missing_ok=True)
-    return GaussianParams.from_tensors(load_file(stage.folder / "params.safetensors")), stage
+    return GaussianParams.from_tensors(read_safetensors(stage.folder / "params.safetensors")[0]), stage

@@ -249,7 +249,9 @@ def test_a_damaged_or_foreign_checkpoint_is_refused(tmp_path):
     save_file({"x": torch.zeros(2)}, foreign)
     with pytest.raises(ValueError, match=tells("damaged: expected a kfgs field checkpoint", "read", "delete it")):
         fit_field(start(), cameras, targets, SHORT, checkpoint=damaged)
-    with pytest.raises(ValueError, match=tells("foreign: expected a kfgs field checkpoint", "other tensors", "delete it")):
+    with pytest.raises(
+        ValueError, match=tells("foreign: expected a kfgs field checkpoint", "other tensors", "delete it")
+    ):
         fit_field(start(), cameras, targets, SHORT, checkpoint=foreign)
 
 

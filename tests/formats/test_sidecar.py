@@ -187,3 +187,27 @@ def test_names_named_after_the_stem_are_read_and_left_alone(tmp_path):
     write_splats(path, _splats().gaussians.replace(labels=None))
     assert not names_path(path).exists()
     assert shared.read_bytes() == content
+
+
+def test_labels_and_names_are_found_through_a_link(path):
+    link = path.parent / "elsewhere" / "b.splat"
+    link.parent.mkdir()
+    link.symlink_to(path)
+    again = link.with_name("c.splat")
+    again.symlink_to(link)
+    for place in (link, again):
+        found = read_splats(place)
+        assert found.classes == CLASSES
+        assert torch.equal(found.gaussians.labels, read_splats(path).gaussians.labels)
+        assert found.extra["score"].tolist() == read_splats(path).extra["score"].tolist()
+    write_names(link, ("of", "the", "link"))  # what is next to the link comes first
+    assert read_splats(link).classes == ("of", "the", "link")
+    assert read_splats(path).classes == CLASSES
+
+
+def test_writing_to_a_link_leaves_the_file_it_led_to(path):
+    link = path.parent / "b.splat"
+    link.symlink_to(path)
+    write_splats(link, _splats().gaussians.replace(labels=None))
+    assert read_splats(link).gaussians.labels is None
+    assert read_splats(path).classes == CLASSES

@@ -50,7 +50,7 @@ def test_bad_input_is_named(tmp_path):
         LabelSet(("wall",), torch.zeros(1, 3)).index("chair")
 
 
-@pytest.mark.parametrize("header", ["'shape': (1099511627776, 512)", "'shape': (1L, \'\'\'", "'shape': " + "(" * 9000])
+@pytest.mark.parametrize("header", ["'shape': (1099511627776, 512)", "'shape': (1L, '''", "'shape': " + "(" * 9000])
 def test_rows_whose_header_lies_are_named(tmp_path, header):
     text = f"{{'descr': '<f8', 'fortran_order': False, {header}, }}".encode()
     (tmp_path / "text.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text)
