@@ -76,7 +76,7 @@ def recall_classes(info: dict[str, Any], folder: Path | None) -> LabelSet:
     if not noted or folder is None:
         raise ValueError(
             "classes: expected a label set, or a field that remembers the classes of its scene, got neither; pass "
-            "load_label_set(names, embeddings)"
+            "the classes (in Python: load_label_set(names, embeddings))"
         )
     files = [_absolute(folder, str(one["path"])) for one in noted]
     for file, one in zip(files, noted, strict=True):
