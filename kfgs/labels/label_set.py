@@ -49,7 +49,9 @@ class LabelSet:
                 f"names: expected a list of class names, got the text {self.names!r:.80}; put it into a list"
             )
         object.__setattr__(self, "names", tuple(self.names))
-        object.__setattr__(self, "embeddings", as_tensor("embeddings", self.embeddings))
+        object.__setattr__(self, "embeddings", as_tensor("embeddings", self.embeddings, floating=True))
+        if self.negatives is not None:
+            object.__setattr__(self, "negatives", as_tensor("negatives", self.negatives, floating=True))
         if self.embeddings.ndim != 2 or len(self.names) != len(self.embeddings):
             raise ValueError(
                 f"embeddings: expected [C, D] with C = {len(self.names)} (one row per name), "
@@ -117,6 +119,7 @@ class LabelSet:
         Raises:
             ValueError: if the name is taken, or the row has another number of channels.
         """
+        embedding = as_tensor("embedding", embedding, floating=True)
         if _shape(embedding) != (self.dim,):
             raise ValueError(
                 f"embedding: expected ({self.dim},) (from the {len(self)} classes), got {_shape(embedding)}; "

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from .._arrays import read_array
 from .._check import as_tensor, check_shapes
 from .._files import atomic_path
-from .._rows import EPS
+from .._rows import ENCODE, EPS, check_directions
 from ._store import read_tensors, write_tensors
 from .codebook import Codebook, compare
 
@@ -184,6 +184,5 @@ def _quantize_map(maps: FeatureMaps, i: int, codebook: Codebook) -> NDArray[np.u
     feature_map = as_tensor(f"maps[{i}]", maps[i])  # once: this may read a file
     check_shapes((f"maps[{i}]", feature_map, f"h w {codebook.dim}"))
     index, _, length = compare(feature_map, codebook.unit)
-    if not bool(torch.isfinite(length).all()):
-        raise ValueError(f"maps[{i}]: expected finite features, got NaN or infinity; encode that image again")
+    check_directions(f"maps[{i}]", feature_map, length, ENCODE)
     return index.masked_fill(length <= EPS, codebook.size).cpu().numpy().astype(np.uint16)

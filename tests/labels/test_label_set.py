@@ -222,3 +222,16 @@ def test_a_card_in_a_notebook():
     assert "30: 0, 1, 2" in shown
     assert "clip" in shown
     assert len(shown) < 900
+
+
+def test_rows_may_be_arrays_and_must_be_of_floating_point():
+    words = LabelSet(("a", "b"), torch.eye(2), np.eye(2), ("x", "y"))
+    assert isinstance(words.negatives, torch.Tensor)
+    assert words.with_class("c", np.ones(2)).embeddings[-1].tolist() == [1, 1]
+    for make in (
+        lambda: LabelSet(("a", "b"), torch.eye(2).long()),
+        lambda: LabelSet(("a", "b"), torch.eye(2), np.eye(2, dtype=int), ("x", "y")),
+        lambda: words.with_class("c", torch.ones(2).long()),
+    ):
+        with pytest.raises(TypeError, match=tells("expected floating-point numbers", "int64")):
+            make()
