@@ -90,6 +90,18 @@ def as_tensor(name: str, value: Any, *, floating: bool = False) -> Tensor:
     return value
 
 
+def moved_to(value: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+    """`value.to(...)`; a ValueError if there is no such device here."""
+    try:
+        return value.to(*args, **kwargs)
+    except (AssertionError, RuntimeError) as error:  # torch without CUDA; no driver, no such GPU, no such name
+        asked = ", ".join(map(str, (*args, *kwargs.values())))
+        raise ValueError(
+            f"device: expected one that this torch can use, got {asked} ({error_line(error)}); use 'cpu', or install a torch "
+            "for that device"
+        ) from error
+
+
 def _from_numbers(name: str, value: Any, floating: bool) -> Tensor:
     """Lists and whatever NumPy calls an array. Our own sequences, which may read a file for each item, are not looked into."""
     is_list = type(value) in (list, tuple, range) or isinstance(

@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ def _read_umask() -> int:
     return umask
 
 
+NESTED = 200  # most levels of lists and objects in JSON: neither people nor kfgs write half as many
 _UMASK = _read_umask()  # once: it can only be read by setting it, for all threads
 
 
@@ -92,9 +93,32 @@ def read_json(path: str | Path) -> Any:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected a JSON file there")
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:  # not UTF-8, not JSON, or an integer of thousands of digits
+        return parse_json(path.read_text(encoding="utf-8"))
+    except ValueError as error:
         raise ValueError(f"{path}: expected a JSON file, but it cannot be parsed ({error})") from error
+
+
+def parse_json(text: str | bytes, **options: Any) -> Any:
+    """The value of a JSON text that somebody else wrote; `options` are those of `json.loads`.
+
+    Raises:
+        ValueError: if it is not JSON in UTF-8, has an integer of thousands of digits, or more than `NESTED` levels.
+    """
+    deep = f"brackets nest more than {NESTED} deep"
+    try:
+        value = json.loads(text, **options)
+    except RecursionError:
+        raise ValueError(deep) from None
+    level, depth = [value], 0  # not by recursion, which what follows (repr, json.dumps) has not endless room for
+    while level := [part for one in level for part in _inside(one) if type(part) in (dict, list)]:
+        depth += 1
+        if depth >= NESTED:
+            raise ValueError(deep)
+    return value
+
+
+def _inside(value: Any) -> Iterable[Any]:
+    return value.values() if type(value) is dict else value if type(value) is list else ()
 
 
 def digest_file(path: str | Path) -> str:

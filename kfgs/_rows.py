@@ -7,6 +7,9 @@ from torch import Tensor
 
 EPS = 1e-8  # the one epsilon of every cosine in kfgs: a row not longer than this counts as all-zero
 
+REMOVE = "remove or repair such rows"
+ENCODE = "encode that image again"
+
 
 def unit_rows(
     x: Tensor,  # [..., D]
@@ -29,21 +32,40 @@ def unit_embeddings(embeddings: Tensor, name: str = "embeddings") -> Tensor:  # 
     """Normalise class embeddings, refusing none at all, all-zero rows (they would beat every opposite) and NaN."""
     if len(embeddings) == 0:
         raise ValueError(f"{name}: expected at least one class, got {tuple(embeddings.shape)}; pass one row per class")
-    check_finite(name, embeddings)
-    empty = row_norms(embeddings) <= EPS
+    lengths = row_norms(embeddings)
+    check_directions(name, embeddings, lengths)
+    empty = lengths <= EPS
     if bool(empty.any()):
         row = int(empty.nonzero()[0])
+        got = (
+            f"a length of {float(embeddings[row].double().norm()):.3g}" if bool(embeddings[row].any()) else "all zeros"
+        )
         raise ValueError(
-            f"{name}: expected rows with a direction, got all zeros in row {row}; drop or replace that class"
+            f"{name}: expected rows with a direction (longer than {EPS:g}), got {got} in row {row}; drop or replace that class"
         )
     return unit_rows(embeddings.detach())
 
 
-def check_finite(name: str, values: Tensor) -> None:
+def check_directions(
+    name: str,
+    rows: Tensor,  # [..., D]
+    lengths: Tensor | None = None,  # of the rows, if they are known
+    advice: str = REMOVE,
+) -> None:
+    """Raise a ValueError if the length of a row is not finite: for NaN, infinity, or numbers whose squares overflow."""
+    lengths = row_norms(rows) if lengths is None else lengths
+    if bool(torch.isfinite(lengths).all()):
+        return
+    check_finite(name, rows, advice)
+    largest = float(rows.abs().max())
+    raise ValueError(
+        f"{name}: expected numbers whose squares fit into {rows.dtype}, got {largest:.3g}; divide all of them by {largest:.0e}"
+    )
+
+
+def check_finite(name: str, values: Tensor, advice: str = REMOVE) -> None:
     """Raise a ValueError if a number is NaN or infinite."""
     finite = torch.isfinite(values)
     if not bool(finite.all()):
         row = int((~finite).nonzero()[0, 0])
-        raise ValueError(
-            f"{name}: expected finite numbers, got NaN or infinity in row {row}; remove or repair such rows"
-        )
+        raise ValueError(f"{name}: expected finite numbers, got NaN or infinity in row {row}; {advice}")

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ._check import as_array, as_tensor, check_shapes
+from ._check import as_array, as_tensor, check_shapes, moved_to
 
 Array = np.ndarray[Any, Any]
 ELSEWHERE = {
@@ -27,8 +27,8 @@ class Gaussians:
     """N 3-D Gaussians. All values are **activated**; raw (log, logit) values live only in `fields.GaussianParams`.
 
     **Convention**: quaternions are (w, x, y, z) and need not be unit (they are normalised where used); scales are
-    standard deviations in world units; labels are class indices with -1 = none. A semantic field carries `features`,
-    a colour field `sh`. NumPy arrays are accepted and become tensors that share their memory.
+    standard deviations in world units; labels are class indices with -1 = none, and become int64. A semantic field carries
+    `features`, a colour field `sh`. NumPy arrays are accepted and become tensors that share their memory.
 
     `gaussians[mask]` (or an index, a slice, a `Selection`) is a new, smaller cloud; `len` counts the Gaussians.
 
@@ -54,8 +54,10 @@ class Gaussians:
                 object.__setattr__(self, name, as_tensor(name, value, floating=name != "labels"))
         for name, value in self._tensors().items():
             as_tensor(name, value, floating=name != "labels")
-        if self.labels is not None and self.labels.is_floating_point():
+        if self.labels is not None and (self.labels.is_floating_point() or self.labels.dtype == torch.bool):
             raise TypeError(f"labels: expected whole numbers, got {self.labels.dtype}; convert them with .long()")
+        if self.labels is not None:  # unsigned ones have no -1
+            object.__setattr__(self, "labels", self.labels.long())
         check_shapes(
             ("means", self.means, "N 3"),
             ("quats", self.quats, "N 4"),
@@ -127,7 +129,7 @@ class Gaussians:
 
     def to(self, *args: Any, **kwargs: Any) -> Gaussians:
         """Move or convert the floating tensors as `Tensor.to` does; labels keep their integer type."""
-        moved = {name: value.to(*args, **kwargs) for name, value in self._tensors().items() if name != "labels"}
+        moved = {name: moved_to(value, *args, **kwargs) for name, value in self._tensors().items() if name != "labels"}
         if self.labels is not None:
             moved["labels"] = self.labels.to(moved["means"].device)
         return Gaussians(**moved)

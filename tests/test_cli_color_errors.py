@@ -85,17 +85,21 @@ ERRORS = {
         (["{labelled}", "--out", "{o}.ply"], ("edits:", "got none", "--remove")),
         (
             ["{labelled}", "--out", "{o}.ply", "--remove", "chiar"],
-            ("edits[0] (remove): class:", "wall, floor", "got 'chiar'"),
+            ("--remove chiar: class:", "wall, floor", "got 'chiar'"),
         ),
         (
             ["{labelled}", "--out", "{o}.ply", "--recolor", "chair:rde"],
             ("--recolor:", "'#c04040', 'teal'", "'rgb(192, 64, 64)'", "got 'rde'"),
         ),
+        (
+            ["{labelled}", "--out", "{o}.ply", "--opacity", "rug:0.5", "--scale", "chair:1e200"],
+            ("--scale chair:1e200: positions:", "finite"),
+        ),
         (["{labelled}", "--out", "{o}.ply", "--move", "chair:1,2"], ("--move:", "got 'chair:1,2'")),
         (["{labelled}", "--out", "{o}.ply", "--insert", "{tmp}/no.ply"], ("--insert:", "got '{tmp}/no.ply'")),
         (
             ["{labelled}", "--out", "{o}.ply", "--insert", "{room}/text.npy"],
-            ("edits[0] (insert): {room}/text.npy:", "compressed_ply"),
+            ("--insert {room}/text.npy: {room}/text.npy:", "compressed_ply"),
         ),
         (["{labelled}", "--out", "{splat}", "--insert", "{splat}"], ("--out:", "{splat}", "got the same")),
         (["{labelled}", "--out", "{labelled}", "--remove", "chair"], ("--out:", "{labelled}", "got the same")),

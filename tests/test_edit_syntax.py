@@ -13,7 +13,7 @@ from kfgs.labels.where import Component, Either, OfClass
 
 
 def read(**words):
-    return list(parse_edits(Edits(**words)))
+    return [edit for _, edit in parse_edits(Edits(**words))]
 
 
 def test_each_option_is_the_edit_it_says():

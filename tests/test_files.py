@@ -194,3 +194,15 @@ def test_bytes_and_seconds_in_words():
     ]
     times = [seconds_in_words(seconds) for seconds in (None, 40, 89, 720, 11_880)]
     assert times == ["unknown", "40 s", "89 s", "12 min", "3.3 h"]
+
+
+@pytest.mark.parametrize("pair", ["[]", '{"a":}'], ids=["lists", "objects"])
+def test_json_that_nests_too_deep_is_a_clear_error(tmp_path, pair):
+    left, right = pair[:-1], pair[-1]
+    file = tmp_path / "classes.json"
+    for depth in (201, 990, 100_000):
+        file.write_text(left * depth + "1" + right * depth)
+        with pytest.raises(ValueError, match=tells(file, "JSON", "brackets nest more than 200 deep")):
+            read_json(file)
+    file.write_text(left * 199 + "1" + right * 199)
+    assert read_json(file)

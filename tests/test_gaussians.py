@@ -173,3 +173,41 @@ def test_what_is_looked_for_here_is_pointed_to(name, where):
         getattr(cloud(1), name)
     assert not hasattr(cloud(1), "nothing")
     assert copy.copy(cloud(2)).labels.tolist() == [-1, 0]
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64])
+def test_labels_of_any_whole_type_become_int64(dtype, tmp_path):
+    from kfgs.formats import read_splats, write_splats
+
+    labelled = cloud(degree=0).replace(labels=torch.tensor([0, 3, 1, 2], dtype=dtype))
+    assert labelled.labels.dtype == torch.int64
+    for name in ("a.ply", "a.spz", "a.splat"):
+        write_splats(tmp_path / name, labelled)
+        assert read_splats(tmp_path / name).gaussians.labels.tolist() == [0, 3, 1, 2]
+    assert cloud().replace(labels=np.array([0, 1, 2, 3], dtype=np.uint16)).labels.dtype == torch.int64
+
+
+@pytest.mark.parametrize("labels", [torch.rand(4), np.array([0.5, 1, 2, 3]), torch.tensor([True, False, True, True])])
+def test_labels_that_are_no_whole_numbers_are_refused(labels):
+    with pytest.raises(TypeError, match=tells("labels:", "whole numbers", "got", ".long()")):
+        cloud().replace(labels=labels)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_device_that_is_not_there_is_a_clear_error():
+    with pytest.raises(ValueError, match=tells("device:", "got cuda", "use 'cpu'")):
+        cloud().to("cuda")
+    with pytest.raises(ValueError, match=tells("device:", "got nonsense", "use 'cpu'")):
+        cloud().to("nonsense")
+
+
+def test_mixed_types_are_named_where_they_meet():
+    from kfgs.cameras import Camera
+    from kfgs.splat import rasterize
+
+    camera = Camera(torch.eye(4), torch.tensor([[9.0, 0, 8], [0, 9, 8], [0, 0, 1]]), 16, 16)
+    mixed = cloud().replace(features=torch.zeros(4, 2, dtype=torch.float64))
+    with pytest.raises(
+        ValueError, match=tells("features", "float32", "from gaussians.means", "got torch.float64", ".to(")
+    ):
+        rasterize(mixed, camera)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .._card import cut
-from .._check import as_tensor, check_choice, check_range, check_shapes
+from .._check import as_tensor, check_choice, check_range, check_shapes, moved_to
 
 DistortionModel = Literal["brown_conrady", "kannala_brandt"]
 COEFFICIENTS = {"brown_conrady": (4, 5, 8), "kannala_brandt": (4,)}
@@ -190,7 +190,7 @@ class Camera:
 
     def to(self, *args: Any, **kwargs: Any) -> Camera:
         """Move or convert the matrices as `Tensor.to` does."""
-        return replace(self, viewmat=self.viewmat.to(*args, **kwargs), K=self.K.to(*args, **kwargs))
+        return replace(self, viewmat=moved_to(self.viewmat, *args, **kwargs), K=moved_to(self.K, *args, **kwargs))
 
 
 def unit_vector(name: str, vector: Tensor | Sequence[float]) -> Tensor:  # [3] float64

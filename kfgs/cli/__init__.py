@@ -66,7 +66,7 @@ def main(arguments: list[str] | None = None) -> int:
         say(f"kfgs {__version__}")
         return 0
     if name not in COMMANDS:
-        _fail(_unknown(name))
+        say(_unknown(name), sys.stderr)
         raise SystemExit(2)
     command = COMMANDS[name]
     called[:] = ["kfgs", name, *given]
@@ -82,19 +82,15 @@ def main(arguments: list[str] | None = None) -> int:
             )  # an option's text on one line
             tyro.cli(command, prog=f"kfgs {name}", description=_description(command), args=given, config=STYLE)
     except KeyboardInterrupt:
-        _fail("interrupted" + ("; the same command goes on where it stopped" if name in RESUMED else ""))
+        say("interrupted" + ("; the same command goes on where it stopped" if name in RESUMED else ""), sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of the output has ended, for instance `head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter complains when it ends
         return 141
     except (ValueError, TypeError, OSError, ImportError, ArithmeticError) as error:
-        _fail(f"error: {spoken(str(error))}")
+        say(f"error: {spoken(str(error))}", sys.stderr)
         return 1
     return 0
-
-
-def _fail(text: str) -> None:
-    print(text, file=sys.stderr)  # noqa: T201
 
 
 def _expand_home(word: str) -> str:
@@ -155,7 +151,11 @@ def _shown_names(kind: Any) -> dict[str, str]:
 
 
 def _in_options(message: str, names: dict[str, str]) -> str:
-    """A message about arguments as one about options: "splat_scene: expected" becomes "--splat-scene: expected"."""
+    """A message about arguments as one about options: "splat_scene: expected" becomes "--splat-scene: expected".
+
+    What is said in brackets for Python alone, "(in Python: ...)", is left out.
+    """
+    message = re.sub(r" \(in Python: (?:[^()]|\([^()]*\))*\)", "", message)
     about, colon, rest = message.partition(": ")
     arguments = about.replace("-", "_").split(", ")
     if colon and all(argument in names for argument in arguments):

@@ -10,6 +10,8 @@ from typing import Any, Literal
 
 from .options import Several
 
+_THREE = "3 numbers between commas"
+
 
 @dataclass(frozen=True)
 class Edits:
@@ -41,8 +43,8 @@ class Edits:
     """A splat file to add, "lamp.ply"; with a translation, "lamp.ply:1,0,0". No other edit touches it."""
 
 
-def parse_edits(asked: Edits) -> Iterator[Any]:
-    """The edits of the options, in the order of `Edits`, so that a class can be recoloured before it is removed.
+def parse_edits(asked: Edits) -> Iterator[tuple[str, Any]]:
+    """The edits of the options, each after its words ("--scale lamp:2"), in the order of `Edits`: recolour before remove.
 
     Parts of a class (`chair/1`) are counted after the earlier edits; removed parts of one class are counted together. A class
     with a name that ends in `/1` can only be edited in Python.
@@ -57,19 +59,19 @@ def parse_edits(asked: Edits) -> Iterator[Any]:
 
     for words in asked.recolor:
         name, value = _split("recolor", words, "plant:#c04040")
-        yield Recolor(_where("recolor", name), parse_color(value, "recolor"), asked.mode)
+        yield f"--recolor {words}", Recolor(_where("recolor", name), parse_color(value, "recolor"), asked.mode)
     for words in asked.opacity:
         name, value = _split("opacity", words, "lamp:0.3")
         (factor,) = _numbers("opacity", words, value, "a factor from 0 to 1", 1)
         if not 0 <= factor <= 1:
             raise ValueError(f"opacity: expected a factor from 0 to 1 after the colon, got {words!r}; 0 hides, 1 keeps")
-        yield Opacity(_where("opacity", name), factor)
+        yield f"--opacity {words}", Opacity(_where("opacity", name), factor)
     for words in asked.scale:
         name, value = _split("scale", words, "lamp:1.5")
         (factor,) = _numbers("scale", words, value, "a factor above 0", 1)
         if factor <= 0:
             raise ValueError(f"scale: expected a factor above 0 after the colon, got {words!r}; 0.5 halves, 2 doubles")
-        yield Move(_where("scale", name), scale=factor)
+        yield f"--scale {words}", Move(_where("scale", name), scale=factor)
     for words in asked.rotate:
         name, value = _split("rotate", words, "table:z,90")
         axis, _, degrees = value.partition(",")
@@ -78,19 +80,23 @@ def parse_edits(asked: Edits) -> Iterator[Any]:
                 f"rotate: expected an axis (x, y or z) and degrees, got {words!r}; write it as 'table:z,90'"
             )
         (angle,) = _numbers("rotate", words, degrees, "an axis (x, y or z) and degrees", 1)
-        yield Move(_where("rotate", name), rotation=Turn(AXES[axis], angle))
+        yield f"--rotate {words}", Move(_where("rotate", name), rotation=Turn(AXES[axis], angle))
     for words in asked.move:
         name, value = _split("move", words, "table:0.5,0,0")
-        yield Move(_where("move", name), _numbers("move", words, value, "3 numbers between commas", 3))
+        yield f"--move {words}", Move(_where("move", name), _numbers("move", words, value, _THREE, 3))
     for words in asked.duplicate:
         name, value = _split("duplicate", words, "chair:1,0,0")
-        yield Duplicate(_where("duplicate", name), _numbers("duplicate", words, value, "3 numbers between commas", 3))
-    for parts in _together(asked.remove).values():
-        yield Remove(parts[0] if len(parts) == 1 else Either(tuple(parts)))
+        yield (
+            f"--duplicate {words}",
+            Duplicate(_where("duplicate", name), _numbers("duplicate", words, value, _THREE, 3)),
+        )
+    for words, parts in _together(asked.remove):
+        yield f"--remove {' '.join(words)}", Remove(parts[0] if len(parts) == 1 else Either(tuple(parts)))
     if asked.extract:
-        yield Extract(Either(tuple(_where("extract", words) for words in asked.extract)))
+        where = Either(tuple(_where("extract", words) for words in asked.extract))
+        yield f"--extract {' '.join(asked.extract)}", Extract(where)
     for words in asked.insert:
-        yield _insertion(words)
+        yield f"--insert {words}", _insertion(words)
 
 
 def inserted_files(edits: Iterable[Any]) -> list[Path]:
@@ -105,7 +111,7 @@ def check_parts(splats: Any, edits: Iterable[Any]) -> None:
 
     Args:
         splats: the cloud before the edits.
-        edits: from `parse_edits`.
+        edits: those of `parse_edits`, without the words.
     """
     import torch
 
@@ -149,14 +155,16 @@ def _where(option: str, words: str) -> Any:
     return Component(OfClass(name), rank=int(part) - 1)
 
 
-def _together(remove: Sequence[str]) -> dict[str, list[Any]]:
+def _together(remove: Sequence[str]) -> list[tuple[list[str], list[Any]]]:
     """The removed parts by class (ignoring case), because removing one part changes the numbers of the others."""
-    found: dict[str, list[Any]] = {}
+    found: dict[str, tuple[list[str], list[Any]]] = {}
     for words in dict.fromkeys(remove):
         where = _where("remove", words)
         of_class = getattr(where, "where", where)
-        found.setdefault(of_class.name.casefold(), []).append(where)
-    return found
+        said, parts = found.setdefault(of_class.name.casefold(), ([], []))
+        said.append(words)
+        parts.append(where)
+    return list(found.values())
 
 
 def _insertion(words: str) -> Any:
@@ -172,7 +180,7 @@ def _insertion(words: str) -> Any:
         raise ValueError(f"insert: expected a splat file, or one with a translation, got {words!r}; no file {path!r}")
     if not value:
         return Insert(Path(path))
-    shift = torch.tensor(_numbers("insert", words, value, "3 numbers between commas", 3), dtype=torch.float64)
+    shift = torch.tensor(_numbers("insert", words, value, _THREE, 3), dtype=torch.float64)
     return Insert(Path(path), Similarity(1.0, torch.eye(3, dtype=torch.float64), shift))
 
 

@@ -126,8 +126,8 @@ def fit(
         check_alone("steps", training.steps, "with --splat, which needs no training")
     as_taken = views.load(scene)
     loaded = as_taken.undistorted()
-    check_scene(loaded)  # before hours of features
     chosen = loaded.views(views.split)
+    check_scene(loaded, chosen)  # before hours of features
     if teacher.teacher is not None:
         for name, given in (("features", maps.features), ("level", maps.level)):
             check_alone(name, given, "with --teacher, whose maps are not stored")

@@ -6,15 +6,28 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
+LINE, END = 2000, 600
+"""Most characters of a printed line, and how many of them are from its end, where an error says what to do."""
 called: list[str] = []
 """The words of the command that runs, for its report."""
 
 
-def say(text: str) -> None:
-    """Print a line at once."""
-    print(text, flush=True)  # noqa: T201 - the place that prints
+def say(text: str, file: TextIO | None = None) -> None:
+    r"""Print a line at once, to standard output or a file; the place that prints.
+
+    Names from foreign files may hold anything: what is not printable is shown as Python writes it (`\x1b`), and the middle
+    of a very long line is left out.
+    """
+    print("\n".join(_shown(line) for line in text.split("\n")), file=file, flush=True)
+
+
+def _shown(line: str) -> str:
+    left = len(line) - LINE
+    if left > 0:
+        line = f"{line[: LINE - END]} ... ({left} characters left out) ... {line[-END:]}"
+    return "".join(one if one.isprintable() or one == "\t" else ascii(one)[1:-1] for one in line)
 
 
 def wrote(paths: list[Path]) -> None:

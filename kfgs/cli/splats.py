@@ -126,15 +126,15 @@ def edit(
         scene.check_images()
     replayed = EditList() if replay is None else EditList.load(replay, anywhere=True)  # the user's own file
     asked, listed = tuple(parse_edits(edits)), replayed
-    for one in asked:
+    for _, one in asked:
         listed = listed.then(one)
     if len(listed) == 0:
         raise ValueError("edits: expected at least one, got none; give --remove, --recolor, --move or another")
     check_target("out", out, *inserted_files(listed))
-    before = open_splats("splats", splats, labelled=any(edit.op != "insert" for edit in asked))
-    check_parts(replayed.apply(before), asked)
+    before = open_splats("splats", splats, labelled=any(edit.op != "insert" for _, edit in asked))
+    check_parts(replayed.apply(before), [one for _, one in asked])
     cameras = [] if scene.scene is None else _cameras_to_show(before, scene, views)
-    after = listed.apply(before)
+    after = _apply(listed, before, [words for words, _ in asked])
     say(f"{len(before)} Gaussians before, {len(after)} after {len(listed)} edit(s)")
     if len(after) == 0:
         say("note: nothing is left")
@@ -171,6 +171,19 @@ def convert(source: Positional[Path], target: Positional[Path]) -> None:
     say_lost(written)
     say(f"{_bytes_of(source) / 2**10:,.1f} KiB -> {_bytes_of(target) / 2**10:,.1f} KiB")
     wrote(written.paths)
+
+
+def _apply(edits: Any, splats: Any, asked: list[str]) -> Any:
+    """Apply edits, of which the last ones come from options: the error of one quotes the option's words."""
+    from ..labels.edits.edit_list import EditError
+
+    try:
+        return edits.apply(splats)
+    except EditError as error:
+        option = error.index - (len(edits) - len(asked))
+        if option < 0:
+            raise
+        raise ValueError(f"{asked[option]}: {error.why}") from error
 
 
 def _edits_beside(out: Path, replay: Path | None) -> Path:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from .._files import parse_json
 from .registry import get_protocol
 
 
@@ -73,7 +74,7 @@ def _parse(hint: Any, text: str) -> Any:
 def _parse_tuple(inside: tuple[Any, ...], text: str) -> tuple[Any, ...]:
     nested = any(get_origin(one) is tuple for one in inside)
     parts = (
-        json.loads(text)
+        parse_json(text)
         if nested or text.startswith("[")
         else [part.strip() for part in text.split(",") if part.strip()]
     )

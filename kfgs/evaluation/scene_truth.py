@@ -6,9 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
-from zipfile import BadZipFile
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,6 +15,7 @@ from .._files import read_json
 from ..cameras.camera import Camera
 from ..scenes.load import load_scene
 from ..scenes.scene import Scene
+from .datasets.surface_points import load_surface_points
 from .segmentation import load_label_map
 
 BORDER = 2  # pixels around the class whose light is mixed: pictures are sampled, Gaussians have soft edges
@@ -91,19 +90,8 @@ class SceneTruth:
             FileNotFoundError: if the scene lacks `surface.npz`.
             ValueError: if it is damaged.
         """
-        path = self.folder / "surface.npz"
-        if not path.is_file():
-            raise FileNotFoundError(
-                f"{path}: no such file; expected points of all surfaces there, which only scenes of make_toy_room have"
-            )
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                points, labels = file["points"], file["labels"]
-        except (ValueError, KeyError, OSError, EOFError, AttributeError, BadZipFile) as error:
-            raise ValueError(
-                f"{path}: expected the arrays 'points' and 'labels', but it cannot be read ({error}); make the room again"
-            ) from error
-        return torch.from_numpy(points), torch.from_numpy(labels.astype(np.int64)) == self.label
+        truth = load_surface_points(self.folder)
+        return truth.points, truth.labels == self.label
 
 
 def _check_size(path: Path, shape: tuple[int, ...], camera: Camera) -> None:

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from .._card import short_repr
 from ..cameras import resize_labels
 from ..metrics import ConfusionMatrix, Score
+from ..scenes.files import open_picture
 
 VOID = 255
 PROTOCOL = (
@@ -31,16 +31,11 @@ def load_label_map(path: str | Path) -> Tensor:  # [H, W] int64, -1 = void
         ValueError: if it is not an 8-bit single-channel picture.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected a label picture there")
-    try:
-        picture = Image.open(path)
-    except UnidentifiedImageError as error:
-        raise ValueError(f"{path}: expected a picture of labels, but it cannot be decoded; write it again") from error
-    with picture:
-        if picture.mode not in ("L", "P"):
-            raise ValueError(f"{path}: expected 8-bit class indices (mode L or P), got mode {picture.mode}")
-        values = torch.from_numpy(np.array(picture)).long()
+    with open_picture(path, "a label picture", "write it again") as picture:
+        mode = picture.mode
+        values = torch.from_numpy(np.array(picture)).long() if mode in ("L", "P") else None
+    if values is None:
+        raise ValueError(f"{path}: expected 8-bit class indices (mode L or P), got mode {mode}")
     return torch.where(values == VOID, -1, values)
 
 

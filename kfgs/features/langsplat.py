@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .._arrays import read_array
 from .._check import check_choice, check_whole
 
 INDEX, ROWS = "_s.npy", "_f.npy"  # endings after the stem: masks [L, H, W], and their features [M, D]
@@ -36,12 +37,12 @@ class MaskFeatures:
         if stride is not None:
             check_whole("stride", stride, 1)
         self.file, partner = file, rows_file(file)
-        index = np.load(file, mmap_mode="r", allow_pickle=False)
+        index = read_array(file, mapped=True)
         if index.ndim != 3 or 0 in index.shape or index.dtype.kind not in "iuf":
             raise ValueError(f"expected mask numbers [4, H, W], got {index.dtype} {index.shape}")
         if not partner.is_file():
             raise FileNotFoundError(f"expected {partner.name} with the masks' features in the same folder, got none")
-        rows = np.load(partner, allow_pickle=False)
+        rows = read_array(partner)
         if rows.ndim != 2 or rows.shape[1] == 0 or rows.dtype.kind != "f":
             raise ValueError(f"expected floats [M, D] in {partner.name}, got {rows.dtype} {rows.shape}")
         if not 0 <= level < index.shape[0]:

@@ -11,11 +11,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import safe_open
 from torch import Tensor
 
+from .._arrays import FileError, read_array, read_safetensors
 from .._check import check_shapes
 from .._files import atomic_path
+from ..scenes.files import some
 from ..teachers.torch_files import Placeholder, check_plain, load_torch_file
 from .langsplat import INDEX, ROWS, MaskFeatures
 
@@ -25,6 +26,7 @@ Axes = Literal["h w D", "D h w"]
 
 WIDTHS = frozenset((128, 256, 384, 512, 768, 1024, 1152, 1280, 1536))
 """Numbers of channels of known encoders. A first axis of one of these sizes, and a last axis of none, hints at [D, h, w]."""
+AGAIN = "encode it again"
 ROW_BLOCK = 32  # rows of a map converted at a time: 30 MB in single precision at 480 x 512 channels
 
 
@@ -63,16 +65,14 @@ def _open_torch(file: Path, _: Reading) -> Any:
 
 
 def _open_numpy(file: Path, _: Reading) -> Any:
-    with np.errstate(over="ignore"):  # a header may state any size; one larger than the file is refused
-        return np.load(file, mmap_mode="r", allow_pickle=False)
+    return read_array(file, "a feature map", AGAIN, mapped=True)
 
 
 def _open_safetensors(file: Path, _: Reading) -> Any:
-    with safe_open(file, framework="pt") as tensors:
-        names = list(tensors.keys())
-        if len(names) != 1:
-            raise ValueError(f"expected one tensor, got {len(names)}: {', '.join(names[:5])}")
-        return tensors.get_tensor(names[0])  # mapped, not read
+    tensors, _ = read_safetensors(file, "a feature map", AGAIN)
+    if len(tensors) != 1:
+        raise ValueError(f"expected one tensor, got {len(tensors)}: {some(list(tensors))}")
+    return next(iter(tensors.values()))  # mapped, not read
 
 
 def _open_langsplat(file: Path, reading: Reading) -> Any:
@@ -123,9 +123,11 @@ def open_map(file: Path, reading: Reading = Reading(), own: Container[Path] = ()
     assert layout is not None, f"{file} is no map"
     try:
         found = layout.open(file, reading)
+    except FileError:
+        raise
     except Exception as error:  # a damaged pickle raises almost anything: struct.error, KeyError, EOFError, ...
         raise ValueError(
-            f"{file}: expected a feature map, but it cannot be read ({_reason(error)}); encode it again"
+            f"{file}: expected a feature map, but it cannot be read ({_reason(error)}); {AGAIN}"
         ) from error
     if isinstance(found, MaskFeatures):
         return found

@@ -82,11 +82,10 @@ def read_manifest(folder: str | Path) -> Manifest | None:
         if not _is_plain(teacher, LEVELS):
             raise ValueError("teacher holds NaN or infinity, or is nested too deeply")
         return Manifest(teacher, {stem: _read_record(stem, entry) for stem, entry in maps.items()}, discarded)
-    except (ValueError, RecursionError) as error:
-        deep = isinstance(error, RecursionError)
+    except ValueError as error:
         raise ValueError(
             f"{path}: expected a manifest of kfgs, but it is damaged "
-            f"({'nested too deeply' if deep else str(error).removeprefix(f'{path}: ')}); "
+            f"({str(error).removeprefix(f'{path}: ')}); "
             "delete it to use the maps without it, or delete it and run `kfgs features` with --overwrite, which makes them "
             "again"
         ) from error

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._arrays import read_array
 from .._files import atomic_path, digest_file, digest_value, read_json, write_json
 from ..quant.sampling import SAMPLES, sample_grid
 from ..scenes import Scene
@@ -115,8 +116,8 @@ class RecomputedMaps(Sequence[Tensor]):
             self.store / f"{self.stems[i]}-{digest_value(about)[:16]}.npy"
         )  # the name says what the content depends on
         try:
-            return torch.from_numpy(np.load(file, allow_pickle=False)).float()
-        except (OSError, EOFError, ValueError):  # not made yet, or damaged
+            return torch.from_numpy(read_array(file)).float()
+        except (OSError, ValueError):  # not made yet, or damaged
             features = self[i]
         if i == 0:
             write_json(self._shape_file, list(features.shape))

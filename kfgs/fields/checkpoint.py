@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from .._arrays import read_safetensors
 from .._card import short_repr
 from .._check import as_tensor
-from .._files import atomic_path, digest_value
+from .._files import atomic_path, digest_value, parse_json
 from ..cameras import Camera
 from ..cameras.camera import NEAR
 from .config import FieldConfig
@@ -84,27 +84,18 @@ def read_checkpoint(path: Path, identity: dict[str, str]) -> Checkpoint | None:
     """
     if not path.exists():
         return None
+    advice = "delete it to start again, or give another path"
+    tensors, metadata = read_safetensors(path, f"a kfgs {KIND}", advice, kfgs=(KIND, VERSION))
     try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (the handle is no mapping)
-    except (SafetensorError, OSError) as error:
-        raise ValueError(
-            f"checkpoint: expected a kfgs {KIND} at {path}, but it cannot be read ({error}); delete it to start again"
-        ) from error
-    if metadata.get("kfgs") != KIND or metadata.get("version") != VERSION:
-        found = f"{metadata.get('kfgs', 'other tensors')} (version {metadata.get('version')})"
-        raise ValueError(
-            f"checkpoint: expected a kfgs {KIND} of version {VERSION} at {path}, got {found}; give another path"
-        )
-    known = json.loads(metadata["identity"])
+        known, state = (dict(parse_json(metadata[key])) for key in ("identity", "state"))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected a kfgs {KIND}, but it cannot be read ({error}); {advice}") from error
     differing = sorted(name for name in identity | known if identity.get(name) != known.get(name))
     if differing:
         raise ValueError(
-            f"checkpoint: expected one of this very fit at {path}, got one with other {', '.join(differing)}; "
-            "delete it to start again, or give another path"
+            f"checkpoint: expected one of this very fit at {path}, got one with other {', '.join(differing)}; {advice}"
         )
-    return Checkpoint(tensors, json.loads(metadata["state"]))
+    return Checkpoint(tensors, state)
 
 
 def _digest_tensors(tensors: Sequence[Tensor]) -> str:

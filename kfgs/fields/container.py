@@ -19,6 +19,7 @@ import zstandard
 from safetensors import SafetensorError
 from torch import Tensor
 
+from .._files import parse_json
 from ..formats.order import morton_codes
 from ..formats.values import unit_quats
 from .coding import (
@@ -137,9 +138,9 @@ def peek(head: bytes) -> dict[str, Any] | None:
     if not 2 <= length <= min(HEADER, len(head) - 8):
         return None
     try:
-        about = json.loads(json.loads(head[8 : 8 + length])["__metadata__"]["kfgs"])
+        about = parse_json(parse_json(head[8 : 8 + length])["__metadata__"]["kfgs"])
         return dict(about) if about["kind"] == KIND else None
-    except (ValueError, LookupError, TypeError, RecursionError):
+    except (ValueError, LookupError, TypeError):
         return None
 
 
@@ -217,7 +218,7 @@ def _unpack(data: bytes) -> tuple[dict[str, Tensor], dict[str, Any]]:
         if stream.dtype != torch.uint8 or stream.ndim != 1:
             raise ValueError(f"{name}: expected a stream of bytes, got {stream.dtype} {tuple(stream.shape)}")
     packed = {name: stream.numpy().tobytes() for name, stream in streams.items()}
-    description = json.loads(
+    description = parse_json(
         _decompress(packed.pop(ABOUT), None, WORDS), parse_constant=_no_constant, parse_float=_finite
     )
     entries = description.pop("tensors")

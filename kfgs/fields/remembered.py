@@ -29,6 +29,19 @@ def remember(scene: Path, field: Path, channels: int | None = None) -> dict[str,
     return found
 
 
+def check_notes(info: object) -> dict[str, Any]:
+    """A field's `info` as it is; a ValueError if it is no object, or if views or classes are not as `remember` writes them."""
+    if not isinstance(info, dict):
+        raise ValueError(f"info: expected an object, got {type(info).__name__}")
+    views, classes = info.get("views", []), info.get("classes", [])
+    if not isinstance(views, list | tuple) or not all(isinstance(name, str) for name in views):
+        raise ValueError(f"info.views: expected a list of names, got {views!r:.80}")
+    files = classes if isinstance(classes, list | tuple) else [None]
+    if not all(isinstance(one, dict) and {"path", "sha256"} <= set(one) for one in files):
+        raise ValueError(f"info.classes: expected a list of files with path and sha256, got {classes!r:.80}")
+    return info
+
+
 def rebased(info: dict[str, Any], old: Path | None, new: Path) -> dict[str, Any]:
     """The notes of a field that moves to another folder."""
     if old is None or old.resolve() == new.resolve():
@@ -63,7 +76,7 @@ def recall_classes(info: dict[str, Any], folder: Path | None) -> LabelSet:
     if not noted or folder is None:
         raise ValueError(
             "classes: expected a label set, or a field that remembers the classes of its scene, got neither; pass "
-            "load_label_set(names, embeddings)"
+            "the classes (in Python: load_label_set(names, embeddings))"
         )
     files = [_absolute(folder, str(one["path"])) for one in noted]
     for file, one in zip(files, noted, strict=True):

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from .._card import html_card
 from .._check import as_tensor, check_choice
-from .._rows import unit_embeddings, unit_rows
+from .._rows import check_directions, unit_embeddings, unit_rows
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels import Classification, CodewordLabels, LabelSet, Score, Selection, label_codewords, select_by_similarity
@@ -163,6 +163,7 @@ class SemanticField:
             if self.linear is not None and (rule == "fused" or self._is_linear):
                 return self.linear.cosines(self._own, unit)
             if self.codebook is None:
+                check_directions("gaussians.features", self.features)
                 return torch.cat([unit_rows(part) @ unit.T for part in self.features.split(parts.CHUNK)])
             per_codeword = self.codebook.unit.to(unit) @ unit.T  # [K, M]
             index = [self.codebook.quantize(self.decode(part)) for part in self.features.split(parts.CHUNK)]

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor
 
+from .._arrays import read_safetensors
 from .._check import check_choice
 from .._files import atomic_folder, atomic_path, digest_file, read_json, write_json
 from ..cameras import Camera
@@ -22,7 +22,7 @@ from .answers import Seen
 from .container import HEADER, pack_tensors, peek, unpack_tensors
 from .parts import check_parts
 from .precision import PRECISIONS, Rounding
-from .remembered import rebased, recall_classes
+from .remembered import check_notes, rebased, recall_classes
 
 FORMAT, VERSIONS = "kfgs.semantic_field", (1, 2, 3)
 """Version 2 may hold linear latents, fused answers and cameras; version 3 the classes."""
@@ -61,7 +61,7 @@ def save_field(path: str | Path, parts: Mapping[str, Any], precision: str | Roun
             f"path: expected a new {'file' if single else 'folder'} or an older field at {path}, got something else; "
             "give another"
         )
-    parts = {**parts, "info": rebased(parts["info"], parts["folder"], path)}
+    parts = {**parts, "info": rebased(check_notes(parts["info"]), parts["folder"], path)}
     if single:
         data = pack_parts({**parts, "words": _words(parts, path)}, precision or "lossless")
         with atomic_path(path) as temporary:
@@ -113,12 +113,7 @@ def load_field(path: str | Path) -> dict[str, Any]:
             f"{path}: expected {TENSORS} as it was saved, got {'another' if (path / TENSORS).is_file() else 'none'}; "
             "copy the whole folder again, or fit the field again"
         )
-    try:
-        tensors = load_file(path / TENSORS)
-    except SafetensorError as error:
-        raise ValueError(
-            f"{path}: expected a field, but its parts do not fit together ({error}); fit it again"
-        ) from error
+    tensors, _ = read_safetensors(path / TENSORS, "the numbers of a field", "fit it again")
     return _from_tensors(str(path), tensors, description)
 
 
@@ -180,7 +175,7 @@ def _from_tensors(name: str, tensors: dict[str, Tensor], description: dict[str, 
             "gaussians": Gaussians(**_part(tensors, "gaussians")),
             "codebook": Codebook.from_tensors(codebook) if codebook else None,
             "autoencoder": Autoencoder.from_tensors(autoencoder) if autoencoder else None,
-            "info": dict(description["info"]),
+            "info": check_notes(description["info"]),
             "linear": LinearLatents.from_tensors(linear) if linear else None,
             "answers": answers.get("latents"),
             "seen": Seen(**seen) if seen else None,

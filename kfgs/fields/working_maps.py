@@ -11,9 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._arrays import read_arrays
 from .._check import as_tensor, check_shapes
 from .._files import atomic_path
-from .._rows import EPS, row_norms, unit_rows
+from .._rows import ENCODE, EPS, check_directions, row_norms, unit_rows
 from ..cameras import Camera
 from ..cameras.resample import from_bchw, to_bchw
 from ..quant import FeatureMaps
@@ -100,9 +101,9 @@ class WorkingMaps:
             with atomic_path(file) as path, path.open("wb") as opened:
                 np.savez(opened, rows=rows.to(torch.float16).cpu().numpy(), shape=np.asarray(shape))
             return rows, torch.tensor(shape, dtype=torch.float64)
-        with np.load(file, allow_pickle=False) as found:
-            rows = torch.from_numpy(found["rows"].astype(np.float32)).to(self._directions)
-            return rows, torch.from_numpy(found["shape"]).double()
+        found = read_arrays(file)
+        rows = torch.from_numpy(found["rows"].astype(np.float32)).to(self._directions)
+        return rows, torch.from_numpy(found["shape"]).double()
 
     def _make(self, i: int) -> tuple[Tensor, tuple[int, int]]:  # [h, w, d']
         """Read a map in the working directions, and shrink it to its working size."""
@@ -122,8 +123,7 @@ class WorkingMaps:
         check_shapes((f"maps[{i}]", block, ("h", "w", len(self._directions))))
         features = block.to(self._directions)
         lengths = row_norms(features)
-        if not bool(torch.isfinite(lengths).all()):
-            raise ValueError(f"maps[{i}]: expected finite features, got NaN or infinity; encode that image again")
+        check_directions(f"maps[{i}]", features, lengths, ENCODE)
         known = (lengths > EPS)[..., None]
         return (features @ self._directions) / lengths.clamp_min(EPS)[..., None] * known, known
 
@@ -143,12 +143,14 @@ def working_directions(maps: FeatureMaps) -> Tensor:  # [D, d']
         else:
             rows = grid(i, None, samples)
             check_shapes((f"maps[{i}]", rows, ("n", channels)))
-        rows = unit_rows(rows.float())
-        if not bool(torch.isfinite(rows).all()):
-            raise ValueError(f"maps[{i}]: expected finite features, got NaN or infinity; encode that image again")
+        rows = rows.float()
+        check_directions(f"maps[{i}]", rows, advice=ENCODE)
+        rows = unit_rows(rows)
         moment = moment + rows.T @ rows
     assert isinstance(moment, Tensor)
     values, directions = principal_directions(moment)
     if not float(values[0]) > 0:
-        raise ValueError(f"maps: expected nonzero features, got {len(maps)} all-zero maps; check the teacher")
+        raise ValueError(
+            f"maps: expected features longer than {EPS:g}, got none in {len(maps)} maps; check the teacher"
+        )
     return directions[:, :WORKING].float()

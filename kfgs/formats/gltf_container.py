@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from .._files import atomic_path
+from .._files import atomic_path, parse_json
 
 MAGIC = b"glTF"
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
@@ -156,8 +156,8 @@ def open_document(path: Path) -> Document:
     if values > _MOST_VALUES:  # each becomes an object of Python's, tens of times larger than its text
         raise ValueError(f"{path}: expected at most {_MOST_VALUES} values in its JSON, got {values}; split the scene")
     try:
-        root = json.loads(text)
-    except (ValueError, RecursionError) as error:
+        root = parse_json(text)
+    except ValueError as error:
         raise ValueError(
             f"{path}: expected glTF, but its JSON cannot be parsed ({error!s:.120}); write it again"
         ) from error

@@ -7,9 +7,11 @@ rotation as (w, x, y, z) and f_rest channel by channel. kfgs adds `class_id` and
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ..gaussians import Gaussians
@@ -119,8 +121,19 @@ def gaussians_from_columns(columns: Columns) -> Gaussians:
         opacities=stack_columns(columns, ["opacity"])[:, 0].sigmoid(),
         features=stack_columns(columns, features) if features else None,
         sh=sh,
-        labels=torch.from_numpy(columns["class_id"].astype(np.int64)) if "class_id" in columns else None,
+        labels=_labels(columns["class_id"]) if "class_id" in columns else None,
     )
+
+
+def _labels(values: NDArray[Any]) -> Tensor:  # [N] -> [N] int64
+    """Labels of any type of numbers; a ValueError for a number that is not whole."""
+    whole = np.isfinite(values) & (values == np.trunc(values)) & (np.abs(values.astype(np.float64)) < 2**53)
+    if not whole.all():
+        row = int((~whole).argmax())
+        raise ValueError(
+            f"class_id: expected whole numbers, got {values[row]} at Gaussian {row}; are these scores? name the column score"
+        )
+    return torch.from_numpy(values.astype(np.int64))
 
 
 def columns_from_gaussians(gaussians: Gaussians) -> Columns:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from .._arrays import read_arrays
 from .._files import atomic_path, digest_file, read_json, write_json
 from .splat_file import SCORE, SplatFile
 
@@ -72,11 +72,13 @@ def write_sidecar(path: Path, splats: SplatFile, *, holds_labels: bool) -> list[
 def read_sidecar(path: Path, splats: SplatFile) -> SplatFile:
     """Add labels and names from the files next to a splat file; those in the splat file have priority.
 
+    If `path` is a link, files next to the link come first, then those next to the file that it leads to.
+
     Raises:
         ValueError: if such a file is damaged, or its labels belong to another version of the splat file.
     """
-    beside = labels_path(path)
-    if splats.gaussians.labels is None and beside.is_file():
+    beside = _first(labels_path(place) for place in _places(path))
+    if splats.gaussians.labels is None and beside is not None:
         splats = _with_labels(beside, path, splats)
     names = find_names(path)
     if splats.gaussians.labels is not None and not splats.classes and names is not None:
@@ -85,8 +87,20 @@ def read_sidecar(path: Path, splats: SplatFile) -> SplatFile:
 
 
 def find_names(path: str | Path) -> Path | None:
-    """The file with the class names of a splat file: `names_path`, or else `shared_names_path`; None if neither exists."""
-    return next((found for found in (names_path(path), shared_names_path(path)) if found.is_file()), None)
+    """The file with the class names of a splat file: `names_path`, or else `shared_names_path`; None if neither exists.
+
+    Both are looked for next to the path, then, if that is a link, next to the file that it leads to.
+    """
+    return _first(name(place) for name in (names_path, shared_names_path) for place in _places(path))
+
+
+def _places(path: str | Path) -> tuple[Path, ...]:
+    """A path, and the file that it leads to if it is a link."""
+    return (Path(path), Path(path).resolve())
+
+
+def _first(paths: Iterable[Path]) -> Path | None:
+    return next((path for path in paths if path.is_file()), None)
 
 
 def read_names(path: Path) -> tuple[str, ...]:
@@ -121,18 +135,12 @@ def _with_labels(beside: Path, path: Path, splats: SplatFile) -> SplatFile:
 
 def _load_labels(beside: Path, path: Path, count: int) -> tuple[NDArray[Any], NDArray[Any] | None, str]:
     """Read `class_id`, `score` and the digest of their splat file; sizes are checked before unpacking."""
-    try:
-        with zipfile.ZipFile(beside) as archive:
-            sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
-        if sum(sizes.values()) > 16 * count + _NPZ_HEADERS:
-            raise ValueError(f"{sum(sizes.values())} bytes for {count} Gaussians")
-        with np.load(beside, allow_pickle=False) as file:
-            labels, of = file["class_id"], str(file["of"])
-            score = file.get(SCORE)
-    except (ValueError, KeyError, OSError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(
-            f"{beside}: expected labels of {path.name}, but it cannot be read ({error}); delete it"
-        ) from error
+    found = read_arrays(
+        beside, f"labels of the {count} Gaussians of {path.name}", "delete it", most=16 * count + _NPZ_HEADERS
+    )
+    if not {"class_id", "of"} <= set(found):
+        raise ValueError(f"{beside}: expected the arrays class_id and of, got {', '.join(found) or 'none'}; delete it")
+    labels, of, score = found["class_id"], str(found["of"]), found.get(SCORE)
     if labels.dtype.kind not in "iu" or (score is not None and score.dtype.kind != "f"):
         raise ValueError(f"{beside}: expected whole numbers as class_id, got {labels.dtype}; delete it")
     return labels, score, of

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import math
 import warnings
 import zipfile
@@ -14,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+
+from .._files import parse_json
 
 META = "meta.json"
 _META_BYTES = 1 << 22  # three codebooks of 256 numbers and a few names take 20 KB
@@ -105,8 +106,8 @@ class SogFiles:
         """The content of `meta.json`."""
         data = self.read(META, _META_BYTES)
         try:
-            meta = json.loads(data.decode("utf-8"))
-        except (ValueError, RecursionError) as error:  # not UTF-8, not JSON, or an integer of thousands of digits
+            meta = parse_json(data.decode("utf-8"))
+        except ValueError as error:
             raise ValueError(f"{self.path}: expected JSON in {META}, but it cannot be parsed ({error})") from error
         if not isinstance(meta, dict):
             raise ValueError(f"{self.path}: expected an object in {META}, got {type(meta).__name__}; export it again")

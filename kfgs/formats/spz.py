@@ -30,6 +30,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from .._check import check_choice, check_whole
+from .._files import parse_json
 from ..gaussians import Gaussians
 from .render_mode import ANTIALIASED as ANTIALIASED_MODE
 from .render_mode import describe_lost_mode
@@ -198,8 +199,8 @@ def _unpack_labels(path: Path, payload: bytes, count: int) -> _LabelRecord:
             if size
             else b""
         )
-        classes = json.loads(plain[size - names_size :]) if names_size else []
-    except (zstandard.ZstdError, ValueError, RecursionError) as error:
+        classes = parse_json(plain[size - names_size :]) if names_size else []
+    except (zstandard.ZstdError, ValueError) as error:
         raise ValueError(f"{path}: expected {size} bytes of labels, but they cannot be read ({error})") from error
     class_id = np.frombuffer(plain, "<i4", n).astype(np.int32)
     score = np.frombuffer(plain, "<f4", n, 4 * n).astype(np.float32) if scores else None

@@ -47,7 +47,7 @@ def positive_scales(path: Path, scales: NDArray[np.float32]) -> Tensor:  # [N, 3
             f"{path}: expected scales of 0 or more, got {scales[row].tolist()} at Gaussian {row}; the file is damaged, or "
             "of another format"
         )
-    return torch.from_numpy(np.maximum(scales, np.float32(_TINY_SCALE)))
+    return torch.from_numpy(np.where(scales == 0, np.float32(_TINY_SCALE), scales))
 
 
 def flip_axes(g: Gaussians, axes: tuple[int, int, int]) -> Gaussians:
@@ -107,7 +107,7 @@ def _check_rows(name: str, expected: str, values: Tensor, good: Tensor) -> None:
     row = int(bad.nonzero()[0])
     raise ValueError(
         f"{name}: expected {expected} in every Gaussian, got {values[row].flatten()[:4].tolist()} at {row} and others at "
-        f"{int(bad.sum()) - 1} more of {len(bad)}; correct them, or leave these Gaussians out with select"
+        f"{int(bad.sum()) - 1} more of {len(bad)}; correct them, or leave these Gaussians out (in Python: with select)"
     )
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._check import as_tensor, check_shapes, check_whole
-from .._rows import EPS, check_finite, row_norms, unit_embeddings, unit_rows
+from .._rows import EPS, check_directions, check_finite, row_norms, unit_embeddings, unit_rows
 from .components import component_numbers
 from .scores import Score, select_by_similarity
 from .selection import Selection
@@ -55,10 +55,11 @@ def label_codewords(
     Raises:
         ValueError: if shapes disagree, there is no class, an embedding is all-zero, or a number is not finite.
     """
-    codewords, embeddings = as_tensor("codewords", codewords), as_tensor("embeddings", embeddings)
+    codewords = as_tensor("codewords", codewords, floating=True)
+    embeddings = as_tensor("embeddings", embeddings, floating=True)
     check_shapes(("codewords", codewords, "K D"), ("embeddings", embeddings, "C D"))
     classes = unit_embeddings(embeddings)
-    check_finite("codewords", codewords)
+    check_directions("codewords", codewords)
     with torch.no_grad():
         similarity = unit_rows(codewords) @ classes.T.to(codewords)
         return CodewordLabels(_best(codewords, similarity).labels, similarity)
@@ -87,10 +88,11 @@ def classify(
         >>> classify(torch.tensor([[2.0, 0.0], [0.1, 0.3], [0.0, 0.0]]), torch.eye(2)).labels.tolist()
         [0, 1, -1]
     """
-    features, embeddings = as_tensor("features", features), as_tensor("embeddings", embeddings)
+    features = as_tensor("features", features, floating=True)
+    embeddings = as_tensor("embeddings", embeddings, floating=True)
     check_shapes(("features", features, "N D"), ("embeddings", embeddings, "C D"))
     classes = unit_embeddings(embeddings).T.to(features)
-    check_finite("features", features)
+    check_directions("features", features)
     with torch.no_grad():
         parts = [_best(rows, unit_rows(rows) @ classes) for rows in features.split(CHUNK)]
     return Classification(torch.cat([part.labels for part in parts]), torch.cat([part.scores for part in parts]))
@@ -124,13 +126,13 @@ def select_by_query(
         ValueError: if shapes disagree, the query or a negative is all-zero, the threshold is out of range, or a number
             is not finite.
     """
-    features, query = as_tensor("features", features), as_tensor("query", query)
-    negatives = None if negatives is None else as_tensor("negatives", negatives)
+    features, query = as_tensor("features", features, floating=True), as_tensor("query", query, floating=True)
+    negatives = None if negatives is None else as_tensor("negatives", negatives, floating=True)
     check_shapes(("features", features, "N D"), ("query", query, "D"), ("negatives", negatives, "M D"))
     rows = unit_embeddings(query[None], "query").to(features)
     if negatives is not None:
         rows = torch.cat([rows, unit_embeddings(negatives, "negatives").to(features)])
-    check_finite("features", features)
+    check_directions("features", features)
     with torch.no_grad():
         similarity = torch.cat([unit_rows(part) @ rows.T for part in features.split(CHUNK)])
         something = row_norms(features) > EPS
@@ -179,7 +181,7 @@ def select_like(
     Raises:
         ValueError: as `select_by_query`, or if there are no examples or an index is out of range.
     """
-    features = as_tensor("features", features)
+    features = as_tensor("features", features, floating=True)
     check_shapes(("features", features, "N D"))
     rows = torch.atleast_1d(as_tensor("like", like)).to(features.device)
     rows = rows.nonzero()[:, 0] if rows.dtype == torch.bool and len(rows) == len(features) else rows

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from .._arrays import read_array, read_safetensors
 from .._card import cut, html_card
 from .._check import as_tensor
-from .._files import atomic_path, read_json
+from .._files import atomic_path, parse_json, read_json
 from .names import class_index, class_indices
 
 KIND, VERSION = "label set", "1"  # of the metadata's "kfgs" and "version"
@@ -49,7 +49,9 @@ class LabelSet:
                 f"names: expected a list of class names, got the text {self.names!r:.80}; put it into a list"
             )
         object.__setattr__(self, "names", tuple(self.names))
-        object.__setattr__(self, "embeddings", as_tensor("embeddings", self.embeddings))
+        object.__setattr__(self, "embeddings", as_tensor("embeddings", self.embeddings, floating=True))
+        if self.negatives is not None:
+            object.__setattr__(self, "negatives", as_tensor("negatives", self.negatives, floating=True))
         if self.embeddings.ndim != 2 or len(self.names) != len(self.embeddings):
             raise ValueError(
                 f"embeddings: expected [C, D] with C = {len(self.names)} (one row per name), "
@@ -117,6 +119,7 @@ class LabelSet:
         Raises:
             ValueError: if the name is taken, or the row has another number of channels.
         """
+        embedding = as_tensor("embedding", embedding, floating=True)
         if _shape(embedding) != (self.dim,):
             raise ValueError(
                 f"embedding: expected ({self.dim},) (from the {len(self)} classes), got {_shape(embedding)}; "
@@ -224,36 +227,21 @@ def _shape(rows: Tensor | None) -> tuple[int, ...] | None:
 
 def _read_table(path: Path) -> LabelSet:
     """Read what `LabelSet.save` wrote."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected a table of words there, which `kfgs text` makes")
-    try:
-        with safe_open(path, framework="pt") as file:
-            found = file.metadata() or {}
-            if (found.get("kfgs"), found.get("version")) != (KIND, VERSION):
-                raise ValueError(
-                    f"{path}: expected a kfgs {KIND}, version {VERSION}, got {found.get('kfgs') or 'other tensors'} "
-                    f"{found.get('version', '')}; make one with `kfgs text`"
-                )
-            parts = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 (no mapping)
-        names, negative_names, info = (json.loads(found[key]) for key in ("names", "negative_names", "info"))
-        fields = tuple(names), parts["embeddings"], parts.get("negatives"), tuple(negative_names), {**info}
-    except (SafetensorError, KeyError, TypeError, json.JSONDecodeError) as error:
-        raise ValueError(
-            f"{path}: expected a kfgs {KIND}, but it cannot be read ({error}); make it again with `kfgs text`"
-        ) from error
+    expected, advice = f"a kfgs {KIND} (a table of words)", "make it again with `kfgs text`"
+    parts, metadata = read_safetensors(path, expected, advice, kfgs=(KIND, VERSION))
+    parts = {name: rows.float() for name, rows in parts.items()}
     for name, rows in parts.items():
         if rows.ndim != 2 or not torch.isfinite(rows).all():
-            raise ValueError(f"{path}: expected finite rows of {name}, got others; make it again with `kfgs text`")
-    return LabelSet(*fields)
+            raise ValueError(f"{path}: expected finite rows of {name}, got others; {advice}")
+    try:
+        names, negative_names, info = (parse_json(metadata[key]) for key in ("names", "negative_names", "info"))
+        return LabelSet(tuple(names), parts["embeddings"], parts.get("negatives"), tuple(negative_names), {**info})
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected {expected}, but it cannot be read ({error}); {advice}") from error
 
 
 def _read_rows(path: Path, count: int, classes: str | Path) -> Any:  # [C, D] float32
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected an .npy file with one embedding row per class")
-    try:
-        rows = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise ValueError(f"{path}: expected an .npy file of numbers, but it cannot be read ({error})") from error
+    rows = read_array(path, "an .npy file of numbers, one embedding row per class")
     if rows.ndim != 2 or rows.dtype.kind != "f" or len(rows) != count or not np.isfinite(rows).all():
         raise ValueError(
             f"{path}: expected finite floats [C, D] with C = {count} (from {classes}), got {rows.dtype} {rows.shape}"

@@ -47,7 +47,7 @@ def class_rows(classes: Classes, dim: int, info: dict[str, Any]) -> Tensor:  # [
         _check_words(classes, dim, info)
         return classes.embeddings
     try:
-        rows = as_tensor("embeddings", classes, floating=isinstance(classes, list | tuple))
+        rows = as_tensor("embeddings", classes, floating=True)
     except TypeError as error:
         raise TypeError(
             f"classes: expected a LabelSet or embeddings [C, {dim}], got {type(classes).__name__}; load_label_set reads one, "
@@ -84,12 +84,13 @@ def make_question(
         others = classes.embeddings[_unlike(classes.embeddings, row)]
     else:
         check_rows("embedding", target, (), dim)
-        target = as_tensor("embedding", target)
+        target = as_tensor("embedding", target, floating=True)
         row, words = target if rows is None else target.to(rows), "embedding"
         others = row.new_zeros(0, dim) if rows is None else rows[_unlike(rows, row)]
     if not isinstance(negatives, str):
+        negatives = as_tensor("negatives", negatives, floating=True)
         check_rows("negatives", negatives, ("M",), dim)
-        return Question(row, as_tensor("negatives", negatives), words)
+        return Question(row, negatives, words)
     table = classes if isinstance(classes, LabelSet) else None
     canonical = _canonical(table, words, row)
     if negatives == "auto":

@@ -187,7 +187,7 @@ def _common_frame(
     try:
         alignment = align_clouds(*clouds)
     except SceneError as error:
-        raise SceneError(f"{error} (frame=Similarity.identity() says that both share one frame)") from error
+        raise SceneError(f"{error} (in Python: frame=Similarity.identity() says that both share one frame)") from error
     if _stays(clouds[0], alignment):
         note = f"at first {check.summary}; but of all frames their own fits best, by the {alignment.how}: they share it"
         return Similarity.identity(), None, note

@@ -205,8 +205,7 @@ def fit_color(
             split has no views, or `folder/color.ply` is a file that no fit in this folder wrote.
     """
     config, progress = config or ColorConfig.paper(), as_progress(progress)
-    scene.views(config.split)  # raises for a split without views
-    check_scene(scene)
+    check_scene(scene, scene.views(config.split))
     return make_color(Run(Path(folder), report), scene, config, training_device(device), progress, overwrite=True)
 
 

@@ -8,8 +8,8 @@ from tempfile import TemporaryDirectory
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file
 
+from .._arrays import read_safetensors
 from .._files import digest_file
 from ..fields import GaussianParams
 from ..formats import read_splats, write_splats
@@ -49,7 +49,7 @@ def what_is(path: Path) -> str:
 
 def stage_gaussians(folder: Path) -> Gaussians:
     """The Gaussians of a finished colour stage."""
-    return GaussianParams.from_tensors(load_file(folder / "params.safetensors")).activated().detach()
+    return GaussianParams.from_tensors(read_safetensors(folder / "params.safetensors")[0]).activated().detach()
 
 
 def is_saved(path: Path, ours: Gaussians) -> bool:

@@ -7,10 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-
 from ..evaluation import LabelSet, load_label_set, score_recolor, score_removal, score_surface, score_views
+from ..evaluation.datasets.surface_points import load_surface_points
 from ..evaluation.surface import SurfaceReport
 from ..features import FeatureFolder
 from ..formats import SplatFile, write_splats
@@ -149,8 +147,8 @@ def _edit_colors(
 def _label_surface(gaussians: Gaussians, folder: Path, out: Path, classes: LabelSet) -> SurfaceReport:
     """Carry the Gaussians' labels to the room's true surface points and score them (protocol `kfgs-surface/1`)."""
     assert gaussians.labels is not None
-    with np.load(folder / "surface.npz") as surface:
-        points, true = torch.from_numpy(surface["points"]).float(), torch.from_numpy(surface["labels"]).long()
+    truth = load_surface_points(folder)
+    points, true = truth.points.float(), truth.labels
     report = score_surface(gaussians.means, gaussians.labels, points, true)
     columns = {name: points[:, i].contiguous().numpy() for i, name in enumerate("xyz")}
     write_ply(out, columns | label_columns(report.transfer.labels, classes.names), comments=("labels carried by kfgs",))

@@ -180,7 +180,7 @@ def _check_inputs(scene: Scene, views: Sequence[int], maps: Maps, config: FitCon
             f"maps: expected one teacher map per view of split {split!r} ({len(views)}), got {len(maps)}; "
             f"read them with FeatureFolder(path).of(scene, {split!r})"
         )
-    check_scene(scene)
+    check_scene(scene, views)
     stems = getattr(maps, "stems", None)
     if stems is not None and [Path(stem).name for stem in stems] != [Path(scene.stem(i)).name for i in views]:
         raise ValueError(

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
+from .._arrays import read_safetensors
 from .._files import write_json
 from .._progress import Progress
 from ..cameras import Camera
@@ -87,7 +88,7 @@ def uplift_stage(
 
     stage = run.stage("uplift", inputs, make)
     shutil.rmtree(scratch, ignore_errors=True)
-    tensors = load_file(stage.folder / "uplift.safetensors")
+    tensors = read_safetensors(stage.folder / "uplift.safetensors")[0]
     return SemanticField(
         Gaussians(**{name: tensors[name] for name in (*SHAPE, "features")}),
         linear=LinearLatents(tensors["basis"]),
@@ -161,7 +162,7 @@ def answers_stage(run: Run, field: SemanticField, cameras: Sequence[Camera]) -> 
         tensors = {"latents": found.latents, "basis": found.linear.basis, **found.seen._asdict()}
         save_file({name: value.cpu().contiguous() for name, value in tensors.items()}, folder / "answers.safetensors")
 
-    tensors = load_file(run.stage("answers", inputs, make).folder / "answers.safetensors")
+    tensors = read_safetensors(run.stage("answers", inputs, make).folder / "answers.safetensors")[0]
     seen = Seen(tensors["pixels"], tensors["agreement"])
     return field.with_answers(cameras, Answers(tensors["latents"], LinearLatents(tensors["basis"]), seen))
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
+from .._arrays import read_safetensors
 from .._files import write_json
+from ..cameras.projection import project_points
 from ..fields import FieldConfig, FieldFit, GaussianParams
 from ..fields.config import check_extent
 from ..scenes import Scene
@@ -41,14 +43,19 @@ def training_device(device: str | torch.device = "auto") -> torch.device:
     return chosen
 
 
-def check_scene(scene: Scene) -> None:
-    """Raise a ValueError if a scene cannot be trained on: it has a lens, or no points to start from."""
+def check_scene(scene: Scene, views: Sequence[int]) -> None:
+    """Raise a ValueError if some views cannot be trained on: a camera has a lens, or there are no points in their sight."""
     if scene.distorted:
         raise ValueError("scene: expected cameras without distortion, got a lens; pass scene.undistorted()")
     if len(scene.points) < 2:
         raise ValueError(
             f"scene: expected sparse points to start from, got {len(scene.points)}; a transforms.json needs a "
             "ply_file_path, or estimate the scene with `kfgs sfm`"
+        )
+    if not any(bool(project_points(scene.cameras[i], scene.points)[2].any()) for i in views):
+        raise ValueError(
+            f"scene: expected points that some view shows, got {len(scene.points)} out of sight of all {len(views)} views; "
+            "do points and poses share one frame? is the up axis or the direction of the poses flipped?"
         )
 
 
@@ -83,4 +90,4 @@ def field_stage(
 
     stage = run.stage(name, inputs, make)
     scratch.unlink(missing_ok=True)
-    return GaussianParams.from_tensors(load_file(stage.folder / "params.safetensors")), stage
+    return GaussianParams.from_tensors(read_safetensors(stage.folder / "params.safetensors")[0]), stage

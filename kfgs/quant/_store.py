@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from .._arrays import read_safetensors
 from .._files import atomic_path
 
 KIND, VERSION = "kfgs", "1"  # the metadata's key for the kind of file, and the version of all of them
@@ -22,20 +22,10 @@ def write_tensors(path: str | Path, tensors: Mapping[str, Tensor], *, kind: str)
 
 
 def read_tensors(path: str | Path, *, kind: str) -> dict[str, Tensor]:
-    """Read tensors, refusing a file of another kind.
+    """Read tensors, refusing a file of another kind or version.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is no .safetensors file, or is of another kind.
+        ValueError: if it is no .safetensors file, or is of another kind or version.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected a kfgs {kind} (.safetensors) there")
-    try:
-        with safe_open(path, framework="pt") as file:
-            found = (file.metadata() or {}).get(KIND)
-            if found != kind:
-                raise ValueError(f"{path}: expected a kfgs {kind}, got {found or 'other tensors'}; pass another file")
-            return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (the handle is no mapping)
-    except SafetensorError as error:
-        raise ValueError(f"{path}: expected a kfgs {kind} (.safetensors), but it cannot be read ({error})") from error
+    return read_safetensors(path, f"a kfgs {kind} (.safetensors)", "pass another file", kfgs=(kind, VERSION))[0]

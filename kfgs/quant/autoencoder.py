@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._check import as_tensor, check_range, check_shapes
+from .._check import as_tensor, check_range, check_shapes, moved_to
 from .._rows import unit_rows
 from ._store import read_tensors, write_tensors
 
@@ -89,7 +89,7 @@ class Autoencoder:
     def to(self, *args: Any, **kwargs: Any) -> Autoencoder:
         """Move or convert the weights as `Tensor.to` does."""
         encoder, decoder = (
-            tuple((weight.to(*args, **kwargs), bias.to(*args, **kwargs)) for weight, bias in layers)
+            tuple((moved_to(weight, *args, **kwargs), moved_to(bias, *args, **kwargs)) for weight, bias in layers)
             for layers in (self.encoder, self.decoder)
         )
         return Autoencoder(encoder, decoder, self.low, self.high)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from .._card import html_card, short_repr, short_value
-from .._check import as_array, as_tensor, check_range, check_shapes
+from .._check import as_array, as_tensor, check_range, check_shapes, moved_to
 from .._rows import EPS, row_norms, unit_rows
 from ._store import read_tensors, write_tensors
 
@@ -103,7 +103,7 @@ class Codebook:
         bad = (~(torch.isfinite(norms) & (norms > EPS))).nonzero()[:, 0].tolist()
         if bad:
             raise ValueError(
-                f"codewords: expected finite rows that are not all-zero, got bad rows {bad[:8]}; leave them out"
+                f"codewords: expected rows of a finite length above {EPS:g}, got others in rows {bad[:8]}; leave them out"
             )
 
     __repr__ = short_repr
@@ -168,7 +168,7 @@ class Codebook:
 
     def to(self, *args: Any, **kwargs: Any) -> Codebook:
         """Move or convert the codewords as `Tensor.to` does."""
-        return Codebook(self.codewords.to(*args, **kwargs))
+        return Codebook(moved_to(self.codewords, *args, **kwargs))
 
     def to_tensors(self) -> dict[str, Tensor]:
         """The tensors that `from_tensors` reads."""

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from .._card import short_repr
 from .._check import as_tensor, check_range, check_shapes, check_whole
 from .._progress import Progress, as_progress
-from .._rows import EPS, row_norms, unit_rows
+from .._rows import ENCODE, EPS, check_directions, row_norms, unit_rows
 from .codebook import Codebook
 from .evolve import EvolvingCodebook, Tally, prune
 from .grow import ROUNDS, grow, kmeans
@@ -213,7 +213,9 @@ def _pool(maps: FeatureMaps, config: CodebookConfig, progress: Progress) -> Tens
         parts.append(unit_rows(features))
     pool = torch.cat(parts)
     if len(pool) == 0:
-        raise ValueError(f"maps: expected nonzero features, got {len(maps)} all-zero maps; check the teacher")
+        raise ValueError(
+            f"maps: expected features longer than {EPS:g}, got none in {len(maps)} maps; check the teacher"
+        )
     return pool
 
 
@@ -279,7 +281,7 @@ def _first_codewords(maps: FeatureMaps, config: CodebookConfig) -> Tensor:  # [K
         features = _samples(maps, i, config)
         if features.shape[0] > 0:
             return features[farthest_points(features, config.initial)]
-    raise ValueError(f"maps: expected nonzero features, got {len(maps)} all-zero maps; check the teacher")
+    raise ValueError(f"maps: expected features longer than {EPS:g}, got none in {len(maps)} maps; check the teacher")
 
 
 def _samples(maps: FeatureMaps, i: int, config: CodebookConfig, dim: int | None = None) -> Tensor:  # [n, D]
@@ -295,7 +297,6 @@ def _samples(maps: FeatureMaps, i: int, config: CodebookConfig, dim: int | None 
     # row by row, whatever memory they come in: sums over another layout differ in their last bits
     features = features.to(torch.promote_types(features.dtype, torch.float32)).contiguous()
     norms = row_norms(features)
-    if not bool(torch.isfinite(norms).all()):
-        raise ValueError(f"maps[{i}]: expected finite features, got NaN or infinity; encode that image again")
+    check_directions(f"maps[{i}]", features, norms, ENCODE)
     nonzero = norms > EPS
     return features if bool(nonzero.all()) else features[nonzero]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
-from .._check import as_tensor, check_range, check_shapes, check_whole
+from .._check import as_tensor, check_range, check_shapes, check_whole, moved_to
 from .._rows import unit_rows
 
 NOISE = 1e-10  # of the first eigenvalue: rounding in float32 gives so much to directions that are not in the data
@@ -75,7 +75,7 @@ class LinearLatents:
 
     def to(self, *args: Any, **kwargs: Any) -> LinearLatents:
         """Move or convert the basis as `Tensor.to` does."""
-        return LinearLatents(self.basis.to(*args, **kwargs))
+        return LinearLatents(moved_to(self.basis, *args, **kwargs))
 
     def to_tensors(self) -> dict[str, Tensor]:
         """The tensors that `from_tensors` reads."""

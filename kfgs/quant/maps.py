@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
+from .._arrays import read_array
 from .._check import as_tensor, check_shapes
 from .._files import atomic_path
-from .._rows import EPS
+from .._rows import ENCODE, EPS, check_directions
 from ._store import read_tensors, write_tensors
 from .codebook import Codebook, compare
 
@@ -170,7 +171,7 @@ def quantize_maps(
     for i in tqdm(range(len(maps)), desc="quantise", disable=not progress):
         kept = None if scratch is None else scratch / f"{i}.npy"
         if kept is not None and kept.is_file():
-            quantised.append(np.load(kept, allow_pickle=False))
+            quantised.append(read_array(kept))
             continue
         quantised.append(_quantize_map(maps, i, codebook))
         if kept is not None:
@@ -183,6 +184,5 @@ def _quantize_map(maps: FeatureMaps, i: int, codebook: Codebook) -> NDArray[np.u
     feature_map = as_tensor(f"maps[{i}]", maps[i])  # once: this may read a file
     check_shapes((f"maps[{i}]", feature_map, f"h w {codebook.dim}"))
     index, _, length = compare(feature_map, codebook.unit)
-    if not bool(torch.isfinite(length).all()):
-        raise ValueError(f"maps[{i}]: expected finite features, got NaN or infinity; encode that image again")
+    check_directions(f"maps[{i}]", feature_map, length, ENCODE)
     return index.masked_fill(length <= EPS, codebook.size).cpu().numpy().astype(np.uint16)

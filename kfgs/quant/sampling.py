@@ -99,7 +99,9 @@ def farthest_points(
     check_range("count", count, 1)
     rows = (row_norms(features) > EPS).nonzero()[:, 0]
     if rows.numel() == 0:
-        raise ValueError(f"features: expected a nonzero row, got {features.shape[0]} all-zero rows; check the teacher")
+        raise ValueError(
+            f"features: expected a row longer than {EPS:g}, got none of {features.shape[0]}; check the teacher"
+        )
     unit = unit_rows(features[rows])
     if rows.numel() == 1:
         return rows

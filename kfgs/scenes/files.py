@@ -4,15 +4,24 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from kornia.io import ImageLoadType, load_image
+import numpy as np
+import torch
+from PIL import Image
 from torch import Tensor
 
+from .._check import one_line
 from .._files import read_json
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")  # kornia decodes these
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
+ORIENTATION = 0x0112  # EXIF's tag
+PIXELS, SMALL, PACKED = 1 << 27, 1 << 25, 200
+"""Most pixels of a picture (2 GB while it is read), and most for each byte of its file beyond SMALL; photos have about 10."""
 MAX_SIDE = 100_000  # pixels: beyond any sensor, so a larger number is a wrong byte
 MAX_NUMBER = 1e15  # of lengths and intrinsics: still far inside float32
 
@@ -77,21 +86,57 @@ def list_images(folder: str | Path) -> list[str]:
 def read_image(path: str | Path) -> Tensor:  # [H, W, 3] float32 in [0, 1]
     """Read a PNG, JPEG, TIFF or WebP file. Transparent pixels are laid on white; EXIF orientation is ignored, as by COLMAP.
 
+    Grey, palette, CMYK and 16-bit pictures are converted. Pillow reads them all: kornia's reader gives the same values but
+    refuses some of these, and its decoders panic when memory is short.
+
     Raises:
         FileNotFoundError: if there is no such file.
-        SceneError: if it cannot be decoded.
+        SceneError: if it cannot be decoded, or has more pixels than `open_picture` allows.
+    """
+    with open_picture(path) as picture:
+        picture.getexif().pop(ORIENTATION, None)  # Pillow would turn a TIFF
+        if picture.mode.startswith(("I", "F")):
+            values = np.asarray(picture)
+            if values.dtype.kind == "f" or values.min(initial=0) < 0 or values.max(initial=0) > 65535:
+                raise ValueError(f"its pixels are {values.dtype}, not whole numbers of at most 16 bits")
+            return torch.from_numpy(values.astype(np.float32) / 65535)[..., None].expand(-1, -1, 3).contiguous()
+        if "A" in picture.mode or "transparency" in picture.info:
+            whole = picture.convert("RGBA")
+            return _as_floats(Image.alpha_composite(Image.new("RGBA", whole.size, "white"), whole))
+        return _as_floats(picture)
+
+
+def _as_floats(picture: Image.Image) -> Tensor:  # [H, W, 3] in [0, 1]
+    return torch.from_numpy(np.array(picture.convert("RGB"))).float().div_(255)
+
+
+@contextmanager
+def open_picture(
+    path: str | Path,
+    expected: str = "a PNG, JPEG, TIFF or WebP image",
+    advice: str = "replace the file or take it out of the scene",
+) -> Iterator[Image.Image]:
+    """Open a picture; its pixels are read when they are used. Whatever fails meanwhile becomes a SceneError.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        SceneError: if it cannot be decoded, or states more than `PIXELS` pixels, or more than `PACKED` for each of its bytes.
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected an image there")
+        raise FileNotFoundError(f"{path}: no such file; expected {expected} there")
     try:
-        image = load_image(str(path), ImageLoadType.RGB32)
-    except (ValueError, RuntimeError, OSError) as error:
-        raise SceneError(
-            f"{path}: expected a PNG, JPEG, TIFF or WebP image, but it cannot be decoded ({error}); "
-            "replace the file or take it out of the scene"
-        ) from error
-    return image.permute(1, 2, 0).contiguous()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our limits come next
+            picture = Image.open(path)
+        with picture:
+            width, height = picture.size
+            if width * height > min(PIXELS, max(SMALL, PACKED * path.stat().st_size)):
+                raise ValueError(f"{width}x{height} pixels in {path.stat().st_size} bytes are too many to be one")
+            yield picture
+    except Exception as error:  # hostile bytes raise almost anything, memory may be short
+        why = one_line(error, 160) or type(error).__name__
+        raise SceneError(f"{path}: expected {expected}, but it cannot be decoded ({why}); {advice}") from error
 
 
 def read_scene_json(path: str | Path, advice: str) -> Any:
@@ -105,5 +150,3 @@ def read_scene_json(path: str | Path, advice: str) -> Any:
         return read_json(path)
     except ValueError as error:
         raise SceneError(f"{error}; {advice}") from error
-    except RecursionError as error:
-        raise SceneError(f"{path}: expected a JSON file, got brackets nested too deep; {advice}") from error

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .._arrays import read_array
 from .files import SceneError, list_images, natural_key
 from .posed import PosedPicture, picture_size, scene_of_poses
 from .scene import Scene
@@ -66,13 +67,11 @@ def load_llff(folder: str | Path, images: str | Path | None = None) -> Scene:
 
 def _read(path: Path) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:  # [V, 3, 5]
     try:
-        values = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise SceneError(
-            f"{path}: expected an array [V, 17], but it cannot be read ({error}); copy it again"
-        ) from error
-    if getattr(values, "ndim", 0) != 2 or values.shape[1] != 17 or len(values) == 0 or values.dtype.kind != "f":
-        got = f"{values.dtype} {values.shape}" if isinstance(values, np.ndarray) else "an archive"
+        values = read_array(path, "an array [V, 17]", "copy it again")
+    except ValueError as error:
+        raise SceneError(str(error)) from error
+    if values.ndim != 2 or values.shape[1] != 17 or len(values) == 0 or values.dtype.kind != "f":
+        got = f"{values.dtype} {values.shape}"
         raise SceneError(f"{path}: expected floats [V, 17] as LLFF writes them, got {got}; copy it again")
     matrices = values[:, :15].astype(np.float64).reshape(-1, 3, 5)
     if not (matrices[0, :, 4] > 0).all():

@@ -10,12 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from .._card import short_repr
 from ..cameras.camera import Camera
-from .files import MAX_NUMBER, SceneError, is_file, list_images, natural_key, read_image, some
+from .files import MAX_NUMBER, SceneError, is_file, list_images, natural_key, open_picture, read_image, some
 from .scene import Scene
 
 DEPTH_VIEWS = 25  # depth pictures that are read for points: enough to see a room from all sides, a second to decode
@@ -42,13 +41,8 @@ def picture_size(path: Path) -> tuple[int, int]:
     Raises:
         SceneError: if it is no picture.
     """
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (UnidentifiedImageError, OSError, ValueError) as error:
-        raise SceneError(
-            f"{path}: expected a picture, but its header cannot be read ({error}); copy it again"
-        ) from error
+    with open_picture(path, "a picture", "copy it again") as picture:
+        return picture.size
 
 
 def read_numbers(path: Path, expected: str) -> Matrix:  # [rows, columns]
@@ -168,11 +162,8 @@ def read_depth(path: Path) -> NDArray[Any]:  # [H, W]
     Raises:
         SceneError: if it is no picture with one channel.
     """
-    try:
-        with Image.open(path) as image:
-            depth = np.asarray(image)
-    except (UnidentifiedImageError, OSError, ValueError) as error:
-        raise SceneError(f"{path}: expected a depth PNG, but it cannot be read ({error}); copy it again") from error
+    with open_picture(path, "a depth PNG", "copy it again") as picture:
+        depth = np.asarray(picture)
     if depth.ndim != 2:
         raise SceneError(f"{path}: expected a depth PNG with one channel, got {depth.shape}; is this a colour picture?")
     return depth

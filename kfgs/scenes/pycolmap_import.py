@@ -28,7 +28,8 @@ def import_pycolmap() -> Any:
     """The module, loaded at the first call. Raises an ImportError if it is not installed, with the install line."""
     before = signal.getsignal(signal.SIGTERM)
     try:
-        import pycolmap
+        with _late_interrupt():
+            import pycolmap
     except ImportError as error:
         raise ImportError(
             "pycolmap: needed to estimate cameras, to undistort and to align, but it cannot be imported; "
@@ -38,6 +39,22 @@ def import_pycolmap() -> Any:
     if before is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, before)
     return pycolmap
+
+
+@contextlib.contextmanager
+def _late_interrupt() -> Iterator[None]:
+    """Deliver Ctrl-C only after the block: inside a C++ module that loads, it would become an ImportError or a crash."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
+        if came:
+            signal.raise_signal(signal.SIGINT)
 
 
 @contextlib.contextmanager

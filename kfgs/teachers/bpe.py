@@ -10,7 +10,6 @@ from __future__ import annotations
 import bz2
 import gzip
 import html
-import json
 import re
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,6 +21,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
+
+from .._files import parse_json
 
 MERGES = 48_894  # CLIP uses so many of the 262,144 in OpenAI's file
 _END = "</w>"
@@ -176,8 +177,8 @@ def _from_folder(folder: Path) -> Tokenizer:
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        found = json.loads(_read_text(path))
-    except json.JSONDecodeError as error:
+        found = parse_json(_read_text(path))
+    except ValueError as error:
         raise ValueError(f"{path}: expected JSON of a tokenizer, got something else ({error}); get it again") from error
     return found if isinstance(found, dict) else {}
 

@@ -30,12 +30,13 @@ from torch.serialization import (
 )
 
 from .._check import one_line
-from .pickle_check import BrokenPickleError, OtherProtocolError, PickleNames, UnsafePickleError, check_pickle
+from .pickle_check import STEPS, BrokenPickleError, OtherProtocolError, PickleNames, UnsafePickleError, check_pickle
 
 _ZIP = b"PK\x03\x04"  # first bytes of files of torch >= 1.6; older files are a sequence of pickles
 _LEGACY_MAGIC = b"\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19."  # 0x1950A86A20F9469CFC6C as a pickle
 _AGAIN = "download it again or name another file"
 _CONVERT = "save it again with torch.save and its default pickle_protocol, or as .safetensors, where you trust it"
+FACTS = 1000  # opcodes of the magic number, the version and the facts about the system of a file of torch < 1.6
 _LOCK = threading.Lock()  # the names that torch allows are global
 
 _SIGNATURES: tuple[tuple[bytes, str], ...] = (
@@ -236,9 +237,9 @@ def _pickle_in_legacy(file: BinaryIO, head: bytes) -> tuple[bytes, PickleNames]:
         raise TorchFileError(f"{what}, not what torch.save writes")
     with mmap(file.fileno(), 0, access=ACCESS_READ) as data:  # its read(n) reserves no more memory than there are bytes
         starts, names = [], []
-        for _ in range(5):  # the last: the keys of the storages, whose values follow
+        for most in (FACTS, FACTS, FACTS, STEPS, STEPS):  # the last: the keys of the storages, whose values follow
             starts.append(data.tell())
-            names.append(check_pickle(data))
+            names.append(check_pickle(data, most))
         return data[starts[3] : starts[4]], names[3]
 
 

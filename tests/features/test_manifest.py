@@ -100,7 +100,7 @@ def test_another_format_is_named(tmp_path, text):
     ("text", "words"),
     [
         ("{", ("JSON", "(Expecting")),
-        ("[" * 100_000 + "]" * 100_000, ("nested",)),
+        ("[" * 100_000 + "]" * 100_000, ("nest more than",)),
         ('{"seconds": ' + "1" * 5000 + "}", ("JSON", "(Exceeds")),
     ],
 )

@@ -247,9 +247,11 @@ def test_a_damaged_or_foreign_checkpoint_is_refused(tmp_path):
     damaged, foreign = tmp_path / "damaged", tmp_path / "foreign"
     damaged.write_bytes(b"nothing of the kind")
     save_file({"x": torch.zeros(2)}, foreign)
-    with pytest.raises(ValueError, match=tells("checkpoint:", "damaged", "read")):
+    with pytest.raises(ValueError, match=tells("damaged: expected a kfgs field checkpoint", "read", "delete it")):
         fit_field(start(), cameras, targets, SHORT, checkpoint=damaged)
-    with pytest.raises(ValueError, match=tells("checkpoint:", "foreign", "tensors")):
+    with pytest.raises(
+        ValueError, match=tells("foreign: expected a kfgs field checkpoint", "other tensors", "delete it")
+    ):
         fit_field(start(), cameras, targets, SHORT, checkpoint=foreign)
 
 

@@ -445,6 +445,10 @@ def test_missing_foreign_and_damaged_folders(tmp_path):
     rewrite(version=99)
     with pytest.raises(ValueError, match=tells("field:", "version 1 or 2", "got 99")):
         SemanticField.load(path)
+    for info in ([], "text", None, 7, {"views": 7}, {"views": [["a"]]}, {"classes": "text.npy"}, {"classes": [{}]}):
+        rewrite(info=info)
+        with pytest.raises(ValueError, match=tells("field:", "parts", "info", "expected")):
+            SemanticField.load(path)
     (path / "field.json").write_text("{")
     with pytest.raises(ValueError, match=tells("field.json:", "JSON")):
         SemanticField.load(path)
@@ -469,7 +473,7 @@ def test_a_pickle_under_the_right_name_is_not_opened(tmp_path):
     (path / "field.safetensors").write_bytes(content)
     description = json.loads((path / "field.json").read_text())
     (path / "field.json").write_text(json.dumps(description | {"sha256": hashlib.sha256(content).hexdigest()}))
-    with pytest.raises(ValueError, match=tells("field:", "parts", "header")):
+    with pytest.raises(ValueError, match=tells("field.safetensors:", "numbers of a field", "header")):
         SemanticField.load(path)
 
 
@@ -552,3 +556,10 @@ def test_another_dtype_gives_the_same_answers(mode):
         picture = one.segment(camera, embeddings(), rule=rule)
         assert other.segment(camera.to(torch.float64), embeddings(), rule=rule).equal(picture)
     assert other.to(torch.float32).features.equal(one.features)
+
+
+def test_a_description_that_nests_too_deep_is_named(tmp_path):
+    field().save(tmp_path / "field")
+    (tmp_path / "field" / "field.json").write_text('{"info": ' + "[" * 100_000 + "]" * 100_000 + "}")
+    with pytest.raises(ValueError, match=tells("field.json:", "nest more than 200 deep")):
+        SemanticField.load(tmp_path / "field")

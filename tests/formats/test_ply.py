@@ -3,6 +3,7 @@ import pytest
 import torch
 from messages import tells
 
+from kfgs.formats import read_splats, write_splats
 from kfgs.formats.ply import (
     other_elements,
     points_from_columns,
@@ -248,3 +249,22 @@ def test_elements_that_cannot_be_read_are_named(tmp_path):
 def test_a_comment_may_speak_of_the_header(tmp_path):
     write_ply(tmp_path / "a.ply", {"x": np.float32([1, 2])}, comments=("before end_header there is this",))
     assert read_ply(tmp_path / "a.ply")["x"].tolist() == [1, 2]
+
+
+@pytest.mark.parametrize("label", [0.5, float("nan"), float("inf"), 1e300])
+def test_labels_that_are_no_whole_numbers_are_named(tmp_path, label):
+    path = tmp_path / "a.ply"
+    columns = columns_from_gaussians(_cloud())
+    count = len(columns["x"])
+    write_ply(path, columns | {"class_id": np.full(count, 2.0)})
+    assert read_splats(path).gaussians.labels.tolist() == [2] * count
+    write_ply(path, columns | {"class_id": np.array([0.0] * (count - 1) + [label])})
+    with pytest.raises(ValueError, match=tells("a.ply:", "class_id:", "whole numbers", f"at Gaussian {count - 1}")):
+        read_splats(path)
+
+
+def test_scales_far_below_the_smallest_that_is_needed_come_back(tmp_path):
+    scales = torch.tensor([[1e-12, 1e-20, 3e-30], [1.0, 1e-9, 1e-38]])
+    cloud = _cloud()[:2].replace(scales=scales, labels=None)
+    write_splats(tmp_path / "a.ply", cloud)
+    assert torch.allclose(read_splats(tmp_path / "a.ply").gaussians.scales, scales, rtol=1e-4, atol=0)

@@ -80,12 +80,12 @@ def test_labels_of_another_version_are_refused(path):
         ({"class_id": np.zeros(6, np.float32)}, ("class_id", "got float32")),
         ({"class_id": np.full(6, "a")}, ("class_id", "got <U1")),
         ({"class_id": np.full(6, -2)}, ("class_id", "-1")),
-        ({"class_id": None}, ("read", "class_id", "delete")),
-        ({"of": None}, ("read", "'of is", "delete")),
+        ({"class_id": None}, ("class_id and of", "got of, score", "delete")),
+        ({"of": None}, ("class_id and of", "got class_id, score", "delete")),
         ({"of": np.array("other")}, ("a.splat", "another version")),
         ({"score": np.full(6, np.nan)}, ("finite", "scores")),
         ({"score": np.zeros(7)}, ("finite", "scores", "as many")),
-        ({"score": np.zeros(100_000)}, ("(800", "6 Gaussians")),
+        ({"score": np.zeros(100_000)}, ("800664 bytes", "6 Gaussians")),
         ({"class_id": np.array([None] * 6)}, ("read", "a.splat")),  # pickled objects are never loaded
     ],
 )
@@ -115,6 +115,21 @@ def test_an_archive_that_unpacks_to_gigabytes_is_not_unpacked(path):
         archive.writestr("class_id.npy", b"\0" * (64 << 20))
     assert labels_path(path).stat().st_size < 100_000
     with pytest.raises(ValueError, match=tells("a.splat.labels.npz:", "67108864", "6 Gaussians")):
+        read_splats(path)
+
+
+def test_labels_that_state_gigabytes_in_a_small_array_are_named(path):
+    content = io.BytesIO()
+    np.lib.format.write_array_header_1_0(content, {"descr": "<i4", "fortran_order": False, "shape": (1 << 32,)})
+    with zipfile.ZipFile(labels_path(path), "w") as archive:
+        archive.writestr("class_id.npy", content.getvalue())
+    with pytest.raises(ValueError, match=tells("a.splat.labels.npz:", "17179869184 bytes", "delete")):
+        read_splats(path)
+
+
+def test_names_that_nest_too_deep_are_named(path):
+    names_path(path).write_text('{"class_id": ' + "[" * 100_000 + "]" * 100_000 + "}")
+    with pytest.raises(ValueError, match=tells("a.splat.classes.json:", "nest more than 200 deep")):
         read_splats(path)
 
 
@@ -172,3 +187,27 @@ def test_names_named_after_the_stem_are_read_and_left_alone(tmp_path):
     write_splats(path, _splats().gaussians.replace(labels=None))
     assert not names_path(path).exists()
     assert shared.read_bytes() == content
+
+
+def test_labels_and_names_are_found_through_a_link(path):
+    link = path.parent / "elsewhere" / "b.splat"
+    link.parent.mkdir()
+    link.symlink_to(path)
+    again = link.with_name("c.splat")
+    again.symlink_to(link)
+    for place in (link, again):
+        found = read_splats(place)
+        assert found.classes == CLASSES
+        assert torch.equal(found.gaussians.labels, read_splats(path).gaussians.labels)
+        assert found.extra["score"].tolist() == read_splats(path).extra["score"].tolist()
+    write_names(link, ("of", "the", "link"))  # what is next to the link comes first
+    assert read_splats(link).classes == ("of", "the", "link")
+    assert read_splats(path).classes == CLASSES
+
+
+def test_writing_to_a_link_leaves_the_file_it_led_to(path):
+    link = path.parent / "b.splat"
+    link.symlink_to(path)
+    write_splats(link, _splats().gaussians.replace(labels=None))
+    assert read_splats(link).gaussians.labels is None
+    assert read_splats(path).classes == CLASSES

@@ -130,3 +130,42 @@ def test_arrays_are_taken_and_a_name_gets_advice():
     for call in (lambda: select_by_query(rows, "chair"), lambda: classify(rows, "chair")):
         with pytest.raises(TypeError, match=tells("'chair'", "field.query", "OfClass")):
             call()
+
+
+WHOLE = torch.eye(3, dtype=torch.int64)
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda whole: classify(torch.eye(3), whole),
+        lambda whole: classify(whole, torch.eye(3)),
+        lambda whole: label_codewords(torch.eye(3), whole),
+        lambda whole: select_by_query(torch.eye(3), whole[0]),
+        lambda whole: select_by_query(torch.eye(3), torch.eye(3)[0], negatives=whole),
+        lambda whole: select_like(whole, 0),
+    ],
+)
+@pytest.mark.parametrize("whole", [WHOLE, WHOLE.numpy()], ids=["torch", "numpy"])
+def test_whole_numbers_in_the_place_of_features_are_named(ask, whole):
+    with pytest.raises(TypeError, match=tells("expected floating-point numbers", "int64", "convert")):
+        ask(whole)
+
+
+@pytest.mark.parametrize("size", [1e20, 1e37])
+def test_numbers_whose_squares_overflow_are_named(size):
+    huge = torch.eye(3) * size
+    for ask in (
+        lambda: classify(huge, torch.eye(3)),
+        lambda: classify(torch.eye(3), huge),
+        lambda: label_codewords(huge, torch.eye(3)),
+        lambda: select_by_query(huge, torch.eye(3)[0]),
+    ):
+        with pytest.raises(ValueError, match=tells("squares", "float32", f"got {size:.3g}", "divide")):
+            ask()
+    assert classify(huge.double(), torch.eye(3).double()).labels.tolist() == [0, 1, 2]
+
+
+def test_a_tiny_embedding_is_not_called_zero():
+    with pytest.raises(ValueError, match=tells("embeddings:", "1e-08", "a length of 1e-37 in row 1")):
+        classify(torch.eye(2), torch.tensor([[1.0, 0], [0, 1e-37]]))

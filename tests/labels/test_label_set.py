@@ -50,6 +50,26 @@ def test_bad_input_is_named(tmp_path):
         LabelSet(("wall",), torch.zeros(1, 3)).index("chair")
 
 
+@pytest.mark.parametrize("header", ["'shape': (1099511627776, 512)", "'shape': (1L, '''", "'shape': " + "(" * 9000])
+def test_rows_whose_header_lies_are_named(tmp_path, header):
+    text = f"{{'descr': '<f8', 'fortran_order': False, {header}, }}".encode()
+    (tmp_path / "text.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text)
+    (tmp_path / "classes.json").write_text('["wall"]')
+    with pytest.raises(ValueError, match=tells("text.npy:", "one embedding row per class", "cannot be read")):
+        load_label_set(tmp_path / "classes.json", tmp_path / "text.npy")
+
+
+def test_texts_that_nest_too_deep_are_named(tmp_path):
+    deep = "[" * 100_000 + "]" * 100_000
+    (tmp_path / "classes.json").write_text(deep)
+    with pytest.raises(ValueError, match=tells("classes.json:", "nest more than 200 deep")):
+        load_label_set(tmp_path / "classes.json")
+    metadata = {"kfgs": "label set", "version": "1", "names": '["a"]', "negative_names": "[]", "info": deep}
+    save_file({"embeddings": torch.ones(1, 3)}, tmp_path / "t.safetensors", metadata=metadata)
+    with pytest.raises(ValueError, match=tells("t.safetensors:", "nest more than 200 deep", "`kfgs text`")):
+        load_label_set(tmp_path / "t.safetensors")
+
+
 def _words():
     info = {"teacher": {"name": "letters", "weights": "abc"}, "templates": ["{}"], "synonyms": {"chair": ["seat"]}}
     rows = torch.tensor([[1.0, 2, 3], [0, 1, 0], [4, 0, 1]])
@@ -100,7 +120,7 @@ def test_select_and_with_class():
 
 def test_a_table_that_is_none_is_named(tmp_path):
     path = tmp_path / "t.safetensors"
-    with pytest.raises(FileNotFoundError, match=tells("t.safetensors:", "no such file", "`kfgs text`")):
+    with pytest.raises(FileNotFoundError, match=tells("t.safetensors:", "no such file", "table of words")):
         load_label_set(path)
     path.write_bytes(b"\x08\0\0\0\0\0\0\0nonsense")
     with pytest.raises(ValueError, match=tells("t.safetensors:", "label set", "read")):
@@ -202,3 +222,16 @@ def test_a_card_in_a_notebook():
     assert "30: 0, 1, 2" in shown
     assert "clip" in shown
     assert len(shown) < 900
+
+
+def test_rows_may_be_arrays_and_must_be_of_floating_point():
+    words = LabelSet(("a", "b"), torch.eye(2), np.eye(2), ("x", "y"))
+    assert isinstance(words.negatives, torch.Tensor)
+    assert words.with_class("c", np.ones(2)).embeddings[-1].tolist() == [1, 1]
+    for make in (
+        lambda: LabelSet(("a", "b"), torch.eye(2).long()),
+        lambda: LabelSet(("a", "b"), torch.eye(2), np.eye(2, dtype=int), ("x", "y")),
+        lambda: words.with_class("c", torch.ones(2).long()),
+    ):
+        with pytest.raises(TypeError, match=tells("expected floating-point numbers", "int64")):
+            make()

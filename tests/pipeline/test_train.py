@@ -1,10 +1,15 @@
 """Where a field is trained."""
 
+from pathlib import Path
+
 import pytest
 import torch
 from messages import tells
 
-from kfgs.pipeline.train import training_device
+from kfgs.cameras import Camera
+from kfgs.pipeline import fit_color
+from kfgs.pipeline.train import check_scene, training_device
+from kfgs.scenes import Scene
 
 
 def test_auto_is_the_gpu_if_there_is_one():
@@ -20,3 +25,25 @@ def test_a_named_device_is_taken():
 def test_what_is_not_there_is_refused(device):
     with pytest.raises(ValueError, match=tells("device:", f"got {device!r}")):
         training_device(device)
+
+
+def scene_with(points: torch.Tensor) -> Scene:
+    K = torch.tensor([[20.0, 0, 16], [0, 20, 12], [0, 0, 1]])
+    turned = torch.diag(torch.tensor([-1.0, 1, -1, 1]))  # looks back
+    cameras = [Camera(E, K, 32, 24, f"{i}.png") for i, E in enumerate((torch.eye(4), turned))]
+    paths = [Path(f"{i}.png") for i in range(2)]
+    return Scene(cameras, paths, points, torch.zeros(len(points), 3, dtype=torch.uint8), {"train": [0], "test": [1]})
+
+
+def test_points_out_of_sight_of_all_views_are_refused():
+    behind = torch.tensor([[0.0, 0, -2], [0.1, 0, -3], [50.0, 0, 1]])
+    with pytest.raises(ValueError, match=tells("scene:", "got 3 out of sight of all 1 views", "one frame?")):
+        check_scene(scene_with(behind), [0])
+    check_scene(scene_with(behind), [0, 1])  # the other view shows two of them
+    check_scene(scene_with(torch.cat([behind, torch.tensor([[0.0, 0, 2]])])), [0])
+
+
+def test_a_colour_field_of_points_out_of_sight_is_refused_before_training(tmp_path):
+    with pytest.raises(ValueError, match=tells("out of sight")):
+        fit_color(scene_with(torch.tensor([[0.0, 0, -2], [0.1, 0, -3]])), tmp_path / "run")
+    assert not (tmp_path / "run").exists()

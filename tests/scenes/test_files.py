@@ -1,6 +1,22 @@
-import pytest
+import io
+import struct
+import tracemalloc
+import warnings
+import zlib
 
-from kfgs.scenes import file_stem
+import numpy as np
+import pytest
+import torch
+from messages import tells
+from PIL import Image
+
+from kfgs.scenes import SceneError, file_stem, read_image
+from kfgs.scenes.files import open_picture
+from kfgs.scenes.posed import picture_size, read_depth
+
+RNG = np.random.default_rng(0)
+COLORS = RNG.integers(0, 256, (5, 7, 3), dtype=np.uint8)
+ALPHA = RNG.integers(0, 256, (5, 7), dtype=np.uint8)
 
 
 @pytest.mark.parametrize(
@@ -8,3 +24,120 @@ from kfgs.scenes import file_stem
 )
 def test_file_stem(name: str, stem: str) -> None:
     assert file_stem(name) == stem
+
+
+def read(path) -> np.ndarray:
+    found = read_image(path)
+    assert found.dtype == torch.float32
+    assert found.is_contiguous()
+    return found.numpy() * 255
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".webp"])
+def test_colours_are_read_as_written(tmp_path, suffix):
+    Image.fromarray(COLORS).save(tmp_path / f"a{suffix}", lossless=True)
+    assert np.array_equal(read(tmp_path / f"a{suffix}").round(4), COLORS)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".webp", ".tif"])
+def test_transparent_pixels_are_laid_on_white(tmp_path, suffix):
+    Image.fromarray(np.dstack([COLORS, ALPHA])).save(tmp_path / f"a{suffix}", lossless=True, exact=True)
+    share = ALPHA[..., None] / 255
+    assert np.abs(read(tmp_path / f"a{suffix}") - (share * COLORS + (1 - share) * 255)).max() <= 0.51
+
+
+def test_odd_pictures_are_converted(tmp_path):
+    grey = COLORS[..., 0]
+    whole = Image.fromarray(COLORS)
+    white = Image.new("RGB", whole.size, "white")
+    kinds = {
+        "palette.png": (whole.quantize(32), np.asarray(whole.quantize(32).convert("RGB"))),
+        "grey.png": (Image.fromarray(grey), grey[..., None]),
+        "bits.png": (Image.fromarray(grey > 128), (grey > 128)[..., None] * 255),
+        "grey16.png": (Image.fromarray(grey.astype(np.uint16) * 257), grey[..., None]),
+        "grey16.tif": (Image.fromarray(grey.astype(np.uint16) * 257), grey[..., None]),
+        "grey_alpha.png": (
+            Image.fromarray(np.dstack([grey, ALPHA])),
+            np.asarray(Image.composite(Image.fromarray(grey).convert("RGB"), white, Image.fromarray(ALPHA))),
+        ),
+        "cmyk.tif": (whole.convert("CMYK"), COLORS),
+    }
+    for name, (picture, expected) in kinds.items():
+        picture.save(tmp_path / name)
+        assert np.abs(read(tmp_path / name) - np.broadcast_to(expected, COLORS.shape)).max() <= 1.01, name
+    whole.resize((70, 50)).convert("CMYK").save(tmp_path / "cmyk.jpg", quality=100)
+    same = np.asarray(Image.open(tmp_path / "cmyk.jpg").convert("RGB"))
+    assert np.array_equal(read(tmp_path / "cmyk.jpg").round(4), same)
+
+
+def test_orientation_is_ignored(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    for name in ("a.tif", "a.jpg"):
+        Image.fromarray(COLORS).save(tmp_path / name, exif=exif)
+        assert read_image(tmp_path / name).shape == (5, 7, 3)
+
+
+def test_pixels_that_are_no_colours_are_named(tmp_path):
+    Image.fromarray(COLORS[..., 0].astype(np.float32)).save(tmp_path / "a.tif")
+    with pytest.raises(SceneError, match=tells("a.tif", "float32", "16 bits", "replace the file")):
+        read_image(tmp_path / "a.tif")
+
+
+def png(width: int, height: int, rows: bytes) -> bytes:
+    """A grey PNG whose header states any size."""
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize(("width", "height"), [(14_000, 14_000), (60_000, 60_000), (9_000, 9_000), (1 << 30, 1 << 30)])
+def test_a_small_file_of_many_pixels_is_refused_before_memory_is_asked_for(tmp_path, width, height):
+    file = tmp_path / "a.png"
+    file.write_bytes(png(width, height, b"\0" * 100_000))
+    readers = (read_image, picture_size, read_depth)
+    tracemalloc.start()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            for reader in readers:
+                with pytest.raises(SceneError, match=tells(file, "expected a", "cannot be decoded")):
+                    reader(file)
+        assert tracemalloc.get_traced_memory()[1] < 20_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_what_a_decoder_raises_is_named(tmp_path, monkeypatch):
+    for content in (
+        b"",
+        b"\xff\xd8\xff\xe0" + bytes(100),
+        png(7, 5, b"\0" * 3),
+        b"II*\0" + bytes(60),
+        b"RIFF\0\0\0\0WEBPVP8 ",
+    ):
+        (tmp_path / "a.png").write_bytes(content)
+        with pytest.raises(SceneError, match=tells("a.png", "PNG, JPEG, TIFF or WebP", "cannot be decoded", "replace")):
+            read_image(tmp_path / "a.png")
+    with pytest.raises(FileNotFoundError, match=tells("none.png", "no such file")):
+        read_image(tmp_path / "none.png")
+    buffer = io.BytesIO()
+    Image.fromarray(COLORS).save(buffer, "PNG")
+    (tmp_path / "a.png").write_bytes(buffer.getvalue())
+
+    def short(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(Image.Image, "convert", short)
+    with pytest.raises(SceneError, match=tells("a.png", "MemoryError")):
+        read_image(tmp_path / "a.png")
+
+
+def test_pictures_are_closed(tmp_path):
+    Image.fromarray(COLORS).save(tmp_path / "a.png")
+    with open_picture(tmp_path / "a.png") as picture:
+        assert picture.size == (7, 5)
+    assert picture.fp is None

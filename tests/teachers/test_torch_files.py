@@ -347,7 +347,7 @@ def test_a_place_in_the_memo_far_away_takes_no_memory(tmp_path: Path, container)
 def test_too_many_opcodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.pt").write_bytes(archive(b"(" * 20 + b"N."))
     assert load_torch_file(tmp_path / "a.pt") is None
-    monkeypatch.setattr(pickle_check, "_STEPS", 10)
+    monkeypatch.setattr(pickle_check.check_pickle, "__defaults__", (10,))
     with pytest.raises(TorchFileError, match=tells("10 opcodes")):
         load_torch_file(tmp_path / "a.pt")
 
@@ -473,3 +473,29 @@ def test_torch_reads_the_pickle_that_was_checked(tmp_path: Path, container) -> N
     assert torch._C.PyTorchFileReader(str(tmp_path / "a.pt")).get_record("data.pkl") == evil
     with pytest.raises(TorchFileError, match=tells("two readers")):
         load_torch_file(tmp_path / "a.pt")
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"](" + b"K\x01" * 2_500_000 + b"e", "600,000 opcodes"),
+        (b"Nq\x00](" + b"h\x00" * 2_500_000 + b"e", "600,000 opcodes"),
+        (b"(" * 5_000_000, "nests more than 1000 deep"),
+    ],
+    ids=["numbers", "copies", "marks"],
+)
+def test_a_pickle_of_5_mb_that_takes_long_is_refused(tmp_path: Path, content: bytes, told: str) -> None:
+    path = tmp_path / "a.pt"
+    path.write_bytes(archive(b"\x80\x02" + content + b"."))
+    with pytest.raises(TorchFileError, match=tells(told)):
+        load_torch_file(path)
+
+
+def test_the_facts_before_an_old_file_are_short(tmp_path: Path) -> None:
+    path, whole = tmp_path / "a.pt", legacy(pickled({"a": 1}))
+    path.write_bytes(whole)
+    assert load_torch_file(path) == {"a": 1}
+    magic = whole.index(b".") + 1
+    path.write_bytes(whole[:magic] + b"\x80\x02](" + b"K\x01" * 2_000 + b"e." + whole[magic:])
+    with pytest.raises(TorchFileError, match=tells("1,000 opcodes")):
+        load_torch_file(path)

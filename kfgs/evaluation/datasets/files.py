@@ -9,10 +9,9 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
-from ...scenes.files import some
+from ...scenes.files import open_picture, some
 
 T = TypeVar("T")
 
@@ -37,21 +36,6 @@ class ReadWhenAsked(Mapping[str, T]):
         return len(self._readers)
 
 
-def open_picture(path: Path, expected: str) -> Image.Image:
-    """Open a picture; its pixels are read later.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is no picture.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected {expected} there")
-    try:
-        return Image.open(path)
-    except (UnidentifiedImageError, OSError) as error:
-        raise ValueError(f"{path}: expected {expected}, but it cannot be decoded ({error}); copy it again") from error
-
-
 def read_pixels(path: Path, expected: str, mode: str | None = None) -> NDArray[Any]:
     """The values of a picture, converted to a mode of PIL if one is named.
 
@@ -59,13 +43,8 @@ def read_pixels(path: Path, expected: str, mode: str | None = None) -> NDArray[A
         FileNotFoundError: if there is no such file.
         ValueError: if it cannot be decoded.
     """
-    with open_picture(path, expected) as picture:
-        try:
-            return np.asarray(picture if mode is None else picture.convert(mode))
-        except (OSError, ValueError, SyntaxError) as error:
-            raise ValueError(
-                f"{path}: expected {expected}, but it cannot be decoded ({error}); copy it again"
-            ) from error
+    with open_picture(path, expected, "copy it again") as picture:
+        return np.asarray(picture if mode is None else picture.convert(mode))
 
 
 def read_mask(path: Path) -> Tensor:  # [H, W] bool

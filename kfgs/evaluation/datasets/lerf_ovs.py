@@ -16,9 +16,10 @@ import torch
 
 from ..._files import read_json
 from ...scenes.files import natural_key, some
+from ...scenes.posed import picture_size
 from ..class_lists import load_classes
 from ..truth import MaskAndBoxes, MaskTruth
-from .files import ReadWhenAsked, find_folder, open_picture
+from .files import ReadWhenAsked, find_folder
 from .polygons import MOST, fill_polygon, say_range, union
 
 
@@ -88,13 +89,11 @@ def read_lerf_json(path: Path) -> dict[str, MaskAndBoxes]:
     if height * width > MOST:
         raise ValueError(f"{path}: expected the size of a picture, got {width}x{height}; correct the file")
     picture = path.with_suffix(".jpg")
-    if picture.is_file():
-        with open_picture(picture, "the annotated picture") as image:
-            if image.size != (width, height):
-                raise ValueError(
-                    f"{path}: expected the size of {picture.name} ({image.width}x{image.height}), got {width}x{height}; "
-                    "polygons and picture do not belong together"
-                )
+    if picture.is_file() and (size := picture_size(picture)) != (width, height):
+        raise ValueError(
+            f"{path}: expected the size of {picture.name} ({size[0]}x{size[1]}), got {width}x{height}; polygons and picture do "
+            "not belong together"
+        )
     found: dict[str, list[tuple[torch.Tensor, torch.Tensor]]] = {}
     for number, entry in enumerate(objects):
         text, mask, box = _object(path, number, entry, (height, width))

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..._arrays import read_array
 from ..._check import check_choice
 from ..class_lists import load_classes
 from ..truth import PointTruth
@@ -108,15 +109,7 @@ def _labels(file: Path, count: int, classes: int | None, benchmark: str) -> Tens
 
 def _read(file: Path, expected: str, kinds: str) -> NDArray[np.generic]:
     """An array of one of the kinds of NumPy's `dtype.kind`."""
-    if not file.is_file():
-        raise FileNotFoundError(f"{file}: no such file; expected {expected} there")
-    try:
-        values = np.load(file, allow_pickle=False)
-    except (ValueError, OSError, EOFError, TypeError) as error:
-        raise ValueError(
-            f"{file}: expected {expected}, but it cannot be read ({error}); copy the file again"
-        ) from error
-    if not isinstance(values, np.ndarray) or values.dtype.kind not in kinds or values.ndim == 0:
-        got = getattr(values, "dtype", type(values).__name__)
-        raise ValueError(f"{file}: expected {expected}, got {got}; copy the file again")
+    values = read_array(file, expected, "copy the file again")
+    if values.dtype.kind not in kinds or values.ndim == 0:
+        raise ValueError(f"{file}: expected {expected}, got {values.dtype}; copy the file again")
     return values

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
 
+from ..._arrays import read_arrays
 from ..._files import read_json
 from ..truth import PointTruth
 
@@ -23,14 +23,11 @@ def load_surface_points(path: str | Path) -> PointTruth:
         ValueError: if one is damaged.
     """
     file = Path(path) / "surface.npz"
-    if not file.is_file():
-        raise FileNotFoundError(f"{file}: no such file; expected points of all surfaces there")
+    expected, advice = "the arrays 'points' and 'labels', points of all surfaces", "make the room again"
+    arrays = read_arrays(file, expected, advice)
     names = read_json(file.with_name("classes.json"))
     try:
-        with np.load(file, allow_pickle=False) as arrays:
-            points, labels = arrays["points"], arrays["labels"].astype(np.int64)
+        points, labels = arrays["points"], arrays["labels"].astype(np.int64)
         return PointTruth(torch.from_numpy(points), torch.from_numpy(labels), dict(enumerate(names)))
-    except (ValueError, KeyError, OSError, EOFError, AttributeError, TypeError, BadZipFile) as error:
-        raise ValueError(
-            f"{file}: expected the arrays 'points' and 'labels', but it cannot be read ({error}); make the room again"
-        ) from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{file}: expected {expected}, but it cannot be read ({error}); {advice}") from error

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..._arrays import read_array
 from ...formats import read_splats
 from .files import plain_tensor, read_torch
 from .splatted import Level, SplattedMethod
@@ -64,12 +65,7 @@ def load_splat_features(
 def _read_rows(path: Path) -> Tensor:  # [N, D]
     expected = "one array of features [N, D]"
     if path.suffix == ".npy":
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such file; expected {expected} there")
-        try:
-            value: object = torch.from_numpy(np.array(np.load(path, allow_pickle=False), dtype=np.float32))
-        except (ValueError, OSError, EOFError, TypeError) as error:
-            raise ValueError(f"{path}: expected {expected}, but it cannot be read ({error}); write it again") from error
+        value: object = torch.from_numpy(read_array(path, expected, "write it again").astype(np.float32))
     else:
         value = read_torch(path, expected)
         if isinstance(value, Mapping) and len(value) == 1:

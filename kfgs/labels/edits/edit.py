@@ -83,7 +83,7 @@ class OnSelection(Edit):
         if not self.allow_empty and not bool(mask.any()):
             raise ValueError(
                 f"where: expected a selection of some of {len(splats)} Gaussians, got none from {self.where!r:.120}; "
-                f"{_present(splats)}, or allow none (in Python: allow_empty=True)"
+                f"{_present(splats)} (in Python: or pass allow_empty=True)"
             )
         return mask
 

@@ -20,6 +20,14 @@ FORMAT, VERSION = "kfgs.edits", 1
 OPS: dict[str, type[Edit]] = {op.op: op for op in (Remove, Extract, Recolor, Opacity, Move, Duplicate, Insert)}
 
 
+class EditError(ValueError):
+    """An edit of a list that cannot be done: its place in the list, and why."""
+
+    def __init__(self, index: int, edit: Edit, why: ValueError) -> None:
+        super().__init__(f"edits[{index}] ({edit.op}): {why}")
+        self.index, self.why = index, why
+
+
 @dataclass(frozen=True)
 class EditList:
     """Edits that are applied one after the other, each to the result of the one before.
@@ -92,14 +100,14 @@ class EditList:
         """The cloud after all edits.
 
         Raises:
-            ValueError: if an edit cannot be done; the message says which.
+            EditError: if an edit cannot be done; the message says which.
             FileNotFoundError: if a file to insert is missing.
         """
         for i, edit in enumerate(self.edits):
             try:
                 splats = edit.apply(splats)
             except ValueError as error:
-                raise ValueError(f"edits[{i}] ({edit.op}): {error}") from error
+                raise EditError(i, edit, error) from error
         return splats
 
     def save(self, path: str | Path) -> Path:
@@ -136,11 +144,7 @@ class EditList:
                 message names the place in the file.
         """
         path = Path(path)
-        try:
-            content = read_json(path)
-        except RecursionError as error:
-            raise ValueError(f"{path}: expected saved edits, got JSON that nests too deep; write it again") from error
-        return EditList.from_json(content, str(path), path.parent, anywhere=anywhere)
+        return EditList.from_json(read_json(path), str(path), path.parent, anywhere=anywhere)
 
     @staticmethod
     def from_json(content: Any, name: str, folder: str | Path = ".", *, anywhere: bool = False) -> EditList:

@@ -13,10 +13,10 @@ import torch
 from ...cameras.similarity import Similarity
 from ...formats.splat_file import SplatFile
 from ...formats.table import read_splats
-from ...splat.transform import transform_gaussians
 from .._json import number_of, numbers_of
 from .edit import Edit
 from .merge import join
+from .motion import transformed
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class Insert(Edit):
         """See `Edit.apply`; reads the file if it is one."""
         part = self.source if isinstance(self.source, SplatFile) else read_splats(self.source)
         if self.similarity is not None:
-            part = part.replace(gaussians=transform_gaussians(part.gaussians, self.similarity))
+            part = part.replace(gaussians=transformed(part.gaussians, self.similarity))
         return join(splats, part)
 
     def to_json(self) -> dict[str, Any]:

@@ -47,7 +47,10 @@ def _joined_sh(a: Tensor | None, b: Tensor | None) -> Tensor | None:
         return None
     if a is None or b is None:
         which = "the scene" if a is None else "what is inserted"
-        raise ValueError(f"sh: expected colours in both clouds, got none in {which}; add them with gaussians.replace()")
+        raise ValueError(
+            f"sh: expected colours in both clouds, got none in {which}; choose one with colours (in Python: or add them with "
+            "gaussians.replace())"
+        )
     count = max(a.shape[1], b.shape[1])
     return torch.cat([torch.nn.functional.pad(sh.to(a), (0, 0, 0, count - sh.shape[1])) for sh in (a, b)])
 
@@ -60,7 +63,7 @@ def _joined_features(a: Gaussians, b: Gaussians) -> Tensor | None:
     if len(channels) > 1:
         raise ValueError(
             f"features: expected as many channels in both clouds, got {given[0].shape[1]} and {given[1].shape[1]}; "
-            "drop one side's with gaussians.replace(features=None)"
+            "insert a splat without features (in Python: drop one side's with gaussians.replace(features=None))"
         )
     width = channels.pop()
     parts = [a.means.new_zeros(len(c), width) if c.features is None else c.features.to(a.means) for c in (a, b)]

@@ -98,7 +98,7 @@ class Move(_Motion):
         if not bool(mask.any()):
             return splats
         part = splats.gaussians.select(mask)
-        moved = transform_gaussians(part, self.similarity(part))
+        moved = transformed(part, self.similarity(part))
         rows = {name: values.clone() for name, values in vars(splats.gaussians).items() if values is not None}
         for name, values in rows.items():
             values[mask] = getattr(moved, name)
@@ -117,8 +117,21 @@ class Duplicate(_Motion):
         if not bool(mask.any()):
             return splats
         copy = splats.select(mask)
-        moved = transform_gaussians(copy.gaussians, self.similarity(copy.gaussians))
+        moved = transformed(copy.gaussians, self.similarity(copy.gaussians))
         return join(splats, copy.replace(gaussians=moved))
+
+
+def transformed(gaussians: Gaussians, similarity: Similarity) -> Gaussians:
+    """`transform_gaussians`; a ValueError if a number overflows, or a scale becomes 0."""
+    moved = transform_gaussians(gaussians, similarity)
+    for name, old, new in (("positions", gaussians.means, moved.means), ("scales", gaussians.scales, moved.scales)):
+        good = new.isfinite() & ((new > 0) if name == "scales" else True)
+        if not bool((good | ~old.isfinite()).all()):
+            raise ValueError(
+                f"{name}: expected finite ones that {new.dtype} can hold, got some beyond after scale {similarity.scale:g} and "
+                f"translation {[float(f'{part:.3g}') for part in similarity.translation.tolist()]}; move less far, or scale less"
+            )
+    return moved
 
 
 def _rotation(value: Any) -> Turn | tuple[float, ...] | None:

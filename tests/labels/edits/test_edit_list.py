@@ -254,7 +254,7 @@ def test_edits_of_others_are_refused_with_the_place(tmp_path, edit, message):
 def test_json_that_nests_without_end(tmp_path):
     path = tmp_path / "edits.json"
     path.write_text("[" * 200_000)
-    with pytest.raises(ValueError, match=tells("edits.json:", "got JSON")):
+    with pytest.raises(ValueError, match=tells("edits.json:", "JSON", "nest more than")):
         EditList.load(path)
 
 

@@ -187,3 +187,21 @@ def test_the_centroid_of_what_is_invisible_is_the_plain_mean():
         moved = Move("chair", rotation=("z", 90), scale=2.0).apply(faint).gaussians
         chair = splats.gaussians.labels == 1
         torch.testing.assert_close(moved.means[chair].mean(dim=0), splats.gaussians.means[chair].mean(dim=0))
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        Move("chair", (1e39, 0, 0)),
+        Move("chair", scale=1e200),
+        Move("chair", scale=3, pivot=(1e38, 0, 3e38)),
+        Move("chair", scale=1e-60),
+        Duplicate("chair", (0, -1e39, 0)),
+    ],
+    ids=repr,
+)
+def test_what_overflows_is_an_error_and_no_infinity(edit):
+    splats = scene()
+    splats = splats.replace(gaussians=splats.gaussians.to(torch.float32))
+    with pytest.raises(ValueError, match=tells("expected finite", "float32", "after scale", "less")):
+        edit.apply(splats)

@@ -1,0 +1,151 @@
+"""Read arrays and tensors from files that others wrote: `.npy`, `.npz`, `.safetensors`.
+
+A header can state any size. Here each is compared with the bytes that are there before memory is asked for, and nothing
+pickled is ever loaded. What is wrong with a file becomes one `FileError`.
+"""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ._check import one_line
+
+Array = NDArray[Any]
+SPARE, RATIO = 64 << 20, 100
+"""A compressed `.npz` may unpack to SPARE bytes plus RATIO times its own size."""
+_KINDS = "biufcU"  # of NumPy's dtype.kind: numbers and texts
+AGAIN = "copy it again, or write it again"
+_AXIS = 1 << 48  # longest axis; NumPy multiplies axes in 64 bits
+
+
+class FileError(ValueError):
+    """A file that cannot be read. The message names the file, what was expected, what is wrong, and what to do."""
+
+
+def read_array(
+    path: str | Path, expected: str = "an .npy file of numbers", advice: str = AGAIN, *, mapped: bool = False
+) -> Array:
+    """Read a `.npy` file.
+
+    Args:
+        path: the file.
+        expected: what should be there, for the message.
+        advice: the end of the message.
+        mapped: map the file into memory; values are read when they are used.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        FileError: if it is no `.npy` file of numbers, is damaged or cut short, or states more values than it has.
+    """
+    with _named(path, expected, advice), Path(path).open("rb") as file:
+        size = Path(path).stat().st_size
+        stated = _stated_bytes(file)
+        if stated > size - file.tell():
+            raise ValueError(f"its header states {stated} bytes of values, {size - file.tell()} follow")
+        if mapped:
+            array: Array = np.load(path, mmap_mode="r", allow_pickle=False)
+            return array
+        file.seek(0)
+        return np.lib.format.read_array(file, allow_pickle=False)
+
+
+def read_arrays(
+    path: str | Path, expected: str = "an .npz file of arrays", advice: str = AGAIN, *, most: int | None = None
+) -> dict[str, Array]:
+    """Read all arrays of an `.npz` file, by name.
+
+    Args:
+        path: the file.
+        expected: what should be there, for the message.
+        advice: the end of the message.
+        most: bytes that the arrays and their headers may have together; None: what `SPARE` and `RATIO` allow.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        FileError: if it is no `.npz` file of numbers and texts, is damaged, or unpacks to more than `most` bytes.
+    """
+    found = {}
+    with _named(path, expected, advice), zipfile.ZipFile(path) as archive:
+        total = sum(entry.file_size for entry in archive.infolist())
+        most = SPARE + RATIO * Path(path).stat().st_size if most is None else most
+        if total > most:
+            raise ValueError(f"it would unpack to {total} bytes, expected at most {most}")
+        for entry in archive.infolist():
+            with archive.open(entry) as file:
+                stated = _stated_bytes(file)
+                if stated != entry.file_size - file.tell():
+                    raise ValueError(f"{one_line(entry.filename)} states {stated} bytes of values, and has others")
+            with archive.open(entry) as file:
+                found[entry.filename.removesuffix(".npy")] = np.lib.format.read_array(file, allow_pickle=False)
+    return found
+
+
+def read_safetensors(
+    path: str | Path,
+    expected: str = "a .safetensors file",
+    advice: str = AGAIN,
+    *,
+    kfgs: tuple[str, str] | None = None,
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Read all tensors of a `.safetensors` file, and the texts of its metadata. Values are mapped, and read when used.
+
+    Args:
+        path: the file.
+        expected: what should be there, for the message.
+        advice: the end of the message.
+        kfgs: the kind and the version that the metadata must state under "kfgs" and "version"; checked before tensors
+            are read.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        FileError: if it is another file, damaged, cut short, or of another kind or version.
+    """
+    from safetensors import safe_open  # imports torch
+
+    with _named(path, expected, advice), safe_open(path, framework="pt") as file:
+        metadata = dict(file.metadata() or {})
+        kind, version = (metadata.get(key) for key in ("kfgs", "version"))
+        if kfgs is None or (kind, version) == kfgs:
+            return {name: file.get_tensor(name) for name in file.keys()}, metadata  # noqa: SIM118 (no mapping)
+    what = one_line(kind) if kind else "other tensors"
+    if kind == kfgs[0]:
+        what, advice = f"version {one_line(version)}", "use the kfgs that wrote it"
+    raise FileError(f"{path}: expected a kfgs {kfgs[0]}, version {kfgs[1]}, got {what}; {advice}")
+
+
+def _stated_bytes(file: IO[bytes]) -> int:
+    """The bytes of values that the header of a `.npy` file states; leaves the file behind the header."""
+    version = np.lib.format.read_magic(file)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"version {version} of the .npy format is not for plain numbers")
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    if dtype.kind not in _KINDS or (dtype.itemsize == 0 and math.prod(shape) > 1):
+        what = "pickled objects, which are never loaded" if dtype.hasobject else f"values of type {dtype}"
+        raise ValueError(f"it holds {one_line(what)}")
+    if any(not 0 <= axis <= _AXIS for axis in shape):
+        raise ValueError(f"it states the shape {one_line(shape)}")
+    return math.prod(shape) * dtype.itemsize
+
+
+@contextmanager
+def _named(path: str | Path, expected: str, advice: str) -> Iterator[None]:
+    """Turn whatever fails while a file is read into a `FileError`."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected {expected} there")
+    try:
+        yield
+    except PermissionError:
+        raise
+    except Exception as error:  # hostile bytes raise almost anything: MemoryError, TokenError, OverflowError, ...
+        kind = "" if isinstance(error, ValueError | OSError) else f"{type(error).__name__}: "
+        why = f"{kind}{one_line(error, 160)}".rstrip(": ")
+        raise FileError(f"{path}: expected {expected}, but it cannot be read ({why}); {advice}") from error

@@ -1,0 +1,211 @@
+"""Files of arrays that others wrote: what they state is compared with what they hold."""
+
+import io
+import json
+import struct
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from messages import tells
+from safetensors.torch import save_file
+
+from kfgs._arrays import FileError, read_array, read_arrays, read_safetensors
+
+
+def npy(header: bytes, values: bytes = b"", version: tuple[int, int] = (1, 0)) -> bytes:
+    """The bytes of a .npy file with any header."""
+    length = struct.pack("<H" if version == (1, 0) else "<I", len(header))
+    return b"\x93NUMPY" + bytes(version) + length + header + values
+
+
+def stated(descr: str, shape: str, fortran: str = "False") -> bytes:
+    return f"{{'descr': '{descr}', 'fortran_order': {fortran}, 'shape': {shape}, }}\n".encode()
+
+
+LIES = {
+    "8 TiB": npy(stated("<f8", "(1099511627776,)"), b"1234"),
+    "overflow to 0": npy(stated("<f4", "(4294967296, 4294967296)")),
+    "beyond 64 bits": npy(stated("<f4", "(1000000000000000000000000, 0)")),
+    "negative": npy(stated("<f4", "(-1, 2)")),
+    "booleans as axes": npy(stated("<f4", "(True, -5)"), b"1234"),
+    "one short": npy(stated("<f4", "(3,)"), b"\0" * 11),
+    "open bracket": npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': (3,"),
+    "token error": npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': (3L, '''\n"),
+    "deep brackets": npy(b"(" * 9000),
+    "deep minus": npy(b"-" * 9000 + b"1"),
+    "long header": npy(b"{'descr': '<f4', 'fortran_order': False, 'shape': (" + b"1," * 9000 + b"), }", version=(2, 0)),
+    "null bytes": npy(b"\0" * 64),
+    "no text": npy(bytes(range(128, 256))),
+    "other version": npy(stated("<f4", "(3,)"), b"\0" * 12, version=(3, 0)),
+    "structured": npy(b"{'descr': [('a', '<f4')], 'fortran_order': False, 'shape': (3,), }", b"\0" * 12),
+    "nothing wide": npy(stated("<U0", "(4611686018427387904,)")),
+    "dates": npy(stated("<M8[s]", "(1,)"), b"\0" * 8),
+    "cut in the header": npy(stated("<f4", "(3,)"))[:20],
+    "empty": b"",
+    "text": b"no array at all",
+}
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+@pytest.mark.parametrize("lie", LIES.values(), ids=LIES)
+def test_a_header_that_lies_is_found_before_memory_is_asked_for(tmp_path, lie, mapped):
+    file = tmp_path / "text.npy"
+    file.write_bytes(lie)
+    tracemalloc.start()
+    try:
+        with pytest.raises(FileError, match=tells(file, "numbers", "cannot be read", "again")) as caught:
+            read_array(file, mapped=mapped)
+        assert tracemalloc.get_traced_memory()[1] < 20_000_000
+    finally:
+        tracemalloc.stop()
+    assert len(str(caught.value)) < 500
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+def test_pickled_objects_are_never_loaded(tmp_path, mapped):
+    file, made = tmp_path / "a.npy", tmp_path / "made"
+
+    class Harmful:
+        def __reduce__(self):
+            return (made.mkdir, ())
+
+    np.save(file, np.array([Harmful(), 1], dtype=object), allow_pickle=True)
+    with pytest.raises(FileError, match=tells(file, "pickled objects", "never loaded")):
+        read_array(file, mapped=mapped)
+    np.savez(tmp_path / "a.npz", a=np.array([Harmful()], dtype=object))
+    with pytest.raises(FileError, match=tells("a.npz", "pickled objects", "never loaded")):
+        read_arrays(tmp_path / "a.npz")
+    assert not made.exists()
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.arange(24, dtype=np.float32).reshape(2, 3, 4),
+        np.asfortranarray(np.arange(6.0).reshape(2, 3)),
+        np.arange(5, dtype=">i2"),
+        np.array([True, False]),
+        np.float16([[1.5]]),
+        np.zeros((3, 0), np.float32),
+        np.array(7),
+    ],
+    ids=lambda values: f"{values.dtype}{values.shape}",
+)
+def test_arrays_are_read_as_numpy_wrote_them(tmp_path, values, mapped):
+    np.save(tmp_path / "a.npy", values)
+    if mapped and values.size == 0:
+        return
+    found = read_array(tmp_path / "a.npy", mapped=mapped)
+    assert found.dtype == values.dtype
+    assert np.array_equal(found, values)
+    assert isinstance(found, np.memmap) == mapped
+
+
+def test_missing_files_are_named(tmp_path):
+    for read, name in ((read_array, "a.npy"), (read_arrays, "a.npz"), (read_safetensors, "a.safetensors")):
+        with pytest.raises(FileNotFoundError, match=tells(name, "no such file", "expected")):
+            read(tmp_path / name)
+
+
+def zipped(tmp_path, entries: dict[str, bytes], kind: int = zipfile.ZIP_DEFLATED):
+    file = tmp_path / "a.npz"
+    with zipfile.ZipFile(file, "w", kind) as archive:
+        for name, content in entries.items():
+            archive.writestr(name, content)
+    return file
+
+
+def test_archives_are_read_as_numpy_wrote_them(tmp_path):
+    np.savez_compressed(tmp_path / "a.npz", a=np.arange(4), name=np.array("abc"), none=np.zeros((0, 3)))
+    found = read_arrays(tmp_path / "a.npz")
+    assert found["a"].tolist() == [0, 1, 2, 3]
+    assert str(found["name"]) == "abc"
+    assert found["none"].shape == (0, 3)
+
+
+@pytest.mark.parametrize("lie", LIES.values(), ids=LIES)
+def test_a_lying_array_in_an_archive_is_found(tmp_path, lie):
+    file = zipped(tmp_path, {"class_id.npy": lie})
+    tracemalloc.start()
+    try:
+        with pytest.raises(FileError, match=tells(file, "cannot be read", "again")):
+            read_arrays(file)
+        assert tracemalloc.get_traced_memory()[1] < 20_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_an_archive_unpacks_to_no_more_than_allowed(tmp_path):
+    zeros = io.BytesIO()
+    np.save(zeros, np.zeros(200_000_000, np.uint8))
+    file = zipped(tmp_path, {"a.npy": zeros.getvalue()})
+    assert file.stat().st_size < 1_000_000
+    with pytest.raises(FileError, match=tells(file, "unpack to 200000128 bytes")):
+        read_arrays(file)
+    with pytest.raises(FileError, match=tells(file, "at most 1000")):
+        read_arrays(file, most=1000)
+
+
+def test_a_damaged_archive_is_one_error(tmp_path):
+    whole = zipped(tmp_path, {"a.npy": npy(stated("<f4", "(3,)"), b"\0" * 12)}, zipfile.ZIP_STORED).read_bytes()
+    rng = np.random.default_rng(0)
+    file = tmp_path / "b.npz"
+    refused = 0
+    for _ in range(300):
+        damaged = bytearray(whole)
+        for place in rng.integers(len(whole), size=3):
+            damaged[place] = rng.integers(256)
+        file.write_bytes(damaged)
+        try:
+            read_arrays(file)
+        except FileError:
+            refused += 1
+    assert refused > 200
+
+
+def safetensors(header: object, data: bytes = b"") -> bytes:
+    text = header if isinstance(header, bytes) else json.dumps(header).encode()
+    return struct.pack("<Q", len(text)) + text + data
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\xff" * 64,
+        safetensors({"a": {"dtype": "F32", "shape": [1 << 40], "data_offsets": [0, 1 << 42]}}),
+        safetensors({"a": {"dtype": "F32", "shape": [1 << 32, 1 << 32], "data_offsets": [0, 0]}}),
+        safetensors({"a": {"dtype": "F32", "shape": [2], "data_offsets": [0, 4]}}, b"\0" * 4),
+        safetensors({"a": {"dtype": "NEW", "shape": [1], "data_offsets": [0, 4]}}, b"\0" * 4),
+        safetensors(b"[" * 100_000),
+        safetensors({"__metadata__": {"kfgs": 7}}),
+    ],
+    ids=["empty", "ff", "4 TiB", "overflow", "two for one", "new type", "nested", "number in metadata"],
+)
+def test_safetensors_that_lie_are_one_error(tmp_path, content):
+    file = tmp_path / "a.safetensors"
+    file.write_bytes(content)
+    with pytest.raises(FileError, match=tells(file, "cannot be read", "again")):
+        read_safetensors(file)
+
+
+def test_safetensors_say_their_kind_and_version(tmp_path):
+    file = tmp_path / "a.safetensors"
+    for metadata, told in (
+        (None, ("got other tensors", "a kfgs codebook, version 1", "fit it")),
+        ({"kfgs": "index maps", "version": "1"}, ("got index maps", "fit it")),
+        ({"kfgs": "codebook", "version": "2"}, ("got version 2", "use the kfgs that wrote it")),
+        ({"kfgs": "codebook"}, ("got version None", "use the kfgs that wrote it")),
+    ):
+        save_file({"a": torch.zeros(2)}, file, metadata=metadata)
+        with pytest.raises(FileError, match=tells(file, *told)):
+            read_safetensors(file, advice="fit it", kfgs=("codebook", "1"))
+    save_file({"a": torch.ones(2)}, file, metadata={"kfgs": "codebook", "version": "1", "more": "x"})
+    tensors, metadata = read_safetensors(file, kfgs=("codebook", "1"))
+    assert tensors["a"].tolist() == [1, 1]
+    assert metadata["more"] == "x"
