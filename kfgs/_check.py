@@ -17,6 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ._card import error_line
+
 PARTS = ("embeddings", "codewords", "map", "means", "gaussians")  # where our objects keep what is mostly meant
 
 
