@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -96,8 +95,6 @@ class Run:
         else:
             self.say(f"{name}: working")
             start = time.perf_counter()
-            for left_over in target.parent.glob(f".{target.name}.*"):  # of a process that was killed
-                shutil.rmtree(left_over, ignore_errors=True)
             with atomic_folder(target) as temporary, say_compiling(self.say):
                 earlier = make(temporary) or 0.0
                 seconds = time.perf_counter() - start + earlier

@@ -1,0 +1,79 @@
+"""Files: atomic writing, locks, outputs checked before the work, JSON, digests of what was read; sizes and times in words."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from .atomic import FullDiskError, atomic_folder, atomic_path, current_file, hidden_folder
+from .locks import locked
+from .paths import as_path, check_output
+
+__all__ = [
+    "FullDiskError",
+    "as_path",
+    "atomic_folder",
+    "atomic_path",
+    "bytes_in_words",
+    "check_output",
+    "current_file",
+    "digest_file",
+    "digest_value",
+    "hidden_folder",
+    "locked",
+    "read_json",
+    "seconds_in_words",
+    "write_json",
+]
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    """Write `value` as indented JSON, atomically; NaN and infinity are refused (ValueError)."""
+    text = json.dumps(value, indent=2, allow_nan=False) + "\n"
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def read_json(path: str | Path) -> Any:
+    """Read a JSON file; the error names the file and what is wrong with it.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not UTF-8 JSON.
+    """
+    path = as_path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected a JSON file there")
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:  # not UTF-8, not JSON, or an integer of thousands of digits
+        raise ValueError(f"{path}: expected a JSON file, but it cannot be parsed ({error})") from error
+
+
+def digest_file(path: str | Path) -> str:
+    """SHA-256 of a file's bytes, in hexadecimal."""
+    with as_path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def digest_value(value: Any) -> str:
+    """SHA-256 of a JSON-able value (keys sorted), in hexadecimal."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, allow_nan=False).encode()).hexdigest()
+
+
+def bytes_in_words(count: float | None) -> str:
+    """Bytes for people: `15.9 GB`, `0.3 MB`; `unknown` for None."""
+    if count is None:
+        return "unknown"
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
+
+
+def seconds_in_words(seconds: float | None) -> str:
+    """A duration for people: `40 s`, `12 min`, `3.3 h`; `unknown` for None."""
+    if seconds is None:
+        return "unknown"
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
