@@ -27,6 +27,7 @@ from .output import called, say, warnings_as_notes
 from .pack import pack
 from .query import info, label, segment, select
 from .render import render
+from .runs import runs
 from .splats import attach, convert, edit
 from .text import text
 from .view import view
@@ -35,7 +36,7 @@ GROUPS: dict[str, tuple[Any, ...]] = {
     "Start here": (demo, info),
     "Make a semantic field": (sfm, plan, features, text, fit, uplift),
     "Ask it": (select, segment, label, view, render),
-    "Store it": (pack,),
+    "Store it": (pack, runs),
     "Score it": (evaluate, compare),
     "Colour splats": (color, attach, edit, convert),
 }

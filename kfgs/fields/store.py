@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from .._check import check_choice
-from .._files import atomic_folder, atomic_path, digest_file, read_json, write_json
+from .._files import as_path, atomic_folder, atomic_path, current_file, digest_file, read_json, write_json
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels import LabelSet
@@ -29,23 +30,29 @@ FORMAT, VERSIONS = "kfgs.semantic_field", (1, 2, 3)
 TENSORS, DESCRIPTION = "field.safetensors", "field.json"
 SUFFIX = ".kfgs.safetensors"
 """Of a field in one file."""
+ATTEMPTS = 3  # to read a folder that other processes write to
 
 
 def find_field(path: str | Path) -> Path | None:
     """The field at a path: a field folder, a packed field, or the field of a run folder; None if there is none."""
-    path = Path(path)
-    found = (one for one in (path, path / "field") if (one / DESCRIPTION).is_file())
+    path = as_path(path)
+    found = (one for one in (path, path / "field") if describes_field(one))
     return next(found, path if _peek(path) is not None else None)
+
+
+def describes_field(folder: Path) -> bool:
+    """Whether a folder is that of a field."""
+    return current_file(folder, DESCRIPTION).is_file()
 
 
 def field_data(path: Path) -> Path:
     """The file with the numbers of a field: in its folder, or the packed file."""
-    return path / TENSORS if path.is_dir() else path
+    return current_file(path, TENSORS) if path.is_dir() else path
 
 
 def save_field(path: str | Path, parts: Mapping[str, Any], precision: str | Rounding | None = None) -> None:
     """Write the parts of a field, as returned by `load_field`; see `SemanticField.save`."""
-    path = Path(path)
+    path = as_path(path)
     single = path.name.endswith(SUFFIX)
     if precision is not None and not single:
         raise ValueError(
@@ -55,7 +62,7 @@ def save_field(path: str | Path, parts: Mapping[str, Any], precision: str | Roun
     if single:
         older = not path.exists() or _peek(path) is not None
     else:
-        older = not path.exists() or (path / DESCRIPTION).is_file() or (path.is_dir() and not any(path.iterdir()))
+        older = not path.exists() or describes_field(path) or (path.is_dir() and not any(path.iterdir()))
     if not older:
         raise FileExistsError(
             f"path: expected a new {'file' if single else 'folder'} or an older field at {path}, got something else; "
@@ -91,15 +98,26 @@ def unpack_parts(data: bytes, name: str = "data") -> dict[str, Any]:
 
 def load_field(path: str | Path) -> dict[str, Any]:
     """The parts of a field, by name; see `SemanticField.load`."""
-    path = Path(path)
+    path = as_path(path)
     if path.is_file():
         return unpack_parts(b"" if _peek(path) is None else path.read_bytes(), str(path))
-    if not (path / DESCRIPTION).is_file():
+    tensors, description = _read_folder(path)
+    return _from_tensors(str(path), tensors, description)
+
+
+def read_description(path: Path) -> dict[str, Any]:
+    """What `field.json` says about the field of a folder.
+
+    Raises:
+        FileNotFoundError: if there is no field.
+        ValueError: if the file is damaged, or of another format or version.
+    """
+    if not describes_field(path):
         raise FileNotFoundError(
             f"{path}: expected a saved field, a file or a folder with {DESCRIPTION}, found none; pass what "
             "SemanticField.save got"
         )
-    description = read_json(path / DESCRIPTION)
+    description = read_json(current_file(path, DESCRIPTION))
     found = description.get("format") if isinstance(description, dict) else None
     if found != FORMAT:
         raise ValueError(f"{path}: expected a field ({FORMAT}), got {found!r}; pass what SemanticField.save wrote")
@@ -108,18 +126,29 @@ def load_field(path: str | Path) -> dict[str, Any]:
         raise ValueError(
             f"{path}: expected format version {known}, got {description.get('version')!r}; use the kfgs that wrote it"
         )
-    if not (path / TENSORS).is_file() or digest_file(path / TENSORS) != description.get("sha256"):
-        raise ValueError(
-            f"{path}: expected {TENSORS} as it was saved, got {'another' if (path / TENSORS).is_file() else 'none'}; "
-            "copy the whole folder again, or fit the field again"
-        )
-    try:
-        tensors = load_file(path / TENSORS)
-    except SafetensorError as error:
-        raise ValueError(
-            f"{path}: expected a field, but its parts do not fit together ({error}); fit it again"
-        ) from error
-    return _from_tensors(str(path), tensors, description)
+    return dict(description)
+
+
+def _read_folder(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and description of a field folder. If another process replaces them meanwhile, they are read again."""
+    for _ in range(ATTEMPTS):
+        description, file = read_description(path), current_file(path, TENSORS)
+        try:
+            before = file.stat()
+            if digest_file(file) == description.get("sha256"):
+                tensors = load_file(file)
+                if os.path.samestat(before, file.stat()):
+                    return tensors, description
+        except FileNotFoundError:
+            continue
+        except SafetensorError as error:
+            raise ValueError(
+                f"{path}: expected a field, but its parts do not fit together ({error}); fit it again"
+            ) from error
+    raise ValueError(
+        f"{path}: expected {TENSORS} as it was saved, got {'another' if file.is_file() else 'none'}; copy the whole folder "
+        "again, or fit the field again"
+    )
 
 
 def _peek(path: Path) -> dict[str, Any] | None:

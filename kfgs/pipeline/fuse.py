@@ -34,23 +34,24 @@ def find_geometry(
     config: ColorConfig,
     device: torch.device,
     progress: Progress,
-) -> tuple[Gaussians, str]:
-    """The Gaussians to fuse onto, and their origin.
+) -> tuple[Gaussians, dict[str, Any]]:
+    """The Gaussians to fuse onto, and their origin, for `field.json`.
 
     Without a splat they are the colour field of the run. Its stage is found again if it is there. A longer colour field of the
     same scene, as `kfgs color` makes it in the same run folder, is taken instead. A shorter one is not, but its
     `color.ply` stays.
     """
     if isinstance(splat, Gaussians):
-        return splat, "given"
+        return splat, {"geometry": "given"}
     if isinstance(splat, SplatFile):
-        return splat.gaussians, "given"
+        return splat.gaussians, {"geometry": "given"}
     if splat is not None:
-        return read_splats(splat).gaussians, str(splat)
+        return read_splats(splat).gaussians, {"geometry": str(splat)}
     found = find_color(run, scene, config)
     if found is None:
-        found = make_color(run, scene, config, device, progress, overwrite=False).gaussians
-    return found, "trained on the pictures"
+        found = make_color(run, scene, config, device, progress, overwrite=False).gaussians, config.field.steps
+    gaussians, steps = found
+    return gaussians, {"geometry": "trained on the pictures", "steps": {"color": steps}}
 
 
 def uplift_stage(

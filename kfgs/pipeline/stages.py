@@ -11,6 +11,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._files import atomic_folder, digest_file, digest_value, read_json, write_json
+from .._files import atomic_folder, digest_file, digest_value, locked, read_json, write_json
 from ..cameras import Camera
 from ..cameras.camera import NEAR
 from ..scenes import Scene
 from ..splat.engines.table import say_compiling
 
-STAGE_FILE = "stage.json"
+STAGE_FILE, LOCK = "stage.json", ".run.lock"
 STAGE_VERSION = 2
 """Part of every key: raised if the same inputs give another result in a new version, so that old stages are not reused."""
 
@@ -104,6 +105,14 @@ class Run:
             self.say(f"{name}: done in {seconds:.1f} s")
         self.stages.append(done)
         return done
+
+    def locked(self) -> AbstractContextManager[None]:
+        """Keep other processes from working in the folder.
+
+        Raises:
+            ValueError: if one works there already; the message says which. Nothing is written then.
+        """
+        return locked(self.folder, LOCK)
 
     def scratch(self, name: str, inputs: dict[str, Any]) -> Path:
         """A path for the unfinished work of a stage (checkpoints), kept until the stage is done."""
