@@ -7,11 +7,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-from .atomic import FullDiskError, atomic_folder, atomic_path, current_file, hidden_folder
+from .atomic import HIDDEN, FullDiskError, atomic_folder, atomic_path, current_file, hidden_folder
 from .locks import locked
 from .paths import as_path, check_output
 
 __all__ = [
+    "HIDDEN",
     "FullDiskError",
     "as_path",
     "atomic_folder",

@@ -100,10 +100,12 @@ def _fail(text: str) -> None:
 
 def _expand_home(word: str) -> str:
     """A word of the command line with `~` as the home folder: `~/scene`, `--out=~/run`."""
-    option, equals, value = word.partition("=")
-    if option.startswith("--") and equals:
-        return f"{option}={os.path.expanduser(value)}"
-    return os.path.expanduser(word)
+    from .._files import as_path
+
+    option, _, value = word.partition("=")
+    if option.startswith("--") and value.startswith("~"):
+        return f"{option}={as_path(value)}"
+    return str(as_path(word)) if word.startswith("~") else word
 
 
 def _overview() -> str:

@@ -57,7 +57,7 @@ def features(
         found.raise_if_bad()
         return
     target = out if out is not None else scene_folder(scene) / "features"
-    check_folder("out", target)
+    check_folder("out", target, None, scene_folder(scene) / "images", views.images)
     network = choose_teacher(teacher.teacher, teacher.weights, teacher.fast, teacher.size, device)
     made = extract_features(network, loaded, target, views.split, overwrite=overwrite, report=say, progress=True)
     shapes = sorted({" x ".join(map(str, record.shape)) for record in made.maps.values()})

@@ -56,7 +56,7 @@ def render(
     from ..viz import save_animation
     from ..viz.animation import SUFFIXES, check_target
 
-    check_file("out", out)
+    check_file("out", out, classes.scene)
     if out.suffix.lower() not in SUFFIXES:
         raise ValueError(f"out: expected a name that ends in .gif or .mp4, got {out.name!r}; rename it")
     check_target(out, fps)

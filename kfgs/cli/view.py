@@ -73,7 +73,8 @@ def view(
     from ..viz.explorer.entry import check_place
     from ..viz.headless import require
 
-    check_folder("out", out)
+    if where in ("html", "picture") or out.exists():  # the others write only when asked
+        check_folder("out", out, classes.scene)
     check_whole("port", display.port, 0, 65535)
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))

@@ -13,6 +13,7 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from .._card import short_repr
+from .._files import as_path
 from ..cameras import resize_labels
 from ..metrics import ConfusionMatrix, Score
 
@@ -30,7 +31,7 @@ def load_label_map(path: str | Path) -> Tensor:  # [H, W] int64, -1 = void
         FileNotFoundError: if there is no such file.
         ValueError: if it is not an 8-bit single-channel picture.
     """
-    path = Path(path)
+    path = as_path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected a label picture there")
     try:

@@ -10,11 +10,12 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 
 from .._check import check_choice
 from .._files import as_path, atomic_folder, atomic_path, current_file, digest_file, read_json, write_json
+from .._tensors import save_tensors
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels import LabelSet
@@ -59,15 +60,7 @@ def save_field(path: str | Path, parts: Mapping[str, Any], precision: str | Roun
             f"path: expected a name that ends in {SUFFIX} for a field in one file, got {path}; give another, or leave "
             "precision out to write a folder"
         )
-    if single:
-        older = not path.exists() or _peek(path) is not None
-    else:
-        older = not path.exists() or describes_field(path) or (path.is_dir() and not any(path.iterdir()))
-    if not older:
-        raise FileExistsError(
-            f"path: expected a new {'file' if single else 'folder'} or an older field at {path}, got something else; "
-            "give another"
-        )
+    check_place(path)
     parts = {**parts, "info": rebased(parts["info"], parts["folder"], path)}
     if single:
         data = pack_parts({**parts, "words": _words(parts, path)}, precision or "lossless")
@@ -76,10 +69,21 @@ def save_field(path: str | Path, parts: Mapping[str, Any], precision: str | Roun
         return
     tensors, description = _to_tensors(parts)
     with atomic_folder(path) as folder:
-        save_file(tensors, folder / TENSORS)
+        save_tensors(folder / TENSORS, tensors)
         version = VERSIONS[-1] if "words" in description else VERSIONS[-2]
         about = {"format": FORMAT, "version": version, "sha256": digest_file(folder / TENSORS)}
         write_json(folder / DESCRIPTION, about | description)
+
+
+def check_place(path: Path) -> None:
+    """Raise a FileExistsError unless there is nothing at `path`, or a field that may be replaced."""
+    single = path.name.endswith(SUFFIX)
+    older = _peek(path) is not None if single else path.is_dir() and (describes_field(path) or not any(path.iterdir()))
+    if path.exists() and not older:
+        raise FileExistsError(
+            f"path: expected a new {'file' if single else 'folder'} or an older field at {path}, got something else; "
+            "give another"
+        )
 
 
 def pack_parts(parts: Mapping[str, Any], precision: str | Rounding) -> bytes:

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from .._files import current_file
+
 META = "meta.json"
 _META_BYTES = 1 << 22  # three codebooks of 256 numbers and a few names take 20 KB
 _SPARE_PIXELS = 1 << 16  # unused pixels that an image may have
@@ -69,7 +71,7 @@ class SogFiles:
         return data
 
     def _read_folder(self, name: str, limit: int) -> bytes:
-        file = self._folder / name
+        file = current_file(self._folder, name)
         if not file.is_file():
             raise ValueError(f"{self.path}: expected {name!r} in the folder, got no such file; copy all of the scene")
         with file.open("rb") as stream:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from .._files import check_output
 from ..evaluation import LabelSet, load_label_set, score_recolor, score_removal, score_surface, score_views
 from ..evaluation.surface import SurfaceReport
 from ..features import FeatureFolder
@@ -56,7 +57,7 @@ def run(
         report: called with one line per step.
         progress: show progress bars.
     """
-    out, say = Path(out), report or (lambda text: None)
+    out, say = check_output("out", out, "a folder"), report or (lambda text: None)
     config = config or FitConfig.cpu()
     say("making the toy room")
     folder = make_toy_room(out / "scene", room or ToyConfig())

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 
-from .._files import write_json
+from .._files import as_path, write_json
 from .._progress import Progress
+from .._tensors import save_tensors
 from ..cameras import Camera
 from ..fields import Answers, Seen, SemanticField, UpliftConfig, fused_answers, remember, uplift_maps
 from ..formats import SplatFile, read_splats
@@ -83,7 +84,7 @@ def uplift_stage(
         cloud = found.gaussians
         tensors = {name: getattr(cloud, name) for name in (*SHAPE, "features")}
         tensors |= {"basis": found.latents.basis, "pixels": found.pixels, "agreement": found.agreement}
-        save_file({name: value.cpu().contiguous() for name, value in tensors.items()}, folder / "uplift.safetensors")
+        save_tensors(folder / "uplift.safetensors", tensors)
         write_json(folder / "facts.json", {"gaussians": len(cloud), "latents": found.latents.latent})
 
     stage = run.stage("uplift", inputs, make)
@@ -144,11 +145,13 @@ def uplift(
         "method": "uplift",
         "views": [camera.name for camera in cameras],
         **({"teacher": teacher} if teacher else {}),
-        **({} if folder is None or scene.folder is None else remember(scene.folder, Path(folder), found.latents.dim)),
+        **(
+            {} if folder is None or scene.folder is None else remember(scene.folder, as_path(folder), found.latents.dim)
+        ),
         "kfgs": version("kfgs"),
     }
     seen = Seen(found.pixels, found.agreement)
-    place = None if folder is None else Path(folder)
+    place = None if folder is None else as_path(folder)
     return SemanticField(found.gaussians, info=info, linear=found.latents, seen=seen, cameras=cameras, folder=place)
 
 
@@ -160,7 +163,7 @@ def answers_stage(run: Run, field: SemanticField, cameras: Sequence[Camera]) -> 
     def make(folder: Path) -> None:
         found = fused_answers(field.gaussians, field.codebook, field.autoencoder, cameras)
         tensors = {"latents": found.latents, "basis": found.linear.basis, **found.seen._asdict()}
-        save_file({name: value.cpu().contiguous() for name, value in tensors.items()}, folder / "answers.safetensors")
+        save_tensors(folder / "answers.safetensors", tensors)
 
     tensors = load_file(run.stage("answers", inputs, make).folder / "answers.safetensors")
     seen = Seen(tensors["pixels"], tensors["agreement"])

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from .._files import as_path, atomic_path, bytes_in_words, current_file, seconds_in_words
+from .._files import atomic_path, bytes_in_words, current_file, seconds_in_words
 from ..fields import SemanticField
 from ..fields.store import DESCRIPTION, TENSORS
 from ..labels import LabelSet

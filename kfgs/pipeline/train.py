@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 
 from .._files import write_json
+from .._tensors import save_tensors
 from ..fields import FieldConfig, FieldFit, GaussianParams
 from ..fields.config import check_extent
 from ..scenes import Scene
@@ -76,8 +77,7 @@ def field_stage(
     def make(folder: Path) -> float:
         started = time.perf_counter()
         fit = train(scratch)
-        tensors = {key: value.cpu().contiguous() for key, value in fit.params.to_tensors().items()}
-        save_file(tensors, folder / "params.safetensors")
+        save_tensors(folder / "params.safetensors", fit.params.to_tensors())
         write_json(folder / "history.json", fit.history)
         return max(0.0, fit.history[-1]["seconds"] - (time.perf_counter() - started))  # before it was killed
 

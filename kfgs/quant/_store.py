@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
-from .._files import atomic_path
+from .._files import as_path, atomic_path
+from .._tensors import save_tensors
 
 KIND, VERSION = "kfgs", "1"  # the metadata's key for the kind of file, and the version of all of them
 
@@ -17,8 +17,7 @@ KIND, VERSION = "kfgs", "1"  # the metadata's key for the kind of file, and the 
 def write_tensors(path: str | Path, tensors: Mapping[str, Tensor], *, kind: str) -> None:
     """Write tensors (copied to the CPU) and their kind."""
     with atomic_path(path) as temporary:
-        whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-        save_file(whole, temporary, metadata={KIND: kind, "version": VERSION})
+        save_tensors(temporary, tensors, {KIND: kind, "version": VERSION})
 
 
 def read_tensors(path: str | Path, *, kind: str) -> dict[str, Tensor]:
@@ -28,7 +27,7 @@ def read_tensors(path: str | Path, *, kind: str) -> dict[str, Tensor]:
         FileNotFoundError: if there is no such file.
         ValueError: if it is no .safetensors file, or is of another kind.
     """
-    path = Path(path)
+    path = as_path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected a kfgs {kind} (.safetensors) there")
     try:

@@ -10,7 +10,7 @@ from typing import Any
 from kornia.io import ImageLoadType, load_image
 from torch import Tensor
 
-from .._files import read_json
+from .._files import as_path, read_json
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")  # kornia decodes these
 MAX_SIDE = 100_000  # pixels: beyond any sensor, so a larger number is a wrong byte
@@ -64,7 +64,7 @@ def list_images(folder: str | Path) -> list[str]:
 
     Hidden files and folders are left out; links to folders are not followed.
     """
-    root = Path(folder)
+    root = as_path(folder)
     names: list[str] = []
     for here, folders, files in os.walk(root):
         folders[:] = [name for name in folders if not name.startswith(".")]
@@ -81,7 +81,7 @@ def read_image(path: str | Path) -> Tensor:  # [H, W, 3] float32 in [0, 1]
         FileNotFoundError: if there is no such file.
         SceneError: if it cannot be decoded.
     """
-    path = Path(path)
+    path = as_path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected an image there")
     try:

@@ -259,7 +259,9 @@ except OSError as error:
 
 
 def test_a_library_that_cannot_write_names_the_output(tmp_path):
-    done = subprocess.run([sys.executable, "-c", LIMITED, tmp_path / "a.bin"], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, tmp_path / "a.bin"], capture_output=True, text=True, check=True
+    )
     assert str(tmp_path / "a.bin") in done.stdout
     assert "kfgs-unfinished" not in done.stdout
     assert names(tmp_path) == []

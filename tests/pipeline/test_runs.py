@@ -16,7 +16,6 @@ from kfgs.pipeline.runs import compare_fields, find_run_field, keep_field, list_
 from kfgs.pipeline.stages import LOCK, Run
 from kfgs.scenes import load_scene
 
-
 TINY = """
 import torch
 from kfgs.fields import SemanticField
@@ -30,8 +29,9 @@ def tiny_field(number=0):
         info={"method": "fuse"},
     )
 """
-exec(TINY)
-tiny_field: Callable[..., SemanticField]
+names: dict[str, Callable[..., SemanticField]] = {}
+exec(TINY, names)
+tiny_field = names["tiny_field"]
 
 
 def a_field(number: int, **info: object) -> SemanticField:
@@ -170,7 +170,9 @@ def test_a_second_fit_in_the_folder_is_refused_and_destroys_nothing(fuse, tmp_pa
 
         def __getitem__(self, i):
             if not seen:
-                with pytest.raises(ValueError, match=tells("folder:", tmp_path, f"process {os.getpid()}", "wait")) as caught:
+                with pytest.raises(
+                    ValueError, match=tells("folder:", tmp_path, f"process {os.getpid()}", "wait")
+                ) as caught:
                     fit_scene(scene, maps, tmp_path, config, splat=splat)
                 seen.append(caught.value)
             return maps[i]
@@ -179,4 +181,4 @@ def test_a_second_fit_in_the_folder_is_refused_and_destroys_nothing(fuse, tmp_pa
     assert seen
     assert len(list_fields(tmp_path)) == 1
     with Run(tmp_path).locked():  # free again
-        assert "pytest" in (tmp_path / LOCK).read_text()
+        assert f"process {os.getpid()} of " in (tmp_path / LOCK).read_text()

@@ -8,7 +8,7 @@ from zipfile import BadZipFile
 import numpy as np
 import torch
 
-from ..._files import read_json
+from ..._files import as_path, read_json
 from ..truth import PointTruth
 
 
@@ -22,7 +22,7 @@ def load_surface_points(path: str | Path) -> PointTruth:
         FileNotFoundError: if one of the two is missing.
         ValueError: if one is damaged.
     """
-    file = Path(path) / "surface.npz"
+    file = as_path(path) / "surface.npz"
     if not file.is_file():
         raise FileNotFoundError(f"{file}: no such file; expected points of all surfaces there")
     names = read_json(file.with_name("classes.json"))
