@@ -23,7 +23,12 @@ def as_path(path: str | Path) -> Path:
 
 
 def check_output(
-    name: str, path: str | Path, kind: Literal["a file", "a folder"], *, apart: Iterable[Path | None] = ()
+    name: str,
+    path: str | Path,
+    kind: Literal["a file", "a folder"],
+    *,
+    apart: Iterable[Path] = (),
+    other: Iterable[Path | None] = (),
 ) -> Path:
     """Check before the work that its result can be written.
 
@@ -31,13 +36,15 @@ def check_output(
         name: the argument, for messages.
         path: the file or folder to write; it need not exist.
         kind: which of the two.
-        apart: folders in which nothing may be written: the pictures and feature maps of a scene. None is skipped.
+        apart: folders in which nothing may be written: those of a scene for its pictures and feature maps.
+        other: folders that it must not be, but may lie in; None is skipped.
 
     Returns:
         The path, with `~` expanded.
 
     Raises:
-        ValueError: if a folder is in place of a file, or a file in place of a folder or above; or it lies in one of `apart`.
+        ValueError: if a folder is in place of a file, or a file in place of a folder or above; or if `apart` or
+            `other` forbid it.
         OSError: if it cannot be written to, or the disk is full.
     """
     target = as_path(path)
@@ -48,11 +55,12 @@ def check_output(
     if not above.is_dir():
         raise ValueError(f"{name}: expected a folder to write to, got {path} below the file {above}; give another")
     real = Path(os.path.realpath(target))
-    for folder in apart:
-        if folder is not None and Path(os.path.realpath(folder)) in (real, *real.parents):
+    forbidden = [(folder, (real, *real.parents)) for folder in apart]
+    forbidden += [(folder, (real,)) for folder in other if folder is not None]
+    for folder, places in forbidden:
+        if Path(os.path.realpath(folder)) in places:
             raise ValueError(
-                f"{name}: expected a place apart from the pictures and feature maps of the scene, got {path} in {folder}; "
-                "give another"
+                f"{name}: expected a place apart from the pictures and feature maps in {folder}, got {path}; give another"
             )
     try:
         if target.exists() and not os.access(target, os.W_OK):

@@ -23,7 +23,7 @@ import tyro
 from .evaluate import compare, evaluate
 from .features import features, plan
 from .fit import color, demo, fit, sfm, uplift
-from .output import called, say, warnings_as_notes
+from .output import called, said_on_stderr, say, warnings_as_notes
 from .pack import pack
 from .query import info, label, segment, select
 from .render import render
@@ -77,7 +77,7 @@ def main(arguments: list[str] | None = None) -> int:
         return _in_options(message, names)
 
     try:
-        with warnings_as_notes(spoken):
+        with warnings_as_notes(spoken), said_on_stderr():
             command.__doc__ = re.sub(
                 r"\n {8,}(?!kfgs)", " ", inspect.getdoc(command) or ""
             )  # an option's text on one line

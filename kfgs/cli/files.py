@@ -8,22 +8,22 @@ from typing import Any
 # Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
 
 
-def check_file(name: str, target: Path, scene: Path | None = None, *apart: Path | None) -> None:
-    """Check that a file can be written, and is not among the pictures and maps of a scene or in another folder `apart`.
+def check_file(name: str, target: Path, scene: Path | None = None) -> None:
+    """Check that a file can be written, and does not lie among the pictures or maps of a scene.
 
     Raises:
         ValueError, OSError: see `check_output`.
     """
     from .._files import check_output
 
-    check_output(name, target, "a file", apart=[*_of_scene(scene), *apart])
+    check_output(name, target, "a file", apart=_of_scene(scene))
 
 
-def check_folder(name: str, target: Path, scene: Path | None = None, *apart: Path | None) -> None:
-    """The same for a folder."""
+def check_folder(name: str, target: Path, scene: Path | None = None, *others: Path | None) -> None:
+    """The same for a folder, which is none of `others` either."""
     from .._files import check_output
 
-    check_output(name, target, "a folder", apart=[*_of_scene(scene), *apart])
+    check_output(name, target, "a folder", apart=_of_scene(scene), other=others)
 
 
 def check_target(name: str, target: Path, *sources: Path, scene: Path | None = None) -> None:

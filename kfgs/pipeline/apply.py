@@ -89,11 +89,13 @@ def segment_scene(
     Returns:
         The label map [H, W] of each view by its stem.
     """
-    out, read = as_path(out), {path.parent for path in scene.image_paths} - {scene.folder}
-    apart = [*read, maps, *([] if scene.folder is None else [scene.folder / "features"])]
-    for name in ("", *SEGMENTED):
-        check_output("out", out / name, "a folder", apart=apart)
+    out = as_path(out)
     check_range("pictures", pictures, 0)
+    apart = [] if scene.folder is None else [scene.folder / "images", scene.folder / "features"]
+    for name in SEGMENTED if pictures else SEGMENTED[:2]:
+        check_output(
+            "out", out / name, "a folder", apart=apart, other=[maps, *{one.parent for one in scene.image_paths}]
+        )
     if len(classes) > VOID:
         raise ValueError(
             f"classes: expected at most {VOID} (label pictures hold a byte per pixel, {VOID} = none), got {len(classes)}; "

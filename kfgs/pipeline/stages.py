@@ -19,11 +19,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._compiling import say_compiling
 from .._files import atomic_folder, digest_file, digest_value, locked, read_json, write_json
 from ..cameras import Camera
 from ..cameras.camera import NEAR
 from ..scenes import Scene
-from ..splat.engines.table import say_compiling
 
 STAGE_FILE, LOCK = "stage.json", ".run.lock"
 STAGE_VERSION = 2

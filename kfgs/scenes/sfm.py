@@ -101,7 +101,7 @@ def run_sfm(
     Raises:
         FileNotFoundError: if there is no such folder.
         FileExistsError: if `out/sparse/0` holds a model, and `replace` is False.
-        ValueError: if `out` is a file, or lies in `images`.
+        ValueError: if `out` is a file, or the folder of the images.
         SceneError: if there are fewer than 3 images, pycolmap fails, or the largest model places fewer than
             `min_registered` of the images (the rest is lost, or COLMAP split the scene into unconnected models).
         ImportError: if pycolmap is not installed.
@@ -112,7 +112,7 @@ def run_sfm(
     images, out, config = as_path(images), as_path(out), config or SfmConfig()
     if not images.is_dir():
         raise FileNotFoundError(f"{images}: no such folder; expected the images there")
-    check_output("out", out, "a folder", apart=[images])
+    check_output("out", out, "a folder", other=[images])
     model = out / "sparse" / "0"
     if has_model(model) and not replace:
         raise FileExistsError(
