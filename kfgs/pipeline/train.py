@@ -43,13 +43,18 @@ def training_device(device: str | torch.device = "auto") -> torch.device:
 
 
 def check_scene(scene: Scene) -> None:
-    """Raise a ValueError if a scene cannot be trained on: it has a lens, or no points to start from."""
+    """Raise a ValueError if a scene cannot be trained on: it has a lens, or no points to start from (or one position only)."""
     if scene.distorted:
         raise ValueError("scene: expected cameras without distortion, got a lens; pass scene.undistorted()")
     if len(scene.points) < 2:
         raise ValueError(
             f"scene: expected sparse points to start from, got {len(scene.points)}; a transforms.json needs a "
             "ply_file_path, or estimate the scene with `kfgs sfm`"
+        )
+    if bool((scene.points == scene.points[0]).all()):
+        raise ValueError(
+            f"scene: expected sparse points at different positions, got {len(scene.points)} at one; estimate the scene again "
+            "(`kfgs sfm`)"
         )
 
 
