@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .._files import atomic_path
+from .._files import as_path, atomic_path
 
 Columns = dict[str, NDArray[Any]]
 
@@ -139,7 +139,7 @@ def _plural(element: _Element) -> str:
 
 
 def _existing(path: str | Path) -> Path:
-    path = Path(path)
+    path = as_path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected a PLY file there")
     return path

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..._card import cut
-from ..._files import read_json, write_json
+from ..._files import as_path, read_json, write_json
 from ...formats.splat_file import SplatFile
 from .._json import build, checked_object
 from ..where import Where
@@ -119,7 +119,7 @@ class EditList:
         Raises:
             ValueError: if an insert holds a cloud in memory.
         """
-        path = Path(path)
+        path = as_path(path)
         write_json(
             path,
             {"format": FORMAT, "version": VERSION}
@@ -143,7 +143,7 @@ class EditList:
             ValueError: if it is another kind of file or of another version, or an edit in it is unknown or wrong; the
                 message names the place in the file.
         """
-        path = Path(path)
+        path = as_path(path)
         return EditList.from_json(read_json(path), str(path), path.parent, anywhere=anywhere)
 
     @staticmethod

@@ -1,0 +1,229 @@
+"""Files and folders that are either whole or absent, however their writer ends.
+
+What is being written lies in a hidden folder beside its place, `.kfgs-unfinished/new-*`, and is moved from there in one step.
+A lock shows that its writer lives; the next writer beside it deletes what others left.
+
+A folder that holds files already stays, with everything in it that the new content does not replace. The new content moves to
+`FOLDER/.kfgs-unfinished/waiting` in one step, and from there its files move to their places one by one. From that step on,
+`current_file` finds the new ones, before it the old ones, and the next writer finishes what a killed one began.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from .locks import try_lock
+from .paths import as_path
+
+HIDDEN, WAITING, LOCK = ".kfgs-unfinished", "waiting", ".kfgs-lock"
+ATTEMPTS = 100  # to put a folder where other processes put theirs
+FULL = (errno.ENOSPC, errno.EDQUOT)
+UNNAMED = (*FULL, errno.EIO, errno.EFBIG, errno.EROFS)  # errors of writing, which Python raises without a file
+SHORT = "requested and"  # in the message of numpy
+NOTHING = 1 << 14  # bytes: a disk with less is full
+
+
+class FullDiskError(OSError):
+    """The disk has no space for an output; the message names the file or folder that was asked for."""
+
+
+def _read_umask() -> int:
+    umask = os.umask(0)
+    os.umask(umask)
+    return umask
+
+
+UMASK = _read_umask()  # once: it can only be read by setting it, for all threads
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Give a hidden path of the same name to write a file to, and move it to `path` if the block succeeds.
+
+    Raises:
+        FullDiskError: if the disk is full.
+        OSError: if `path` cannot be written; all errors name `path`, none the hidden one.
+    """
+    target = as_path(path)
+    with hidden_folder(target.parent, target) as place:
+        new = place / target.name
+        yield new
+        _make_ordinary(new)
+        os.replace(new, target)
+
+
+@contextmanager
+def atomic_folder(path: str | Path) -> Iterator[Path]:
+    """Give a hidden folder to fill, and put it to `path` if the block succeeds. Errors are those of `atomic_path`.
+
+    If `path` holds files already, the new ones replace those of the same names, all others stay; then the block must make
+    no folders. Read such a folder with `current_file`. A link to a folder stays a link.
+    """
+    target = Path(os.path.realpath(as_path(path)))
+    with hidden_folder(target if _is_used(target) else target.parent, as_path(path)) as place:
+        new = place / "new"
+        new.mkdir(mode=0o777 & ~UMASK)
+        yield new
+        for file in new.rglob("*"):
+            if file.is_file() and not file.is_symlink():
+                _make_ordinary(file)
+        _put(new, target)
+
+
+def current_file(folder: Path, name: str) -> Path:
+    """Where a file of a folder is that `atomic_folder` wrote, also if its writer was killed while moving the files."""
+    waiting = folder / HIDDEN / WAITING / name
+    return waiting if waiting.exists() else folder / name
+
+
+@contextmanager
+def hidden_folder(parent: Path, target: Path | None = None) -> Iterator[Path]:
+    """Make a hidden folder in `parent` (made if missing) to work in, and delete it in the end.
+
+    Those of processes that have ended without deleting theirs are deleted first; those of living ones stay.
+
+    Args:
+        parent: a folder.
+        target: what is written, for errors: they name it instead of the hidden folder.
+    """
+    shown = parent if target is None else target
+    hidden = parent / HIDDEN
+    try:
+        _sweep(hidden)
+        place, handle = _take(hidden)
+    except OSError as error:
+        raise _retold(error, hidden, shown) or error from error
+    try:
+        yield place
+    except Exception as error:
+        told = _retold(error, place, shown)
+        if told is None:
+            raise
+        raise told from error
+    finally:
+        _discard(place)
+        os.close(handle)
+        with suppress(OSError):  # another process works in it
+            hidden.rmdir()
+
+
+def _take(hidden: Path) -> tuple[Path, int]:
+    """A new folder in `hidden`, and its lock."""
+    while True:
+        try:
+            hidden.mkdir(parents=True, exist_ok=True)
+            place = Path(tempfile.mkdtemp(prefix="new-", dir=hidden))
+            handle = os.open(place / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+        except (FileNotFoundError, FileExistsError):  # another process deleted one of them, which was empty
+            if not hidden.parent.is_dir() or hidden.is_file():
+                raise
+            continue
+        if try_lock(handle) is not False and os.fstat(handle).st_nlink:
+            return place, handle
+        os.close(handle)  # another process took it for one that was left
+
+
+def _sweep(hidden: Path) -> None:
+    """Delete the folders in `hidden` whose writers have ended."""
+    for place in hidden.glob("new-*"):
+        try:
+            handle = os.open(place / LOCK, os.O_RDWR)
+        except OSError:  # its writer ended before locking it; if it lives, it makes another
+            with suppress(OSError):
+                place.rmdir()
+            continue
+        try:
+            if try_lock(handle):
+                _discard(place)
+        finally:
+            os.close(handle)
+
+
+def _discard(place: Path) -> None:
+    """Delete a hidden folder; its lock last, so that it can be deleted again after a kill."""
+    with suppress(OSError):
+        for entry in list(os.scandir(place)):
+            if entry.name == LOCK:
+                continue
+            if entry.is_dir(follow_symlinks=False):
+                shutil.rmtree(entry.path, ignore_errors=True)
+            else:
+                with suppress(OSError):
+                    os.unlink(entry.path)
+        os.unlink(place / LOCK)
+        place.rmdir()
+
+
+def _put(new: Path, target: Path) -> None:
+    """Put a finished folder in its place, or its files into the folder that is there."""
+    waiting = target / HIDDEN / WAITING
+    for attempt in range(ATTEMPTS):
+        try:
+            if not _is_used(target):
+                os.replace(new, target)  # also in place of an empty folder
+                return
+            _settle(target)
+            waiting.parent.mkdir(exist_ok=True)
+            os.replace(new, waiting)
+        except OSError as error:  # another process put its own there meanwhile, or has just finished
+            known = error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOENT)
+            if not known or not new.is_dir() or attempt == ATTEMPTS - 1:
+                raise
+        else:
+            _settle(target)
+            return
+
+
+def _settle(folder: Path) -> None:
+    """Move waiting files to their places in a folder. Several processes may do so at once."""
+    waiting = folder / HIDDEN / WAITING
+    try:
+        names = sorted(os.listdir(waiting))
+    except FileNotFoundError:
+        return
+    for name in names:
+        with suppress(FileNotFoundError):  # another process moved it
+            os.replace(waiting / name, folder / name)
+    for left in (waiting, waiting.parent):
+        with suppress(OSError):
+            left.rmdir()
+
+
+def _is_used(folder: Path) -> bool:
+    return folder.is_dir() and any(folder.iterdir())
+
+
+def _make_ordinary(file: Path) -> None:
+    """Give a file the permissions of any new one: safetensors makes private files."""
+    file.chmod(0o666 & ~UMASK)
+
+
+def _retold(error: Exception, place: Path, target: Path) -> OSError | None:
+    """An error of writing as one that names `target`; None if it can be raised as it is."""
+    if isinstance(error, FullDiskError | ValueError | TypeError | LookupError):
+        return None
+    text = str(error)
+    rust = re.search(r"\(os error (\d+)\)", text)  # of safetensors
+    code = int(rust[1]) if rust else getattr(error, "errno", None)
+    if code in FULL or SHORT in text or _free(place) < NOTHING:
+        return FullDiskError(
+            f"{target}: expected space on the disk to write it, got {_free(place):,} bytes free; free some (or raise the "
+            "limit on files), or choose another disk"
+        )
+    unnamed = code in UNNAMED and getattr(error, "filename", None) is None
+    if code is not None and (unnamed or str(place) in text):
+        return OSError(code, os.strerror(code), str(target))
+    return None
+
+
+def _free(place: Path) -> int:
+    with suppress(OSError):
+        return shutil.disk_usage(next(folder for folder in (place, *place.parents) if folder.is_dir())).free
+    return NOTHING
