@@ -132,7 +132,11 @@ def _take(hidden: Path) -> tuple[Path, int]:
 
 def _sweep(hidden: Path) -> None:
     """Delete the folders in `hidden` whose writers have ended."""
-    for place in hidden.glob("new-*"):
+    try:
+        names = os.listdir(hidden)
+    except FileNotFoundError:  # never there, or another process has just deleted it
+        return
+    for place in (hidden / name for name in names if name.startswith("new-")):
         try:
             handle = os.open(place / LOCK, os.O_RDWR)
         except OSError:  # its writer ended before locking it; if it lives, it makes another
