@@ -96,7 +96,7 @@ def find_names(path: str | Path) -> Path | None:
 
 def _places(path: str | Path) -> tuple[Path, ...]:
     """A path, and the file that it leads to if it is a link."""
-    return (Path(path), Path(path).resolve())
+    return (as_path(path), as_path(path).resolve())
 
 
 def _first(paths: Iterable[Path]) -> Path | None:

@@ -176,7 +176,7 @@ class EditList:
             if not isinstance(values, list) or (key == "edits" and key not in content):
                 raise ValueError(f"{name}: {key}: expected a list of edits, got {values!r:.80}; write it as [...]")
             try:
-                lists[key] = tuple(_read(v, f"{key}[{i}]", Path(folder), anywhere) for i, v in enumerate(values))
+                lists[key] = tuple(_read(v, f"{key}[{i}]", as_path(folder), anywhere) for i, v in enumerate(values))
             except FileNotFoundError as error:
                 raise FileNotFoundError(f"{name}: {error}") from error
             except ValueError as error:
