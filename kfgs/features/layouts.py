@@ -69,7 +69,7 @@ def _open_numpy(file: Path, _: Reading) -> Any:
 
 
 def _open_safetensors(file: Path, _: Reading) -> Any:
-    tensors, _ = read_safetensors(file, "a feature map", AGAIN)
+    tensors = read_safetensors(file, "a feature map", AGAIN)[0]
     if len(tensors) != 1:
         raise ValueError(f"expected one tensor, got {len(tensors)}: {some(list(tensors))}")
     return next(iter(tensors.values()))  # mapped, not read
