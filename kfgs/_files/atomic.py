@@ -63,8 +63,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Give a hidden folder to fill, and put it to `path` if the block succeeds. Errors are those of `atomic_path`.
 
-    If `path` holds files already, the new ones replace those of the same names, all others stay; then the block must make
-    no folders. Read such a folder with `current_file`. A link to a folder stays a link.
+    If `path` holds files already, the new ones replace those of the same names, all others stay. Read such a folder with
+    `current_file`. A link to a folder stays a link.
     """
     target = Path(os.path.realpath(as_path(path)))
     with hidden_folder(target if _is_used(target) else target.parent, as_path(path)) as place:
@@ -133,10 +133,12 @@ def _take(hidden: Path) -> tuple[Path, int]:
 def _sweep(hidden: Path) -> None:
     """Delete the folders in `hidden` whose writers have ended."""
     try:
-        names = os.listdir(hidden)
+        names = [] if hidden.is_symlink() else os.listdir(hidden)
     except FileNotFoundError:  # never there, or another process has just deleted it
         return
     for place in (hidden / name for name in names if name.startswith("new-")):
+        if place.is_symlink():
+            continue
         try:
             handle = os.open(place / LOCK, os.O_RDWR)
         except OSError:  # its writer ended before locking it; if it lives, it makes another
@@ -174,6 +176,7 @@ def _put(new: Path, target: Path) -> None:
                 os.replace(new, target)  # also in place of an empty folder
                 return
             _settle(target)
+            _check_kinds(new, target)
             waiting.parent.mkdir(exist_ok=True)
             os.replace(new, waiting)
         except OSError as error:  # another process put its own there meanwhile, or has just finished
@@ -188,16 +191,34 @@ def _put(new: Path, target: Path) -> None:
 def _settle(folder: Path) -> None:
     """Move waiting files to their places in a folder. Several processes may do so at once."""
     waiting = folder / HIDDEN / WAITING
+    if not waiting.is_symlink() and not waiting.parent.is_symlink():  # a stranger's link could lead anywhere
+        _move_in(waiting, folder)
+        with suppress(OSError):
+            waiting.parent.rmdir()
+
+
+def _move_in(source: Path, target: Path) -> None:
+    """Move all that is in a folder into another one; folders of the same names are joined."""
     try:
-        names = sorted(os.listdir(waiting))
+        entries = sorted(os.scandir(source), key=lambda entry: entry.name)
     except FileNotFoundError:
         return
-    for name in names:
+    for entry in entries:
         with suppress(FileNotFoundError):  # another process moved it
-            os.replace(waiting / name, folder / name)
-    for left in (waiting, waiting.parent):
-        with suppress(OSError):
-            left.rmdir()
+            if entry.is_dir(follow_symlinks=False) and (target / entry.name).is_dir():
+                _move_in(Path(entry.path), target / entry.name)
+            else:
+                os.replace(entry.path, target / entry.name)
+    with suppress(OSError):
+        source.rmdir()
+
+
+def _check_kinds(new: Path, target: Path) -> None:
+    """Raise unless files would replace files, and folders join folders: a move that has begun must come to its end."""
+    for path in new.rglob("*"):
+        there = target / path.relative_to(new)
+        if os.path.lexists(there) and path.is_dir() != there.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "a folder is in place of a file, or a file of a folder", str(there))
 
 
 def _is_used(folder: Path) -> bool:

@@ -49,8 +49,8 @@ def check_output(
     """
     target = as_path(path)
     if target.exists() and target.is_dir() != (kind == "a folder"):
-        found = "a file" if kind == "a folder" else "a folder"
-        raise ValueError(f"{name}: expected {kind} or nothing at {path}, got {found}; give another name")
+        got = "a file" if kind == "a folder" else "a folder"
+        raise ValueError(f"{name}: expected {kind} or nothing at {path}, got {got}; give another name")
     above = next(place for place in target.absolute().parents if place.exists())
     if not above.is_dir():
         raise ValueError(f"{name}: expected a folder to write to, got {path} below the file {above}; give another")

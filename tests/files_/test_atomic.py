@@ -2,6 +2,7 @@ import os
 import stat
 import subprocess
 import sys
+from contextlib import suppress
 
 import pytest
 import torch
@@ -130,6 +131,40 @@ def test_failed_folder_leaves_the_old_one(tmp_path):
         write_and_fail(atomic_folder(target), "new.txt")
     assert names(target) == ["old.txt"]
     assert names(tmp_path) == ["scene"]
+
+
+def test_folders_in_folders_are_joined(tmp_path):
+    for content in ("old", "new"):
+        with atomic_folder(tmp_path / "scene") as temporary:
+            (temporary / "images" / content).mkdir(parents=True)
+            (temporary / "images" / "a.png").write_text(content)
+    assert names(tmp_path / "scene") == ["images"]
+    assert names(tmp_path / "scene" / "images") == ["a.png", "new", "old"]
+    assert (tmp_path / "scene" / "images" / "a.png").read_text() == "new"
+
+
+def test_a_folder_in_place_of_a_file_is_refused_before_anything_is_moved(tmp_path):
+    (tmp_path / "scene" / "b.txt").mkdir(parents=True)
+    (tmp_path / "scene" / "a.txt").write_text("old")
+    with pytest.raises(IsADirectoryError, match=tells("b.txt")), atomic_folder(tmp_path / "scene") as temporary:
+        [(temporary / name).write_text("new") for name in ("a.txt", "b.txt")]
+    assert (tmp_path / "scene" / "a.txt").read_text() == "old"
+    assert names(tmp_path / "scene") == ["a.txt", "b.txt"]
+
+
+@pytest.mark.parametrize("link", [".kfgs-unfinished", ".kfgs-unfinished/waiting", ".kfgs-unfinished/new-x"])
+def test_links_in_a_strangers_folder_move_and_delete_nothing_elsewhere(tmp_path, link):
+    mine = tmp_path / "mine"
+    for name in ("a.txt", ".kfgs-lock", "waiting/a.txt", "new-x/.kfgs-lock", "new-x/a.txt"):
+        (mine / name).parent.mkdir(parents=True, exist_ok=True)
+        (mine / name).write_text("mine")
+    before = sorted(mine.rglob("*"))
+    (tmp_path / "folder" / link).parent.mkdir(parents=True)
+    (tmp_path / "folder" / "a.txt").touch()
+    (tmp_path / "folder" / link).symlink_to(mine)
+    with suppress(OSError), atomic_folder(tmp_path / "folder") as temporary:
+        (temporary / "a.txt").write_text("new")
+    assert sorted(mine.rglob("*")) == before
 
 
 def test_files_that_came_meanwhile_stay(tmp_path):

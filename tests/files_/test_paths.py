@@ -82,8 +82,9 @@ def test_a_file_that_is_read_only_is_refused(tmp_path, monkeypatch):
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's full device")
 def test_a_full_disk_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(paths_module.tempfile, "TemporaryFile", lambda **_: Path("/dev/full").open("wb", buffering=0))  # noqa: SIM115
-    refused(tmp_path / "run", "a folder", "No space left", error=OSError)
+    with Path("/dev/full").open("wb", buffering=0) as full:
+        monkeypatch.setattr(paths_module.tempfile, "TemporaryFile", lambda **_: full)
+        refused(tmp_path / "run", "a folder", "No space left", error=OSError)
 
 
 def test_pictures_and_maps_stay_apart(tmp_path):
