@@ -450,9 +450,20 @@ def test_the_photo_is_of_the_view_that_looks_the_same_way(browser, tmp_path):
         assert found == 1
 
 
+class BlackPhotos:
+    def __init__(self, scene):
+        pass
+
+    def __contains__(self, camera):
+        return True
+
+    def __call__(self, camera):
+        return np.zeros((camera.height, camera.width, 3), np.uint8)
+
+
 def test_the_list_of_views_scrolls_to_the_current_one(browser, tmp_path, monkeypatch):
     """Photos are loaded when they come into sight; their places must not move then."""
-    monkeypatch.setattr(html, "_photo", lambda _, camera: np.zeros((camera.height, camera.width, 3), np.uint8))
+    monkeypatch.setattr(html, "Photos", BlackPhotos)
     state = cases_explorer.line(cameras=cases_explorer.cameras(90))
     for page in show(browser, save_html(state, tmp_path / "page.html", scene=object())):
         page.keyboard.press("[")

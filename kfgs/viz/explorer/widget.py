@@ -132,9 +132,7 @@ def make_widget(
 def still(exploration: Exploration) -> str:
     """What the first camera sees, in the colours that the viewer opens with: a JPEG file in base64, as notebooks hold it."""
     side = exploration.sides[-1]
-    camera = exploration.cameras[0]
-    scale = min(1.0, STILL / max(camera.size))
-    camera = camera.resized(round(scale * camera.height), round(scale * camera.width))
+    camera = exploration.cameras[0].fitted(STILL)
     cloud = exploration.cloud(side)
     if exploration.show != "rgb" or cloud.sh is None:
         colors = torch.from_numpy(exploration.colors(side)).to(cloud.means) / 255
