@@ -55,7 +55,7 @@ def test_bad_input_is_named(tmp_path):
     with pytest.raises(ValueError, match=tells("truth:", "pixel", "void")):
         evaluate_segmentation(lambda stem: torch.zeros(1, 1).long(), {"a": torch.full((1, 1), -1)}, ["x"])
     (tmp_path / "broken.png").write_bytes(b"PNG?")
-    with pytest.raises(ValueError, match=tells("broken.png:", "label picture", "decoded")):
+    with pytest.raises(ValueError, match=tells("broken.png:", "labels", "decoded")):
         load_label_map(tmp_path / "broken.png")
     with pytest.raises(FileNotFoundError, match=tells("none.png:", "no such file", "label")):
         load_label_map(tmp_path / "none.png")
