@@ -512,6 +512,13 @@ def test_a_page_that_opens_with_a_question_has_the_suggested_gamma(browser, tmp_
         assert page.locator("section:has(#gamma) .note").inner_text().startswith("Suggested: ")
 
 
+def test_a_pressed_button_can_be_read_while_the_pointer_is_on_it(page):
+    page.click(".choice >> text=Score")
+    color = page.evaluate("getComputedStyle(document.querySelector('.choice [aria-pressed=true]')).backgroundColor")
+    assert page.locator(".choice [aria-pressed=true]:hover").inner_text() == "Score"
+    assert color == page.evaluate("getComputedStyle(viewer.rail.element.firstChild).backgroundColor")
+
+
 def test_every_control_has_a_name(page):
     ask(page, "chair")
     nameless = page.evaluate(
