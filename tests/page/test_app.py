@@ -367,11 +367,53 @@ def test_a_reload_keeps_the_work_and_a_saved_state_opens_again(page, tmp_path):
     page.evaluate("viewer.model.invert()")
     page.set_input_files("input[type=file]", tmp_path / "state.json")
     until(page, lambda tab: tab.evaluate("JSON.stringify(viewer.model)") == before)
-    for wrong in ("{}", "no JSON", '{"format": "kfgs.view", "version": 1, "sides": {"color": {"count": 3}}}'):
-        (tmp_path / "wrong.json").write_text(wrong)
-        page.evaluate("viewer.say('')")
-        page.set_input_files("input[type=file]", tmp_path / "wrong.json")
+    page.keyboard.press("Control+z")  # one step of undo
+    assert page.evaluate("[viewer.model.answer.words, viewer.model.byHand]") == ["table", True]
+
+
+def open_state(page, folder, state):
+    (folder / "state.json").write_text(state if isinstance(state, str) else json.dumps(state))
+    page.evaluate("viewer.say('')")
+    page.set_input_files("input[type=file]", folder / "state.json")
+
+
+def test_a_state_without_a_question_ends_the_one_that_is_shown(page, tmp_path):
+    saved = page.evaluate("JSON.stringify(viewer.model)")
+    ask(page, "chair")
+    open_state(page, tmp_path, saved)
+    until(page, lambda tab: tab.evaluate("JSON.stringify(viewer.model)") == saved)
+
+
+def test_a_selection_by_example_is_kept_as_a_selection(page):
+    """Nobody answers "like the selection" when the page is opened again."""
+    ask(page, "chair")
+    selected = mask(page, "color")
+    page.evaluate("viewer.model.ask({...viewer.model.answer, words: 'like the selection', example: true})")
+    page.evaluate("viewer.open(JSON.parse(JSON.stringify(viewer.model)))")
+    np.testing.assert_array_equal(mask(page, "color"), selected)
+    assert page.evaluate("[viewer.model.answer, viewer.toast.hidden]") == [None, True]
+
+
+def test_a_state_that_somebody_changed_is_refused_as_a_whole(page, tmp_path):
+    ask(page, "chair")
+    page.evaluate("viewer.model.fade(0.5)")
+    before = page.evaluate("JSON.stringify(viewer.model)")
+    own = json.loads(before)
+    rows = {"kind": "index", "indices": [0, 1]}
+    wrong = [
+        {"op": "explode", "where": rows},
+        {"op": "remove", "where": {"kind": "class", "name": "chair"}},
+        {"op": "remove", "where": {"kind": "index", "indices": [450]}},
+        {"op": "opacity", "where": rows, "factor": 5},
+        {"op": "recolor", "where": rows, "mode": "tint"},
+        {"op": "move", "where": rows, "translation": [0, 0]},
+    ]
+    states = [own | {"sides": own["sides"] | {"color": own["sides"]["color"] | {"edits": [edit]}}} for edit in wrong]
+    other = {"format": "kfgs.view", "version": 1}
+    for state in (*states, {}, "no JSON", other, other | {"sides": {"color": {"count": 3}}}):
+        open_state(page, tmp_path, state)
         page.wait_for_selector("[role=alert]:visible")
+        assert re.match("This (state|file) (is|has) ", page.locator("[role=alert]:visible").inner_text())
         assert page.evaluate("JSON.stringify(viewer.model)") == before
 
 
