@@ -27,10 +27,14 @@ export function makeTop(app) {
   const count = (name) => whole(model.counts(model.side).classes[model.names.indexOf(name)]);
   const what = link.phrases ? "Search for anything" : "Search for a class";
   const search = searchBox({
-    label: what, placeholder: what, onchoose: (words) => app.ask(words), onclear: () => app.ask(null),
+    label: what, placeholder: what, onchoose: (words) => app.ask(meant(words)), onclear: () => app.ask(null),
     suggest: (text) => suggestions(text === model.answer?.words ? "" : text, names),
     describe: (name) => [h("span", {}, name), h("small", {}, count(name))],
   });
+  const meant = (words) => {
+    const found = link.phrases ? [] : suggestions(words, names);
+    return found.length === 1 ? found[0] : words; // the only class that the typed letters can become
+  };
   const modes = Object.entries(app.modes).map(([mode, text]) => [mode, text, `Show ${text.toLowerCase()} (M)`]);
   const photos = header.cameras.some((camera) => camera.thumbnail);
   if (photos) modes.unshift(["photo", "Photo", "Lay the photo of the nearest view over the scene (P)"]);
@@ -118,7 +122,7 @@ export function makeViews(app) {
   return { element: h("div", group, ...buttons), set };
 }
 
-/** The photo of a view over the scene, with its opacity. Returns {elements, show(url), hide(), place(left, top, w, h)}. */
+/** The photo of a view over the scene, with its opacity. Returns {elements, show(url), place({left, top, width, height})}. */
 export function makePhoto() {
   const image = h("img", { class: "photo", alt: "", hidden: true });
   const fade = (event) => (image.style.opacity = event.target.value);

@@ -199,12 +199,19 @@ def test_suggestions_show_names_as_words_and_arrow_keys_choose(page):
     page.wait_for_selector("h2:has-text('Search: chair')", state="hidden")
 
 
+def test_letters_of_one_class_only_are_enough(page):
+    ask(page, "HAI")
+    page.wait_for_selector("h2:has-text('Search: chair')")
+    ask(page, "a")  # chair, table
+    assert "“a” is none of the classes" in page.locator("[role=alert]:visible").inner_text()
+
+
 def test_other_words_need_python_and_the_page_says_so(page):
     ask(page, "chairs in the corner")
     page.wait_for_selector("[role=alert]:visible")
     said = page.locator("[role=alert]:visible").inner_text()
     assert "is none of the classes" in said
-    assert "needs Python" in said
+    assert "need Python" in said
     assert page.evaluate("viewer.model.answer") is None
 
 
