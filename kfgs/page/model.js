@@ -502,13 +502,21 @@ export class Model extends EventTarget {
     const [had, wanted] = [this.applied, this.now.edits];
     let same = 0;
     while (same < had.length && had[same] === wanted[same]) same++;
+    const others = [...had.slice(same), ...wanted.slice(same)];
+    if (others.some(({ op }) => ["remove", "move", "duplicate"].includes(op))) this.parts = null; // their places are others now
+    this.applied = wanted;
+    const [last, next] = others;
+    if (others.length === 2 && wanted.length === had.length && next.op === "move" && next.rows === last.rows) {
+      const translation = next.translation.map((value, axis) => value - last.translation[axis]); // a drag goes on
+      for (const side of this.sides) this.clouds[side].apply({ ...next, translation });
+      return;
+    }
     const changed = new Set(had.slice(same).flatMap(({ rows }) => Object.keys(rows)));
     for (const side of changed) {
       this.clouds[side] = new Cloud(this.packed, side);
       for (const edit of wanted.slice(0, same)) this.clouds[side].apply(edit);
     }
     for (const edit of wanted.slice(same)) for (const side of this.sides) this.clouds[side].apply(edit);
-    this.applied = wanted;
   }
 
   bySides() {

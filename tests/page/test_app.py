@@ -445,6 +445,28 @@ def test_a_ball_selects_what_lies_in_it_and_a_drag_moves_it(page):
     assert place_of(page, "color", int(selected[0])) == pytest.approx(before)
 
 
+def test_a_drag_that_goes_on_does_not_repeat_the_earlier_edits(page):
+    ask(page, "table")
+    page.evaluate("viewer.model.recolor([0.1, 0.8, 0.3])")
+    page.evaluate("viewer.model.move([1, 0, 0])")
+    cloud = page.evaluate_handle("viewer.model.clouds.color")
+    page.evaluate("viewer.model.move([0, 1, 0], true)")
+    assert page.evaluate("cloud => cloud === viewer.model.clouds.color", cloud)
+    moved = page.evaluate("[...viewer.model.clouds.color.means]")
+    page.keyboard.press("Control+z")
+    page.keyboard.press("Control+Shift+Z")
+    assert page.evaluate("[...viewer.model.clouds.color.means]") == pytest.approx(moved, abs=1e-5)
+
+
+def test_parts_end_when_their_gaussians_go_elsewhere(page):
+    ask(page, "table")
+    parts = "{side: 'color', name: 'table', parts: [{count: 1, corners: Array(8).fill([0, 0, 0])}], numbers: []}"
+    for edit, left in (("recolor([1, 0, 0])", True), ("move([0, 0, 1])", False), ("undo()", False), ("remove()", False)):
+        page.evaluate(f"viewer.model.setParts({parts})")
+        page.evaluate(f"viewer.model.{edit}")
+        assert page.locator("section:has-text('Connected parts')").is_visible() == left
+
+
 def test_a_tooltip_names_what_the_pointer_rests_on(page):
     middle = np.mean([place_of(page, "color", i) for i in range(150, 300)], axis=0)
     page.mouse.move(*middle)
