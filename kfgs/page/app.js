@@ -434,10 +434,12 @@ class App {
     this.gliding = requestAnimationFrame(step);
   }
 
-  /** Move the camera so that the selection, or everything, fills the view. */
+  /** Move the camera so that the selection fills the view; without one, go to the first view, since a room has walls. */
   fit() {
-    const found = this.model.extent(this.model.side);
+    const { model, header } = this;
+    const found = model.extent(model.side);
     if (!found) return;
+    if (!model.counts(model.side).selected && Number.isInteger(header.default_view)) return this.goTo(header.default_view);
     this.leaveView();
     this.glide(() => this.eye.fit(found));
   }

@@ -45,6 +45,11 @@ export class Model extends EventTarget {
     return this.clouds[side].count;
   }
 
+  /** What a Gaussian of a side is called. */
+  kindOf(side) {
+    return this.sides.length > 1 ? `${SIDE_WORDS[side]} Gaussian` : "Gaussian";
+  }
+
   /** Whether labels reach the colour cloud from the semantic one. */
   get carried() {
     return this.packed.header.buffers["color/source"] !== undefined;
@@ -463,7 +468,7 @@ export class Model extends EventTarget {
   sentences() {
     const lines = [];
     const counts = this.counts(this.side);
-    const kind = `${SIDE_WORDS[this.side]} Gaussians`;
+    const kind = `${this.kindOf(this.side)}s`;
     const some = `${whole(counts.selected)} of ${whole(counts.total)} ${kind}`;
     if (this.byHand) lines.push(`${some} are selected by hand.`);
     else if (this.answer) lines.push(`${some} score above ${short(this.gamma)} for “${this.answer.words}”.`);

@@ -467,6 +467,16 @@ def test_parts_end_when_their_gaussians_go_elsewhere(page):
         assert page.locator("section:has-text('Connected parts')").is_visible() == left
 
 
+def test_a_field_alone_has_no_colours_to_change_and_its_gaussians_need_no_adjective(browser, tmp_path):
+    state = Exploration(FieldMeaning(cases_explorer.field("fused"), cases_explorer.classes()))
+    for page in show(browser, save_html(state, tmp_path / "page.html")):
+        ask(page, state.meaning.names[0])
+        assert "score above" in page.locator(".said").inner_text()
+        assert "semantic" not in page.locator(".said, .panel").first.inner_text()
+        assert page.locator("text=Opacity").is_visible()
+        assert not page.locator("text=Recolour").is_visible()
+
+
 def test_a_tooltip_names_what_the_pointer_rests_on(page):
     middle = np.mean([place_of(page, "color", i) for i in range(150, 300)], axis=0)
     page.mouse.move(*middle)
@@ -503,8 +513,13 @@ def test_buttons_go_to_the_scenes_views(browser, tmp_path):
         page.keyboard.press("]")
         until(page, lambda tab: tab.locator("[aria-current=true][aria-label='Go to view_1']").count())
         until(page, lambda tab: np.allclose(tab.evaluate(VIEWMAT), views[1].viewmat.flatten(), atol=1e-6))
+        ask(page, "chair")
+        page.locator(".stage").focus()
         page.keyboard.press("f")
         assert current.count() == 0
+        page.keyboard.press("Escape")
+        page.keyboard.press("f")
+        until(page, lambda tab: np.allclose(tab.evaluate(VIEWMAT), views[0].viewmat.flatten(), atol=1e-6))
 
 
 def test_the_photo_is_of_the_view_that_looks_the_same_way(browser, tmp_path):
