@@ -461,7 +461,12 @@ def test_a_drag_that_goes_on_does_not_repeat_the_earlier_edits(page):
 def test_parts_end_when_their_gaussians_go_elsewhere(page):
     ask(page, "table")
     parts = "{side: 'color', name: 'table', parts: [{count: 1, corners: Array(8).fill([0, 0, 0])}], numbers: []}"
-    for edit, left in (("recolor([1, 0, 0])", True), ("move([0, 0, 1])", False), ("undo()", False), ("remove()", False)):
+    for edit, left in (
+        ("recolor([1, 0, 0])", True),
+        ("move([0, 0, 1])", False),
+        ("undo()", False),
+        ("remove()", False),
+    ):
         page.evaluate(f"viewer.model.setParts({parts})")
         page.evaluate(f"viewer.model.{edit}")
         assert page.locator("section:has-text('Connected parts')").is_visible() == left
