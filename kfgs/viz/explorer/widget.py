@@ -36,7 +36,7 @@ export default {
     const bytes = new Uint8Array(raw.buffer, raw.byteOffset, raw.byteLength);
     const header = model.get("header");
     const packed = { header, data: await kfgs.inflate(bytes, header) };
-    const link = new kfgs.PythonLink(kfgs.callWidget(model), model.get("phrases"));
+    const link = new kfgs.PythonLink(kfgs.callWidget(model), header);
     const app = await kfgs.mount(root, packed, link);
     const ask = () => app.ask(model.get("question"));
     model.on("change:question", ask);
@@ -102,7 +102,6 @@ def make_widget(
         _css = read_text("app.css")
         header = traitlets.Dict().tag(sync=True)
         data = traitlets.Bytes().tag(sync=True)
-        phrases = traitlets.Bool().tag(sync=True)
         question = traitlets.Unicode().tag(sync=True)
         height = traitlets.Int().tag(sync=True)
 
@@ -116,7 +115,6 @@ def make_widget(
     widget = Viewer(
         header=packed.header,
         data=packed.compressed(),
-        phrases=exploration.meaning.phrases,
         question="" if exploration.asked is None else exploration.asked.words,
         height=height,
     )
