@@ -362,18 +362,19 @@ def test_a_reload_keeps_the_work_and_a_saved_state_opens_again(page, tmp_path):
     with page.expect_download() as download:
         page.click("text=Save state")
     download.value.save_as(tmp_path / "state.json")
-    before = page.evaluate("JSON.stringify(viewer.model)")
+    before = page.evaluate("viewer.state()")
+    assert {"mode", "view"} < set(json.loads(before))
     assert json.loads((tmp_path / "state.json").read_text()) == json.loads(before)
     until(page, lambda tab: tab.evaluate("sessionStorage.getItem(viewer.place)") == before)
     page.on("dialog", lambda dialog: dialog.accept())  # "changes may not be saved"
     page.reload()
     page.wait_for_selector(".kfgs:not([aria-busy])")
-    assert page.evaluate("JSON.stringify(viewer.model)") == before
+    assert page.evaluate("viewer.state()") == before
     page.click("text=Restore all")
     page.evaluate("viewer.ask('table')")
     page.evaluate("viewer.model.invert()")
     page.set_input_files("input[type=file]", tmp_path / "state.json")
-    until(page, lambda tab: tab.evaluate("JSON.stringify(viewer.model)") == before)
+    until(page, lambda tab: tab.evaluate("viewer.state()") == before)
     page.keyboard.press("Control+z")  # one step of undo
     assert page.evaluate("[viewer.model.answer.words, viewer.model.byHand]") == ["table", True]
 
@@ -493,6 +494,36 @@ def test_a_tooltip_names_what_the_pointer_rests_on(page):
     page.mouse.up()
 
 
+def test_without_keys_a_selection_can_be_added_to(page):
+    """As on a tablet, which has no Shift."""
+    first, second = (
+        np.mean([place_of(page, "color", i) for i in range(start, start + 150)], axis=0) for start in (150, 0)
+    )
+    page.keyboard.press("5")
+    for how, middle in (("Select anew", first), ("Add to the selection (Shift)", second)):
+        page.click(f"button[title='{how}']")
+        page.mouse.move(*middle)
+        page.mouse.down()
+        page.mouse.move(middle[0] + 30, middle[1], steps=3)
+        page.mouse.up()
+    selected = mask(page, "color")
+    assert selected[:150].any()
+    assert selected[150:300].any()
+    page.keyboard.press("1")
+    assert not page.locator("button[title='Select anew']").is_visible()
+
+
+def test_hidden_gaussians_of_a_selection_are_told(page, state):
+    ask(page, "chair")
+    count = int(mask(page, "color").sum())
+    page.evaluate("viewer.model.setHidden([1])")
+    state.set_hidden(["chair"])
+    hidden = int((mask(page, "color") & ~state.drawn("color")).sum())
+    state.set_hidden([])
+    assert 0 < hidden <= count
+    assert f"{hidden} of these are hidden, and change with the others." in page.locator(".said").inner_text()
+
+
 def test_keys_fly_and_turn_and_help_lists_them(page):
     before = page.evaluate("viewer.eye.view.position")
     page.locator(".stage").focus()
@@ -522,6 +553,14 @@ def test_buttons_go_to_the_scenes_views(browser, tmp_path):
         page.locator(".stage").focus()
         page.keyboard.press("f")
         assert current.count() == 0
+        page.evaluate("new Promise((done) => setTimeout(done, 500))")  # the camera glides
+        place, middle = (
+            np.array(page.evaluate(f"viewer.{what}")) for what in ("eye.view.position", "model.extent('color').center")
+        )
+        far = min(np.linalg.norm(np.asarray(view.center) - middle) for view in views)
+        assert np.linalg.norm(place - middle) <= max(far, np.linalg.norm(views[0].center.numpy() - middle)) + 1e-6
+        ahead = np.array(page.evaluate("viewer.eye.view.R.slice(6)"))
+        np.testing.assert_allclose(ahead, (middle - place) / np.linalg.norm(middle - place), atol=1e-4)
         page.keyboard.press("Escape")
         page.keyboard.press("f")
         until(page, lambda tab: np.allclose(tab.evaluate(VIEWMAT), views[0].viewmat.flatten(), atol=1e-6))
@@ -603,7 +642,7 @@ def test_the_page_opens_as_python_left_it(browser, tmp_path):
         agree(page, state)
         np.testing.assert_array_equal(mask(page, "color", "drawn"), state.drawn("color"))
         assert page.get_attribute(".kfgs", "data-theme") == "dark"
-        assert page.locator(".choice [aria-pressed=true]").inner_text() == "Colour"
+        assert page.locator(".top .choice [aria-pressed=true]").inner_text() == "Colour"
         assert page.locator("button[aria-label='Undo']").is_disabled()
 
 
