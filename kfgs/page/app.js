@@ -19,7 +19,7 @@ const NARROW = { narrow: 900, slim: 640, thin: 480 }; // CSS pixels of the width
 const LOW = 420; // of the height
 const HOVER = 120; // milliseconds that the pointer rests before a tooltip
 const REMEMBER = 500; // milliseconds after the last change
-const ASIDE = 1.3; // how far beside the originals copies appear, of their radius
+const ASIDE = 1; // how far beside the originals copies appear, of their radius
 
 /**
  * Show a scene in an element.
@@ -278,7 +278,7 @@ class App {
     const found = model.extent(model.side);
     if (!found || !model.duplicate([0, 1, 2].map((axis) => ASIDE * found.radius * eye.view.R[axis]))) return;
     this.setTool("shift");
-    this.say("Drag the copy into its place.");
+    this.say("Drag the copy into its place; F shows it.");
   }
 
   // the state: saved, opened, remembered when the tab is reloaded
@@ -459,14 +459,15 @@ class App {
     this.glide(() => this.eye.fit(found, from));
   }
 
-  /** The scene's camera in whose picture a ball lies most completely, of equal ones the nearest; null without cameras. */
+  /** The nearest of the scene's cameras in whose picture a ball lies, or lies most completely; null without cameras. */
   viewThatSees({ center, radius }) {
     const { cameras } = this.header;
     const cost = ({ viewmat: m, K: [fx, fy, cx, cy], width, height }) => {
       const [x, y, z] = [0, 4, 8].map((row) => m[row] * center[0] + m[row + 1] * center[1] + m[row + 2] * center[2] + m[row + 3]);
       if (z < radius / 4) return Infinity; // behind it, or in the middle
-      const out = (place, size) => Math.max(0, -place, place - size) / size;
-      return 10 * (out((fx * x) / z + cx, width) + out((fy * y) / z + cy, height)) + z / radius / 10;
+      const out = (place, half, size) => (Math.max(0, half - place) + Math.max(0, place + half - size)) / size;
+      const cut = out((fx * x) / z + cx, (fx * radius) / z, width) + out((fy * y) / z + cy, (fy * radius) / z, height);
+      return 10 * cut + z / radius / 10;
     };
     return cameras.reduce((best, own) => (cost(own) < (best ? cost(best) : Infinity) ? own : best), null);
   }
