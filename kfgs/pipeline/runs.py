@@ -156,7 +156,9 @@ def _read(path: Path, *, current: bool = False) -> RunField:
     about = read_description(path)
     info, digest, count = (about.get(name) for name in ("info", "sha256", "gaussians"))
     if not (isinstance(info, dict) and isinstance(count, int) and re.fullmatch("[0-9a-f]{64}", str(digest))):
-        raise ValueError(f"{path}: expected info, sha256 and a number of gaussians in {DESCRIPTION}; fit the field again")
+        raise ValueError(
+            f"{path}: expected info, sha256 and a number of gaussians in {DESCRIPTION}; fit the field again"
+        )
     return RunField(path, str(digest)[:KEY], current, current_file(path, DESCRIPTION).stat().st_mtime, count, info)
 
 
