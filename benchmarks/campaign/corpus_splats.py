@@ -37,8 +37,13 @@ def make(folder: Path, add: Add) -> None:
         place = folder / name
         place.mkdir(parents=True)
         path = place / f"a{module.SUFFIXES[0]}"
-        for file in write_splats(path, cloud()).paths:
+        for file in write_splats(path, cloud()).paths[0 if module.HOLDS_LABELS else 1 :]:
             add("splats", place, file.name, opens=path.name)
+        if not module.HOLDS_LABELS:  # their digest would refuse every mutant
+            alone = folder / f"{name}-alone"
+            alone.mkdir()
+            write_splats(alone / path.name, cloud(labels=False))
+            add("splats", alone, path.name)
     _others(folder / "others", add)
 
 
