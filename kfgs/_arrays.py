@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ._check import one_line
+from ._files import as_path
 
 Array = NDArray[Any]
 SPARE, RATIO = 64 << 20, 100
@@ -45,8 +46,8 @@ def read_array(
         FileNotFoundError: if there is no such file.
         FileError: if it is no `.npy` file of numbers, is damaged or cut short, or states more values than it has.
     """
-    with _named(path, expected, advice), Path(path).open("rb") as file:
-        size = Path(path).stat().st_size
+    with _named(path, expected, advice), as_path(path).open("rb") as file:
+        size = as_path(path).stat().st_size
         stated = _stated_bytes(file)
         if stated > size - file.tell():
             raise ValueError(f"its header states {stated} bytes of values, {size - file.tell()} follow")
@@ -75,7 +76,7 @@ def read_arrays(
     found = {}
     with _named(path, expected, advice), zipfile.ZipFile(path) as archive:
         total = sum(entry.file_size for entry in archive.infolist())
-        most = SPARE + RATIO * Path(path).stat().st_size if most is None else most
+        most = SPARE + RATIO * as_path(path).stat().st_size if most is None else most
         if total > most:
             raise ValueError(f"it would unpack to {total} bytes, expected at most {most}")
         for entry in archive.infolist():
@@ -139,7 +140,7 @@ def _stated_bytes(file: IO[bytes]) -> int:
 @contextmanager
 def _named(path: str | Path, expected: str, advice: str) -> Iterator[None]:
     """Turn whatever fails while a file is read into a `FileError`."""
-    if not Path(path).is_file():
+    if not as_path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file; expected {expected} there")
     try:
         yield

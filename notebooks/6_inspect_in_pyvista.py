@@ -32,7 +32,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from IPython import display
 from PIL import Image
 
 from kfgs import (
@@ -267,37 +266,16 @@ Image.fromarray(view.screenshot())
 # %% [markdown]
 # ### Live
 #
-# The viewer draws in the browser, with everything to click, select, edit and undo:
-#
-# ```python
-# everything = {"classes": classes, "cameras": cameras}
-# viz.explore(field, color, **everything)                     # here, as a widget: the last value of a cell
-# viz.explore(field, color, **everything, where="browser")    # a page that only this machine opens; interrupt the kernel to go on
-# viz.explore(field, color, **everything, where="window")     # both clouds in a pyvista window; the cell waits until it is closed
-# ```
-#
-# or, from a shell, `kfgs view data/run/field --color data/run/color.ply --scene data/room`. To ask for words that are no
-# classes, pass the teacher's text encoder as `embed=`.
-
-# %% [markdown]
-# ## Files to send around
-#
-# A turntable (GIF; MP4 with the extra `video`), drawn by kfgs's rasteriser without OpenGL, of what stands in the room.
+# The viewer draws in the browser, with everything to click, select, edit and undo. In a notebook it is a widget; where
+# widgets cannot run, on a web page for instance, you see a picture of it.
 
 # %%
-orbit = Orbit(frames=8, size=(165, 220), elevation_degrees=40, zoom=1.5)
-film = viz.save_turntable(out / "turntable.gif", inside, orbit=orbit, up=up, fps=5)
-print(f"{film.stat().st_size / 1000:.0f} kB")
-display.Image(film)
+viewer = viz.explore(field, color, classes=classes, cameras=cameras, where="notebook")
+viewer.ask(word)
+viewer
 
 # %% [markdown]
-# And the viewer with the scene in one file, which any browser opens without a server or a connection.
-
-# %%
-page = view.save_html(out / "room.html", title=folder.name)
-print(f"{page.name}: {page.stat().st_size / 1e6:.1f} MB")
-view.close()
-display.FileLink(page)
-
-# %% [markdown]
-# Next: [7_your_own_images](7_your_own_images.py) starts from photographs, with a teacher of your own.
+# `where="browser"` opens it as a page that only this machine can open (interrupt the kernel to go on), `where="window"` both
+# clouds in a pyvista window, and `viewer.save_html("room.html")` writes one file to send around. From a shell:
+# `kfgs view data/run/field --color data/run/color.ply --scene data/room`. To ask for words that are no classes, pass the
+# teacher's text encoder as `embed=`.

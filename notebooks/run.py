@@ -108,7 +108,9 @@ def _execute_in(notebook: Any, folder: Path, seconds: int, *, home: str, stderr:
         connection_file=f"{home}/kernel.json",
     )
     resources = {"metadata": {"path": str(folder)}}
-    client = NotebookClient(notebook, km=manager, timeout=seconds, resources=resources, on_cell_start=note)
+    client = NotebookClient(
+        notebook, km=manager, timeout=seconds, resources=resources, on_cell_start=note, store_widget_state=False
+    )
     environment = os.environ | {"IPYTHONDIR": home, "PYDEVD_DISABLE_FILE_VALIDATION": "1"}
     try:
         client.execute(env=environment, stderr=stderr, cleanup_kc=True)

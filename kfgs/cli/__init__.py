@@ -23,10 +23,11 @@ import tyro
 from .evaluate import compare, evaluate
 from .features import features, plan
 from .fit import color, demo, fit, sfm, uplift
-from .output import called, say, warnings_as_notes
+from .output import called, said_on_stderr, say, warnings_as_notes
 from .pack import pack
 from .query import info, label, segment, select
 from .render import render
+from .runs import runs
 from .splats import attach, convert, edit
 from .text import text
 from .view import view
@@ -35,7 +36,7 @@ GROUPS: dict[str, tuple[Any, ...]] = {
     "Start here": (demo, info),
     "Make a semantic field": (sfm, plan, features, text, fit, uplift),
     "Ask it": (select, segment, label, view, render),
-    "Store it": (pack,),
+    "Store it": (pack, runs),
     "Score it": (evaluate, compare),
     "Colour splats": (color, attach, edit, convert),
 }
@@ -76,7 +77,7 @@ def main(arguments: list[str] | None = None) -> int:
         return _in_options(message, names)
 
     try:
-        with warnings_as_notes(spoken):
+        with warnings_as_notes(spoken), said_on_stderr():
             command.__doc__ = re.sub(
                 r"\n {8,}(?!kfgs)", " ", inspect.getdoc(command) or ""
             )  # an option's text on one line
@@ -95,10 +96,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _expand_home(word: str) -> str:
     """A word of the command line with `~` as the home folder: `~/scene`, `--out=~/run`."""
-    option, equals, value = word.partition("=")
-    if option.startswith("--") and equals:
-        return f"{option}={os.path.expanduser(value)}"
-    return os.path.expanduser(word)
+    from .._files import as_path
+
+    option, _, value = word.partition("=")
+    if option.startswith("--") and value.startswith("~"):
+        return f"{option}={as_path(value)}"
+    return str(as_path(word)) if word.startswith("~") else word
 
 
 def _overview() -> str:

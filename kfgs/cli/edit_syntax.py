@@ -90,8 +90,8 @@ def parse_edits(asked: Edits) -> Iterator[tuple[str, Any]]:
             f"--duplicate {words}",
             Duplicate(_where("duplicate", name), _numbers("duplicate", words, value, _THREE, 3)),
         )
-    for words, parts in _together(asked.remove):
-        yield f"--remove {' '.join(words)}", Remove(parts[0] if len(parts) == 1 else Either(tuple(parts)))
+    for removed, parts in _together(asked.remove):
+        yield f"--remove {' '.join(removed)}", Remove(parts[0] if len(parts) == 1 else Either(tuple(parts)))
     if asked.extract:
         where = Either(tuple(_where("extract", words) for words in asked.extract))
         yield f"--extract {' '.join(asked.extract)}", Extract(where)

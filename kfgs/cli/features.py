@@ -50,14 +50,15 @@ def features(
             check_alone(name, given, "with --check, which encodes nothing")
     else:
         check_alone("level", level, "without --check; it is of LangSplat's maps")
+    target = out if out is not None else scene_folder(scene) / "features"
+    if check is None:
+        check_folder("out", target, None, scene_folder(scene) / "images", views.images)
     loaded = views.load(scene)
     if check is not None:
         found = FeatureFolder(check, level=level or "default").check(loaded, views.split)
         say(str(found))
         found.raise_if_bad()
         return
-    target = out if out is not None else scene_folder(scene) / "features"
-    check_folder("out", target)
     network = choose_teacher(teacher.teacher, teacher.weights, teacher.fast, teacher.size, device)
     made = extract_features(network, loaded, target, views.split, overwrite=overwrite, report=say, progress=True)
     shapes = sorted({" x ".join(map(str, record.shape)) for record in made.maps.values()})

@@ -8,18 +8,26 @@ from typing import Any
 # Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
 
 
-def check_file(name: str, target: Path) -> None:
-    """Raise a ValueError unless `target` is a file or can become one."""
-    _check_place(name, target, "a file")
+def check_file(name: str, target: Path, scene: Path | None = None) -> None:
+    """Check that a file can be written, and does not lie among the pictures or maps of a scene.
+
+    Raises:
+        ValueError, OSError: see `check_output`.
+    """
+    from .._files import check_output
+
+    check_output(name, target, "a file", apart=_of_scene(scene))
 
 
-def check_folder(name: str, target: Path) -> None:
-    """Raise a ValueError unless `target` is a folder or can become one."""
-    _check_place(name, target, "a folder")
+def check_folder(name: str, target: Path, scene: Path | None = None, *others: Path | None) -> None:
+    """The same for a folder, which is none of `others` either."""
+    from .._files import check_output
+
+    check_output(name, target, "a folder", apart=_of_scene(scene), other=others)
 
 
-def check_target(name: str, target: Path, *sources: Path) -> None:
-    """Raise a ValueError unless `target` can become a splat file that overwrites none of the sources."""
+def check_target(name: str, target: Path, *sources: Path, scene: Path | None = None) -> None:
+    """Raise a ValueError unless `target` can become a splat file that overwrites none of the sources; see `check_file`."""
     from ..formats import formats
 
     endings = tuple(ending for one in formats().values() if hasattr(one, "write") for ending in one.SUFFIXES)
@@ -28,7 +36,7 @@ def check_target(name: str, target: Path, *sources: Path) -> None:
             f"{name}: expected a file whose name ends in one of {', '.join(endings)}, got {target}; "
             "the ending chooses the format"
         )
-    check_file(name, target)
+    check_file(name, target, scene)
     for source in sources:
         if target.resolve() == source.resolve():
             raise ValueError(f"{name}: expected another file than {source}, got the same; give another name")
@@ -86,10 +94,7 @@ def open_splats(name: str, path: Path, *, labelled: bool = False) -> Any:
     return splats
 
 
-def _check_place(name: str, target: Path, kind: str) -> None:
-    if target.exists() and target.is_dir() != (kind == "a folder"):
-        other = "a file" if kind == "a folder" else "a folder"
-        raise ValueError(f"{name}: expected {kind} or nothing at {target}, got {other}; give another name")
-    above = next(place for place in (*target.parents, Path("/")) if place.exists())
-    if not above.is_dir():
-        raise ValueError(f"{name}: expected a folder to write to, got {target} below the file {above}; give another")
+def _of_scene(scene: Path | None) -> list[Path]:
+    """The folders of a scene (a folder, or its transforms.json) from which pictures and maps are read."""
+    root = None if scene is None else scene if scene.is_dir() else scene.parent
+    return [] if root is None else [root / "images", root / "features"]

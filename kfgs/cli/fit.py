@@ -32,6 +32,7 @@ def demo(out: Path = Path("kfgs_demo"), seed: int = 0) -> None:
     from ..pipeline import demo as run_demo
     from ..toy.room_folder import ToyConfig
 
+    check_folder("out", out)
     wrote(run_demo.run(out, fit_config(FieldMethod(), seed=seed), room=ToyConfig(seed=seed), report=say, progress=True))
     say(f"next: kfgs view {out / 'run' / 'field'} --scene {out / 'scene'} --color {out / 'color.ply'}")
 
@@ -44,6 +45,7 @@ def sfm(
     no_single_camera: Flag = False,
     min_registered: float = 0.9,
     seed: int = 0,
+    replace: Flag = False,
 ) -> None:
     """Find the cameras of a folder of photographs (structure from motion, pycolmap).
 
@@ -59,8 +61,11 @@ def sfm(
         no_single_camera: The photographs were taken with several cameras, or with changes of zoom.
         min_registered: Share of the images that must be placed; fewer is an error.
         seed: Every random choice follows from it.
+        replace: Replace a model that is in OUT/sparse/0 already; without it that is an error.
     """
     from ..scenes import SfmConfig, run_sfm
+
+    check_folder("out", out, None, images)
 
     config = SfmConfig(
         matching=matching,
@@ -69,7 +74,7 @@ def sfm(
         min_registered=min_registered,
         seed=seed,
     )
-    say(str(run_sfm(images, out, config=config, progress=True)))
+    say(str(run_sfm(images, out, config=config, replace=replace, progress=True)))
     written = [out / "sparse" / "0"]
     beside = out / "images"
     if not os.path.lexists(beside):
@@ -119,7 +124,7 @@ def fit(
         method, seed=training.seed, steps=training.steps, max_gaussians=training.max_gaussians, split=views.split
     )
     config = dataclasses.replace(config, undistorted_features=maps.undistorted_features, device=training.device)
-    check_folder("out", out)
+    check_folder("out", out, scene, views.images, maps.features)
     if method.method == "paper":
         check_alone("splat", splat, "with --method paper, which trains its own Gaussians")
     elif splat is not None:
@@ -179,10 +184,12 @@ def uplift(
         max_gaussians: Prune and merge to at most this many; every Gaussian is kept when not given.
     """
     from ..fields import UpliftConfig
+    from ..fields.store import check_place
     from ..pipeline import FitConfig
     from ..pipeline.fuse import uplift as uplift_scene
 
-    check_folder("out", out)
+    check_folder("out", out, scene, views.images, maps.features)
+    check_place(out)
     as_taken = views.load(scene)
     loaded = as_taken.undistorted()
     found = stored_maps(as_taken, loaded.views(views.split), maps.folder(scene), maps.level)
@@ -223,7 +230,7 @@ def color(
     from ..pipeline.compare import PhotoPictures
 
     check_whole("pictures", pictures, 0)
-    check_folder("out", out)
+    check_folder("out", out, scene, views.images)
     config = {"quick": ColorConfig.quick, "cpu": ColorConfig.cpu, "paper": ColorConfig.paper}[preset]()
     fields = config.field if training.steps is None else config.field.with_steps(training.steps)
     if training.max_gaussians is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -63,4 +64,16 @@ def warnings_as_notes(spoken: Callable[[str], str]) -> Iterator[None]:
             say(f"note: {spoken(str(message))}")
 
         warnings.showwarning = note
+        yield
+
+
+@contextmanager
+def said_on_stderr() -> Iterator[None]:
+    """Say on stderr when the kernels of the CPU engine are compiled, beside the progress bars."""
+    from .._compiling import say_compiling
+
+    def tell(text: str) -> None:
+        print(f"note: {text}", file=sys.stderr, flush=True)  # noqa: T201
+
+    with say_compiling(tell):
         yield

@@ -59,7 +59,7 @@ def select(
     if not source.exists() and Path(query).exists():
         raise ValueError(f"query, source: expected a class, then a file, got {query!r}, {str(source)!r}; swap them")
     if out is not None:
-        check_folder("out", out)
+        check_folder("out", out, classes.scene)
     if threshold is not None:
         check_range("threshold", threshold, 0, 1)
     classes.check_images()
@@ -123,8 +123,10 @@ def segment(
     from .._files import read_json
     from ..fields import recall_scene
     from ..pipeline import score_scene, segment_scene, true_labels, write_report
+    from ..pipeline.apply import SEGMENTED
     from ..viz import plot_iou, plot_largest_confusions
 
+    check_folder("out", out)
     loaded_field = open_field("field", field)
     scene = recall_scene(loaded_field.info, loaded_field.folder) if classes.scene is None else classes.scene
     classes = dataclasses.replace(classes, scene=scene)
@@ -158,8 +160,7 @@ def segment(
         maps=maps,
         progress=True,
     )
-    names = ("predicted", "colored", "sheets", "overlay", "features")
-    written = [out / name for name in names if (out / name).is_dir()]
+    written = [out / name for name in SEGMENTED if (out / name).is_dir()]
     if truth:
         scores = score_scene(found, truth, label_set)
         say(str(scores))
@@ -202,6 +203,7 @@ def label(
     """
     import torch
 
+    from .._check import check_range
     from ..pipeline import label_cloud, read_cloud, save_labelled
 
     for name, value, other, needed in (
@@ -210,6 +212,9 @@ def label(
     ):
         if value is not None and needed is None:
             raise ValueError(f"{name}: expected --{other} with it, got none; it would have no effect")
+    check_folder("out", out, classes.scene)
+    if distance is not None:
+        check_range("distance", distance, 0, closed=(False, False))
     loaded = classes.open_field("field", field)
     label_set = classes.of_field(loaded)
     carried = None if cloud is None else read_cloud(cloud)

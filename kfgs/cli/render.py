@@ -56,7 +56,7 @@ def render(
     from ..viz import save_animation
     from ..viz.animation import SUFFIXES, check_target
 
-    check_file("out", out)
+    check_file("out", out, classes.scene)
     if out.suffix.lower() not in SUFFIXES:
         raise ValueError(f"out: expected a name that ends in .gif or .mp4, got {out.name!r}; rename it")
     check_target(out, fps)
@@ -90,7 +90,7 @@ def render(
 
 def _colors(field: Path | None, color: Path | None, meaning: Any) -> Any:
     """The colour cloud: the given one, the source's own, or that of the run; None if there is none."""
-    from .._files import read_json
+    from ..fields.store import read_description
 
     if color is not None:
         return open_splats("color", color).gaussians
@@ -98,7 +98,7 @@ def _colors(field: Path | None, color: Path | None, meaning: Any) -> Any:
         return meaning.gaussians
     if field is None or field.is_file():
         return None
-    geometry = read_json(field / "field.json").get("info", {}).get("geometry")
+    geometry = read_description(field).get("info", {}).get("geometry")
     for place in (field.parent / "color.ply", Path(str(geometry))):
         if place.is_file() and not is_field(place):
             say(f"colours: {place}")

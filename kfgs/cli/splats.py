@@ -53,13 +53,16 @@ def attach(
             Without it the shapes of the clouds do.
         same_frame: Do not compare the frames; they are the same.
     """
+    from .._check import check_range
     from ..cameras.similarity import Similarity
     from ..formats import write_splats
     from ..pipeline.attach import attach as attach_field
     from ..scenes import SceneError, load_scene
 
-    check_target("out", out, splats)
+    check_target("out", out, splats, scene=classes.scene)
     classes.check_images()
+    if distance is not None:
+        check_range("distance", distance, 0, closed=(False, False))
     if same_frame and splat_scene is not None:
         raise ValueError("same_frame: expected it alone, got --splat-scene too, whose cameras find the frame; drop one")
     loaded, cloud = classes.open_field("field", field), open_splats("splats", splats)
@@ -118,7 +121,7 @@ def edit(
     from ..labels.edits import EditList
     from ..pipeline.compare import views_of_edits, write_comparison
 
-    check_target("out", out, splats)
+    check_target("out", out, splats, scene=scene.scene)
     saved = _edits_beside(out, replay)
     check_whole("pictures", pictures, 0)
     if scene.scene is None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from .files import check_alone, open_field
+from .files import check_alone, check_file, open_field
 from .options import Classes, Flag, Given, Name, Positional, Teacher
 from .output import say, wrote
 
@@ -54,6 +54,7 @@ def text(
 
     if out.suffix != SUFFIX or out.is_dir():
         raise ValueError(f"out: expected a file whose name ends in {SUFFIX}, got {out}; give another name")
+    check_file("out", out)
     if examples is not None:
         for name, given in ({"names": names, "templates": templates} | dataclasses.asdict(teacher)).items():
             check_alone(name, given, "with --examples, which replace words")

@@ -69,7 +69,8 @@ def view(
         out: Folder for saved pictures and selections.
     """
     place = "browser" if where == "auto" else where
-    check_folder("out", out)
+    if where in ("html", "picture") or out.exists():  # the others write only when asked
+        check_folder("out", out, classes.scene)
     read = functools.partial(_read, source, color, ask, distance, classes, teacher)
     if place == "browser":
         _serve(read, source, out, classes, display)

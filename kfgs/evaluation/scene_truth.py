@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
-from .._files import read_json
+from .._files import as_path, read_json
 from ..cameras.camera import Camera
 from ..scenes.load import load_scene
 from ..scenes.scene import Scene
@@ -54,7 +54,7 @@ class SceneTruth:
             FileNotFoundError: if there is no such scene, or it lacks labels.
             ValueError: if it has no such class or split, or no view shows the class.
         """
-        folder = Path(folder)
+        folder = as_path(folder)
         names = read_json(folder / "classes.json")
         if name not in names:
             raise ValueError(f"name: expected one of {', '.join(names)} (classes of {folder}), got {name!r}")

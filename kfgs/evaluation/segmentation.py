@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
+from .._files import as_path
 from ..cameras import resize_labels
 from ..metrics import ConfusionMatrix, Score
 from ..scenes.files import open_picture
@@ -30,7 +31,7 @@ def load_label_map(path: str | Path) -> Tensor:  # [H, W] int64, -1 = void
         FileNotFoundError: if there is no such file.
         ValueError: if it is not an 8-bit single-channel picture.
     """
-    path = Path(path)
+    path = as_path(path)
     with open_picture(path, "a label picture", "write it again") as picture:
         mode = picture.mode
         values = torch.from_numpy(np.array(picture)).long() if mode in ("L", "P") else None

@@ -13,13 +13,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._check import one_line
-from .._files import bytes_in_words, digest_file, seconds_in_words
+from .._files import as_path, bytes_in_words, digest_file, locked, seconds_in_words
 from ..scenes import Scene
 from ..teachers.protocol import Teacher, as_teacher, identify
 from .layouts import map_file, write_npy_map
 from .manifest import MANIFEST, Manifest, MapRecord, read_manifest
 from .pictures import Picture, Split, as_pictures
-from .writer import MapWriter, encode_half, locked
+from .writer import LOCK, MapWriter, encode_half
 
 
 def extract_features(
@@ -62,8 +62,8 @@ def extract_features(
             process is writing to it.
         OSError: if the folder cannot be written to, or the disk has no space for the maps.
     """
-    folder, teacher, chosen = Path(folder), as_teacher(teacher), as_pictures(pictures, split, exist=True)
-    with locked(folder):
+    folder, teacher, chosen = as_path(folder), as_teacher(teacher), as_pictures(pictures, split, exist=True)
+    with locked(folder, LOCK):
         writer = MapWriter(folder, identify(teacher), chosen, overwrite=overwrite)
         digests = {picture.stem: digest_file(picture.path) for picture in chosen}
         doubts = {stem: writer.doubt(stem, digest) for stem, digest in digests.items()}
@@ -116,14 +116,14 @@ def discard_maps(folder: str | Path, stems: Sequence[str] | None = None, *, dry_
             another process is writing to it. Then nothing is deleted.
         TypeError: if `stems` is a text.
     """
-    folder = Path(folder)
+    folder = as_path(folder)
     manifest = read_manifest(folder)
     if manifest is None:  # an error before there is a lock file in a folder of another program
         raise ValueError(
             f"folder: expected maps that kfgs made (with {MANIFEST}), got none in {folder}; kfgs cannot make the maps of "
             "other programs again: delete them by hand"
         )
-    with nullcontext() if dry_run else locked(folder):
+    with nullcontext() if dry_run else locked(folder, LOCK):
         manifest = read_manifest(folder) or manifest
         files = _discardable(folder, manifest, stems)
         freed = sum(file.stat().st_size for file in files)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
+from .._files import as_path
 from ..scenes.files import IMAGE_SUFFIXES, some
 from .layouts import FEATURE_3DGS, LAYOUTS, OWN, Reading, StoredMap, layout_of, open_map
 from .manifest import MANIFEST, MapRecord, read_manifest
@@ -22,7 +23,7 @@ class MapFinder:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
+        self.path = as_path(path)
         if not self.path.is_dir():
             raise NotADirectoryError(f"path: expected a folder of feature maps, got {self.path}; check its name")
         self.manifest = read_manifest(self.path)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from .._arrays import FileError, read_array, read_safetensors
 from .._check import check_shapes
-from .._files import atomic_path
+from .._files import as_path, atomic_path
 from ..scenes.files import some
 from ..teachers.torch_files import Placeholder, check_plain, load_torch_file
 from .langsplat import INDEX, ROWS, MaskFeatures
@@ -69,7 +69,7 @@ def _open_numpy(file: Path, _: Reading) -> Any:
 
 
 def _open_safetensors(file: Path, _: Reading) -> Any:
-    tensors, _ = read_safetensors(file, "a feature map", AGAIN)
+    tensors = read_safetensors(file, "a feature map", AGAIN)[0]
     if len(tensors) != 1:
         raise ValueError(f"expected one tensor, got {len(tensors)}: {some(list(tensors))}")
     return next(iter(tensors.values()))  # mapped, not read
@@ -231,7 +231,7 @@ def write_npy_map(
         ValueError: if `features` is not [h, w, D], or not finite in float16 (largest value 65504).
     """
     check_shapes(("features", features, "h w D"))
-    target = Path(path)
+    target = as_path(path)
     header = {"descr": "<f2", "fortran_order": False, "shape": tuple(map(int, features.shape))}
     with atomic_path(target) as temporary, temporary.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, header)
@@ -259,7 +259,7 @@ def save_feature_map(path: str | Path, stem: str, features: Tensor) -> Path:  # 
     for i in range(h):  # row by row, which transposes in the cache: 0.3 s instead of 5 s at 360 x 480 x 512
         half[:, i] = features[i].detach().to(torch.float16).T.contiguous()
     _check_half(half, stem)
-    target = Path(path) / f"{stem}{FEATURE_3DGS.suffix}"
+    target = as_path(path) / f"{stem}{FEATURE_3DGS.suffix}"
     with atomic_path(target) as temporary:
         torch.save(half, temporary)
     return target

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from .._check import one_line
-from .._files import digest_file, read_json, write_json
+from .._files import as_path, digest_file, read_json, write_json
 
 MANIFEST = "features.json"
 FORMAT = "kfgs-features/1"
@@ -69,7 +69,7 @@ def read_manifest(folder: str | Path) -> Manifest | None:
     Raises:
         ValueError: if the manifest is damaged, or of another version.
     """
-    path = Path(folder) / MANIFEST
+    path = as_path(folder) / MANIFEST
     if not path.is_file():
         return None
     try:

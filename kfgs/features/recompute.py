@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .._arrays import read_array
-from .._files import atomic_path, digest_file, digest_value, read_json, write_json
+from .._files import as_path, atomic_path, digest_file, digest_value, read_json, write_json
 from ..quant.sampling import SAMPLES, sample_grid
 from ..scenes import Scene
 from ..teachers.protocol import Teacher, as_teacher, identify
@@ -53,7 +53,7 @@ class RecomputedMaps(Sequence[Tensor]):
     ) -> None:
         self.teacher, self.pictures = as_teacher(teacher), as_pictures(scene, split, exist=True)
         self.identity = plain_identity(identify(self.teacher))
-        self.store = Path(store) / f"samples-{digest_value(self.identity)[:12]}"
+        self.store = as_path(store) / f"samples-{digest_value(self.identity)[:12]}"
         self._image_digests: dict[int, str] = {}
 
     def __len__(self) -> int:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,46 +18,12 @@ from .layouts import LAYOUTS, OWN, layout_of, map_file
 from .manifest import MANIFEST, Manifest, MapRecord, differences, plain_identity
 from .pictures import Picture
 
-try:
-    import fcntl
-except ImportError:  # Windows: two processes that write to one folder are not noticed there
-    fcntl = None  # type: ignore[assignment]
-
 LOCK = ".features.lock"
 ROW_BLOCK = 8  # rows of a map rounded at a time: 4 MB at 480 x 512 channels
 
 
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Keep other processes from writing to a folder of maps; the folder is made if it does not exist.
-
-    Raises:
-        ValueError: if another process is writing to it.
-        OSError: if it cannot be made or written to; the message says so.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        file = (folder / LOCK).open("a")
-    except OSError as error:
-        raise type(error)(
-            f"folder: expected a folder that can be written to, got {folder} ({error.strerror}); choose another"
-        ) from error
-    with file:
-        if fcntl is not None:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise ValueError(
-                    f"folder: expected one that no other process writes to, got {folder}, which is in use; wait until "
-                    "that process has ended"
-                ) from error
-        yield  # the empty file stays: if it were removed, two processes could hold locks of the same name
-
-
 class MapWriter:
     """Adds one teacher's maps to a folder and records each in its manifest. Use it while the folder is `locked`.
-
-    Half-written files that a killed process left for these pictures are deleted.
 
     Args:
         folder: the folder of maps.
@@ -74,17 +39,12 @@ class MapWriter:
     def __init__(
         self, folder: Path, identity: Mapping[str, Any], pictures: Sequence[Picture], *, overwrite: bool = False
     ) -> None:
-        wanted, files = plain_identity(identity), [map_file(folder, picture.stem) for picture in pictures]
+        wanted = plain_identity(identity)
         found = _make_room(MapFinder(folder), [picture.stem for picture in pictures], wanted, overwrite=overwrite)
         self.folder, self.manifest = folder, found or Manifest(wanted)
         self._missing = {stem for stem, one in self.manifest.maps.items() if not (folder / one.file).is_file()}
         if found is None:
             self.manifest.save(folder)  # from now on, a map without a record is one that a killed process left
-        for file in [folder / MANIFEST, *files]:
-            if file.parent.is_dir():
-                literal = "".join(f"[{c}]" if c in "*?[" else c for c in file.name)
-                for left_over in file.parent.glob(f".{literal}.*"):
-                    left_over.unlink(missing_ok=True)
 
     def doubt(self, stem: str, image_digest: str) -> str | None:
         """Why a picture's map must be made (again); None if the existing map can be used."""

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save_file
 from torch import Tensor
 
 from .._arrays import read_safetensors
 from .._card import short_repr
 from .._check import as_tensor
 from .._files import atomic_path, digest_value, parse_json
+from .._tensors import save_tensors
 from ..cameras import Camera
 from ..cameras.camera import NEAR
 from .config import FieldConfig
@@ -65,7 +65,6 @@ def identify_fit(
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint, identity: dict[str, str]) -> None:
     """Write the file; it is whole or absent."""
-    tensors = {name: value.detach().cpu().contiguous() for name, value in checkpoint.tensors.items()}
     metadata = {
         "kfgs": KIND,
         "version": VERSION,
@@ -73,7 +72,7 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint, identity: dict[str, str
         "state": json.dumps(checkpoint.state, allow_nan=False),
     }
     with atomic_path(path) as temporary:
-        save_file(tensors, temporary, metadata=metadata)
+        save_tensors(temporary, checkpoint.tensors, metadata)
 
 
 def read_checkpoint(path: Path, identity: dict[str, str]) -> Checkpoint | None:

@@ -12,6 +12,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from .._card import short_repr
+from .._files import as_path
 from .._progress import Progress, as_progress
 from ..cameras import Camera
 from ..cameras.bounds import camera_extent
@@ -80,7 +81,7 @@ def fit_field(
     _check_views(params, cameras, targets)
     extent = check_extent(camera_extent(cameras, params.means)) if config.extent is None else config.extent
     trainer = Trainer(params, cameras, targets, config, extent, loss, generator)
-    path, identity = (Path(checkpoint) if checkpoint is not None else None), {}
+    path, identity = (as_path(checkpoint) if checkpoint is not None else None), {}
     if path is not None:
         others = {"extent": float(extent), "loss": getattr(loss, "__qualname__", None) or repr(loss)}
         identity = identify_fit(params, cameras, targets, config, generator=generator, others=others)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from .._card import html_card
 from .._check import as_tensor, check_choice
+from .._files import as_path
 from .._rows import check_directions, unit_embeddings, unit_rows
 from ..cameras import Camera
 from ..gaussians import Gaussians
@@ -354,7 +355,7 @@ class SemanticField:
     @classmethod
     def load(cls, path: str | Path) -> SemanticField:
         """Read what `save` wrote; a FileNotFoundError if nothing is there, a ValueError if it is no field or damaged."""
-        return cls(**load_field(path), folder=Path(path))
+        return cls(**load_field(path), folder=as_path(path))
 
     @property
     def _is_linear(self) -> bool:

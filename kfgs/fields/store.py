@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save_file
 from torch import Tensor
 
 from .._arrays import read_safetensors
 from .._check import check_choice
-from .._files import atomic_folder, atomic_path, digest_file, read_json, write_json
+from .._files import as_path, atomic_folder, atomic_path, current_file, digest_file, read_json, write_json
+from .._tensors import save_tensors
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels import LabelSet
@@ -29,38 +30,36 @@ FORMAT, VERSIONS = "kfgs.semantic_field", (1, 2, 3)
 TENSORS, DESCRIPTION = "field.safetensors", "field.json"
 SUFFIX = ".kfgs.safetensors"
 """Of a field in one file."""
+ATTEMPTS = 3  # to read a folder that other processes write to
 
 
 def find_field(path: str | Path) -> Path | None:
     """The field at a path: a field folder, a packed field, or the field of a run folder; None if there is none."""
-    path = Path(path)
-    found = (one for one in (path, path / "field") if (one / DESCRIPTION).is_file())
+    path = as_path(path)
+    found = (one for one in (path, path / "field") if describes_field(one))
     return next(found, path if _peek(path) is not None else None)
+
+
+def describes_field(folder: Path) -> bool:
+    """Whether a folder is that of a field."""
+    return current_file(folder, DESCRIPTION).is_file()
 
 
 def field_data(path: Path) -> Path:
     """The file with the numbers of a field: in its folder, or the packed file."""
-    return path / TENSORS if path.is_dir() else path
+    return current_file(path, TENSORS) if path.is_dir() else path
 
 
 def save_field(path: str | Path, parts: Mapping[str, Any], precision: str | Rounding | None = None) -> None:
     """Write the parts of a field, as returned by `load_field`; see `SemanticField.save`."""
-    path = Path(path)
+    path = as_path(path)
     single = path.name.endswith(SUFFIX)
     if precision is not None and not single:
         raise ValueError(
             f"path: expected a name that ends in {SUFFIX} for a field in one file, got {path}; give another, or leave "
             "precision out to write a folder"
         )
-    if single:
-        older = not path.exists() or _peek(path) is not None
-    else:
-        older = not path.exists() or (path / DESCRIPTION).is_file() or (path.is_dir() and not any(path.iterdir()))
-    if not older:
-        raise FileExistsError(
-            f"path: expected a new {'file' if single else 'folder'} or an older field at {path}, got something else; "
-            "give another"
-        )
+    check_place(path)
     parts = {**parts, "info": rebased(check_notes(parts["info"]), parts["folder"], path)}
     if single:
         data = pack_parts({**parts, "words": _words(parts, path)}, precision or "lossless")
@@ -69,10 +68,21 @@ def save_field(path: str | Path, parts: Mapping[str, Any], precision: str | Roun
         return
     tensors, description = _to_tensors(parts)
     with atomic_folder(path) as folder:
-        save_file(tensors, folder / TENSORS)
+        save_tensors(folder / TENSORS, tensors)
         version = VERSIONS[-1] if "words" in description else VERSIONS[-2]
         about = {"format": FORMAT, "version": version, "sha256": digest_file(folder / TENSORS)}
         write_json(folder / DESCRIPTION, about | description)
+
+
+def check_place(path: Path) -> None:
+    """Raise a FileExistsError unless there is nothing at `path`, or a field that may be replaced."""
+    single = path.name.endswith(SUFFIX)
+    older = _peek(path) is not None if single else path.is_dir() and (describes_field(path) or not any(path.iterdir()))
+    if path.exists() and not older:
+        raise FileExistsError(
+            f"path: expected a new {'file' if single else 'folder'} or an older field at {path}, got something else; "
+            "give another"
+        )
 
 
 def pack_parts(parts: Mapping[str, Any], precision: str | Rounding) -> bytes:
@@ -91,15 +101,26 @@ def unpack_parts(data: bytes, name: str = "data") -> dict[str, Any]:
 
 def load_field(path: str | Path) -> dict[str, Any]:
     """The parts of a field, by name; see `SemanticField.load`."""
-    path = Path(path)
+    path = as_path(path)
     if path.is_file():
         return unpack_parts(b"" if _peek(path) is None else path.read_bytes(), str(path))
-    if not (path / DESCRIPTION).is_file():
+    tensors, description = _read_folder(path)
+    return _from_tensors(str(path), tensors, description)
+
+
+def read_description(path: Path) -> dict[str, Any]:
+    """What `field.json` says about the field of a folder.
+
+    Raises:
+        FileNotFoundError: if there is no field.
+        ValueError: if the file is damaged, or of another format or version.
+    """
+    if not describes_field(path):
         raise FileNotFoundError(
             f"{path}: expected a saved field, a file or a folder with {DESCRIPTION}, found none; pass what "
             "SemanticField.save got"
         )
-    description = read_json(path / DESCRIPTION)
+    description = read_json(current_file(path, DESCRIPTION))
     found = description.get("format") if isinstance(description, dict) else None
     if found != FORMAT:
         raise ValueError(f"{path}: expected a field ({FORMAT}), got {found!r}; pass what SemanticField.save wrote")
@@ -108,13 +129,25 @@ def load_field(path: str | Path) -> dict[str, Any]:
         raise ValueError(
             f"{path}: expected format version {known}, got {description.get('version')!r}; use the kfgs that wrote it"
         )
-    if not (path / TENSORS).is_file() or digest_file(path / TENSORS) != description.get("sha256"):
-        raise ValueError(
-            f"{path}: expected {TENSORS} as it was saved, got {'another' if (path / TENSORS).is_file() else 'none'}; "
-            "copy the whole folder again, or fit the field again"
-        )
-    tensors, _ = read_safetensors(path / TENSORS, "the numbers of a field", "fit it again")
-    return _from_tensors(str(path), tensors, description)
+    return dict(description)
+
+
+def _read_folder(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and description of a field folder. If another process replaces them meanwhile, they are read again."""
+    for _ in range(ATTEMPTS):
+        description, file = read_description(path), current_file(path, TENSORS)
+        try:
+            before = file.stat()
+            if digest_file(file) == description.get("sha256"):
+                tensors, _ = read_safetensors(file, "the numbers of a field", "fit it again")
+                if os.path.samestat(before, file.stat()):
+                    return tensors, description
+        except FileNotFoundError:
+            continue
+    raise ValueError(
+        f"{path}: expected {TENSORS} as it was saved, got {'another' if file.is_file() else 'none'}; copy the whole folder "
+        "again, or fit the field again"
+    )
 
 
 def _peek(path: Path) -> dict[str, Any] | None:

@@ -151,6 +151,6 @@ def working_directions(maps: FeatureMaps) -> Tensor:  # [D, d']
     values, directions = principal_directions(moment)
     if not float(values[0]) > 0:
         raise ValueError(
-            f"maps: expected features longer than {EPS:g}, got none in {len(maps)} maps; check the teacher"
+            f"maps: expected nonzero features (longer than {EPS:g}), got {len(maps)} maps without; check the teacher"
         )
     return directions[:, :WORKING].float()

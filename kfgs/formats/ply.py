@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .._files import atomic_path
+from .._files import as_path, atomic_path
 
 Columns = dict[str, NDArray[Any]]
 
@@ -54,11 +54,11 @@ def _parse_header(path: Path, file: BinaryIO) -> _Header:
     newline = head.find(b"\n", end)
     if not head.startswith(b"ply") or end < 1 or newline < 0:
         raise ValueError(f"{path}: expected a PLY file ('ply' ... 'end_header'), got something else")
-    layout, elements, comments = "", [], []
+    layout, version, elements, comments = "", "", [], []
     for line in head[:end].decode("ascii", "replace").splitlines():
         words = line.split()
         if words[:1] == ["format"] and len(words) > 1:
-            layout = words[1]
+            layout, version = words[1], " ".join(words[2:])
         elif words[:1] == ["comment"]:
             comments.append(line[len("comment ") :].strip())
         elif words[:1] == ["element"] and len(words) == 3:
@@ -72,6 +72,8 @@ def _parse_header(path: Path, file: BinaryIO) -> _Header:
                 elements[-1].lists.append(line)
     if layout not in ("binary_little_endian", "binary_big_endian", "ascii"):
         raise ValueError(f"{path}: expected a binary or ascii PLY, got format {layout!r:.40}")
+    if version not in ("", "1.0"):
+        raise ValueError(f"{path}: expected a PLY file of version 1.0, got {version!r:.40}; write it as 1.0")
     names = [element.name for element in elements]
     if len(set(names)) != len(names):
         raise ValueError(f"{path}: expected elements of different names, got {names!r:.80}; write the file again")
@@ -139,7 +141,7 @@ def _plural(element: _Element) -> str:
 
 
 def _existing(path: str | Path) -> Path:
-    path = Path(path)
+    path = as_path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected a PLY file there")
     return path

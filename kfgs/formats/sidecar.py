@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from .._arrays import read_arrays
-from .._files import atomic_path, digest_file, read_json, write_json
+from .._files import as_path, atomic_path, digest_file, read_json, write_json
 from .splat_file import SCORE, SplatFile
 
 _NPZ_HEADERS = 1 << 16  # bytes of headers in an .npz file of three arrays
@@ -19,7 +19,7 @@ _NPZ_HEADERS = 1 << 16  # bytes of headers in an .npz file of three arrays
 
 def names_path(path: str | Path) -> Path:
     """`scene.ply` -> `scene.ply.classes.json`: the names of the classes of this one splat file."""
-    path = Path(path)
+    path = as_path(path)
     return path.with_name(path.name + ".classes.json")
 
 
@@ -28,12 +28,12 @@ def shared_names_path(path: str | Path) -> Path:
 
     It may also belong to `scene.spz`, so it is never written or deleted.
     """
-    return Path(path).with_suffix(".classes.json")
+    return as_path(path).with_suffix(".classes.json")
 
 
 def labels_path(path: str | Path) -> Path:
     """`scene.splat` -> `scene.splat.labels.npz`: `class_id` and `score` of a format that cannot hold them."""
-    path = Path(path)
+    path = as_path(path)
     return path.with_name(path.name + ".labels.npz")
 
 
@@ -96,7 +96,7 @@ def find_names(path: str | Path) -> Path | None:
 
 def _places(path: str | Path) -> tuple[Path, ...]:
     """A path, and the file that it leads to if it is a link."""
-    return (Path(path), Path(path).resolve())
+    return (as_path(path), as_path(path).resolve())
 
 
 def _first(paths: Iterable[Path]) -> Path | None:

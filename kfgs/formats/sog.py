@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .._files import atomic_folder, atomic_path
+from .._files import HIDDEN, atomic_folder, atomic_path
 from ..gaussians import Gaussians
 from .order import morton_order
 from .palette import Palette, fit_codebook, fit_palette, nearest_codes
@@ -43,6 +43,7 @@ SORTS = True
 _LARGEST_FIRST = 252  # alpha of a rotation whose largest component is w
 _PER_LINE = 64  # rows of the palette in a line of its image
 _LEVELS = 65535
+REST_FILES = ("shN_centroids.webp", "shN_labels.webp")
 
 
 class _Rest(NamedTuple):
@@ -106,6 +107,8 @@ def write(path: Path, splats: SplatFile) -> tuple[str, ...]:
         with atomic_folder(path) as folder:
             for name, data in files.items():
                 (folder / name).write_bytes(data)
+        for name in set(REST_FILES) - set(files):  # of an older scene with more harmonics
+            (path / name).unlink(missing_ok=True)
     return describe_loss(splats, ".sog", 3)
 
 
@@ -219,7 +222,7 @@ def _encode(g: Gaussians, mode: dict[str, Any]) -> dict[str, bytes]:
     }
     rest = _fit_rest(g.sh)
     if rest is not None:
-        names = ["shN_centroids.webp", "shN_labels.webp"]
+        names = list(REST_FILES)
         images |= dict(zip(names, _rest_images(rest), strict=True))
         degree = {9: 1, 24: 2, 45: 3}[rest.codes.shape[1]]
         book = rest.codebook.tolist()
@@ -261,12 +264,13 @@ def _rest_error(sh: Tensor, rest: _Rest | None) -> float:
 
 
 def _check_folder(path: Path) -> None:
-    """Raise unless a folder holds only a scene, because it is replaced as a whole."""
+    """Raise unless a folder holds only a scene, whose files are replaced."""
     if not path.exists():
         return
     others = [] if path.is_dir() else [path.name]
     if path.is_dir():
-        others = [file.name for file in path.iterdir() if file.name != META and file.suffix != ".webp"]
+        known = (META, HIDDEN)
+        others = [file.name for file in path.iterdir() if file.name not in known and file.suffix != ".webp"]
     if others or path.name == META:
         raise ValueError(
             f"path: expected a new folder, or one with a SOG scene alone, got {path} with {', '.join(others[:3])}; choose "

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from .._files import parse_json
+from .._files import current_file, parse_json
 
 META = "meta.json"
 _META_BYTES = 1 << 22  # three codebooks of 256 numbers and a few names take 20 KB
@@ -70,7 +70,7 @@ class SogFiles:
         return data
 
     def _read_folder(self, name: str, limit: int) -> bytes:
-        file = self._folder / name
+        file = current_file(self._folder, name)
         if not file.is_file():
             raise ValueError(f"{self.path}: expected {name!r} in the folder, got no such file; copy all of the scene")
         with file.open("rb") as stream:

@@ -30,7 +30,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from .._check import check_choice, check_whole
-from .._files import parse_json
+from .._files import as_path, parse_json
 from ..gaussians import Gaussians
 from .render_mode import ANTIALIASED as ANTIALIASED_MODE
 from .render_mode import describe_lost_mode
@@ -144,7 +144,7 @@ def write_spz(
     flags = ANTIALIASED if splats.info.get(ANTIALIASED_MODE) else 0
     records = [] if g.labels is None else [(LABELS, _pack_labels(_record(splats)))]
     streams = pack(g, version, fractional_bits, sh_bits)
-    write_container(Path(path), Container(version, len(g), degree, fractional_bits, flags, streams, records))
+    write_container(as_path(path), Container(version, len(g), degree, fractional_bits, flags, streams, records))
     return _lost(splats, g, fractional_bits)
 
 

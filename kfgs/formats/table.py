@@ -24,6 +24,7 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
+from .._files import as_path
 from ..gaussians import Gaussians
 from .order import morton_order
 from .sidecar import find_names, names_path, read_sidecar, write_sidecar
@@ -55,7 +56,7 @@ def find_format(path: str | Path) -> ModuleType:
         FileNotFoundError: if there is no such file.
         ValueError: if it is none of the known formats.
     """
-    path = Path(path)
+    path = as_path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file; expected a splat file there")
     head = b""
@@ -80,7 +81,7 @@ def read_splats(path: str | Path) -> SplatFile:
         ValueError: if it is of no known format, or damaged: truncated, with counts that disagree, numbers that are not
             finite, or labels without a name in its classes.
     """
-    path = Path(path)
+    path = as_path(path)
     module = find_format(path)
     splats: SplatFile = read_sidecar(path, module.read(path))
     labels = splats.gaussians.labels
@@ -114,7 +115,7 @@ def write_splats(path: str | Path, splats: SplatFile | Gaussians, *, format: str
             NaN or infinite, a scale not positive, an opacity outside [0, 1] (both ends are allowed), or a label has no name
             in `classes`. Nothing is written then.
     """
-    path = Path(path)
+    path = as_path(path)
     if isinstance(splats, Gaussians):
         splats = SplatFile(splats)
     module = _format_to_write(path, format)

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
 from torch import Tensor
 
 from .._arrays import read_array, read_safetensors
 from .._card import cut, html_card
 from .._check import as_tensor
-from .._files import atomic_path, parse_json, read_json
+from .._files import as_path, atomic_path, parse_json, read_json
+from .._tensors import save_tensors
 from .names import class_index, class_indices
 
 KIND, VERSION = "label set", "1"  # of the metadata's "kfgs" and "version"
@@ -134,7 +134,7 @@ class LabelSet:
         Raises:
             ValueError: if the name does not end in .safetensors, or `info` is not JSON.
         """
-        path = Path(path)
+        path = as_path(path)
         if path.suffix != SUFFIX:
             raise ValueError(f"path: expected a file name that ends in {SUFFIX}, got {path}; give another name")
         try:
@@ -149,7 +149,7 @@ class LabelSet:
             tensors = {
                 name: rows.detach().to("cpu", torch.float32).contiguous().clone() for name, rows in parts.items()
             }
-            save_file(tensors, temporary, metadata={"kfgs": KIND, "version": VERSION, "info": info} | names)
+            save_tensors(temporary, tensors, {"kfgs": KIND, "version": VERSION, "info": info} | names)
 
 
 def load_label_set(classes: str | Path, embeddings: str | Path | None = None) -> LabelSet:
@@ -164,10 +164,10 @@ def load_label_set(classes: str | Path, embeddings: str | Path | None = None) ->
         FileNotFoundError: if a file is missing.
         ValueError: if a file has another content, the counts differ, or embeddings are missing or given twice.
     """
-    if Path(classes).suffix == SUFFIX:
+    if as_path(classes).suffix == SUFFIX:
         if embeddings is not None:
             raise ValueError(f"embeddings: expected none with the table {classes}, got {embeddings}; leave it out")
-        return _read_table(Path(classes))
+        return _read_table(as_path(classes))
     names = read_json(classes)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or not names:
         raise ValueError(
@@ -178,9 +178,9 @@ def load_label_set(classes: str | Path, embeddings: str | Path | None = None) ->
             f"embeddings: expected an .npy file of one row per name in {classes}, got none; pass it, or pass a table that "
             "`kfgs text` made, instead of both"
         )
-    if Path(embeddings).suffix == SUFFIX:
-        return _read_table(Path(embeddings)).select(names)
-    return LabelSet(tuple(names), torch.from_numpy(_read_rows(Path(embeddings), len(names), classes)))
+    if as_path(embeddings).suffix == SUFFIX:
+        return _read_table(as_path(embeddings)).select(names)
+    return LabelSet(tuple(names), torch.from_numpy(_read_rows(as_path(embeddings), len(names), classes)))
 
 
 def teacher_mismatch(field: dict[str, Any], words: dict[str, Any]) -> str | None:

@@ -25,6 +25,7 @@ from .plan import Plan, plan_scene
 from .plan_maps import NamedTeacher
 from .question import Question, open_question
 from .run_report import write_run_report
+from .runs import RunField, compare_fields, list_fields, restore_field
 from .stages import Run
 
 __all__ = [
@@ -34,16 +35,20 @@ __all__ = [
     "Plan",
     "Question",
     "Run",
+    "RunField",
     "attach",
+    "compare_fields",
     "describe",
     "evaluate",
     "feature_colors",
     "fit_color",
     "fit_scene",
     "label_cloud",
+    "list_fields",
     "open_question",
     "plan_scene",
     "read_cloud",
+    "restore_field",
     "save_labelled",
     "score_scene",
     "score_teacher",

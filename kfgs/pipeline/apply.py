@@ -13,7 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._check import check_range
-from .._files import atomic_path, write_json
+from .._files import as_path, atomic_path, check_output, write_json
 from ..cameras import resize_labels, undistort_labels
 from ..evaluation import SegmentationReport, evaluate_segmentation, load_label_map
 from ..evaluation.segmentation import VOID
@@ -32,6 +32,9 @@ from ..viz.palette import UNLABELLED
 from ..viz.pictures import Array
 from .fit import FitResult, load_history
 from .sheets import segmentation_sheet, teacher_labels
+
+SEGMENTED = ("predicted", "colored", "sheets", "overlay", "features")
+"""The folders that `segment_scene` makes."""
 
 
 def save_label_map(path: Path, labels: Tensor) -> None:  # [H, W] int64
@@ -86,8 +89,13 @@ def segment_scene(
     Returns:
         The label map [H, W] of each view by its stem.
     """
-    out = Path(out)
+    out = as_path(out)
     check_range("pictures", pictures, 0)
+    apart = [] if scene.folder is None else [scene.folder / "images", scene.folder / "features"]
+    for name in SEGMENTED if pictures else SEGMENTED[:2]:
+        check_output(
+            "out", out / name, "a folder", apart=apart, other=[maps, *{one.parent for one in scene.image_paths}]
+        )
     if len(classes) > VOID:
         raise ValueError(
             f"classes: expected at most {VOID} (label pictures hold a byte per pixel, {VOID} = none), got {len(classes)}; "
@@ -197,7 +205,7 @@ def save_labelled(
         classes: names for the JSON file.
         rule: how labels and scores were found, for the JSON file.
     """
-    path = Path(path)
+    path = as_path(path)
     assert gaussians.labels is not None
     columns = columns_from_gaussians(gaussians) | label_columns(gaussians.labels, classes.names, scores)
     write_ply(path, columns, comments=("kfgs labelled Gaussians",))
@@ -259,7 +267,7 @@ def label_cloud(
         added = {"class_id": added["class_id"]}
     write_ply(out, cloud | added, comments=("labels carried by kfgs",))
     return moved, [
-        Path(out),
+        as_path(out),
         write_names(out, classes.names, **{"distance": moved.distance, "distance from": moved.how}),
     ]
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._check import check_range, check_whole
-from .._files import read_json
+from .._files import check_output, read_json
 from .._progress import Progress, as_progress
 from ..cameras import Camera, resize_map
 from ..fields import ColorLoss, FieldConfig, FieldFit, GaussianParams, fit_field
@@ -202,11 +202,14 @@ def fit_color(
 
     Raises:
         ValueError: if a camera has distortion, there is no such device, the scene has no points to start from, the
-            split has no views, or `folder/color.ply` is a file that no fit in this folder wrote.
+            split has no views, `folder/color.ply` is a file that no fit in this folder wrote, or another process works in
+            `folder`.
     """
     config, progress = config or ColorConfig.paper(), as_progress(progress)
     check_scene(scene, scene.views(config.split))
-    return make_color(Run(Path(folder), report), scene, config, training_device(device), progress, overwrite=True)
+    run, target = Run(check_output("folder", folder, "a folder"), report), training_device(device)
+    with run.locked():
+        return make_color(run, scene, config, target, progress, overwrite=True)
 
 
 def make_color(
@@ -242,8 +245,8 @@ def make_color(
     return result
 
 
-def find_color(run: Run, scene: Scene, config: ColorConfig) -> Gaussians | None:
-    """The Gaussians of the longest colour stage in the run, if it has this scene and more steps than `config`; else None.
+def find_color(run: Run, scene: Scene, config: ColorConfig) -> tuple[Gaussians, int] | None:
+    """Gaussians and steps of the longest colour stage in the run, if it has this scene and more steps than `config`; else None.
 
     `kfgs color` makes such a stage in the same run folder.
     """
@@ -260,7 +263,7 @@ def find_color(run: Run, scene: Scene, config: ColorConfig) -> Gaussians | None:
     if best is None or best[0] <= config.field.steps:
         return None
     run.say(f"geometry: the colours of {best[0]:,} steps that are in {run.folder}")
-    return stage_gaussians(best[1])
+    return stage_gaussians(best[1]), best[0]
 
 
 def _inputs(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig) -> dict[str, Any]:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import torch
 from safetensors import SafetensorError
 
 from .._arrays import read_safetensors
-from .._files import digest_file
+from .._files import digest_file, hidden_folder
 from ..fields import GaussianParams
 from ..formats import read_splats, write_splats
 from ..gaussians import Gaussians
@@ -24,9 +23,9 @@ def may_replace(run: Run, path: Path) -> bool:
     if not path.is_file():  # a folder, or a link to nothing
         return False
     found = digest_file(path)
-    with TemporaryDirectory(prefix=".color-", dir=run.folder) as place:
+    with hidden_folder(run.folder) as place:
         for params in sorted((run.folder / "stages").glob("color-*/params.safetensors")):
-            written = Path(place) / path.name
+            written = place / path.name
             try:
                 write_splats(written, stage_gaussians(params.parent))
             except (OSError, ValueError, KeyError, SafetensorError):  # a damaged stage wrote nothing that is known

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_whole
+from .._files import as_path
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..splat import rasterize
@@ -107,7 +108,7 @@ def write_comparison(
     """
     height, width = (max(camera.size[i] for camera in cameras) for i in (0, 1))
     rows = [[_padded(render_color(cloud, camera), height, width) for cloud in (before, after)] for camera in cameras]
-    path = Path(path)
+    path = as_path(path)
     save_picture(path, picture_grid(rows, titles))
     return path
 

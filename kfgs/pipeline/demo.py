@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from .._files import check_output
 from ..evaluation import LabelSet, load_label_set, score_recolor, score_removal, score_surface, score_views
 from ..evaluation.datasets.surface_points import load_surface_points
 from ..evaluation.surface import SurfaceReport
@@ -54,7 +55,7 @@ def run(
         report: called with one line per step.
         progress: show progress bars.
     """
-    out, say = Path(out), report or (lambda text: None)
+    out, say = check_output("out", out, "a folder"), report or (lambda text: None)
     config = config or FitConfig.cpu()
     say("making the toy room")
     folder = make_toy_room(out / "scene", room or ToyConfig())

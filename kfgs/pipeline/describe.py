@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from .._check import one_line
-from .._files import bytes_in_words, read_json
+from .._files import as_path, bytes_in_words, read_json
 from ..features.manifest import MANIFEST, read_manifest
 from ..fields import SemanticField
 from ..fields.store import find_field
@@ -21,7 +21,7 @@ def describe(path: str | Path) -> str:
         FileNotFoundError: if the path does not exist.
         ValueError: if it is none of these.
     """
-    path = Path(path)
+    path = as_path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder; expected a field, a run, a scene or a splat file")
     field = find_field(path)

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from .._files import digest_file
+from .._files import as_path, digest_file
 from ..evaluation import Encode, FieldMethod, LabelSet, Method, Report
 from ..evaluation.digests import digest_data
 from ..evaluation.encoders import TableEncoder
@@ -80,7 +80,7 @@ def evaluate(
 def check_kind(field: Any, protocol: str) -> None:
     """Raise a TypeError if a protocol of Gaussians or colours is asked about a folder of a teacher's maps."""
     name = next((one for one in (*IN_SPACE, *OF_COLORS) if protocol in (one, one.partition("/")[0])), None)
-    if name is not None and isinstance(field, str | Path) and is_maps(Path(field)):
+    if name is not None and isinstance(field, str | Path) and is_maps(as_path(field)):
         raise TypeError(
             f"field: expected a result with Gaussians for {name}, got {field}, a teacher's feature maps; use a protocol of views"
         )
@@ -93,7 +93,7 @@ def open_result(path: str | Path, question: Question, with_file: str | Path | No
         FileNotFoundError: if it is missing.
         ValueError: if it is of no known kind.
     """
-    path = Path(path)
+    path = as_path(path)
     folder = find_field(path)
     if with_file is not None and (folder is not None or is_maps(path)):
         raise ValueError(f"with_file: expected none with a result of kfgs, got {with_file}; leave it out")

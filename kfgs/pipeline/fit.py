@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from .._card import short_repr
-from .._files import digest_value, read_json, write_json
+from .._files import as_path, check_output, digest_value, read_json, write_json
 from .._progress import Progress, as_progress
 from ..cameras import Camera
 from ..fields import (
@@ -45,6 +45,7 @@ from .color import ColorConfig, find_color
 from .config import FitConfig
 from .fuse import answers_stage, find_geometry, uplift_stage, without_lens
 from .maps import KnownFeatures, Maps, UndistortedMaps, as_maps, check_readable, map_digests, map_shape
+from .runs import keep_field, say_kept
 from .stages import Run, Stage, UnfinishedError, describe_lens, digest_scene, stage_generator
 from .train import check_scene, field_stage, training_device, with_extent
 
@@ -206,7 +207,8 @@ def fit_scene(
         maps: one teacher map [h, w, D] per training view; read one at a time; a `FeatureFolder`, or a list in memory. When
             the stages that read them are finished, the maps may be deleted (`discard_maps`), except for the paper's mode
             `decouple`.
-        folder: the run folder; the finished field goes to `folder/field`.
+        folder: the run folder; the finished field goes to `folder/field`. A field that other options made there before is kept as
+            `folder/field@<key>`; `restore_field` brings it back.
         config: the method and its options.
         splat: of method `fuse`, the Gaussians to fuse onto, in the scene's frame: a splat file or its content. None trains them
             on the pictures with `config.color` and writes them to `folder/color.ply`, unless that file exists. If `fit_color`
@@ -217,7 +219,8 @@ def fit_scene(
     Raises:
         TypeError: if `maps` is neither, or `progress` neither a bool nor a function.
         ValueError: if the counts of views and maps differ, a camera has distortion, there is no such device, a splat is given
-            to the paper's method, or its mode `decouple` gets `RecomputedMaps`.
+            to the paper's method, or its mode `decouple` gets `RecomputedMaps`; if `folder` is a file, or another process
+            works in it.
         FileNotFoundError: if a stage needs maps that were discarded, or a picture is missing.
     """
     config, progress, maps = config or FitConfig(), as_progress(progress), as_maps(maps)
@@ -225,36 +228,44 @@ def fit_scene(
     _check_inputs(scene, scene.views(config.split), maps, config)
     if splat is not None and config.method == "paper":
         raise ValueError("splat: expected none for method 'paper', which trains its own Gaussians; leave it out")
-    run, teacher = Run(Path(folder), report), getattr(maps, "identity", None)
-    job = _job(run, scene, maps, config, target_device, progress)
-    found, about = _make_field(job, splat)
-    done = FitResult(found, Path(folder), run.stages)
-    info = {
-        "method": config.method,
-        **about,
-        "seed": config.seed,
-        "views": [camera.name for camera in job.cameras],
-        "teacher_map": list(map_shape(job.maps)),
-        **({"teacher": teacher} if teacher else {}),
-        **({} if scene.folder is None else remember(scene.folder, done.field_path, found.dim)),
-        "seconds": {stage.name: round(stage.seconds, 3) for stage in run.stages},
-        "kfgs": version("kfgs"),
-    }
-    done = replace(done, field=replace(found, info=info, folder=done.field_path))
-    if not _is_saved(done.field, done.field_path):
-        done.field.save(done.field_path)
+    run = Run(check_output("folder", folder, "a folder"), report)
+    with run.locked():
+        job = _job(run, scene, maps, config, target_device, progress)
+        found, about = _make_field(job, splat)
+        done = FitResult(found, run.folder, run.stages)
+        about |= _facts(job, found, done.field_path, getattr(maps, "identity", None))
+        done = replace(done, field=replace(found, info=about, folder=done.field_path))
+        if not _is_saved(done.field, done.field_path):
+            before = keep_field(run.folder)
+            done.field.save(done.field_path)
+            say_kept(run, before)
     return done
 
 
+def _facts(job: _Job, field: SemanticField, path: Path, teacher: Any) -> dict[str, Any]:
+    """What `field.json` says about the origin of a field."""
+    scene, stages = job.scene, job.run.stages
+    return {
+        "seed": job.config.seed,
+        "views": [camera.name for camera in job.cameras],
+        "teacher_map": list(map_shape(job.maps)),
+        **({"teacher": teacher} if teacher else {}),
+        **({} if scene.folder is None else remember(scene.folder, path, field.dim)),
+        "seconds": {stage.name: round(stage.seconds, 3) for stage in stages},
+        "kfgs": version("kfgs"),
+    }
+
+
 def _make_field(job: _Job, splat: Gaussians | SplatFile | str | Path | None) -> tuple[SemanticField, dict[str, Any]]:
-    """All stages of a method: the field, and its origin for `field.json`."""
+    """All stages of a method: the field, and what decided it, for `field.json`."""
     config = job.config
     if config.method == "paper":
-        return answers_stage(job.run, _paper_stages(job), job.cameras), {"mode": config.mode}
-    geometry, where = find_geometry(job.run, job.scene, splat, _color_config(config), job.device, job.progress)
+        about = {"method": config.method, "mode": config.mode, "steps": {"field": config.field.steps}}
+        return answers_stage(job.run, _paper_stages(job), job.cameras), about
+    geometry, origin = find_geometry(job.run, job.scene, splat, _color_config(config), job.device, job.progress)
     inputs = {"features": job.features, "config": asdict(config.uplift), "seed": config.seed}
     found = uplift_stage(job.run, geometry, job.cameras, job.maps, config.uplift, inputs, job.progress is True)
-    return found, {"geometry": where}
+    return found, {"method": config.method, **origin}
 
 
 def _paper_stages(job: _Job) -> SemanticField:
@@ -294,7 +305,7 @@ def finished_stages(scene: Scene, maps: Maps | None, folder: str | Path, config:
         folder: the run folder; it may be missing.
         config: as for `fit_scene`.
     """
-    run, device = Run(Path(folder), look_only=True), torch.device("cpu")
+    run, device = Run(as_path(folder), look_only=True), torch.device("cpu")
     with suppress(UnfinishedError):
         if maps is not None:
             _make_field(_job(run, scene, maps, config, device, False), None)

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save_file
 
 from .._arrays import read_safetensors
-from .._files import write_json
+from .._files import as_path, write_json
 from .._progress import Progress
+from .._tensors import save_tensors
 from ..cameras import Camera
 from ..fields import Answers, Seen, SemanticField, UpliftConfig, fused_answers, remember, uplift_maps
 from ..formats import SplatFile, read_splats
@@ -35,23 +35,24 @@ def find_geometry(
     config: ColorConfig,
     device: torch.device,
     progress: Progress,
-) -> tuple[Gaussians, str]:
-    """The Gaussians to fuse onto, and their origin.
+) -> tuple[Gaussians, dict[str, Any]]:
+    """The Gaussians to fuse onto, and their origin, for `field.json`.
 
     Without a splat they are the colour field of the run. Its stage is found again if it is there. A longer colour field of the
     same scene, as `kfgs color` makes it in the same run folder, is taken instead. A shorter one is not, but its
     `color.ply` stays.
     """
     if isinstance(splat, Gaussians):
-        return splat, "given"
+        return splat, {"geometry": "given"}
     if isinstance(splat, SplatFile):
-        return splat.gaussians, "given"
+        return splat.gaussians, {"geometry": "given"}
     if splat is not None:
-        return read_splats(splat).gaussians, str(splat)
+        return read_splats(splat).gaussians, {"geometry": str(splat)}
     found = find_color(run, scene, config)
     if found is None:
-        found = make_color(run, scene, config, device, progress, overwrite=False).gaussians
-    return found, "trained on the pictures"
+        found = make_color(run, scene, config, device, progress, overwrite=False).gaussians, config.field.steps
+    gaussians, steps = found
+    return gaussians, {"geometry": "trained on the pictures", "steps": {"color": steps}}
 
 
 def uplift_stage(
@@ -83,7 +84,7 @@ def uplift_stage(
         cloud = found.gaussians
         tensors = {name: getattr(cloud, name) for name in (*SHAPE, "features")}
         tensors |= {"basis": found.latents.basis, "pixels": found.pixels, "agreement": found.agreement}
-        save_file({name: value.cpu().contiguous() for name, value in tensors.items()}, folder / "uplift.safetensors")
+        save_tensors(folder / "uplift.safetensors", tensors)
         write_json(folder / "facts.json", {"gaussians": len(cloud), "latents": found.latents.latent})
 
     stage = run.stage("uplift", inputs, make)
@@ -144,11 +145,13 @@ def uplift(
         "method": "uplift",
         "views": [camera.name for camera in cameras],
         **({"teacher": teacher} if teacher else {}),
-        **({} if folder is None or scene.folder is None else remember(scene.folder, Path(folder), found.latents.dim)),
+        **(
+            {} if folder is None or scene.folder is None else remember(scene.folder, as_path(folder), found.latents.dim)
+        ),
         "kfgs": version("kfgs"),
     }
     seen = Seen(found.pixels, found.agreement)
-    place = None if folder is None else Path(folder)
+    place = None if folder is None else as_path(folder)
     return SemanticField(found.gaussians, info=info, linear=found.latents, seen=seen, cameras=cameras, folder=place)
 
 
@@ -160,7 +163,7 @@ def answers_stage(run: Run, field: SemanticField, cameras: Sequence[Camera]) -> 
     def make(folder: Path) -> None:
         found = fused_answers(field.gaussians, field.codebook, field.autoencoder, cameras)
         tensors = {"latents": found.latents, "basis": found.linear.basis, **found.seen._asdict()}
-        save_file({name: value.cpu().contiguous() for name, value in tensors.items()}, folder / "answers.safetensors")
+        save_tensors(folder / "answers.safetensors", tensors)
 
     tensors = read_safetensors(run.stage("answers", inputs, make).folder / "answers.safetensors")[0]
     seen = Seen(tensors["pixels"], tensors["agreement"])

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_choice
-from .._files import bytes_in_words, seconds_in_words
+from .._files import as_path, bytes_in_words, seconds_in_words
 from ..features import FeatureFolder
 from ..scenes import Scene
 from ..teachers import Teacher
@@ -163,7 +163,7 @@ def plan_scene(
         raise ValueError(
             f"dense: expected 'keep' with mode 'decouple', whose field learns from the dense maps, got {dense!r}; keep them"
         )
-    folder = Path(features) if features is not None else (scene.folder or Path()) / FEATURES
+    folder = as_path(features) if features is not None else (scene.folder or Path()) / FEATURES
     teacher = NamedTeacher(teacher) if isinstance(teacher, str) else teacher
     stored = find_stored(scene, config.split, folder, teacher)
     views, straight = scene.views(config.split), scene.undistorted()
@@ -178,7 +178,7 @@ def plan_scene(
         done=frozenset(done),
     )
     notes = [] if stored.note is None else [stored.note]
-    if run is not None and not Path(run).is_dir():
+    if run is not None and not as_path(run).is_dir():
         notes.append(f"there is no folder {run} yet, so no stage is finished")
     if isinstance(teacher, NamedTeacher) and teacher.weights is not None and not sizes.missing:
         notes.append(f"no map is missing, so {teacher.name} and its weights were not looked at")

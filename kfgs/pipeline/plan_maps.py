@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from .._files import as_path
 from ..features import FeatureFolder, pictures_of, read_manifest, write_npy_map
 from ..scenes import Scene
 from ..teachers import TRANSFORMERS, LSeg, LSegConfig, LSegOptions, Teacher, as_teacher, load_teacher, teacher_names
@@ -47,7 +48,7 @@ class NamedTeacher:
         why, options = f"{self.name} was not run, so no size or time of its maps is known:", dict(self.options)
         if self.weights is None and self.name in teacher_names():
             return None, f"{why} no weights are named; pass --weights PATH"
-        on_hub = self.name in TRANSFORMERS and not Path(str(self.weights)).expanduser().exists()
+        on_hub = self.name in TRANSFORMERS and not as_path(str(self.weights)).exists()
         try:
             return load_teacher(self.name, self.weights, **options | ({"local_only": True} if on_hub else {})), None
         except ValueError as error:

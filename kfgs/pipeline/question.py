@@ -13,6 +13,7 @@ from torch import Tensor
 
 from .._card import short_repr
 from .._check import check_choice
+from .._files import as_path
 from ..cameras import undistort_labels
 from ..evaluation import (
     Encode,
@@ -155,7 +156,7 @@ def open_question(
         FileNotFoundError: if the scene or its truth is missing.
         ValueError: if protocol, options, split, truth or labels do not fit.
     """
-    given, folder = dict(options or {}), Path(scene)
+    given, folder = dict(options or {}), as_path(scene)
     name = get_protocol(protocol).name
     inputs = _edit_inputs(name, given)
     if labels is not None:
@@ -203,7 +204,7 @@ def _edit_inputs(name: str, given: dict[str, Any]) -> dict[str, Any]:
             f"set: expected {words} with {name} (what the splat was before, and what was edited), got none; add it"
         )
     inputs = {key: given.pop(key) for key in wanted}
-    if "before" in inputs and not Path(inputs["before"]).is_file():
+    if "before" in inputs and not as_path(inputs["before"]).is_file():
         raise FileNotFoundError(f"{inputs['before']}: no such file; expected the splat before the edit there")
     if "rgb" in inputs:
         inputs["rgb"] = parse_color(inputs["rgb"], "rgb")
@@ -211,7 +212,7 @@ def _edit_inputs(name: str, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _ask_teacher(protocol: Any, folder: Path, scene: Scene, truth: str | Path | None, split: str | None) -> Question:
-    maps = Path(truth) if truth is not None else folder / "features"
+    maps = as_path(truth) if truth is not None else folder / "features"
     if not maps.is_dir():
         raise FileNotFoundError(
             f"truth: expected the teacher's feature maps, got {maps}, which is no folder; name the folder that has them"
@@ -311,7 +312,7 @@ def _digest_scene(scene: Scene, folder: Path, protocol: Any, inputs: Mapping[str
         *(folder / "labels" / f"{scene.stem(i)}.png" for i in indices),
     ]
     there = [file for file in files if file.is_file()]
-    return digest_data([there, {key: Path(value) if key == "before" else value for key, value in inputs.items()}])
+    return digest_data([there, {key: as_path(value) if key == "before" else value for key, value in inputs.items()}])
 
 
 def colors_of(found: Any, name: str) -> Gaussians:

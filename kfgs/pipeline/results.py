@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .._card import short_repr
-from .._files import atomic_path, read_json, write_json
+from .._files import as_path, atomic_path, read_json, write_json
 from ..evaluation import Encode, LabelSet, Report, get_protocol
 from ..evaluation.encoders import TableEncoder
+from ..fields.store import describes_field
 from .evaluate import check_kind, digest_method, evaluate, is_maps, open_result
 from .question import Question
 from .side_by_side import check_comparable, check_several, rank, show_views, table_text, write_pictures
@@ -171,7 +172,7 @@ def _read_kept(path: Path) -> Kept:
 def _second_files(paths: Sequence[Path], words: Sequence[str]) -> dict[Path, Path]:
     """The file of each result that has one."""
     found: dict[Path, Path] = {}
-    own = [path for path in paths if is_maps(path) or any((p / "field.json").is_file() for p in (path, path / "field"))]
+    own = [path for path in paths if is_maps(path) or any(describes_field(one) for one in (path, path / "field"))]
     foreign = [path for path in paths if path not in own]
     for word in words:
         ends = [i for i, letter in enumerate(word) if letter == "=" and Path(word[:i]) in paths]
@@ -187,7 +188,7 @@ def _second_files(paths: Sequence[Path], words: Sequence[str]) -> dict[Path, Pat
             )
         if path in found:
             raise ValueError(f"with_file: expected one file for {path}, got {found[path]} and {file}; leave one out")
-        found[path] = Path(file)
+        found[path] = as_path(file)
     return found
 
 

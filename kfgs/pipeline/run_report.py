@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from .._files import atomic_path, bytes_in_words, seconds_in_words
+from .._files import atomic_path, bytes_in_words, current_file, seconds_in_words
 from ..fields import SemanticField
+from ..fields.store import DESCRIPTION, TENSORS
 from ..labels import LabelSet
 from ..scenes import Scene
 from ..viz import overlay_labels, save_picture
@@ -92,7 +93,7 @@ def write_run_report(
     preview = write_preview(result.folder / "preview.png", result.field, scene, config.split)
     training = write_training_pictures(result)
     field, info = result.field, result.field.info
-    size = sum(file.stat().st_size for file in result.field_path.iterdir())
+    size = sum(current_file(result.field_path, name).stat().st_size for name in (TENSORS, DESCRIPTION))
     teacher = info.get("teacher") or {}
     facts = {
         "scene": f"{scene.folder or 'in memory'}: {len(scene)} views, {len(info.get('views', ()))} of them used",

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,13 +19,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._files import atomic_folder, digest_file, digest_value, read_json, write_json
+from .._compiling import say_compiling
+from .._files import atomic_folder, digest_file, digest_value, locked, read_json, write_json
 from ..cameras import Camera
 from ..cameras.camera import NEAR
 from ..scenes import Scene
-from ..splat.engines.table import say_compiling
 
-STAGE_FILE = "stage.json"
+STAGE_FILE, LOCK = "stage.json", ".run.lock"
 STAGE_VERSION = 2
 """Part of every key: raised if the same inputs give another result in a new version, so that old stages are not reused."""
 
@@ -96,8 +96,6 @@ class Run:
         else:
             self.say(f"{name}: working")
             start = time.perf_counter()
-            for left_over in target.parent.glob(f".{target.name}.*"):  # of a process that was killed
-                shutil.rmtree(left_over, ignore_errors=True)
             with atomic_folder(target) as temporary, say_compiling(self.say):
                 earlier = make(temporary) or 0.0
                 seconds = time.perf_counter() - start + earlier
@@ -107,6 +105,14 @@ class Run:
             self.say(f"{name}: done in {seconds:.1f} s")
         self.stages.append(done)
         return done
+
+    def locked(self) -> AbstractContextManager[None]:
+        """Keep other processes from working in the folder.
+
+        Raises:
+            ValueError: if one works there already; the message says which. Nothing is written then.
+        """
+        return locked(self.folder, LOCK)
 
     def scratch(self, name: str, inputs: dict[str, Any]) -> Path:
         """A path for the unfinished work of a stage (checkpoints), kept until the stage is done."""

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save_file
 
 from .._arrays import read_safetensors
 from .._files import write_json
+from .._tensors import save_tensors
 from ..cameras.projection import project_points
 from ..fields import FieldConfig, FieldFit, GaussianParams
 from ..fields.config import check_extent
@@ -44,13 +44,18 @@ def training_device(device: str | torch.device = "auto") -> torch.device:
 
 
 def check_scene(scene: Scene, views: Sequence[int]) -> None:
-    """Raise a ValueError if some views cannot be trained on: a camera has a lens, or there are no points in their sight."""
+    """Raise a ValueError if some views cannot be trained on: a camera has a lens, or there are no different points in sight."""
     if scene.distorted:
         raise ValueError("scene: expected cameras without distortion, got a lens; pass scene.undistorted()")
     if len(scene.points) < 2:
         raise ValueError(
             f"scene: expected sparse points to start from, got {len(scene.points)}; a transforms.json needs a "
             "ply_file_path, or estimate the scene with `kfgs sfm`"
+        )
+    if bool((scene.points == scene.points[0]).all()):
+        raise ValueError(
+            f"scene: expected sparse points at different positions, got {len(scene.points)} at one; estimate the scene again "
+            "(`kfgs sfm`)"
         )
     if not any(bool(project_points(scene.cameras[i], scene.points)[2].any()) for i in views):
         raise ValueError(
@@ -83,8 +88,7 @@ def field_stage(
     def make(folder: Path) -> float:
         started = time.perf_counter()
         fit = train(scratch)
-        tensors = {key: value.cpu().contiguous() for key, value in fit.params.to_tensors().items()}
-        save_file(tensors, folder / "params.safetensors")
+        save_tensors(folder / "params.safetensors", fit.params.to_tensors())
         write_json(folder / "history.json", fit.history)
         return max(0.0, fit.history[-1]["seconds"] - (time.perf_counter() - started))  # before it was killed
 

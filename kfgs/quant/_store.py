@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from safetensors.torch import save_file
 from torch import Tensor
 
 from .._arrays import read_safetensors
 from .._files import atomic_path
+from .._tensors import save_tensors
 
 KIND, VERSION = "kfgs", "1"  # the metadata's key for the kind of file, and the version of all of them
 
@@ -17,8 +17,7 @@ KIND, VERSION = "kfgs", "1"  # the metadata's key for the kind of file, and the 
 def write_tensors(path: str | Path, tensors: Mapping[str, Tensor], *, kind: str) -> None:
     """Write tensors (copied to the CPU) and their kind."""
     with atomic_path(path) as temporary:
-        whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-        save_file(whole, temporary, metadata={KIND: kind, "version": VERSION})
+        save_tensors(temporary, tensors, {KIND: kind, "version": VERSION})
 
 
 def read_tensors(path: str | Path, *, kind: str) -> dict[str, Tensor]:

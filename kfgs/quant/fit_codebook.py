@@ -214,7 +214,7 @@ def _pool(maps: FeatureMaps, config: CodebookConfig, progress: Progress) -> Tens
     pool = torch.cat(parts)
     if len(pool) == 0:
         raise ValueError(
-            f"maps: expected features longer than {EPS:g}, got none in {len(maps)} maps; check the teacher"
+            f"maps: expected nonzero features (longer than {EPS:g}), got {len(maps)} maps without; check the teacher"
         )
     return pool
 
@@ -281,7 +281,9 @@ def _first_codewords(maps: FeatureMaps, config: CodebookConfig) -> Tensor:  # [K
         features = _samples(maps, i, config)
         if features.shape[0] > 0:
             return features[farthest_points(features, config.initial)]
-    raise ValueError(f"maps: expected features longer than {EPS:g}, got none in {len(maps)} maps; check the teacher")
+    raise ValueError(
+        f"maps: expected nonzero features (longer than {EPS:g}), got {len(maps)} maps without; check the teacher"
+    )
 
 
 def _samples(maps: FeatureMaps, i: int, config: CodebookConfig, dim: int | None = None) -> Tensor:  # [n, D]

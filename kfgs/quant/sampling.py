@@ -100,7 +100,7 @@ def farthest_points(
     rows = (row_norms(features) > EPS).nonzero()[:, 0]
     if rows.numel() == 0:
         raise ValueError(
-            f"features: expected a row longer than {EPS:g}, got none of {features.shape[0]}; check the teacher"
+            f"features: expected a nonzero row (longer than {EPS:g}), got {features.shape[0]} others; check the teacher"
         )
     unit = unit_rows(features[rows])
     if rows.numel() == 1:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from .._files import as_path
 from ..cameras.camera import Camera, Distortion
 from .colmap_files import CAMERA_MODELS
 from .colmap_model import ColmapImage, ColmapModel, read_model
@@ -78,7 +79,7 @@ def load_colmap(path: str | Path, images: str | Path) -> Scene:
         FileNotFoundError: if a folder is missing.
         SceneError: if the model is damaged, a lens has no exact form in kfgs, or no image has both a pose and a file.
     """
-    path, folder = Path(path), Path(images)
+    path, folder = as_path(path), as_path(images)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder; expected the images of {path} there")
     model = read_model(path)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._card import short_repr
+from .._files import as_path, current_file
 from .colmap_files import CAMERA_MODELS, OBSERVATIONS, TRACK, Table, open_table, require
 from .files import MAX_SIDE, SceneError
 
@@ -77,7 +78,7 @@ class ColmapModel:
 
 def has_model(path: str | Path) -> bool:
     """Whether a folder holds a COLMAP cameras or images file, whole or not."""
-    return any((Path(path) / f"{name}.{suffix}").is_file() for name in FILES[:2] for suffix in ("bin", "txt"))
+    return any((as_path(path) / f"{name}.{suffix}").is_file() for name in FILES[:2] for suffix in ("bin", "txt"))
 
 
 def read_model(path: str | Path) -> ColmapModel:
@@ -94,17 +95,19 @@ def read_model(path: str | Path) -> ColmapModel:
         FileNotFoundError: if there is no such folder.
         SceneError: if the model is incomplete or damaged. The message names the file and the place in it.
     """
-    folder = Path(path)
+    folder = as_path(path)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder; expected a COLMAP model there")
-    whole = [suffix for suffix in ("bin", "txt") if all((folder / f"{name}.{suffix}").is_file() for name in FILES)]
+    whole = [
+        suffix for suffix in ("bin", "txt") if all(current_file(folder, f"{name}.{suffix}").is_file() for name in FILES)
+    ]
     if not whole:
         present = sorted(file.name for file in folder.iterdir() if file.stem in FILES)
         raise SceneError(
             f"{folder}: expected a COLMAP model (cameras, images and points3D, all as .bin or all as .txt), got "
             f"{', '.join(present) or 'none of these files'}; copy the missing files or run COLMAP (`kfgs sfm`)"
         )
-    files = {name: folder / f"{name}.{whole[0]}" for name in (*FILES, "rigs", "frames")}
+    files = {name: current_file(folder, f"{name}.{whole[0]}") for name in (*FILES, "rigs", "frames")}
     tables = {name: open_table(file) for name, file in files.items() if file.is_file()}
     cameras = _read_cameras(tables["cameras"])
     images = _read_images(tables["images"], cameras)

@@ -16,7 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from .._check import one_line
-from .._files import read_json
+from .._files import as_path, read_json
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
 ORIENTATION = 0x0112  # EXIF's tag
@@ -73,7 +73,7 @@ def list_images(folder: str | Path) -> list[str]:
 
     Hidden files and folders are left out; links to folders are not followed.
     """
-    root = Path(folder)
+    root = as_path(folder)
     names: list[str] = []
     for here, folders, files in os.walk(root):
         folders[:] = [name for name in folders if not name.startswith(".")]
@@ -122,7 +122,7 @@ def open_picture(
         FileNotFoundError: if there is no such file.
         SceneError: if it cannot be decoded, or states more than `PIXELS` pixels, or more than `PACKED` for each of its bytes.
     """
-    path = Path(path)
+    path = as_path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected {expected} there")
     try:

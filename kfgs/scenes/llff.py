@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from .._arrays import read_array
+from .._files import as_path
 from .files import SceneError, list_images, natural_key
 from .posed import PosedPicture, picture_size, scene_of_poses
 from .scene import Scene
@@ -38,10 +39,10 @@ def load_llff(folder: str | Path, images: str | Path | None = None) -> Scene:
         FileNotFoundError: if a file or folder is missing.
         SceneError: if the poses are damaged, or differ in number or shape from the pictures.
     """
-    folder = Path(folder)
+    folder = as_path(folder)
     path = folder / POSES
     rows = _read(path)
-    source = Path(images) if images is not None else _pictures(folder)
+    source = as_path(images) if images is not None else _pictures(folder)
     names = list_images(source)
     if len(names) != len(rows):
         raise SceneError(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from .._check import check_choice
+from .._files import as_path
 from .colmap import load_colmap
 from .colmap_model import has_model
 from .files import SceneError, natural_key, some
@@ -70,12 +71,12 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
         SceneError: if there is no scene, or it cannot be used.
         ValueError: if `split` is unknown.
     """
-    path = Path(path)
+    path = as_path(path)
     check_choice("split", split, ("auto", "file", *RULES))
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such folder; expected a scene there")
     root = path if path.is_dir() else path.parent
-    if images is not None and not Path(images).is_dir() and (root / images).is_dir():
+    if images is not None and not as_path(images).is_dir() and (root / images).is_dir():
         images = root / images
     scene = replace(_load_views(path, root, images), folder=root)
     return _with_split(scene, root, split)

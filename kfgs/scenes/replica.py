@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .._files import as_path
 from .files import MAX_SIDE, SceneError, read_scene_json
 from .posed import Matrix, numbered_pictures, picture_size, points_from_depth, scene_of_poses
 from .scene import Scene
@@ -34,7 +35,7 @@ def load_nice_slam(folder: str | Path) -> Scene:
         FileNotFoundError: if a file is missing.
         SceneError: if one is damaged, or a picture has no pose.
     """
-    folder = Path(folder)
+    folder = as_path(folder)
     K, size, scale = _cam_params(folder)
     views, notes = numbered_pictures(folder / "results", r"frame(\d+)\.(?:jpg|jpeg|png)", folder / "traj.txt")
     _check_size(views[0].path, size, "cam_params.json says")
@@ -57,7 +58,7 @@ def load_semantic_nerf(folder: str | Path) -> Scene:
         FileNotFoundError: if a file is missing.
         SceneError: if one is damaged, or a picture has no pose.
     """
-    folder = Path(folder)
+    folder = as_path(folder)
     views, notes = numbered_pictures(folder / "rgb", r"rgb_(\d+)\.(?:png|jpg)", folder / "traj_w_c.txt")
     size = width, height = picture_size(views[0].path)
     focal = width / 2 / math.tan(_FIELD_OF_VIEW / 2)

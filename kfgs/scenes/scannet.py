@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._files import as_path
 from ..formats.ply import points_from_columns, read_ply
 from .files import SceneError, file_stem, list_images, some
 from .posed import Matrix, PosedPicture, picture_size, points_from_depth, read_numbers, scene_of_poses
@@ -36,7 +37,7 @@ def load_scannet(folder: str | Path) -> Scene:
         FileNotFoundError: if a file is missing.
         SceneError: if one is damaged, or no view has a pose.
     """
-    folder = Path(folder)
+    folder = as_path(folder)
     names = list_images(folder / "color")
     with_pose = [name for name in names if (folder / "pose" / f"{file_stem(name)}.txt").is_file()]
     if not with_pose:

@@ -12,8 +12,9 @@ from typing import Any, Literal
 from tqdm import tqdm
 
 from .._check import check_choice, check_range
-from .._files import atomic_folder
+from .._files import as_path, atomic_folder, check_output
 from .colmap import SUPPORTED_MODELS
+from .colmap_model import has_model
 from .files import SceneError, list_images, some
 from .pycolmap_import import quiet_pycolmap, scene_errors
 
@@ -78,14 +79,20 @@ class SfmReport:
 
 
 def run_sfm(
-    images: str | Path, out: str | Path, *, config: SfmConfig | None = None, progress: bool = False
+    images: str | Path,
+    out: str | Path,
+    *,
+    config: SfmConfig | None = None,
+    replace: bool = False,
+    progress: bool = False,
 ) -> SfmReport:
     """Estimate cameras and a sparse cloud, and write them to `out/sparse/0`.
 
     Args:
         images: folder of images (with subfolders); other files are ignored.
-        out: scene folder; `out/sparse/0` appears complete or not at all, and replaces an older one.
+        out: scene folder; `out/sparse/0` appears complete or not at all.
         config: options; the default suits up to a few hundred photos of one camera.
+        replace: replace the files of a model that is in `out/sparse/0` already; other files there stay.
         progress: show a bar: images described, pairs compared, images placed.
 
     Returns:
@@ -93,6 +100,8 @@ def run_sfm(
 
     Raises:
         FileNotFoundError: if there is no such folder.
+        FileExistsError: if `out/sparse/0` holds a model, and `replace` is False.
+        ValueError: if `out` is a file, or the folder of the images.
         SceneError: if there are fewer than 3 images, pycolmap fails, or the largest model places fewer than
             `min_registered` of the images (the rest is lost, or COLMAP split the scene into unconnected models).
         ImportError: if pycolmap is not installed.
@@ -100,9 +109,16 @@ def run_sfm(
     Note:
         Every random choice is seeded; several threads may still differ in the last digits.
     """
-    images, out, config = Path(images), Path(out), config or SfmConfig()
+    images, out, config = as_path(images), as_path(out), config or SfmConfig()
     if not images.is_dir():
         raise FileNotFoundError(f"{images}: no such folder; expected the images there")
+    check_output("out", out, "a folder", other=[images])
+    model = out / "sparse" / "0"
+    if has_model(model) and not replace:
+        raise FileExistsError(
+            f"out: expected a scene folder without a model, got one in {model}; name another folder, or pass replace=True "
+            "(--replace) to give up that model"
+        )
     names = list_images(images)
     if len(names) < 3:
         raise SceneError(f"{images}: expected at least 3 images (PNG, JPEG, TIFF, WebP), got {len(names)}; add views")
@@ -120,7 +136,7 @@ def run_sfm(
         models = sorted(run.models, key=lambda model: -model.num_reg_images())
         sizes = tuple(model.num_reg_images() for model in models)
         _require_one_model(images, sizes, names, config)
-        with atomic_folder(out / "sparse" / "0") as folder:
+        with atomic_folder(model) as folder:
             models[0].write(str(folder))
         placed = {image.name for image in models[0].images.values() if image.has_pose}
         return SfmReport(

@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._files import as_path
 from ..cameras.camera import Camera, Distortion
 from ..formats.ply import points_from_columns, read_ply
 from .files import (
@@ -78,10 +79,10 @@ def load_transforms(path: str | Path, images: str | Path | None = None) -> Scene
         SceneError: if it is damaged, a number is missing or implausible, a lens has no exact form in kfgs, or no frame
             has a file.
     """
-    files = _files(Path(path))
+    files = _files(as_path(path))
     readers = {}
     for split, file in files.items():
-        reader = _Reader(file, file.parent, None if images is None else Path(images))
+        reader = _Reader(file, file.parent, None if images is None else as_path(images))
         readers[split] = (reader, _read_frames(reader))
     views = [(camera, image, split) for split, (reader, _) in readers.items() for camera, image in reader.views]
     missing = [name for reader, _ in readers.values() for name in reader.missing]

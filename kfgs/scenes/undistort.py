@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .._files import atomic_folder
+from .._files import as_path, atomic_folder, check_output
 from .colmap_model import read_model
 from .files import SceneError
 from .pycolmap_import import quiet_pycolmap, scene_errors
@@ -28,9 +28,10 @@ def undistort_scene(images: str | Path, model: str | Path, out: str | Path) -> P
         FileNotFoundError: if a folder is missing.
         SceneError: if `out` holds files, the model is damaged, or pycolmap fails on it or on the images.
     """
-    images, model, out = Path(images), Path(model), Path(out)
+    images, model, out = as_path(images), as_path(model), as_path(out)
     if not images.is_dir():
         raise FileNotFoundError(f"{images}: no such folder; expected the images of {model} there")
+    check_output("out", out, "a folder", apart=[images])
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise SceneError(
             f"{out}: expected a new or empty folder for the undistorted scene, got one in use; choose another"

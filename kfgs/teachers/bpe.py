@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .._files import parse_json
+from .._files import as_path, parse_json
 
 MERGES = 48_894  # CLIP uses so many of the 262,144 in OpenAI's file
 _END = "</w>"
@@ -147,7 +147,7 @@ def load_tokenizer(path: str | Path | None = None) -> Tokenizer:
     """
     if path is None:
         return Tokenizer(_shipped_merges())
-    path = Path(path)
+    path = as_path(path)
     if path.is_dir():
         return _from_folder(path)
     return Tokenizer(_parse(_read_text(path).split("\n"), str(path)))

@@ -11,7 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from .._check import one_line
-from .._files import digest_file
+from .._files import as_path, digest_file
 from .torch_files import Placeholder, TorchFileError, check_plain, load_torch_file
 
 _EXPECTED = "expected a checkpoint (.ckpt, .pt, .pth or .safetensors)"
@@ -34,7 +34,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Tensor]:
         ValueError: if it is not a checkpoint, is damaged, or names something dangerous. The message is one line that says
             what the file is.
     """
-    path = Path(path)
+    path = as_path(path)
     with _readable(path):
         with path.open("rb") as file:
             head = file.read(9)
@@ -48,7 +48,7 @@ def weights_digest(path: str | Path) -> str:
         FileNotFoundError: if there is no such file.
         ValueError: if it is a folder, or cannot be read.
     """
-    path = Path(path)
+    path = as_path(path)
     with _readable(path):
         return digest_file(path)
 

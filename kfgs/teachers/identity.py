@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from .._files import digest_file, digest_value
+from .._files import as_path, digest_file, digest_value
 
 _DIGITS = 16  # of a digest of code: 64 bits
 _PLAIN = (bool, int, float, complex, str, bytes, type(None), type(Ellipsis))
@@ -47,7 +47,7 @@ def weights_identity(weights: str | Path | None) -> str | None:
     """SHA-256 of a file, or of the files in a folder (without hidden ones); any other text as it is."""
     if weights is None or weights == "":
         return None
-    path = Path(weights).expanduser()
+    path = as_path(weights)
     if path.is_file():
         return digest_file(path)
     if path.is_dir():

@@ -13,6 +13,7 @@ from kornia.models.sam import Sam, SamConfig
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
+from .._files import as_path
 from .checkpoint import read_checkpoint, weights_digest
 from .protocol import check_picture
 from .transformers_teacher import resize_picture
@@ -36,7 +37,7 @@ def load_sam(source: str | Path) -> SamTeacher:
         FileNotFoundError: if there is no such file.
         ValueError: if it is damaged, or no checkpoint of SAM; the message names missing weights.
     """
-    path = Path(source).expanduser()
+    path = as_path(source)
     state = read_checkpoint(path)
     encoder_state = {
         name.removeprefix(_PREFIX): tensor.float() if tensor.is_floating_point() else tensor

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from .._card import error_line
-from .._files import digest_file, digest_value, read_json
+from .._files import as_path, digest_file, digest_value, read_json
 from .transformers_table import TRANSFORMERS
 
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
@@ -70,7 +70,7 @@ def find_class(transformers: Any, name: str, kind: str) -> Any:
 
 def find_source(kind: str, source: str | Path) -> Path | str:
     """The path if it exists, else `source` as a hub id; a FileNotFoundError if it cannot be one."""
-    path = Path(source).expanduser()
+    path = as_path(source)
     if path.exists():
         return path
     if isinstance(source, str) and _HUB_ID.fullmatch(source):

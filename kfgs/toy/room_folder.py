@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from .._check import check_size, check_whole
-from .._files import atomic_folder, read_json, write_json
+from .._files import as_path, atomic_folder, check_output, read_json, write_json
 from ..cameras.camera import Camera
 from .colmap import write_model
 from .geometry import Array, Solid, normals, sample_surface, visible
@@ -109,11 +109,12 @@ def make_toy_room(path: str | Path, config: ToyConfig | None = None, *, progress
     Raises:
         FileExistsError: if `path` holds anything else.
     """
-    path, config = Path(path), config or ToyConfig()
+    path, config = as_path(path), config or ToyConfig()
     about = {"version": VERSION, "config": json.loads(json.dumps(asdict(config)))}
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         _check_same(path, about)
         return path
+    check_output("path", path, "a folder")
     solids = build_room(config.seed)
     noise = Noise(np.random.default_rng([config.seed, 3]))
     cameras, testing = walk_cameras(config.train_views, config.test_views, config.size)

@@ -13,7 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from .._check import check_range
-from .._files import atomic_path
+from .._files import as_path, atomic_path
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from .film_frames import Show, as_shows, draw_frame, legend_under
@@ -112,7 +112,7 @@ def _write(path: str | Path, frames: Iterable[Tensor | Array], fps: float, strip
 
 def check_target(path: str | Path, fps: float) -> Path:
     """Check the target before the first frame is drawn."""
-    target = Path(path)
+    target = as_path(path)
     suffix = target.suffix.lower()
     if suffix not in SUFFIXES:
         raise ValueError(f"path: expected a name that ends in .gif or .mp4, got {target.name!r}; rename it")

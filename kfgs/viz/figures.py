@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._files import atomic_path
+from .._files import as_path, atomic_path
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -65,8 +65,8 @@ def finish(axes: Axes, path: str | Path | None) -> Figure:
 
 def save_figure(figure: Figure, path: str | Path) -> None:
     """Write a PNG file, whole or not at all. Raises a ValueError if the name does not end in .png."""
-    if Path(path).suffix.lower() != ".png":
-        raise ValueError(f"path: expected a name that ends in .png, got {Path(path).name!r}; rename it")
+    if as_path(path).suffix.lower() != ".png":
+        raise ValueError(f"path: expected a name that ends in .png, got {as_path(path).name!r}; rename it")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", bbox_inches="tight")  # otherwise labels beside square pictures are cut
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from .._check import as_array, check_range, check_shapes
-from .._files import atomic_path
+from .._files import as_path, atomic_path
 from .palette import palette
 
 Array = np.ndarray[Any, Any]
@@ -144,7 +144,7 @@ def save_picture(
     Raises:
         ValueError: if the name does not end in .png, or the array is no picture.
     """
-    target, values = Path(path), as_array(picture, "picture")
+    target, values = as_path(path), as_array(picture, "picture")
     if target.suffix.lower() != ".png":
         raise ValueError(f"path: expected a name that ends in .png, got {target.name!r}; rename it")
     if values.dtype != np.uint8 and not np.issubdtype(values.dtype, np.floating):

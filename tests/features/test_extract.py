@@ -201,8 +201,10 @@ def test_killed_in_the_middle_it_goes_on_and_redoes_no_picture(tmp_path, monkeyp
     assert child.wait() == -signal.SIGKILL
     assert sorted(contents(folder)) == ["0.npy", "1.npy"]
     assert set(read_manifest(folder).maps) == {"0", "1"}
-    (folder / ".2.npy.half.npy").write_bytes(b"half")  # as if it had died while writing
-    (folder / ".features.json.half.json").write_bytes(b"half")
+    left = folder / ".kfgs-unfinished" / "new-left"  # as if it had died while writing
+    left.mkdir(parents=True)
+    (left / ".kfgs-lock").touch()
+    (left / "2.npy").write_bytes(b"half")
     monkeypatch.setattr(sys, "argv", ["", str(tmp_path), str(log), "quick", "maps"])
     exec(CHILD, {})
     assert len(log.read_text().split()) == 3 + 3  # the third was in hand

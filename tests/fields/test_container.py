@@ -138,7 +138,6 @@ def test_saving_replaces_an_older_file_and_nothing_else(tmp_path):
 UNREADABLE = {
     "gaussians.opacities": ({"opacities": torch.full((40,), 1.5)}, "0 to 1"),
     "gaussians.scales": ({"scales": torch.full((40, 3), -0.1)}, "-0.1"),
-    "gaussians.labels": ({"labels": torch.arange(40).to(torch.uint16)}, "int64"),
 }
 
 

@@ -541,6 +541,10 @@ def test_wrong_counts_and_shapes_are_named():
 def test_maps_that_say_nothing_and_views_that_show_nothing_are_named():
     with pytest.raises(ValueError, match=tells("maps:", "zero", "got 4")):
         uplift_maps(cloud(), cameras(), [torch.zeros(5, 6, 3)] * 4)
+    with pytest.raises(ValueError, match=tells("maps:", "longer than 1e-08", "got 4")):
+        uplift_maps(cloud(), cameras(), [torch.full((5, 6, 3), 1e-37)] * 4)
+    with pytest.raises(ValueError, match=tells("maps[0]:", "squares", "float32", "got 1e+37", "divide")):
+        uplift_maps(cloud(), cameras(), [torch.full((5, 6, 3), 1e37)] * 4)
     with pytest.raises(ValueError, match=tells("cameras:", "show", "got none")):
         uplift_maps(balls([[0.0, 0.0, -2.0]]), ahead(), [torch.ones(8, 8, 2)])
 

@@ -79,6 +79,16 @@ def test_other_pages_and_other_names_are_refused(server):
     assert ask(server, secret(server), Host=f"localhost:{port}")[0] == 200
 
 
+@pytest.mark.parametrize(
+    "host", [b"[", b"]", b"[::1", b"[zz]", b"a:b:c", b"\xff\xe2\x84\x80", b"\x00", b"", b"@", b"%"]
+)
+def test_a_malformed_host_is_refused_and_prints_nothing(server, capfd, host):
+    with socket.create_connection(("127.0.0.1", urlsplit(server.url).port)) as connection:
+        connection.sendall(f"GET {secret(server)} HTTP/1.0\r\n".encode() + b"Host: " + host + b"\r\n\r\n")
+        assert connection.makefile("rb").readline().split()[1] == b"403"
+    assert capfd.readouterr().err == ""
+
+
 def test_a_call_and_its_answer(server):
     body = pack_message({"name": "ask", "args": {"words": "chair"}}, b"abc")
     status, content, _ = ask(server, secret(server) + "call", "POST", body)

@@ -74,8 +74,10 @@ def test_a_damaged_stage_is_named(tmp_path):
 
 
 def test_what_a_killed_process_left_is_swept_and_its_time_is_counted(tmp_path):
-    name = Run(tmp_path / "other").stage("a", {}, lambda folder: 0.0).folder.name
-    (tmp_path / "stages" / f".{name}.left").mkdir(parents=True)
+    left = tmp_path / "stages" / ".kfgs-unfinished" / "new-left"
+    left.mkdir(parents=True)
+    (left / ".kfgs-lock").touch()
+    (left / "half").write_text("half")
     stage = Run(tmp_path).stage("a", {}, lambda folder: 1000.0)
     assert [path.name for path in (tmp_path / "stages").iterdir()] == [stage.folder.name]
     assert stage.seconds >= 1000

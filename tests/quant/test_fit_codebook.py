@@ -245,6 +245,10 @@ def test_bad_maps():
     broken[1, 2, 3] = float("nan")
     with pytest.raises(ValueError, match=tells("maps[1]:", "got NaN")):
         fit_codebook([torch.ones(2, 3, 4), broken])
+    with pytest.raises(ValueError, match=tells("maps[0]:", "squares", "float32", "got 1e+37", "divide")):
+        fit_codebook([torch.full((2, 3, 4), 1e37)])
+    with pytest.raises(ValueError, match=tells("maps:", "longer than 1e-08", "got 2 maps")):
+        fit_codebook([torch.full((2, 3, 4), 1e-37)] * 2)
 
 
 @pytest.mark.parametrize(

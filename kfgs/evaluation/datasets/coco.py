@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..._files import read_json
+from ..._files import as_path, read_json
 from ...scenes.files import file_stem
 from ..class_lists import VOID_NAMES, name_key
 from ..truth import LabelTruth, MaskAndBoxes, MaskTruth
@@ -35,7 +35,7 @@ def load_coco_masks(path: str | Path) -> MaskTruth:
         FileNotFoundError: if there is no such file.
         ValueError: if it is damaged; the message names the annotation.
     """
-    path = Path(path)
+    path = as_path(path)
     names, pictures = _read(path)
     void = [category for category in names if _is_void(names[category])]
     shown = {s: p for s, p in pictures.items() if any(one.get("category_id") not in void for _, one in p.objects)}
@@ -51,7 +51,7 @@ def load_coco_labels(path: str | Path) -> LabelTruth:
         FileNotFoundError: if there is no such file.
         ValueError: if it is damaged; the message names the annotation.
     """
-    path = Path(path)
+    path = as_path(path)
     names, pictures = _read(path)
     asked = [category for category in names if not _is_void(names[category])]
     index = {category: asked.index(category) if category in asked else -1 for category in names}

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ..._files import as_path
 from ..truth import LabelTruth, MaskTruth, PointTruth
 from .coco import load_coco_masks
 from .label_folder import load_labels
@@ -30,7 +31,7 @@ def find_labels(path: str | Path) -> LabelTruth:
         FileNotFoundError: if there are none.
         ValueError: if a file is damaged.
     """
-    path = Path(path)
+    path = as_path(path)
     places: list[tuple[str, Reader]] = [
         ("labels_scored/*.png", lambda at: load_labels(at / "labels_scored")),
         ("labels/*.png", lambda at: load_labels(at / "labels")),
@@ -48,7 +49,7 @@ def find_masks(path: str | Path) -> MaskTruth:
         FileNotFoundError: if there are none.
         ValueError: if a file is damaged.
     """
-    path = Path(path)
+    path = as_path(path)
     places: list[tuple[str, Reader]] = [
         ("segmentations/classes.txt", load_3dovs),
         ("classes.txt", load_3dovs),
@@ -73,7 +74,7 @@ def find_points(path: str | Path, benchmark: str | None = None) -> PointTruth:
         FileNotFoundError: if there are none.
         ValueError: if a file is damaged, or the classes of SceneSplat's labels are unknown.
     """
-    path = Path(path)
+    path = as_path(path)
     places: list[tuple[str, Reader]] = [
         ("habitat/mesh_semantic.ply", load_replica_points),
         ("mesh_semantic.ply", load_replica_points),

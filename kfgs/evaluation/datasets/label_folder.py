@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from ..._files import read_json
+from ..._files import as_path, read_json
 from ...scenes.files import file_stem, list_images, some
 from ..class_lists import VOID_NAMES, name_key
 from ..truth import LabelTruth
@@ -52,7 +52,7 @@ def load_labels(path: str | Path, table: str | Path | None = None, void: int = 2
         >>> load_labels(folder).maps["rgb_1"].tolist()
         [[0, 1], [-1, 0]]
     """
-    path = Path(path)
+    path = as_path(path)
     if path.suffix == ".json" and path.is_file():
         return load_coco_labels(path)
     if not path.is_dir():
@@ -62,7 +62,7 @@ def load_labels(path: str | Path, table: str | Path | None = None, void: int = 2
         raise FileNotFoundError(
             f"{path}: expected label pictures (.png) there, found none; JPEGs would change the labels"
         )
-    source = _find_table(path) if table is None else Path(table)
+    source = _find_table(path) if table is None else as_path(table)
     named = read_table(source)
     names = tuple(name for name in named if name_key(name) not in VOID_NAMES)
     index = {entry: names.index(name) if name in names else -1 for name, entry in named.items()}
@@ -92,7 +92,7 @@ def read_table(path: str | Path) -> dict[str, Entry]:
         FileNotFoundError: if there is no such file.
         ValueError: if it is no table, mixes ids and colours, or has a name or an entry twice.
     """
-    path = Path(path)
+    path = as_path(path)
     pairs = _csv_pairs(path) if path.suffix.lower() == ".csv" else _json_pairs(path)
     found: dict[str, Entry] = {}
     for name, value in pairs:

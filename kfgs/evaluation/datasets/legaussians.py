@@ -9,6 +9,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+from ..._files import as_path
 from ...scenes.files import natural_key, some
 from ..class_lists import load_classes
 from ..truth import MaskAndBoxes, MaskTruth
@@ -32,7 +33,7 @@ def load_legaussians(path: str | Path, scene: str | None = None) -> MaskTruth:
         FileNotFoundError: if there are no masks, or a view of the authors has none.
         ValueError: if a mask has an unknown text, or a file is damaged.
     """
-    path = Path(path)
+    path = as_path(path)
     base = path.parent if path.name == "segmentations" else path
     base = base / scene if scene and base.name != scene else base
     folder = find_folder([base / "segmentations", base], "*/*.png", "masks of LEGaussians")

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from ..._files import read_json
+from ..._files import as_path, read_json
 from ...scenes.files import natural_key, some
 from ...scenes.posed import picture_size
 from ..class_lists import load_classes
@@ -40,7 +40,7 @@ def load_lerf_ovs(path: str | Path, scene: str | None = None) -> MaskTruth:
         FileNotFoundError: if there are no labels, or a published picture of one of the four scenes has none.
         ValueError: if a file is damaged; the message names the file and the object.
     """
-    path = Path(path)
+    path = as_path(path)
     root = path / scene if scene else path
     places = [root.parent / "label" / root.name, root / "label", root]  # a scene may have other JSONs: transforms.json
     folder = (

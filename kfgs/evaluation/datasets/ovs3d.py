@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+from ..._files import as_path
 from ...scenes.files import file_stem, list_images, natural_key, some
 from ..truth import MaskAndBoxes, MaskTruth
 from .files import ReadWhenAsked, check_names, read_mask
@@ -30,7 +31,7 @@ def load_3dovs(path: str | Path) -> MaskTruth:
         FileNotFoundError: if there is no `classes.txt`.
         ValueError: if a mask's name is not in the list, a view has no picture, or a file is damaged.
     """
-    path = Path(path)
+    path = as_path(path)
     folder = path if path.name == "segmentations" else path / "segmentations"
     texts = read_texts(folder)
     views = sorted((f for f in folder.iterdir() if f.is_dir()), key=lambda f: natural_key(f.name))

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..._files import read_json
+from ..._files import as_path, read_json
 from ...formats.ply import points_from_columns
 from ...formats.ply_mesh import read_mesh
 from ...scenes.files import natural_key, some
@@ -37,7 +37,7 @@ def load_replica_points(path: str | Path) -> PointTruth:
         FileNotFoundError: if one of the two files is missing.
         ValueError: if one is damaged, or a face has no object.
     """
-    path = Path(path)
+    path = as_path(path)
     places = [path] if path.suffix == ".ply" else [path / "habitat" / "mesh_semantic.ply", path / "mesh_semantic.ply"]
     file = next((place for place in places if place.is_file()), None)
     if file is None:
@@ -71,7 +71,7 @@ def load_semantic_nerf_labels(path: str | Path, info: str | Path | None = None) 
         FileNotFoundError: if there are no pictures, or no `info_semantic.json`.
         ValueError: if one is damaged, or no picture shows a named class.
     """
-    path = Path(path)
+    path = as_path(path)
     folder = path / "semantic_class"
     files = sorted(folder.glob("semantic_class_*.png"), key=lambda file: natural_key(file.name))
     if not files:
@@ -79,7 +79,7 @@ def load_semantic_nerf_labels(path: str | Path, info: str | Path | None = None) 
             f"{folder}: expected semantic_class_0.png and so on, found none; give the sequence's folder"
         )
     above = [path, *list(path.resolve().parents)[:2]]
-    places = [Path(info)] if info is not None else [f / name for f in above for name in (INFO, f"habitat/{INFO}")]
+    places = [as_path(info)] if info is not None else [f / name for f in above for name in (INFO, f"habitat/{INFO}")]
     found = next((place for place in places if place.is_file()), None)
     if found is None:
         raise FileNotFoundError(

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..._files import read_json
+from ..._files import as_path, read_json
 from ...formats.ply import points_from_columns, read_ply
 from ...scenes.files import some
 from ..class_lists import load_classes
@@ -33,7 +33,7 @@ def load_scannet_points(path: str | Path) -> PointTruth:
         FileNotFoundError: if there is no such mesh.
         ValueError: if it is damaged, or has no ids of NYU40.
     """
-    file = _find(Path(path))
+    file = _find(as_path(path))
     columns = read_ply(file)
     if "label" not in columns:
         raise ValueError(

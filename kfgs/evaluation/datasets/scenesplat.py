@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ..._arrays import read_array
 from ..._check import check_choice
+from ..._files import as_path
 from ..class_lists import load_classes
 from ..truth import PointTruth
 
@@ -44,7 +45,7 @@ def load_scenesplat_points(path: str | Path, benchmark: str | None = None) -> Po
         FileNotFoundError: if a file is missing.
         ValueError: if the benchmark is unknown or cannot be told, or a file is damaged or does not fit; the message names it.
     """
-    path = Path(path)
+    path = as_path(path)
     if benchmark is not None:
         check_choice("benchmark", benchmark, tuple(SEGMENTS))
     file = path if path.suffix == ".npy" else _find(path, benchmark)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ..._arrays import read_arrays
-from ..._files import read_json
+from ..._files import as_path, read_json
 from ..truth import PointTruth
 
 
@@ -22,7 +22,7 @@ def load_surface_points(path: str | Path) -> PointTruth:
         FileNotFoundError: if one of the two is missing.
         ValueError: if one is damaged.
     """
-    file = Path(path) / "surface.npz"
+    file = as_path(path) / "surface.npz"
     expected, advice = "the arrays 'points' and 'labels', points of all surfaces", "make the room again"
     arrays = read_arrays(file, expected, advice)
     names = read_json(file.with_name("classes.json"))

@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from ..._files import as_path
 from ...formats import read_splats
 from .decoders import perceptron_from_state
 from .files import find_numbered, read_state
@@ -39,7 +40,7 @@ def load_feature3dgs(run: str | Path, step: int | None = None, *, decoder: str |
         FileNotFoundError: if a file is missing.
         ValueError: if the PLY has no features, or a file is damaged or does not fit.
     """
-    run = Path(run)
+    run = as_path(run)
     what = "a point cloud of Feature 3DGS"
     ply = run if run.is_file() else find_numbered(run, "point_cloud/iteration_*/point_cloud.ply", step, what)
     gaussians = read_splats(ply).gaussians
@@ -49,7 +50,7 @@ def load_feature3dgs(run: str | Path, step: int | None = None, *, decoder: str |
             "features?"
         )
     channels = int(gaussians.features.shape[1])
-    file = Path(decoder) if decoder is not None else None
+    file = as_path(decoder) if decoder is not None else None
     if file is None and not run.is_file():
         beside = run / f"decoder_chkpnt{ply.parent.name.removeprefix('iteration_')}.pth"
         file = beside if beside.is_file() else None

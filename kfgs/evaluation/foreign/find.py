@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..._files import as_path
 from .feature3dgs import load_feature3dgs
 from .langsplat import has_levels, level_runs, load_langsplat, load_langsplat_v2, load_occam
 from .legaussians import load_legaussians_field
@@ -30,7 +31,7 @@ def load_foreign(path: str | Path, with_file: str | Path | None = None) -> Splat
         FileNotFoundError: if there is nothing, or a second file is needed and missing.
         ValueError: if no program is recognised, or a file is damaged.
     """
-    path = Path(path)
+    path = as_path(path)
     run = path if path.exists() else level_runs(path)[0]
     if not run.exists():
         raise FileNotFoundError(f"{path}: no such file or folder; expected a result: {LAYOUTS}")

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from ..._check import check_whole
+from ..._files import as_path
 from .decoders import CodeSum, perceptron_from_state
 from .files import check_rows, find_numbered, read_capture, read_state
 from .splatted import Level, SplattedMethod
@@ -48,7 +49,7 @@ def load_langsplat(runs: Runs, autoencoder: str | Path, step: int | None = None)
         FileNotFoundError: if a file is missing.
         ValueError: if one is damaged, or of another program.
     """
-    file, levels = Path(autoencoder), []
+    file, levels = as_path(autoencoder), []
     state = read_state(file, "the autoencoder of LangSplat")
     for path in _checkpoints(runs, step, "chkpnt*.pth", "a checkpoint of LangSplat"):
         found = read_capture(path, {"language features": 7})
@@ -122,7 +123,7 @@ def load_occam(run: str | Path, step: int | None = None) -> SplattedMethod:
         FileNotFoundError: if there is none.
         ValueError: if one is damaged, or of another program.
     """
-    run = Path(run)
+    run = as_path(run)
     if run.is_file():
         paths = [run]
     else:
@@ -154,10 +155,10 @@ def has_levels(base: Path) -> bool:
 def _checkpoints(runs: Runs, step: int | None, pattern: str, what: str) -> list[Path]:
     """The checkpoint of each level."""
     if isinstance(runs, str | Path):
-        base = Path(runs)
+        base = as_path(runs)
         folders = [base] if base.exists() and not has_levels(base) else level_runs(base)
     else:
-        folders = [Path(run) for run in runs]
+        folders = [as_path(run) for run in runs]
     if not folders:
         raise ValueError("runs: expected the folders of one to three runs, got none; give them in the order s, m, l")
     return [path if path.is_file() else find_numbered(path, pattern, step, what) for path in folders]

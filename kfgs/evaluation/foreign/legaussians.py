@@ -12,6 +12,7 @@ from pathlib import Path
 
 import torch
 
+from ..._files import as_path
 from ...formats import read_splats
 from ...gaussians import Gaussians
 from .decoders import CodeMixture, perceptron_from_state
@@ -45,14 +46,14 @@ def load_legaussians_field(
         FileNotFoundError: if a file is missing.
         ValueError: if one is damaged, of another program, or does not fit.
     """
-    run = Path(run)
+    run = as_path(run)
     decoder = find_numbered(run, "index_decoder_chkpnt*.pth", step, "the index decoder of LEGaussians")
     at = int(decoder.stem.removeprefix("index_decoder_chkpnt"))
     gaussians = _read_gaussians(run, at)
     assert gaussians.features is not None
     state = read_state(decoder, "the index decoder of LEGaussians")
     network = perceptron_from_state(decoder, state, r"conv(\d+)", int(gaussians.features.shape[1]))
-    book = read_state(Path(codebook), "the codebook of LEGaussians").get("embedding.weight")
+    book = read_state(as_path(codebook), "the codebook of LEGaussians").get("embedding.weight")
     if book is None or book.ndim != 2 or len(book) != network.outputs or book.shape[1] < channels:
         got = "none" if book is None else str(list(book.shape))
         raise ValueError(

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ..._arrays import read_array
+from ..._files import as_path
 from ...formats import read_splats
 from .files import plain_tensor, read_torch
 from .splatted import Level, SplattedMethod
@@ -38,11 +39,11 @@ def load_splat_features(
         FileNotFoundError: if a file is missing.
         ValueError: if there are no features, or not one row per Gaussian.
     """
-    path = Path(splats)
+    path = as_path(splats)
     file = read_splats(path)
     gaussians = file.gaussians
     if features is not None:
-        values = _read_rows(Path(features))
+        values = _read_rows(as_path(features))
         if len(values) != len(gaussians):
             raise ValueError(
                 f"{features}: expected [{len(gaussians)}, D], a row for each Gaussian of {path}, got {list(values.shape)}; some "

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..._card import cut
-from ..._files import read_json, write_json
+from ..._files import as_path, read_json, write_json
 from ...formats.splat_file import SplatFile
 from .._json import build, checked_object
 from ..where import Where
@@ -119,7 +119,7 @@ class EditList:
         Raises:
             ValueError: if an insert holds a cloud in memory.
         """
-        path = Path(path)
+        path = as_path(path)
         write_json(
             path,
             {"format": FORMAT, "version": VERSION}
@@ -143,7 +143,7 @@ class EditList:
             ValueError: if it is another kind of file or of another version, or an edit in it is unknown or wrong; the
                 message names the place in the file.
         """
-        path = Path(path)
+        path = as_path(path)
         return EditList.from_json(read_json(path), str(path), path.parent, anywhere=anywhere)
 
     @staticmethod
@@ -176,7 +176,7 @@ class EditList:
             if not isinstance(values, list) or (key == "edits" and key not in content):
                 raise ValueError(f"{name}: {key}: expected a list of edits, got {values!r:.80}; write it as [...]")
             try:
-                lists[key] = tuple(_read(v, f"{key}[{i}]", Path(folder), anywhere) for i, v in enumerate(values))
+                lists[key] = tuple(_read(v, f"{key}[{i}]", as_path(folder), anywhere) for i, v in enumerate(values))
             except FileNotFoundError as error:
                 raise FileNotFoundError(f"{name}: {error}") from error
             except ValueError as error:

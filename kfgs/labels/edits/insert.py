@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import torch
 
+from ..._files import as_path
 from ...cameras.similarity import Similarity
 from ...formats.splat_file import SplatFile
 from ...formats.table import read_splats
@@ -80,7 +81,7 @@ class Insert(Edit):
         """The same edit with its path relative to the folder if it lies in it, else in full."""
         if isinstance(self.source, SplatFile):
             return self
-        path, folder = Path(self.source).resolve(), folder.resolve()
+        path, folder = as_path(self.source).resolve(), folder.resolve()
         inside = path.is_relative_to(folder)
         return replace(self, source=path.relative_to(folder).as_posix() if inside else str(path))
 

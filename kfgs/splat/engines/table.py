@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
@@ -88,28 +88,6 @@ def _own_symbols() -> Iterator[None]:
             yield
         finally:
             sys.setdlopenflags(flags)
-
-
-COMPILING = "compiling the CPU engine's kernels: a minute or two in all, once on this machine"
-_SAID: list[str] = []  # the line above, once it was said
-
-
-@contextmanager
-def say_compiling(say: Callable[[str], None]) -> Iterator[None]:
-    """Say so, once in a process, when the CPU engine's kernels must be compiled: the first use on a machine waits for it."""
-    if _SAID or "numba" not in available_engines():
-        yield
-        return
-    load("numba")
-    from .cpu.cache import on_compile
-
-    def tell() -> None:
-        if not _SAID:
-            _SAID.append(COMPILING)
-            say(COMPILING)
-
-    with on_compile(tell):
-        yield
 
 
 def choose(engine: str, device: str, dtype: torch.dtype) -> str:

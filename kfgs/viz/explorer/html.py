@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from ..._files import atomic_path
+from ..._files import as_path, atomic_path
 from ...cameras import Camera
 from ...page.document import OFFLINE_START, POLICY, document
 from ...page.server import pack_message
@@ -46,7 +46,7 @@ def save_html(
     Raises:
         ValueError: if the name does not end in .html.
     """
-    target = Path(path)
+    target = as_path(path)
     if target.suffix.lower() != ".html":
         raise ValueError(f"path: expected a name that ends in .html, got {target.name!r}; rename it")
     packed = pack_view(exploration, title=title, scene=scene)

@@ -286,7 +286,7 @@ def _cameras(buffers: _Buffers, cameras: Iterable[Camera], thumbnails: Iterable[
         picture = next(pictures, None)
         name = None if picture is None else f"thumbnails/{index}"
         if name is not None and picture is not None:
-            buffers.add(name, _jpeg(picture))
+            buffers.add(name, np.frombuffer(as_jpeg(picture), dtype=np.uint8))
         packed.append(
             {
                 "name": camera.name,
@@ -301,7 +301,8 @@ def _cameras(buffers: _Buffers, cameras: Iterable[Camera], thumbnails: Iterable[
     return packed
 
 
-def _jpeg(picture: Array) -> Array:  # [h, w, 3] uint8 -> [bytes] uint8
+def as_jpeg(picture: Array) -> bytes:  # [h, w, 3] uint8
+    """A picture as a JPEG file."""
     stream = io.BytesIO()
     Image.fromarray(picture).save(stream, "JPEG", quality=80)
-    return np.frombuffer(stream.getvalue(), dtype=np.uint8)
+    return stream.getvalue()

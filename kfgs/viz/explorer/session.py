@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ..._check import check_choice
+from ..._files import as_path
 from ...formats import SplatFile, write_splats
 from ...formats.splat_file import SCORE
 from ...labels import EditList, Selection, connected_parts
@@ -39,7 +40,7 @@ class Session:
     """
 
     def __init__(self, state: Exploration, out: str | Path = "kfgs_view") -> None:
-        self.state, self.out = state, Path(out)
+        self.state, self.out = state, as_path(out)
         self._lock = Lock()
         self._calls = {
             "ask": self._ask,

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from ..._check import as_array, check_choice, check_range, check_whole
+from ..._files import as_path
 from ...cameras import Camera
 from ...gaussians import Gaussians
 from ...labels import Selection, class_indices
@@ -307,7 +308,7 @@ class Exploration:
             raise ValueError(
                 f"selection: expected at least one Gaussian, got none ({words}); ask first, or lower gamma"
             )
-        return save_sides(sides, self.details(), self.meaning.names, self.cameras, Path(folder))
+        return save_sides(sides, self.details(), self.meaning.names, self.cameras, as_path(folder))
 
     def selection(self, side: Side) -> Selection:
         """The selection on a side, with its scores (0 if unknown) and gamma.

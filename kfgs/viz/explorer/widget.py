@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import base64
-import html
-import io
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from PIL import Image
 
 from ...page import APP, inline_script, read_text
 from ...page.server import answer_call
 from ...splat import rasterize
 from ..pictures import as_bytes
-from .carried import Array
 from .html import pack_view
+from .pack import as_jpeg
 from .session import Session
 from .state import Exploration
 
@@ -113,7 +110,7 @@ def make_widget(
             found = super()._repr_mimebundle_(**options)
             bundle = found[0] if isinstance(found, tuple) else found
             if bundle is not None and exploration.cameras:
-                bundle["text/html"] = picture_html(still(exploration))
+                bundle["image/jpeg"] = still(exploration)
             return found
 
     widget = Viewer(
@@ -132,8 +129,8 @@ def make_widget(
     return widget
 
 
-def still(exploration: Exploration) -> Array:  # [h, w, 3] uint8
-    """What the first camera sees, in the colours that the viewer opens with."""
+def still(exploration: Exploration) -> str:
+    """What the first camera sees, in the colours that the viewer opens with: a JPEG file in base64, as notebooks hold it."""
     side = exploration.sides[-1]
     camera = exploration.cameras[0]
     scale = min(1.0, STILL / max(camera.size))
@@ -143,14 +140,5 @@ def still(exploration: Exploration) -> Array:  # [h, w, 3] uint8
         colors = torch.from_numpy(exploration.colors(side)).to(cloud.means) / 255
         cloud = cloud.replace(features=colors, sh=None)
     with torch.no_grad():
-        return as_bytes(rasterize(cloud.replace(labels=None), camera, background=cloud.means.new_ones(3)).map)
-
-
-def picture_html(picture: Array) -> str:
-    """A picture as an element for a saved notebook."""
-    file = io.BytesIO()
-    Image.fromarray(picture).save(file, "JPEG", quality=80, optimize=True)
-    data = base64.b64encode(file.getvalue()).decode("ascii")
-    return (
-        f'<img alt="{html.escape("the viewer, as it was")}" style="max-width:100%" src="data:image/jpeg;base64,{data}">'
-    )
+        picture = as_bytes(rasterize(cloud.replace(labels=None), camera, background=cloud.means.new_ones(3)).map)
+    return base64.b64encode(as_jpeg(picture)).decode("ascii")

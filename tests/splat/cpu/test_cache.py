@@ -171,7 +171,7 @@ def test_no_kernel_goes_around():
 SORT = """
 import numpy as np
 from numba import njit
-from kfgs.splat.engines.table import say_compiling
+from kfgs._compiling import say_compiling
 from kfgs.splat.engines.cpu.radix import sort_rows
 
 made = {}
@@ -190,3 +190,29 @@ def test_the_first_process_says_that_it_compiles(tmp_path):
         for _ in range(2)
     ]
     assert said == ["compiling the CPU engine's kernels: a minute or two in all, once on this machine\n", ""]
+
+
+COMMAND = """
+import sys
+import numpy as np
+from kfgs import cli
+
+def sort():
+    "Sort."
+    from kfgs.splat.engines.cpu.radix import sort_rows
+    sort_rows(np.arange(3, dtype=np.uint32))
+    print("sorted")
+
+cli.COMMANDS["sort"] = sort
+sys.exit(cli.main(["sort"]))
+"""
+
+
+def test_every_command_says_on_stderr_that_it_compiles(tmp_path):
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    ran = [
+        subprocess.run([sys.executable, "-c", COMMAND], env=environment, capture_output=True, text=True, check=True)
+        for _ in range(2)
+    ]
+    line = "note: compiling the CPU engine's kernels: a minute or two in all, once on this machine\n"
+    assert [(done.stdout, done.stderr) for done in ran] == [("sorted\n", line), ("sorted\n", "")]

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from zlib import crc32
 
 from numba import njit
 from numba.core import event
+
+from kfgs._compiling import tell_compiling
 
 _HERE = Path(__file__).parent
 _FILES = [file for folder in (_HERE, _HERE.parent) for file in sorted(folder.glob("*.py"))]  # contract.py is above
@@ -37,24 +38,16 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return decorate
 
 
-class _First(event.Listener):
-    """Calls a function when the first of kfgs's kernels is about to be compiled; loading one from disk does not count."""
-
-    def __init__(self, tell: Callable[[], None]) -> None:
-        self._tell, self._told = tell, False
+class _Compiling(event.Listener):
+    """Tells when one of kfgs's kernels is about to be compiled."""
 
     def on_start(self, event: event.Event) -> None:
         function = getattr(event.data["dispatcher"], "py_func", None)
-        if not self._told and (getattr(function, "__module__", None) or "").startswith("kfgs."):
-            self._told = True
-            self._tell()
+        if (getattr(function, "__module__", None) or "").startswith("kfgs."):
+            tell_compiling()
 
     def on_end(self, event: event.Event) -> None:
         pass
 
 
-@contextmanager
-def on_compile(tell: Callable[[], None]) -> Iterator[None]:
-    """Call `tell` once if a kernel must be compiled before the block ends."""
-    with event.install_listener("numba:compile", _First(tell)):
-        yield
+event.register("numba:compile", _Compiling())

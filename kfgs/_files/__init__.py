@@ -1,78 +1,37 @@
-"""Files that are either whole or absent: atomic writing, JSON, and digests of what was read; sizes and times in words.
-
-Every file of kfgs is written beside its final name and moved there in one step, so a killed process leaves nothing
-half-written behind.
-"""
+"""Files: atomic writing, locks, outputs checked before the work, JSON, digests of what was read; sizes and times in words."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
-import tempfile
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from .atomic import HIDDEN, FullDiskError, atomic_folder, atomic_path, current_file, hidden_folder
+from .locks import locked
+from .paths import as_path, check_output
 
-def _read_umask() -> int:
-    umask = os.umask(0)
-    os.umask(umask)
-    return umask
-
+__all__ = [
+    "HIDDEN",
+    "FullDiskError",
+    "as_path",
+    "atomic_folder",
+    "atomic_path",
+    "bytes_in_words",
+    "check_output",
+    "current_file",
+    "digest_file",
+    "digest_value",
+    "hidden_folder",
+    "locked",
+    "parse_json",
+    "read_json",
+    "seconds_in_words",
+    "write_json",
+]
 
 NESTED = 200  # most levels of lists and objects in JSON: neither people nor kfgs write half as many
-_UMASK = _read_umask()  # once: it can only be read by setting it, for all threads
-
-
-def _make_ordinary(file: Path) -> None:
-    """Give a file the permissions of any new one: mkstemp makes private files, and so does safetensors."""
-    file.chmod(0o666 & ~_UMASK)
-
-
-@contextmanager
-def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Give a temporary name beside `path` to write a file to, and move it to `path` if the block succeeds."""
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=target.suffix, dir=target.parent)
-    os.close(handle)
-    _make_ordinary(Path(name))
-    try:
-        yield Path(name)
-        _make_ordinary(Path(name))
-        os.replace(name, target)
-    finally:
-        Path(name).unlink(missing_ok=True)
-
-
-@contextmanager
-def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """Give a temporary folder beside `path` to fill, and move it to `path` (replacing it) if the block succeeds."""
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
-    temporary.chmod(0o777 & ~_UMASK)
-    try:
-        yield temporary
-        for path in temporary.rglob("*"):
-            if path.is_file() and not path.is_symlink():
-                _make_ordinary(path)
-        if target.exists():
-            old = temporary.with_name(temporary.name + ".old")
-            os.replace(target, old)
-            try:
-                os.replace(temporary, target)
-            except BaseException:
-                os.replace(old, target)
-                raise
-            shutil.rmtree(old, ignore_errors=True)
-        else:
-            os.replace(temporary, target)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def write_json(path: str | Path, value: Any) -> None:
@@ -89,7 +48,7 @@ def read_json(path: str | Path) -> Any:
         FileNotFoundError: if there is no such file.
         ValueError: if it is not UTF-8 JSON.
     """
-    path = Path(path)
+    path = as_path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected a JSON file there")
     try:
@@ -123,7 +82,7 @@ def _inside(value: Any) -> Iterable[Any]:
 
 def digest_file(path: str | Path) -> str:
     """SHA-256 of a file's bytes, in hexadecimal."""
-    with Path(path).open("rb") as file:
+    with as_path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

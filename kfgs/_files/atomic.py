@@ -1,0 +1,254 @@
+"""Files and folders that are either whole or absent, however their writer ends.
+
+What is being written lies in a hidden folder beside its place, `.kfgs-unfinished/new-*`, and is moved from there in one step.
+A lock shows that its writer lives; the next writer beside it deletes what others left.
+
+A folder that holds files already stays, with everything in it that the new content does not replace. The new content moves to
+`FOLDER/.kfgs-unfinished/waiting` in one step, and from there its files move to their places one by one. From that step on,
+`current_file` finds the new ones, before it the old ones, and the next writer finishes what a killed one began.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from .locks import try_lock
+from .paths import as_path
+
+HIDDEN, WAITING, LOCK = ".kfgs-unfinished", "waiting", ".kfgs-lock"
+ATTEMPTS = 100  # to put a folder where other processes put theirs
+FULL = (errno.ENOSPC, errno.EDQUOT)
+UNNAMED = (*FULL, errno.EIO, errno.EFBIG, errno.EROFS)  # errors of writing, which Python raises without a file
+SHORT = "requested and"  # in the message of numpy
+NOTHING = 1 << 14  # bytes: a disk with less is full
+
+
+class FullDiskError(OSError):
+    """The disk has no space for an output; the message names the file or folder that was asked for."""
+
+
+def _read_umask() -> int:
+    umask = os.umask(0)
+    os.umask(umask)
+    return umask
+
+
+UMASK = _read_umask()  # once: it can only be read by setting it, for all threads
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Give a hidden path of the same name to write a file to, and move it to `path` if the block succeeds.
+
+    Raises:
+        FullDiskError: if the disk is full.
+        OSError: if `path` cannot be written; all errors name `path`, none the hidden one.
+    """
+    target = as_path(path)
+    with hidden_folder(target.parent, target) as place:
+        new = place / target.name
+        yield new
+        _make_ordinary(new)
+        os.replace(new, target)
+
+
+@contextmanager
+def atomic_folder(path: str | Path) -> Iterator[Path]:
+    """Give a hidden folder to fill, and put it to `path` if the block succeeds. Errors are those of `atomic_path`.
+
+    If `path` holds files already, the new ones replace those of the same names, all others stay. Read such a folder with
+    `current_file`. A link to a folder stays a link.
+    """
+    target = Path(os.path.realpath(as_path(path)))
+    with hidden_folder(target if _is_used(target) else target.parent, as_path(path)) as place:
+        new = place / "new"
+        new.mkdir(mode=0o777 & ~UMASK)
+        yield new
+        for file in new.rglob("*"):
+            if file.is_file() and not file.is_symlink():
+                _make_ordinary(file)
+        _put(new, target)
+
+
+def current_file(folder: Path, name: str) -> Path:
+    """Where a file of a folder is that `atomic_folder` wrote, also if its writer was killed while moving the files."""
+    waiting = folder / HIDDEN / WAITING / name
+    return waiting if waiting.exists() else folder / name
+
+
+@contextmanager
+def hidden_folder(parent: Path, target: Path | None = None) -> Iterator[Path]:
+    """Make a hidden folder in `parent` (made if missing) to work in, and delete it in the end.
+
+    Those of processes that have ended without deleting theirs are deleted first; those of living ones stay.
+
+    Args:
+        parent: a folder.
+        target: what is written, for errors: they name it instead of the hidden folder.
+    """
+    shown = parent if target is None else target
+    hidden = parent / HIDDEN
+    try:
+        _sweep(hidden)
+        place, handle = _take(hidden)
+    except OSError as error:
+        raise _retold(error, hidden, shown) or error from error
+    try:
+        yield place
+    except Exception as error:
+        told = _retold(error, place, shown)
+        if told is None:
+            raise
+        raise told from error
+    finally:
+        _discard(place)
+        os.close(handle)
+        with suppress(OSError):  # another process works in it
+            hidden.rmdir()
+
+
+def _take(hidden: Path) -> tuple[Path, int]:
+    """A new folder in `hidden`, and its lock."""
+    while True:
+        try:
+            hidden.mkdir(parents=True, exist_ok=True)
+            place = Path(tempfile.mkdtemp(prefix="new-", dir=hidden))
+            handle = os.open(place / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+        except (FileNotFoundError, FileExistsError):  # another process deleted one of them, which was empty
+            if not hidden.parent.is_dir() or hidden.is_file():
+                raise
+            continue
+        if try_lock(handle) is not False and os.fstat(handle).st_nlink:
+            return place, handle
+        os.close(handle)  # another process took it for one that was left
+
+
+def _sweep(hidden: Path) -> None:
+    """Delete the folders in `hidden` whose writers have ended."""
+    try:
+        names = [] if hidden.is_symlink() else os.listdir(hidden)
+    except FileNotFoundError:  # never there, or another process has just deleted it
+        return
+    for place in (hidden / name for name in names if name.startswith("new-")):
+        if place.is_symlink():
+            continue
+        try:
+            handle = os.open(place / LOCK, os.O_RDWR)
+        except OSError:  # its writer ended before locking it; if it lives, it makes another
+            with suppress(OSError):
+                place.rmdir()
+            continue
+        try:
+            if try_lock(handle):
+                _discard(place)
+        finally:
+            os.close(handle)
+
+
+def _discard(place: Path) -> None:
+    """Delete a hidden folder; its lock last, so that it can be deleted again after a kill."""
+    with suppress(OSError):
+        for entry in list(os.scandir(place)):
+            if entry.name == LOCK:
+                continue
+            if entry.is_dir(follow_symlinks=False):
+                shutil.rmtree(entry.path, ignore_errors=True)
+            else:
+                with suppress(OSError):
+                    os.unlink(entry.path)
+        os.unlink(place / LOCK)
+        place.rmdir()
+
+
+def _put(new: Path, target: Path) -> None:
+    """Put a finished folder in its place, or its files into the folder that is there."""
+    waiting = target / HIDDEN / WAITING
+    for attempt in range(ATTEMPTS):
+        try:
+            if not _is_used(target):
+                os.replace(new, target)  # also in place of an empty folder
+                return
+            _settle(target)
+            _check_kinds(new, target)
+            waiting.parent.mkdir(exist_ok=True)
+            os.replace(new, waiting)
+        except OSError as error:  # another process put its own there meanwhile, or has just finished
+            known = error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOENT)
+            if not known or not new.is_dir() or attempt == ATTEMPTS - 1:
+                raise
+        else:
+            _settle(target)
+            return
+
+
+def _settle(folder: Path) -> None:
+    """Move waiting files to their places in a folder. Several processes may do so at once."""
+    waiting = folder / HIDDEN / WAITING
+    if not waiting.is_symlink() and not waiting.parent.is_symlink():  # a stranger's link could lead anywhere
+        _move_in(waiting, folder)
+        with suppress(OSError):
+            waiting.parent.rmdir()
+
+
+def _move_in(source: Path, target: Path) -> None:
+    """Move all that is in a folder into another one; folders of the same names are joined."""
+    try:
+        entries = sorted(os.scandir(source), key=lambda entry: entry.name)
+    except FileNotFoundError:
+        return
+    for entry in entries:
+        with suppress(FileNotFoundError):  # another process moved it
+            if entry.is_dir(follow_symlinks=False) and (target / entry.name).is_dir():
+                _move_in(Path(entry.path), target / entry.name)
+            else:
+                os.replace(entry.path, target / entry.name)
+    with suppress(OSError):
+        source.rmdir()
+
+
+def _check_kinds(new: Path, target: Path) -> None:
+    """Raise unless files would replace files, and folders join folders: a move that has begun must come to its end."""
+    for path in new.rglob("*"):
+        there = target / path.relative_to(new)
+        if os.path.lexists(there) and path.is_dir() != there.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "a folder is in place of a file, or a file of a folder", str(there))
+
+
+def _is_used(folder: Path) -> bool:
+    return folder.is_dir() and any(folder.iterdir())
+
+
+def _make_ordinary(file: Path) -> None:
+    """Give a file the permissions of any new one: safetensors makes private files."""
+    file.chmod(0o666 & ~UMASK)
+
+
+def _retold(error: Exception, place: Path, target: Path) -> OSError | None:
+    """An error of writing as one that names `target`; None if it can be raised as it is."""
+    if isinstance(error, FullDiskError | ValueError | TypeError | LookupError):
+        return None
+    text = str(error)
+    rust = re.search(r"\(os error (\d+)\)", text)  # of safetensors
+    code = int(rust[1]) if rust else getattr(error, "errno", None)
+    if code in FULL or SHORT in text or _free(place) < NOTHING:
+        return FullDiskError(
+            f"{target}: expected space on the disk to write it, got {_free(place):,} bytes free; free some (or raise the "
+            "limit on files), or choose another disk"
+        )
+    unnamed = code in UNNAMED and getattr(error, "filename", None) is None
+    if code is not None and (unnamed or str(place) in text):
+        return OSError(code, os.strerror(code), str(target))
+    return None
+
+
+def _free(place: Path) -> int:
+    with suppress(OSError):
+        return shutil.disk_usage(next(folder for folder in (place, *place.parents) if folder.is_dir())).free
+    return NOTHING

@@ -1,0 +1,76 @@
+"""Paths as users write them, and the check of an output before the work."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Literal
+
+BLOCK = 4096  # bytes written on trial: a disk without them is full
+
+
+def as_path(path: str | Path) -> Path:
+    """A path as a user wrote it, with `~` as the home folder.
+
+    As in a shell, `~name` is the home folder of a user if there is one of that name, else an ordinary name.
+
+    Raises:
+        TypeError: if it is no path.
+    """
+    return Path(os.path.expanduser(path))
+
+
+def check_output(
+    name: str,
+    path: str | Path,
+    kind: Literal["a file", "a folder"],
+    *,
+    apart: Iterable[Path] = (),
+    other: Iterable[Path | None] = (),
+) -> Path:
+    """Check before the work that its result can be written.
+
+    Args:
+        name: the argument, for messages.
+        path: the file or folder to write; it need not exist.
+        kind: which of the two.
+        apart: folders in which nothing may be written: those of a scene for its pictures and feature maps.
+        other: folders that it must not be, but may lie in; None is skipped.
+
+    Returns:
+        The path, with `~` expanded.
+
+    Raises:
+        ValueError: if a folder is in place of a file, or a file in place of a folder or above; or if `apart` or
+            `other` forbid it.
+        OSError: if it cannot be written to, or the disk is full.
+    """
+    target = as_path(path)
+    if target.exists() and target.is_dir() != (kind == "a folder"):
+        got = "a file" if kind == "a folder" else "a folder"
+        raise ValueError(f"{name}: expected {kind} or nothing at {path}, got {got}; give another name")
+    above = next(place for place in target.absolute().parents if place.exists())
+    if not above.is_dir():
+        raise ValueError(f"{name}: expected a folder to write to, got {path} below the file {above}; give another")
+    real = Path(os.path.realpath(target))
+    forbidden = [(folder, (real, *real.parents)) for folder in apart]
+    forbidden += [(folder, (real,)) for folder in other if folder is not None]
+    for folder, places in forbidden:
+        if Path(os.path.realpath(folder)) in places:
+            raise ValueError(
+                f"{name}: expected a place apart from the pictures and feature maps in {folder}, got {path}; give another"
+            )
+    try:
+        if target.exists() and not os.access(target, os.W_OK):
+            raise PermissionError(13, "Permission denied")
+        with tempfile.TemporaryFile(dir=target if target.is_dir() else above, buffering=0) as trial:
+            full = trial.write(bytes(BLOCK)) < BLOCK
+    except OSError as error:
+        raise type(error)(
+            f"{name}: expected {kind} that can be written, got {path} ({error.strerror}); choose another place"
+        ) from error
+    if full:
+        raise OSError(f"{name}: expected space on the disk for {path}, got none; free some, or choose another place")
+    return target

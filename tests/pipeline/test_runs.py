@@ -1,0 +1,184 @@
+import dataclasses
+import os
+from collections.abc import Callable
+
+import pytest
+import torch
+from killed import kill_everywhere
+from messages import tells
+from small_room import make_room
+
+from kfgs.features import FeatureFolder
+from kfgs.fields import SemanticField
+from kfgs.gaussians import Gaussians
+from kfgs.pipeline import FitConfig, fit_scene
+from kfgs.pipeline.runs import compare_fields, find_run_field, keep_field, list_fields, restore_field
+from kfgs.pipeline.stages import LOCK, Run
+from kfgs.scenes import load_scene
+
+TINY = """
+import torch
+from kfgs.fields import SemanticField
+from kfgs.gaussians import Gaussians
+
+def tiny_field(number=0):
+    means = torch.arange(12.0).view(4, 3) + number
+    quats = torch.tensor([1.0, 0, 0, 0]).repeat(4, 1)
+    return SemanticField(
+        Gaussians(means, quats, torch.full((4, 3), 0.5), torch.full((4,), 0.5), features=torch.eye(4)),
+        info={"method": "fuse"},
+    )
+"""
+names: dict[str, Callable[..., SemanticField]] = {}
+exec(TINY, names)
+tiny_field = names["tiny_field"]
+
+
+def a_field(number: int, **info: object) -> SemanticField:
+    return dataclasses.replace(tiny_field(number), info={"method": "fuse", **info})
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run folder with three fields; the last one is current."""
+    for number in range(3):
+        keep_field(tmp_path)
+        a_field(number, seed=number, steps={"color": 100 * number}).save(tmp_path / "field")
+        date = 1_000_000_000 + number
+        os.utime(tmp_path / "field" / "field.json", (date, date))
+    return tmp_path
+
+
+def first(path):
+    return int(SemanticField.load(path).gaussians.means[0, 0])
+
+
+def test_fields_are_listed_the_current_one_first_then_the_latest(run):
+    fields = list_fields(run)
+    assert [field.current for field in fields] == [True, False, False]
+    assert [field.info["seed"] for field in fields] == [2, 1, 0]
+    assert [first(field.path) for field in fields] == [2, 1, 0]
+    assert [field.path.name for field in fields] == ["field", *(f"field@{field.key}" for field in fields[1:])]
+    assert str(fields[1]).startswith(f"{fields[1].key}  fuse, ")
+    assert "100 steps (color), of 2001-09-" in str(fields[1])
+
+
+def test_an_earlier_field_comes_back_and_the_current_one_is_kept(run):
+    before = list_fields(run)
+    restored = restore_field(run, before[2].key[:6])
+    assert first(run / "field") == 0
+    assert (restored.key, restored.current) == (before[2].key, True)
+    after = list_fields(run)
+    assert [field.key for field in after] == [before[2].key, before[0].key, before[1].key]
+    assert [first(field.path) for field in after] == [0, 2, 1]
+    assert restore_field(run, before[2].key).current  # it is: nothing to do
+    assert [field.key for field in list_fields(run)] == [field.key for field in after]
+
+
+def test_a_users_files_in_the_field_stay_when_another_one_is_restored(run):
+    (run / "field" / "notes.txt").write_text("mine")
+    restore_field(run, list_fields(run)[1].key)
+    assert (run / "field" / "notes.txt").read_text() == "mine"
+
+
+def test_a_comparison_names_what_differs_and_nothing_else(run):
+    fields = list_fields(run)
+    rows = compare_fields(fields[1], fields[0])
+    assert rows == [("seed", "1", "2"), ("steps.color", "100", "200")]
+    assert compare_fields(fields[0], fields[0]) == []
+
+
+@pytest.mark.parametrize("key", ["", "nonsense", "../field"])
+def test_an_unknown_key_is_refused_with_those_that_are_there(run, key):
+    with pytest.raises(ValueError, match=tells("key:", *(field.key for field in list_fields(run)), repr(key))):
+        find_run_field(run, key)
+
+
+def test_a_folder_without_fields_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match=tells(tmp_path, "kfgs fit")):
+        list_fields(tmp_path)
+
+
+RESTORE = f"""
+{TINY}
+from kfgs.pipeline.runs import keep_field, list_fields, restore_field
+
+def prepare(folder):
+    tiny_field(0).save(folder / "field")
+    (folder / "field" / "notes.txt").write_text("mine")
+    keep_field(folder)
+    tiny_field(1).save(folder / "field")
+
+def work(folder):
+    restore_field(folder, list_fields(folder)[1].key)
+"""
+
+
+def test_at_every_kill_of_a_restore_both_fields_are_there(tmp_path):
+    for folder in kill_everywhere(RESTORE, tmp_path / "kills"):
+        fields = list_fields(folder)
+        assert {first(field.path) for field in fields} == {0, 1}
+        assert (folder / "field" / "notes.txt").read_text() == "mine"
+        restore_field(folder, next(field.key for field in fields if first(field.path) == 0))
+        assert first(folder / "field") == 0
+
+
+@pytest.fixture(scope="module")
+def fuse(tmp_path_factory):
+    scene = load_scene(make_room(tmp_path_factory.mktemp("room") / "scene"))
+    maps = FeatureFolder(scene.folder / "features", [scene.stem(i) for i in scene.splits["train"]])
+    config = FitConfig.cpu()
+    return scene, maps, config, tiny_splat(scene)
+
+
+def tiny_splat(scene):
+    points = scene.points[:: len(scene.points) // 50].float()
+    quats = torch.tensor([1.0, 0, 0, 0]).repeat(len(points), 1)
+    return Gaussians(points, quats, torch.full((len(points), 3), 0.3), torch.full((len(points),), 0.9))
+
+
+def test_a_fit_with_other_options_keeps_the_field_and_says_so(fuse, tmp_path):
+    scene, maps, config, splat = fuse
+    lines: list[str] = []
+    one = fit_scene(scene, maps, tmp_path, config, splat=splat, report=lines.append)
+    (one.field_path / "notes.txt").write_text("mine")
+    fit_scene(scene, maps, tmp_path, config, splat=splat, report=lines.append)
+    assert len(list_fields(tmp_path)) == 1
+    assert not any("current" in line for line in lines)
+    other = dataclasses.replace(config, uplift=dataclasses.replace(config.uplift, max_gaussians=10))
+    two = fit_scene(scene, maps, tmp_path, other, splat=splat, report=lines.append)
+    fields = list_fields(tmp_path)
+    assert [len(SemanticField.load(field.path)) for field in fields] == [len(two.field), len(one.field)]
+    assert len(two.field) != len(one.field)
+    (said,) = [line for line in lines if "current" in line]
+    assert str(fields[1].path) in said
+    assert "kfgs runs" in said
+    assert (two.field_path / "notes.txt").read_text() == "mine"
+
+
+def test_a_second_fit_in_the_folder_is_refused_and_destroys_nothing(fuse, tmp_path):
+    scene, maps, config, splat = fuse
+    seen = []
+
+    class Second:
+        """Maps that start another fit of the same folder when they are read."""
+
+        path, files, stems, identity = maps.path, maps.files, maps.stems, None
+
+        def __len__(self):
+            return len(maps)
+
+        def __getitem__(self, i):
+            if not seen:
+                with pytest.raises(
+                    ValueError, match=tells("folder:", tmp_path, f"process {os.getpid()}", "wait")
+                ) as caught:
+                    fit_scene(scene, maps, tmp_path, config, splat=splat)
+                seen.append(caught.value)
+            return maps[i]
+
+    fit_scene(scene, Second(), tmp_path, config, splat=splat)
+    assert seen
+    assert len(list_fields(tmp_path)) == 1
+    with Run(tmp_path).locked():  # free again
+        assert f"process {os.getpid()} of " in (tmp_path / LOCK).read_text()

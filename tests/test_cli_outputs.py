@@ -1,0 +1,240 @@
+"""What commands do before, while and after they write: outputs that cannot be written, full disks, earlier fields."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+
+import pytest
+import torch
+from messages import tells
+from small_room import fit_run, make_room
+
+from kfgs.cli import main
+from kfgs.fields import SemanticField
+from kfgs.formats import write_splats
+from kfgs.gaussians import Gaussians
+from kfgs.pipeline.runs import list_fields
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    return make_room(tmp_path_factory.mktemp("outputs") / "scene")
+
+
+@pytest.fixture(scope="module")
+def run(room, tmp_path_factory):
+    return fit_run(room, tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture
+def splat(tmp_path):
+    count = 500
+    cloud = Gaussians(
+        torch.rand(count, 3),
+        torch.nn.functional.normalize(torch.rand(count, 4)),
+        torch.full((count, 3), 0.1),
+        torch.full((count,), 0.5),
+        sh=torch.rand(count, 1, 3),
+        labels=torch.zeros(count, dtype=torch.int64),
+    )
+    write_splats(tmp_path / "a.ply", cloud)
+    return tmp_path / "a.ply"
+
+
+def files(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def refused(arguments, capsys, *parts):
+    assert main([str(word) for word in arguments]) == 1
+    error = capsys.readouterr().err
+    assert re.search(tells(*parts), error), error
+    assert "kfgs-unfinished" not in error
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "demo --out {file}",
+        "sfm {room}/images --out {file}",
+        "features {room} --teacher lseg --out {file}",
+        "fit {room} --out {file}",
+        "color {room} --out {file}",
+        "uplift {room} {splat} --out {file}",
+        "segment {run}/field --out {file}",
+        "label {run}/field --out {file}",
+        "select chair {run}/field --out {file}",
+        "view {run}/field --out {file}",
+        "compare {run}/field {run}/field --out {file}",
+        "text chair --teacher lseg --out {file}/deep/a.safetensors",
+        "attach {run}/field {splat} --out {file}/deep/a.ply",
+        "edit {splat} --remove chair --out {file}/deep/a.ply",
+        "convert {splat} {file}/deep/a.ply",
+        "render {run} --out {file}/deep/a.gif",
+        "pack {run}/field {file}/deep/a.kfgs.safetensors",
+        "evaluate {run}/field --out {file}/deep/a.json",
+        "plan {room} --out {file}/deep/a.json",
+    ],
+)
+def test_an_output_that_cannot_be_is_refused_before_the_work(words, room, run, splat, capsys, monkeypatch):
+    file = splat.parent / "file"
+    file.write_text("mine")
+    before = files(splat.parent)
+    arguments = [word.format(file=file, room=room, run=run, splat=splat) for word in words.split()]
+    monkeypatch.setattr(SemanticField, "load", None)  # the work
+    monkeypatch.setattr("kfgs.scenes.load_scene", None)
+    refused(arguments, capsys, "expected a folder", file)
+    assert files(splat.parent) == before
+
+
+@pytest.mark.parametrize("place", ["images", "features", "images/deep"])
+@pytest.mark.parametrize(
+    "words", ["fit {room} --out {out}", "color {room} --out {out}", "segment {run}/field --out {out}"]
+)
+def test_nothing_is_written_among_pictures_and_maps(place, words, room, run, capsys):
+    before = set(room.rglob("*"))
+    arguments = [word.format(room=room, run=run, out=room / place) for word in words.split()]
+    refused(arguments, capsys, "--out:", "pictures and feature maps", room / place)
+    assert set(room.rglob("*")) == before
+
+
+def test_segmenting_into_the_scene_puts_no_pictures_among_its_maps(room, run, capsys):
+    before = set((room / "features").iterdir())
+    refused(["segment", run / "field", "--out", room], capsys, "--out:", room / "features")
+    assert set((room / "features").iterdir()) == before
+    assert not (room / "predicted").exists()
+
+
+def test_home_is_no_folder_named_tilde(splat, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    assert main(["convert", str(splat), "~/b.ply"]) == 0
+    assert main(["convert", "~/b.ply", "c.splat"]) == 0
+    write_splats("~/d.ply", Gaussians(*(torch.rand(2, n) for n in (3, 4, 3)), torch.rand(2), sh=torch.rand(2, 1, 3)))
+    assert (tmp_path / "home" / "d.ply").is_file()
+    assert not (tmp_path / "~").exists()
+
+
+LIMITED = """
+import resource, sys
+from kfgs.cli import main
+import kfgs.formats.table, torch
+resource.setrlimit(resource.RLIMIT_FSIZE, (2048, 2048))
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("name", ["b.ply", "b.splat", "b.spz", "b.sog", "b.glb", "b.compressed.ply"])
+def test_a_disk_that_takes_no_more_is_one_message_with_the_file(name, splat, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, "convert", splat, tmp_path / name], capture_output=True, text=True
+    )
+    assert done.returncode == 1, done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert str(tmp_path / name) in done.stderr
+    assert "kfgs-unfinished" not in done.stderr
+    assert not any(path.name.startswith((".", name)) for path in tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("words", ["label {run}/field --cloud {splat}", "attach {run}/field {splat} --by distance"])
+@pytest.mark.parametrize("distance", ["0", "-1", "nan"])
+def test_a_distance_of_nothing_is_refused_before_the_work(words, distance, run, splat, capsys, monkeypatch):
+    monkeypatch.setattr(SemanticField, "load", None)
+    arguments = [word.format(run=run, splat=splat) for word in words.split()]
+    refused([*arguments, "--out", splat.parent / "o.ply", "--distance", distance], capsys, "--distance:", "got")
+
+
+def test_a_model_is_not_replaced_unasked(room, tmp_path, capsys):
+    scene = tmp_path / "scene"
+    shutil.copytree(room, scene)
+    before = files(scene)
+    refused(["sfm", room / "images", "--out", scene], capsys, "sparse/0", "--replace")
+    assert files(scene) == before
+
+
+@pytest.fixture
+def two(run, tmp_path):
+    """A run folder in which another field became current, and a user has a file in the field."""
+    out = tmp_path / "run"
+    shutil.copytree(run, out)
+    (out / "field" / "notes.txt").write_text("mine")
+    return out
+
+
+def test_runs_lists_compares_and_restores(two, room, capsys):
+    first = list_fields(two)[0].key
+    arguments = [
+        "fit",
+        room,
+        "--out",
+        two,
+        "--method",
+        "paper",
+        "--mode",
+        "adc",
+        "--steps",
+        "20",
+        "--max-gaussians",
+        "500",
+    ]
+    capsys.readouterr()
+    assert main([str(word) for word in arguments]) == 0
+    said = capsys.readouterr().out
+    assert f"kept as {two / f'field@{first}'}" in said
+    assert "kfgs runs" in said
+    assert (two / "field" / "notes.txt").read_text() == "mine"
+    second = list_fields(two)[0].key
+
+    assert main(["runs", str(two)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert re.match(rf"current  {second}  paper, .* Gaussians, 20 steps \(field\), of \d{{4}}-", lines[0])
+    assert re.match(rf"         {first}  paper, .* Gaussians, 60 steps \(field\), of \d{{4}}-", lines[1])
+    assert "--restore KEY" in lines[2]
+
+    assert main(["runs", str(two), "--compare", first[:5]]) == 0
+    table = capsys.readouterr().out
+    assert re.search(rf"{first} +{second} \(current\)", table)
+    assert re.search(r"steps.field +60 +20", table)
+    assert "teacher_map" not in table
+    assert f"kfgs compare {two / f'field@{first}'} {two / 'field'}" in table
+
+    assert main(["runs", str(two), "--restore", first]) == 0
+    assert f"{two / 'field'} is now {first}" in capsys.readouterr().out
+    assert [field.key for field in list_fields(two)] == [first, second]
+    assert (two / "field" / "notes.txt").read_text() == "mine"
+    assert main(["info", str(two / "field")]) == 0
+    refused(["runs", two, "--restore", "nothing"], capsys, "key", first, second)
+    refused(["runs", room], capsys, room, "kfgs fit")
+
+
+def test_two_runs_of_kfgs_give_the_same_bytes(room, run, tmp_path):
+    again = fit_run(room, tmp_path / "again")
+    for file in sorted((run / "stages").glob("*/*.safetensors")):
+        assert (again / file.relative_to(run)).read_bytes() == file.read_bytes(), file
+    assert (again / "field" / "field.safetensors").read_bytes() == (run / "field" / "field.safetensors").read_bytes()
+
+
+KILLED = """
+import os, signal, sys, pathlib
+def hook(event, arguments):
+    if event == "os.rename":  # everything is written, nothing is in its place
+        os.kill(os.getpid(), signal.SIGKILL)
+from kfgs.cli import main
+import kfgs.formats.table, kfgs.toy.room_folder, torch
+sys.addaudithook(hook)
+main(sys.argv[1:])
+"""
+
+
+def test_what_killed_commands_left_is_swept_by_the_next(splat, tmp_path):
+    place = tmp_path / "place"
+    (tmp_path / "a.ply.classes.json").write_text('{"class_id": {"0": "chair"}}')
+    for words in (["convert", splat, place / "b.spz"], ["edit", splat, "--remove", "chair", "--out", place / "c.ply"]):
+        done = subprocess.run([sys.executable, "-c", KILLED, *words])
+        assert done.returncode < 0
+        assert os.listdir(place) == [".kfgs-unfinished"]
+        assert main(["convert", str(splat), str(place / "d.splat")]) == 0
+        assert not (place / ".kfgs-unfinished").exists()
+        shutil.rmtree(place)
