@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
+import signal
 import sys
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: processes are forked
 os.environ.setdefault("NUMBA_NUM_THREADS", "1")
@@ -33,22 +36,36 @@ def main(words: list[str] | None = None) -> int:
     scratch = given.scratch or (quick if quick.is_dir() else given.out) / f"kfgs-campaign-{os.getpid()}"
     record = Record(given.out, scratch)
     options = {"seed": given.seed, "seconds": 60 * given.minutes, "only": given.only, "most": given.most}
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the scratch folder is deleted
     try:
         for kind in given.kinds.split(","):
-            if kind == "files":
-                from campaign.files import run_files
-
-                run_files(record, workers=given.workers, **options)
-            elif kind in KINDS:
-                raise SystemExit(f"{kind}: not yet")
-            else:
+            if kind not in KINDS:
                 parser.error(f"--kinds: expected some of {', '.join(KINDS)}, got {kind}")
+            _run(kind, record, given.workers, options)
     finally:
-        import shutil
-
         shutil.rmtree(scratch, ignore_errors=True)
     print(record.table())
     return 1 if record.findings() else 0
+
+
+def _run(kind: str, record: Record, workers: int, options: dict[str, Any]) -> None:
+    """Import as late as possible: processes are forked from one that has used nothing."""
+    if kind == "files":
+        from campaign.files import run_files
+
+        run_files(record, workers=workers, **options)
+    elif kind == "kills":
+        from campaign.kills import run_kills
+
+        run_kills(record, **options)
+    elif kind == "long":
+        from campaign.long import run_long
+
+        run_long(record, **options)
+    else:
+        from campaign import crowds
+
+        {"pairs": crowds.run_pairs, "signals": crowds.run_signals, "full": crowds.run_full}[kind](record, **options)
 
 
 if __name__ == "__main__":

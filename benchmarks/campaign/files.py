@@ -35,7 +35,16 @@ SPACE = 16 << 30  # bytes of addresses: more is refused by the system, so that t
 KEPT = 5  # stored mutants of one case and kind of finding
 
 
-def run_files(record: Record, *, seed: int, seconds: float, workers: int, only: str = "", most: int | None = None) -> None:
+def run_files(
+    record: Record,
+    *,
+    seed: int,
+    seconds: float,
+    workers: int = 1,
+    only: str = "",
+    most: int | None = None,
+    batch: int = BATCH,
+) -> None:
     """Run batches, each of the case with the fewest mutants so far, until the time is over or `most` mutants are done."""
     work = record.scratch / "files"
     cases = [case for case in make_corpus(work / "corpus") if only in case.name or only == case.reader]
@@ -48,20 +57,20 @@ def run_files(record: Record, *, seed: int, seconds: float, workers: int, only: 
     while True:
         while len(running) < workers and time.monotonic() < end and (most is None or begun < most):
             case = min(cases, key=lambda case: done[case.name])
-            count = BATCH if most is None else min(BATCH, most - begun)
-            batch = _Batch(case, seed, done[case.name], count, work / f"place{len(running)}-{begun}")
-            running[batch.start()] = batch
+            count = batch if most is None else min(batch, most - begun)
+            one = _Batch(case, seed, done[case.name], count, work / f"place{len(running)}-{begun}")
+            running[one.start()] = one
             done[case.name] += count
             begun += count
         if not running:
             return
-        for pid, batch in list(running.items()):
-            if batch.ended(pid):
+        for pid, one in list(running.items()):
+            if one.ended(pid):
                 del running[pid]
-                for line in batch.results():
+                for line in one.results():
                     record.add(line)
                     if "number" in line:
-                        _keep(record, batch.case, seed, line)
+                        _keep(record, one.case, seed, line)
         time.sleep(0.005)
 
 
@@ -110,6 +119,7 @@ class _Batch:
             os._exit(code)
 
     def _work(self) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         resource.setrlimit(resource.RLIMIT_AS, (SPACE, SPACE))

@@ -52,7 +52,9 @@ def make_fixture(folder: Path) -> None:
         toy,
         command("uplift", "room", "labelled.ply", "--out", "run/field"),
         command("uplift", "room", "other.ply", "--out", "older"),
-        command("pack", "run/field", "--out", "packed.kfgs.safetensors"),
+        command("pack", "run/field", "packed.kfgs.safetensors"),
+        command("fit", "room", "--splat", "other.ply", "--out", "two"),
+        command("fit", "room", "--splat", "labelled.ply", "--out", "two"),
     ]
     for step in steps:
         ended = Process(step, folder).wait()
@@ -85,16 +87,22 @@ def _with(*, files: dict[str, str] | None = None, notes: tuple[str, ...] = ("not
 
 
 def _save_html() -> None:
-    from kfgs.formats import read_splats
-    from kfgs.viz.explorer.html import save_html
+    from kfgs import explore, read_splats
 
-    save_html(Path("work/page.html"), read_splats("in/labelled.ply"))
+    explore(read_splats("in/labelled.ply"), where="notebook").save_html("work/page.html")
 
 
 def _save_edits() -> None:
     from kfgs.labels import EditList, Recolor, Remove
 
     EditList().then(Recolor("plant", "#c04040")).then(Remove("chair")).save("work/a.edits.json")
+
+
+def _restore() -> int:
+    from kfgs.pipeline.runs import list_fields
+
+    key = next(one.key for one in list_fields("in/two") if not one.current)
+    return command("runs", "work/run", "--restore", key)() or 0
 
 
 def _toy_room() -> None:
@@ -108,9 +116,7 @@ def _toy_room() -> None:
 def all_jobs() -> list[Job]:
     """Every job, the quick ones first."""
     field, room = "in/run/field", ("--scene", "in/room")
-    kept = {"notes": ("notes.txt", "field/notes.txt", "run/field/mine.ply", "run/notes.txt")}
-    run = {"work/run": "run"}
-    del run
+    images, times = (".html", ".png"), (".json", ".html", ".png")
     return [
         Job("convert", command("convert", "in/labelled.ply", "work/a.spz"), _with(files={"a.spz": "other.ply"})),
         Job("convert with labels beside", command("convert", "in/labelled.ply", "work/a.splat"), _with()),
@@ -121,27 +127,28 @@ def all_jobs() -> list[Job]:
         Job("toy room", _toy_room, _with()),
         Job("label", command("label", field, "--out", "work/labelled", "--cloud", "in/labelled.ply", "--distance", "1", *room),
             _with(files={"labelled/gaussians.ply": "other.ply"}, notes=("labelled/notes.txt",))),
-        Job("pack", command("pack", field, "--out", "work/a.kfgs.safetensors"),
-            _with(files={"a.kfgs.safetensors": "packed.kfgs.safetensors"}), loose=(".kfgs.safetensors",)),
-        Job("unpack", command("pack", "in/packed.kfgs.safetensors", "--out", "work/field"),
+        Job("pack", command("pack", field, "work/a.kfgs.safetensors"),
+            _with(files={"a.kfgs.safetensors": "packed.kfgs.safetensors"})),
+        Job("unpack", command("pack", "in/packed.kfgs.safetensors", "work/field"),
             _with(files={"field": "older"}, notes=("notes.txt", "field/notes.txt")), fields=("field",)),
         Job("select", command("select", "chair", field, "--out", "work/chairs", *room), _with(notes=("chairs/notes.txt",))),
         Job("select in a splat", command("select", "chair", "in/labelled.ply", "--out", "work/chairs"), _with(notes=("chairs/a.txt",))),
-        Job("segment", command("segment", field, "--out", "work/seen", "--pictures", "1", *room), _with(notes=("seen/notes.txt",))),
+        Job("segment", command("segment", field, "--out", "work/seen", "--pictures", "1", *room), _with(notes=("seen/notes.txt",)),
+            loose=images),
         Job("text of examples", command("text", "--examples", "in/clicks.json", "--field", field, "--out", "work/t.safetensors"), _with()),
-        Job("attach", command("attach", "in/labelled.ply", field, "--out", "work/a.ply", *room), _with(files={"a.ply": "other.ply"})),
+        Job("attach", command("attach", field, "in/labelled.ply", "--out", "work/a.ply", *room), _with(files={"a.ply": "other.ply"})),
+        Job("save html", _save_html, _with()),
         Job("uplift", command("uplift", "in/room", "in/labelled.ply", "--out", "work/field"),
-            _with(files={"field": "older"}, notes=("notes.txt", "field/notes.txt")), fields=("field",), loose=(".json",)),
+            _with(files={"field": "older"}, notes=("notes.txt", "field/notes.txt")), fields=("field",)),
         Job("features", command("features", "in/room", "--teacher", "campaign.jobs:grey_teacher", "--out", "work/maps"),
             _with(notes=("maps/notes.txt",)), loose=("features.json",), resumed=True),
         Job("fit", command("fit", "in/room", "--splat", "in/labelled.ply", "--out", "work/run"),
-            _with(files={"run/field": "older"}, notes=kept["notes"][2:]), fields=("run/field",),
-            loose=(".json", ".html", ".png"), resumed=True),
-        Job("fit by the paper", command("fit", "in/room", "--method", "paper", "--mode", "adc", "--steps", "12", "--max-gaussians", "100",
-                                       "--out", "work/run"),
-            _with(notes=("run/notes.txt",)), fields=("run/field",), loose=(".json", ".html", ".png"), resumed=True),
-        Job("color", command("color", "in/room", "--out", "work/run", "--steps", "12"), _with(notes=("run/notes.txt",)),
-            loose=(".json", ".html", ".png"), resumed=True),
-        Job("restore an earlier field", command("runs", "work/run", "--restore", "KEY"), _with(), fields=("run/field",)),
-        Job("save html", _save_html, _with()),
+            _with(files={"run/field": "older"}, notes=("run/field/mine.ply", "run/notes.txt")), fields=("run/field",),
+            loose=times, resumed=True),
+        Job("restore an earlier field", _restore, _with(files={"run": "two"}, notes=("run/field/mine.ply",)), fields=("run/field",)),
+        Job("fit by the paper", command("fit", "in/room", "--method", "paper", "--mode", "adc", "--steps", "12",
+                                       "--max-gaussians", "100", "--out", "work/run"),
+            _with(notes=("run/notes.txt",)), fields=("run/field",), loose=times, resumed=True),
+        Job("color", command("color", "in/room", "--out", "work/run", "--preset", "quick", "--steps", "12"),
+            _with(notes=("run/notes.txt",)), loose=times, resumed=True),
     ]  # fmt: skip

@@ -103,7 +103,7 @@ def _json(value: Any, rng: Random) -> bytes:
 def _strange(old: Any, rng: Random) -> Any:
     """A value in place of another: near it, or of another kind."""
     roll = rng.random()
-    if isinstance(old, int | float) and not isinstance(old, bool) and roll < 0.4:
+    if isinstance(old, int | float) and not isinstance(old, bool) and roll < 0.4 and abs(old) < 1e15:
         return rng.choice([old + 1, -old, old * 1000, old / 3, int(old) + 10**6])
     if isinstance(old, str) and roll < 0.3:
         return rng.choice([old + "x", old * 50, old[:-1], old.upper()])

@@ -74,6 +74,10 @@ class Process:
         """Send a signal, if it still runs."""
         os.kill(self.pid, number)
 
+    def ready(self) -> bool:
+        """Whether the command has begun: signals are handled as in a process of its own."""
+        return self.log.exists()
+
     def running(self) -> bool:
         """Whether it still runs. It is not waited for: `wait` does."""
         return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
@@ -98,12 +102,13 @@ class Process:
 def _prepare(folder: Path, log: Path, limit: int | None) -> None:
     import resource
 
-    out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-    os.dup2(out, 1)
-    os.dup2(out, 2)
     os.setpgid(0, 0)
     os.chdir(folder)
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    os.dup2(out, 1)
+    os.dup2(out, 2)
     if limit is not None:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
