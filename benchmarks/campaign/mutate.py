@@ -32,7 +32,10 @@ def mutate(data: bytes, rng: Random) -> bytes:
 
 def _once(data: bytes, rng: Random) -> bytes:
     if rng.random() < 0.65:
-        changed = _structured(data, rng)
+        try:
+            changed = _structured(data, rng)
+        except Exception:  # what earlier mutations left cannot be put together
+            changed = None
         if changed is not None:
             return changed
     return _blind(data, rng)
@@ -54,10 +57,7 @@ def _structured(data: bytes, rng: Random, depth: int = 0) -> bytes | None:
             i = rng.randrange(len(parts))
             name, body = parts[i]
             parts[i] = (name, _structured(body, rng, depth + 1) or _blind(body, rng))
-        try:
-            return container.close(parts)
-        except (ValueError, struct.error, OverflowError):  # a part that cannot be stated
-            return None
+        return container.close(parts)
     if data[:1] in b"{[" and data:
         try:
             return _json(json.loads(data), rng)
