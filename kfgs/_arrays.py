@@ -141,7 +141,7 @@ def _stated_bytes(file: IO[bytes]) -> int:
 def _named(path: str | Path, expected: str, advice: str) -> Iterator[None]:
     """Turn whatever fails while a file is read into a `FileError`."""
     if not as_path(path).is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected {expected} there")
+        raise FileNotFoundError(f"{path}: no such file; expected {expected} there; {advice}")
     try:
         yield
     except PermissionError:

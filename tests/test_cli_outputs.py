@@ -121,21 +121,47 @@ LIMITED = """
 import resource, sys
 from kfgs.cli import main
 import kfgs.formats.table, torch
-resource.setrlimit(resource.RLIMIT_FSIZE, (2048, 2048))
-sys.exit(main(sys.argv[1:]))
+limit = int(sys.argv[1])
+resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+sys.exit(main(sys.argv[2:]))
 """
 
 
 @pytest.mark.parametrize("name", ["b.ply", "b.splat", "b.spz", "b.sog", "b.glb", "b.compressed.ply"])
 def test_a_disk_that_takes_no_more_is_one_message_with_the_file(name, splat, tmp_path):
     done = subprocess.run(
-        [sys.executable, "-c", LIMITED, "convert", splat, tmp_path / name], capture_output=True, text=True
+        [sys.executable, "-c", LIMITED, "2048", "convert", splat, tmp_path / name], capture_output=True, text=True
     )
     assert done.returncode == 1, done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     assert str(tmp_path / name) in done.stderr
     assert "kfgs-unfinished" not in done.stderr
     assert not any(path.name.startswith((".", name)) for path in tmp_path.iterdir())
+
+
+def test_a_disk_that_takes_no_more_while_training_is_one_message(room, tmp_path):
+    words = ["color", room, "--out", tmp_path / "run", "--preset", "quick", "--steps", "20"]
+    done = subprocess.run([sys.executable, "-c", LIMITED, "30000", *words], capture_output=True, text=True)
+    assert done.returncode == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    assert f"error: [Errno 27] File too large: '{tmp_path / 'run' / 'unfinished' / 'color-'}" in done.stderr
+    assert [path.name for path in (tmp_path / "run").rglob(".*")] == [".run.lock"]
+
+
+def test_the_second_fit_and_the_second_color_are_told_who_works_there(room, run, capsys):
+    before = files(run)
+    hold = (
+        "import sys, pathlib; from kfgs.pipeline import Run\n"
+        "with Run(pathlib.Path(sys.argv[1])).locked(): print('held', flush=True); sys.stdin.read()"
+    )
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", hold, run], **pipes) as first:
+        assert first.stdout.readline() == b"held\n"
+        lock = {run / ".run.lock": (run / ".run.lock").read_bytes()}
+        for words in (["fit", room, "--out", run, "--method", "paper"], ["color", room, "--out", run]):
+            refused(words, capsys, run, f"process {first.pid} of", "wait")
+        assert files(run) == before | lock
+        first.stdin.close()
 
 
 @pytest.mark.parametrize("words", ["label {run}/field --cloud {splat}", "attach {run}/field {splat} --by distance"])
@@ -219,7 +245,7 @@ def test_two_runs_of_kfgs_give_the_same_bytes(room, run, tmp_path):
 KILLED = """
 import os, signal, sys, pathlib
 def hook(event, arguments):
-    if event == "os.rename":  # everything is written, nothing is in its place
+    if event == "os.rename" and "place" in str(arguments[0]):  # everything is written, nothing is in its place
         os.kill(os.getpid(), signal.SIGKILL)
 from kfgs.cli import main
 import kfgs.formats.table, kfgs.toy.room_folder, torch

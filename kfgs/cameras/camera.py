@@ -188,6 +188,11 @@ class Camera:
         )
         return replace(self, K=self.K * factors[:, None], width=width, height=height)
 
+    def fitted(self, longest: int) -> Camera:
+        """The same view with at most so many pixels on its longer edge."""
+        scale = min(1.0, longest / max(self.size))
+        return self.resized(max(1, round(scale * self.height)), max(1, round(scale * self.width)))
+
     def to(self, *args: Any, **kwargs: Any) -> Camera:
         """Move or convert the matrices as `Tensor.to` does."""
         return replace(self, viewmat=moved_to(self.viewmat, *args, **kwargs), K=moved_to(self.K, *args, **kwargs))

@@ -282,11 +282,12 @@ def _scene_of(field: Any, classes: Classes) -> Any:
 
 def _draw(path: Path, query: str, gaussians: Any, things: list[Any], cameras: Any, scene: Any) -> list[Path]:
     """Draw the parts over photographs; without them over the cloud's own colours, if it has some."""
-    from ..pipeline.part_pictures import photos_of, write_parts
+    from ..pipeline.part_pictures import write_parts
     from ..viz import show_cloud
+    from ..viz.shows import Photos
 
     under = None if gaussians.sh is None else show_cloud(gaussians, color_by="rgb")
-    under = under if scene is None else photos_of(scene)
+    under = under if scene is None else Photos(scene)
     drawn = write_parts(path, gaussians, things, cameras or (), under, query)
     return [] if drawn is None else [drawn]
 

@@ -94,7 +94,7 @@ def _serve(read: Callable[[], Any], source: Path, out: Path, classes: Classes, d
 
     if not source.exists():
         read()  # says what is wrong
-    with PageServer(document(source.resolve().stem, PYTHON_START), display.host, display.port) as page:
+    with PageServer(document(_title(source), PYTHON_START), display.host, display.port) as page:
         announce(page, out, say)
         _viewer(read(), source, out, classes, display).show_in(page)
         wait()
@@ -140,7 +140,13 @@ def _viewer(state: Any, source: Path, out: Path, classes: Classes, display: Disp
 
     state.set_show(display.show or state.first_show)
     scene = None if classes.scene is None else classes.load_scene().undistorted()
-    return Viewer(state, ExploreOptions(out=out), title=source.resolve().stem, scene=scene)
+    return Viewer(state, ExploreOptions(out=out), title=_title(source), scene=scene)
+
+
+def _title(source: Path) -> str:
+    """What tells one page from another: the run of RUN/field, else the file."""
+    path = source.resolve()
+    return path.parent.name if path.name == "field" else path.stem
 
 
 def _draw(state: Any, place: Where, out: Path, display: Display) -> None:

@@ -32,7 +32,7 @@ def load_label_map(path: str | Path) -> Tensor:  # [H, W] int64, -1 = void
         ValueError: if it is not an 8-bit single-channel picture.
     """
     path = as_path(path)
-    with open_picture(path, "a label picture", "write it again") as picture:
+    with open_picture(path, "a picture of labels", "write it again") as picture:
         mode = picture.mode
         values = torch.from_numpy(np.array(picture)).long() if mode in ("L", "P") else None
     if values is None:

@@ -245,7 +245,7 @@ class App {
     const sides = (of) => Object.fromEntries(model.sides.map((side) => [side, of(side)]));
     const edits = () => sides((side) => model.editsOf(side));
     const lambda = () => (model.carried ? model.lambda : null);
-    const asked = () => ({ words: this.inPython ? model.answer.words : null, gamma: model.gamma, lambda: lambda() });
+    const asked = () => ({ words: model.words, gamma: model.gamma, lambda: lambda() });
     const wrote = (paths) => this.say(`Saved: ${paths.join(", ")}`);
     return {
       describe: (side, index) => link.describe(side, index),
@@ -255,11 +255,6 @@ class App {
         wrote(await link.saveSelection({ ...asked(), edits: edits(), masks: sides((side) => model.selected(side)) }))),
       saveEdits: () => this.attempt(async () => wrote(await link.saveEdits(edits(), lambda()))),
     };
-  }
-
-  /** Whether the question is one of words: not "like the selection". */
-  get inPython() {
-    return this.model.answer !== null && !this.model.answer.example;
   }
 
   /** Do something, or say why it cannot be done. */
@@ -273,7 +268,7 @@ class App {
 
   async split() {
     const { model } = this;
-    const [side, name] = [model.side, this.inPython ? model.answer.words : "part"];
+    const [side, name] = [model.side, model.words ?? "part"];
     model.setParts({ side, name, ...(await this.link.parts(side, model.selected(side), model.editsOf(side))) });
   }
 
@@ -291,17 +286,13 @@ class App {
   }
 
   openFile(file) {
-    return file && this.attempt(async () => this.open(JSON.parse(await file.text().catch(() => "null"))));
+    return file && this.attempt(async () => this.open(await new Response(file).json().catch(() => null)));
   }
 
-  /** Show a state that `Model.toJSON` gave. */
+  /** Show a state that `Model.toJSON` gave; without its question, if nobody answers that any more. */
   async open(saved) {
-    this.model.fromJSON(saved);
-    if (!saved.words) return;
-    const { now } = this.model;
-    this.model.ask(await this.link.ask(saved.words));
-    this.model.setGamma(saved.gamma);
-    if (Object.keys(now.hand).length) this.model.step("open", { hand: now.hand });
+    const answer = saved?.words ? await this.attempt(() => this.link.ask(saved.words)) : null;
+    this.model.fromJSON(saved, answer ?? null);
   }
 
   /** Keep edits and selection for a reload of the tab. */
@@ -443,10 +434,12 @@ class App {
     this.gliding = requestAnimationFrame(step);
   }
 
-  /** Move the camera so that the selection, or everything, fills the view. */
+  /** Move the camera so that the selection fills the view; without one, go to the first view, since a room has walls. */
   fit() {
-    const found = this.model.extent(this.model.side);
+    const { model, header } = this;
+    const found = model.extent(model.side);
     if (!found) return;
+    if (!model.counts(model.side).selected && Number.isInteger(header.default_view)) return this.goTo(header.default_view);
     this.leaveView();
     this.glide(() => this.eye.fit(found));
   }

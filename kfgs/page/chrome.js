@@ -12,7 +12,7 @@ const LAYOUTS = [["one", "One view"], ["split", "Side by side"], ["slider", "Sli
 const HELP = [
   ["Drag", "turn the view"], ["Right drag, Shift + drag", "move it sideways"], ["Wheel, two fingers, + −", "zoom"],
   ["W A S D, Q E", "fly (Shift: faster)"], ["Click", "pick a Gaussian"], ["Double click", "turn about this point"],
-  ["F", "fit the selection, or everything"], ["[ ]", "previous and next photo view"], ["P", "photo over the view"],
+  ["F", "fit the selection, or the first view"], ["[ ]", "previous and next photo view"], ["P", "photo over the view"],
   ["/", "search"], ["M", "next colour mode"], ["1 2 3 4 5", "move, box, lasso, brush, ball"], ["6", "drag the selection (Shift: up and down)"], [", .", "smaller and larger brush"],
   ["Shift or Alt + tool", "add to or subtract from the selection"], ["Delete", "remove the selection"],
   ["Ctrl + I", "invert the selection"], ["Ctrl + Z, Ctrl + Shift + Z", "undo, redo"],
@@ -27,10 +27,14 @@ export function makeTop(app) {
   const count = (name) => whole(model.counts(model.side).classes[model.names.indexOf(name)]);
   const what = link.phrases ? "Search for anything" : "Search for a class";
   const search = searchBox({
-    label: what, placeholder: what, onchoose: (words) => app.ask(words), onclear: () => app.ask(null),
+    label: what, placeholder: what, onchoose: (words) => app.ask(meant(words)), onclear: () => app.ask(null),
     suggest: (text) => suggestions(text === model.answer?.words ? "" : text, names),
     describe: (name) => [h("span", {}, name), h("small", {}, count(name))],
   });
+  const meant = (words) => {
+    const found = link.phrases ? [] : suggestions(words, names);
+    return found.length === 1 ? found[0] : words; // the only class that the typed letters can become
+  };
   const modes = Object.entries(app.modes).map(([mode, text]) => [mode, text, `Show ${text.toLowerCase()} (M)`]);
   const photos = header.cameras.some((camera) => camera.thumbnail);
   if (photos) modes.unshift(["photo", "Photo", "Lay the photo of the nearest view over the scene (P)"]);
@@ -60,7 +64,7 @@ export function makeTop(app) {
 export function makeRail(app) {
   const make = ([tool, [label, key]]) => iconButton(tool, label, () => app.setTool(tool), { key, "data-tool": tool });
   const buttons = Object.entries(TOOLS).map(make);
-  const fit = iconButton("fit", "Fit the selection, or everything", () => app.fit(), { key: "F" });
+  const fit = iconButton("fit", "Fit the selection, or go to the first view", () => app.fit(), { key: "F" });
   const set = (tool) => buttons.forEach((one) => one.setAttribute("aria-pressed", String(one.dataset.tool === tool)));
   set("move");
   return { element: h("div", { class: "rail card", role: "toolbar", "aria-label": "Tools" }, ...buttons, fit), set };
@@ -78,10 +82,11 @@ export function makeCaptions(app) {
   const caption = (pane, at) => {
     const change = (changes) => (Object.assign(pane, changes), app.refreshPanes());
     const alone = panes.list.length === 1;
-    if (alone && model.sides.length < 2) return [];
+    const one = model.sides.length < 2;
+    if (alone && one) return [];
     if (alone) return [select("Cloud", model.sides.map((side) => [side, cloudName(side)]), pane.side, (side) => change({ side }))];
     const choices = model.sides.flatMap((side) =>
-      Object.entries(app.modes).map(([mode, text]) => [`${side} ${mode}`, `${cloudName(side)}: ${text.toLowerCase()}`]));
+      Object.entries(app.modes).map(([mode, text]) => [`${side} ${mode}`, one ? text : `${cloudName(side)}: ${text.toLowerCase()}`]));
     const set = (value) => change({ side: value.split(" ")[0], mode: value.split(" ")[1] });
     return [select(`View ${at + 1}`, choices, `${pane.side} ${pane.mode}`, set)];
   };
@@ -118,7 +123,7 @@ export function makeViews(app) {
   return { element: h("div", group, ...buttons), set };
 }
 
-/** The photo of a view over the scene, with its opacity. Returns {elements, show(url), hide(), place(left, top, w, h)}. */
+/** The photo of a view over the scene, with its opacity. Returns {elements, show(url), place({left, top, width, height})}. */
 export function makePhoto() {
   const image = h("img", { class: "photo", alt: "", hidden: true });
   const fade = (event) => (image.style.opacity = event.target.value);

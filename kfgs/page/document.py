@@ -21,7 +21,7 @@ PYTHON_START = """\
     root.textContent = "";
     if (!loaded?.ok) throw new Error("Python does not answer; its terminal says why.");
     const [header, data] = kfgs.readMessage(await loaded.arrayBuffer());
-    const link = new kfgs.PythonLink(kfgs.callPage, header.phrases);
+    const link = new kfgs.PythonLink(kfgs.callPage, header);
     window.viewer = await kfgs.mount(root, { header, data }, link);"""
 PAGE = """\
 <!doctype html>

@@ -1,10 +1,10 @@
-/** Who answers what the page cannot: in an exported file the packed scores; later the server or the notebook. */
+/** Who answers questions: in an exported file the packed scores, else Python behind a page or a notebook. */
 
 import { bufferOf, questionNumber } from "./clouds.js";
 
 const PATIENCE = 60_000; // milliseconds for an answer of a kernel
-const NEEDS_PYTHON =
-  "Searching for any words needs Python: open the scene with “kfgs view” or in a notebook. This file knows its classes only";
+const NEEDS_PYTHON = "Any other words need Python: open the scene with “kfgs view” or in a notebook.";
+const NEEDS_TEACHER = "Any other words need the teacher's text encoder: start “kfgs view” with --teacher.";
 
 /** Answers questions about classes from the scores in the pack. */
 export class OfflineLink {
@@ -22,7 +22,7 @@ export class OfflineLink {
   async ask(words) {
     const name = className(words, this.names);
     const found = this.packed.header.query[name];
-    if (!found) throw new Error(explain(words, this.names));
+    if (!found) throw new Error(explain(words, this.names, NEEDS_PYTHON));
     return { ...found, words: name, number: questionNumber(found.buffer), scores: bufferOf(this.packed, found.buffer) };
   }
 }
@@ -43,10 +43,10 @@ export function suggestions(typed, names) {
   return [...begins, ...unique.filter((name) => !begins.includes(name) && name.toLowerCase().includes(stem))];
 }
 
-function explain(words, names) {
+function explain(words, names, needs) {
   const near = nearest(words.trim(), names);
   const hint = near ? `Did you mean “${near}”? ` : "";
-  return `“${words.trim()}” is none of the classes. ${hint}${NEEDS_PYTHON}: ${listed(names)}.`;
+  return `“${words.trim()}” is none of the classes (${listed(names)}). ${hint}${needs}`;
 }
 
 function listed(names) {
@@ -70,19 +70,20 @@ function nearest(words, names) {
 export class PythonLink {
   /**
    * @param {(name: string, args: object, attached?: Uint8Array) => Promise<[object, ArrayBuffer]>} call `callPage` or `callWidget`
-   * @param {boolean} phrases whether it answers any words
+   * @param {object} header of the pack: has the classes, and whether Python answers any words
    */
-  constructor(call, phrases) {
-    Object.assign(this, { call, phrases, python: true });
+  constructor(call, { phrases, classes }) {
+    Object.assign(this, { call, phrases, names: classes.map(({ name }) => name), python: true });
   }
 
   /** As `OfflineLink.ask`; there is no `number` for words that are no class. */
   async ask(words) {
+    if (!this.phrases && className(words, this.names) === null) throw new Error(explain(words, this.names, NEEDS_TEACHER));
     const [answer, scores] = await this.call("ask", { words });
     return { ...answer, number: answer.number ?? undefined, scores: new Float32Array(scores) };
   }
 
-  /** Neighbours and views of a Gaussian: {neighbours: [{index, distance}], views: [{index, name, weight}]}. */
+  /** The views that see a Gaussian: {views: [{index, name, weight}]}. */
   async describe(side, index) {
     return (await this.call("describe", { side, index }))[0];
   }
@@ -93,7 +94,7 @@ export class PythonLink {
     return { ...answer, number: undefined, example: true, scores: new Float32Array(scores) };
   }
 
-  /** Connected parts of a mask: {parts: [{count, volume, low, high}], numbers: Int16Array}, the largest first; -1: of no part. */
+  /** Connected parts of a mask: {parts: [{count, volume, corners}], numbers: Int16Array}, the largest first; -1: of no part. */
   async parts(side, mask, edits) {
     const [answer, numbers] = await this.call("parts", { side, edits: { [side]: edits } }, bitsOf(mask));
     return { ...answer, numbers: new Int16Array(numbers) };
@@ -112,7 +113,7 @@ export class PythonLink {
   }
 }
 
-/** Call Python over the page's own address; see page_server.py for the form of a message. */
+/** Call Python over the page's own address; see server.py for the form of a message. */
 export async function callPage(name, args, attached) {
   const sent = await fetch("call", { method: "POST", body: packMessage({ name, args }, attached) }).catch(() => null);
   if (!sent) throw new Error("Python does not answer: has “kfgs view” ended?");

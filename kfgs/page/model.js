@@ -5,6 +5,7 @@ import { Cloud, bufferOf, cloudsOf } from "./clouds.js";
 const MOST_UNDONE = 50; // steps; a step holds at most the masks that it changed
 const BINS = 64; // of the histograms
 const REACH = 3; // grow by so many typical distances between neighbours
+const NOTHING = { answer: null, gamma: null, gammaHow: "", hand: {} }; // asked or selected
 export const SIDE_WORDS = { color: "colour", semantic: "semantic" };
 
 /** A whole number with separators: 100,000. */
@@ -33,7 +34,7 @@ export class Model extends EventTarget {
     this.hidden = new Set();
     this.picked = null; // {side, index}
     this.parts = null; // {side, name, parts, numbers}
-    this.now = { answer: null, gamma: null, gammaHow: "", hand: {}, edits: [], what: "", id: 0 };
+    this.now = { ...NOTHING, edits: [], what: "", id: 0 };
     this.past = [];
     this.future = [];
     this.cache = new Map();
@@ -44,6 +45,11 @@ export class Model extends EventTarget {
     return this.clouds[side].count;
   }
 
+  /** What a Gaussian of a side is called. */
+  kindOf(side) {
+    return this.sides.length > 1 ? `${SIDE_WORDS[side]} Gaussian` : "Gaussian";
+  }
+
   /** Whether labels reach the colour cloud from the semantic one. */
   get carried() {
     return this.packed.header.buffers["color/source"] !== undefined;
@@ -51,6 +57,11 @@ export class Model extends EventTarget {
 
   get answer() {
     return this.now.answer;
+  }
+
+  /** The words of the question; null if there is none, or it was asked by an example ("like the selection"). */
+  get words() {
+    return this.answer && !this.answer.example ? this.answer.words : null;
   }
 
   get gamma() {
@@ -81,9 +92,14 @@ export class Model extends EventTarget {
   /** Show the answer to a question (see link.js); null clears it. The selection is then the question's. */
   ask(answer) {
     this.parts = null;
-    if (answer) answer.id ??= ++this.answers;
-    const { gamma = null, how = "" } = answer ?? {};
-    this.step(answer ? `search for ${answer.words}` : "clear the search", { answer, gamma, gammaHow: how, hand: {} });
+    this.step(answer ? `search for ${answer.words}` : "clear the search", this.answered(answer));
+  }
+
+  /** The question and its suggested gamma, as a part of the state. */
+  answered(answer) {
+    if (!answer) return NOTHING;
+    answer.id ??= ++this.answers;
+    return { answer, gamma: answer.gamma, gammaHow: answer.how, hand: {} };
   }
 
   /** Select Gaussians that score above gamma; steps of one drag of a slider are one step of undo. */
@@ -225,7 +241,7 @@ export class Model extends EventTarget {
 
   /** Drop the question and the selection by hand. */
   clear() {
-    if (this.selecting) this.step("clear selection", { answer: null, gamma: null, gammaHow: "", hand: {} });
+    if (this.selecting) this.step("clear selection", NOTHING);
   }
 
   /** Add the neighbours of selected Gaussians (grow) or drop those next to unselected ones (shrink). */
@@ -243,7 +259,7 @@ export class Model extends EventTarget {
 
   /** Remove the selected Gaussians of both sides; the selection ends. Returns how many. */
   remove() {
-    return this.edit("remove", {}, { answer: null, gamma: null, gammaHow: "", hand: {} });
+    return this.edit("remove", {}, NOTHING);
   }
 
   /** Give the selected Gaussians a colour, [r, g, b] in 0..1, and keep their shading. Returns how many. */
@@ -269,7 +285,7 @@ export class Model extends EventTarget {
       const count = this.total(side);
       return [side, new Uint8Array(count + length).fill(1, count)];
     });
-    return this.edit("duplicate", { translation }, { answer: null, gamma: null, gammaHow: "", hand: Object.fromEntries(hand) });
+    return this.edit("duplicate", { translation }, { ...NOTHING, hand: Object.fromEntries(hand) });
   }
 
   /**
@@ -382,10 +398,10 @@ export class Model extends EventTarget {
 
   /** The state as JSON. Edits have the form of kfgs.labels.EditList; their order is kept, but removals come last. */
   toJSON() {
-    const asked = { words: this.answer?.words ?? null, gamma: this.gamma, lambda: this.carried ? this.lambda : null };
+    const asked = { words: this.words, gamma: this.gamma, lambda: this.carried ? this.lambda : null };
     const sides = this.sides.map((side) => {
       const count = this.packed.header.sides[side].count;
-      const selected = this.byHand ? [...indices(this.selected(side))] : null;
+      const selected = this.byHand || this.answer?.example ? [...indices(this.selected(side))] : null;
       return [side, { count, selected, edits: this.editsOf(side) }];
     });
     return { format: "kfgs.view", version: 1, ...asked, hidden: [...this.hidden], sides: Object.fromEntries(sides) };
@@ -401,29 +417,33 @@ export class Model extends EventTarget {
   }
 
   /**
-   * Become what `toJSON` gave, except for the question; one step of undo.
-   * @throws {Error} a sentence for people, if it was of another scene
+   * Become what `toJSON` gave; one step of undo, except for lambda and hidden classes.
+   * @param {object} saved
+   * @param {object?} answer to the question that was saved
+   * @throws {Error} a sentence for people, if it is of another scene, or somebody changed it into what cannot be done
    */
-  fromJSON(saved) {
+  fromJSON(saved, answer) {
     if (saved?.format !== "kfgs.view" || saved.version !== 1) throw new Error("This file is no state of the viewer (“Save state”).");
-    const other = this.sides.find((side) => saved.sides[side]?.count !== this.packed.header.sides[side].count);
+    const other = this.sides.find((side) => saved.sides?.[side]?.count !== this.packed.header.sides[side].count);
     if (other) {
-      const [count, own] = [saved.sides[other]?.count ?? 0, this.packed.header.sides[other].count];
+      const [count, own] = [saved.sides?.[other]?.count ?? 0, this.packed.header.sides[other].count];
       throw new Error(`This state is of another scene, with ${whole(count)} ${SIDE_WORDS[other]} Gaussians; here are ${whole(own)}.`);
     }
-    const edits = this.sides.flatMap((side) =>
-      saved.sides[side].edits.map(({ where, ...edit }) => ({ ...edit, rows: { [side]: Uint32Array.from(where.indices) } })));
-    const hand = {};
+    const [edits, hand] = [[], {}];
     for (const side of this.sides) {
-      const { selected, count } = saved.sides[side];
-      const copies = edits.filter(({ op, rows }) => op === "duplicate" && side in rows);
-      if (!selected) continue;
-      hand[side] = new Uint8Array(copies.reduce((all, { rows }) => all + rows[side].length, count));
-      for (const i of selected) hand[side][i] = 1;
+      let { count, selected, edits: own } = saved.sides[side];
+      for (const { where, ...edit } of own) {
+        if (!possible(edit, where?.indices, count)) throw new Error(`This state has an edit that cannot be done: ${JSON.stringify(edit)}.`);
+        edits.push({ ...edit, rows: { [side]: Uint32Array.from(where.indices) } });
+        if (edit.op === "duplicate") count += where.indices.length;
+      }
+      if (selected) hand[side] = new Uint8Array(count);
+      for (const i of selected ?? []) hand[side][i] = 1;
     }
-    this.step("open", { edits, hand });
-    if (saved.lambda !== null) this.lambda = saved.lambda;
-    this.setHidden(saved.hidden);
+    this.hidden = new Set(saved.hidden);
+    if (saved.lambda > 0) this.lambda = Number(saved.lambda);
+    const given = answer && Number.isFinite(saved.gamma) && saved.gamma !== answer.gamma;
+    this.step("open", { ...this.answered(answer), ...(given ? { gamma: saved.gamma, gammaHow: "given" } : {}), hand, edits });
   }
 
   /** Counts of the question's scores in bins from `low` to `high`. */
@@ -448,7 +468,7 @@ export class Model extends EventTarget {
   sentences() {
     const lines = [];
     const counts = this.counts(this.side);
-    const kind = `${SIDE_WORDS[this.side]} Gaussians`;
+    const kind = `${this.kindOf(this.side)}s`;
     const some = `${whole(counts.selected)} of ${whole(counts.total)} ${kind}`;
     if (this.byHand) lines.push(`${some} are selected by hand.`);
     else if (this.answer) lines.push(`${some} score above ${short(this.gamma)} for “${this.answer.words}”.`);
@@ -487,13 +507,21 @@ export class Model extends EventTarget {
     const [had, wanted] = [this.applied, this.now.edits];
     let same = 0;
     while (same < had.length && had[same] === wanted[same]) same++;
+    const others = [...had.slice(same), ...wanted.slice(same)];
+    if (others.some(({ op }) => ["remove", "move", "duplicate"].includes(op))) this.parts = null; // their places are others now
+    this.applied = wanted;
+    const [last, next] = others;
+    if (others.length === 2 && wanted.length === had.length && next.op === "move" && next.rows === last.rows) {
+      const translation = next.translation.map((value, axis) => value - last.translation[axis]); // a drag goes on
+      for (const side of this.sides) this.clouds[side].apply({ ...next, translation });
+      return;
+    }
     const changed = new Set(had.slice(same).flatMap(({ rows }) => Object.keys(rows)));
     for (const side of changed) {
       this.clouds[side] = new Cloud(this.packed, side);
       for (const edit of wanted.slice(0, same)) this.clouds[side].apply(edit);
     }
     for (const edit of wanted.slice(same)) for (const side of this.sides) this.clouds[side].apply(edit);
-    this.applied = wanted;
   }
 
   bySides() {
@@ -533,6 +561,17 @@ export function sum(mask) {
 
 /** The numbers of what a mask has, Uint32Array. */
 const indices = (mask) => Uint32Array.from(mask.keys()).filter((i) => mask[i]);
+
+/** Whether an edit that was read can be done to these Gaussians of so many. */
+function possible({ op, factor, rgb, mode, translation }, rows, count) {
+  const within = (values, low, high) => Array.isArray(values) && values.every((one) => Number.isFinite(one) && one >= low && one <= high);
+  const vector = (values, low, high) => within(values, low, high) && values.length === 3;
+  const values = {
+    remove: () => true, opacity: () => within([factor], 0, 1), recolor: () => vector(rgb, 0, 1) && mode === "tint",
+    move: () => vector(translation, -Infinity, Infinity), duplicate: () => vector(translation, -Infinity, Infinity),
+  };
+  return within(rows, 0, count - 1) && (values[op]?.() ?? false);
+}
 
 function sameRows(a, b) {
   const same = (p, q) => p?.length === q.length && p.every((row, k) => row === q[k]);

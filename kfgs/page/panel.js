@@ -120,10 +120,11 @@ function selectionPart(model, act) {
   const color = h("input", { type: "color", value: "#c04040", "aria-label": "New colour", onchange: paint });
   const fade = () => model.fade(opacity.value / 100);
   const opacity = h("input", { type: "range", min: 0, max: 100, value: 100, "aria-label": "Opacity", onchange: fade });
+  const recolor = h("label", { class: "pair", title: "Give the selection a colour, and keep its shading" }, "Recolour", color);
   const edits = [
     button("Remove", "Remove the selected Gaussians (Delete)", () => model.remove(), { class: "danger" }),
     button("Duplicate", "Add a copy of the selected Gaussians beside them; move it with tool 6", act.duplicate),
-    h("label", { class: "pair", title: "Give the selection a colour, and keep its shading" }, "Recolour", color),
+    recolor,
     h("label", { class: "pair", title: "Make the selection transparent" }, "Opacity", opacity),
   ];
   const restore = button("Restore all", "Undo all edits", () => model.restore(), { class: "link" });
@@ -147,11 +148,12 @@ function selectionPart(model, act) {
     save.hidden = boxes.hidden && !model.edited;
     if (files.length) [files[0].hidden, files[1].hidden] = [boxes.hidden, !model.edited];
     restore.hidden = !model.edited;
+    recolor.hidden = !model.sides.some((side) => model.clouds[side].colored && model.counts(side).selected);
     if (model.now.what !== "opacity") opacity.value = 100;
     const more = other ? `, and ${whole(model.counts(other).selected)} ${SIDE_WORDS[other]} ones` : "";
     said.textContent = boxes.hidden
       ? "Search for a class, or select with the box, the lasso, the brush or the ball."
-      : `${whole(count)} ${SIDE_WORDS[model.side]} Gaussians${more}`;
+      : `${whole(count)} ${model.kindOf(model.side)}s${more}`;
   };
   return { element, refresh };
 }
@@ -202,7 +204,7 @@ function pickLines(model, found) {
   const score = Number.isFinite(found.score) ? `, score ${found.score.toFixed(3)}` : "";
   const lines = [
     h("p", {}, h("span", { class: "swatch", style: `background:${css(color)}` }), h("strong", {}, found.name), score),
-    h("p", { class: "note" }, `${SIDE_WORDS[found.side]} Gaussian ${found.index} at ${place.map(short).join(", ")}`),
+    h("p", { class: "note" }, `${model.kindOf(found.side)} ${found.index} at ${place.map(short).join(", ")}`),
   ];
   if (found.distance !== null) {
     const away = found.distance > 0 ? `${short(found.distance)} away` : "in the same place";

@@ -12,7 +12,7 @@ export class Tools {
    * @param {HTMLElement} stage what the pointer works on
    * @param {Eye} eye the camera
    * @param {{moved(), grab(), click(x, y), twice(x, y), hover(x, y), shape(polygon, how), ball(x, y, radius, how),
-   *   brush(x, y, how, first), brushSize(), shift(dx, dy, first, upward)}} on places are CSS pixels of the stage; `how`:
+   *   brush(x, y, how, first), brushSize(), shift(dx, dy, upward, first)}} on places are CSS pixels of the stage; `how`:
    *   replace, add, subtract
    */
   constructor(stage, eye, on) {

@@ -10,10 +10,9 @@ import numpy as np
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..labels.parts import Part
-from ..scenes import Scene
 from ..viz import save_picture
 from ..viz.film_frames import Show
-from ..viz.pictures import Array, as_bytes, picture_grid, resize_photo
+from ..viz.pictures import picture_grid
 from ..viz.shows import show_selection
 
 WIDTH = 360  # pixels of a picture
@@ -30,7 +29,7 @@ def write_parts(
         gaussians: the cloud that was selected in.
         parts: from `connected_parts`, with these cameras.
         cameras: the views.
-        under: draws the picture below, for instance `photos_of(scene)`.
+        under: draws the picture below, for instance `Photos(scene)`.
         name: of the selection; parts are named name/1, name/2.
     """
     pictures, titles = [], []
@@ -53,18 +52,3 @@ def write_parts(
     ]
     save_picture(path, np.concatenate(rows))
     return path
-
-
-def photos_of(scene: Scene) -> Show:
-    """Make a function camera -> photograph of the view with its name, at the camera's size; grey without a photograph.
-
-    The scene must be undistorted like the cameras.
-    """
-    places = {camera.name: i for i, camera in enumerate(scene.cameras) if scene.image_paths[i].is_file()}
-
-    def show(camera: Camera) -> Array:
-        if camera.name not in places:
-            return np.full((camera.height, camera.width, 3), 200, np.uint8)
-        return as_bytes(resize_photo(scene.image(places[camera.name]), camera.size))
-
-    return show

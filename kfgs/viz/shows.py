@@ -11,10 +11,11 @@ from torch import Tensor
 from .._check import check_shapes
 from ..cameras import Camera
 from ..gaussians import Gaussians
+from ..scenes import Scene
 from ..splat import rasterize, rasterize_labels
 from .film_frames import Show
 from .palette import palette
-from .pictures import Array, as_bytes, overlay_labels
+from .pictures import Array, as_bytes, overlay_labels, resize_photo
 
 COVERED = 0.5  # opacity from which a pixel has a class
 OUTLINE = (213, 94, 0)  # vermilion of Okabe and Ito
@@ -75,3 +76,24 @@ def show_selection(gaussians: Gaussians, mask: Tensor, under: Show | None = None
         return np.rint(picture).astype(np.uint8)
 
     return show
+
+
+class Photos:
+    """The photographs of a scene by the names of its views: a function camera -> picture; grey where there is none.
+
+    The scene must be undistorted like the cameras.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._places = {camera.name: i for i, camera in enumerate(scene.cameras) if scene.image_paths[i].is_file()}
+
+    def __contains__(self, camera: Camera) -> bool:
+        """Whether there is a photograph of this view."""
+        return camera.name in self._places
+
+    def __call__(self, camera: Camera) -> Array:  # [H, W, 3] uint8
+        """The photograph at the camera's size."""
+        if camera not in self:
+            return np.full((camera.height, camera.width, 3), 200, np.uint8)
+        return as_bytes(resize_photo(self._scene.image(self._places[camera.name]), camera.size))

@@ -42,6 +42,14 @@ def test_resized_agrees_with_colmap_and_not_with_integer_centers():
     assert abs(integer_centers - float(camera.K[0, 2])) > 0.2
 
 
+def test_fitted_makes_the_longer_edge_no_longer_than_asked():
+    camera = Camera(torch.eye(4), K, 96, 64)
+    assert (camera.fitted(48).width, camera.fitted(48).height) == (48, 32)
+    assert camera.fitted(48).K.equal(camera.resized(32, 48).K)
+    assert camera.fitted(500).size == camera.size
+    assert Camera(torch.eye(4), K, 96, 1).fitted(10).size == (1, 10)
+
+
 def test_resized_keeps_the_lens():
     lens = Distortion("brown_conrady", (-0.1, 0, 0, 0))
     assert Camera(torch.eye(4), K, 96, 64, distortion=lens).resized(32, 48).distortion == lens

@@ -199,12 +199,19 @@ def test_suggestions_show_names_as_words_and_arrow_keys_choose(page):
     page.wait_for_selector("h2:has-text('Search: chair')", state="hidden")
 
 
+def test_letters_of_one_class_only_are_enough(page):
+    ask(page, "HAI")
+    page.wait_for_selector("h2:has-text('Search: chair')")
+    ask(page, "a")  # chair, table
+    assert "“a” is none of the classes" in page.locator("[role=alert]:visible").inner_text()
+
+
 def test_other_words_need_python_and_the_page_says_so(page):
     ask(page, "chairs in the corner")
     page.wait_for_selector("[role=alert]:visible")
     said = page.locator("[role=alert]:visible").inner_text()
     assert "is none of the classes" in said
-    assert "needs Python" in said
+    assert "need Python" in said
     assert page.evaluate("viewer.model.answer") is None
 
 
@@ -367,11 +374,53 @@ def test_a_reload_keeps_the_work_and_a_saved_state_opens_again(page, tmp_path):
     page.evaluate("viewer.model.invert()")
     page.set_input_files("input[type=file]", tmp_path / "state.json")
     until(page, lambda tab: tab.evaluate("JSON.stringify(viewer.model)") == before)
-    for wrong in ("{}", "no JSON", '{"format": "kfgs.view", "version": 1, "sides": {"color": {"count": 3}}}'):
-        (tmp_path / "wrong.json").write_text(wrong)
-        page.evaluate("viewer.say('')")
-        page.set_input_files("input[type=file]", tmp_path / "wrong.json")
+    page.keyboard.press("Control+z")  # one step of undo
+    assert page.evaluate("[viewer.model.answer.words, viewer.model.byHand]") == ["table", True]
+
+
+def open_state(page, folder, state):
+    (folder / "state.json").write_text(state if isinstance(state, str) else json.dumps(state))
+    page.evaluate("viewer.say('')")
+    page.set_input_files("input[type=file]", folder / "state.json")
+
+
+def test_a_state_without_a_question_ends_the_one_that_is_shown(page, tmp_path):
+    saved = page.evaluate("JSON.stringify(viewer.model)")
+    ask(page, "chair")
+    open_state(page, tmp_path, saved)
+    until(page, lambda tab: tab.evaluate("JSON.stringify(viewer.model)") == saved)
+
+
+def test_a_selection_by_example_is_kept_as_a_selection(page):
+    """Nobody answers "like the selection" when the page is opened again."""
+    ask(page, "chair")
+    selected = mask(page, "color")
+    page.evaluate("viewer.model.ask({...viewer.model.answer, words: 'like the selection', example: true})")
+    page.evaluate("viewer.open(JSON.parse(JSON.stringify(viewer.model)))")
+    np.testing.assert_array_equal(mask(page, "color"), selected)
+    assert page.evaluate("[viewer.model.answer, viewer.toast.hidden]") == [None, True]
+
+
+def test_a_state_that_somebody_changed_is_refused_as_a_whole(page, tmp_path):
+    ask(page, "chair")
+    page.evaluate("viewer.model.fade(0.5)")
+    before = page.evaluate("JSON.stringify(viewer.model)")
+    own = json.loads(before)
+    rows = {"kind": "index", "indices": [0, 1]}
+    wrong = [
+        {"op": "explode", "where": rows},
+        {"op": "remove", "where": {"kind": "class", "name": "chair"}},
+        {"op": "remove", "where": {"kind": "index", "indices": [450]}},
+        {"op": "opacity", "where": rows, "factor": 5},
+        {"op": "recolor", "where": rows, "mode": "tint"},
+        {"op": "move", "where": rows, "translation": [0, 0]},
+    ]
+    states = [own | {"sides": own["sides"] | {"color": own["sides"]["color"] | {"edits": [edit]}}} for edit in wrong]
+    other = {"format": "kfgs.view", "version": 1}
+    for state in (*states, {}, "no JSON", other, other | {"sides": {"color": {"count": 3}}}):
+        open_state(page, tmp_path, state)
         page.wait_for_selector("[role=alert]:visible")
+        assert re.match("This (state|file) (is|has) ", page.locator("[role=alert]:visible").inner_text())
         assert page.evaluate("JSON.stringify(viewer.model)") == before
 
 
@@ -394,6 +443,43 @@ def test_a_ball_selects_what_lies_in_it_and_a_drag_moves_it(page):
     assert np.array(place_of(page, "color", int(selected[0]))) - before == pytest.approx([40, -20], abs=8)
     page.keyboard.press("Control+z")
     assert place_of(page, "color", int(selected[0])) == pytest.approx(before)
+
+
+def test_a_drag_that_goes_on_does_not_repeat_the_earlier_edits(page):
+    ask(page, "table")
+    page.evaluate("viewer.model.recolor([0.1, 0.8, 0.3])")
+    page.evaluate("viewer.model.move([1, 0, 0])")
+    cloud = page.evaluate_handle("viewer.model.clouds.color")
+    page.evaluate("viewer.model.move([0, 1, 0], true)")
+    assert page.evaluate("cloud => cloud === viewer.model.clouds.color", cloud)
+    moved = page.evaluate("[...viewer.model.clouds.color.means]")
+    page.keyboard.press("Control+z")
+    page.keyboard.press("Control+Shift+Z")
+    assert page.evaluate("[...viewer.model.clouds.color.means]") == pytest.approx(moved, abs=1e-5)
+
+
+def test_parts_end_when_their_gaussians_go_elsewhere(page):
+    ask(page, "table")
+    parts = "{side: 'color', name: 'table', parts: [{count: 1, corners: Array(8).fill([0, 0, 0])}], numbers: []}"
+    for edit, left in (
+        ("recolor([1, 0, 0])", True),
+        ("move([0, 0, 1])", False),
+        ("undo()", False),
+        ("remove()", False),
+    ):
+        page.evaluate(f"viewer.model.setParts({parts})")
+        page.evaluate(f"viewer.model.{edit}")
+        assert page.locator("section:has-text('Connected parts')").is_visible() == left
+
+
+def test_a_field_alone_has_no_colours_to_change_and_its_gaussians_need_no_adjective(browser, tmp_path):
+    state = Exploration(FieldMeaning(cases_explorer.field("fused"), cases_explorer.classes()))
+    for page in show(browser, save_html(state, tmp_path / "page.html")):
+        ask(page, state.meaning.names[0])
+        assert "score above" in page.locator(".said").inner_text()
+        assert "semantic" not in page.locator(".said, .panel").first.inner_text()
+        assert page.locator("text=Opacity").is_visible()
+        assert not page.locator("text=Recolour").is_visible()
 
 
 def test_a_tooltip_names_what_the_pointer_rests_on(page):
@@ -432,8 +518,13 @@ def test_buttons_go_to_the_scenes_views(browser, tmp_path):
         page.keyboard.press("]")
         until(page, lambda tab: tab.locator("[aria-current=true][aria-label='Go to view_1']").count())
         until(page, lambda tab: np.allclose(tab.evaluate(VIEWMAT), views[1].viewmat.flatten(), atol=1e-6))
+        ask(page, "chair")
+        page.locator(".stage").focus()
         page.keyboard.press("f")
         assert current.count() == 0
+        page.keyboard.press("Escape")
+        page.keyboard.press("f")
+        until(page, lambda tab: np.allclose(tab.evaluate(VIEWMAT), views[0].viewmat.flatten(), atol=1e-6))
 
 
 def test_the_photo_is_of_the_view_that_looks_the_same_way(browser, tmp_path):
@@ -450,9 +541,20 @@ def test_the_photo_is_of_the_view_that_looks_the_same_way(browser, tmp_path):
         assert found == 1
 
 
+class BlackPhotos:
+    def __init__(self, scene):
+        pass
+
+    def __contains__(self, camera):
+        return True
+
+    def __call__(self, camera):
+        return np.zeros((camera.height, camera.width, 3), np.uint8)
+
+
 def test_the_list_of_views_scrolls_to_the_current_one(browser, tmp_path, monkeypatch):
     """Photos are loaded when they come into sight; their places must not move then."""
-    monkeypatch.setattr(html, "_photo", lambda _, camera: np.zeros((camera.height, camera.width, 3), np.uint8))
+    monkeypatch.setattr(html, "Photos", BlackPhotos)
     state = cases_explorer.line(cameras=cases_explorer.cameras(90))
     for page in show(browser, save_html(state, tmp_path / "page.html", scene=object())):
         page.keyboard.press("[")
@@ -510,6 +612,13 @@ def test_a_page_that_opens_with_a_question_has_the_suggested_gamma(browser, tmp_
     state.ask("chair")
     for page in show(browser, save_html(state, tmp_path / "page.html")):
         assert page.locator("section:has(#gamma) .note").inner_text().startswith("Suggested: ")
+
+
+def test_a_pressed_button_can_be_read_while_the_pointer_is_on_it(page):
+    page.click(".choice >> text=Score")
+    color = page.evaluate("getComputedStyle(document.querySelector('.choice [aria-pressed=true]')).backgroundColor")
+    assert page.locator(".choice [aria-pressed=true]:hover").inner_text() == "Score"
+    assert color == page.evaluate("getComputedStyle(viewer.rail.element.firstChild).backgroundColor")
 
 
 def test_every_control_has_a_name(page):

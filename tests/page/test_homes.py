@@ -67,7 +67,7 @@ def in_widget(page, state, out):
 
     page.expose_function("python", python)
     page.set_content("<body></body>")
-    values = {name: getattr(widget, name) for name in ("header", "phrases", "question", "height")}
+    values = {name: getattr(widget, name) for name in ("header", "question", "height")}
     values["data"] = base64.b64encode(widget.data).decode()
     page.evaluate(WIDGET, {"script": str(widget._esm), "style": str(widget._css), "values": values})
     yield
@@ -94,6 +94,10 @@ def test_one_person_everywhere(browser, tmp_path, home):
     page.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
     with home(page, state, out):
         page.wait_for_selector(".kfgs:not([aria-busy])")
+        page.fill("#query", "lamp")  # no class
+        page.press("#query", "Enter")
+        needs = "kfgs view” or in a notebook" if home is in_file else "--teacher"
+        page.wait_for_selector(f"[role=alert]:has-text('“lamp” is none of the classes'):has-text('{needs}')")
         page.fill("#query", "chair")  # query
         page.press("#query", "Enter")
         page.wait_for_selector("h2:has-text('Search: chair')")

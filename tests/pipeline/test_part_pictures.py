@@ -8,8 +8,9 @@ from small_room import make_room
 from kfgs.cameras import Camera
 from kfgs.gaussians import Gaussians
 from kfgs.labels import Selection, connected_parts
-from kfgs.pipeline.part_pictures import WIDTH, photos_of, write_parts
+from kfgs.pipeline.part_pictures import WIDTH, write_parts
 from kfgs.scenes import load_scene
+from kfgs.viz.shows import Photos
 
 K = torch.tensor([[40.0, 0, 40], [0, 40, 30], [0, 0, 1]])
 
@@ -53,5 +54,5 @@ def test_photographs_are_found_by_name(tmp_path):
     scene = load_scene(make_room(tmp_path / "scene"))
     view = scene.views("test")[0]
     camera = scene.cameras[view]
-    np.testing.assert_allclose(photos_of(scene)(camera), scene.image(view) * 255, atol=1)
-    assert (photos_of(scene)(dataclasses.replace(camera, name="other.png")) == 200).all()
+    np.testing.assert_allclose(Photos(scene)(camera), scene.image(view) * 255, atol=1)
+    assert (Photos(scene)(dataclasses.replace(camera, name="other.png")) == 200).all()

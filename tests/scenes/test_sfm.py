@@ -146,3 +146,41 @@ def test_sequential_matching_of_names_with_blanks(tmp_path: Path) -> None:
     assert _matched(tmp_path / "a", ["a 1.png", "a 2.png"]) == {frozenset(("a 1.png", "a 2.png"))}
     with pytest.raises(SceneError, match=tells("images:", "got a 9.png, a 10.png", "rename")):
         _matched(tmp_path / "b", ["a 9.png", "a 10.png"])
+
+
+class _Placed:
+    """A run of pycolmap that places all images."""
+
+    def __init__(self, *_: object) -> None:
+        self.models, self.images, self.points3D = [self], {}, {}
+
+    def extract(self) -> None: ...
+
+    match = map = extract
+
+    def num_reg_images(self) -> int:
+        return 3
+
+    def compute_mean_reprojection_error(self) -> float:
+        return 0.0
+
+    def write(self, folder: str) -> None:
+        for name in ("cameras", "images", "points3D"):
+            (Path(folder) / f"{name}.bin").write_bytes(b"new")
+
+
+def test_a_model_is_replaced_only_when_asked_and_other_files_stay(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("kfgs.scenes.sfm._Run", _Placed)
+    (tmp_path / "photos").mkdir()
+    for name in "abc":
+        (tmp_path / "photos" / f"{name}.png").touch()
+    run_sfm(tmp_path / "photos", tmp_path / "scene")
+    model = tmp_path / "scene" / "sparse" / "0"
+    (model / "cameras.bin").write_bytes(b"old")
+    (model / "notes.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match=tells("out:", model, "replace")):
+        run_sfm(tmp_path / "photos", tmp_path / "scene")
+    assert (model / "cameras.bin").read_bytes() == b"old"
+    run_sfm(tmp_path / "photos", tmp_path / "scene", replace=True)
+    assert (model / "cameras.bin").read_bytes() == b"new"
+    assert (model / "notes.txt").read_text() == "mine"

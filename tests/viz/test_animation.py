@@ -1,5 +1,6 @@
 import importlib.util
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -96,6 +97,7 @@ def film_writer(monkeypatch):
 
     def write_frames(path, size, **options):
         kept.size, kept.options = size, options
+        Path(path).touch()
         try:
             while True:
                 frame = yield

@@ -7,16 +7,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from PIL import Image
-
 from ..._files import as_path, atomic_path
-from ...cameras import Camera
 from ...page.document import OFFLINE_START, POLICY, document
 from ...page.server import pack_message
 from ...scenes import Scene
-from ..pictures import as_bytes
-from .carried import Array
+from ..shows import Photos
 from .pack import Packed, pack_scene
 from .state import Exploration
 
@@ -69,7 +64,9 @@ def pack_view(exploration: Exploration, *, title: str = "kfgs", scene: Scene | N
     """Pack an exploration with the photos of its cameras, and what it shows now; arguments as in `save_html`."""
     asked = exploration.asked
     questions = [*exploration.meaning.names, *([] if asked is None or asked.known else [asked.words])]
-    photos = [] if scene is None else [_photo(scene, camera) for camera in exploration.cameras]
+    taken = None if scene is None else Photos(scene)
+    small = [camera.fitted(PHOTO) for camera in exploration.cameras]
+    photos = [] if taken is None else [taken(camera) if camera in taken else None for camera in small]
     packed = pack_scene(exploration, title=title, questions=questions, thumbnails=photos)
     return packed._replace(header=packed.header | {"start": _start(exploration)})
 
@@ -83,16 +80,6 @@ def _start(exploration: Exploration) -> dict[str, Any]:
         "words": None if asked is None else asked.words,
         "gamma": exploration.gamma,
     }
-
-
-def _photo(scene: Scene, camera: Camera) -> Array | None:  # [h, w, 3] uint8
-    """A small photo of a camera; None if the scene has no camera of this name."""
-    found = [index for index, own in enumerate(scene.cameras) if own.name == camera.name]
-    if not found:
-        return None
-    picture = Image.fromarray(as_bytes(scene.image(found[0])))
-    picture.thumbnail((PHOTO, PHOTO))
-    return np.asarray(picture)
 
 
 def _json(value: object) -> str:

@@ -36,7 +36,7 @@ export default {
     const bytes = new Uint8Array(raw.buffer, raw.byteOffset, raw.byteLength);
     const header = model.get("header");
     const packed = { header, data: await kfgs.inflate(bytes, header) };
-    const link = new kfgs.PythonLink(kfgs.callWidget(model), model.get("phrases"));
+    const link = new kfgs.PythonLink(kfgs.callWidget(model), header);
     const app = await kfgs.mount(root, packed, link);
     const ask = () => app.ask(model.get("question"));
     model.on("change:question", ask);
@@ -102,7 +102,6 @@ def make_widget(
         _css = read_text("app.css")
         header = traitlets.Dict().tag(sync=True)
         data = traitlets.Bytes().tag(sync=True)
-        phrases = traitlets.Bool().tag(sync=True)
         question = traitlets.Unicode().tag(sync=True)
         height = traitlets.Int().tag(sync=True)
 
@@ -116,7 +115,6 @@ def make_widget(
     widget = Viewer(
         header=packed.header,
         data=packed.compressed(),
-        phrases=exploration.meaning.phrases,
         question="" if exploration.asked is None else exploration.asked.words,
         height=height,
     )
@@ -132,9 +130,7 @@ def make_widget(
 def still(exploration: Exploration) -> str:
     """What the first camera sees, in the colours that the viewer opens with: a JPEG file in base64, as notebooks hold it."""
     side = exploration.sides[-1]
-    camera = exploration.cameras[0]
-    scale = min(1.0, STILL / max(camera.size))
-    camera = camera.resized(round(scale * camera.height), round(scale * camera.width))
+    camera = exploration.cameras[0].fitted(STILL)
     cloud = exploration.cloud(side)
     if exploration.show != "rgb" or cloud.sh is None:
         colors = torch.from_numpy(exploration.colors(side)).to(cloud.means) / 255

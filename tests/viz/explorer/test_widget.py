@@ -43,7 +43,7 @@ def test_the_scene_is_sent_once(tmp_path):
     assert widget.header["buffers"] == packed.header["buffers"]
     assert widget.header["start"]["words"] == "chair"
     assert widget.data == packed.compressed()
-    assert (widget.question, widget.phrases) == ("chair", False)
+    assert (widget.question, widget.header["phrases"]) == ("chair", False)
 
 
 def test_calls_are_answered_with_their_number(tmp_path):
