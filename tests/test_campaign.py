@@ -133,11 +133,14 @@ jobs.make_fixture = kills.make_fixture = lambda folder: folder.mkdir(parents=Tru
 
 
 def test_a_command_that_writes_halves_is_found(tmp_path):
-    code = JOBS + """
+    code = (
+        JOBS
+        + """
 kills.all_jobs = lambda: [jobs.Job("plain", write_plainly, prepare)]
 kills.TIMED = 0
 kills.run_kills(record, seed=1, seconds=60, most=3)
 """
+    )
     found = findings(run(code, tmp_path))
     assert {line["why"] for line in found} == {"neither old nor new: a.out"}
 

@@ -15,7 +15,7 @@ os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 if __package__ in (None, ""):
     sys.path[0] = str(Path(__file__).resolve().parents[1])  # instead of this folder, whose names are common words
 
-from campaign.record import Record  # noqa: E402
+from campaign.record import Record
 
 KINDS = ("files", "kills", "pairs", "signals", "full", "long")
 
@@ -30,7 +30,9 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--workers", type=int, default=1, help="processes at once, for files (default: 1)")
     parser.add_argument("--only", default="", help="cases or jobs whose name holds this word")
     parser.add_argument("--most", type=int, help="most mutants or kills of this start")
-    parser.add_argument("--scratch", type=Path, help="place for working files; default: /dev/shm if there is one, else OUT")
+    parser.add_argument(
+        "--scratch", type=Path, help="place for working files; default: /dev/shm if there is one, else OUT"
+    )
     given = parser.parse_args(words)
     quick = Path("/dev/shm")
     scratch = given.scratch or (quick if quick.is_dir() else given.out) / f"kfgs-campaign-{os.getpid()}"

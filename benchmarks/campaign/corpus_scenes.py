@@ -41,7 +41,12 @@ def _text_model(room: Path, place: Path, add: Add) -> None:
     (place / "sparse/0").mkdir(parents=True)
     pycolmap.Reconstruction(str(room / "sparse/0")).write_text(str(place / "sparse/0"))
     (place / "sparse/0/test.txt").write_text("view_001\n")
-    add("scene", place, *(f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D", "rigs", "frames", "test")), opens=".")
+    add(
+        "scene",
+        place,
+        *(f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D", "rigs", "frames", "test")),
+        opens=".",
+    )
 
 
 def _line(pose: np.ndarray) -> str:

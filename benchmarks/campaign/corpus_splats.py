@@ -69,7 +69,9 @@ def _ascii_ply() -> bytes:
 
 
 def _mesh() -> bytes:
-    head = "ply\nformat binary_little_endian 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    head = (
+        "ply\nformat binary_little_endian 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    )
     head += "element face 2\nproperty list uchar int vertex_indices\nproperty int object_id\nend_header\n"
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4").tobytes()
     return head.encode() + corners + b"".join(struct.pack("<B3ii", 3, *three) for three in ((0, 1, 2, 7), (0, 2, 3, 9)))

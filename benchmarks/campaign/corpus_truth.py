@@ -75,7 +75,9 @@ def _points(folder: Path, add: Add) -> None:
     axes = {axis: np.arange(6, dtype=np.float32) for axis in "xyz"}
     colors = {name: np.zeros(6, np.uint8) for name in ("red", "green", "blue", "alpha")}
     stem = "scene0000_00"
-    write_ply(scan / f"{stem}_vh_clean_2.labels.ply", axes | colors | {"label": np.array([0, 1, 1, 5, 28, 40], np.uint16)})
+    write_ply(
+        scan / f"{stem}_vh_clean_2.labels.ply", axes | colors | {"label": np.array([0, 1, 1, 5, 28, 40], np.uint16)}
+    )
     (scan / f"{stem}_vh_clean_2.0.010000.segs.json").write_text(json.dumps({"segIndices": [7, 7, 9, 9, 3, 5]}))
     groups = [{"id": 0, "objectId": 0, "segments": [7], "label": "wall"}, {"objectId": 1, "segments": [3, 9]}]
     (scan / f"{stem}.aggregation.json").write_text(json.dumps({"segGroups": groups}))
@@ -104,7 +106,9 @@ def _programs(folder: Path, add: Add) -> None:
     place = folder / "feature3dgs"
     raw, column = _raw(), {}
     column |= {axis: raw["xyz"][:, i] for i, axis in enumerate("xyz")} | {"opacity": raw["opacity"][:, 0]}
-    column |= {f"f_dc_{i}": raw["dc"][:, 0, i] for i in range(3)} | {f"scale_{i}": raw["scales"][:, i] for i in range(3)}
+    column |= {f"f_dc_{i}": raw["dc"][:, 0, i] for i in range(3)} | {
+        f"scale_{i}": raw["scales"][:, i] for i in range(3)
+    }
     column |= {f"rot_{i}": raw["quats"][:, i] for i in range(4)} | {f"semantic_{i}": raw["xyz"][:, i] for i in range(3)}
     ply = "point_cloud/iteration_30000/point_cloud.ply"
     (place / ply).parent.mkdir(parents=True)

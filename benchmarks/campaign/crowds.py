@@ -182,5 +182,3 @@ def _note(record: Record, kind: str, job: Job, seed: int, number: int, faults: l
     record.add(base)
     for fault in faults:
         record.add(base | {"kind": f"{kind} finding", "what": fault.partition(":")[0], "why": fault})
-
-

@@ -68,7 +68,9 @@ def grey_teacher(picture: torch.Tensor) -> torch.Tensor:
     return torch.cat([small**power for power in range(1, 6)] + [torch.ones_like(small[:1])])
 
 
-def _with(*, files: dict[str, str] | None = None, notes: tuple[str, ...] = ("notes.txt",)) -> Callable[[Path, Path], None]:
+def _with(
+    *, files: dict[str, str] | None = None, notes: tuple[str, ...] = ("notes.txt",)
+) -> Callable[[Path, Path], None]:
     """Copies of the fixture's files and folders by their names in `work/`, and the user's notes."""
 
     def prepare(fixture: Path, work: Path) -> None:
@@ -122,33 +124,109 @@ def all_jobs() -> list[Job]:
         Job("convert with labels beside", command("convert", "in/labelled.ply", "work/a.splat"), _with()),
         Job("convert to sog", command("convert", "in/labelled.ply", "work/a.sog"), _with()),
         Job("convert to gltf", command("convert", "in/labelled.ply", "work/a.gltf"), _with()),
-        Job("edit", command("edit", "in/labelled.ply", "--out", "work/a.ply", "--remove", "chair"), _with(files={"a.ply": "other.ply"})),
+        Job(
+            "edit",
+            command("edit", "in/labelled.ply", "--out", "work/a.ply", "--remove", "chair"),
+            _with(files={"a.ply": "other.ply"}),
+        ),
         Job("save edits", _save_edits, _with()),
         Job("toy room", _toy_room, _with()),
-        Job("label", command("label", field, "--out", "work/labelled", "--cloud", "in/labelled.ply", "--distance", "1", *room),
-            _with(files={"labelled/gaussians.ply": "other.ply"}, notes=("labelled/notes.txt",))),
-        Job("pack", command("pack", field, "work/a.kfgs.safetensors"),
-            _with(files={"a.kfgs.safetensors": "packed.kfgs.safetensors"})),
-        Job("unpack", command("pack", "in/packed.kfgs.safetensors", "work/field"),
-            _with(files={"field": "older"}, notes=("notes.txt", "field/notes.txt")), fields=("field",)),
-        Job("select", command("select", "chair", field, "--out", "work/chairs", *room), _with(notes=("chairs/notes.txt",))),
-        Job("select in a splat", command("select", "chair", "in/labelled.ply", "--out", "work/chairs"), _with(notes=("chairs/a.txt",))),
-        Job("segment", command("segment", field, "--out", "work/seen", "--pictures", "1", *room), _with(notes=("seen/notes.txt",)),
-            loose=images),
-        Job("text of examples", command("text", "--examples", "in/clicks.json", "--field", field, "--out", "work/t.safetensors"), _with()),
-        Job("attach", command("attach", field, "in/labelled.ply", "--out", "work/a.ply", *room), _with(files={"a.ply": "other.ply"})),
+        Job(
+            "label",
+            command("label", field, "--out", "work/labelled", "--cloud", "in/labelled.ply", "--distance", "1", *room),
+            _with(files={"labelled/gaussians.ply": "other.ply"}, notes=("labelled/notes.txt",)),
+        ),
+        Job(
+            "pack",
+            command("pack", field, "work/a.kfgs.safetensors"),
+            _with(files={"a.kfgs.safetensors": "packed.kfgs.safetensors"}),
+        ),
+        Job(
+            "unpack",
+            command("pack", "in/packed.kfgs.safetensors", "work/field"),
+            _with(files={"field": "older"}, notes=("notes.txt", "field/notes.txt")),
+            fields=("field",),
+        ),
+        Job(
+            "select",
+            command("select", "chair", field, "--out", "work/chairs", *room),
+            _with(notes=("chairs/notes.txt",)),
+        ),
+        Job(
+            "select in a splat",
+            command("select", "chair", "in/labelled.ply", "--out", "work/chairs"),
+            _with(notes=("chairs/a.txt",)),
+        ),
+        Job(
+            "segment",
+            command("segment", field, "--out", "work/seen", "--pictures", "1", *room),
+            _with(notes=("seen/notes.txt",)),
+            loose=images,
+        ),
+        Job(
+            "text of examples",
+            command("text", "--examples", "in/clicks.json", "--field", field, "--out", "work/t.safetensors"),
+            _with(),
+        ),
+        Job(
+            "attach",
+            command("attach", field, "in/labelled.ply", "--out", "work/a.ply", *room),
+            _with(files={"a.ply": "other.ply"}),
+        ),
         Job("save html", _save_html, _with()),
-        Job("uplift", command("uplift", "in/room", "in/labelled.ply", "--out", "work/field"),
-            _with(files={"field": "older"}, notes=("notes.txt", "field/notes.txt")), fields=("field",)),
-        Job("features", command("features", "in/room", "--teacher", "campaign.jobs:grey_teacher", "--out", "work/maps"),
-            _with(notes=("maps/notes.txt",)), loose=("features.json",), resumed=True),
-        Job("fit", command("fit", "in/room", "--splat", "in/labelled.ply", "--out", "work/run"),
-            _with(files={"run/field": "older"}, notes=("run/field/mine.ply", "run/notes.txt")), fields=("run/field",),
-            loose=times, resumed=True),
-        Job("restore an earlier field", _restore, _with(files={"run": "two"}, notes=("run/field/mine.ply",)), fields=("run/field",)),
-        Job("fit by the paper", command("fit", "in/room", "--method", "paper", "--mode", "adc", "--steps", "12",
-                                       "--max-gaussians", "100", "--out", "work/run"),
-            _with(notes=("run/notes.txt",)), fields=("run/field",), loose=times, resumed=True),
-        Job("color", command("color", "in/room", "--out", "work/run", "--preset", "quick", "--steps", "12"),
-            _with(notes=("run/notes.txt",)), loose=times, resumed=True),
-    ]  # fmt: skip
+        Job(
+            "uplift",
+            command("uplift", "in/room", "in/labelled.ply", "--out", "work/field"),
+            _with(files={"field": "older"}, notes=("notes.txt", "field/notes.txt")),
+            fields=("field",),
+        ),
+        Job(
+            "features",
+            command("features", "in/room", "--teacher", "campaign.jobs:grey_teacher", "--out", "work/maps"),
+            _with(notes=("maps/notes.txt",)),
+            loose=("features.json",),
+            resumed=True,
+        ),
+        Job(
+            "fit",
+            command("fit", "in/room", "--splat", "in/labelled.ply", "--out", "work/run"),
+            _with(files={"run/field": "older"}, notes=("run/field/mine.ply", "run/notes.txt")),
+            fields=("run/field",),
+            loose=times,
+            resumed=True,
+        ),
+        Job(
+            "restore an earlier field",
+            _restore,
+            _with(files={"run": "two"}, notes=("run/field/mine.ply",)),
+            fields=("run/field",),
+        ),
+        Job(
+            "fit by the paper",
+            command(
+                "fit",
+                "in/room",
+                "--method",
+                "paper",
+                "--mode",
+                "adc",
+                "--steps",
+                "12",
+                "--max-gaussians",
+                "100",
+                "--out",
+                "work/run",
+            ),
+            _with(notes=("run/notes.txt",)),
+            fields=("run/field",),
+            loose=times,
+            resumed=True,
+        ),
+        Job(
+            "color",
+            command("color", "in/room", "--out", "work/run", "--preset", "quick", "--steps", "12"),
+            _with(notes=("run/notes.txt",)),
+            loose=times,
+            resumed=True,
+        ),
+    ]

@@ -142,7 +142,11 @@ def _text(text: str, rng: Random) -> bytes:
     elif how == 3:
         lines[i] = lines[i][: rng.randrange(len(lines[i]) + 1)]
     else:
-        lines[i] = lines[i].replace(" ", rng.choice(("", "  ", "\t", "\0", ","))).replace("\n", rng.choice(("\n", "\r", "\r\n")))
+        lines[i] = (
+            lines[i]
+            .replace(" ", rng.choice(("", "  ", "\t", "\0", ",")))
+            .replace("\n", rng.choice(("\n", "\r", "\r\n")))
+        )
     return "".join(lines).encode()
 
 

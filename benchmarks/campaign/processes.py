@@ -12,6 +12,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -130,10 +131,8 @@ def _count_events(counts: int, kill_at: int | None) -> None:
         seen += 1
         if kill_at is not None and seen == kill_at + 1:
             os.kill(os.getpid(), signal.SIGKILL)
-        try:
+        with suppress(BlockingIOError):
             os.write(counts, b".")
-        except BlockingIOError:
-            pass
 
     sys.addaudithook(hook)
 

@@ -14,7 +14,10 @@ State = dict[str, str]
 
 
 def state_of(folder: Path, loose: tuple[str, ...] = (), skip: tuple[str, ...] = ()) -> State:
-    """A digest for each visible file by its name; of `loose` files only what does not tell the time; folders in `skip` are left out."""
+    """A digest for each visible file by its name. Of `loose` files only what does not tell the time counts.
+
+    Folders in `skip` are left out.
+    """
     found = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
@@ -28,7 +31,9 @@ def state_of(folder: Path, loose: tuple[str, ...] = (), skip: tuple[str, ...] = 
 def hidden_in(folder: Path) -> list[str]:
     """Files and folders that begin with a dot, except locks, which stay on purpose."""
     names = [path.relative_to(folder).as_posix() for path in folder.rglob("*")]
-    return sorted(name for name in names if any(part.startswith(".") for part in Path(name).parts) and not name.endswith("lock"))
+    return sorted(
+        name for name in names if any(part.startswith(".") for part in Path(name).parts) and not name.endswith("lock")
+    )
 
 
 def field_state(folder: Path) -> str:
