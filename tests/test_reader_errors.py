@@ -34,6 +34,12 @@ def test_whole_numbers_of_hundreds_of_digits_are_no_json(tmp_path, content):
         read_examples(file)
 
 
+def test_a_gaussian_of_infinite_number_is_named(tmp_path):
+    (tmp_path / "clicks.json").write_text('{"chair": [{"gaussians": [1e999]}]}')
+    with pytest.raises(ValueError, match=tells("clicks.json", "'chair'[0]", "infinity")):
+        read_examples(tmp_path / "clicks.json")
+
+
 def test_numbers_that_a_float_holds_are_json(tmp_path):
     (tmp_path / "clicks.json").write_text(json.dumps({"chair": [{"gaussians": [2**62]}]}))
     assert read_examples(tmp_path / "clicks.json")["chair"][0].indices == [2**62]
