@@ -96,8 +96,8 @@ class Bench:
                 yield f"neither the old nor the new field: {name}"
         yield from self._foreign()
 
-    def repeated(self, job: Job, ended: Ended) -> Iterator[str]:
-        """What is wrong after the command was given again."""
+    def repeated(self, job: Job, ended: Ended, *, idle: bool = False) -> Iterator[str]:
+        """What is wrong after the command was given again. An `idle` one had nothing to write, and so swept nothing."""
         known = self.reference(job)
         if ended.code or ended.hung:
             yield f"the second run {'hung' if ended.hung else f'ended with {ended.code}'}: {ended.said[-400:]}"
@@ -111,7 +111,7 @@ class Bench:
             if value != known.fields[name][1]:
                 yield f"the second run gave another field: {name}"
         more = sorted(set(hidden_in(self.work)) - set(known.hidden))
-        if more:
+        if more and not idle:
             yield f"left hidden: {', '.join(more[:5])}"
         yield from self._foreign()
 
@@ -173,7 +173,8 @@ def _kill(record: Record, bench: Bench, job: Job, seed: int, at: int | float) ->
         first = process.wait()
     faults = [f"the first run ended with {first.code}: {first.said[-300:]}"] if first.code not in (0, -9) else []
     faults += bench.disturbed(job)
-    faults += bench.repeated(job, bench.start(job).wait())
+    idle = job.idle and not faults and state_of(bench.work, job.loose, job.fields) == known.new
+    faults += bench.repeated(job, bench.start(job).wait(), idle=idle)
     base = {"kind": "kills", "case": job.name, "seed": seed, "at": at}
     record.add(base | {"killed": first.code == -9, "seconds": round(time.monotonic() - began, 2)})
     for fault in faults:
