@@ -73,6 +73,7 @@ def test_a_broken_reader_is_found_with_its_mutant(tmp_path, fault):
     assert 1 <= len(found) < 40  # those that are not shorter went well, also after a crash
     (batch,) = [line for line in lines if line["kind"] == "files"]
     assert batch["mutants"] == 40
+    assert batch["read"] + batch["refused"] + len(found) == 40
     kept = sorted((tmp_path / "out" / "findings").rglob("*words.txt"))
     assert len(kept) == min(5, len(found))
     assert all(len(path.read_bytes()) < 20 for path in kept)
