@@ -46,7 +46,7 @@ def read_array(
         FileNotFoundError: if there is no such file.
         FileError: if it is no `.npy` file of numbers, is damaged or cut short, or states more values than it has.
     """
-    with _named(path, expected, advice), as_path(path).open("rb") as file:
+    with reading(path, expected, advice), as_path(path).open("rb") as file:
         size = as_path(path).stat().st_size
         stated = _stated_bytes(file)
         if stated > size - file.tell():
@@ -74,7 +74,7 @@ def read_arrays(
         FileError: if it is no `.npz` file of numbers and texts, is damaged, or unpacks to more than `most` bytes.
     """
     found = {}
-    with _named(path, expected, advice), zipfile.ZipFile(path) as archive:
+    with reading(path, expected, advice), zipfile.ZipFile(path) as archive:
         total = sum(entry.file_size for entry in archive.infolist())
         most = SPARE + RATIO * as_path(path).stat().st_size if most is None else most
         if total > most:
@@ -111,7 +111,7 @@ def read_safetensors(
     """
     from safetensors import safe_open  # imports torch
 
-    with _named(path, expected, advice), safe_open(path, framework="pt") as file:
+    with reading(path, expected, advice), safe_open(path, framework="pt") as file:
         metadata = dict(file.metadata() or {})
         kind, version = (metadata.get(key) for key in ("kfgs", "version"))
         if kfgs is None or (kind, version) == kfgs:
@@ -138,13 +138,23 @@ def _stated_bytes(file: IO[bytes]) -> int:
 
 
 @contextmanager
-def _named(path: str | Path, expected: str, advice: str) -> Iterator[None]:
-    """Turn whatever fails while a file is read into a `FileError`."""
+def reading(path: str | Path, expected: str, advice: str = AGAIN) -> Iterator[None]:
+    """Turn whatever fails while a file is read, and its content checked, into a `FileError`.
+
+    Args:
+        path: the file.
+        expected: what should be there, for the message.
+        advice: the end of the message.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        FileError: if the block fails. One of the block itself is raised as it is, and so is a PermissionError.
+    """
     if not as_path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file; expected {expected} there; {advice}")
     try:
         yield
-    except PermissionError:
+    except (PermissionError, FileError):
         raise
     except Exception as error:  # hostile bytes raise almost anything: MemoryError, TokenError, OverflowError, ...
         kind = "" if isinstance(error, ValueError | OSError) else f"{type(error).__name__}: "

@@ -32,6 +32,7 @@ __all__ = [
 ]
 
 NESTED = 200  # most levels of lists and objects in JSON: neither people nor kfgs write half as many
+DIGITS = 300  # most digits of a whole number in JSON: it fits into a float, so that nobody has to ask
 
 
 def write_json(path: str | Path, value: Any) -> None:
@@ -61,11 +62,11 @@ def parse_json(text: str | bytes, **options: Any) -> Any:
     """The value of a JSON text that somebody else wrote; `options` are those of `json.loads`.
 
     Raises:
-        ValueError: if it is not JSON in UTF-8, has an integer of thousands of digits, or more than `NESTED` levels.
+        ValueError: if it is not JSON in UTF-8, has an integer of more than `DIGITS` digits, or more than `NESTED` levels.
     """
     deep = f"brackets nest more than {NESTED} deep"
     try:
-        value = json.loads(text, **options)
+        value = json.loads(text, **{"parse_int": _whole_number} | options)
     except RecursionError:
         raise ValueError(deep) from None
     level, depth = [value], 0  # not by recursion, which what follows (repr, json.dumps) has not endless room for
@@ -74,6 +75,12 @@ def parse_json(text: str | bytes, **options: Any) -> Any:
         if depth >= NESTED:
             raise ValueError(deep)
     return value
+
+
+def _whole_number(word: str) -> int:
+    if len(word) > DIGITS:
+        raise ValueError(f"a number has {len(word)} digits")
+    return int(word)
 
 
 def _inside(value: Any) -> Iterable[Any]:

@@ -116,7 +116,7 @@ def _read(where: str, one: Any) -> Example:
         if keys == {"view", "box"}:
             x0, y0, x1, y1 = map(float, one["box"])
             return Box(str(one["view"]), (x0, y0, x1, y1))
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:  # int(infinity)
         raise ValueError(f"{where}: expected numbers ({error}); see kfgs text --help") from error
     raise ValueError(
         f"{where}: expected 'view' with 'points' or 'box', or 'gaussians', got {sorted(keys) or type(one).__name__}; correct it"

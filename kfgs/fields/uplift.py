@@ -101,7 +101,7 @@ def uplift_maps(
 
     Only the directions of features matter. No classes are used, so the result answers any text. Each map is read once for
     the average and, for at most 32 views, once before to find the working directions. Memory holds 2 x [N, 65] numbers; the
-    maps in the working directions, at most 10 MB each, are in files.
+    maps in the working directions, at most 20 MB each, are in files.
 
     Args:
         gaussians: any cloud in the cameras' frame; its colours and features are not used.

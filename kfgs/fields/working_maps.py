@@ -99,10 +99,11 @@ class WorkingMaps:
         if not file.is_file():
             rows, shape = self._make(i)
             with atomic_path(file) as path, path.open("wb") as opened:
-                np.savez(opened, rows=rows.to(torch.float16).cpu().numpy(), shape=np.asarray(shape))
+                # not rounded, so that a run that goes on gives the same bits
+                np.savez(opened, rows=rows.cpu().numpy(), shape=np.asarray(shape))
             return rows, torch.tensor(shape, dtype=torch.float64)
         found = read_arrays(file)
-        rows = torch.from_numpy(found["rows"].astype(np.float32)).to(self._directions)
+        rows = torch.from_numpy(found["rows"]).to(self._directions)
         return rows, torch.from_numpy(found["shape"]).double()
 
     def _make(self, i: int) -> tuple[Tensor, tuple[int, int]]:  # [h, w, d']

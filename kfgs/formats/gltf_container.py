@@ -6,7 +6,6 @@ Every index, offset and length is checked against the file before anything is re
 from __future__ import annotations
 
 import base64
-import binascii
 import json
 import struct
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -110,7 +109,7 @@ class Document:
                 raise self.wrong(f"{where}.uri", "data:...;base64,...", uri[:40])
             try:
                 return base64.b64decode(text, validate=True)
-            except binascii.Error as error:
+            except ValueError as error:
                 raise self.wrong(f"{where}.uri", "base64", str(error)) from error
         file = self._beside(uri, where)
         if not file.is_file():

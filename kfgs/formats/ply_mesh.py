@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .._arrays import reading
 from .._card import short_repr
 from .ply import _TYPES, Columns, _check_scalars, _check_vertex, _Element, _existing, _parse_header, _read_element
 
@@ -76,8 +77,9 @@ def _split(path: Path, face: _Element) -> tuple[list[tuple[str, str]], list[tupl
     """The properties before and after the list."""
     with path.open("rb") as file:
         head = file.read(1 << 20).split(b"end_header")[0].decode("ascii", "replace").splitlines()
-    start = next(i for i, line in enumerate(head) if line.split()[:2] == ["element", "face"])
-    place = next(i for i, line in enumerate(head[start:]) if line.split()[:2] == ["property", "list"])
+    with reading(path, "a mesh whose header has 'element face' and its list"):
+        start = next(i for i, line in enumerate(head) if line.split()[:2] == ["element", "face"])
+        place = next(i for i, line in enumerate(head[start:]) if line.split()[:2] == ["property", "list"])
     count = sum(line.split()[:1] == ["property"] for line in head[start : start + place])
     return face.properties[:count], face.properties[count:]
 

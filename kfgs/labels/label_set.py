@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._arrays import read_array, read_safetensors
+from .._arrays import read_array, read_safetensors, reading
 from .._card import cut, html_card
 from .._check import as_tensor
 from .._files import as_path, atomic_path, parse_json, read_json
@@ -180,7 +180,9 @@ def load_label_set(classes: str | Path, embeddings: str | Path | None = None) ->
         )
     if as_path(embeddings).suffix == SUFFIX:
         return _read_table(as_path(embeddings)).select(names)
-    return LabelSet(tuple(names), torch.from_numpy(_read_rows(as_path(embeddings), len(names), classes)))
+    rows = torch.from_numpy(_read_rows(as_path(embeddings), len(names), classes))
+    with reading(classes, "a JSON list of different class names", "correct the list"):
+        return LabelSet(tuple(names), rows)
 
 
 def teacher_mismatch(field: dict[str, Any], words: dict[str, Any]) -> str | None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from .._check import one_line
-from .._files import as_path, bytes_in_words, read_json
+from .._files import as_path, bytes_in_words
 from ..features.manifest import MANIFEST, read_manifest
 from ..fields import SemanticField
 from ..fields.store import find_field
 from ..formats import SplatFile, find_format, read_splats
 from ..formats.ply import read_ply
 from ..scenes import load_scene
+from .stages import read_stage
 
 
 def describe(path: str | Path) -> str:
@@ -38,8 +39,8 @@ def describe(path: str | Path) -> str:
     if (path / MANIFEST).is_file():
         return _describe_maps(path)
     if (path / "stages").is_dir():
-        done = [read_json(file) for file in sorted((path / "stages").glob("[!.]*/stage.json"))]
-        lines = [f"  {about['name']}: done in {about['seconds']:.1f} s" for about in done]
+        done = [read_stage(file) for file in sorted((path / "stages").glob("[!.]*/stage.json"))]
+        lines = [f"  {one_line(about['name'])}: done in {about['seconds']:.1f} s" for about in done]
         return "\n".join([f"{path}: unfinished run; start `kfgs fit` again to go on", *lines])
     scene = load_scene(path)
     sizes = sorted({camera.size for camera in scene.cameras})

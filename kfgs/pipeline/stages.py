@@ -19,6 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._arrays import reading
 from .._compiling import say_compiling
 from .._files import atomic_folder, digest_file, digest_value, locked, read_json, write_json
 from ..cameras import Camera
@@ -39,6 +40,13 @@ class Stage:
     folder: Path
     seconds: float
     reused: bool
+
+
+def read_stage(file: Path) -> dict[str, Any]:
+    """The description of a finished stage; a ValueError if it has no name or no time."""
+    about = read_json(file)
+    with reading(file, "the description of a stage", "delete its folder, and it will be made again"):
+        return {**about, "name": str(about["name"]), "seconds": float(about["seconds"])}
 
 
 class UnfinishedError(Exception):
@@ -79,7 +87,7 @@ class Run:
         key = _key(name, inputs)
         target = self.folder / "stages" / f"{name}-{key}"
         if (target / STAGE_FILE).is_file():
-            about = read_json(target / STAGE_FILE)
+            about = read_stage(target / STAGE_FILE)
             if about.get("inputs") != json.loads(json.dumps(inputs)):
                 raise ValueError(
                     f"{target}: expected the stage of these inputs, found the inputs of another stage; delete it"
@@ -89,7 +97,7 @@ class Run:
                     f"{target}: expected the files {about.get('files')} (name: bytes), found {_sizes(target)}; the stage "
                     "is damaged: delete the folder, and it will be made again"
                 )
-            done = Stage(name, key, target, float(about["seconds"]), True)
+            done = Stage(name, key, target, about["seconds"], True)
             self.say(f"{name}: found in {target.name} (made in {done.seconds:.1f} s)")
         elif self.look_only:
             raise UnfinishedError(name)

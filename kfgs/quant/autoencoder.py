@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .._arrays import reading
 from .._check import as_tensor, check_range, check_shapes, moved_to
 from .._rows import unit_rows
 from ._store import read_tensors, write_tensors
@@ -136,7 +137,9 @@ class Autoencoder:
             FileNotFoundError: if there is no such file.
             ValueError: if the file is not an autoencoder of kfgs.
         """
-        return Autoencoder.from_tensors(read_tensors(path, kind="autoencoder"))
+        tensors = read_tensors(path, kind="autoencoder")
+        with reading(path, "an autoencoder of kfgs"):
+            return Autoencoder.from_tensors(tensors)
 
     def _encode(self, rows: Tensor) -> Tensor:  # [n, D] -> [n, d]
         unit = unit_latents(mlp(self.encoder, unit_rows(rows)))

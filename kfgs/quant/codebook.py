@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._arrays import reading
 from .._card import html_card, short_repr, short_value
 from .._check import as_array, as_tensor, check_range, check_shapes, moved_to
 from .._rows import EPS, row_norms, unit_rows
@@ -197,7 +198,9 @@ class Codebook:
             FileNotFoundError: if there is no such file.
             ValueError: if the file is not a codebook of kfgs.
         """
-        return Codebook.from_tensors(read_tensors(path, kind="codebook"))
+        tensors = read_tensors(path, kind="codebook")
+        with reading(path, "a codebook of kfgs"):
+            return Codebook.from_tensors(tensors)
 
     def _checked(self, features: Tensor) -> Tensor:
         features = as_tensor("features", features)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from .._arrays import read_array
+from .._arrays import read_array, reading
 from .._check import as_tensor, check_shapes
 from .._files import atomic_path
 from .._rows import ENCODE, EPS, check_directions
@@ -103,7 +103,8 @@ class IndexMaps(Sequence[NDArray[Any]]):
             ValueError: if the file holds no index maps of kfgs.
         """
         tensors = read_tensors(path, kind="index maps")
-        return IndexMaps([tensors[f"map.{i}"].numpy() for i in range(len(tensors) - 1)], int(tensors["size"]))
+        with reading(path, "index maps of kfgs"):
+            return IndexMaps([tensors[f"map.{i}"].numpy() for i in range(len(tensors) - 1)], int(tensors["size"]))
 
 
 class LatentMaps(Sequence[Tensor]):

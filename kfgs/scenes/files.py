@@ -20,8 +20,13 @@ from .._files import as_path, read_json
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp")
 ORIENTATION = 0x0112  # EXIF's tag
-PIXELS, SMALL, PACKED = 1 << 27, 1 << 25, 200
-"""Most pixels of a picture (2 GB while it is read), and most for each byte of its file beyond SMALL; photos have about 10."""
+PIXELS, SMALL, COLORS, PACKED = 1 << 27, 1 << 24, 9 << 20, 200
+"""Most pixels of a picture (4 GB while it is read), and most for each byte of its file, which photos have about 10 of, beyond
+SMALL, or COLORS in colour.
+
+In colour a pixel takes up to 31 bytes while it is read: COLORS, a little more than 4096 x 2160, takes less than 300 MB.
+SMALL, for masks and labels, is more than 4032 x 3024 (3D-OVS), whose masks have 400 pixels a byte."""
+LONGEST = 400  # digits of a number in a name: no file's name is so long, a name in a stranger's table may be
 MAX_SIDE = 100_000  # pixels: beyond any sensor, so a larger number is a wrong byte
 MAX_NUMBER = 1e15  # of lengths and intrinsics: still far inside float32
 
@@ -41,7 +46,7 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
         ['rgb_5', 'rgb_10']
     """
     parts = re.split(r"([0-9]+)", name)
-    return [(0, int(part), part) if i % 2 else (1, 0, part) for i, part in enumerate(parts)]
+    return [(0, int(part[:LONGEST]), part) if i % 2 else (1, 0, part) for i, part in enumerate(parts)]
 
 
 def file_stem(name: str) -> str:
@@ -93,7 +98,7 @@ def read_image(path: str | Path) -> Tensor:  # [H, W, 3] float32 in [0, 1]
         FileNotFoundError: if there is no such file.
         SceneError: if it cannot be decoded, or has more pixels than `open_picture` allows.
     """
-    with open_picture(path) as picture:
+    with open_picture(path, small=COLORS) as picture:
         picture.getexif().pop(ORIENTATION, None)  # Pillow would turn a TIFF
         if picture.mode.startswith(("I", "F")):
             values = np.asarray(picture)
@@ -115,12 +120,15 @@ def open_picture(
     path: str | Path,
     expected: str = "a PNG, JPEG, TIFF or WebP image",
     advice: str = "replace the file or take it out of the scene",
+    *,
+    small: int = SMALL,
 ) -> Iterator[Image.Image]:
     """Open a picture; its pixels are read when they are used. Whatever fails meanwhile becomes a SceneError.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        SceneError: if it cannot be decoded, or states more than `PIXELS` pixels, or more than `PACKED` for each of its bytes.
+        SceneError: if it cannot be decoded, or states more than `PIXELS` pixels, or more than `small` and than `PACKED` for each
+            of its bytes.
     """
     path = as_path(path)
     if not path.is_file():
@@ -131,7 +139,7 @@ def open_picture(
             picture = Image.open(path)
         with picture:
             width, height = picture.size
-            if width * height > min(PIXELS, max(SMALL, PACKED * path.stat().st_size)):
+            if width * height > min(PIXELS, max(small, PACKED * path.stat().st_size)):
                 raise ValueError(f"{width}x{height} pixels in {path.stat().st_size} bytes are too many to be one")
             yield picture
     except Exception as error:  # hostile bytes raise almost anything, memory may be short

@@ -78,7 +78,12 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
     root = path if path.is_dir() else path.parent
     if images is not None and not as_path(images).is_dir() and (root / images).is_dir():
         images = root / images
-    scene = replace(_load_views(path, root, images), folder=root)
+    try:
+        scene = replace(_load_views(path, root, images), folder=root)
+    except SceneError as error:  # of cameras that do not fit together
+        if str(root) in str(error):
+            raise
+        raise SceneError(f"{path}: {error}") from error
     return _with_split(scene, root, split)
 
 

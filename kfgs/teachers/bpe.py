@@ -12,6 +12,7 @@ import gzip
 import html
 import re
 import unicodedata
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from importlib.resources import files
@@ -195,7 +196,12 @@ def _read_text(path: Path) -> str:
             packed = raw.read(2) == b"\x1f\x8b"
         with gzip.open(path) if packed else path.open("rb") as file:
             return file.read(_LIMIT).decode("utf-8")
-    except (OSError, EOFError, UnicodeDecodeError) as error:  # a damaged or cut gzip file is an OSError or EOFError
+    except (
+        OSError,
+        EOFError,
+        zlib.error,
+        UnicodeDecodeError,
+    ) as error:  # of damaged or cut gzip files, all but the last
         raise ValueError(
             f"{path}: expected CLIP's vocabulary, but it cannot be read as text ({error}); get it again"
         ) from error

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+from ..._arrays import reading
 from ..._files import as_path
 from ...scenes.files import file_stem, list_images, natural_key, some
 from ..truth import MaskAndBoxes, MaskTruth
@@ -52,9 +53,8 @@ def read_texts(folder: Path) -> list[str]:
         ValueError: if it is empty or has a text twice.
     """
     file = folder / "classes.txt"
-    if not file.is_file():
-        raise FileNotFoundError(f"{file}: no such file; expected the texts of a 3D-OVS scene there, one per line")
-    texts = [line.strip() for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
+    with reading(file, "the texts of a 3D-OVS scene, one per line"):
+        texts = [line.strip() for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
     if not texts or len(set(texts)) != len(texts):
         raise ValueError(
             f"{file}: expected different texts, one per line, got {some(texts) or 'none'}; correct the file"

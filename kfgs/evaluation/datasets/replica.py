@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..._arrays import reading
 from ..._files import as_path, read_json
 from ...formats.ply import points_from_columns
 from ...formats.ply_mesh import read_mesh
@@ -49,7 +50,8 @@ def load_replica_points(path: str | Path) -> PointTruth:
             "habitat/mesh_semantic.ply, not mesh.ply"
         )
     names, of_object = read_replica_info(file.with_name(INFO))
-    points = points_from_columns(mesh.vertices)
+    with reading(file, "a mesh with vertices"):
+        points = points_from_columns(mesh.vertices)
     objects = np.repeat(mesh.faces["object_id"].astype(np.int64), mesh.counts)
     instances = _most_frequent(mesh.corners, objects, len(points))
     unique, inverse = np.unique(instances, return_inverse=True)

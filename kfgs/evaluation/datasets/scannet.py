@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..._arrays import reading
 from ..._files import as_path, read_json
 from ...formats.ply import points_from_columns, read_ply
 from ...scenes.files import some
@@ -45,7 +46,9 @@ def load_scannet_points(path: str | Path) -> PointTruth:
         got = labels.unique()[:5].tolist()
         raise ValueError(f"{file}: expected NYU40 ids of 1 to 40, got only {got}; are these labels of another table?")
     names = {int(number): name for number, name in load_classes("scannet")["names"].items()}
-    return PointTruth(points_from_columns(columns), labels, names, _instances(file, len(labels)))
+    with reading(file, "a mesh with labelled vertices"):
+        points = points_from_columns(columns)
+    return PointTruth(points, labels, names, _instances(file, len(labels)))
 
 
 def _find(path: Path) -> Path:
@@ -72,6 +75,7 @@ def _instances(file: Path, count: int) -> Tensor | None:  # [P] int64
     try:
         index = np.array(of_vertex, dtype=np.int64)
         objects = {int(segment): int(group["objectId"]) for group in listed for segment in group["segments"]}
+        np.array(list(objects.values()), dtype=np.int64)  # an OverflowError if one is too large
     except (TypeError, ValueError, KeyError, OverflowError) as error:
         raise ValueError(
             f"{groups}: expected groups with 'objectId' and 'segments' ({error}); download it again"

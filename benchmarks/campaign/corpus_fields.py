@@ -1,0 +1,123 @@
+"""Semantic fields in a folder and in one file, their classes, codebooks and checkpoints; edits and examples."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from kfgs.cameras import Camera
+from kfgs.fields import Seen, SemanticField
+from kfgs.fields.checkpoint import Checkpoint, write_checkpoint
+from kfgs.formats import write_splats
+from kfgs.gaussians import Gaussians
+from kfgs.labels import (
+    Component,
+    Duplicate,
+    EditList,
+    InBox,
+    Insert,
+    LabelSet,
+    Move,
+    OfClass,
+    Opacity,
+    Recolor,
+    Remove,
+    Turn,
+)
+from kfgs.quant import Autoencoder, Codebook, IndexMaps, LinearLatents
+
+from .corpus import SEED, Add
+from .corpus_splats import cloud
+
+DIM = 8
+
+
+def tiny_field(method: str = "fused", n: int = 16) -> SemanticField:
+    """A field with every part that its method has."""
+    g = torch.Generator().manual_seed(SEED)
+
+    def random(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=g)
+
+    d = {"fused": 3, "adc+sc": 2}.get(method, DIM)
+    gaussians = Gaussians(
+        random(n, 3), random(n, 4), torch.exp(random(n, 3) - 3), torch.rand(n, generator=g) * 0.9 + 0.05,
+        features=random(n, d),
+    )  # fmt: skip
+    parts: dict[str, object] = {"linear": LinearLatents(torch.linalg.qr(random(DIM, 3)).Q)}
+    if method != "fused":
+        parts |= {"codebook": Codebook(random(5, DIM)), "answers": random(n, 3)}
+    if method == "adc+sc":
+        layers = (((random(2, DIM), random(2)),), ((random(DIM, 2), random(DIM)),))
+        parts["autoencoder"] = Autoencoder(*layers, low=-0.5, high=0.75)
+    words = LabelSet(("wall", "chair"), random(2, DIM), random(1, DIM), ("object",), {"teacher": {"name": "toy"}})
+    camera = Camera(torch.eye(4), torch.tensor([[40.0, 0, 20], [0, 41, 8], [0, 0, 1]]), 40, 16, "first")
+    seen = Seen(torch.rand(n, generator=g) * 50, torch.rand(n, generator=g))
+    return SemanticField(gaussians, info={"seconds": 1.5}, seen=seen, cameras=(camera,), words=words, **parts)
+
+
+def make(folder: Path, add: Add) -> None:
+    """Fields, classes, what training keeps, and lists of edits."""
+    for method in ("fused", "adc+sc"):
+        place = folder / method
+        field = tiny_field(method)
+        field.save(place / "field")
+        add("field", place, "field/field.json", "field/field.safetensors", opens="field")
+        for precision in ("lossless", "fine", "tiny"):
+            field.save(place / f"{precision}.kfgs.safetensors", precision)
+            add("field", place, f"{precision}.kfgs.safetensors")
+    _classes(folder / "classes", add)
+    _parts(folder / "parts", add)
+    _edits(folder / "edits", add)
+
+
+def _classes(place: Path, add: Add) -> None:
+    place.mkdir()
+    words = tiny_field().words
+    assert words is not None
+    words.save(place / "text.safetensors")
+    (place / "classes.json").write_text(json.dumps(["wall", "chair"]))
+    np.save(place / "text.npy", words.embeddings.numpy())
+    (place / "words.txt").write_text("wall\nchair;armchair\n")
+    add("table", place, "text.safetensors")
+    add("names and rows", place, "classes.json", "text.npy", opens=".")
+    add("words", place, "words.txt", "classes.json")
+    shown = {"chair": [{"view": "a.png", "points": [[1, 2]]}, {"view": "b", "box": [0, 0, 3, 4]}, {"gaussians": [3]}]}
+    (place / "clicks.json").write_text(json.dumps(shown))
+    add("examples", place, "clicks.json")
+
+
+def _parts(place: Path, add: Add) -> None:
+    place.mkdir()
+    field = tiny_field("adc+sc")
+    assert field.codebook is not None
+    assert field.autoencoder is not None
+    field.codebook.save(place / "codebook.safetensors")
+    field.autoencoder.save(place / "autoencoder.safetensors")
+    IndexMaps([np.arange(12, dtype=np.uint8).reshape(3, 4) % 6], 5).save(place / "maps.npz")
+    add("codebook", place, "codebook.safetensors")
+    add("autoencoder", place, "autoencoder.safetensors")
+    add("index maps", place, "maps.npz")
+    checkpoint = Checkpoint({"a": torch.ones(3, 2)}, {"step": 4, "history": [1.0, 2.0]})
+    write_checkpoint(place / "checkpoint.safetensors", checkpoint, {"config": "x"})
+    add("training", place, "checkpoint.safetensors")
+    run = place / "run/stages/uplift-0123"
+    run.mkdir(parents=True)
+    (run / "stage.json").write_text(json.dumps({"name": "uplift", "seconds": 1.5, "inputs": {}}))
+    add("description", place, "run/stages/uplift-0123/stage.json", opens="run")
+
+
+def _edits(place: Path, add: Add) -> None:
+    place.mkdir()
+    write_splats(place / "lamp.ply", cloud(5))
+    plant = OfClass("plant") - InBox((0, 0, 0), (0.1, 0.1, 0.1))
+    edits = EditList([
+        Recolor(plant, "#c04040", "hue"), Opacity("wall", 0.3), Move("chair", (0.5, 0, 0), Turn("z", 30), 1.5),
+        Duplicate(Component(OfClass("chair"), 10.0), (1, 0, 0)), Remove("wall", grow=0.01), Insert(place / "lamp.ply"),
+    ])  # fmt: skip
+    edits.undo().save(place / "a.edits.json")
+    edits.save(place / "b.edits.json")
+    add("edits", place, "a.edits.json", "b.edits.json")

@@ -1,0 +1,79 @@
+"""Feature maps as kfgs and other programs write them, and checkpoints."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from safetensors.torch import save_file
+
+from kfgs.features import Picture, extract_features
+
+from .corpus import SEED, Add
+
+MAP = np.random.default_rng(SEED).standard_normal((3, 4, 5)).astype(np.float16)
+
+
+def make(folder: Path, add: Add) -> None:
+    """Folders of maps, checkpoints, and a tokenizer's tables."""
+    place = folder / "others"
+    place.mkdir(parents=True)
+    np.save(place / "a.npy", MAP)
+    add("maps", place, "a.npy", opens=".")
+    place = folder / "feature3dgs"
+    place.mkdir()
+    torch.save(torch.from_numpy(MAP).permute(2, 0, 1).contiguous(), place / "a_fmap_CxHxW.pt")
+    add("maps", place, "a_fmap_CxHxW.pt", opens=".")
+    place = folder / "safetensors"
+    place.mkdir()
+    save_file({"map": torch.from_numpy(MAP)}, place / "a.safetensors")
+    add("maps", place, "a.safetensors", opens=".")
+    place = folder / "langsplat"
+    place.mkdir()
+    np.save(place / "a_s.npy", np.arange(4 * 6 * 8, dtype=np.float32).reshape(4, 6, 8) % 4 - 1)
+    np.save(place / "a_f.npy", MAP.reshape(12, 5)[:4].astype(np.float32))
+    add("maps", place, "a_s.npy", "a_f.npy", opens=".")
+    _written(folder / "written", add)
+    _checkpoints(folder / "checkpoints", add)
+    _tokenizer(folder / "tokenizer", add)
+
+
+def _grey(picture: torch.Tensor) -> torch.Tensor:
+    """A teacher: colours and their products."""
+    small = picture[:, ::4, ::4]
+    return torch.cat([small, small.square() + 0.1])
+
+
+def _written(place: Path, add: Add) -> None:
+    pictures = place.with_name("pictures")
+    pictures.mkdir()
+    for name in ("a", "b"):
+        Image.fromarray((np.arange(12 * 16 * 3).reshape(12, 16, 3) % 256).astype(np.uint8)).save(
+            pictures / f"{name}.png"
+        )
+    shown = [Picture(path.stem, path, (12, 16)) for path in sorted(pictures.iterdir())]
+    extract_features(_grey, shown, place)
+    add("maps", place, "features.json", opens=".")
+    add("manifest", place, "features.json", opens=".")
+
+
+def _checkpoints(place: Path, add: Add) -> None:
+    place.mkdir()
+    state = {"conv.weight": torch.ones(4, 3), "conv.bias": torch.zeros(4, dtype=torch.float16), "step": torch.tensor(3)}
+    torch.save(state, place / "state.pt")
+    torch.save({"state_dict": state, "epoch": 3, "hyper": {"lr": 0.1, "names": ["a", "b"]}}, place / "lightning.ckpt")
+    torch.save(state, place / "legacy.pth", _use_new_zipfile_serialization=False)
+    save_file(state, place / "state.safetensors")
+    add("checkpoint", place, "state.pt", "lightning.ckpt", "legacy.pth", "state.safetensors")
+
+
+def _tokenizer(place: Path, add: Add) -> None:
+    place.mkdir()
+    merges = "#version: 0.2\nt h\nth e</w>\n"
+    with gzip.GzipFile(place / "merges.txt.gz", "w", mtime=0) as file:
+        file.write(merges.encode())
+    (place / "merges.txt").write_text(merges)
+    add("tokenizer", place, "merges.txt.gz", "merges.txt")

@@ -1,0 +1,201 @@
+"""The readers of kfgs, each as a function of a path that uses everything it reads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+
+def _splats(path: Path) -> None:
+    from kfgs.formats import read_splats
+
+    read_splats(path)
+
+
+def _cloud(path: Path) -> None:
+    from kfgs.pipeline.apply import read_cloud
+
+    read_cloud(path)
+
+
+def _mesh(path: Path) -> None:
+    from kfgs.formats.ply_mesh import read_mesh
+
+    read_mesh(path)
+
+
+def _scene(path: Path) -> None:
+    from kfgs.scenes import load_scene
+
+    load_scene(path).image(0)
+
+
+def _points(path: Path) -> None:
+    from kfgs.evaluation.datasets import find_points
+
+    find_points(path)
+
+
+def _labels(path: Path) -> None:
+    from kfgs.evaluation.datasets import find_labels
+    from kfgs.evaluation.segmentation import load_label_map
+
+    maps = find_labels(path).maps
+    for stem in maps:
+        found = maps[stem]
+        if isinstance(found, Path):
+            load_label_map(found)
+
+
+def _masks(path: Path) -> None:
+    from kfgs.evaluation.datasets import find_masks
+
+    frames = find_masks(path).frames
+    for stem in frames:
+        dict(frames[stem])
+
+
+def _picture(path: Path) -> None:
+    from kfgs.scenes import read_image
+
+    read_image(path)
+
+
+def _label_map(path: Path) -> None:
+    from kfgs.evaluation import load_label_map
+
+    load_label_map(path)
+
+
+def _field(path: Path) -> None:
+    from kfgs.fields import SemanticField
+
+    field = SemanticField.load(path)
+    field.summary()
+    repr(field)
+    if field.words is not None:
+        field.classify()
+
+
+def _table(path: Path) -> None:
+    from kfgs.labels import load_label_set
+
+    load_label_set(path)
+
+
+def _names_and_rows(path: Path) -> None:
+    from kfgs.labels import load_label_set
+
+    load_label_set(path / "classes.json", path / "text.npy")
+
+
+def _words(path: Path) -> None:
+    from kfgs.cli.text import read_words
+
+    read_words(str(path))
+
+
+def _examples(path: Path) -> None:
+    from kfgs.fields import read_examples
+
+    read_examples(path)
+
+
+def _codebook(path: Path) -> None:
+    from kfgs.quant import Codebook
+
+    Codebook.load(path)
+
+
+def _autoencoder(path: Path) -> None:
+    from kfgs.quant import Autoencoder
+
+    Autoencoder.load(path)
+
+
+def _index_maps(path: Path) -> None:
+    from kfgs.quant import IndexMaps
+
+    IndexMaps.load(path)
+
+
+def _training(path: Path) -> None:
+    from kfgs.fields.checkpoint import read_checkpoint
+
+    read_checkpoint(path, {"config": "x"})
+
+
+def _description(path: Path) -> None:
+    from kfgs.pipeline.describe import describe
+
+    describe(path)
+
+
+def _edits(path: Path) -> None:
+    from kfgs.labels import EditList
+
+    repr(EditList.load(path))
+
+
+def _maps(path: Path) -> None:
+    from kfgs.features import FeatureFolder
+
+    folder = FeatureFolder(path)
+    folder.check()
+    for i in range(len(folder)):
+        folder[i]
+
+
+def _manifest(path: Path) -> None:
+    from kfgs.features import read_manifest
+
+    repr(read_manifest(path))
+
+
+def _checkpoint(path: Path) -> None:
+    from kfgs.teachers import read_checkpoint
+
+    for value in read_checkpoint(path).values():
+        value.sum()
+
+
+def _tokenizer(path: Path) -> None:
+    from kfgs.teachers.bpe import load_tokenizer
+
+    load_tokenizer(path)
+
+
+def _foreign(path: Path) -> None:
+    from kfgs.evaluation.foreign import load_foreign
+
+    load_foreign(path)
+
+
+READERS: dict[str, Callable[[Path], None]] = {
+    "splats": _splats,
+    "cloud": _cloud,
+    "mesh": _mesh,
+    "scene": _scene,
+    "points": _points,
+    "labels": _labels,
+    "masks": _masks,
+    "picture": _picture,
+    "label map": _label_map,
+    "field": _field,
+    "table": _table,
+    "names and rows": _names_and_rows,
+    "words": _words,
+    "examples": _examples,
+    "codebook": _codebook,
+    "autoencoder": _autoencoder,
+    "index maps": _index_maps,
+    "training": _training,
+    "description": _description,
+    "edits": _edits,
+    "maps": _maps,
+    "manifest": _manifest,
+    "checkpoint": _checkpoint,
+    "tokenizer": _tokenizer,
+    "foreign": _foreign,
+}
+MAY_RAISE_TYPE_ERROR = ("maps",)  # documented by FeatureFolder: a file that holds anything but one tensor

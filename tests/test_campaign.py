@@ -1,0 +1,188 @@
+"""The standing campaign in short: its mutants and kills find nothing in kfgs, and find each kind of fault that is put in."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+if not (BENCHMARKS / "campaign").is_dir():  # a source distribution comes without them
+    pytest.skip(f"no folder {BENCHMARKS}", allow_module_level=True)
+if not Path("/proc/self/clear_refs").exists():
+    pytest.skip("the campaign watches its processes through Linux's /proc", allow_module_level=True)
+
+START = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {benchmarks!r})
+from campaign import crowds, files, jobs, kills, processes, readers
+from campaign.record import Record
+record = Record(Path({out!r}), Path({scratch!r}))
+"""
+
+
+def run(code, folder, *, minutes=4):
+    """Run code in a process of its own, from which the campaign may fork; the lines of its record."""
+    start = START.format(benchmarks=str(BENCHMARKS), out=str(folder / "out"), scratch=str(folder / "scratch"))
+    done = subprocess.run([sys.executable, "-c", start + code], capture_output=True, text=True, timeout=60 * minutes)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return [json.loads(line) for line in (folder / "out" / "results.jsonl").read_text().splitlines()]
+
+
+def findings(lines):
+    return [line for line in lines if line["kind"].endswith("finding")]
+
+
+def test_mutants_of_every_file_are_read_or_refused(tmp_path):
+    lines = run("files.run_files(record, seed=18, seconds=100, most=1800, batch=12)", tmp_path)
+    assert findings(lines) == []
+    readers = {line["reader"] for line in lines}
+    assert len(readers) == 25
+    assert sum(line["mutants"] for line in lines) >= 1000  # a slow machine may do fewer than 1,800
+    assert sum(line["refused"] for line in lines) > 300
+    assert sum(line["read"] for line in lines) > 100
+
+
+BROKEN = """
+files.SECONDS = 0.3
+def broken(path):
+    data = path.read_bytes()
+    if {condition}:
+        {fault}
+readers.READERS["words"] = broken
+files.run_files(record, seed=1, seconds=60, only="words.txt", most=40, batch=40)
+"""
+FAULTS = {
+    "error": "raise KeyError('wall')",
+    "crash": "import os; os.abort()",
+    "hang": "while True: pass",
+    "memory": "bytearray(b'x') * (320 << 20)",
+    "slow": "import time; end = time.process_time() + 0.35\n        while time.process_time() < end: pass",
+    "nameless": "raise ValueError('something is wrong')",
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_broken_reader_is_found_with_its_mutant(tmp_path, fault):
+    condition = "len(data) < 20" if fault != "hang" else "len(data) < 20 and not data.startswith(b'wall')"
+    lines = run(BROKEN.format(condition=condition, fault=FAULTS[fault]), tmp_path)
+    found = findings(lines)
+    assert {line["what"] for line in found} == {fault}
+    assert 1 <= len(found) < 40  # those that are not shorter went well, also after a crash
+    (batch,) = [line for line in lines if line["kind"] == "files"]
+    assert batch["mutants"] == 40
+    assert batch["read"] + batch["refused"] + len(found) == 40
+    kept = sorted((tmp_path / "out" / "findings").rglob("*words.txt"))
+    assert len(kept) == min(5, len(found))
+    assert all(len(path.read_bytes()) < 20 for path in kept)
+
+
+def test_mutants_follow_from_seed_case_and_number(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    from campaign.files import make_mutant
+
+    data = b'{"version": 1, "edits": [{"op": "remove", "where": {"class": "chair"}}]}'
+    one, again = ([make_mutant(data, "a", 3, number) for number in range(300)] for _ in range(2))
+    assert one == again
+    assert len(set(one)) > 200
+    assert one != [make_mutant(data, "a", 4, number) for number in range(300)]
+    parsed = 0
+    for mutant in one:
+        try:
+            json.loads(mutant)
+            parsed += 1
+        except ValueError:
+            pass
+    assert 100 < parsed < 290  # structure-aware ones beside blind ones
+
+
+def test_containers_come_back_and_keep_lengths_and_checksums(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import numpy as np
+    from campaign.containers import open_container
+    from PIL import Image
+
+    np.savez(tmp_path / "a.npz", a=np.arange(5))
+    np.save(tmp_path / "a.npy", np.arange(5))
+    Image.new("RGB", (4, 3)).save(tmp_path / "a.png")
+    for path in tmp_path.iterdir():
+        container = open_container(path.read_bytes())
+        path.write_bytes(container.close(container.parts))
+    assert np.load(tmp_path / "a.npz")["a"].tolist() == np.load(tmp_path / "a.npy").tolist() == [0, 1, 2, 3, 4]
+    container = open_container((tmp_path / "a.png").read_bytes())
+    longer = [(name, body + b"\0" * (name == "IHDR")) for name, body in container.parts]
+    (tmp_path / "a.png").write_bytes(container.close(longer))
+    with Image.open(tmp_path / "a.png") as picture:
+        picture.load()  # the checksum fits
+
+
+JOBS = """
+def write_plainly():
+    with open("work/a.txt.new", "wb") as file: file.write(b"new")
+    with open("work/a.out", "r+b") as file:
+        file.write(b"n")
+        file.flush()
+        open("work/other", "w").close()  # an event in the middle of the file
+        file.write(b"ew")
+def prepare(fixture, work):
+    (work / "a.out").write_bytes(b"old")
+    (work / "notes.txt").write_text(jobs.NOTES)
+jobs.make_fixture = kills.make_fixture = lambda folder: folder.mkdir(parents=True)
+"""
+
+
+def test_a_command_that_writes_halves_is_found(tmp_path):
+    code = (
+        JOBS
+        + """
+kills.all_jobs = lambda: [jobs.Job("plain", write_plainly, prepare)]
+kills.TIMED = 0
+kills.run_kills(record, seed=1, seconds=60, most=3)
+"""
+    )
+    found = findings(run(code, tmp_path))
+    assert {line["why"] for line in found} == {"neither old nor new: a.out"}
+
+
+def test_kills_find_nothing_in_a_command_that_converts(tmp_path):
+    code = """
+kills.make_fixture = lambda folder: _fixture(folder)
+def _fixture(folder):
+    from campaign.corpus_splats import cloud
+    from kfgs.formats import write_splats
+    folder.mkdir(parents=True)
+    for name, n in (("labelled.ply", 40), ("other.ply", 30)):
+        write_splats(folder / name, cloud(n))
+for run in (kills.run_kills, crowds.run_pairs, crowds.run_signals, crowds.run_full):
+    run(record, seed=1, seconds=30, most=12 if run is kills.run_kills else 3, only="convert with")
+"""
+    lines = run(code, tmp_path)
+    assert findings(lines) == []
+    assert {line["kind"] for line in lines} == {"kills", "pairs", "signals", "full"}
+    assert sum(line["kind"] == "kills" and line["killed"] for line in lines) >= 3
+
+
+def test_a_second_start_goes_on(tmp_path):
+    one = "files.run_files(record, seed=2, seconds=60, only='words', most=10, batch=10)"
+    lines = run(one + "\n" + one, tmp_path)
+    again = run(one, tmp_path)
+    assert [(line["case"], line["first"]) for line in again] == [
+        ("fields/classes/words.txt", 0), ("fields/classes/classes.json (words)", 0), ("fields/classes/words.txt", 10)
+    ]  # fmt: skip
+    assert again[:2] == lines
+
+
+def test_leaks_are_found_and_flat_runs_are_not(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    from campaign.long import faults_of, measure
+
+    kept = []
+    leak = measure(lambda i: kept.append(bytes(200_000)), 200, 20)
+    assert faults_of(leak)[0].startswith("memory grows")
+    kept.clear()
+    flat = measure(lambda i: bytes(200_000), 200, 20)
+    assert faults_of(flat) == []
+    assert flat["rounds"] == 200
+    assert faults_of(flat | {"threads_last": flat["threads_first"] + 1}) != []

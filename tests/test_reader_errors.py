@@ -1,0 +1,195 @@
+"""Damaged files that a campaign found: each is refused by an error that names it, never by another one."""
+
+import gzip
+import json
+import struct
+
+import numpy as np
+import pytest
+import torch
+from messages import tells
+from PIL import Image
+
+from kfgs.evaluation.datasets import load_3dovs, load_coco_labels, load_replica_points, load_scannet_points
+from kfgs.fields import read_examples
+from kfgs.formats import read_splats
+from kfgs.formats.ply import write_ply
+from kfgs.formats.ply_mesh import read_mesh
+from kfgs.labels import load_label_set
+from kfgs.pipeline.describe import describe
+from kfgs.quant import Autoencoder, Codebook, IndexMaps
+from kfgs.quant._store import write_tensors
+from kfgs.scenes import SceneError, load_scene, read_image
+from kfgs.scenes.files import natural_key
+from kfgs.teachers.bpe import load_tokenizer
+
+HUGE = 10**400  # a whole number that no float holds
+
+
+@pytest.mark.parametrize("content", [HUGE, [0.5, HUGE], {"camera": {"w": HUGE}}])
+def test_whole_numbers_of_hundreds_of_digits_are_no_json(tmp_path, content):
+    file = tmp_path / "clicks.json"
+    file.write_text(json.dumps({"chair": [{"view": "a", "points": [[content, 1]]}]}))
+    with pytest.raises(ValueError, match=tells(file, "401 digits")):
+        read_examples(file)
+
+
+def test_a_gaussian_of_infinite_number_is_named(tmp_path):
+    (tmp_path / "clicks.json").write_text('{"chair": [{"gaussians": [1e999]}]}')
+    with pytest.raises(ValueError, match=tells("clicks.json", "'chair'[0]", "infinity")):
+        read_examples(tmp_path / "clicks.json")
+
+
+def test_numbers_that_a_float_holds_are_json(tmp_path):
+    (tmp_path / "clicks.json").write_text(json.dumps({"chair": [{"gaussians": [2**62]}]}))
+    assert read_examples(tmp_path / "clicks.json")["chair"][0].indices == [2**62]
+
+
+def test_coordinates_beyond_every_float(tmp_path):
+    square = [[HUGE, 1, 5, 1, 5, 4]]
+    annotation = {"id": 1, "image_id": 1, "category_id": 1, "segmentation": square, "bbox": [1, 1, 4, 3]}
+    images = [{"id": 1, "file_name": "a.png", "width": 8, "height": 6}]
+    whole = {"images": images, "categories": [{"id": 1, "name": "chair"}], "annotations": [annotation]}
+    (tmp_path / "annotations.json").write_text(json.dumps(whole))
+    with pytest.raises(ValueError, match=tells("annotations.json", "digits")):
+        dict(load_coco_labels(tmp_path / "annotations.json").maps)
+
+
+def test_texts_that_are_not_utf8(tmp_path):
+    (tmp_path / "segmentations" / "00").mkdir(parents=True)
+    Image.new("L", (4, 3)).save(tmp_path / "segmentations" / "00" / "chair.png")
+    (tmp_path / "segmentations" / "classes.txt").write_bytes(b"chair\n\xd2\n")
+    with pytest.raises(ValueError, match=tells("classes.txt", "texts of a 3D-OVS scene", "utf-8")):
+        load_3dovs(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("kind", "reader", "tensors"),
+    [
+        ("index maps", IndexMaps.load, {"map.0": torch.zeros(4, dtype=torch.uint8), "size": torch.tensor(3)}),
+        ("index maps", IndexMaps.load, {"map.0": torch.zeros(2, 2, dtype=torch.uint8), "other": torch.tensor(3)}),
+        ("codebook", Codebook.load, {"codewords": torch.zeros(2, 3)}),
+        ("codebook", Codebook.load, {"rows": torch.ones(2, 3)}),
+        ("autoencoder", Autoencoder.load, {"range": torch.tensor([1.0, 0.0])}),
+    ],
+)
+def test_tensors_that_do_not_fit_name_the_file(tmp_path, kind, reader, tensors):
+    file = tmp_path / "a.safetensors"
+    write_tensors(file, tensors, kind=kind)
+    with pytest.raises(ValueError, match=tells(file, kind)):
+        reader(file)
+
+
+@pytest.mark.parametrize(
+    "stage", [[], {}, {"name": "uplift"}, {"name": "uplift", "seconds": "long"}, {"name": "a", "seconds": None}]
+)
+def test_the_description_of_a_stage_that_says_something_else(tmp_path, stage):
+    file = tmp_path / "stages" / "uplift-01" / "stage.json"
+    file.parent.mkdir(parents=True)
+    file.write_text(json.dumps(stage))
+    with pytest.raises(ValueError, match=tells(file, "description of a stage", "delete")):
+        describe(tmp_path)
+
+
+def test_class_names_that_repeat_name_the_file(tmp_path):
+    (tmp_path / "classes.json").write_text('["chair", "chair"]')
+    np.save(tmp_path / "text.npy", np.ones((2, 3), np.float32))
+    with pytest.raises(ValueError, match=tells("classes.json", "different", "chair")):
+        load_label_set(tmp_path / "classes.json", tmp_path / "text.npy")
+
+
+def test_a_compressed_vocabulary_with_damaged_blocks(tmp_path):
+    data = bytearray(gzip.compress(b"t h\n" * 500))
+    data[10] = 0xFF  # the first block's kind
+    (tmp_path / "merges.txt.gz").write_bytes(data)
+    with pytest.raises(ValueError, match=tells("merges.txt.gz", "vocabulary")):
+        load_tokenizer(tmp_path / "merges.txt.gz")
+
+
+def test_a_gltf_whose_buffer_is_no_ascii(tmp_path):
+    document = {"asset": {"version": "2.0"}, "buffers": [{"byteLength": 3, "uri": "data:a;base64,AAé"}]}
+    document |= {"bufferViews": [{"buffer": 0, "byteLength": 3}], "extensionsUsed": ["KHR_gaussian_splatting"]}
+    accessor = {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 1}
+    attributes = {"POSITION": 0}
+    primitive = {"mode": 0, "attributes": attributes, "extensions": {"KHR_gaussian_splatting": {"kernel": "ellipse"}}}
+    document |= {"accessors": [accessor], "meshes": [{"primitives": [primitive]}], "nodes": [{"mesh": 0}]}
+    document |= {"scenes": [{"nodes": [0]}], "scene": 0}
+    (tmp_path / "a.gltf").write_text(json.dumps(document))
+    with pytest.raises(ValueError, match=tells("a.gltf")):
+        read_splats(tmp_path / "a.gltf")
+
+
+def _scan(folder, columns):
+    file = folder / "scene0000_00_vh_clean_2.labels.ply"
+    write_ply(file, columns | {"label": np.array([1, 2], np.uint16)})
+    return file
+
+
+def test_a_scan_without_positions_is_named(tmp_path):
+    file = _scan(tmp_path, {axis: np.zeros(2, np.float32) for axis in "xz"})
+    with pytest.raises(ValueError, match=tells(file, "y missing")):
+        load_scannet_points(file)
+
+
+def test_objects_beyond_every_integer(tmp_path):
+    file = _scan(tmp_path, {axis: np.zeros(2, np.float32) for axis in "xyz"})
+    (tmp_path / "scene0000_00_vh_clean_2.0.010000.segs.json").write_text('{"segIndices": [7, 9]}')
+    groups = [{"objectId": 2**70, "segments": [7]}]
+    (tmp_path / "scene0000_00.aggregation.json").write_text(json.dumps({"segGroups": groups}))
+    with pytest.raises(ValueError, match=tells("scene0000_00.aggregation.json", "objectId")):
+        load_scannet_points(file)
+
+
+def _mesh(folder, face):
+    head = (
+        "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    )
+    faces = "property list uchar int vertex_indices\nproperty int object_id\nend_header\n"
+    body = np.zeros((3, 3), "<f4").tobytes() + struct.pack("<B3ii", 3, 0, 1, 2, 7)
+    path = folder / "mesh_semantic.ply"
+    path.write_bytes((head + face + faces).encode() + body)
+    return path
+
+
+def test_a_mesh_is_read_and_one_whose_header_seems_to_end_earlier_is_named(tmp_path):
+    assert read_mesh(_mesh(tmp_path, "element face 1\n")).corners.tolist() == [0, 1, 2]
+    with pytest.raises(ValueError, match=tells("mesh_semantic.ply")):
+        read_mesh(_mesh(tmp_path, "comment an end_header\nelement face 1\n"))
+
+
+def test_replica_without_positions_is_named(tmp_path):
+    path = _mesh(tmp_path, "element face 1\n")
+    path.write_bytes(path.read_bytes().replace(b"float y", b"float v"))
+    (tmp_path / "info_semantic.json").write_text(
+        '{"classes": [{"id": 1, "name": "a"}], "objects": [{"id": 7, "class_id": 1}]}'
+    )
+    with pytest.raises(ValueError, match=tells(path.name, "y missing")):
+        load_replica_points(path)
+
+
+def test_pictures_of_one_name_in_a_transforms_json_name_the_folder(tmp_path):
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", (8, 6)).save(tmp_path / "images" / "a.png")
+    frame = {"file_path": "images/a.png", "transform_matrix": np.eye(4).tolist()}
+    top = {"w": 8, "h": 6, "fl_x": 5.0, "fl_y": 5.0, "cx": 4.0, "cy": 3.0, "frames": [frame, frame]}
+    (tmp_path / "transforms.json").write_text(json.dumps(top))
+    with pytest.raises(SceneError, match=tells(tmp_path, "'a' twice")):
+        load_scene(tmp_path)
+
+
+def test_a_name_of_thousands_of_digits_can_be_sorted():
+    names = ["a" + "9" * 5000, "a10", "a9"]
+    assert sorted(names, key=natural_key) == ["a9", "a10", names[0]]
+
+
+@pytest.mark.parametrize("ending", ["png", "gif", "tiff"])
+def test_a_small_picture_of_many_colours_is_refused_and_a_mask_of_a_photos_size_is_not(tmp_path, ending):
+    from kfgs.scenes.files import open_picture
+
+    file = tmp_path / f"a.{ending}"
+    Image.new("L", (4032, 3024)).save(file, **({"compression": "tiff_deflate"} if ending == "tiff" else {}))
+    assert file.stat().st_size < 60_000
+    with pytest.raises(SceneError, match=tells(file, "4032x3024")):  # 380 MB as floats
+        read_image(file)
+    with open_picture(file) as picture:
+        assert picture.size == (4032, 3024)
