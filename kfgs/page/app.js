@@ -315,7 +315,11 @@ class App {
     clearTimeout(this.remembering);
     const { model } = this;
     const wanted = () => (model.edited || model.selecting ? this.state() : null);
-    this.remembering = setTimeout(() => keep(this.place, wanted()), REMEMBER);
+    this.remembering = setTimeout(() => {
+      if (keep(this.place, wanted()) || this.warned) return;
+      this.warned = true;
+      this.say("This browser cannot keep so much for a reload of the tab: “Save state” writes it into a file.");
+    }, REMEMBER);
   }
 
   async remembered() {

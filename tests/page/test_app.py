@@ -686,3 +686,13 @@ def test_other_names_are_refused(state, tmp_path):
     with pytest.raises(ValueError, match=r"path: expected a name that ends in .html, got 'scene.ply'"):
         save_html(state, tmp_path / "scene.ply")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_work_that_a_browser_cannot_keep_is_told_once(page):
+    page.evaluate("() => { Storage.prototype.setItem = () => { throw new Error('full'); }; }")
+    ask(page, "chair")
+    page.wait_for_selector("[role=alert]:has-text('Save state')")
+    page.evaluate("viewer.say('')")
+    ask(page, "table")
+    page.wait_for_timeout(800)
+    assert not page.locator("[role=alert]:visible").count()
