@@ -37,11 +37,12 @@ class RunField:
     info: dict[str, Any]
 
     def __str__(self) -> str:
-        steps = (self.info.get("steps") or {}).items()
+        steps = self.info.get("steps")
+        known = steps.items() if isinstance(steps, dict) else ()  # another program may have written the file
         parts = [
             str(self.info.get("method", "unknown method")),
             f"{self.gaussians:,} Gaussians",
-            *(f"{count:,} steps ({stage})" for stage, count in steps),
+            *(f"{count:,} steps ({stage})" for stage, count in known if isinstance(count, int)),
             f"of {time.strftime('%Y-%m-%d %H:%M', time.localtime(self.saved))}",
         ]
         return one_line(f"{self.key}  {', '.join(parts)}", 200)

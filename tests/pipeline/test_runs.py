@@ -132,6 +132,13 @@ def test_a_damaged_field_never_takes_the_place_of_a_whole_one(run, what):
     assert first(run / "field") == 2
 
 
+@pytest.mark.parametrize("steps", [3, [1], "many", {"color": "many"}, {"color": None}, None])
+def test_steps_that_another_program_wrote_are_left_out(tmp_path, steps):
+    a_field(0, steps=steps).save(tmp_path / "field")
+    (found,) = list_fields(tmp_path)
+    assert str(found).startswith(f"{found.key}  fuse, 4 Gaussians, of ")
+
+
 def test_a_description_cannot_lead_out_of_the_run_folder(run, tmp_path):
     file = run / "field" / "field.json"
     about = json.loads(file.read_text())
