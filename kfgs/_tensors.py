@@ -12,7 +12,7 @@ from torch import Tensor
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
-    """Write tensors from any device, with texts in the header. safetensors writes the texts in random order; here it is theirs.
+    """Write tensors from any device, with texts in the header, in their order (safetensors alone would shuffle them).
 
     Raises:
         SafetensorError: if the file cannot be written; `atomic_path` makes an OSError of it.

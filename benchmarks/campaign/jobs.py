@@ -27,6 +27,8 @@ class Job:
     """Field folders in `work/`, which are compared by their reader: their files may be between old and new."""
     loose: tuple[str, ...] = ()
     """Endings of files whose bytes differ between two undisturbed runs, because they tell the time."""
+    idle: bool = False
+    """Whether a run that finds its result finished writes nothing."""
     resumed: bool = False
     """Whether a killed run goes on, so that files of its stages are reused."""
 
@@ -130,7 +132,7 @@ def all_jobs() -> list[Job]:
             _with(files={"a.ply": "other.ply"}),
         ),
         Job("save edits", _save_edits, _with()),
-        Job("toy room", _toy_room, _with()),
+        Job("toy room", _toy_room, _with(), idle=True),
         Job(
             "label",
             command("label", field, "--out", "work/labelled", "--cloud", "in/labelled.ply", "--distance", "1", *room),

@@ -89,16 +89,15 @@ class Bench:
             elif name not in known.new and now.get(name) != value:
                 yield f"changed a file that the command does not write: {name}"
         for name, value in now.items():
-            grows = job.resumed and name.endswith("features.json")  # a list of the maps that are there
-            if value not in (known.old.get(name), known.new.get(name)) and not (grows or self._between(job, name)):
+            if value not in (known.old.get(name), known.new.get(name)) and not self._between(job, name):
                 yield f"neither old nor new: {name}"
         for name, value in fields.items():
             if value not in known.fields[name]:
                 yield f"neither the old nor the new field: {name}"
         yield from self._foreign()
 
-    def repeated(self, job: Job, ended: Ended) -> Iterator[str]:
-        """What is wrong after the command was given again."""
+    def repeated(self, job: Job, ended: Ended, *, idle: bool = False) -> Iterator[str]:
+        """What is wrong after the command was given again. An `idle` one had nothing to write, and so swept nothing."""
         known = self.reference(job)
         if ended.code or ended.hung:
             yield f"the second run {'hung' if ended.hung else f'ended with {ended.code}'}: {ended.said[-400:]}"
@@ -111,21 +110,10 @@ class Bench:
         for name, value in fields.items():
             if value != known.fields[name][1]:
                 yield f"the second run gave another field: {name}"
-        if set(hidden_in(self.work)) - set(known.hidden):
-            self._write_beside()
         more = sorted(set(hidden_in(self.work)) - set(known.hidden))
-        if more:
+        if more and not idle:
             yield f"left hidden: {', '.join(more[:5])}"
         yield from self._foreign()
-
-    def _write_beside(self) -> None:
-        """Write another file beside what is hidden: a command that had nothing to write there has swept nothing."""
-        from kfgs._files import HIDDEN, atomic_path
-
-        for hidden in [*self.work.rglob(HIDDEN)]:
-            with atomic_path(hidden.parent / "beside") as path:
-                path.write_text("")
-            (hidden.parent / "beside").unlink()
 
     def _between(self, job: Job, name: str) -> bool:
         """Whether a file is one that a resumed run keeps for itself while it works."""
@@ -185,7 +173,8 @@ def _kill(record: Record, bench: Bench, job: Job, seed: int, at: int | float) ->
         first = process.wait()
     faults = [f"the first run ended with {first.code}: {first.said[-300:]}"] if first.code not in (0, -9) else []
     faults += bench.disturbed(job)
-    faults += bench.repeated(job, bench.start(job).wait())
+    idle = job.idle and not faults and state_of(bench.work, job.loose, job.fields) == known.new
+    faults += bench.repeated(job, bench.start(job).wait(), idle=idle)
     base = {"kind": "kills", "case": job.name, "seed": seed, "at": at}
     record.add(base | {"killed": first.code == -9, "seconds": round(time.monotonic() - began, 2)})
     for fault in faults:

@@ -69,7 +69,7 @@ def parse_json(text: str | bytes, **options: Any) -> Any:
         value = json.loads(text, **{"parse_int": _whole_number} | options)
     except RecursionError:
         raise ValueError(deep) from None
-    level, depth = [value], 0  # not by recursion, which what follows (repr, json.dumps) has not endless room for
+    level, depth = [value], 0  # in a loop: recursion ends at some 1,000 levels
     while level := [part for one in level for part in _inside(one) if type(part) in (dict, list)]:
         depth += 1
         if depth >= NESTED:

@@ -222,7 +222,7 @@ def _check_kinds(new: Path, target: Path) -> None:
 
 
 def _is_used(folder: Path) -> bool:
-    """Whether a folder must stay what it is: it holds something, is a disk, or the process runs in it (`--out .`)."""
+    """Whether a folder may not be replaced by another: it holds something, is a disk, or the process runs in it (`--out .`)."""
     return folder.is_dir() and (any(folder.iterdir()) or folder.is_mount() or os.path.samefile(folder, os.curdir))
 
 

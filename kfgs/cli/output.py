@@ -41,7 +41,7 @@ def wrote(paths: list[Path]) -> None:
 def say_counts(labels: Any, names: Sequence[str]) -> None:
     """Print the number of Gaussians of each class, and of those without a class."""
     for i, name in enumerate(names):
-        say(f"  {name:<16s} {int((labels == i).sum()):8d} Gaussians")
+        say(f"  {_shown(name):<16s} {int((labels == i).sum()):8d} Gaussians")
     if bool((labels < 0).any()):
         say(f"  {'(none)':<16s} {int((labels < 0).sum()):8d} Gaussians")
 
