@@ -38,17 +38,17 @@ def findings(lines):
 
 
 def test_mutants_of_every_file_are_read_or_refused(tmp_path):
-    lines = run("files.run_files(record, seed=18, seconds=100, most=1800, batch=12)", tmp_path)
+    lines = run("files.run_files(record, seed=18, seconds=3000, most=1500, batch=12)", tmp_path, minutes=14)
     assert findings(lines) == []
     readers = {line["reader"] for line in lines}
     assert len(readers) == 25
-    assert sum(line["mutants"] for line in lines) >= 1000  # a slow machine may do fewer than 1,800
+    assert sum(line["mutants"] for line in lines) == 1500
     assert sum(line["refused"] for line in lines) > 300
     assert sum(line["read"] for line in lines) > 100
 
 
 BROKEN = """
-files.SECONDS = 0.2
+files.SECONDS = 1
 def broken(path):
     data = path.read_bytes()
     exec(dict({faults!r}).get(len(data), ""))
@@ -60,7 +60,7 @@ FAULTS = {  # of a mutant of so many bytes
     "crash": (21, "import os; os.abort()"),
     "hang": (15, "while True: pass"),
     "memory": (22, "bytearray(b'x') * (320 << 20)"),
-    "slow": (24, "import time; end = time.process_time() + 0.3\nwhile time.process_time() < end: pass"),
+    "slow": (24, "import time; end = time.process_time() + 1.2\nwhile time.process_time() < end: pass"),
     "nameless": (17, "raise ValueError('something is wrong')"),
 }
 
