@@ -1,11 +1,13 @@
 """What the command line prints of names that others chose."""
 
 import io
+import signal
 import sys
 
 import pytest
 import torch
 
+from kfgs import cli
 from kfgs.cli import _in_options, main
 from kfgs.cli.output import END, LINE, say
 from kfgs.formats import SplatFile, write_splats
@@ -78,3 +80,18 @@ def test_half_a_surrogate_pair_can_be_printed(stream, monkeypatch):
 def test_advice_for_python_is_left_out_on_the_command_line():
     message = "splat: no frame (in Python: frame=Similarity.identity() says so); give cameras (see f(x))"
     assert _in_options(message, {}) == "splat: no frame; give cameras (see f(x))"
+
+
+@pytest.mark.parametrize("error", [AttributeError, ImportError, SystemError])
+def test_an_interrupt_that_a_loading_module_turns_into_another_error_is_one(error, monkeypatch, capsys):
+    def probe() -> None:
+        """Load a module."""
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise error("partially initialized module") from None
+
+    monkeypatch.setitem(cli.COMMANDS, "probe", probe)
+    assert cli.main(["probe"]) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -107,6 +107,14 @@ def test_segmenting_into_the_scene_puts_no_pictures_among_its_maps(room, run, ca
     assert not (room / "predicted").exists()
 
 
+@pytest.mark.parametrize("given", [[], ["--scene", "{room}"]])
+def test_a_selection_puts_no_picture_among_those_of_the_scene(given, room, run, capsys):
+    before = set(room.rglob("*"))
+    given = [word.format(room=room) for word in given]
+    refused(["select", "chair", run / "field", "--out", room / "images", *given], capsys, "--out:", room / "images")
+    assert set(room.rglob("*")) == before
+
+
 def test_home_is_no_folder_named_tilde(splat, tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.chdir(tmp_path)

@@ -10,6 +10,7 @@ import torch
 from cases_packed import assert_same, assert_within, field
 from messages import tells
 
+from kfgs._files import digest_file
 from kfgs.cli import main, options
 from kfgs.evaluation import Report
 from kfgs.fields import SemanticField, remember
@@ -131,13 +132,17 @@ def test_scores_travel_in_the_file(place, tmp_path, capsys):
         (["{place}/run", "{tmp}/o" + ENDING], ("FIELD:", "a run folder", "pass {place}/run/field")),
         (["{place}/run/field", "{tmp}/o", "--precision", "small"], ("--precision:", "folder", ENDING)),
         (["{place}/room" + ENDING, "{place}/room" + ENDING], ("OUT:", "another place")),
+        (["{place}/room" + ENDING, "{place}/run/field"], ("OUT:", "{place}/run/field", "holds a field", "rename")),
+        (["{place}/room" + ENDING, "{place}/run"], ("{place}/run", "something else", "another")),
         (["{place}/run/field", "{tmp}/o" + ENDING, "--scores", "{tmp}/no.json"], ("no.json:", "no such file")),
     ],
 )
 def test_bad_input_ends_with_one_message_and_no_files(arguments, message, place, tmp_path, capsys):
     fill = {"tmp": str(tmp_path), "place": str(place)}
+    before = digest_file(place / "run" / "field" / "field.json")
     assert main(["pack", *(one.format(**fill) for one in arguments)]) == 1
     said = capsys.readouterr().err
     assert said.startswith("error: ")
     assert re.search(tells(*(part.format(**fill) for part in message)), said)
     assert not list(tmp_path.iterdir())
+    assert digest_file(place / "run" / "field" / "field.json") == before

@@ -222,7 +222,8 @@ def _check_kinds(new: Path, target: Path) -> None:
 
 
 def _is_used(folder: Path) -> bool:
-    return folder.is_dir() and any(folder.iterdir())
+    """Whether a folder must stay what it is: it holds something, is a disk, or the process runs in it (`--out .`)."""
+    return folder.is_dir() and (any(folder.iterdir()) or folder.is_mount() or os.path.samefile(folder, os.curdir))
 
 
 def _make_ordinary(file: Path) -> None:

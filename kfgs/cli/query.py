@@ -67,6 +67,8 @@ def select(
     counted = not asked_by_text and threshold is None  # parts are numbered as `kfgs edit` does
     if asked_by_text:
         field = classes.open_field("source", source)
+        if out is not None and classes.scene is None:
+            check_folder("out", out, _remembered(field))
         label_set, target = ask(query, classes, teacher, field)
         query = target if isinstance(target, str) else query
         how = None if score == "auto" else score
@@ -269,13 +271,23 @@ def _save(out: Path, query: str, cloud: Any, found: Any, things: list[Any]) -> l
 
 def _scene_of(field: Any, classes: Classes) -> Any:
     """The scene of --scene or of the field, for its photographs; None if it is not there any more."""
-    from ..fields import recall_scene
     from ..scenes import load_scene
 
     if classes.scene is not None:
         return classes.load_scene().undistorted()
+    folder = _remembered(field)
     try:
-        return load_scene(recall_scene(field.info, field.folder)).undistorted()
+        return None if folder is None else load_scene(folder).undistorted()
+    except (OSError, ValueError):
+        return None
+
+
+def _remembered(field: Any) -> Path | None:
+    """The scene folder that a field remembers; None if there is none, or it is gone."""
+    from ..fields import recall_scene
+
+    try:
+        return recall_scene(field.info, field.folder)
     except (OSError, ValueError):
         return None
 

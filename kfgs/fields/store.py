@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ FORMAT, VERSIONS = "kfgs.semantic_field", (1, 2, 3)
 TENSORS, DESCRIPTION = "field.safetensors", "field.json"
 SUFFIX = ".kfgs.safetensors"
 """Of a field in one file."""
-ATTEMPTS = 3  # to read a folder that other processes write to
+ATTEMPTS = 5  # to read a folder that other processes write to
 
 
 def find_field(path: str | Path) -> Path | None:
@@ -42,7 +43,7 @@ def find_field(path: str | Path) -> Path | None:
 
 def describes_field(folder: Path) -> bool:
     """Whether a folder is that of a field."""
-    return current_file(folder, DESCRIPTION).is_file()
+    return current_file(folder, DESCRIPTION).is_file() or (folder / DESCRIPTION).is_file()  # it was just moved there
 
 
 def field_data(path: Path) -> Path:
@@ -134,16 +135,14 @@ def read_description(path: Path) -> dict[str, Any]:
 
 def _read_folder(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and description of a field folder. If another process replaces them meanwhile, they are read again."""
-    for _ in range(ATTEMPTS):
-        description, file = read_description(path), current_file(path, TENSORS)
-        try:
-            before = file.stat()
-            if digest_file(file) == description.get("sha256"):
+    for attempt in range(ATTEMPTS):
+        with suppress(OSError, ValueError) if attempt < ATTEMPTS - 1 else nullcontext():
+            description, file = read_description(path), current_file(path, TENSORS)
+            before = file.stat() if file.is_file() else None
+            if before is not None and digest_file(file) == description.get("sha256"):
                 tensors, _ = read_safetensors(file, "the numbers of a field", "fit it again")
                 if os.path.samestat(before, file.stat()):
                     return tensors, description
-        except FileNotFoundError:
-            continue
     raise ValueError(
         f"{path}: expected {TENSORS} as it was saved, got {'another' if file.is_file() else 'none'}; copy the whole folder "
         "again, or fit the field again"

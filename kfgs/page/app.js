@@ -19,7 +19,7 @@ const NARROW = { narrow: 900, slim: 640, thin: 480 }; // CSS pixels of the width
 const LOW = 420; // of the height
 const HOVER = 120; // milliseconds that the pointer rests before a tooltip
 const REMEMBER = 500; // milliseconds after the last change
-const ASIDE = 0.7; // how far beside the originals copies appear, of their radius
+const ASIDE = 1; // how far beside the originals copies appear, of their radius
 
 /**
  * Show a scene in an element.
@@ -249,7 +249,7 @@ class App {
     const wrote = (paths) => this.say(`Saved: ${paths.join(", ")}`);
     return {
       describe: (side, index) => link.describe(side, index),
-      similar: () => this.attempt(async () => model.ask(await link.similar(model.meant()))),
+      similar: this.header.examples && (() => this.attempt(async () => model.ask(await link.similar(model.meant())))),
       split: () => this.attempt(() => this.split()),
       saveSelection: () => this.attempt(async () =>
         wrote(await link.saveSelection({ ...asked(), edits: edits(), masks: sides((side) => model.selected(side)) }))),
@@ -276,13 +276,20 @@ class App {
   duplicate() {
     const { model, eye } = this;
     const found = model.extent(model.side);
-    if (found) model.duplicate([0, 1, 2].map((axis) => ASIDE * found.radius * eye.view.R[axis]));
+    if (!found || !model.duplicate([0, 1, 2].map((axis) => ASIDE * found.radius * eye.view.R[axis]))) return;
+    this.setTool("shift");
+    this.say("Drag the copy into its place; F shows it.");
   }
 
   // the state: saved, opened, remembered when the tab is reloaded
 
   saveState() {
-    download("kfgs_view.json", new Blob([JSON.stringify(this.model)], { type: "application/json" }));
+    download("kfgs_view.json", new Blob([this.state()], { type: "application/json" }));
+  }
+
+  /** The state as JSON, with what the first pane shows from where. */
+  state() {
+    return JSON.stringify({ ...this.model.toJSON(), mode: this.panes.list[0].mode, view: this.eye.view });
   }
 
   openFile(file) {
@@ -293,6 +300,13 @@ class App {
   async open(saved) {
     const answer = saved?.words ? await this.attempt(() => this.link.ask(saved.words)) : null;
     this.model.fromJSON(saved, answer ?? null);
+    const { mode, view } = saved;
+    if (mode in this.modes) this.panes.list[0].mode = mode;
+    if (possibleView(view)) {
+      this.leaveView();
+      this.eye.view = view;
+    }
+    this.refreshPanes();
   }
 
   /** Keep edits and selection for a reload of the tab. */
@@ -300,8 +314,12 @@ class App {
     if (!this.alone || this.root.hasAttribute("aria-busy")) return;
     clearTimeout(this.remembering);
     const { model } = this;
-    const wanted = () => (model.edited || model.selecting ? JSON.stringify(model) : null);
-    this.remembering = setTimeout(() => keep(this.place, wanted()), REMEMBER);
+    const wanted = () => (model.edited || model.selecting ? this.state() : null);
+    this.remembering = setTimeout(() => {
+      if (keep(this.place, wanted()) || this.warned) return;
+      this.warned = true;
+      this.say("This browser cannot keep so much for a reload of the tab: “Save state” writes it into a file.");
+    }, REMEMBER);
   }
 
   async remembered() {
@@ -441,7 +459,21 @@ class App {
     if (!found) return;
     if (!model.counts(model.side).selected && Number.isInteger(header.default_view)) return this.goTo(header.default_view);
     this.leaveView();
-    this.glide(() => this.eye.fit(found));
+    const from = model.counts(model.side).selected ? this.viewThatSees(found) : null;
+    this.glide(() => this.eye.fit(found, from));
+  }
+
+  /** The nearest of the scene's cameras in whose picture a ball lies, or lies most completely; null without cameras. */
+  viewThatSees({ center, radius }) {
+    const { cameras } = this.header;
+    const cost = ({ viewmat: m, K: [fx, fy, cx, cy], width, height }) => {
+      const [x, y, z] = [0, 4, 8].map((row) => m[row] * center[0] + m[row + 1] * center[1] + m[row + 2] * center[2] + m[row + 3]);
+      if (z < radius / 4) return Infinity; // behind it, or in the middle
+      const out = (place, half, size) => (Math.max(0, half - place) + Math.max(0, place + half - size)) / size;
+      const cut = out((fx * x) / z + cx, (fx * radius) / z, width) + out((fy * y) / z + cy, (fy * radius) / z, height);
+      return 10 * cut + z / radius / 10;
+    };
+    return cameras.reduce((best, own) => (cost(own) < (best ? cost(best) : Infinity) ? own : best), null);
   }
 
   /** Go to a camera of the scene. */
@@ -549,6 +581,9 @@ class App {
     return true;
   }
 }
+
+const possibleView = (view) =>
+  [...(view?.R ?? []), ...(view?.position ?? []), view?.distance].filter(Number.isFinite).length === 13;
 
 function possibleModes({ sides, buffers }) {
   const absent = { color: !sides.color && sides.semantic.sh_degree === null, latents: !buffers["semantic/latents"] };

@@ -92,9 +92,13 @@ export function fly(view, [right, up, forward]) {
   return {...view, position: add(add(add(view.position, axis(view, 0), right), axis(view, 1), -up), axis(view, 2), forward)};
 }
 
-/** Look at a ball from the same direction, so that it fills the picture; fov: the smaller field of view in radians. */
-export function fit(view, center, radius, fov) {
-  const distance = Math.max(radius, 1e-6) / Math.sin(fov / 2);
+/**
+ * Look at a ball from the same direction, so that it fills the picture.
+ * @param {number} fov the smaller field of view in radians
+ * @param {number} most largest distance
+ */
+export function fit(view, center, radius, fov, most = Infinity) {
+  const distance = Math.min(Math.max(radius, 1e-6) / Math.sin(fov / 2), most);
   return {...view, distance, position: add(center, axis(view, 2), -distance)};
 }
 
@@ -124,17 +128,4 @@ export function between(a, b, t) {
     position: mix(a.position, b.position),
     distance: Math.exp((1 - t) * Math.log(a.distance) + t * Math.log(b.distance)),
   };
-}
-
-/** The ball that holds the middle of some points: median centre, 95 % of the distances. means: [N * 3]; mask: which. */
-export function ballOf(means, mask = null) {
-  const kept = [];
-  const every = Math.max(1, Math.floor(means.length / 3 / 20000));
-  const step = mask ? 1 : every;
-  for (let i = 0; 3 * i < means.length; i += step) if (!mask || mask[i]) kept.push(i);
-  if (!kept.length) return null;
-  const middle = (values) => values.sort((p, q) => p - q)[values.length >> 1];
-  const center = [0, 1, 2].map((k) => middle(kept.map((i) => means[3 * i + k])));
-  const far = kept.map((i) => Math.hypot(...[0, 1, 2].map((k) => means[3 * i + k] - center[k]))).sort((p, q) => p - q);
-  return {center, radius: far[Math.floor(0.95 * (far.length - 1))]};
 }

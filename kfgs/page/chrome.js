@@ -8,9 +8,12 @@ export const TOOLS = {
   move: ["Move the view", "1"], box: ["Box selection", "2"], lasso: ["Lasso selection", "3"], brush: ["Brush selection", "4"],
   ball: ["Ball selection: drag from its middle", "5"], shift: ["Move the selected Gaussians (Shift: up and down)", "6"],
 };
+const HOWS = [
+  ["replace", "=", "Select anew"], ["add", "+", "Add to the selection (Shift)"], ["subtract", "−", "Subtract from the selection (Alt)"],
+];
 const LAYOUTS = [["one", "One view"], ["split", "Side by side"], ["slider", "Slider"]];
 const HELP = [
-  ["Drag", "turn the view"], ["Right drag, Shift + drag", "move it sideways"], ["Wheel, two fingers, + −", "zoom"],
+  ["Drag", "turn the view"], ["Right drag, Shift + drag", "move it sideways"], ["Middle drag, Ctrl + drag", "look around"], ["Wheel, two fingers, + −", "zoom"],
   ["W A S D, Q E", "fly (Shift: faster)"], ["Click", "pick a Gaussian"], ["Double click", "turn about this point"],
   ["F", "fit the selection, or the first view"], ["[ ]", "previous and next photo view"], ["P", "photo over the view"],
   ["/", "search"], ["M", "next colour mode"], ["1 2 3 4 5", "move, box, lasso, brush, ball"], ["6", "drag the selection (Shift: up and down)"], [", .", "smaller and larger brush"],
@@ -64,10 +67,18 @@ export function makeTop(app) {
 export function makeRail(app) {
   const make = ([tool, [label, key]]) => iconButton(tool, label, () => app.setTool(tool), { key, "data-tool": tool });
   const buttons = Object.entries(TOOLS).map(make);
+  const how = choice("What a selection does", HOWS, (own) => {
+    app.tools.how = own;
+    how.set(own);
+  });
+  how.set("replace");
   const fit = iconButton("fit", "Fit the selection, or go to the first view", () => app.fit(), { key: "F" });
-  const set = (tool) => buttons.forEach((one) => one.setAttribute("aria-pressed", String(one.dataset.tool === tool)));
+  const set = (tool) => {
+    buttons.forEach((one) => one.setAttribute("aria-pressed", String(one.dataset.tool === tool)));
+    how.element.hidden = tool === "move" || tool === "shift";
+  };
   set("move");
-  return { element: h("div", { class: "rail card", role: "toolbar", "aria-label": "Tools" }, ...buttons, fit), set };
+  return { element: h("div", { class: "rail card", role: "toolbar", "aria-label": "Tools" }, ...buttons, fit, how.element), set };
 }
 
 /** What each pane shows, at its upper edge, and the border between two. Returns {element, refresh()}. */

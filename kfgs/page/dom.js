@@ -207,12 +207,15 @@ export function download(name, blob) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
 }
 
-/** Keep a text until the tab is closed, null: forget it. Where that is not allowed, or it is too long, nothing is kept. */
+/** Keep a text until the tab is closed, null: forget it. Returns whether that was possible. */
 export function keep(name, text) {
   try {
     sessionStorage.removeItem(name);
     if (text !== null) sessionStorage.setItem(name, text);
-  } catch {} // a frame without an origin of its own, or no space
+    return true;
+  } catch {
+    return false; // a frame without an origin of its own, or no space
+  }
 }
 
 /** What was kept, or null. */

@@ -39,9 +39,12 @@ export class Eye {
     this.loose = true;
   }
 
-  fit({ center, radius }) {
+  /** Show a ball as large as possible; `from`: no farther away than a camera, and from its side (a room has walls). */
+  fit({ center, radius }, from = null) {
     const { fx, fy, width, height } = this.at(100, 100);
-    this.view = fit(this.view, center, radius, 2 * Math.atan(Math.min(width / fx, height / fy) / 2));
+    if (from) this.view = lookAt(viewOf(from.viewmat, 1).position, center, this.up);
+    const most = from ? this.view.distance : Infinity;
+    this.view = fit(this.view, center, radius, 2 * Math.atan(Math.min(width / fx, height / fy) / 2), most);
     this.loose = false;
   }
 

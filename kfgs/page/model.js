@@ -1,6 +1,7 @@
 /** The viewer's state and rules: question, gamma, lambda, hidden classes, selection, edits, undo. Uses no DOM. */
 
 import { Cloud, bufferOf, cloudsOf } from "./clouds.js";
+import { near, spacing, squared } from "./points.js";
 
 const MOST_UNDONE = 50; // steps; a step holds at most the masks that it changed
 const BINS = 64; // of the histograms
@@ -248,8 +249,8 @@ export class Model extends EventTarget {
   grow(side = this.side, shrink = false) {
     const [mask, drawn] = [this.selected(side), this.drawn(side)];
     const from = shrink ? mask.map((on, i) => (on ? 0 : drawn[i])) : mask;
-    const near = within(this.clouds[side].means, from, this.reach(side));
-    const made = mask.map((on, i) => (shrink ? (on && !near[i] ? 1 : 0) : on || (near[i] && drawn[i]) ? 1 : 0));
+    const close = near(this.clouds[side].means, from, this.reach(side));
+    const made = mask.map((on, i) => (shrink ? (on && !close[i] ? 1 : 0) : on || (close[i] && drawn[i]) ? 1 : 0));
     this.step(shrink ? "shrink selection" : "grow selection", { hand: { ...this.bySides(), [side]: made } });
   }
 
@@ -473,6 +474,9 @@ export class Model extends EventTarget {
     if (this.byHand) lines.push(`${some} are selected by hand.`);
     else if (this.answer) lines.push(`${some} score above ${short(this.gamma)} for “${this.answer.words}”.`);
     else lines.push(`${whole(counts.total)} ${kind}.`);
+    const seen = this.hidden.size ? this.drawn(this.side) : null;
+    const hidden = seen ? counts.selected - sum(this.selected(this.side).map((on, i) => on & seen[i])) : 0;
+    if (hidden) lines.push(`${whole(hidden)} of these are hidden, and change with the others.`);
     if (counts.removed) lines.push(`${whole(counts.removed)} are removed.`);
     return lines;
   }
@@ -585,51 +589,4 @@ function bins(values, place) {
     if (at >= 0) made[Math.min(at, BINS - 1)] += Number.isFinite(values[i]) ? 1 : 0;
   }
   return made;
-}
-
-/** The median distance to the nearest other Gaussian, from a sample. */
-function spacing(points) {
-  const count = points.length / 3;
-  const step = Math.max(1, Math.floor(count / 60));
-  const found = [];
-  for (let i = 0; i < count; i += step) {
-    let least = Infinity;
-    for (let j = 0; j < count; j++) {
-      const far = squared(points, i, j);
-      if (far > 0 && far < least) least = far;
-    }
-    found.push(Math.sqrt(least));
-  }
-  found.sort((a, b) => a - b);
-  return found[found.length >> 1] || 1e-6;
-}
-
-function squared(points, i, j) {
-  let all = 0;
-  for (let axis = 0; axis < 3; axis++) all += (points[3 * i + axis] - points[3 * j + axis]) ** 2;
-  return all;
-}
-
-/** Which points lie within a distance of one that the mask has; with a grid of cells of that size. */
-function within(points, mask, reach) {
-  const cells = new Map(); // of hashes: a cell may hold points of others, whose distances tell
-  const hash = (x, y, z) => (x * 73856093) ^ (y * 19349663) ^ (z * 83492791);
-  const cell = (i) => [0, 1, 2].map((axis) => Math.floor(points[3 * i + axis] / reach));
-  const near = mask.slice();
-  for (let i = 0; i < mask.length; i++) {
-    if (!mask[i]) continue;
-    const key = hash(...cell(i));
-    if (!cells.has(key)) cells.set(key, []);
-    cells.get(key).push(i);
-  }
-  const close = (i) => {
-    const [x, y, z] = cell(i);
-    for (let k = 0; k < 27; k++) {
-      const others = cells.get(hash(x + (k % 3) - 1, y + (Math.floor(k / 3) % 3) - 1, z + Math.floor(k / 9) - 1));
-      if (others?.some((j) => squared(points, i, j) <= reach * reach)) return true;
-    }
-    return false;
-  };
-  for (let i = 0; i < mask.length; i++) if (!mask[i] && close(i)) near[i] = 1;
-  return near;
 }

@@ -97,19 +97,23 @@ export class Panes {
 
   /** Draw soon, if need be coarsely, and in full when nothing changes any more. */
   hurry() {
+    this.rest();
+    this.redraw();
+  }
+
+  /** What is drawn from now on may be coarse; when nothing changes any more, it is drawn in full. */
+  rest() {
     this.moving = true;
     clearTimeout(this.resting);
     this.resting = setTimeout(() => ((this.moving = false), this.redraw()), REST);
-    this.redraw();
   }
 
   /** Resolves when there is a picture, perhaps a coarse one that is drawn in full soon. */
   async first() {
-    this.moving = true;
-    this.draw();
+    this.rest();
+    this.draw(); // nothing yet, but the order is asked for
     await this.renderer.ordered();
     this.draw();
-    this.hurry();
   }
 
   /** Resolves when the picture is that of the state. */

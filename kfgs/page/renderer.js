@@ -18,7 +18,7 @@ const LEVELS = [
   {scale: 0.4, least: 1 / 40, enough: 0.95, share: 0.6},
   {scale: 0.4, least: 1 / 40, enough: 0.95, share: 0.3},
 ];
-const FIRST = 2; // level of the first moving frame: a picture soon, on any machine
+const FIRST = 3; // level of the first moving frame: a picture soon, on any machine
 const SLOW = 90; // ms for a moving frame: then the next ones are smaller
 const PIECES = 8; // parts of the order, between which covered pixels are found
 const MARGIN = 1.1; // of the picture whose Gaussians are sorted, so that a turn shows no empty border

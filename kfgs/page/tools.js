@@ -16,7 +16,7 @@ export class Tools {
    *   replace, add, subtract
    */
   constructor(stage, eye, on) {
-    Object.assign(this, { stage, eye, on, tool: "move", points: new Map(), keys: new Set(), drag: null });
+    Object.assign(this, { stage, eye, on, tool: "move", points: new Map(), how: "replace", keys: new Set(), drag: null });
     this.overlay = svg("svg", { class: "overlay", "aria-hidden": "true" });
     stage.append(this.overlay);
     const listen = (name, handler) => stage.addEventListener(name, handler.bind(this), { passive: false });
@@ -46,6 +46,7 @@ export class Tools {
 
   down(event) {
     if (event.target.closest("button, input, select, .card")) return;
+    if (event.button === 1) event.preventDefault(); // no scrolling by the middle button
     this.stage.focus({ preventScroll: true });
     this.on.hover(null);
     this.stage.setPointerCapture(event.pointerId);
@@ -53,8 +54,9 @@ export class Tools {
     this.points.set(event.pointerId, place);
     if (this.points.size > 1) return this.cancelShape();
     const selects = this.tool !== "move" && event.button === 0;
-    const kind = selects ? this.tool : event.button === 0 && !event.shiftKey ? "orbit" : "pan";
-    const how = event.altKey ? "subtract" : event.shiftKey ? "add" : "replace";
+    const looks = event.button === 1 || (event.button === 0 && (event.ctrlKey || event.metaKey));
+    const kind = selects ? this.tool : looks ? "look" : event.button === 0 && !event.shiftKey ? "orbit" : "pan";
+    const how = event.altKey ? "subtract" : event.shiftKey ? "add" : this.how;
     this.drag = { kind, how, start: place, last: place, path: [place], far: 0 };
     if (kind === "brush") this.paint(place, true);
     if (kind === "orbit" && !this.flying) this.on.grab();
@@ -75,10 +77,10 @@ export class Tools {
     const [dx, dy] = [place[0] - drag.last[0], place[1] - drag.last[1]];
     drag.far = Math.max(drag.far, Math.hypot(place[0] - drag.start[0], place[1] - drag.start[1]));
     drag.last = place;
-    if (drag.kind === "orbit" || drag.kind === "pan") {
+    if (["orbit", "pan", "look"].includes(drag.kind)) {
       if (drag.far < CLICK) return;
       if (drag.kind === "pan") eye.pan(dx, dy);
-      else if (this.flying) eye.turn(dx, dy);
+      else if (drag.kind === "look" || this.flying) eye.turn(dx, dy);
       else eye.orbit(dx, dy);
       this.on.moved();
     } else if (drag.kind === "brush") this.paint(place, false);

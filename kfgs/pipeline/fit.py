@@ -45,7 +45,7 @@ from .color import ColorConfig, find_color
 from .config import FitConfig
 from .fuse import answers_stage, find_geometry, uplift_stage, without_lens
 from .maps import KnownFeatures, Maps, UndistortedMaps, as_maps, check_readable, map_digests, map_shape
-from .runs import keep_field, say_kept
+from .runs import check_current, keep_field, say_kept
 from .stages import Run, Stage, UnfinishedError, describe_lens, digest_scene, stage_generator
 from .train import check_scene, field_stage, training_device, with_extent
 
@@ -219,8 +219,9 @@ def fit_scene(
     Raises:
         TypeError: if `maps` is neither, or `progress` neither a bool nor a function.
         ValueError: if the counts of views and maps differ, a camera has distortion, there is no such device, a splat is given
-            to the paper's method, or its mode `decouple` gets `RecomputedMaps`; if `folder` is a file, or another process
-            works in it.
+            to the paper's method, or its mode `decouple` gets `RecomputedMaps`; if `folder` is a file, another process
+            works in it, or its field is damaged.
+        FileExistsError: if `folder/field` is no field.
         FileNotFoundError: if a stage needs maps that were discarded, or a picture is missing.
     """
     config, progress, maps = config or FitConfig(), as_progress(progress), as_maps(maps)
@@ -230,6 +231,7 @@ def fit_scene(
         raise ValueError("splat: expected none for method 'paper', which trains its own Gaussians; leave it out")
     run = Run(check_output("folder", folder, "a folder"), report)
     with run.locked():
+        check_current(run.folder)
         job = _job(run, scene, maps, config, target_device, progress)
         found, about = _make_field(job, splat)
         done = FitResult(found, run.folder, run.stages)

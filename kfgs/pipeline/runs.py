@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import time
+import warnings
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from .._check import one_line
 from .._files import as_path, atomic_folder, current_file
-from ..fields.store import DESCRIPTION, TENSORS, describes_field, read_description
+from ..fields.store import DESCRIPTION, TENSORS, check_place, describes_field, load_field, read_description
 from .stages import Run
 
 FIELD, KEPT = "field", "field@"
@@ -33,11 +37,12 @@ class RunField:
     info: dict[str, Any]
 
     def __str__(self) -> str:
-        steps = (self.info.get("steps") or {}).items()
+        steps = self.info.get("steps")
+        known = steps.items() if isinstance(steps, dict) else ()  # another program may have written the file
         parts = [
             str(self.info.get("method", "unknown method")),
             f"{self.gaussians:,} Gaussians",
-            *(f"{count:,} steps ({stage})" for stage, count in steps),
+            *(f"{count:,} steps ({stage})" for stage, count in known if isinstance(count, int)),
             f"of {time.strftime('%Y-%m-%d %H:%M', time.localtime(self.saved))}",
         ]
         return one_line(f"{self.key}  {', '.join(parts)}", 200)
@@ -46,14 +51,13 @@ class RunField:
 def list_fields(folder: str | Path) -> list[RunField]:
     """The fields of a run folder, the current one first, then the earlier ones, the latest first.
 
+    Damaged ones are left out, with a warning.
+
     Raises:
         FileNotFoundError: if the folder has none.
-        ValueError: if one is damaged.
     """
     folder = as_path(folder)
-    current = folder / FIELD
-    found = [_read(current, current=True)] if describes_field(current) else []
-    earlier = [_read(path) for path in folder.glob(f"{KEPT}*") if describes_field(path)]
+    found, earlier = _read_all([folder / FIELD], current=True), _read_all(sorted(folder.glob(f"{KEPT}*")))
     known = {one.key for one in found}
     found += sorted((one for one in earlier if one.key not in known), key=lambda one: -one.saved)
     if not found:
@@ -73,6 +77,18 @@ def find_run_field(folder: str | Path, key: str) -> RunField:
     return found[0]
 
 
+def check_current(folder: Path) -> None:
+    """Check before the work that `RUN/field` is free, or holds a whole field, which can be kept.
+
+    Raises:
+        FileExistsError: if something else is there.
+        ValueError: if it holds a damaged field.
+    """
+    check_place(folder / FIELD)
+    if describes_field(folder / FIELD):
+        _check_whole(folder / FIELD)
+
+
 def keep_field(folder: Path) -> RunField | None:
     """Copy the current field of a run folder to `field@<key>`, before another one takes its place; None if there is none."""
     if not describes_field(folder / FIELD):
@@ -89,7 +105,10 @@ def say_kept(run: Run, before: RunField | None) -> None:
     if before is None:
         return
     if _read(run.folder / FIELD).key == before.key:
-        shutil.rmtree(before.path)
+        for name in (DESCRIPTION, TENSORS):
+            current_file(before.path, name).unlink()
+        with suppress(OSError):  # it holds files of the user
+            before.path.rmdir()
         return
     run.say(
         f"field: another one is current now; the one before ({before}) is kept as {before.path} (`kfgs runs "
@@ -105,7 +124,7 @@ def restore_field(folder: str | Path, key: str) -> RunField:
         key: of the field, or its first digits.
 
     Raises:
-        ValueError: if no field has this key, or another process works in the folder.
+        ValueError: if no field has this key, it or the current one is damaged, or another process works in the folder.
     """
     folder = as_path(folder)
     wanted = find_run_field(folder, key)
@@ -136,14 +155,38 @@ def _facts(field: RunField) -> dict[str, Any]:
 
 def _read(path: Path, *, current: bool = False) -> RunField:
     about = read_description(path)
-    info = about.get("info")
-    saved = current_file(path, DESCRIPTION).stat().st_mtime
-    count = about.get("gaussians", 0)
-    return RunField(path, str(about["sha256"])[:KEY], current, saved, count, info if isinstance(info, dict) else {})
+    info, digest, count = (about.get(name) for name in ("info", "sha256", "gaussians"))
+    if not (isinstance(info, dict) and isinstance(count, int) and re.fullmatch("[0-9a-f]{64}", str(digest))):
+        raise ValueError(
+            f"{path}: expected info, sha256 and a number of gaussians in {DESCRIPTION}; fit the field again"
+        )
+    return RunField(path, str(digest)[:KEY], current, current_file(path, DESCRIPTION).stat().st_mtime, count, info)
+
+
+def _read_all(paths: Iterable[Path], *, current: bool = False) -> list[RunField]:
+    """Those of some folders that are fields; a warning for each damaged one."""
+    found = []
+    for path in paths:
+        try:
+            if describes_field(path):
+                found.append(_read(path, current=current))
+        except (OSError, ValueError) as error:
+            warnings.warn(f"{error}; it is left out", stacklevel=3)
+    return found
+
+
+def _check_whole(path: Path) -> None:
+    try:
+        load_field(path)
+    except (OSError, ValueError) as error:
+        raise ValueError(
+            f"{path}: expected a whole field, got a damaged one ({error}); rename the folder, or delete it"
+        ) from error
 
 
 def _copy(source: Path, target: Path) -> None:
-    """Copy a field with its date."""
+    """Copy a whole field with its date."""
+    _check_whole(source)
     with atomic_folder(target) as new:
         for name in (TENSORS, DESCRIPTION):
             shutil.copy2(current_file(source, name), new / name)

@@ -69,9 +69,9 @@ def test_what_is_saved_comes_back(folder):
         ({"maps": []}, ["maps"]),
         ({"teacher": [["a", 1]]}, ["teacher"]),
         ({"discarded": 1}, ["discarded"]),
-        ({"seconds": 10**400}, ["sub/a", "seconds", "100000"]),
-        ({"bytes": 10**400}, ["sub/a", "bytes", "100000"]),
-        ({"shape": [10**400, 2, 3]}, ["sub/a", "shape", "[100000"]),
+        ({"seconds": 10**400}, ["a number has 401 digits"]),
+        ({"bytes": 10**30}, ["sub/a", "bytes", "100000"]),
+        ({"shape": [10**30, 2, 3]}, ["sub/a", "shape", "[100000"]),
         ({"maps": {"a\n\x1b[31m": []}}, [r"a\n\x1b[31m"]),
         ({"teacher": {"name": "t", "options": {"scale": float("inf")}}}, ["teacher", "infinity"]),
         ({"teacher": nested(100)}, ["teacher", "nested"]),
@@ -101,7 +101,7 @@ def test_another_format_is_named(tmp_path, text):
     [
         ("{", ("JSON", "(Expecting")),
         ("[" * 100_000 + "]" * 100_000, ("nest more than",)),
-        ('{"seconds": ' + "1" * 5000 + "}", ("JSON", "(Exceeds")),
+        ('{"seconds": ' + "1" * 5000 + "}", ("JSON", "(a number has 5000 digits")),
     ],
 )
 def test_what_is_no_json_says_the_way_out(tmp_path, text, words):

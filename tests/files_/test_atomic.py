@@ -113,6 +113,13 @@ def test_a_folder_keeps_what_the_new_one_does_not_replace(tmp_path):
     assert names(tmp_path) == ["scene"]
 
 
+def test_the_folder_that_a_shell_is_in_stays_the_same(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with atomic_folder(".") as temporary:
+        (temporary / "a.txt").write_text("a")
+    assert os.listdir() == ["a.txt"]
+
+
 def test_a_link_to_a_folder_stays_one(tmp_path):
     (tmp_path / "disk" / "scene").mkdir(parents=True)
     (tmp_path / "disk" / "scene" / "notes.txt").write_text("mine")

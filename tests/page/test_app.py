@@ -4,6 +4,7 @@ import io
 import itertools
 import json
 import re
+from functools import partial
 
 import cases_explorer
 import cases_page
@@ -362,18 +363,19 @@ def test_a_reload_keeps_the_work_and_a_saved_state_opens_again(page, tmp_path):
     with page.expect_download() as download:
         page.click("text=Save state")
     download.value.save_as(tmp_path / "state.json")
-    before = page.evaluate("JSON.stringify(viewer.model)")
+    before = page.evaluate("viewer.state()")
+    assert {"mode", "view"} < set(json.loads(before))
     assert json.loads((tmp_path / "state.json").read_text()) == json.loads(before)
     until(page, lambda tab: tab.evaluate("sessionStorage.getItem(viewer.place)") == before)
     page.on("dialog", lambda dialog: dialog.accept())  # "changes may not be saved"
     page.reload()
     page.wait_for_selector(".kfgs:not([aria-busy])")
-    assert page.evaluate("JSON.stringify(viewer.model)") == before
+    assert page.evaluate("viewer.state()") == before
     page.click("text=Restore all")
     page.evaluate("viewer.ask('table')")
     page.evaluate("viewer.model.invert()")
     page.set_input_files("input[type=file]", tmp_path / "state.json")
-    until(page, lambda tab: tab.evaluate("JSON.stringify(viewer.model)") == before)
+    until(page, lambda tab: tab.evaluate("viewer.state()") == before)
     page.keyboard.press("Control+z")  # one step of undo
     assert page.evaluate("[viewer.model.answer.words, viewer.model.byHand]") == ["table", True]
 
@@ -493,6 +495,36 @@ def test_a_tooltip_names_what_the_pointer_rests_on(page):
     page.mouse.up()
 
 
+def test_without_keys_a_selection_can_be_added_to(page):
+    """As on a tablet, which has no Shift."""
+    first, second = (
+        np.mean([place_of(page, "color", i) for i in range(start, start + 150)], axis=0) for start in (150, 0)
+    )
+    page.keyboard.press("5")
+    for how, middle in (("Select anew", first), ("Add to the selection (Shift)", second)):
+        page.click(f"button[title='{how}']")
+        page.mouse.move(*middle)
+        page.mouse.down()
+        page.mouse.move(middle[0] + 30, middle[1], steps=3)
+        page.mouse.up()
+    selected = mask(page, "color")
+    assert selected[:150].any()
+    assert selected[150:300].any()
+    page.keyboard.press("1")
+    assert not page.locator("button[title='Select anew']").is_visible()
+
+
+def test_hidden_gaussians_of_a_selection_are_told(page, state):
+    ask(page, "chair")
+    count = int(mask(page, "color").sum())
+    page.evaluate("viewer.model.setHidden([1])")
+    state.set_hidden(["chair"])
+    hidden = int((mask(page, "color") & ~state.drawn("color")).sum())
+    state.set_hidden([])
+    assert 0 < hidden <= count
+    assert f"{hidden} of these are hidden, and change with the others." in page.locator(".said").inner_text()
+
+
 def test_keys_fly_and_turn_and_help_lists_them(page):
     before = page.evaluate("viewer.eye.view.position")
     page.locator(".stage").focus()
@@ -510,6 +542,13 @@ def test_keys_fly_and_turn_and_help_lists_them(page):
     assert not page.locator("dialog").is_visible()
 
 
+def looks_at(point, look, farthest, tab):
+    """Whether the camera looks at a point, from no farther away."""
+    place, ahead = np.array(tab.evaluate(look)).reshape(2, 3)
+    far = np.linalg.norm(point - place)
+    return far < farthest + 1e-6 and np.allclose(ahead, (point - place) / far, atol=1e-4)
+
+
 def test_buttons_go_to_the_scenes_views(browser, tmp_path):
     views = cases_explorer.cameras()
     for page in show(browser, save_html(cases_explorer.line(cameras=views), tmp_path / "page.html")):
@@ -522,6 +561,11 @@ def test_buttons_go_to_the_scenes_views(browser, tmp_path):
         page.locator(".stage").focus()
         page.keyboard.press("f")
         assert current.count() == 0
+        middle = np.array(page.evaluate("viewer.model.extent('color').center"))
+        look = "[...viewer.eye.view.position, ...viewer.eye.view.R.slice(6)]"
+
+        farthest = max(np.linalg.norm(view.center.numpy() - middle) for view in views)
+        until(page, partial(looks_at, middle, look, farthest))
         page.keyboard.press("Escape")
         page.keyboard.press("f")
         until(page, lambda tab: np.allclose(tab.evaluate(VIEWMAT), views[0].viewmat.flatten(), atol=1e-6))
@@ -603,7 +647,7 @@ def test_the_page_opens_as_python_left_it(browser, tmp_path):
         agree(page, state)
         np.testing.assert_array_equal(mask(page, "color", "drawn"), state.drawn("color"))
         assert page.get_attribute(".kfgs", "data-theme") == "dark"
-        assert page.locator(".choice [aria-pressed=true]").inner_text() == "Colour"
+        assert page.locator(".top .choice [aria-pressed=true]").inner_text() == "Colour"
         assert page.locator("button[aria-label='Undo']").is_disabled()
 
 
@@ -647,3 +691,13 @@ def test_other_names_are_refused(state, tmp_path):
     with pytest.raises(ValueError, match=r"path: expected a name that ends in .html, got 'scene.ply'"):
         save_html(state, tmp_path / "scene.ply")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_work_that_a_browser_cannot_keep_is_told_once(page):
+    page.evaluate("() => { Storage.prototype.setItem = () => { throw new Error('full'); }; }")
+    ask(page, "chair")
+    page.wait_for_selector("[role=alert]:has-text('Save state')")
+    page.evaluate("viewer.say('')")
+    ask(page, "table")
+    page.wait_for_timeout(800)
+    assert not page.locator("[role=alert]:visible").count()

@@ -136,14 +136,3 @@ def test_letterboxed_is_that_of_python(call):
         assert [made[name] for name in ("fx", "fy", "cx", "cy")] == pytest.approx(
             K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
         )
-
-
-def test_the_ball_leaves_outliers_out(call):
-    points = np.random.default_rng(0).normal(size=(400, 3))
-    points[:5] = 1000
-    ball = call("ballOf", points.flatten().tolist())
-    assert np.linalg.norm(ball["center"]) < 0.5
-    assert 1.5 < ball["radius"] < 4
-    only = call("ballOf", points.flatten().tolist(), [int(i == 7) for i in range(400)])
-    assert only["center"] == pytest.approx(points[7])
-    assert call("ballOf", [], None) is None

@@ -1,4 +1,5 @@
 import dataclasses
+import json
 import os
 from collections.abc import Callable
 
@@ -12,7 +13,7 @@ from kfgs.features import FeatureFolder
 from kfgs.fields import SemanticField
 from kfgs.gaussians import Gaussians
 from kfgs.pipeline import FitConfig, fit_scene
-from kfgs.pipeline.runs import compare_fields, find_run_field, keep_field, list_fields, restore_field
+from kfgs.pipeline.runs import compare_fields, find_run_field, keep_field, list_fields, restore_field, say_kept
 from kfgs.pipeline.stages import LOCK, Run
 from kfgs.scenes import load_scene
 
@@ -99,6 +100,63 @@ def test_a_folder_without_fields_is_refused(tmp_path):
         list_fields(tmp_path)
 
 
+def damage(field, what):
+    """Three ways to damage a field."""
+    if what == "numbers cut":
+        os.truncate(field / "field.safetensors", 100)
+    elif what == "numbers missing":
+        (field / "field.safetensors").unlink()
+    else:
+        os.truncate(field / "field.json", 50)
+
+
+DAMAGES = ["numbers cut", "numbers missing", "text cut"]
+
+
+def test_a_damaged_field_is_left_out_with_a_warning_and_the_others_are_listed(run):
+    fields = list_fields(run)
+    damage(fields[1].path, "text cut")
+    with pytest.warns(UserWarning, match=tells(fields[1].path, "left out")):
+        assert [field.key for field in list_fields(run)] == [fields[0].key, fields[2].key]
+    damage(run / "field", "text cut")
+    with pytest.warns(UserWarning, match=tells(run / "field", "left out")):
+        assert [field.current for field in list_fields(run)] == [False]
+
+
+@pytest.mark.parametrize("what", DAMAGES[:2])
+def test_a_damaged_field_never_takes_the_place_of_a_whole_one(run, what):
+    earlier = list_fields(run)[1]
+    damage(earlier.path, what)
+    with pytest.raises(ValueError, match=tells(earlier.path, "damaged", "delete")):
+        restore_field(run, earlier.key)
+    assert first(run / "field") == 2
+
+
+@pytest.mark.parametrize("steps", [3, [1], "many", {"color": "many"}, {"color": None}, None])
+def test_steps_that_another_program_wrote_are_left_out(tmp_path, steps):
+    a_field(0, steps=steps).save(tmp_path / "field")
+    (found,) = list_fields(tmp_path)
+    assert str(found).startswith(f"{found.key}  fuse, 4 Gaussians, of ")
+
+
+def test_a_description_cannot_lead_out_of_the_run_folder(run, tmp_path):
+    file = run / "field" / "field.json"
+    about = json.loads(file.read_text())
+    file.write_text(json.dumps({**about, "sha256": "/../../../ou" + 52 * "t"}))
+    with pytest.raises(ValueError, match=tells(run / "field", "sha256")):
+        keep_field(run)
+    with pytest.warns(UserWarning, match="sha256"):
+        assert len(list_fields(run)) == 2
+
+
+def test_a_users_files_in_an_earlier_field_stay_when_the_same_numbers_come_back(run):
+    earlier = list_fields(run)[1]
+    restore_field(run, earlier.key)
+    (earlier.path / "notes.txt").write_text("mine")
+    say_kept(Run(run), keep_field(run))
+    assert [path.name for path in earlier.path.iterdir()] == ["notes.txt"]
+
+
 RESTORE = f"""
 {TINY}
 from kfgs.pipeline.runs import keep_field, list_fields, restore_field
@@ -154,6 +212,23 @@ def test_a_fit_with_other_options_keeps_the_field_and_says_so(fuse, tmp_path):
     assert str(fields[1].path) in said
     assert "kfgs runs" in said
     assert (two.field_path / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("what", [*DAMAGES, "no field"])
+def test_a_field_that_cannot_be_kept_is_named_before_the_work(fuse, tmp_path, what):
+    scene, maps, config, splat = fuse
+    place = tmp_path / "field"
+    if what == "no field":
+        place.mkdir()
+        (place / "notes.txt").write_text("mine")
+    else:
+        a_field(0).save(place)
+        damage(place, what)
+    before = {path.name: path.read_bytes() for path in place.iterdir()}
+    with pytest.raises((ValueError, FileExistsError), match=tells(place)):
+        fit_scene(scene, maps, tmp_path, config, splat=splat)
+    assert not (tmp_path / "stages").exists()
+    assert {path.name: path.read_bytes() for path in place.iterdir()} == before
 
 
 def test_a_second_fit_in_the_folder_is_refused_and_destroys_nothing(fuse, tmp_path):

@@ -55,6 +55,8 @@ class Meaning(Protocol):
     """One line: how labels and scores were found."""
     phrases: bool
     """Whether it answers more than class names."""
+    examples: bool
+    """Whether it answers `similar`."""
 
     def ask(self, words: str) -> Asked:
         """Answer a class name or, if `phrases`, any text.
@@ -115,7 +117,7 @@ class FieldMeaning:
         self._embed = embed
         self._answers: dict[str, Asked] = {}
         self.names = classes.names
-        self.phrases = embed is not None
+        self.phrases, self.examples = embed is not None, True
         self.gaussians = field.gaussians.replace(labels=labels)
 
     def ask(self, words: str) -> Asked:
@@ -188,7 +190,7 @@ class SplatMeaning:
         ValueError: if the splat has no labels.
     """
 
-    phrases = False
+    phrases = examples = False
 
     def __init__(self, splats: SplatFile) -> None:
         labels = splats.gaussians.labels

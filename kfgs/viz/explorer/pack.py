@@ -129,6 +129,7 @@ def pack_scene(
         "lambda": {"value": state.distance, "how": state.distance_how, "low": low, "high": high},
         "by": state.meaning.by,
         "phrases": state.meaning.phrases,
+        "examples": state.meaning.examples,
         "clim": list(state.clim) if state.asked is None else [0.0, 1.0],
         "cameras": _cameras(buffers, state.cameras, thumbnails),
         "up": upwards(state.cameras),
