@@ -56,6 +56,15 @@ def test_coordinates_beyond_every_float(tmp_path):
         dict(load_coco_labels(tmp_path / "annotations.json").maps)
 
 
+def test_an_image_longer_than_any_is_refused_before_masks_are_filled(tmp_path):
+    annotation = {"id": 1, "image_id": 1, "category_id": 1, "segmentation": [[1, 1, 5, 1, 5, 4]], "bbox": [1, 1, 4, 3]}
+    images = [{"id": 1, "file_name": "a.png", "width": 8, "height": 1 << 24}]
+    whole = {"images": images, "categories": [{"id": 1, "name": "chair"}], "annotations": [annotation]}
+    (tmp_path / "annotations.json").write_text(json.dumps(whole))
+    with pytest.raises(ValueError, match=tells("annotations.json", "size of image 'a'", "16777216")):
+        load_coco_labels(tmp_path / "annotations.json")
+
+
 def test_texts_that_are_not_utf8(tmp_path):
     (tmp_path / "segmentations" / "00").mkdir(parents=True)
     Image.new("L", (4, 3)).save(tmp_path / "segmentations" / "00" / "chair.png")

@@ -161,7 +161,7 @@ def all_jobs() -> list[Job]:
         Job(
             "unpack",
             command("pack", "in/packed.kfgs.safetensors", "work/field"),
-            _with(files={"field": "older"}, notes=("notes.txt", "field/notes.txt")),
+            _with(notes=("notes.txt", "field/notes.txt")),
             fields=("field",),
         ),
         Job(
