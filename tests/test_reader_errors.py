@@ -21,6 +21,7 @@ from kfgs.quant import Autoencoder, Codebook, IndexMaps
 from kfgs.quant._store import write_tensors
 from kfgs.scenes import SceneError, load_scene, read_image
 from kfgs.scenes.files import natural_key
+from kfgs.scenes.replica import _cam_params
 from kfgs.teachers.bpe import load_tokenizer
 
 HUGE = 10**400  # a whole number that no float holds
@@ -55,12 +56,36 @@ def test_coordinates_beyond_every_float(tmp_path):
         dict(load_coco_labels(tmp_path / "annotations.json").maps)
 
 
+def test_an_image_longer_than_any_is_refused_before_masks_are_filled(tmp_path):
+    annotation = {"id": 1, "image_id": 1, "category_id": 1, "segmentation": [[1, 1, 5, 1, 5, 4]], "bbox": [1, 1, 4, 3]}
+    images = [{"id": 1, "file_name": "a.png", "width": 8, "height": 1 << 24}]
+    whole = {"images": images, "categories": [{"id": 1, "name": "chair"}], "annotations": [annotation]}
+    (tmp_path / "annotations.json").write_text(json.dumps(whole))
+    with pytest.raises(ValueError, match=tells("annotations.json", "size of image 'a'", "16777216")):
+        load_coco_labels(tmp_path / "annotations.json")
+
+
 def test_texts_that_are_not_utf8(tmp_path):
     (tmp_path / "segmentations" / "00").mkdir(parents=True)
     Image.new("L", (4, 3)).save(tmp_path / "segmentations" / "00" / "chair.png")
     (tmp_path / "segmentations" / "classes.txt").write_bytes(b"chair\n\xd2\n")
     with pytest.raises(ValueError, match=tells("classes.txt", "texts of a 3D-OVS scene", "utf-8")):
         load_3dovs(tmp_path)
+
+
+def test_masks_of_several_sizes_name_their_view(tmp_path):
+    (tmp_path / "segmentations" / "00").mkdir(parents=True)
+    for name, width in (("chair", 4), ("plant", 5)):
+        Image.new("L", (width, 3)).save(tmp_path / "segmentations" / "00" / f"{name}.png")
+    (tmp_path / "segmentations" / "classes.txt").write_text("chair\nplant\n")
+    with pytest.raises(ValueError, match=tells("segmentations/00:", "one size", "(3, 4)", "(3, 5)")):
+        load_3dovs(tmp_path)
+
+
+def test_a_camera_of_whole_numbers_beyond_int64(tmp_path):
+    camera = {"w": 4, "h": 3, "fx": 10**40, "fy": 5, "cx": 2, "cy": 1.5, "scale": 1000}
+    (tmp_path / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    assert _cam_params(tmp_path)[0].dtype == np.float64
 
 
 @pytest.mark.parametrize(

@@ -90,18 +90,34 @@ def _with(
     return prepare
 
 
+def _in_python(function: Callable[[], int | None]) -> Work:
+    """A function of Python, out of which Ctrl-C comes as a KeyboardInterrupt, as one that ends like a command."""
+
+    def work() -> int:
+        try:
+            return function() or 0
+        except KeyboardInterrupt:
+            print("interrupted")
+            return 130
+
+    return work
+
+
+@_in_python
 def _save_html() -> None:
     from kfgs import explore, read_splats
 
     explore(read_splats("in/labelled.ply"), where="notebook").save_html("work/page.html")
 
 
+@_in_python
 def _save_edits() -> None:
     from kfgs.labels import EditList, Recolor, Remove
 
     EditList().then(Recolor("plant", "#c04040")).then(Remove("chair")).save("work/a.edits.json")
 
 
+@_in_python
 def _restore() -> int:
     from kfgs.pipeline.runs import list_fields
 
@@ -109,6 +125,7 @@ def _restore() -> int:
     return command("runs", "work/run", "--restore", key)() or 0
 
 
+@_in_python
 def _toy_room() -> None:
     from kfgs.toy import make_toy_room
 
@@ -146,7 +163,7 @@ def all_jobs() -> list[Job]:
         Job(
             "unpack",
             command("pack", "in/packed.kfgs.safetensors", "work/field"),
-            _with(files={"field": "older"}, notes=("notes.txt", "field/notes.txt")),
+            _with(notes=("notes.txt", "field/notes.txt")),
             fields=("field",),
         ),
         Job(

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from .atomic import HIDDEN, FullDiskError, atomic_folder, atomic_path, current_file, hidden_folder
+from .atomic import HIDDEN, FullDiskError, atomic_folder, atomic_path, current_file, finish_writing, hidden_folder
 from .locks import locked
 from .paths import as_path, check_output
 
@@ -23,6 +23,7 @@ __all__ = [
     "current_file",
     "digest_file",
     "digest_value",
+    "finish_writing",
     "hidden_folder",
     "locked",
     "parse_json",

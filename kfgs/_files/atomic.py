@@ -188,6 +188,16 @@ def _put(new: Path, target: Path) -> None:
             return
 
 
+def finish_writing(folder: Path) -> None:
+    """Finish what killed writers began in a folder, and delete what they left. A reader needs it not; it tidies up."""
+    hidden = folder / HIDDEN
+    if hidden.is_dir():
+        _settle(folder)
+        _sweep(hidden)
+        with suppress(OSError):  # another process works in it
+            hidden.rmdir()
+
+
 def _settle(folder: Path) -> None:
     """Move waiting files to their places in a folder. Several processes may do so at once."""
     waiting = folder / HIDDEN / WAITING

@@ -74,13 +74,14 @@ def main(arguments: list[str] | None = None) -> int:
         raise SystemExit(2)
     command = COMMANDS[name]
     called[:] = ["kfgs", name, *given]
-    names = _shown_names(command)
+    names: dict[str, str] = {}
 
     def spoken(message: str) -> str:
         return _in_options(message, names)
 
     try:
         with _interrupts(), warnings_as_notes(spoken), said_on_stderr():
+            names |= _shown_names(command)
             command.__doc__ = re.sub(
                 r"\n {8,}(?!kfgs)", " ", inspect.getdoc(command) or ""
             )  # an option's text on one line

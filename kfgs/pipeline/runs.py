@@ -128,8 +128,8 @@ def restore_field(folder: str | Path, key: str) -> RunField:
     """
     folder = as_path(folder)
     wanted = find_run_field(folder, key)
-    if not wanted.current:
-        with Run(folder).locked():
+    with Run(folder).locked():
+        if not wanted.current:
             keep_field(folder)
             _copy(wanted.path, folder / FIELD)
     return _read(folder / FIELD, current=True)

@@ -10,8 +10,8 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from .._arrays import reading
 from .._compiling import say_compiling
-from .._files import atomic_folder, digest_file, digest_value, locked, read_json, write_json
+from .._files import atomic_folder, digest_file, digest_value, finish_writing, locked, read_json, write_json
 from ..cameras import Camera
 from ..cameras.camera import NEAR
 from ..scenes import Scene
@@ -114,13 +114,17 @@ class Run:
         self.stages.append(done)
         return done
 
-    def locked(self) -> AbstractContextManager[None]:
-        """Keep other processes from working in the folder.
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes from working in the folder, and finish what a killed one began to write there.
 
         Raises:
             ValueError: if one works there already; the message says which. Nothing is written then.
         """
-        return locked(self.folder, LOCK)
+        with locked(self.folder, LOCK):
+            for place in (self.folder, self.folder / "field"):  # a run that finds all it needs writes neither
+                finish_writing(place)
+            yield
 
     def scratch(self, name: str, inputs: dict[str, Any]) -> Path:
         """A path for the unfinished work of a stage (checkpoints), kept until the stage is done."""

@@ -89,7 +89,8 @@ def _cam_params(folder: Path) -> tuple[Matrix, tuple[int, int], float]:
             f'{path}: expected {{"camera": {{{", ".join(names)}}}}} with positive numbers, got {values!r:.200}; '
             "copy it again from the data set"
         )
-    return np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]]), (int(w), int(h)), float(scale)
+    K = np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]], dtype=np.float64)  # also of large whole numbers
+    return K, (int(w), int(h)), float(scale)
 
 
 def _check_size(path: Path, size: tuple[int, int], says: str) -> None:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..._files import as_path, read_json
-from ...scenes.files import file_stem
+from ...scenes.files import MAX_SIDE, file_stem
 from ..class_lists import VOID_NAMES, name_key
 from ..truth import LabelTruth, MaskAndBoxes, MaskTruth
 from .files import ReadWhenAsked
@@ -77,7 +77,7 @@ def _read(path: Path) -> tuple[dict[int, str], dict[str, _Picture]]:
     if len(set(stems.values())) != len(stems) or len(set(names.values())) != len(names) or not names or not pictures:
         raise ValueError(f"{path}: expected some images and categories, each name once; export it again")
     for number, picture in pictures.items():
-        if min(picture.size) < 1 or picture.size[0] * picture.size[1] > MOST:
+        if min(picture.size) < 1 or max(picture.size) > MAX_SIDE or picture.size[0] * picture.size[1] > MOST:
             raise ValueError(f"{path}: expected a size of image {stems[number]!r}, got {picture.size}; export it again")
     return names, {stems[number]: picture for number, picture in pictures.items()}
 

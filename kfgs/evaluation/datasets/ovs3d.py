@@ -91,4 +91,8 @@ def _read_view(view: Path, texts: list[str]) -> dict[str, MaskAndBoxes]:
     check_names(str(view), list(files), texts, "masks of the texts", "correct classes.txt or the name of the mask")
     if not files:
         raise ValueError(f"{view}: expected masks <text>.png of {some(texts)}, got none; copy the folder again")
-    return {text: MaskAndBoxes(read_mask(files[text])) for text in texts if text in files}
+    masks = {text: read_mask(files[text]) for text in texts if text in files}
+    sizes = {text: tuple(mask.shape) for text, mask in masks.items()}
+    if len(set(sizes.values())) > 1:
+        raise ValueError(f"{view}: expected masks of one size, got {sizes!r:.200}; copy the folder again")
+    return {text: MaskAndBoxes(mask) for text, mask in masks.items()}
