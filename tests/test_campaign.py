@@ -191,10 +191,10 @@ def test_leaks_are_found_and_flat_runs_are_not(monkeypatch):
     from campaign.long import faults_of, measure
 
     kept = []
-    leak = measure(lambda i: kept.append(b"x" * 200_000), 200, 20)
+    leak = measure(lambda i: kept.append(b"x" * 2_000_000), 40, 300)
     assert faults_of(leak)[0].startswith("memory grows")
     kept.clear()
-    flat = measure(lambda i: bytes(200_000), 200, 20)
+    flat = measure(lambda i: b"x" * 2_000_000, 40, 300)
     assert faults_of(flat) == []
-    assert flat["rounds"] == 200
+    assert flat["rounds"] == 40
     assert faults_of(flat | {"threads_last": flat["threads_first"] + 1}) != []
