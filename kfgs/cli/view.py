@@ -73,7 +73,8 @@ def view(
         check_folder("out", out, classes.scene)
     read = functools.partial(_read, source, color, ask, distance, classes, teacher)
     if place == "browser":
-        _serve(read, source, out, classes, display)
+        key = functools.partial(_key, source, color, ask, distance, classes, teacher, display.show)
+        _serve(read, key, source, out, classes, display)
         return
     for name, given, usual in (("host", display.host, "127.0.0.1"), ("port", display.port, 0)):
         check_alone(name, None if given == usual else given, "without --where browser, whose page listens there")
@@ -86,18 +87,37 @@ def view(
         _draw(state, place, out, display)
 
 
-def _serve(read: Callable[[], Any], source: Path, out: Path, classes: Classes, display: Display) -> None:
-    """Serve the page until Ctrl-C; the browser starts while Python loads."""
+def _serve(
+    read: Callable[[], Any], key: Callable[[], str | None], source: Path, out: Path, classes: Classes, display: Display
+) -> None:
+    """Serve the page until Ctrl-C; the browser starts, and shows what it showed the last time, while Python loads."""
     from ..page.document import PYTHON_START, document
+    from ..page.kept import keep_scene, read_scene
     from ..page.server import PageServer
     from ..page.serving import announce, wait
 
     if not source.exists():
         read()  # says what is wrong
     with PageServer(document(_title(source), PYTHON_START), display.host, display.port) as page:
+        before = key()
+        kept = None if before is None else read_scene(before)
+        if kept is not None:
+            page.show(kept)
         announce(page, out, say)
-        _viewer(read(), source, out, classes, display).show_in(page)
+        packed = _viewer(read(), source, out, classes, display).show_in(page)
+        if before is not None and packed != kept and key() == before:
+            keep_scene(before, packed)
         wait()
+
+
+def _key(source: Path, color: Path | None, *options: Any) -> str | None:
+    """What the page's scene depends on; see `scene_key`."""
+    from ..page.kept import scene_key
+
+    words = [source.resolve(), color and color.resolve(), *options]
+    named = [value for option in options if dataclasses.is_dataclass(option) for value in vars(option).values()]
+    files = [Path(value) for value in named if isinstance(value, str | Path) and Path(value).exists()]
+    return scene_key(words, [source, *([color] if color else []), *files])
 
 
 def _check_drawing(place: Where) -> None:

@@ -22,6 +22,9 @@ PYTHON_START = """\
     if (!loaded?.ok) throw new Error("Python does not answer; its terminal says why.");
     const [header, data] = kfgs.readMessage(await loaded.arrayBuffer());
     const link = new kfgs.PythonLink(kfgs.callPage, header);
+    const shown = loaded.headers.get("ETag"); // the scene may have been kept, and be outdated
+    const version = fetch("version").then((answer) => (answer.ok ? answer.text() : shown));
+    version.then((text) => text === shown || location.reload()).catch(() => null);
     window.viewer = await kfgs.mount(root, { header, data }, link);"""
 PAGE = """\
 <!doctype html>

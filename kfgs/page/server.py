@@ -13,6 +13,7 @@ import secrets
 import socket
 import struct
 import sys
+import zlib
 from collections.abc import Callable, Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_address
@@ -39,7 +40,8 @@ Call = Callable[[str, dict[str, Any], bytes], tuple[dict[str, Any], bytes]]
 class PageServer:
     """Serves a page from a thread of its own, until `close` or the end of a `with` block.
 
-    The page is there at once; who asks for the scene, or calls, waits until `show`. So the browser starts while Python loads.
+    The page is there at once; who asks for the scene waits until `show`, and who calls until `show` with an answer. So the
+    browser starts while Python loads.
     A call is a POST to `call`: 4 bytes with the length of a JSON text (little-endian), the JSON {"name", "args"}, and
     attached bytes; the answer has the same form.
 
@@ -63,7 +65,7 @@ class PageServer:
         self._document = document.encode()
         self._pack = b""
         self._call: Call = _no_answer
-        self._shown, self._closed = Event(), Event()
+        self._shown, self._loaded, self._closed = Event(), Event(), Event()
         handler = type("Handler", (_Handler,), {"page": self})
         try:
             self._server = _server_class(host)((host.strip("[]"), port), handler)
@@ -75,32 +77,45 @@ class PageServer:
         self._thread = Thread(target=self._server.serve_forever, name="kfgs-page", daemon=True)
         self._thread.start()
 
-    def show(self, pack: bytes, call: Call) -> None:
+    def show(self, pack: bytes, call: Call | None = None) -> None:
         """Give the page its scene, and what answers its calls.
 
         Args:
             pack: the scene, for `readMessage` of link.js.
-            call: answers calls, in several threads at once.
+            call: answers calls, in several threads at once. None: this scene was kept from an earlier time, and Python still
+                loads; calls wait. If the scene then is another one, the page loads itself again.
         """
-        self._pack, self._call = pack, call
+        self._pack = pack
         self._shown.set()
+        if call is not None:
+            self._call = call
+            self._loaded.set()
 
     def file(self, name: str) -> tuple[str, bytes] | None:
-        """Media type and content of "" (the page) or "pack" (the scene: waits for it); None for others, and after the end."""
+        """Media type and content of a file; None for others than these, and after the end.
+
+        - "": the page
+        - "pack": the scene, as soon as there is one
+        - "version": which scene Python shows once it has loaded, as "pack" has it in its header `ETag`
+        """
         if name == "":
             return "text/html; charset=utf-8", self._document
-        return ("application/octet-stream", self._pack) if name == "pack" and self._wait() else None
+        if name == "pack" and self._wait(self._shown):
+            return "application/octet-stream", self._pack
+        if name == "version" and self._wait(self._loaded):
+            return "text/plain", version_of(self._pack).encode()
+        return None
 
     def answer(self, read: Callable[[], tuple[Mapping[str, Any], bytes]]) -> tuple[dict[str, Any], bytes]:
-        """Answer a call of the page when there is a scene; see `answer_call`."""
-        self._wait()
+        """Answer a call of the page when Python has loaded; see `answer_call`."""
+        self._wait(self._loaded)
         return answer_call(self._call, read)
 
-    def _wait(self) -> bool:
-        """Whether there is a scene, sooner or later."""
-        while not self._shown.wait(0.05) and not self._closed.is_set():
+    def _wait(self, event: Event) -> bool:
+        """Whether it happens, sooner or later."""
+        while not event.wait(0.05) and not self._closed.is_set():
             pass
-        return self._shown.is_set()
+        return event.is_set()
 
     @property
     def url(self) -> str:
@@ -127,6 +142,11 @@ class PageServer:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def version_of(content: bytes) -> str:
+    """What tells one content from another."""
+    return f'"{zlib.crc32(content):08x}"'
 
 
 def is_loopback(host: str) -> bool:
@@ -239,6 +259,7 @@ class _Handler(BaseHTTPRequestHandler):
             headers = {
                 "Content-Type": kind,
                 "Content-Length": str(len(content)),
+                "ETag": version_of(content),
                 "Content-Security-Policy": POLICY,
                 "Referrer-Policy": "no-referrer",  # the address holds the secret
                 "X-Content-Type-Options": "nosniff",

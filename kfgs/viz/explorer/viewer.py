@@ -89,10 +89,11 @@ class Viewer:
         self.show_in(page)
         return page
 
-    def show_in(self, page: PageServer) -> None:
-        """Give a page its scene."""
-        scene = scene_for_page(self.state, title=self.title, scene=self.scene)
-        page.show(scene, Session(self.state, self.options.out).call)
+    def show_in(self, page: PageServer) -> bytes:
+        """Give a page its scene, packed; returns it."""
+        packed = scene_for_page(self.state, title=self.title, scene=self.scene)
+        page.show(packed, Session(self.state, self.options.out).call)
+        return packed
 
     def save_html(self, path: str | Path) -> Path:
         """Write one file that works offline, from a double click; see `kfgs.viz.explorer.save_html`."""
