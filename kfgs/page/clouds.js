@@ -121,7 +121,7 @@ export class Cloud {
     const { count, planes, sh } = this;
     this.origin ??= Uint32Array.from({ length: count }, (_, i) => i);
     this.source ??= Int32Array.from({ length: count }, (_, i) => i);
-    this.far ??= new Float64Array(count); // its own class, at any lambda
+    this.far ??= new Float32Array(count); // its own class, at any lambda
     for (const [name, width] of [["splats", 4], ["dc", 1], ["means", 3], ["removed", 1], ["source", 1], ["far", 1], ["origin", 1]])
       this[name] = withRows(this[name], rows, width);
     this.count += rows.length;

@@ -112,8 +112,10 @@ export class Model extends EventTarget {
   }
 
   setLambda(lambda) {
-    if (!(lambda > 0)) return;
-    this.lambda = lambda;
+    const given = this.packed.header.lambda.value;
+    const value = lambda === given ? given : Math.fround(lambda); // distances are rounded for these: rounded_far in pack.py
+    if (!(value > 0)) return;
+    this.lambda = value;
     this.changed();
   }
 
@@ -442,9 +444,9 @@ export class Model extends EventTarget {
       for (const i of selected ?? []) hand[side][i] = 1;
     }
     this.hidden = new Set(saved.hidden);
-    if (saved.lambda > 0) this.lambda = Number(saved.lambda);
     const given = answer && Number.isFinite(saved.gamma) && saved.gamma !== answer.gamma;
     this.step("open", { ...this.answered(answer), ...(given ? { gamma: saved.gamma, gammaHow: "given" } : {}), hand, edits });
+    this.setLambda(Number(saved.lambda ?? this.lambda));
   }
 
   /** Counts of the question's scores in bins from `low` to `high`. */

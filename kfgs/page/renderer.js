@@ -27,6 +27,15 @@ const LOOK = {
   outline: [1, 0.85, 0.1],
 };
 
+/** The smallest float32 that is at least a number: no float32 tells between the two. */
+function roundedUp(value) {
+  const near = Math.fround(value);
+  if (!(near < value)) return near;
+  const bits = new Int32Array(new Float32Array([near]).buffer);
+  bits[0]++; // of a positive number
+  return new Float32Array(bits.buffer)[0];
+}
+
 /** One canvas, up to two clouds. */
 export class Renderer {
   /**
@@ -262,7 +271,7 @@ export class Renderer {
       dcs: sheet(gl, gl.R32UI, count, null),
       shs: texture(gl, gl.RG32UI, planes ? WIDTH : 1, Math.max(1, planes * rows)),
       marks: sheet(gl, gl.R8UI, count, null),
-      fars: sheet(gl, gl.RG32UI, cloud.far ? count : 1, cloud.far && new Uint32Array(cloud.far.slice().buffer)),
+      fars: sheet(gl, gl.R32F, cloud.far ? count : 1, cloud.far),
       sources: sheet(gl, gl.R32I, cloud.far ? count : 1, cloud.source),
       order: sheet(gl, gl.R32UI, count, null),
     };
@@ -410,8 +419,7 @@ export class Renderer {
     gl.uniform1f(at.mixing, look.mixing);
     gl.uniform1f(at.near, camera.near);
     gl.uniform1f(at.share, state.fresh?.share ?? 1);
-    const bits = new Uint32Array(new Float64Array([look.lambda]).buffer);
-    gl.uniform2ui(at.lambda, bits[1], bits[0]);
+    gl.uniform1f(at.lambda, roundedUp(look.lambda));
     gl.uniformMatrix4fv(at.view, true, m);
     gl.uniform4f(at.pinhole, camera.fx * sx, camera.fy * sy, camera.cx * sx, camera.cy * sy);
     gl.uniform2f(at.size, width, height);

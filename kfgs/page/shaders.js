@@ -24,15 +24,14 @@ void main() {
 }`;
 
 export const PREPARE = `${HEAD}
-uniform usampler2D order, splats, dcs, shs, marks, fars;
+uniform usampler2D order, splats, dcs, shs, marks;
 uniform isampler2D labels, sources;
-uniform sampler2D scores, latents, colormap, classes;
+uniform sampler2D scores, latents, colormap, classes, fars;
 uniform int count, rows, degree, mode;          // count: in view; mode: 0 color, 1 labels, 2 score, 3 latents
 uniform bool carried, asked, masked, dim;       // carried: labels come from the source; masked: selection is a mask
 uniform vec3 center, spread;                    // of the box of the means
 uniform vec2 scaling, dcScale, scoreRange;      // lowest log and step
-uniform float shStep, gamma, mixing, near, share;   // share: of the Gaussians that are drawn
-uniform uvec2 lambda;                           // the bits of a float64: high, low
+uniform float shStep, gamma, lambda, mixing, near, share;   // share: of the Gaussians that are drawn
 uniform mat4 view;
 uniform vec4 pinhole;                           // fx, fy, cx, cy in pixels of the target
 uniform vec2 size;
@@ -127,9 +126,7 @@ void main() {
 
   int source = i;                               // the semantic Gaussian that gives label and score
   if (carried) {
-    uvec2 far = texelFetch(fars, at, 0).xy;
-    bool within = far.y < lambda.x || (far.y == lambda.x && far.x < lambda.y);
-    source = within ? texelFetch(sources, at, 0).x : -1;
+    source = texelFetch(fars, at, 0).x < lambda ? texelFetch(sources, at, 0).x : -1;
   }
   int label = source < 0 ? -1 : texelFetch(labels, place(source), 0).x;
   vec4 group = texelFetch(classes, ivec2(label + 1, 0), 0);

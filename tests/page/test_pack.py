@@ -12,7 +12,7 @@ from small_room import make_room
 from kfgs.formats import SplatFile
 from kfgs.page import inline_script, read_text
 from kfgs.viz.explorer import Exploration, FieldMeaning, SplatMeaning
-from kfgs.viz.explorer.pack import pack_scene
+from kfgs.viz.explorer.pack import pack_scene, rounded_far
 
 
 @pytest.fixture(scope="module")
@@ -113,10 +113,16 @@ def test_labels_and_distances_are_exact(room):
     state, packed = room
     labels, source, far = (buffer(packed, name) for name in ("semantic/labels", "color/source", "color/far"))
     assert labels.tolist() == state.labels("semantic").tolist()
-    for distance in (*np.unique(far)[::500], 0.05, 0.2):
-        state.set_distance(max(float(distance), 1e-9))
-        carried = np.where(far < state.distance, labels[source], -1)
-        assert carried.tolist() == state.labels("color").tolist()
+    distances = np.unique(state.carried.far)
+    assert far.dtype == np.float32
+    # at the start: a distance, a number next to one that no float32 tells from it, any
+    for given in (float(distances[7]), float(distances[9]) * (1 - 1e-9), 0.2):
+        far = rounded_far(state.carried.far, given)
+        # those that the viewer sets, a distance itself and its neighbours among them, and the one given at the start
+        for distance in (*far[np.argsort(far)][::500], *np.nextafter(far[:20], np.float32(9)), np.float32(0.05), given):
+            state.set_distance(max(float(distance), 1e-9))
+            carried = np.where(far < state.distance, labels[source], -1)
+            assert carried.tolist() == state.labels("color").tolist()
 
 
 @pytest.mark.parametrize("meaning", [lambda: FieldMeaning(field("fused"), few_classes()), lambda: grid().meaning])

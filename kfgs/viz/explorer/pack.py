@@ -116,7 +116,7 @@ def pack_scene(
     _add_meaning(buffers, state)
     if state.carried is not None:
         buffers.add("color/source", state.carried.source.astype(np.int32))
-        buffers.add("color/far", state.carried.far.astype(np.float64))
+        buffers.add("color/far", rounded_far(state.carried.far, state.distance))
     from matplotlib import colormaps
 
     buffers.add("colormap", colormaps[COLORMAP](np.arange(256), bytes=True)[:, :3])
@@ -168,6 +168,18 @@ def _add_side(buffers: _Buffers, state: Exploration, side: Side) -> dict[str, An
         "dc": [dc_low, dc_step],
         "sh_step": SH_STEP,
     }
+
+
+def rounded_far(far: Array, given: float) -> Array:  # [N] float64 -> [N] float32
+    """Distances rounded down, so that `rounded < lambda` says what `far < lambda` does for every lambda that is a float32.
+
+    The viewer sets only such lambdas. Between a float32 and the next one lies no other, so a lambda above the lower one is at
+    least the upper one. The lambda that is given at the start may be any number: distances next to it are rounded for it.
+    """
+    nearest = far.astype(np.float32)
+    down = np.where(nearest > far, np.nextafter(nearest, np.float32(-np.inf)), nearest)
+    wrong = (down < given) & (far >= given)
+    return np.where(wrong, np.nextafter(down, np.float32(np.inf)), down).astype(np.float32)
 
 
 def _check_finite(side: Side, cloud: Gaussians) -> None:
