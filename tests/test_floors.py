@@ -28,6 +28,7 @@ FLOORS = (
     {"features"},
     {"evaluation"},
     {"pipeline"},
+    {"scale"},
     {""},  # kfgs/__init__.py, the public names
     {"cli"},
     {"__main__"},

@@ -23,6 +23,7 @@ from typing import Any, get_type_hints
 
 import tyro
 
+from .blocks import blocks, join
 from .evaluate import compare, evaluate
 from .features import features, plan
 from .fit import color, demo, fit, sfm, uplift
@@ -38,13 +39,14 @@ from .view import view
 GROUPS: dict[str, tuple[Any, ...]] = {
     "Start here": (demo, info),
     "Make a semantic field": (sfm, plan, features, text, fit, uplift),
+    "More than one machine": (blocks, join),
     "Ask it": (select, segment, label, view, render),
     "Store it": (pack, runs),
     "Score it": (evaluate, compare),
     "Colour splats": (color, attach, edit, convert),
 }
 COMMANDS = {command.__name__: command for group in GROUPS.values() for command in group}
-RESUMED = {"demo", "features", "fit", "color"}  # commands that reuse their earlier work
+RESUMED = {"demo", "features", "fit", "color", "blocks"}  # commands that reuse their earlier work
 STYLE = (
     tyro.conf.DisallowNone,
     tyro.conf.FlagCreatePairsOff,

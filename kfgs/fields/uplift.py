@@ -92,6 +92,7 @@ def uplift_maps(
     maps: FeatureMaps,  # C maps [h, w, D]
     config: UpliftConfig | None = None,
     *,
+    latents: LinearLatents | None = None,
     generator: torch.Generator | None = None,
     scratch: Path | None = None,
     progress: bool = False,
@@ -108,6 +109,7 @@ def uplift_maps(
         cameras: C posed cameras without distortion.
         maps: one per camera, covering its picture at any size; all-zero features mean "unknown".
         config: see `UpliftConfig`.
+        latents: those of other fields (`sample_latents`), with which these shall agree; None: fitted to this scene.
         generator: draws the first centres of merging; None: seed 0.
         scratch: a folder for these files, used for these maps only; files of a killed process are used again. The caller
             deletes it. None: a temporary folder.
@@ -133,7 +135,7 @@ def uplift_maps(
     cloud = cloud.to(torch.promote_types(cloud.means.dtype, torch.float32))
     steps = len(cameras) * (1 + config.corrections + (config.max_gaussians is not None and config.corrections > 0))
     with torch.no_grad(), tqdm(total=steps, desc="uplift", unit="view", disable=not progress) as bar:
-        directions = working_directions(maps).to(cloud.means)
+        directions = (working_directions(maps) if latents is None else latents.basis).to(cloud.means)
         with WorkingMaps(cameras, maps, directions, config.pixels, scratch) as views:
             sums, shown = _average(cloud, views, bar)
             if not bool((shown > 0).any()):
@@ -145,12 +147,13 @@ def uplift_maps(
                 say(f"note: the Gaussians fill {filled:.0%} of the views; are they in the cameras' frame?")
             average = _mean(sums)
             agreement = row_norms(average).clamp_max(1)
-            chosen = fit_linear_latents(
-                unit_rows(average), _capped(shown), keep=config.keep, maximum=config.max_latents
-            )
-            views.project(chosen.basis)
-            sums = torch.cat([sums[..., :-1] @ chosen.basis, sums[..., -1:]], dim=-1)
-            latents = LinearLatents((directions.double() @ chosen.basis.double()).to(directions))
+            if latents is None:
+                chosen = fit_linear_latents(
+                    unit_rows(average), _capped(shown), keep=config.keep, maximum=config.max_latents
+                )
+                views.project(chosen.basis)
+                sums = torch.cat([sums[..., :-1] @ chosen.basis, sums[..., -1:]], dim=-1)
+                latents = LinearLatents((directions.double() @ chosen.basis.double()).to(directions))
             say(f"fused {len(cameras)} maps of {latents.dim} channels as {latents.latent} latents")
             for _ in range(config.corrections):
                 sums = _correct(cloud, sums, views, bar)
@@ -168,6 +171,22 @@ def uplift_maps(
                 if config.corrections:
                     sums = _correct(cloud, sums, views, bar)
     return Uplifted(cloud.replace(features=_mean(sums)), latents, shown, agreement)
+
+
+def sample_latents(maps: FeatureMaps, *, count: int = 32, views: int = 256) -> LinearLatents:
+    """Latents for several fields of one teacher: the main directions of features that are sampled from their maps.
+
+    Args:
+        maps: of all scenes together, or of all parts of a scene.
+        count: of the latents; fewer if features have fewer channels.
+        views: most maps that are read, evenly chosen.
+
+    Raises:
+        ValueError: if a map is not finite, or all are zero.
+    """
+    check_whole("count", count, 1)
+    check_whole("views", views, 1)
+    return LinearLatents(working_directions(maps, count, views))
 
 
 def _add(cloud: Gaussians, camera: Camera, signal: Tensor, sums: Tensor) -> None:  # [h, w, c], [N, c + 1]

@@ -129,10 +129,10 @@ class WorkingMaps:
         return (features @ self._directions) / lengths.clamp_min(EPS)[..., None] * known, known
 
 
-def working_directions(maps: FeatureMaps) -> Tensor:  # [D, d']
-    """The main directions of unit features, from samples of some evenly spread maps."""
-    most, samples = LOOKED_AT
-    views = sorted({round(i) for i in np.linspace(0, len(maps) - 1, min(most, len(maps)))})
+def working_directions(maps: FeatureMaps, count: int = WORKING, most: int | None = None) -> Tensor:  # [D, d']
+    """The main `count` directions of unit features, from samples of at most `most` (32) evenly spread maps."""
+    samples = LOOKED_AT[1]
+    views = sorted({round(i) for i in np.linspace(0, len(maps) - 1, min(most or LOOKED_AT[0], len(maps)))})
     moment: Tensor | float = 0.0
     for i in views:
         grid: Callable[..., Tensor] | None = getattr(maps, "grid", None)
@@ -154,4 +154,4 @@ def working_directions(maps: FeatureMaps) -> Tensor:  # [D, d']
         raise ValueError(
             f"maps: expected nonzero features (longer than {EPS:g}), got {len(maps)} maps without; check the teacher"
         )
-    return directions[:, :WORKING].float()
+    return directions[:, :count].float()

@@ -36,6 +36,7 @@ from ..quant import (
     Codebook,
     IndexMaps,
     LatentMaps,
+    LinearLatents,
     fit_autoencoder,
     fit_codebook,
     quantize_maps,
@@ -197,6 +198,7 @@ def fit_scene(
     config: FitConfig | None = None,
     *,
     splat: Gaussians | SplatFile | str | Path | None = None,
+    latents: LinearLatents | None = None,
     report: Callable[[str], None] | None = None,
     progress: Progress = False,
 ) -> FitResult:
@@ -213,6 +215,7 @@ def fit_scene(
         splat: of method `fuse`, the Gaussians to fuse onto, in the scene's frame: a splat file or its content. None trains them
             on the pictures with `config.color` and writes them to `folder/color.ply`, unless that file exists. If `fit_color`
             trained for longer in the same folder, its Gaussians are taken instead.
+        latents: of method `fuse`, those of other fields (`fields.sample_latents`), with which this one shall agree.
         report: receives one line per stage.
         progress: True shows bars; a function receives the history rows of every trained stage as they appear.
 
@@ -229,11 +232,13 @@ def fit_scene(
     _check_inputs(scene, scene.views(config.split), maps, config)
     if splat is not None and config.method == "paper":
         raise ValueError("splat: expected none for method 'paper', which trains its own Gaussians; leave it out")
+    if latents is not None and config.method == "paper":
+        raise ValueError("latents: expected none for method 'paper', whose autoencoder makes them; leave it out")
     run = Run(check_output("folder", folder, "a folder"), report)
     with run.locked():
         check_current(run.folder)
         job = _job(run, scene, maps, config, target_device, progress)
-        found, about = _make_field(job, splat)
+        found, about = _make_field(job, splat, latents)
         done = FitResult(found, run.folder, run.stages)
         about |= _facts(job, found, done.field_path, getattr(maps, "identity", None))
         done = replace(done, field=replace(found, info=about, folder=done.field_path))
@@ -258,7 +263,9 @@ def _facts(job: _Job, field: SemanticField, path: Path, teacher: Any) -> dict[st
     }
 
 
-def _make_field(job: _Job, splat: Gaussians | SplatFile | str | Path | None) -> tuple[SemanticField, dict[str, Any]]:
+def _make_field(
+    job: _Job, splat: Gaussians | SplatFile | str | Path | None, latents: LinearLatents | None = None
+) -> tuple[SemanticField, dict[str, Any]]:
     """All stages of a method: the field, and what decided it, for `field.json`."""
     config = job.config
     if config.method == "paper":
@@ -266,7 +273,7 @@ def _make_field(job: _Job, splat: Gaussians | SplatFile | str | Path | None) -> 
         return answers_stage(job.run, _paper_stages(job), job.cameras), about
     geometry, origin = find_geometry(job.run, job.scene, splat, _color_config(config), job.device, job.progress)
     inputs = {"features": job.features, "config": asdict(config.uplift), "seed": config.seed}
-    found = uplift_stage(job.run, geometry, job.cameras, job.maps, config.uplift, inputs, job.progress is True)
+    found = uplift_stage(job.run, geometry, job.cameras, job.maps, config.uplift, inputs, job.progress is True, latents)
     return found, {"method": config.method, **origin}
 
 

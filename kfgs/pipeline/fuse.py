@@ -63,22 +63,25 @@ def uplift_stage(
     config: UpliftConfig,
     inputs: dict[str, Any],
     progress: bool,
+    latents: LinearLatents | None = None,
 ) -> SemanticField:
     """Fuse the maps onto the Gaussians, merge and compress, as a stage of a run.
 
-    `inputs` are those in addition to Gaussians and cameras: `features` (the maps), `config` and `seed`.
+    `inputs` are those in addition to Gaussians, cameras and `latents`: `features` (the maps), `config` and `seed`.
     """
     inputs = {
         "geometry": digest_tensors(*(getattr(geometry, name) for name in SHAPE)),
         "cameras": _digest_cameras(cameras),
         **inputs,
+        **({} if latents is None else {"latents": digest_tensors(latents.basis)}),
     }
     pictures = {"features": inputs["features"], "cameras": inputs["cameras"], "pixels": config.pixels}
+    pictures |= {name: inputs[name] for name in ("latents",) if name in inputs}
     scratch = run.scratch("uplift", pictures)
 
     def make(folder: Path) -> None:
         check_readable(maps, "the uplift")
-        options: dict[str, Any] = {"scratch": scratch, "progress": progress, "report": run.report}
+        options: dict[str, Any] = {"scratch": scratch, "progress": progress, "report": run.report, "latents": latents}
         generator = stage_generator(inputs["seed"], "uplift")
         found = uplift_maps(geometry.to("cpu"), cameras, maps, config, generator=generator, **options)
         cloud = found.gaussians

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from .._arrays import reading
 from .._card import short_repr
 from .._check import as_tensor, check_range, check_shapes, check_whole, moved_to
 from .._rows import unit_rows
+from ._store import read_tensors, write_tensors
 
 NOISE = 1e-10  # of the first eigenvalue: rounding in float32 gives so much to directions that are not in the data
 
@@ -85,6 +88,22 @@ class LinearLatents:
     def from_tensors(tensors: Mapping[str, Tensor]) -> LinearLatents:
         """Latents from the tensors of `to_tensors`; other names are ignored."""
         return LinearLatents(tensors["basis"])
+
+    def save(self, path: str | Path) -> None:
+        """Write the basis to a .safetensors file."""
+        write_tensors(path, self.to_tensors(), kind="linear latents")
+
+    @staticmethod
+    def load(path: str | Path) -> LinearLatents:
+        """Read what `save` wrote.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if the file is another one.
+        """
+        tensors = read_tensors(path, kind="linear latents")
+        with reading(path, "linear latents of kfgs"):
+            return LinearLatents.from_tensors(tensors)
 
 
 def principal_directions(

@@ -88,16 +88,14 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
 
 
 def _load_views(path: Path, root: Path, images: str | Path | None) -> Scene:
-    if path.is_dir():
-        for name in MODEL_FOLDERS:
-            if has_model(path / name):
-                model = path / name
-                scene = load_colmap(model, images if images is not None else _image_folder(path, model))
-                others = sorted(f.name for f in model.parent.iterdir() if f != model and has_model(f))
-                if name == "sparse/0" and others:
-                    note = f"{model.parent} holds other models too ({some(others)}): COLMAP split the images; 0 is used"
-                    scene = replace(scene, notes=(*scene.notes, note))
-                return scene
+    model = find_model(path)
+    if model is not None:
+        scene = load_colmap(model, images if images is not None else _image_folder(path, model))
+        others = sorted(f.name for f in model.parent.iterdir() if f != model and has_model(f))
+        if model == path / "sparse/0" and others:
+            note = f"{model.parent} holds other models too ({some(others)}): COLMAP split the images; 0 is used"
+            scene = replace(scene, notes=(*scene.notes, note))
+        return scene
     if path.suffix == ".json" or any((path / name).is_file() for name in _TRANSFORMS):
         return load_transforms(path, images)
     for layout in _LAYOUTS:
@@ -113,8 +111,13 @@ def _load_views(path: Path, root: Path, images: str | Path | None) -> Scene:
     )
 
 
+def find_model(path: Path) -> Path | None:
+    """The COLMAP model that `load_scene` reads in a scene folder; None if there is none."""
+    return next((path / name for name in MODEL_FOLDERS if path.is_dir() and has_model(path / name)), None)
+
+
 def _is_scene(path: Path) -> bool:
-    model = any(has_model(path / name) for name in MODEL_FOLDERS)
+    model = find_model(path) is not None
     return model or any((path / name).is_file() for name in _TRANSFORMS) or any(a.matches(path) for a in _LAYOUTS)
 
 

@@ -85,7 +85,9 @@ class ToyConfig:
             )
 
 
-def make_toy_room(path: str | Path, config: ToyConfig | None = None, *, progress: bool = False) -> Path:
+def make_toy_room(
+    path: str | Path, config: ToyConfig | None = None, *, embeddings_of: int | None = None, progress: bool = False
+) -> Path:
     """Render a furnished room of 6 x 5 x 2.9 metres and write it as a scene folder.
 
     **Convention**: metres, z up, floor at z = 0; cameras, pixels and the sparse model follow COLMAP; label images hold
@@ -101,6 +103,7 @@ def make_toy_room(path: str | Path, config: ToyConfig | None = None, *, progress
         path: the folder to make. It appears complete or not at all. If it holds a toy room with the same options,
             nothing is written.
         config: options; the default takes about half a minute on two CPU cores and 120 MB of disk.
+        embeddings_of: the seed of the classes' embeddings, which several rooms of a town share; None: the room's own.
         progress: show a bar over the views.
 
     Returns:
@@ -111,6 +114,8 @@ def make_toy_room(path: str | Path, config: ToyConfig | None = None, *, progress
     """
     path, config = as_path(path), config or ToyConfig()
     about = {"version": VERSION, "config": json.loads(json.dumps(asdict(config)))}
+    if embeddings_of is not None:
+        about["embeddings_of"] = embeddings_of
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         _check_same(path, about)
         return path
@@ -121,7 +126,7 @@ def make_toy_room(path: str | Path, config: ToyConfig | None = None, *, progress
     with atomic_folder(path) as folder:
         for name in ("images", "labels", "depth", "features"):
             (folder / name).mkdir()
-        embeddings = class_embeddings(config.feature_dim, config.seed)
+        embeddings = class_embeddings(config.feature_dim, config.seed if embeddings_of is None else embeddings_of)
         for camera in tqdm(cameras, desc="toy room", disable=not progress):
             view = render(solids, noise, camera)
             _write_view(folder, Path(camera.name).stem, view, embeddings, config)

@@ -1,0 +1,140 @@
+"""A toy town fitted whole and in blocks: mIoU on unseen views, agreement on the true surface near seams, memory per block.
+
+    python benchmarks/town.py OUT [--rooms 3x3] [--blocks 16] [--steps 3000] [--seed 0] [--views 24]
+
+Both fuse the same maps onto the same Gaussians: a colour splat trained on the whole town. Each block runs in a process of its
+own, whose peak memory is told. "Near a seam": true surface points within 0.3 m of a border between two blocks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import resource
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+NEAR = 0.3  # metres
+
+
+def main() -> None:
+    """Run, and print a table."""
+    from kfgs.fields import SemanticField, UpliftConfig
+    from kfgs.formats import read_splats
+    from kfgs.pipeline import ColorConfig, FitConfig, fit_color
+    from kfgs.scale import FieldInBlocks, split_scene
+    from kfgs.scenes import load_scene
+    from kfgs.toy.room_folder import ToyConfig
+    from kfgs.toy.town import make_toy_town
+
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--rooms", default="3x3")
+    parser.add_argument("--blocks", type=int, default=16)
+    parser.add_argument("--steps", type=int, default=3000)
+    parser.add_argument("--views", type=int, default=24)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--gaussians", type=int, default=6000, help="most semantic Gaussians per room")
+    args = parser.parse_args()
+    nx, ny = map(int, args.rooms.split("x"))
+    town = args.out / f"town{args.seed}"
+    room = ToyConfig(
+        seed=args.seed, train_views=args.views, test_views=args.views // 4, size=(144, 192), feature_size=(54, 72),
+        feature_dim=128, surface_points=20_000, sparse_points=6_000,
+    )  # fmt: skip
+    if not town.exists():
+        make_toy_town(town, (nx, ny), room, progress=True)
+    scene = load_scene(town)
+    print(
+        f"town {args.seed}: {nx * ny} rooms, {len(scene.views('train'))} training views, {len(scene.views('test'))} test views"
+    )
+    colors = ColorConfig.geometry()
+    colors = replace(colors, field=replace(colors.field.with_steps(args.steps), max_gaussians=20_000 * nx * ny))
+    splat = fit_color(scene, args.out / f"run{args.seed}", colors, progress=True).path
+    total = args.gaussians * nx * ny
+    config = FitConfig(uplift=UpliftConfig(max_gaussians=total))
+    began = time.perf_counter()
+    whole = _apart(_fit_whole, town, args.out / f"run{args.seed}", config, splat)
+    whole["seconds"] = time.perf_counter() - began
+    _print("whole", SemanticField.load(args.out / f"run{args.seed}" / "field"), scene, town, None, whole)
+    folder = args.out / f"blocks{args.seed}"
+    blocks = split_scene(town, folder, args.blocks, splat=splat)
+    began, facts = time.perf_counter(), []
+    everything = len(read_splats(splat).gaussians)
+    for block in blocks:
+        share = len(read_splats(folder / block.name / "splat.ply").gaussians) / everything
+        facts.append(
+            _apart(_fit_block, folder / block.name, FitConfig(uplift=UpliftConfig(max_gaussians=int(total * share))))
+        )
+        print(f"  {block.name}: {len(block.views)} views, {share:.0%} of the Gaussians, {facts[-1]}")
+    took = {"seconds": time.perf_counter() - began, "peak_mib": max(fact["peak_mib"] for fact in facts)}
+    _print(f"{args.blocks} blocks", FieldInBlocks.open(folder).joined(), scene, town, blocks, took)
+    _print("whole", SemanticField.load(args.out / f"run{args.seed}" / "field"), scene, town, blocks, whole)
+
+
+def _fit_whole(town: Path, run: Path, config: Any, splat: Path) -> None:
+    from kfgs.features import FeatureFolder
+    from kfgs.pipeline import fit_scene
+    from kfgs.scenes import load_scene
+
+    scene = load_scene(town)
+    fit_scene(scene, FeatureFolder(town / "features").of(scene, "train"), run, config, splat=splat)
+
+
+def _fit_block(folder: Path, config: Any) -> None:
+    from kfgs.scale import fit_block
+
+    fit_block(folder, config)
+
+
+def _apart(do: Any, *args: Any) -> dict[str, Any]:
+    """Run in a fresh process; its peak memory."""
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(1) as pool:
+        return dict(pool.apply(_measured, (do, args)))
+
+
+def _measured(do: Any, args: tuple[Any, ...]) -> dict[str, Any]:
+    do(*args)
+    return {"peak_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)}
+
+
+def _print(name: str, field: Any, scene: Any, town: Path, blocks: Any, facts: dict[str, Any]) -> None:
+    """One row: scores of a field."""
+    from kfgs.evaluation import evaluate_segmentation, load_label_set, score_surface
+    from kfgs.evaluation.datasets.surface_points import load_surface_points
+    from kfgs.pipeline import true_labels
+
+    classes = load_label_set(town / "classes.json", town / "text.npy")
+    truth = true_labels(scene, town / "labels", "test")
+    cameras = {scene.stem(i): scene.cameras[i] for i in scene.views("test")}
+    report = evaluate_segmentation(lambda stem: field.segment(cameras[stem], classes), truth, classes.names)
+    true = load_surface_points(town)
+    points, labels = true.points, true.labels
+    labelled = field.label(classes)
+    row = {"miou": round(float(report.miou.value), 4), "gaussians": len(field), **facts}
+    for what, rows in _places(points, blocks).items():
+        row[what] = round(score_surface(labelled.means, labelled.labels, points[rows], labels[rows]).agreement, 4)
+    print(name, json.dumps(row))
+
+
+def _places(points: Any, blocks: Any) -> dict[str, Any]:
+    means = points.numpy()
+    if blocks is None:
+        return {"surface": np.ones(len(means), bool)}
+    near = np.zeros(len(means), bool)
+    for block in blocks:
+        low, high = np.array(block.core)
+        inside = ((means >= low - NEAR) & (means < high + NEAR)).all(1)
+        border = (np.abs(means - low) < NEAR).any(1) | (np.abs(means - high) < NEAR).any(1)
+        near |= inside & border
+    return {"surface": np.ones(len(means), bool), "near_seams": near, "elsewhere": ~near}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,75 @@
+"""The commands blocks (cut and fit a large scene) and join (blocks as one field)."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from .files import check_folder
+from .options import FieldMethod, Given, Maps, Positional, SceneFolder, Training, fit_config
+from .output import say, wrote
+
+# Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
+
+
+def blocks(
+    scene: SceneFolder,
+    out: Path,
+    count: int,
+    *,
+    splat: Given[Path] = None,
+    latents: int = 32,
+    maps: Maps,
+    training: Training,
+) -> None:
+    """Make the field of a large scene in blocks, one after the other, so that memory does not grow with the scene.
+
+    Each block is a scene folder of its own (OUT/block00, ...), which other machines can fit, too: `kfgs.scale.fit_block`.
+
+    Examples:
+        kfgs blocks town/ --out city/ --count 16
+        kfgs blocks town/ --out city/ --count 16 --splat town.ply
+        kfgs join city/ --out field/
+
+    Args:
+        out: Receives the blocks. Running again continues where it stopped.
+        count: Number of blocks.
+        splat: Gaussians of the whole scene; without it each block trains its own.
+        latents: Numbers per Gaussian, the same in all blocks.
+    """
+    from ..scale import fit_blocks, split_scene
+
+    check_folder("out", out, scene, maps.features)
+    config = fit_config(FieldMethod(), seed=training.seed, steps=training.steps, max_gaussians=training.max_gaussians)
+    config = dataclasses.replace(config, undistorted_features=maps.undistorted_features, device=training.device)
+    split_scene(scene, out, count, features=maps.folder(scene), splat=splat, latents=latents, report=say)
+    done = fit_blocks(out, config, report=say)
+    say(f"{len(done):,} Gaussians in {len(done.blocks)} blocks")
+    say(f"next: kfgs join {out} --out field")
+    wrote([out / "blocks.json", *(out / block.name / "core" for block in done.blocks)])
+
+
+def join(
+    city: Positional[Path], out: Path, *, box: Given[tuple[float, float, float, float, float, float]] = None
+) -> None:
+    """Write the blocks of a scene, or those in a box, as one field.
+
+    Examples:
+        kfgs join city/ --out field/
+        kfgs join city/ --out street/ --box 0 0 -2  40 10 8
+
+    Args:
+        city: What `kfgs blocks` made.
+        out: The field folder to write.
+        box: Low and high corner, world units; only blocks that touch it are read.
+    """
+    from ..fields.store import check_place
+    from ..scale import FieldInBlocks
+
+    check_folder("out", out)
+    check_place(out)
+    found = FieldInBlocks.open(city)
+    field = found.joined() if box is None else found.within(box[:3], box[3:])
+    field.save(out)
+    say(field.summary())
+    wrote([out])

@@ -1,0 +1,210 @@
+"""A large scene in blocks: cut it, fit each block as a scene of its own, keep the core of each field.
+
+Latents are fitted once, on features from all over the scene, so that those of all blocks mean the same. A block's views and
+Gaussians are all that can say something about its core (`scenes.Block`), so the core of its field is nearly that of the
+whole scene's, and blocks join without a seam.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from .._check import as_array, check_whole
+from .._files import as_path, check_output, read_json, write_json
+from ..features import FeatureFolder
+from ..fields import SemanticField, sample_latents, select_gaussians
+from ..formats import read_splats, write_splats
+from ..pipeline import FitConfig, fit_scene
+from ..quant import LinearLatents
+from ..scenes import Scene, SceneError, load_scene
+from ..scenes.blocks import Block, partition, write_part
+from ..scenes.load import find_model
+from .in_blocks import BLOCKS, CORE, FORMAT, FieldInBlocks, read_blocks
+
+LATENTS, SPLAT = "latents.safetensors", "splat.ply"
+BESIDE = ("classes.json", "text.npy", "text.safetensors", "labels", "labels_scored")
+"""Files and folders of a scene that belong to each of its blocks, too."""
+REACH = 3.0  # standard deviations: farther out, a Gaussian is below 1/255 of any pixel
+
+
+def split_scene(
+    scene: str | Path,
+    out: str | Path,
+    count: int,
+    *,
+    features: str | Path | None = None,
+    splat: str | Path | None = None,
+    latents: int = 32,
+    report: Callable[[str], None] | None = None,
+) -> list[Block]:
+    """Cut a scene into blocks, each a scene folder of its own that `fit_block` or any command takes.
+
+    Pictures, maps and labels are links into the scene. A block's COLMAP model has the images that see its core.
+
+    Args:
+        scene: a folder with a COLMAP model, whose tracks say which image sees which point.
+        out: receives a folder for each block, `blocks.json`, and `latents.safetensors`.
+        count: of blocks.
+        features: folder of feature maps; None: SCENE/features.
+        splat: Gaussians of the whole scene; each block gets those that it needs. None: each block trains its own.
+        latents: numbers per Gaussian, in all blocks.
+        report: called with a line per block.
+
+    Returns:
+        The blocks.
+
+    Raises:
+        SceneError: as `scenes.partition`.
+        FileNotFoundError: if views have no maps.
+        ValueError: if OUT holds another scene's blocks, or others of this scene.
+    """
+    source, out, say = as_path(scene), check_output("out", out, "a folder"), report or (lambda text: None)
+    check_whole("latents", latents, 1)
+    whole = load_scene(source)
+    maps_folder = source / "features" if features is None else as_path(features)
+    maps = FeatureFolder(maps_folder).of(whole, "train")
+    model = find_model(source)
+    if model is None:
+        raise SceneError(f"scene: expected a folder with a COLMAP model, got {source}; make one with `kfgs sfm`")
+    blocks = partition(model, count)
+    facts = {
+        "format": FORMAT,
+        "version": 1,
+        "scene": os.path.relpath(source, out),
+        "blocks": [b.to_json() for b in blocks],
+    }
+    _check_same(out, facts)
+    training = {whole.cameras[i].name for i in whole.views("train")}
+    for block in blocks:
+        if not training & set(block.views):
+            raise SceneError(
+                f"{block.name}: expected training views that see it, got none; ask for fewer blocks than {count}"
+            )
+    out.mkdir(parents=True, exist_ok=True)
+    sample_latents(maps, count=latents).save(out / LATENTS)
+    cloud = None if splat is None else read_splats(splat)
+    for block in blocks:
+        folder = out / block.name
+        write_part(model, block.views, folder / "sparse" / "0")
+        _link(folder / "images", _picture_folder(whole))
+        _link(folder / "features", maps_folder)
+        for name in BESIDE:
+            if (source / name).exists():
+                _link(folder / name, source / name)
+        write_json(folder / "split.json", _splits(whole, block))
+        if cloud is not None:
+            means, radii = as_array(cloud.gaussians.means), REACH * as_array(cloud.gaussians.scales).max(1)
+            write_splats(folder / SPLAT, cloud.select(torch.from_numpy(block.needs(means, radii))))
+        write_json(folder / "block.json", block.to_json())
+        say(f"{block.name}: {len(block.views)} views")
+    write_json(out / BLOCKS, facts)
+    return blocks
+
+
+def fit_block(
+    folder: str | Path,
+    config: FitConfig | None = None,
+    *,
+    report: Callable[[str], None] | None = None,
+    progress: bool = False,
+) -> dict[str, Any]:
+    """Fit the field of one block, and keep its core in `folder/core`. Finished stages in `folder/run` are reused.
+
+    Args:
+        folder: what `split_scene` made.
+        config: of method `fuse`.
+        report: called with a line per stage.
+        progress: show bars.
+
+    Returns:
+        Counts and seconds, as JSON.
+
+    Raises:
+        ValueError: as `fit_scene`, or if no Gaussian lies in the core.
+    """
+    folder, config = as_path(folder), config or FitConfig()
+    block = Block.from_json(read_json(folder / "block.json"))
+    as_taken = load_scene(folder)
+    maps = FeatureFolder(folder / "features").of(as_taken, config.split)
+    splat = folder / SPLAT
+    result = fit_scene(
+        as_taken.undistorted(), maps, folder / "run", config, splat=splat if splat.is_file() else None,
+        latents=LinearLatents.load(folder.parent / LATENTS), report=report, progress=progress,
+    )  # fmt: skip
+    own = torch.from_numpy(block.holds(as_array(result.field.gaussians.means)))
+    if not bool(own.any()):
+        raise ValueError(
+            f"{folder}: expected Gaussians in the block's core, got none of {len(own)}; ask for fewer blocks"
+        )
+    core = select_gaussians(result.field, own)
+    core.save(folder / CORE)
+    low, high = _box(core)
+    facts = {"gaussians": len(core), "of": len(own), "box": [low, high], "seconds": round(result.seconds, 1)}
+    write_json(folder / "core.json", facts)
+    return facts
+
+
+def fit_blocks(
+    out: str | Path,
+    config: FitConfig | None = None,
+    *,
+    client: Any = None,
+    report: Callable[[str], None] | None = None,
+) -> FieldInBlocks:
+    """Fit all blocks of `split_scene`, one after the other or on the workers of a client.
+
+    Args:
+        out: the folder of the blocks.
+        config: of method `fuse`; `max_gaussians` is per block.
+        client: where blocks are fitted, as in `map_scenes`; None: here.
+        report: called with a line per block.
+    """
+    out, say = as_path(out), report or (lambda text: None)
+    names = [block.name for block in read_blocks(out)]
+    submitted = (
+        {name: client.submit(fit_block, str(out / name), config) for name in names} if client is not None else {}
+    )
+    for name in names:
+        facts = submitted[name].result() if client is not None else fit_block(out / name, config)
+        say(f"{name}: {facts['gaussians']:,} Gaussians of {facts['of']:,} in {facts['seconds']} s")
+    return FieldInBlocks.open(out)
+
+
+def _check_same(out: Path, facts: dict[str, Any]) -> None:
+    """Raise a ValueError if the folder holds other blocks."""
+    if (out / BLOCKS).is_file() and read_json(out / BLOCKS) != facts:
+        raise ValueError(
+            f"out: expected a new folder, or one with these blocks, got {out} with others; choose another, or delete it"
+        )
+
+
+def _box(field: SemanticField) -> tuple[list[float], list[float]]:
+    """The box around a field's Gaussians, spread included."""
+    means, radii = as_array(field.gaussians.means), REACH * as_array(field.gaussians.scales).max(1)[:, None]
+    return (means - radii).min(0).tolist(), (means + radii).max(0).tolist()
+
+
+def _splits(scene: Scene, block: Block) -> dict[str, list[str]]:
+    """The block's views in each split."""
+    own = set(block.views)
+    return {
+        name: [scene.stem(i) for i in views if scene.cameras[i].name in own] for name, views in scene.splits.items()
+    }
+
+
+def _picture_folder(scene: Scene) -> Path:
+    """The folder that the names of a scene's pictures are relative to."""
+    path, name = scene.image_paths[0], Path(scene.cameras[0].name)
+    return path.parents[len(name.parts) - 1]
+
+
+def _link(place: Path, target: Path) -> None:
+    """A link to a file or folder, relative, so that both can move together."""
+    if not place.is_symlink():
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.symlink_to(os.path.relpath(target.resolve(), place.parent.resolve()), target_is_directory=target.is_dir())

@@ -1,0 +1,181 @@
+"""A scene in blocks: its fields join to what one field of the whole scene says, and only what is needed is read."""
+
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from messages import tells
+
+from kfgs.cli import main
+from kfgs.evaluation import load_label_map
+from kfgs.features import FeatureFolder
+from kfgs.fields import SemanticField, UpliftConfig, join_fields, sample_latents, select_gaussians, uplift_maps
+from kfgs.formats import SplatFile, write_splats
+from kfgs.gaussians import Gaussians
+from kfgs.pipeline import FitConfig
+from kfgs.quant import LinearLatents
+from kfgs.scale import FieldInBlocks, fit_block, fit_blocks, split_scene
+from kfgs.scenes import SceneError, load_scene
+from kfgs.toy.room_folder import ToyConfig
+from kfgs.toy.town import make_toy_town
+
+ROOM = ToyConfig(
+    train_views=8, test_views=2, size=(60, 80), feature_size=(30, 40), feature_dim=24, surface_points=3_000, sparse_points=800
+)  # fmt: skip
+EVERY = FitConfig(uplift=UpliftConfig(corrections=0))
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory):
+    return make_toy_town(tmp_path_factory.mktemp("town") / "town", (2, 1), ROOM)
+
+
+@pytest.fixture(scope="module")
+def splat(town):
+    """A small ball on each true surface point."""
+    points = torch.from_numpy(np.load(town / "surface.npz")["points"])
+    n = len(points)
+    quats, scales = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1), torch.full((n, 3), 0.04)
+    cloud = Gaussians(points, quats, scales, torch.full((n,), 0.95), sh=torch.zeros(n, 1, 3))
+    write_splats(town.parent / "splat.ply", SplatFile(cloud))
+    return town.parent / "splat.ply"
+
+
+@pytest.fixture(scope="module")
+def fitted(town, splat):
+    folder = town.parent / "blocks"
+    split_scene(town, folder, 3, splat=splat, latents=12)
+    return fit_blocks(folder, EVERY)
+
+
+@pytest.fixture(scope="module")
+def whole(town, splat, fitted):
+    """The same Gaussians with the same latents, fused at once."""
+    from kfgs.formats import read_splats
+
+    scene = load_scene(town)
+    cameras, maps = (
+        [scene.cameras[i] for i in scene.views("train")],
+        FeatureFolder(town / "features").of(scene, "train"),
+    )
+    latents = LinearLatents.load(fitted.folder / "latents.safetensors")
+    return uplift_maps(read_splats(splat).gaussians, cameras, maps, EVERY.uplift, latents=latents)
+
+
+def ordered(means):
+    return np.lexsort(means.numpy().T)
+
+
+def test_a_town_is_one_scene(town):
+    scene = load_scene(town)
+    assert len(scene.cameras) == 20
+    assert {camera.name[:5] for camera in scene.cameras} == {"r000_", "r001_"}
+    assert len(scene.views("train")) == 16
+    x = scene.points[:, 0]
+    assert int((x.abs() < 4).sum()) > 600
+    assert int(((x - 8).abs() < 4).sum()) > 600  # the second room
+    assert load_label_map(town / "labels" / f"{scene.stem(19)}.png").shape == (60, 80)
+
+
+def test_blocks_join_to_what_the_whole_scene_says(fitted, whole):
+    joined = fitted.joined()
+    assert len(joined) == len(fitted) == len(whole.gaussians)  # each Gaussian has one block
+    one, other = ordered(joined.gaussians.means), ordered(whole.gaussians.means)
+    assert torch.equal(joined.gaussians.means[one], whole.gaussians.means[other])
+    a, b = joined.gaussians.features[one], whole.gaussians.features[other]
+    known = a.any(1) & b.any(1)
+    assert float(known.float().mean()) > 0.95
+    assert float((a.any(1) == b.any(1)).float().mean()) > 0.99
+    cosines = torch.nn.functional.cosine_similarity(a[known], b[known], dim=1)
+    assert float((cosines > 0.99).float().mean()) > 0.99  # a view of which a block has less than 1 % is left out
+    assert float(cosines.min()) > 0.7
+
+
+def test_questions_read_one_block_at_a_time(fitted, monkeypatch):
+    reads = []
+    load = SemanticField.load
+    monkeypatch.setattr(SemanticField, "load", staticmethod(lambda path: reads.append(path.parent.name) or load(path)))
+    found = {name: int(selection.mask.sum()) for name, selection in fitted.query("chair")}
+    assert reads == list(found) == [block.name for block in fitted.blocks]
+    joined = fitted.joined()
+    assert sum(found.values()) == int(joined.query("chair").mask.sum())
+    reads.clear()
+    part = fitted.within([-4, -4, -1], [4, 4, 4])  # the first room
+    assert 0 < len(part) < len(joined)
+    assert len(reads) < len(fitted.blocks)
+    with pytest.raises(ValueError, match=tells("low, high", "none")):
+        fitted.within([500, 500, 500], [501, 501, 501])
+
+
+def test_a_view_needs_the_blocks_in_its_picture(fitted, town):
+    scene = load_scene(town)
+    joined = fitted.joined()
+    for i in (0, 5, 13, 19):
+        seen = fitted.seen_from(scene.cameras[i])
+        assert torch.equal(seen.segment(scene.cameras[i]), joined.segment(scene.cameras[i])) or (
+            float((seen.segment(scene.cameras[i]) == joined.segment(scene.cameras[i])).float().mean()) > 0.999
+        )
+
+
+def test_a_second_fit_repeats_nothing(fitted):
+    said = []
+    fit_block(fitted.folder / "block00", EVERY, report=said.append)
+    assert any("found in" in line for line in said)
+    assert not any("working" in line for line in said)
+
+
+def test_other_blocks_are_not_overwritten(fitted, town):
+    with pytest.raises(ValueError, match=tells("out", "others")):
+        split_scene(town, fitted.folder, 4)
+
+
+def test_what_cannot_be_cut_or_opened(tmp_path, town):
+    shutil.copytree(town, tmp_path / "town", ignore=shutil.ignore_patterns("sparse"))
+    K = {"fl_x": 60, "w": 80, "h": 60, "transform_matrix": np.eye(4).tolist()}
+    frames = [{"file_path": f"images/{file.name}", **K} for file in (tmp_path / "town/images").iterdir()]
+    (tmp_path / "town/transforms.json").write_text(json.dumps({"frames": frames}))
+    with pytest.raises(SceneError, match=tells("scene", "COLMAP")):
+        split_scene(tmp_path / "town", tmp_path / "o", 2)
+    with pytest.raises(FileNotFoundError, match=tells("blocks.json", "no such")):
+        FieldInBlocks.open(tmp_path)
+    split_scene(town, tmp_path / "unfitted", 2)
+    with pytest.raises(FileNotFoundError, match=tells("core.json", "kfgs blocks")):
+        FieldInBlocks.open(tmp_path / "unfitted")
+
+
+def test_fields_join_only_if_their_latents_agree(fitted):
+    one, other = fitted.field("block00"), fitted.field("block01")
+    turned = dataclasses.replace(other, linear=LinearLatents(other.linear.basis.flip(1)))
+    with pytest.raises(ValueError, match=tells("fields[1]", "latents")):
+        join_fields([one, turned])
+    with pytest.raises(ValueError, match=tells("fields", "none")):
+        join_fields([])
+    half = select_gaussians(one, torch.arange(len(one)) % 2 == 0)
+    assert torch.equal(half.seen.pixels, one.seen.pixels[::2])
+    assert torch.equal(half.cosines(torch.eye(24)[:2]), one.cosines(torch.eye(24)[:2])[::2])
+
+
+def test_sampled_latents_hold_the_features(town):
+    scene = load_scene(town)
+    maps = FeatureFolder(town / "features").of(scene, "train")
+    latents = sample_latents(maps, count=16)
+    rows = torch.nn.functional.normalize(maps[3].flatten(0, 1), dim=1)
+    assert latents.latent == 16
+    assert float(latents.decode(latents.encode(rows)).norm(dim=1).mean()) > 0.93
+
+
+def test_the_commands(town, splat, tmp_path, capsys):
+    out = tmp_path / "city"
+    assert main(["blocks", str(town), "--out", str(out), "--count", "2", "--splat", str(splat)]) == 0
+    said = capsys.readouterr().out
+    assert "block01" in said
+    assert main(["join", str(out), "--out", str(tmp_path / "field")]) == 0
+    assert len(SemanticField.load(tmp_path / "field")) == len(FieldInBlocks.open(out))
+    box = ["--box", "-4", "-4", "-1", "4", "4", "4"]
+    assert main(["join", str(out), "--out", str(tmp_path / "part"), *box]) == 0
+    assert len(SemanticField.load(tmp_path / "part")) < len(SemanticField.load(tmp_path / "field"))
+    assert main(["join", str(tmp_path), "--out", str(tmp_path / "x")]) == 1
+    assert "blocks.json" in capsys.readouterr().err

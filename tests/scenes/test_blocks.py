@@ -1,0 +1,92 @@
+"""Blocks: cores fill space without overlap, the views that see a core are found, and nothing that hides it is missing."""
+
+import json
+
+import numpy as np
+import pytest
+from messages import tells
+from small_room import make_room
+
+from kfgs.scenes import SceneError, load_scene, read_model
+from kfgs.scenes.blocks import Block, partition, write_part
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    return make_room(tmp_path_factory.mktemp("blocks") / "room")
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7])
+def test_every_point_of_space_lies_in_one_core(room, count):
+    blocks = partition(room / "sparse/0", count)
+    points = np.concatenate([np.random.default_rng(0).normal(0, 50, (500, 3)), read_model(room / "sparse/0").points])
+    assert len(blocks) == count
+    assert (sum(block.holds(points).astype(int) for block in blocks) == 1).all()
+
+
+def test_points_are_shared_evenly_and_outliers_do_not_count(room):
+    points = read_model(room / "sparse/0").points
+    blocks = partition(room / "sparse/0", 4)
+    counts = [int(block.holds(points).sum()) for block in blocks]
+    assert max(counts) < 1.2 * min(counts)
+    assert np.ptp([block.reach for block in blocks]) < 20  # the room is 6 m long, its outliers lie 100 m away
+
+
+def test_views_are_those_whose_tracks_lie_in_the_core(room):
+    model = read_model(room / "sparse/0")
+    ids = {int(number): row for row, number in enumerate(model.point_ids)}
+    for block in partition(model, 3, share=0.3):
+        inside = block.holds(model.points)
+        expected = set()
+        for image in model.images.values():
+            rows = [ids[int(number)] for number in image.observed if number >= 0]
+            if inside[rows].mean() >= 0.3:
+                expected.add(image.name)
+        assert set(block.views) == expected
+
+
+def test_what_stands_between_a_camera_and_the_core_is_needed(room):
+    scene = load_scene(room)
+    centers = {camera.name: camera.center.numpy() for camera in scene.cameras}
+    points = read_model(room / "sparse/0").points
+    for block in partition(room / "sparse/0", 4):
+        core = points[block.holds(points)]
+        core = core[np.abs(core).max(1) < 8]  # without outliers
+        for name in block.views:
+            between = centers[name] + np.linspace(0, 1, 9)[:, None, None] * (core - centers[name])
+            assert (
+                block.needs(between.reshape(-1, 3), np.zeros(between.size // 3)).mean() > 0.97
+            )  # robust_bounds leaves 2 % out
+    assert block.needs(np.array([[1000.0, 1000, 1000]]), np.zeros(1)) == block.holds(np.array([[1000.0, 1000, 1000]]))
+
+
+def test_a_block_survives_json(room):
+    for block in partition(room / "sparse/0", 3):
+        assert Block.from_json(json.loads(json.dumps(block.to_json(), allow_nan=False))) == block
+
+
+def test_a_part_of_a_model_is_a_model(room, tmp_path):
+    block = partition(room / "sparse/0", 4, share=0.5)[1]
+    assert 0 < len(block.views) < 9
+    write_part(room / "sparse/0", block.views, tmp_path / "part")
+    whole, part = load_scene(room), read_model(tmp_path / "part")
+    assert {image.name for image in part.images.values()} == set(block.views)
+    poses = {image.name: image.pose for image in part.images.values()}
+    for camera in whole.cameras:
+        if camera.name in poses:
+            np.testing.assert_allclose(poses[camera.name], camera.viewmat.numpy(), atol=1e-6)
+    with pytest.raises(SceneError, match=tells("names", "nobody.png")):
+        write_part(room / "sparse/0", ["nobody.png"], tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_what_cannot_be_cut(room, tmp_path):
+    with pytest.raises(SceneError, match=tells("count", "fewer")):
+        partition(room / "sparse/0", 10_000)
+    with pytest.raises(ValueError, match=tells("count", "0")):
+        partition(room / "sparse/0", 0)
+    model = read_model(room / "sparse/0")
+    for image in model.images.values():
+        image.observed[:] = -1
+    with pytest.raises(SceneError, match=tells("model", "see")):
+        partition(model, 2)
