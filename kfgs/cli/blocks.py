@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from .files import check_folder
 from .options import FieldMethod, Given, Maps, Positional, SceneFolder, Training, fit_config
@@ -29,7 +32,6 @@ def blocks(
     Examples:
         kfgs blocks town/ --out city/ --count 16
         kfgs blocks town/ --out city/ --count 16 --splat town.ply
-        kfgs join city/ --out field/
 
     Args:
         out: Receives the blocks. Running again continues where it stopped.
@@ -50,26 +52,41 @@ def blocks(
 
 
 def join(
-    city: Positional[Path], out: Path, *, box: Given[tuple[float, float, float, float, float, float]] = None
+    city: Positional[Path], out: Path, *, box: Annotated[Given[str], tyro.conf.arg(metavar="NUMBERS")] = None
 ) -> None:
     """Write the blocks of a scene, or those in a box, as one field.
 
     Examples:
         kfgs join city/ --out field/
-        kfgs join city/ --out street/ --box 0 0 -2  40 10 8
+        kfgs join city/ --out street/ --box 0,0,-2,40,10,8
 
     Args:
         city: What `kfgs blocks` made.
         out: The field folder to write.
-        box: Low and high corner, world units; only blocks that touch it are read.
+        box: x, y, z of the low corner, then of the high one, world units; only blocks that touch it are read.
     """
     from ..fields.store import check_place
     from ..scale import FieldInBlocks
 
+    corners = _corners(box)
     check_folder("out", out)
     check_place(out)
     found = FieldInBlocks.open(city)
-    field = found.joined() if box is None else found.within(box[:3], box[3:])
+    field = found.joined() if corners is None else found.within(corners[:3], corners[3:])
     field.save(out)
     say(field.summary())
     wrote([out])
+
+
+def _corners(box: str | None) -> list[float] | None:
+    """The numbers of --box."""
+    if box is None:
+        return None
+    words = box.replace(",", " ").split()
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 6 or any(low > high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
+        raise ValueError(f"box: expected six numbers, low corner and high corner, as in 0,0,-2,40,10,8, got {box!r}")
+    return numbers

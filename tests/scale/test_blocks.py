@@ -174,8 +174,10 @@ def test_the_commands(town, splat, tmp_path, capsys):
     assert "block01" in said
     assert main(["join", str(out), "--out", str(tmp_path / "field")]) == 0
     assert len(SemanticField.load(tmp_path / "field")) == len(FieldInBlocks.open(out))
-    box = ["--box", "-4", "-4", "-1", "4", "4", "4"]
+    box = ["--box=-4,-4,-1,4,4,4"]
     assert main(["join", str(out), "--out", str(tmp_path / "part"), *box]) == 0
     assert len(SemanticField.load(tmp_path / "part")) < len(SemanticField.load(tmp_path / "field"))
+    assert main(["join", str(out), "--out", str(tmp_path / "x"), "--box", "1,2,3"]) == 1
+    assert "six numbers" in capsys.readouterr().err
     assert main(["join", str(tmp_path), "--out", str(tmp_path / "x")]) == 1
     assert "blocks.json" in capsys.readouterr().err
