@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import resource
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -101,7 +100,9 @@ def _apart(do: Any, *args: Any) -> dict[str, Any]:
 
 def _measured(do: Any, args: tuple[Any, ...]) -> dict[str, Any]:
     do(*args)
-    return {"peak_mib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)}
+    # not ru_maxrss, which a process inherits from the one that started it
+    peak = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+    return {"peak_mib": round(int(peak.split()[1]) / 1024)}
 
 
 def _print(name: str, field: Any, scene: Any, town: Path, blocks: Any, facts: dict[str, Any]) -> None:
