@@ -5,7 +5,8 @@ A lock shows that its writer lives; the next writer beside it deletes what other
 
 A folder that holds files already stays, with everything in it that the new content does not replace. The new content moves to
 `FOLDER/.kfgs-unfinished/waiting` in one step, and from there its files move to their places one by one. From that step on,
-`current_file` finds the new ones, before it the old ones, and the next writer finishes what a killed one began.
+`current_file` finds the new ones, before it the old ones, and the next writer finishes what a killed one began. A reader of
+several files uses `open_current`.
 """
 
 from __future__ import annotations
@@ -15,9 +16,11 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 from .locks import try_lock
 from .paths import as_path
@@ -28,6 +31,8 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 UNNAMED = (*FULL, errno.EIO, errno.EFBIG, errno.EROFS)  # errors of writing, which Python raises without a file
 SHORT = "requested and"  # in the message of numpy
 NOTHING = 1 << 14  # bytes: a disk with less is full
+
+T = TypeVar("T")
 
 
 class FullDiskError(OSError):
@@ -81,6 +86,54 @@ def current_file(folder: Path, name: str) -> Path:
     """Where a file of a folder is that `atomic_folder` wrote, also if its writer was killed while moving the files."""
     waiting = folder / HIDDEN / WAITING / name
     return waiting if waiting.exists() else folder / name
+
+
+def open_current(folder: Path, read: Callable[[Callable[[str], Path]], T]) -> T:
+    """Read several files of a folder that `atomic_folder` wrote, all of them old or all new.
+
+    Args:
+        folder: the folder.
+        read: reads the files and returns what is in them. It is given a function that finds a file by its name, as
+            `current_file` does. It is called again if a file that it found was replaced meanwhile.
+
+    Raises:
+        ValueError: if another process replaces the files all the time.
+        Exception: what `read` raises while no file is replaced.
+    """
+    for _ in range(ATTEMPTS):
+        marks: dict[str, object] = {}
+        try:
+            result = read(partial(_find, folder, marks))
+        except (OSError, ValueError):
+            if not _replaced(folder, marks):
+                raise
+        else:
+            if not _replaced(folder, marks):
+                return result
+    raise ValueError(
+        f"{folder}: expected files that stay while they are read, got a folder that another process writes to all the time; "
+        "wait until it has ended"
+    )
+
+
+def _find(folder: Path, marks: dict[str, object], name: str) -> Path:
+    """The current file of a name; `marks` learns which one it is."""
+    file = current_file(folder, name)
+    marks.setdefault(name, _mark(file))
+    return file
+
+
+def _replaced(folder: Path, marks: dict[str, object]) -> bool:
+    return any(_mark(current_file(folder, name)) != mark for name, mark in marks.items())
+
+
+def _mark(file: Path) -> tuple[object, ...]:
+    """Something that changes when another file takes the place of this one."""
+    try:
+        about = file.stat()
+    except OSError:
+        return (file,)
+    return file, about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns
 
 
 @contextmanager

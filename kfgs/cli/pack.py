@@ -50,7 +50,7 @@ def pack(
             errors of each are printed, and kept in the file. All but lossless sort the Gaussians.
         scores: What `kfgs evaluate --out` wrote about this field: its scores travel in the file. Can be given several times.
     """
-    from ..fields.store import SUFFIX, check_place, describes_field
+    from ..fields.store import SUFFIX, check_place, describes_field, holds_field
     from ..labels.questions import class_rows
 
     classes.check_images()
@@ -59,10 +59,6 @@ def pack(
     if out.resolve() == field.resolve():
         raise ValueError(f"out: expected another place than {field}, got the same; give another name")
     check_place(out)
-    if not single and describes_field(out):  # of a run folder, perhaps: it may have cost hours
-        raise ValueError(
-            f"out: expected a new folder, got {out}, which holds a field; give another name, or rename that one"
-        )
     if not single:
         check_alone("precision", precision, f"for a folder, which keeps every bit; a file ends in {SUFFIX}")
     opened = open_field("field", field)
@@ -73,6 +69,12 @@ def pack(
     if scores:
         kept = [*_listed(opened.info.get("scores")), *(_read_scores(path) for path in scores)]
         opened = dataclasses.replace(opened, info={**opened.info, "scores": kept})
+    if (
+        not single and describes_field(out) and not holds_field(out, vars(opened))
+    ):  # of a run, perhaps: it may have cost hours
+        raise ValueError(
+            f"out: expected a new folder, got {out}, which holds another field; give another name, or rename that one"
+        )
     opened.save(out, (precision or "small") if single else None)
     if single:
         _tell(out, opened)
