@@ -100,6 +100,33 @@ def test_nothing_is_written_among_pictures_and_maps(place, words, room, run, cap
     assert set(room.rglob("*")) == before
 
 
+@pytest.mark.parametrize("name", ["images_4", "photos"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        "fit {room} --out {out}",
+        "uplift {room} {splat} --out {out}",
+        "features {room} --teacher lseg --out {out}",
+        "segment {run}/field --scene {room} --out {out}",
+        "label {run}/field --scene {room} --out {out}",
+        "select chair {run}/field --scene {room} --out {out}",
+        "view {run}/field --scene {room} --where html --out {out}",
+        "render {run} --scene {room} --out {out}/a.gif",
+        "edit {splat} --remove chair --scene {room} --out {out}/a.ply",
+    ],
+)
+def test_pictures_are_known_wherever_they_are_read_from(words, name, room, run, splat, tmp_path, capsys):
+    """Other names than `images`: found by kfgs itself, or named by the user."""
+    scene = tmp_path / "other"
+    shutil.copytree(room, scene)
+    (scene / "images").rename(scene / name)
+    before = set(scene.rglob("*"))
+    given = ["--images", name] if name == "photos" else []
+    arguments = [word.format(room=scene, run=run, splat=splat, out=scene / name) for word in words.split()]
+    refused([*arguments, *given], capsys, "--out:", "pictures and feature maps", scene / name)
+    assert set(scene.rglob("*")) == before
+
+
 def test_segmenting_into_the_scene_puts_no_pictures_among_its_maps(room, run, capsys):
     before = set((room / "features").iterdir())
     refused(["segment", run / "field", "--out", room], capsys, "--out:", room / "features")

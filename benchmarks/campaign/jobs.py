@@ -25,6 +25,8 @@ class Job:
     """Fill `work/` (second argument) from the fixture (first argument)."""
     fields: tuple[str, ...] = ()
     """Field folders in `work/`, which are compared by their reader: their files may be between old and new."""
+    shown: tuple[str, ...] = ()
+    """Files that may be missing between the old ones and the new ones: they show one field and are gone while it changes."""
     loose: tuple[str, ...] = ()
     """Endings of files whose bytes differ between two undisturbed runs, because they tell the time."""
     idle: bool = False
@@ -91,7 +93,7 @@ def _with(
 
 
 def _in_python(function: Callable[[], int | None]) -> Work:
-    """A function of Python, out of which Ctrl-C comes as a KeyboardInterrupt, as one that ends like a command."""
+    """A function of Python, whose refusals and KeyboardInterrupt are exceptions, as one that ends like a command."""
 
     def work() -> int:
         try:
@@ -99,6 +101,9 @@ def _in_python(function: Callable[[], int | None]) -> Work:
         except KeyboardInterrupt:
             print("interrupted")
             return 130
+        except (ValueError, OSError) as error:
+            print(f"error: {error}")
+            return 1
 
     return work
 
@@ -163,7 +168,7 @@ def all_jobs() -> list[Job]:
         Job(
             "unpack",
             command("pack", "in/packed.kfgs.safetensors", "work/field"),
-            _with(notes=("notes.txt", "field/notes.txt")),
+            _with(),
             fields=("field",),
         ),
         Job(
@@ -219,6 +224,7 @@ def all_jobs() -> list[Job]:
             _restore,
             _with(files={"run": "two"}, notes=("run/field/mine.ply",)),
             fields=("run/field",),
+            shown=("run/report.html", "run/preview.png"),
         ),
         Job(
             "fit by the paper",

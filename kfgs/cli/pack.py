@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from .files import check_alone, check_file, check_folder, open_field
+from .._files import check_output
+from .files import check_alone, open_field
 from .options import Classes, GivenPrecision, Positional
 from .output import say, wrote
 
@@ -55,7 +56,7 @@ def pack(
 
     classes.check_images()
     single = out.name.endswith(SUFFIX)
-    (check_file if single else check_folder)("out", out)
+    check_output("out", out, "a file" if single else "a folder")
     if out.resolve() == field.resolve():
         raise ValueError(f"out: expected another place than {field}, got the same; give another name")
     check_place(out)

@@ -6,7 +6,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
-from .files import check_alone, check_folder, is_field, open_field, open_splats
+from .._files import check_output
+from .files import check_alone, inputs_of, is_field, open_field, open_splats
 from .options import Classes, Given, Positional, Teacher
 from .output import say, say_counts, wrote
 from .text import ask
@@ -59,7 +60,7 @@ def select(
     if not source.exists() and Path(query).exists():
         raise ValueError(f"query, source: expected a class, then a file, got {query!r}, {str(source)!r}; swap them")
     if out is not None:
-        check_folder("out", out, classes.scene)
+        check_output("out", out, "a folder", apart=inputs_of(classes.scene, classes.images))
     if threshold is not None:
         check_range("threshold", threshold, 0, 1)
     classes.check_images()
@@ -68,7 +69,7 @@ def select(
     if asked_by_text:
         field = classes.open_field("source", source)
         if out is not None and classes.scene is None:
-            check_folder("out", out, _remembered(field))
+            check_output("out", out, "a folder", apart=inputs_of(_remembered(field)))
         label_set, target = ask(query, classes, teacher, field)
         query = target if isinstance(target, str) else query
         how = None if score == "auto" else score
@@ -128,7 +129,7 @@ def segment(
     from ..pipeline.apply import SEGMENTED
     from ..viz import plot_iou, plot_largest_confusions
 
-    check_folder("out", out)
+    check_output("out", out, "a folder")
     loaded_field = open_field("field", field)
     scene = recall_scene(loaded_field.info, loaded_field.folder) if classes.scene is None else classes.scene
     classes = dataclasses.replace(classes, scene=scene)
@@ -214,7 +215,7 @@ def label(
     ):
         if value is not None and needed is None:
             raise ValueError(f"{name}: expected --{other} with it, got none; it would have no effect")
-    check_folder("out", out, classes.scene)
+    check_output("out", out, "a folder", apart=inputs_of(classes.scene, classes.images))
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
     loaded = classes.open_field("field", field)
