@@ -299,3 +299,18 @@ def test_what_killed_commands_left_is_swept_by_the_next(splat, tmp_path):
         assert main(["convert", str(splat), str(place / "d.splat")]) == 0
         assert not (place / ".kfgs-unfinished").exists()
         shutil.rmtree(place)
+
+
+@pytest.mark.parametrize("limit", [200, 3_000, 9_000, 20_000])
+@pytest.mark.parametrize("words", ["label {run}/field", "select chair {run}/field --scene {room}"])
+def test_a_disk_that_takes_no_more_leaves_the_older_folder_whole(words, limit, room, run, tmp_path):
+    """A limit between the sizes of the files: one of them could be written."""
+    out = tmp_path / "out"
+    arguments = [*words.format(room=room, run=run).split(), "--out", str(out)]
+    done = subprocess.run([sys.executable, "-c", LIMITED, str(limit), *arguments], capture_output=True, text=True)
+    assert done.returncode == 1, done.stderr
+    (error,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert str(out) in error
+    assert "kfgs-unfinished" not in error
+    assert "Traceback" not in done.stderr
+    assert not out.exists() or not list(out.iterdir())

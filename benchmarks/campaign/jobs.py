@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,6 +98,7 @@ def _in_python(function: Callable[[], int | None]) -> Work:
 
     def work() -> int:
         try:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
             return function() or 0
         except KeyboardInterrupt:
             print("interrupted")

@@ -103,9 +103,11 @@ class Process:
 def _prepare(folder: Path, log: Path, limit: int | None) -> None:
     import resource
 
+    from kfgs._interrupts import end_at_once
+
     os.setpgid(0, 0)
     os.chdir(folder)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGINT, end_at_once)  # the first thing that `kfgs` does
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(out, 1)
@@ -142,10 +144,9 @@ def _count_events(counts: int, kill_at: int | None, log: Path) -> None:
 
 def command(*words: str) -> Work:
     """`kfgs` with these words, as a shell starts it."""
+    from kfgs.__main__ import run
 
     def work() -> int:
-        from kfgs.__main__ import run
-
         sys.argv = ["kfgs", *words]
         return run()
 

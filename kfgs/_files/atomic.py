@@ -12,6 +12,7 @@ several files uses `open_current`.
 from __future__ import annotations
 
 import errno
+import math
 import os
 import re
 import shutil
@@ -22,6 +23,7 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+from .former import sweep_former
 from .locks import try_lock
 from .paths import as_path
 
@@ -30,7 +32,7 @@ ATTEMPTS = 100  # to put a folder where other processes put theirs
 FULL = (errno.ENOSPC, errno.EDQUOT)
 UNNAMED = (*FULL, errno.EIO, errno.EFBIG, errno.EROFS)  # errors of writing, which Python raises without a file
 SHORT = "requested and"  # in the message of numpy
-NOTHING = 1 << 14  # bytes: a disk with less is full
+LEAST = 1 << 14  # bytes: a disk with less is full
 
 T = TypeVar("T")
 
@@ -61,6 +63,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         new = place / target.name
         yield new
         _make_ordinary(new)
+        sweep_former(target, new)
         os.replace(new, target)
 
 
@@ -72,13 +75,17 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     `current_file`. A link to a folder stays a link.
     """
     target = Path(os.path.realpath(as_path(path)))
-    with hidden_folder(target if _is_used(target) else target.parent, as_path(path)) as place:
+    used = _is_used(target)
+    if used:  # a writer that made it may have been killed when it was there
+        _tidy(target.parent / HIDDEN)
+    with hidden_folder(target if used else target.parent, as_path(path)) as place:
         new = place / "new"
         new.mkdir(mode=0o777 & ~UMASK)
         yield new
         for file in new.rglob("*"):
             if file.is_file() and not file.is_symlink():
                 _make_ordinary(file)
+        sweep_former(target, new)
         _put(new, target)
 
 
@@ -205,6 +212,13 @@ def _sweep(hidden: Path) -> None:
             os.close(handle)
 
 
+def _tidy(hidden: Path) -> None:
+    """Sweep a folder, and delete it if nothing is left in it."""
+    with suppress(OSError):  # another process works in it, or it may not be changed
+        _sweep(hidden)
+        hidden.rmdir()
+
+
 def _discard(place: Path) -> None:
     """Delete a hidden folder; its lock last, so that it can be deleted again after a kill."""
     with suppress(OSError):
@@ -246,9 +260,7 @@ def finish_writing(folder: Path) -> None:
     hidden = folder / HIDDEN
     if hidden.is_dir():
         _settle(folder)
-        _sweep(hidden)
-        with suppress(OSError):  # another process works in it
-            hidden.rmdir()
+        _tidy(hidden)
 
 
 def _settle(folder: Path) -> None:
@@ -296,14 +308,15 @@ def _make_ordinary(file: Path) -> None:
 
 def _retold(error: Exception, place: Path, target: Path) -> OSError | None:
     """An error of writing as one that names `target`; None if it can be raised as it is."""
-    if isinstance(error, FullDiskError | ValueError | TypeError | LookupError):
+    text, told = str(error), isinstance(error, FullDiskError)
+    if isinstance(error, ValueError | TypeError | LookupError) or (told and str(place) not in text):
         return None
-    text = str(error)
     rust = re.search(r"\(os error (\d+)\)", text)  # of safetensors
     code = int(rust[1]) if rust else getattr(error, "errno", None)
-    if code in FULL or SHORT in text or _free(place) < NOTHING:
+    free = _free(place)
+    if told or code in FULL or SHORT in text or free < LEAST:
         return FullDiskError(
-            f"{target}: expected space on the disk to write it, got {_free(place):,} bytes free; free some (or raise the "
+            f"{target}: expected space on the disk to write it, got {free:,} bytes free; free some (or raise the "
             "limit on files), or choose another disk"
         )
     unnamed = code in UNNAMED and getattr(error, "filename", None) is None
@@ -312,7 +325,8 @@ def _retold(error: Exception, place: Path, target: Path) -> OSError | None:
     return None
 
 
-def _free(place: Path) -> int:
+def _free(place: Path) -> float:
+    """Bytes that are free on the disk of a folder; infinitely many if the system does not say."""
     with suppress(OSError):
         return shutil.disk_usage(next(folder for folder in (place, *place.parents) if folder.is_dir())).free
-    return NOTHING
+    return math.inf

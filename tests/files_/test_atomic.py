@@ -221,6 +221,27 @@ def test_at_every_kill_the_old_folder_or_the_new_one_is_found_and_nothing_else_i
     assert len({str(state) for state in states}) == 2  # some were killed before, and some after the switch
 
 
+MADE = """
+from kfgs._files import atomic_folder
+
+def prepare(folder):
+    pass
+
+def work(folder):
+    with atomic_folder(folder / "field") as new:
+        (new / "a.json").write_text("new")
+"""
+
+
+def test_the_same_writer_again_sweeps_wherever_it_was_killed(tmp_path):
+    """The first one makes the folder, the second one finds it there and works inside it."""
+    for folder in kill_everywhere(MADE, tmp_path / "kills"):
+        with atomic_folder(folder / "field") as new:
+            (new / "a.json").write_text("newer")
+        assert (folder / "field" / "a.json").read_text() == "newer"
+        assert sorted(path.name for path in folder.rglob(".*")) == []
+
+
 FILES = """
 from kfgs._files import atomic_path
 
@@ -343,6 +364,16 @@ def test_a_full_disk_names_the_output(tmp_path, error):
             write(block(tmp_path / "out"))
         assert "kfgs-unfinished" not in str(caught.value)
     assert names(tmp_path) == []
+
+
+def test_a_file_inside_a_folder_that_is_written_is_named_by_the_folder(tmp_path):
+    def write():
+        with atomic_folder(tmp_path / "out") as new, atomic_path(new / "a.bin"):
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(FullDiskError, match=tells(f"{tmp_path / 'out'}: expected space")) as caught:
+        write()
+    assert "kfgs-unfinished" not in str(caught.value)
 
 
 LIMITED = """
