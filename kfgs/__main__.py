@@ -1,5 +1,21 @@
-"""`python -m kfgs` is the `kfgs` command."""
+"""`kfgs` and `python -m kfgs`: the command line."""
 
-from .cli import main
+import signal
+import sys
 
-raise SystemExit(main())
+from ._interrupts import end_at_once
+
+
+def run() -> int:
+    """Run the command of this process; return the exit code."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(
+            signal.SIGINT, end_at_once
+        )  # outside the command, too: while it is imported, and when it has ended
+    from .cli import main
+
+    return main()
+
+
+if __name__ == "__main__":
+    sys.exit(run())

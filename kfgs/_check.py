@@ -34,7 +34,7 @@ def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> di
         The size of each named axis.
 
     Raises:
-        TypeError: if an argument has no shape.
+        TypeError: if an argument has no shape, or is sparse, nested, quantised or on the meta device.
         ValueError: if an axis disagrees; the message names the argument that bound the size.
 
     Example:
@@ -47,6 +47,7 @@ def check_shapes(*arguments: tuple[str, Any, str | tuple[str | int, ...]]) -> di
     for name, value, spec in arguments:
         if value is None:
             continue
+        _check_plain(name, value)
         words = spec.split() if isinstance(spec, str) else spec
         axes = [int(axis) if isinstance(axis, str) and axis.isdigit() else axis for axis in words]
         if not hasattr(value, "shape"):
@@ -82,14 +83,30 @@ def as_tensor(name: str, value: Any, *, floating: bool = False) -> Tensor:
         floating: also require floating-point numbers. The whole numbers of a list become such.
 
     Raises:
-        TypeError: if it is something else, has a mask, or is not of floating point; the message says what to pass instead.
+        TypeError: if it is something else, has a mask, is not of floating point, or is sparse, nested, quantised or on the
+            meta device; the message says what to pass instead.
     """
     advice = ".float()"
     if not isinstance(value, Tensor):
         value, advice = _from_numbers(name, value, floating), '.astype("float32")'
+    _check_plain(name, value)
     if floating and not value.is_floating_point():
         raise TypeError(f"{name}: expected floating-point numbers, got {value.dtype}; convert them with {advice}")
     return value
+
+
+def _check_plain(name: str, value: Any) -> None:
+    """Raise a TypeError if a tensor has no value in memory for each of its elements; anything else passes."""
+    if not isinstance(value, Tensor):
+        return
+    for odd, got, advice in (
+        (value.device.type == "meta", "one on the meta device, which has no values", "make it on another device"),
+        (value.is_nested, "a nested one", "pad it with .to_padded_tensor(0.0)"),
+        (value.layout != torch.strided, f"a sparse one ({value.layout})", "convert it with .to_dense()"),
+        (value.is_quantized, f"a quantised one ({value.dtype})", "convert it with .dequantize()"),
+    ):
+        if odd:
+            raise TypeError(f"{name}: expected a dense tensor, got {got}; {advice}")
 
 
 def moved_to(value: Tensor, *args: Any, **kwargs: Any) -> Tensor:
@@ -155,11 +172,14 @@ def _holds_tensors(value: Any) -> bool:
 def as_array(values: Any, name: str = "values") -> np.ndarray[Any, Any]:
     """A tensor's values as a NumPy array, from any device and without its gradient; lists and arrays through NumPy.
 
+    NumPy has no bfloat16: such values become float32.
+
     Raises:
-        TypeError: if it is a text, or one of our objects that holds tensors.
+        TypeError: if it is a text, one of our objects that holds tensors, or no dense tensor.
     """
     if isinstance(values, Tensor):
-        array: np.ndarray[Any, Any] = values.detach().cpu().numpy()
+        dense = as_tensor(name, values).detach().cpu()
+        array: np.ndarray[Any, Any] = (dense.float() if dense.dtype == torch.bfloat16 else dense).numpy()
         return array
     if isinstance(values, str) or any(hasattr(values, part) for part in PARTS):
         raise TypeError(f"{name}: expected numbers, got {type(values).__name__}; {_instead(values)}")
@@ -190,6 +210,9 @@ def check_range(
     name: str, value: float, low: float, high: float = float("inf"), *, closed: tuple[bool, bool] = (True, True)
 ) -> None:
     """Raise a ValueError unless `value` is a finite number between `low` and `high` (`closed`: are the ends included)."""
+    shape = tuple(getattr(value, "shape", ()))
+    if math.prod(shape) != 1:
+        raise TypeError(f"{name}: expected one number, got {type(value).__name__} of shape {shape}; pass a float")
     over = value >= low if closed[0] else value > low
     under = value <= high if closed[1] else value < high
     if not (over and under and -math.inf < value < math.inf):  # NaN fails every comparison

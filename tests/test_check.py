@@ -8,6 +8,8 @@ import torch
 from messages import tells
 
 from kfgs._check import as_array, as_tensor, check_choice, check_range, check_shapes, check_whole
+from kfgs.gaussians import Gaussians
+from kfgs.labels import LabelSet, transfer_labels
 
 
 def test_sizes_are_returned_by_name():
@@ -89,6 +91,13 @@ def test_range_prints_an_endless_side_as_open():
         check_range("near", -1, 0)
 
 
+@pytest.mark.parametrize("value", [torch.ones(3), np.zeros((2, 2)), torch.ones(0)])
+def test_a_range_is_of_one_number(value):
+    with pytest.raises(TypeError, match=tells("scale:", "one number", "shape", str(tuple(value.shape)))):
+        check_range("scale", value, 0)
+    check_range("scale", torch.tensor(1.0), 0)
+
+
 @pytest.mark.parametrize("value", [2.0, 2.5, math.nan, True, "2"])
 def test_whole_numbers_are_integers(value):
     check_whole("epochs", 2, 1)
@@ -128,6 +137,39 @@ def test_arrays_become_tensors_that_share_their_memory():
 def test_what_is_no_tensor_is_refused_with_advice(value, advice):
     with pytest.raises(TypeError, match=tells("rows", *advice)):
         as_tensor("rows", value)
+
+
+ODD = [
+    (lambda: torch.ones(3, 3).to_sparse(), ("sparse", ".to_dense()")),
+    (lambda: torch.ones(3, 3).to_sparse_csr(), ("sparse", ".to_dense()")),
+    (lambda: torch.ones(3, 3, device="meta"), ("meta device", "no values")),
+    (lambda: torch.nested.nested_tensor([torch.ones(3), torch.ones(2)]), ("nested", ".to_padded_tensor")),
+    (lambda: torch.quantize_per_tensor(torch.ones(3, 3), 0.1, 0, torch.quint8), ("quantised", ".dequantize()")),
+]
+
+
+@pytest.mark.parametrize(("make", "advice"), ODD, ids=["coo", "csr", "meta", "nested", "quantised"])
+@pytest.mark.parametrize(
+    "enter",
+    [
+        lambda odd: as_tensor("means", odd),
+        lambda odd: as_tensor("means", odd, floating=True),
+        lambda odd: as_array(odd, "means"),
+        lambda odd: check_shapes(("means", odd, "N 3")),
+        lambda odd: Gaussians(odd, torch.ones(3, 4), torch.ones(3, 3), torch.ones(3)),
+        lambda odd: transfer_labels(odd, torch.zeros(3, dtype=torch.int64), torch.ones(3, 3), 1.0),
+        lambda odd: LabelSet(("a", "b", "c"), odd),
+    ],
+    ids=["tensor", "floating", "array", "shapes", "Gaussians", "transfer_labels", "LabelSet"],
+)
+@pytest.mark.filterwarnings("ignore:.*(beta state|prototype|quantize|deprecat)")  # torch's, when such tensors are made
+def test_a_tensor_that_is_not_dense_is_refused_with_advice(make, advice, enter):
+    with pytest.raises(TypeError, match=tells("expected a dense tensor", *advice)):
+        enter(make())
+
+
+def test_numpy_has_no_bfloat16():
+    assert as_array(torch.tensor([0.5, 2.0], dtype=torch.bfloat16)).tolist() == [0.5, 2.0]
 
 
 def test_lists_of_numbers_become_tensors():

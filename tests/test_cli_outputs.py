@@ -100,6 +100,33 @@ def test_nothing_is_written_among_pictures_and_maps(place, words, room, run, cap
     assert set(room.rglob("*")) == before
 
 
+@pytest.mark.parametrize("name", ["images_4", "photos"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        "fit {room} --out {out}",
+        "uplift {room} {splat} --out {out}",
+        "features {room} --teacher lseg --out {out}",
+        "segment {run}/field --scene {room} --out {out}",
+        "label {run}/field --scene {room} --out {out}",
+        "select chair {run}/field --scene {room} --out {out}",
+        "view {run}/field --scene {room} --where html --out {out}",
+        "render {run} --scene {room} --out {out}/a.gif",
+        "edit {splat} --remove chair --scene {room} --out {out}/a.ply",
+    ],
+)
+def test_pictures_are_known_wherever_they_are_read_from(words, name, room, run, splat, tmp_path, capsys):
+    """Other names than `images`: found by kfgs itself, or named by the user."""
+    scene = tmp_path / "other"
+    shutil.copytree(room, scene)
+    (scene / "images").rename(scene / name)
+    before = set(scene.rglob("*"))
+    given = ["--images", name] if name == "photos" else []
+    arguments = [word.format(room=scene, run=run, splat=splat, out=scene / name) for word in words.split()]
+    refused([*arguments, *given], capsys, "--out:", "pictures and feature maps", scene / name)
+    assert set(scene.rglob("*")) == before
+
+
 def test_segmenting_into_the_scene_puts_no_pictures_among_its_maps(room, run, capsys):
     before = set((room / "features").iterdir())
     refused(["segment", run / "field", "--out", room], capsys, "--out:", room / "features")
@@ -272,3 +299,18 @@ def test_what_killed_commands_left_is_swept_by_the_next(splat, tmp_path):
         assert main(["convert", str(splat), str(place / "d.splat")]) == 0
         assert not (place / ".kfgs-unfinished").exists()
         shutil.rmtree(place)
+
+
+@pytest.mark.parametrize("limit", [200, 3_000, 9_000, 20_000])
+@pytest.mark.parametrize("words", ["label {run}/field", "select chair {run}/field --scene {room}"])
+def test_a_disk_that_takes_no_more_leaves_the_older_folder_whole(words, limit, room, run, tmp_path):
+    """A limit between the sizes of the files: one of them could be written."""
+    out = tmp_path / "out"
+    arguments = [*words.format(room=room, run=run).split(), "--out", str(out)]
+    done = subprocess.run([sys.executable, "-c", LIMITED, str(limit), *arguments], capture_output=True, text=True)
+    assert done.returncode == 1, done.stderr
+    (error,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert str(out) in error
+    assert "kfgs-unfinished" not in error
+    assert "Traceback" not in done.stderr
+    assert not out.exists() or not list(out.iterdir())

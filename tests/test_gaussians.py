@@ -1,4 +1,6 @@
 import copy
+import re
+from itertools import combinations
 from types import SimpleNamespace
 
 import numpy as np
@@ -6,7 +8,11 @@ import pytest
 import torch
 from messages import tells
 
+from kfgs.cameras import Camera, Similarity
+from kfgs.formats import read_splats, write_splats
 from kfgs.gaussians import Gaussians
+from kfgs.labels import transfer_labels
+from kfgs.splat import rasterize, transform_gaussians
 
 
 def cloud(count=4, features=2, degree=None, labelled=True, seed=0):
@@ -202,12 +208,63 @@ def test_a_device_that_is_not_there_is_a_clear_error():
 
 
 def test_mixed_types_are_named_where_they_meet():
-    from kfgs.cameras import Camera
-    from kfgs.splat import rasterize
-
     camera = Camera(torch.eye(4), torch.tensor([[9.0, 0, 8], [0, 9, 8], [0, 0, 1]]), 16, 16)
     mixed = cloud().replace(features=torch.zeros(4, 2, dtype=torch.float64))
     with pytest.raises(
         ValueError, match=tells("features", "float32", "from gaussians.means", "got torch.float64", ".to(")
     ):
         rasterize(mixed, camera)
+
+
+ENDINGS = (".ply", ".splat", ".spz", ".sog", ".glb", ".compressed.ply")
+NUMBERS = ("means", "quats", "scales", "opacities", "sh", "features")
+MIXED = [("float64", chosen) for count in range(1, 7) for chosen in combinations(NUMBERS, count)]
+MIXED += [(short, (name,)) for short in ("float16", "bfloat16") for name in NUMBERS]
+
+
+def _written(cloud, path):
+    write_splats(path, cloud.replace(features=None))
+    return read_splats(path).gaussians.means
+
+
+@pytest.mark.parametrize(
+    ("dtype", "chosen"), MIXED, ids=lambda value: value if isinstance(value, str) else "+".join(value)
+)
+def test_gaussians_of_mixed_types_give_the_same_or_name_what_differs(dtype, chosen, tmp_path):
+    generator = torch.Generator().manual_seed(3)
+    shapes = {
+        "means": (6, 3),
+        "quats": (6, 4),
+        "scales": (6, 3),
+        "opacities": (6,),
+        "sh": (6, 4, 3),
+        "features": (6, 2),
+    }
+    # of few bits, so that float16 holds every value
+    parts = {name: torch.randint(1, 8, size, generator=generator) / 8 for name, size in shapes.items()}
+    parts["means"] = parts["means"] + torch.tensor([0.0, 0, 2])
+    whole = Gaussians(**parts, labels=torch.arange(6) % 2)
+    mixed = whole.replace(**{name: parts[name].to(getattr(torch, dtype)) for name in chosen})
+    camera = Camera(torch.eye(4), torch.tensor([[9.0, 0, 8], [0, 9, 8], [0, 0, 1]]), 16, 16)
+    twice = Similarity(2.0, torch.eye(3), torch.zeros(3))
+    operations = {
+        "colours": (("features",), lambda cloud: rasterize(cloud.replace(features=None), camera).map),
+        "features": (("sh",), lambda cloud: rasterize(cloud.replace(sh=None), camera).map),
+        "transform": ((), lambda cloud: transform_gaussians(cloud, twice).means),
+        "select": ((), lambda cloud: cloud[cloud.opacities > 0.4].scales),
+        "to": ((), lambda cloud: cloud.to(torch.float32).quats),
+        "transfer": ((), lambda cloud: transfer_labels(cloud.means, cloud.labels, parts["means"], 0.5).labels),
+        "numpy": ((), lambda cloud: torch.as_tensor(cloud.to_numpy()["sh"])),
+        **{ending: ((), lambda cloud, ending=ending: _written(cloud, tmp_path / f"a{ending}")) for ending in ENDINGS},
+    }
+    for name, (unused, operation) in operations.items():
+        refused = None
+        try:
+            found = operation(mixed)
+        except ValueError as error:
+            refused = str(error)
+        if refused is None:
+            assert torch.allclose(found.double(), operation(whole).double(), atol=1e-5), name
+        else:
+            assert (set(NUMBERS) - set(unused)) & set(chosen), f"{name}: {refused}"
+            assert re.search(tells("gaussians.", "expected torch.", "got torch.", "convert"), refused), name

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,8 @@ class Job:
     """Fill `work/` (second argument) from the fixture (first argument)."""
     fields: tuple[str, ...] = ()
     """Field folders in `work/`, which are compared by their reader: their files may be between old and new."""
+    shown: tuple[str, ...] = ()
+    """Files that may be missing between the old ones and the new ones: they show one field and are gone while it changes."""
     loose: tuple[str, ...] = ()
     """Endings of files whose bytes differ between two undisturbed runs, because they tell the time."""
     idle: bool = False
@@ -91,14 +94,18 @@ def _with(
 
 
 def _in_python(function: Callable[[], int | None]) -> Work:
-    """A function of Python, out of which Ctrl-C comes as a KeyboardInterrupt, as one that ends like a command."""
+    """A function of Python, whose refusals and KeyboardInterrupt are exceptions, as one that ends like a command."""
 
     def work() -> int:
         try:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
             return function() or 0
         except KeyboardInterrupt:
             print("interrupted")
             return 130
+        except (ValueError, OSError) as error:
+            print(f"error: {error}")
+            return 1
 
     return work
 
@@ -163,7 +170,7 @@ def all_jobs() -> list[Job]:
         Job(
             "unpack",
             command("pack", "in/packed.kfgs.safetensors", "work/field"),
-            _with(notes=("notes.txt", "field/notes.txt")),
+            _with(),
             fields=("field",),
         ),
         Job(
@@ -219,6 +226,7 @@ def all_jobs() -> list[Job]:
             _restore,
             _with(files={"run": "two"}, notes=("run/field/mine.ply",)),
             fields=("run/field",),
+            shown=("run/report.html", "run/preview.png"),
         ),
         Job(
             "fit by the paper",

@@ -84,7 +84,7 @@ class Bench:
             yield f"unreadable: {type(error).__name__}: {str(error)[:300]}"
             return
         for name, value in known.old.items():
-            if name not in now and name in known.new:
+            if name not in now and name in known.new and name not in job.shown:
                 yield f"lost: {name}"
             elif name not in known.new and now.get(name) != value:
                 yield f"changed a file that the command does not write: {name}"

@@ -58,8 +58,8 @@ class Process:
         if self.pid == 0:
             code = 70
             try:
+                _count_events(counts, kill_at, self.log)
                 _prepare(folder, self.log, limit)
-                _count_events(counts, kill_at)
                 code = work() or 0
             except SystemExit as error:
                 code = error.code if isinstance(error.code, int) else 1
@@ -103,9 +103,11 @@ class Process:
 def _prepare(folder: Path, log: Path, limit: int | None) -> None:
     import resource
 
+    from kfgs._interrupts import end_at_once
+
     os.setpgid(0, 0)
     os.chdir(folder)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGINT, end_at_once)  # the first thing that `kfgs` does
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(out, 1)
@@ -115,8 +117,11 @@ def _prepare(folder: Path, log: Path, limit: int | None) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
 
-def _count_events(counts: int, kill_at: int | None) -> None:
-    """Write a byte for each change of the file system that begins, and kill this process before the chosen one."""
+def _count_events(counts: int, kill_at: int | None, log: Path) -> None:
+    """Write a byte for each change of the file system that begins, and kill this process before the chosen one.
+
+    Opening the log is none: when it is there, signals may come.
+    """
     seen = 0
     os.set_blocking(counts, False)  # after 64 KiB further events are not counted
 
@@ -124,7 +129,7 @@ def _count_events(counts: int, kill_at: int | None) -> None:
         nonlocal seen
         if event == "open":
             path, _, flags = arguments
-            if not isinstance(flags, int) or not flags & WRITES or str(path).startswith(("/dev/", "/proc/")):
+            if not isinstance(flags, int) or not flags & WRITES or str(path).startswith(("/dev/", "/proc/", str(log))):
                 return
         elif not CHANGES.match(event):
             return
@@ -138,11 +143,11 @@ def _count_events(counts: int, kill_at: int | None) -> None:
 
 
 def command(*words: str) -> Work:
-    """`kfgs` with these words."""
+    """`kfgs` with these words, as a shell starts it."""
+    from kfgs.__main__ import run
 
     def work() -> int:
-        from kfgs.cli import main
-
-        return main(list(words))
+        sys.argv = ["kfgs", *words]
+        return run()
 
     return work

@@ -8,7 +8,16 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from .atomic import HIDDEN, FullDiskError, atomic_folder, atomic_path, current_file, finish_writing, hidden_folder
+from .atomic import (
+    HIDDEN,
+    FullDiskError,
+    atomic_folder,
+    atomic_path,
+    current_file,
+    finish_writing,
+    hidden_folder,
+    open_current,
+)
 from .locks import locked
 from .paths import as_path, check_output
 
@@ -26,6 +35,7 @@ __all__ = [
     "finish_writing",
     "hidden_folder",
     "locked",
+    "open_current",
     "parse_json",
     "read_json",
     "seconds_in_words",

@@ -5,20 +5,25 @@ A lock shows that its writer lives; the next writer beside it deletes what other
 
 A folder that holds files already stays, with everything in it that the new content does not replace. The new content moves to
 `FOLDER/.kfgs-unfinished/waiting` in one step, and from there its files move to their places one by one. From that step on,
-`current_file` finds the new ones, before it the old ones, and the next writer finishes what a killed one began.
+`current_file` finds the new ones, before it the old ones, and the next writer finishes what a killed one began. A reader of
+several files uses `open_current`.
 """
 
 from __future__ import annotations
 
 import errno
+import math
 import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
+from .former import sweep_former
 from .locks import try_lock
 from .paths import as_path
 
@@ -27,7 +32,9 @@ ATTEMPTS = 100  # to put a folder where other processes put theirs
 FULL = (errno.ENOSPC, errno.EDQUOT)
 UNNAMED = (*FULL, errno.EIO, errno.EFBIG, errno.EROFS)  # errors of writing, which Python raises without a file
 SHORT = "requested and"  # in the message of numpy
-NOTHING = 1 << 14  # bytes: a disk with less is full
+LEAST = 1 << 14  # bytes: a disk with less is full
+
+T = TypeVar("T")
 
 
 class FullDiskError(OSError):
@@ -56,6 +63,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         new = place / target.name
         yield new
         _make_ordinary(new)
+        sweep_former(target, new)
         os.replace(new, target)
 
 
@@ -67,13 +75,17 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     `current_file`. A link to a folder stays a link.
     """
     target = Path(os.path.realpath(as_path(path)))
-    with hidden_folder(target if _is_used(target) else target.parent, as_path(path)) as place:
+    used = _is_used(target)
+    if used:  # a writer that made it may have been killed when it was there
+        _tidy(target.parent / HIDDEN)
+    with hidden_folder(target if used else target.parent, as_path(path)) as place:
         new = place / "new"
         new.mkdir(mode=0o777 & ~UMASK)
         yield new
         for file in new.rglob("*"):
             if file.is_file() and not file.is_symlink():
                 _make_ordinary(file)
+        sweep_former(target, new)
         _put(new, target)
 
 
@@ -81,6 +93,54 @@ def current_file(folder: Path, name: str) -> Path:
     """Where a file of a folder is that `atomic_folder` wrote, also if its writer was killed while moving the files."""
     waiting = folder / HIDDEN / WAITING / name
     return waiting if waiting.exists() else folder / name
+
+
+def open_current(folder: Path, read: Callable[[Callable[[str], Path]], T]) -> T:
+    """Read several files of a folder that `atomic_folder` wrote, all of them old or all new.
+
+    Args:
+        folder: the folder.
+        read: reads the files and returns what is in them. It is given a function that finds a file by its name, as
+            `current_file` does. It is called again if a file that it found was replaced meanwhile.
+
+    Raises:
+        ValueError: if another process replaces the files all the time.
+        Exception: what `read` raises while no file is replaced.
+    """
+    for _ in range(ATTEMPTS):
+        marks: dict[str, object] = {}
+        try:
+            result = read(partial(_find, folder, marks))
+        except (OSError, ValueError):
+            if not _replaced(folder, marks):
+                raise
+        else:
+            if not _replaced(folder, marks):
+                return result
+    raise ValueError(
+        f"{folder}: expected files that stay while they are read, got a folder that another process writes to all the time; "
+        "wait until it has ended"
+    )
+
+
+def _find(folder: Path, marks: dict[str, object], name: str) -> Path:
+    """The current file of a name; `marks` learns which one it is."""
+    file = current_file(folder, name)
+    marks.setdefault(name, _mark(file))
+    return file
+
+
+def _replaced(folder: Path, marks: dict[str, object]) -> bool:
+    return any(_mark(current_file(folder, name)) != mark for name, mark in marks.items())
+
+
+def _mark(file: Path) -> tuple[object, ...]:
+    """Something that changes when another file takes the place of this one."""
+    try:
+        about = file.stat()
+    except OSError:
+        return (file,)
+    return file, about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns
 
 
 @contextmanager
@@ -152,6 +212,13 @@ def _sweep(hidden: Path) -> None:
             os.close(handle)
 
 
+def _tidy(hidden: Path) -> None:
+    """Sweep a folder, and delete it if nothing is left in it."""
+    with suppress(OSError):  # another process works in it, or it may not be changed
+        _sweep(hidden)
+        hidden.rmdir()
+
+
 def _discard(place: Path) -> None:
     """Delete a hidden folder; its lock last, so that it can be deleted again after a kill."""
     with suppress(OSError):
@@ -193,9 +260,7 @@ def finish_writing(folder: Path) -> None:
     hidden = folder / HIDDEN
     if hidden.is_dir():
         _settle(folder)
-        _sweep(hidden)
-        with suppress(OSError):  # another process works in it
-            hidden.rmdir()
+        _tidy(hidden)
 
 
 def _settle(folder: Path) -> None:
@@ -243,14 +308,15 @@ def _make_ordinary(file: Path) -> None:
 
 def _retold(error: Exception, place: Path, target: Path) -> OSError | None:
     """An error of writing as one that names `target`; None if it can be raised as it is."""
-    if isinstance(error, FullDiskError | ValueError | TypeError | LookupError):
+    text, told = str(error), isinstance(error, FullDiskError)
+    if isinstance(error, ValueError | TypeError | LookupError) or (told and str(place) not in text):
         return None
-    text = str(error)
     rust = re.search(r"\(os error (\d+)\)", text)  # of safetensors
     code = int(rust[1]) if rust else getattr(error, "errno", None)
-    if code in FULL or SHORT in text or _free(place) < NOTHING:
+    free = _free(place)
+    if told or code in FULL or SHORT in text or free < LEAST:
         return FullDiskError(
-            f"{target}: expected space on the disk to write it, got {_free(place):,} bytes free; free some (or raise the "
+            f"{target}: expected space on the disk to write it, got {free:,} bytes free; free some (or raise the "
             "limit on files), or choose another disk"
         )
     unnamed = code in UNNAMED and getattr(error, "filename", None) is None
@@ -259,7 +325,8 @@ def _retold(error: Exception, place: Path, target: Path) -> OSError | None:
     return None
 
 
-def _free(place: Path) -> int:
+def _free(place: Path) -> float:
+    """Bytes that are free on the disk of a folder; infinitely many if the system does not say."""
     with suppress(OSError):
         return shutil.disk_usage(next(folder for folder in (place, *place.parents) if folder.is_dir())).free
-    return NOTHING
+    return math.inf

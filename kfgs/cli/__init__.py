@@ -13,16 +13,14 @@ import inspect
 import os
 import re
 import shutil
-import signal
 import sys
 import textwrap
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any, get_type_hints
 
 import tyro
 
+from .._interrupts import interruptible
 from .blocks import blocks, join
 from .evaluate import compare, evaluate
 from .features import features, plan
@@ -82,7 +80,7 @@ def main(arguments: list[str] | None = None) -> int:
         return _in_options(message, names)
 
     try:
-        with _interrupts(), warnings_as_notes(spoken), said_on_stderr():
+        with interruptible(), warnings_as_notes(spoken), said_on_stderr():
             names |= _shown_names(command)
             command.__doc__ = re.sub(
                 r"\n {8,}(?!kfgs)", " ", inspect.getdoc(command) or ""
@@ -98,30 +96,6 @@ def main(arguments: list[str] | None = None) -> int:
         say(f"error: {spoken(str(error))}", sys.stderr)
         return 1
     return 0
-
-
-@contextmanager
-def _interrupts() -> Iterator[None]:
-    """Make Ctrl-C a KeyboardInterrupt even where a C++ module that loads (numpy, torch) turns it into another error."""
-    came: list[int] = []
-
-    def note(number: int, frame: Any) -> None:
-        came.append(number)
-        signal.default_int_handler(number, frame)
-
-    usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    noted = usual and threading.current_thread() is threading.main_thread()
-    if noted:
-        signal.signal(signal.SIGINT, note)
-    try:
-        yield
-    except Exception as error:
-        if came:
-            raise KeyboardInterrupt from error
-        raise
-    finally:
-        if noted:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _expand_home(word: str) -> str:

@@ -10,7 +10,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from .files import check_file, check_folder, is_field
+from .._files import check_output
+from .files import is_field
 from .options import Classes, Flag, Given, GivenRule, Name, Positional, Several, Teacher
 from .output import say, wrote
 
@@ -60,7 +61,7 @@ def evaluate(
     from ..pipeline.question import open_question
 
     if out is not None:
-        check_file("out", out)
+        check_output("out", out, "a file")
     check_kind(field, protocol)
     classes = with_scene(classes, field)
     encode = find_encoder(teacher, classes, field)
@@ -128,7 +129,7 @@ def compare(
 
     check_range("pictures", pictures, 0)
     if out is not None:
-        check_folder("out", out)
+        check_output("out", out, "a folder")
     results = Results.read(runs, with_file)
     protocol = protocol or (results.first.report.protocol if results.first else "kfgs-pooled/1")
     results.check(protocol)

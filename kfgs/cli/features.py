@@ -7,7 +7,8 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
-from .files import check_alone, check_file, check_folder
+from .._files import check_output
+from .files import check_alone
 from .options import Device, FieldMethod, Flag, Given, GivenLevel, Level, MapTeacher, SceneFolder, Views, fit_config
 from .output import say, wrote
 
@@ -44,6 +45,7 @@ def features(
         device: Where the teacher runs: auto (a GPU if there is one), cpu or cuda.
     """
     from ..features import FeatureFolder, extract_features
+    from ..scenes.load import picture_folders
 
     if check is not None:
         for name, given in (("teacher", teacher.teacher), ("weights", teacher.weights), ("out", out)):
@@ -52,7 +54,7 @@ def features(
         check_alone("level", level, "without --check; it is of LangSplat's maps")
     target = out if out is not None else scene_folder(scene) / "features"
     if check is None:
-        check_folder("out", target, None, scene_folder(scene) / "images", views.images)
+        check_output("out", target, "a folder", apart=picture_folders(scene, views.images))
     loaded = views.load(scene)
     if check is not None:
         found = FeatureFolder(check, level=level or "default").check(loaded, views.split)
@@ -104,7 +106,7 @@ def plan(
     from ..scenes import load_scene
 
     if out is not None:
-        check_file("out", out)
+        check_output("out", out, "a file")
     if features is not None and not features.is_dir():
         raise ValueError(f"features: expected a folder of maps, got {features}, which is none; leave --features out")
     config = fit_config(method, steps=steps, split=views.split)

@@ -2,32 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
+
+from .._files import check_output
 
 # Heavy imports happen inside the functions, so that `kfgs --help` answers at once.
 
 
-def check_file(name: str, target: Path, scene: Path | None = None) -> None:
-    """Check that a file can be written, and does not lie among the pictures or maps of a scene.
+def inputs_of(scene: Path | None, images: Path | None = None) -> Iterator[Path]:
+    """The folders of a scene (a folder, or its transforms.json) from which pictures and feature maps are read.
 
-    Raises:
-        ValueError, OSError: see `check_output`.
+    For the `apart` of `check_output`, which asks for them after its other checks.
     """
-    from .._files import check_output
+    from ..scenes.load import picture_folders
 
-    check_output(name, target, "a file", apart=_of_scene(scene))
-
-
-def check_folder(name: str, target: Path, scene: Path | None = None, *others: Path | None) -> None:
-    """The same for a folder, which is none of `others` either."""
-    from .._files import check_output
-
-    check_output(name, target, "a folder", apart=_of_scene(scene), other=others)
+    if scene is not None:
+        yield (scene if scene.is_dir() else scene.parent) / "features"
+        yield from picture_folders(scene, images)
 
 
-def check_target(name: str, target: Path, *sources: Path, scene: Path | None = None) -> None:
-    """Raise a ValueError unless `target` can become a splat file that overwrites none of the sources; see `check_file`."""
+def check_target(name: str, target: Path, *sources: Path, apart: Iterable[Path] = ()) -> None:
+    """Raise a ValueError unless `target` can become a splat file that overwrites none of the sources; see `check_output`."""
     from ..formats import formats
 
     endings = tuple(ending for one in formats().values() if hasattr(one, "write") for ending in one.SUFFIXES)
@@ -36,7 +33,7 @@ def check_target(name: str, target: Path, *sources: Path, scene: Path | None = N
             f"{name}: expected a file whose name ends in one of {', '.join(endings)}, got {target}; "
             "the ending chooses the format"
         )
-    check_file(name, target, scene)
+    check_output(name, target, "a file", apart=apart)
     for source in sources:
         if target.resolve() == source.resolve():
             raise ValueError(f"{name}: expected another file than {source}, got the same; give another name")
@@ -92,9 +89,3 @@ def open_splats(name: str, path: Path, *, labelled: bool = False) -> Any:
     if labelled and splats.gaussians.labels is None:
         raise ValueError(f"{name}: expected a splat with classes, got {path} without; `kfgs attach` gives it some")
     return splats
-
-
-def _of_scene(scene: Path | None) -> list[Path]:
-    """The folders of a scene (a folder, or its transforms.json) from which pictures and maps are read."""
-    root = None if scene is None else scene if scene.is_dir() else scene.parent
-    return [] if root is None else [root / "images", root / "features"]

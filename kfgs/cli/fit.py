@@ -8,8 +8,9 @@ import shlex
 from pathlib import Path
 from typing import Any, Literal
 
+from .._files import check_output
 from .features import check_discard, choose_teacher, stored_maps
-from .files import check_alone, check_folder, is_field, open_field, open_splats
+from .files import check_alone, inputs_of, is_field, open_field, open_splats
 from .options import FieldMethod, Flag, Given, Maps, MapTeacher, Positional, SceneFolder, Training, Views, fit_config
 from .output import called, say, wrote
 
@@ -32,7 +33,7 @@ def demo(out: Path = Path("kfgs_demo"), seed: int = 0) -> None:
     from ..pipeline import demo as run_demo
     from ..toy.room_folder import ToyConfig
 
-    check_folder("out", out)
+    check_output("out", out, "a folder")
     wrote(run_demo.run(out, fit_config(FieldMethod(), seed=seed), room=ToyConfig(seed=seed), report=say, progress=True))
     say(f"next: kfgs view {out / 'run' / 'field'} --scene {out / 'scene'} --color {out / 'color.ply'}")
 
@@ -65,7 +66,7 @@ def sfm(
     """
     from ..scenes import SfmConfig, run_sfm
 
-    check_folder("out", out, None, images)
+    check_output("out", out, "a folder", other=[images])
 
     config = SfmConfig(
         matching=matching,
@@ -124,7 +125,7 @@ def fit(
         method, seed=training.seed, steps=training.steps, max_gaussians=training.max_gaussians, split=views.split
     )
     config = dataclasses.replace(config, undistorted_features=maps.undistorted_features, device=training.device)
-    check_folder("out", out, scene, views.images, maps.features)
+    check_output("out", out, "a folder", apart=inputs_of(scene, views.images), other=[maps.features])
     if method.method == "paper":
         check_alone("splat", splat, "with --method paper, which trains its own Gaussians")
     elif splat is not None:
@@ -188,7 +189,7 @@ def uplift(
     from ..pipeline import FitConfig
     from ..pipeline.fuse import uplift as uplift_scene
 
-    check_folder("out", out, scene, views.images, maps.features)
+    check_output("out", out, "a folder", apart=inputs_of(scene, views.images), other=[maps.features])
     check_place(out)
     as_taken = views.load(scene)
     loaded = as_taken.undistorted()
@@ -230,7 +231,7 @@ def color(
     from ..pipeline.compare import PhotoPictures
 
     check_whole("pictures", pictures, 0)
-    check_folder("out", out, scene, views.images)
+    check_output("out", out, "a folder", apart=inputs_of(scene, views.images))
     config = {"quick": ColorConfig.quick, "cpu": ColorConfig.cpu, "paper": ColorConfig.paper}[preset]()
     fields = config.field if training.steps is None else config.field.with_steps(training.steps)
     if training.max_gaussians is not None:

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from .files import check_alone, check_file, check_folder, open_field
+from .._files import check_output
+from .files import check_alone, open_field
 from .options import Classes, GivenPrecision, Positional
 from .output import say, wrote
 
@@ -50,19 +51,15 @@ def pack(
             errors of each are printed, and kept in the file. All but lossless sort the Gaussians.
         scores: What `kfgs evaluate --out` wrote about this field: its scores travel in the file. Can be given several times.
     """
-    from ..fields.store import SUFFIX, check_place, describes_field
+    from ..fields.store import SUFFIX, check_place, describes_field, holds_field
     from ..labels.questions import class_rows
 
     classes.check_images()
     single = out.name.endswith(SUFFIX)
-    (check_file if single else check_folder)("out", out)
+    check_output("out", out, "a file" if single else "a folder")
     if out.resolve() == field.resolve():
         raise ValueError(f"out: expected another place than {field}, got the same; give another name")
     check_place(out)
-    if not single and describes_field(out):  # of a run folder, perhaps: it may have cost hours
-        raise ValueError(
-            f"out: expected a new folder, got {out}, which holds a field; give another name, or rename that one"
-        )
     if not single:
         check_alone("precision", precision, f"for a folder, which keeps every bit; a file ends in {SUFFIX}")
     opened = open_field("field", field)
@@ -73,6 +70,12 @@ def pack(
     if scores:
         kept = [*_listed(opened.info.get("scores")), *(_read_scores(path) for path in scores)]
         opened = dataclasses.replace(opened, info={**opened.info, "scores": kept})
+    if (
+        not single and describes_field(out) and not holds_field(out, vars(opened))
+    ):  # of a run, perhaps: it may have cost hours
+        raise ValueError(
+            f"out: expected a new folder, got {out}, which holds another field; give another name, or rename that one"
+        )
     opened.save(out, (precision or "small") if single else None)
     if single:
         _tell(out, opened)

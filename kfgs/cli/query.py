@@ -6,7 +6,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
-from .files import check_alone, check_folder, is_field, open_field, open_splats
+from .._files import atomic_folder, check_output
+from .files import check_alone, inputs_of, is_field, open_field, open_splats
 from .options import Classes, Given, Positional, Teacher
 from .output import say, say_counts, wrote
 from .text import ask
@@ -59,7 +60,7 @@ def select(
     if not source.exists() and Path(query).exists():
         raise ValueError(f"query, source: expected a class, then a file, got {query!r}, {str(source)!r}; swap them")
     if out is not None:
-        check_folder("out", out, classes.scene)
+        check_output("out", out, "a folder", apart=inputs_of(classes.scene, classes.images))
     if threshold is not None:
         check_range("threshold", threshold, 0, 1)
     classes.check_images()
@@ -68,7 +69,7 @@ def select(
     if asked_by_text:
         field = classes.open_field("source", source)
         if out is not None and classes.scene is None:
-            check_folder("out", out, _remembered(field))
+            check_output("out", out, "a folder", apart=inputs_of(_remembered(field)))
         label_set, target = ask(query, classes, teacher, field)
         query = target if isinstance(target, str) else query
         how = None if score == "auto" else score
@@ -92,8 +93,13 @@ def select(
             raise ValueError(
                 f"query: expected Gaussians to save, got none of {query!r}; lower the threshold or drop --out"
             )
-        written = _save(out, query, cloud, found, things)
-        wrote([*written, *_draw(out / "parts.png", query, cloud.gaussians, things, cameras, scene)])
+        with atomic_folder(out) as new:
+            _save(new, query, cloud, found, things)
+            _draw(new / "parts.png", query, cloud.gaussians, things, cameras, scene)
+            written = sorted(path.name for path in new.iterdir())
+        for name in {"parts.png", "selection.ply.classes.json"} - set(written):
+            (out / name).unlink(missing_ok=True)  # of an older selection
+        wrote([out / name for name in written])
 
 
 def segment(
@@ -128,7 +134,7 @@ def segment(
     from ..pipeline.apply import SEGMENTED
     from ..viz import plot_iou, plot_largest_confusions
 
-    check_folder("out", out)
+    check_output("out", out, "a folder")
     loaded_field = open_field("field", field)
     scene = recall_scene(loaded_field.info, loaded_field.folder) if classes.scene is None else classes.scene
     classes = dataclasses.replace(classes, scene=scene)
@@ -214,14 +220,13 @@ def label(
     ):
         if value is not None and needed is None:
             raise ValueError(f"{name}: expected --{other} with it, got none; it would have no effect")
-    check_folder("out", out, classes.scene)
+    check_output("out", out, "a folder", apart=inputs_of(classes.scene, classes.images))
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
     loaded = classes.open_field("field", field)
     label_set = classes.of_field(loaded)
     carried = None if cloud is None else read_cloud(cloud)
-    targets = [out / "gaussians.ply"] + ([] if cloud is None else [out / "cloud.ply"])
-    if cloud is not None and cloud.resolve() in {target.resolve() for target in targets}:
+    if cloud is not None and cloud.resolve() in {(out / name).resolve() for name in ("gaussians.ply", "cloud.ply")}:
         raise ValueError(f"out: expected another folder than that of --cloud, got {out}; {cloud} would be overwritten")
     if query is None:
         labels, scores = loaded.classify(label_set, rule=rule)
@@ -233,14 +238,15 @@ def label(
         how = f"{query}: {len(found)} Gaussians above gamma = {found.threshold:.4f} ({found.how})"
     gaussians = loaded.gaussians.replace(labels=labels)
     say(f"labelled by {how}")
-    written = save_labelled(targets[0], gaussians, scores, label_set, rule=how)
     if query is None:
         say_counts(labels, label_set.names)
-    if carried is not None:
-        moved, paths = label_cloud(gaussians, carried, targets[1], label_set, distance=distance)
-        say(str(moved))
-        written += paths
-    wrote(written)
+    with atomic_folder(out) as new:
+        save_labelled(new / "gaussians.ply", gaussians, scores, label_set, rule=how)
+        if carried is not None:
+            moved, _ = label_cloud(gaussians, carried, new / "cloud.ply", label_set, distance=distance)
+            say(str(moved))
+        written = sorted(path.name for path in new.iterdir())
+    wrote([out / name for name in written])
 
 
 def info(path: Positional[Path]) -> None:
@@ -258,15 +264,15 @@ def info(path: Positional[Path]) -> None:
     say(describe(path))
 
 
-def _save(out: Path, query: str, cloud: Any, found: Any, things: list[Any]) -> list[Path]:
+def _save(folder: Path, query: str, cloud: Any, found: Any, things: list[Any]) -> None:
     """Write a selection as numbers (JSON) and as Gaussians (PLY)."""
     from .._files import write_json
     from ..formats import write_splats
 
     parts = [thing.to_json() for thing in things]
     facts = {"query": query, "threshold": found.threshold, "how": found.how, "count": len(found), "parts": parts}
-    write_json(out / "selection.json", facts)
-    return [out / "selection.json", *write_splats(out / "selection.ply", cloud.select(found.mask)).paths]
+    write_json(folder / "selection.json", facts)
+    write_splats(folder / "selection.ply", cloud.select(found.mask))
 
 
 def _scene_of(field: Any, classes: Classes) -> Any:
@@ -292,7 +298,7 @@ def _remembered(field: Any) -> Path | None:
         return None
 
 
-def _draw(path: Path, query: str, gaussians: Any, things: list[Any], cameras: Any, scene: Any) -> list[Path]:
+def _draw(path: Path, query: str, gaussians: Any, things: list[Any], cameras: Any, scene: Any) -> None:
     """Draw the parts over photographs; without them over the cloud's own colours, if it has some."""
     from ..pipeline.part_pictures import write_parts
     from ..viz import show_cloud
@@ -300,8 +306,7 @@ def _draw(path: Path, query: str, gaussians: Any, things: list[Any], cameras: An
 
     under = None if gaussians.sh is None else show_cloud(gaussians, color_by="rgb")
     under = under if scene is None else Photos(scene)
-    drawn = write_parts(path, gaussians, things, cameras or (), under, query)
-    return [] if drawn is None else [drawn]
+    write_parts(path, gaussians, things, cameras or (), under, query)
 
 
 def _negatives(negatives: Negatives, score: Score) -> Negatives:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from .files import check_file, is_field, open_splats
+from .._files import check_output
+from .files import inputs_of, is_field, open_splats
 from .options import Classes, Given, Positional, Teacher
 from .output import say, wrote
 from .view import open_meaning
@@ -56,7 +57,7 @@ def render(
     from ..viz import save_animation
     from ..viz.animation import SUFFIXES, check_target
 
-    check_file("out", out, classes.scene)
+    check_output("out", out, "a file", apart=inputs_of(classes.scene, classes.images))
     if out.suffix.lower() not in SUFFIXES:
         raise ValueError(f"out: expected a name that ends in .gif or .mp4, got {out.name!r}; rename it")
     check_target(out, fps)

@@ -8,8 +8,9 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal
 
+from .._files import check_output
 from .edit_syntax import Edits, check_parts, inserted_files, parse_edits
-from .files import check_alone, check_file, check_target, open_splats
+from .files import check_alone, check_target, inputs_of, open_splats
 from .options import Classes, Flag, Given, GivenBy, Positional, SceneOption, Several
 from .output import say, say_counts, say_lost, wrote
 
@@ -59,7 +60,7 @@ def attach(
     from ..pipeline.attach import attach as attach_field
     from ..scenes import SceneError, load_scene
 
-    check_target("out", out, splats, scene=classes.scene)
+    check_target("out", out, splats, apart=inputs_of(classes.scene, classes.images))
     classes.check_images()
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
@@ -121,7 +122,7 @@ def edit(
     from ..labels.edits import EditList
     from ..pipeline.compare import views_of_edits, write_comparison
 
-    check_target("out", out, splats, scene=scene.scene)
+    check_target("out", out, splats, apart=inputs_of(scene.scene, scene.images))
     saved = _edits_beside(out, replay)
     check_whole("pictures", pictures, 0)
     if scene.scene is None:
@@ -192,7 +193,7 @@ def _apply(edits: Any, splats: Any, asked: list[str]) -> Any:
 def _edits_beside(out: Path, replay: Path | None) -> Path:
     """The file for the edits of a splat file; a ValueError if it is the file to replay, or cannot be written."""
     saved = out.with_suffix(".edits.json")
-    check_file("out", saved)
+    check_output("out", saved, "a file")
     if replay is not None and replay.resolve() == saved.resolve():
         raise ValueError(
             f"replay: expected another file than {saved}, where the edits behind {out} are saved, got the same; give --out "

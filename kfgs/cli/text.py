@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from .files import check_alone, check_file, open_field
+from .._files import check_output
+from .files import check_alone, open_field
 from .options import Classes, Flag, Given, Name, Positional, Teacher
 from .output import say, wrote
 
@@ -54,7 +55,7 @@ def text(
 
     if out.suffix != SUFFIX or out.is_dir():
         raise ValueError(f"out: expected a file whose name ends in {SUFFIX}, got {out}; give another name")
-    check_file("out", out)
+    check_output("out", out, "a file")
     if examples is not None:
         for name, given in ({"names": names, "templates": templates} | dataclasses.asdict(teacher)).items():
             check_alone(name, given, "with --examples, which replace words")

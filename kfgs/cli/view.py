@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from .files import check_alone, check_folder, is_field, open_splats
+from .._files import check_output
+from .files import check_alone, inputs_of, is_field, open_splats
 from .options import Classes, Given, Positional, Teacher
 from .output import say, wrote
 from .text import note_other_teacher, text_encoder
@@ -70,7 +71,7 @@ def view(
     """
     place = "browser" if where == "auto" else where
     if where in ("html", "picture") or out.exists():  # the others write only when asked
-        check_folder("out", out, classes.scene)
+        check_output("out", out, "a folder", apart=inputs_of(classes.scene, classes.images))
     read = functools.partial(_read, source, color, ask, distance, classes, teacher)
     if place == "browser":
         key = functools.partial(_key, source, color, ask, distance, classes, teacher, display.show)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Mapping
-from contextlib import nullcontext, suppress
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +12,7 @@ from torch import Tensor
 
 from .._arrays import read_safetensors
 from .._check import check_choice
-from .._files import as_path, atomic_folder, atomic_path, current_file, digest_file, read_json, write_json
+from .._files import as_path, atomic_folder, atomic_path, current_file, digest_file, open_current, read_json, write_json
 from .._tensors import save_tensors
 from ..cameras import Camera
 from ..gaussians import Gaussians
@@ -31,7 +29,6 @@ FORMAT, VERSIONS = "kfgs.semantic_field", (1, 2, 3)
 TENSORS, DESCRIPTION = "field.safetensors", "field.json"
 SUFFIX = ".kfgs.safetensors"
 """Of a field in one file."""
-ATTEMPTS = 5  # to read a folder that other processes write to
 
 
 def find_field(path: str | Path) -> Path | None:
@@ -61,18 +58,35 @@ def save_field(path: str | Path, parts: Mapping[str, Any], precision: str | Roun
             "precision out to write a folder"
         )
     check_place(path)
-    parts = {**parts, "info": rebased(check_notes(parts["info"]), parts["folder"], path)}
     if single:
+        parts = _moved(parts, path)
         data = pack_parts({**parts, "words": _words(parts, path)}, precision or "lossless")
         with atomic_path(path) as temporary:
             temporary.write_bytes(data)
         return
-    tensors, description = _to_tensors(parts)
+    tensors, description = _to_tensors(_moved(parts, path))
     with atomic_folder(path) as folder:
         save_tensors(folder / TENSORS, tensors)
         version = VERSIONS[-1] if "words" in description else VERSIONS[-2]
         about = {"format": FORMAT, "version": version, "sha256": digest_file(folder / TENSORS)}
         write_json(folder / DESCRIPTION, about | description)
+
+
+def holds_field(path: Path, parts: Mapping[str, Any]) -> bool:
+    """Whether a folder holds already what `save_field` would write to it."""
+    tensors, description = _to_tensors(_moved(parts, path))
+    try:
+        there, about = _read_folder(path)
+    except (OSError, ValueError):
+        return False
+    same = tensors.keys() == there.keys() and all(torch.equal(tensors[name], there[name]) for name in tensors)
+    rest = {name: value for name, value in about.items() if name not in ("format", "version", "sha256")}
+    return same and rest == json.loads(json.dumps(description))
+
+
+def _moved(parts: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """The parts of a field for another place: paths in its notes are relative to it."""
+    return {**parts, "info": rebased(check_notes(parts["info"]), parts["folder"], path)}
 
 
 def check_place(path: Path) -> None:
@@ -116,12 +130,16 @@ def read_description(path: Path) -> dict[str, Any]:
         FileNotFoundError: if there is no field.
         ValueError: if the file is damaged, or of another format or version.
     """
-    if not describes_field(path):
+    return open_current(path, lambda find: _read_description(path, find(DESCRIPTION)))
+
+
+def _read_description(path: Path, file: Path) -> dict[str, Any]:
+    if not file.is_file():
         raise FileNotFoundError(
             f"{path}: expected a saved field, a file or a folder with {DESCRIPTION}, found none; pass what "
             "SemanticField.save got"
         )
-    description = read_json(current_file(path, DESCRIPTION))
+    description = read_json(file)
     found = description.get("format") if isinstance(description, dict) else None
     if found != FORMAT:
         raise ValueError(f"{path}: expected a field ({FORMAT}), got {found!r}; pass what SemanticField.save wrote")
@@ -134,19 +152,18 @@ def read_description(path: Path) -> dict[str, Any]:
 
 
 def _read_folder(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and description of a field folder. If another process replaces them meanwhile, they are read again."""
-    for attempt in range(ATTEMPTS):
-        with suppress(OSError, ValueError) if attempt < ATTEMPTS - 1 else nullcontext():
-            description, file = read_description(path), current_file(path, TENSORS)
-            before = file.stat() if file.is_file() else None
-            if before is not None and digest_file(file) == description.get("sha256"):
-                tensors, _ = read_safetensors(file, "the numbers of a field", "fit it again")
-                if os.path.samestat(before, file.stat()):
-                    return tensors, description
-    raise ValueError(
-        f"{path}: expected {TENSORS} as it was saved, got {'another' if file.is_file() else 'none'}; copy the whole folder "
-        "again, or fit the field again"
-    )
+    """Tensors and description of a field folder."""
+
+    def read(find: Callable[[str], Path]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        description, file = _read_description(path, find(DESCRIPTION)), find(TENSORS)
+        if not file.is_file() or digest_file(file) != description.get("sha256"):
+            raise ValueError(
+                f"{path}: expected {TENSORS} as it was saved, got {'another' if file.is_file() else 'none'}; copy the whole "
+                "folder again, or fit the field again"
+            )
+        return read_safetensors(file, "the numbers of a field", "fit it again")[0], description
+
+    return open_current(path, read)
 
 
 def _peek(path: Path) -> dict[str, Any] | None:

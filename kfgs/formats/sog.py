@@ -15,6 +15,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +25,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .._files import HIDDEN, atomic_folder, atomic_path
+from .._files import HIDDEN, atomic_folder, atomic_path, open_current
 from ..gaussians import Gaussians
 from .order import morton_order
 from .palette import Palette, fit_codebook, fit_palette, nearest_codes
@@ -67,7 +69,11 @@ def read(path: Path) -> SplatFile:
     Raises:
         ValueError: if it is neither, a file is missing or damaged, or sizes and indices disagree.
     """
-    with SogFiles(path) as files:
+    return open_current(path if path.is_dir() else path.parent, partial(_read, path))
+
+
+def _read(path: Path, find: Callable[[str], Path]) -> SplatFile:
+    with SogFiles(path, find) as files:
         meta = parse_meta(path, files.read_meta(), files.size())
         n = meta.gaussians
         low, high = (_pixels(files, name, n)[:, :3].astype(np.float64) for name in meta.files["means"])

@@ -7,6 +7,7 @@ import math
 import warnings
 import zipfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from .._files import current_file, parse_json
+from .._files import parse_json
 
 META = "meta.json"
 _META_BYTES = 1 << 22  # three codebooks of 256 numbers and a few names take 20 KB
@@ -23,10 +24,15 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)  # a fixed date, so that equal scenes give equal 
 
 
 class SogFiles:
-    """The files of one scene by name. Reads at most as many bytes as the caller allows, and writes nothing to disk."""
+    """The files of one scene by name. Reads at most as many bytes as the caller allows, and writes nothing to disk.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    Args:
+        path: a zip file, a folder, or the `meta.json` in it.
+        find: gives the path of a file in the folder.
+    """
+
+    def __init__(self, path: Path, find: Callable[[str], Path]) -> None:
+        self.path, self._find = path, find
         self._zip: zipfile.ZipFile | None = None
         self._folder = path if path.is_dir() else path.parent
         if path.is_file() and path.name != META:
@@ -70,7 +76,7 @@ class SogFiles:
         return data
 
     def _read_folder(self, name: str, limit: int) -> bytes:
-        file = current_file(self._folder, name)
+        file = self._find(name)
         if not file.is_file():
             raise ValueError(f"{self.path}: expected {name!r} in the folder, got no such file; copy all of the scene")
         with file.open("rb") as stream:

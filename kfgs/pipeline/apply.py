@@ -91,11 +91,10 @@ def segment_scene(
     """
     out = as_path(out)
     check_range("pictures", pictures, 0)
-    apart = [] if scene.folder is None else [scene.folder / "images", scene.folder / "features"]
+    pictures_in = {one.parent for one in scene.image_paths}
+    apart = [*pictures_in - {scene.folder}, *([] if scene.folder is None else [scene.folder / "features"])]
     for name in SEGMENTED if pictures else SEGMENTED[:2]:
-        check_output(
-            "out", out / name, "a folder", apart=apart, other=[maps, *{one.parent for one in scene.image_paths}]
-        )
+        check_output("out", out / name, "a folder", apart=apart, other=[maps, *pictures_in])
     if len(classes) > VOID:
         raise ValueError(
             f"classes: expected at most {VOID} (label pictures hold a byte per pixel, {VOID} = none), got {len(classes)}; "

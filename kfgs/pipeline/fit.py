@@ -6,7 +6,6 @@ also resumes from its last checkpoint.
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -29,6 +28,7 @@ from ..fields import (
     fit_field,
     remember,
 )
+from ..fields.store import holds_field
 from ..formats import SplatFile
 from ..gaussians import Gaussians
 from ..quant import (
@@ -242,7 +242,7 @@ def fit_scene(
         done = FitResult(found, run.folder, run.stages)
         about |= _facts(job, found, done.field_path, getattr(maps, "identity", None))
         done = replace(done, field=replace(found, info=about, folder=done.field_path))
-        if not _is_saved(done.field, done.field_path):
+        if not holds_field(done.field_path, vars(done.field)):
             before = keep_field(run.folder)
             done.field.save(done.field_path)
             say_kept(run, before)
@@ -327,18 +327,6 @@ def finished_stages(scene: Scene, maps: Maps | None, folder: str | Path, config:
 
 def _color_config(config: FitConfig) -> ColorConfig:
     return replace(config.color, seed=config.seed, split=config.split)
-
-
-def _is_saved(field: SemanticField, path: Path) -> bool:
-    """Whether the same field is at `path` already."""
-    try:
-        saved = SemanticField.load(path)
-    except (OSError, ValueError):
-        return False
-    names = ("means", "quats", "scales", "opacities", "features")
-    same = len(saved) == len(field) and saved.features.shape == field.features.shape and saved.method == field.method
-    same = same and all(torch.equal(getattr(saved.gaussians, name), getattr(field.gaussians, name)) for name in names)
-    return same and saved.info == json.loads(json.dumps(field.info))
 
 
 def load_history(stage: Stage) -> list[dict[str, Any]]:

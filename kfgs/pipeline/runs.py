@@ -1,7 +1,12 @@
-"""The fields of a run folder: the current one (`field`), and earlier ones (`field@<key>`), which are kept and can come back."""
+"""The fields of a run folder: the current one (`field`), and earlier ones (`field@<key>`), which are kept and can come back.
+
+What shows a field to people, its report and pictures, lies in the run folder while the field is current, and beside the field
+while it is kept. It is moved out before the field changes, so that a kill leaves no report rather than another field's.
+"""
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import time
@@ -19,6 +24,7 @@ from .stages import Run
 
 FIELD, KEPT = "field", "field@"
 KEY = 12  # hexadecimal digits of a key
+SHOWN = ("report.html", "preview.png", "codebook.png", "field.png")  # what `write_run_report` writes
 LONGEST = 40  # characters of a value in a comparison
 
 
@@ -90,13 +96,18 @@ def check_current(folder: Path) -> None:
 
 
 def keep_field(folder: Path) -> RunField | None:
-    """Copy the current field of a run folder to `field@<key>`, before another one takes its place; None if there is none."""
+    """Copy the current field of a run folder to `field@<key>`, before another one takes its place, and move its report there.
+
+    Returns:
+        The kept field; None if there is no current one.
+    """
     if not describes_field(folder / FIELD):
         return None
     now = _read(folder / FIELD, current=True)
     kept = folder / f"{KEPT}{now.key}"
     if not describes_field(kept):
         _copy(now.path, kept)
+    _move_shown(folder, kept)
     return _read(kept)
 
 
@@ -105,6 +116,7 @@ def say_kept(run: Run, before: RunField | None) -> None:
     if before is None:
         return
     if _read(run.folder / FIELD).key == before.key:
+        _move_shown(before.path, run.folder)
         for name in (DESCRIPTION, TENSORS):
             current_file(before.path, name).unlink()
         with suppress(OSError):  # it holds files of the user
@@ -132,6 +144,7 @@ def restore_field(folder: str | Path, key: str) -> RunField:
         if not wanted.current:
             keep_field(folder)
             _copy(wanted.path, folder / FIELD)
+        _move_shown(folder / f"{KEPT}{wanted.key}", folder)  # also if a killed one came so far
     return _read(folder / FIELD, current=True)
 
 
@@ -182,6 +195,13 @@ def _check_whole(path: Path) -> None:
         raise ValueError(
             f"{path}: expected a whole field, got a damaged one ({error}); rename the folder, or delete it"
         ) from error
+
+
+def _move_shown(source: Path, target: Path) -> None:
+    """Move the report and the pictures of a field."""
+    for name in SHOWN:
+        with suppress(FileNotFoundError):
+            os.replace(source / name, target / name)
 
 
 def _copy(source: Path, target: Path) -> None:

@@ -76,10 +76,8 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such folder; expected a scene there")
     root = path if path.is_dir() else path.parent
-    if images is not None and not as_path(images).is_dir() and (root / images).is_dir():
-        images = root / images
     try:
-        scene = replace(_load_views(path, root, images), folder=root)
+        scene = replace(_load_views(path, _given_folder(root, images)), folder=root)
     except SceneError as error:  # of cameras that do not fit together
         if str(root) in str(error):
             raise
@@ -87,7 +85,31 @@ def load_scene(path: str | Path, *, images: str | Path | None = None, split: Spl
     return _with_split(scene, root, split)
 
 
-def _load_views(path: Path, root: Path, images: str | Path | None) -> Scene:
+def picture_folders(path: str | Path, images: str | Path | None = None) -> list[Path]:
+    """The folders from which `load_scene` reads the pictures of a scene; a model of COLMAP is not read for it.
+
+    The scene folder itself is left out: everything else of a scene lies there, too. If there is no scene, the list is empty.
+    """
+    path = as_path(path)
+    root = path if path.is_dir() else path.parent
+    try:
+        given, model = _given_folder(root, images), find_model(path)
+        if model is not None:
+            found = {as_path(given) if given is not None else _image_folder(path, model)}
+        else:
+            found = {file.parent for file in _load_views(path, given).image_paths}
+    except (OSError, ValueError):
+        return []
+    return sorted(folder for folder in found if folder.resolve() not in (root.resolve(), *root.resolve().parents))
+
+
+def _given_folder(root: Path, images: str | Path | None) -> str | Path | None:
+    """The image folder that the user named, perhaps by its name in the scene folder."""
+    inside = images is not None and not as_path(images).is_dir() and (root / images).is_dir()
+    return root / images if inside and images is not None else images
+
+
+def _load_views(path: Path, images: str | Path | None) -> Scene:
     model = find_model(path)
     if model is not None:
         scene = load_colmap(model, images if images is not None else _image_folder(path, model))
@@ -117,8 +139,11 @@ def find_model(path: Path) -> Path | None:
 
 
 def _is_scene(path: Path) -> bool:
-    model = find_model(path) is not None
-    return model or any((path / name).is_file() for name in _TRANSFORMS) or any(a.matches(path) for a in _LAYOUTS)
+    return (
+        find_model(path) is not None
+        or any((path / name).is_file() for name in _TRANSFORMS)
+        or any(a.matches(path) for a in _LAYOUTS)
+    )
 
 
 def _advice(path: Path) -> str:

@@ -14,7 +14,7 @@ from messages import tells
 from safetensors.torch import save_file
 
 from kfgs import Camera, Gaussians
-from kfgs._files import HIDDEN, current_file
+from kfgs._files import HIDDEN, atomic, current_file
 from kfgs.fields import Seen, SemanticField, store
 from kfgs.metrics import MIB
 from kfgs.quant import Autoencoder, Codebook, LinearLatents
@@ -431,9 +431,10 @@ def test_a_field_is_found_while_another_process_moves_it_to_its_place(tmp_path, 
     def just_moved(folder, name):
         """Where `name` was when a reader asked; it is moved before the reader opens it."""
         asked.append(name)
-        return folder / HIDDEN / "waiting" / name if len(asked) <= 2 else current_file(folder, name)
+        return folder / HIDDEN / "waiting" / name if len(asked) == 1 else current_file(folder, name)
 
-    monkeypatch.setattr(store, "current_file", just_moved)
+    for module in (store, atomic):
+        monkeypatch.setattr(module, "current_file", just_moved)
     assert store.describes_field(tmp_path / "field")
     saved.save(tmp_path / "field")  # not "something else"
     asked.clear()

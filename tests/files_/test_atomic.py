@@ -10,7 +10,7 @@ from killed import kill_everywhere
 from messages import tells
 from safetensors.torch import save_file
 
-from kfgs._files import FullDiskError, atomic, atomic_folder, atomic_path, current_file
+from kfgs._files import FullDiskError, atomic, atomic_folder, atomic_path, current_file, open_current
 
 
 def names(folder):
@@ -221,6 +221,27 @@ def test_at_every_kill_the_old_folder_or_the_new_one_is_found_and_nothing_else_i
     assert len({str(state) for state in states}) == 2  # some were killed before, and some after the switch
 
 
+MADE = """
+from kfgs._files import atomic_folder
+
+def prepare(folder):
+    pass
+
+def work(folder):
+    with atomic_folder(folder / "field") as new:
+        (new / "a.json").write_text("new")
+"""
+
+
+def test_the_same_writer_again_sweeps_wherever_it_was_killed(tmp_path):
+    """The first one makes the folder, the second one finds it there and works inside it."""
+    for folder in kill_everywhere(MADE, tmp_path / "kills"):
+        with atomic_folder(folder / "field") as new:
+            (new / "a.json").write_text("newer")
+        assert (folder / "field" / "a.json").read_text() == "newer"
+        assert sorted(path.name for path in folder.rglob(".*")) == []
+
+
 FILES = """
 from kfgs._files import atomic_path
 
@@ -273,6 +294,65 @@ def test_writers_of_one_place_do_not_disturb_each_other(tmp_path):
     assert len({(tmp_path / "folder" / name).read_text() for name in "xyz"}) == 1
 
 
+def put(folder, text, names=("a", "b")):
+    with atomic_folder(folder) as new:
+        for name in names:
+            (new / name).write_text(text)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_files_that_are_replaced_between_two_reads_are_read_again(tmp_path, fails):
+    folder, rounds = tmp_path / "scene", []
+    put(folder, "old")
+
+    def read(find):
+        first = find("a").read_text()
+        rounds.append(first)
+        if len(rounds) == 1:
+            put(folder, "new", ("a", "b", "c"))
+            if fails:
+                raise ValueError("a and b do not fit")
+        return first, find("b").read_text(), find("c").is_file()
+
+    assert open_current(folder, read) == ("new", "new", True)
+    assert rounds == ["old", "new"]
+
+
+def test_a_file_that_comes_or_goes_counts_as_replaced(tmp_path):
+    put(tmp_path / "scene", "old")
+    rounds = []
+
+    def read(find):
+        missing = find("c").is_file()
+        if not rounds:
+            put(tmp_path / "scene", "new", ("c",))
+        rounds.append(missing)
+        return missing
+
+    assert open_current(tmp_path / "scene", read) is True
+    assert rounds == [False, True]
+
+
+def test_errors_of_a_folder_that_stays_are_those_of_the_reader(tmp_path):
+    def read(find):
+        return find("a").read_text()
+
+    with pytest.raises(FileNotFoundError):
+        open_current(tmp_path, read)
+
+
+def test_a_folder_that_never_stays_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(atomic, "ATTEMPTS", 5)
+
+    def read(find):
+        find("a")
+        put(tmp_path / "scene", "new")
+
+    put(tmp_path / "scene", "old")
+    with pytest.raises(ValueError, match=tells(tmp_path / "scene", "another process", "wait")):
+        open_current(tmp_path / "scene", read)
+
+
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), OSError("796 requested and 286 written")])
 def test_a_full_disk_names_the_output(tmp_path, error):
     def write(block):
@@ -284,6 +364,16 @@ def test_a_full_disk_names_the_output(tmp_path, error):
             write(block(tmp_path / "out"))
         assert "kfgs-unfinished" not in str(caught.value)
     assert names(tmp_path) == []
+
+
+def test_a_file_inside_a_folder_that_is_written_is_named_by_the_folder(tmp_path):
+    def write():
+        with atomic_folder(tmp_path / "out") as new, atomic_path(new / "a.bin"):
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(FullDiskError, match=tells(f"{tmp_path / 'out'}: expected space")) as caught:
+        write()
+    assert "kfgs-unfinished" not in str(caught.value)
 
 
 LIMITED = """

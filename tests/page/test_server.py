@@ -159,6 +159,72 @@ def test_a_slow_call_holds_up_no_other(server):
     slow.join()
 
 
+def stalled(server, request, small=1 << 12):
+    """A tab that sends a request, or the beginning of one, and then neither reads nor sends."""
+    address = urlsplit(server.url)
+    tab = socket.socket()
+    tab.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, small)
+    tab.connect((address.hostname, address.port))
+    tab.sendall(request.replace("{host}", address.netloc).replace("{secret}", server.secret).encode("latin-1"))
+    return tab
+
+
+NEVER_READ = {
+    "the scene": "GET /{secret}/pack HTTP/1.1\r\nHost: {host}\r\n\r\n",
+    "an answer": "POST /{secret}/call HTTP/1.1\r\nHost: {host}\r\nContent-Length: 16000036\r\n\r\n"
+    + pack_message({"name": "big", "args": {}}).decode("latin-1").ljust(36)
+    + "x" * 16_000_000,
+}
+NEVER_SENT = {
+    "a request": "GET /{secret}/pack HTTP/1.1\r\nHost:",
+    "a body": "POST /{secret}/call HTTP/1.1\r\nHost: {host}\r\nContent-Length: 1000\r\n\r\nab",
+}
+
+
+@pytest.mark.parametrize("request_", [*NEVER_READ, *NEVER_SENT])
+def test_tabs_that_stall_hold_up_no_other(request_):
+    """The answers are far larger than what the system buffers, so that their threads do wait for the tabs."""
+    pack = bytes(64 << 20)
+    with PageServer(PAGE) as server:
+        server.show(pack, answer)
+        before = threading.active_count()
+        tabs = [stalled(server, (NEVER_READ | NEVER_SENT)[request_]) for _ in range(12)]
+        end = time.monotonic() + 30
+        while threading.active_count() < before + len(tabs) and time.monotonic() < end:
+            time.sleep(0.01)
+        time.sleep(0.2)
+        assert threading.active_count() >= before + len(tabs)  # all of them wait
+        began = time.monotonic()
+        assert ask(server, secret(server))[1] == PAGE.encode()
+        assert len(ask(server, secret(server) + "pack")[1]) == len(pack)
+        call = pack_message({"name": "look", "args": {"at": 1}}, b"ab")
+        assert read_message(ask(server, secret(server) + "call", "POST", call)[1])[1] == b"ba"
+        assert time.monotonic() - began < 20  # far below PATIENCE, after which a stalled tab is given up
+        began = time.monotonic()
+        server.close()
+        assert time.monotonic() - began < 5
+        for tab in tabs:
+            tab.close()
+        while threading.active_count() >= before and time.monotonic() < end + 30:
+            time.sleep(0.01)
+        assert threading.active_count() < before  # theirs and the server's have ended
+
+
+def test_a_tab_that_never_reads_is_given_up(monkeypatch):
+    monkeypatch.setattr("kfgs.page.server._Handler.timeout", 0.5)
+    with PageServer(PAGE) as server:
+        server.show(bytes(64 << 20), answer)
+        before = threading.active_count()
+        tabs = [stalled(server, request) for request in (*NEVER_READ.values(), *NEVER_SENT.values())]
+        end = time.monotonic() + 30
+        time.sleep(1)
+        while threading.active_count() > before and time.monotonic() < end:
+            time.sleep(0.05)
+        assert threading.active_count() == before
+        for tab in tabs:
+            tab.close()
+
+
 def test_closing_leaves_no_thread_behind():
     before = threading.active_count()
     server = PageServer(PAGE)

@@ -76,6 +76,73 @@ def test_an_earlier_field_comes_back_and_the_current_one_is_kept(run):
     assert [field.key for field in list_fields(run)] == [field.key for field in after]
 
 
+def report(folder, text):
+    for name in ("report.html", "preview.png"):
+        (folder / name).write_text(text)
+
+
+def test_reports_and_pictures_go_with_their_field(tmp_path):
+    for number in range(3):
+        keep_field(tmp_path)
+        a_field(number).save(tmp_path / "field")
+        report(tmp_path, f"field {number}")
+    keys = {first(field.path): field.key for field in list_fields(tmp_path)}
+    for number in (0, 1, 1, 2):
+        restore_field(tmp_path, keys[number])
+        assert (tmp_path / "report.html").read_text() == (tmp_path / "preview.png").read_text() == f"field {number}"
+        kept = {first(path): (path / "report.html") for path in tmp_path.glob("field@*")}
+        assert {n: file.read_text() for n, file in kept.items() if n != number} == {
+            n: f"field {n}" for n in range(3) if n != number
+        }
+
+
+def test_a_field_without_a_report_shows_none(run):
+    report(run, "field 2")
+    restore_field(run, list_fields(run)[1].key)
+    assert not (run / "report.html").exists()
+    assert not (run / "preview.png").exists()
+
+
+def test_the_report_stays_if_the_field_turns_out_the_same(tmp_path):
+    a_field(1).save(tmp_path / "field")
+    report(tmp_path, "field 1")
+    before = keep_field(tmp_path)
+    a_field(1, more="notes").save(tmp_path / "field")
+    say_kept(Run(tmp_path), before)
+    assert (tmp_path / "report.html").read_text() == "field 1"
+    assert [path.name for path in tmp_path.glob("field@*")] == []
+
+
+REPORTS = (
+    TINY
+    + """
+import dataclasses
+from kfgs.pipeline.runs import keep_field, list_fields, restore_field
+
+def prepare(folder):
+    for number in range(2):
+        keep_field(folder)
+        tiny_field(number).save(folder / "field")
+        for name in ("report.html", "preview.png"):
+            (folder / name).write_text(str(number))
+
+def work(folder):
+    restore_field(folder, next(one.key for one in list_fields(folder) if not one.current))
+"""
+)
+
+
+def test_at_every_kill_a_report_is_that_of_the_current_field_or_gone(tmp_path):
+    folders = kill_everywhere(REPORTS, tmp_path / "kills")
+    seen = set()
+    for folder in folders:
+        shown = {(folder / name).read_text() for name in ("report.html", "preview.png") if (folder / name).exists()}
+        seen.add((first(folder / "field"), *shown))
+        restore_field(folder, next(one.key for one in list_fields(folder) if first(one.path) == 0))
+        assert (folder / "report.html").read_text() == (folder / "preview.png").read_text() == "0"
+    assert seen == {(1, "1"), (1,), (0,), (0, "0")}
+
+
 def test_a_users_files_in_the_field_stay_when_another_one_is_restored(run):
     (run / "field" / "notes.txt").write_text("mine")
     restore_field(run, list_fields(run)[1].key)

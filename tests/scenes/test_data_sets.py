@@ -13,6 +13,7 @@ from PIL import Image
 from kfgs.cameras.projection import project_points
 from kfgs.formats.ply import write_ply
 from kfgs.scenes import SceneError, load_scene
+from kfgs.scenes.load import picture_folders
 
 # Camera at (1, 2, 3), looking along world +x, world +z up: right = -y, down = -z, forward = +x
 POSE = np.array([[0.0, 0, 1, 1], [-1, 0, 0, 2], [0, -1, 0, 3], [0, 0, 0, 1]])
@@ -172,6 +173,11 @@ def test_scannet(tmp_path: Path) -> None:
     scene = load_scene(folder)
     assert scene.points.tolist() == [[1, 1, 1], [2, 2, 2]]  # every vertex, in the order of the mesh
     assert scene.colors.tolist() == [[5, 128, 128], [6, 128, 128]]
+
+
+def test_scannets_pictures_are_found_where_they_are_read(tmp_path: Path) -> None:
+    scene = load_scene(_scannet(tmp_path))
+    assert picture_folders(tmp_path) == [tmp_path / "color"] == sorted({file.parent for file in scene.image_paths})
 
 
 def test_scannet_that_is_not_whole(tmp_path: Path) -> None:

@@ -1,8 +1,13 @@
 import io
+import json
+import os
 import struct
+import subprocess
+import sys
 import tracemalloc
 import warnings
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -141,3 +146,57 @@ def test_pictures_are_closed(tmp_path):
     with open_picture(tmp_path / "a.png") as picture:
         assert picture.size == (7, 5)
     assert picture.fp is None
+
+
+SHORT = """
+import os, resource, sys
+from kfgs.scenes import SceneError, read_image
+read_image(sys.argv[2])  # a small one: loads all that is needed
+with open("/proc/self/statm") as about:
+    now = int(about.read().split()[0]) * resource.getpagesize()
+codes = []
+for more in map(int, sys.argv[3:]):
+    child = os.fork()
+    if child == 0:
+        code = 70
+        try:
+            resource.setrlimit(resource.RLIMIT_AS, (now + (more << 20),) * 2)
+            read_image(sys.argv[1])
+            code = 0
+        except SceneError as error:
+            code = 3 if sys.argv[1] in str(error) and "cannot be decoded" in str(error) else 4
+        finally:
+            os._exit(code)
+    codes.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+print(codes)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="the size of a process is read from /proc")
+@pytest.mark.parametrize(
+    ("suffix", "options"),
+    [
+        (".webp", {"lossless": True, "method": 0}),
+        (".webp", {"quality": 80, "method": 0}),
+        (".tif", {}),
+        (".tif", {"compression": "tiff_lzw"}),
+        (".tif", {"compression": "tiff_adobe_deflate"}),
+        (".png", {"compress_level": 1}),
+        (".jpg", {}),
+    ],
+)
+def test_where_memory_is_short_a_picture_is_refused_and_nothing_panics(suffix, options, tmp_path):
+    """Limits from nothing beyond what Python has to enough: some refuse, the last one reads."""
+    pixels = np.random.default_rng(0).integers(0, 256, (150, 200, 3), dtype=np.uint8).repeat(10, 0).repeat(10, 1)
+    Image.fromarray(pixels).save(tmp_path / f"large{suffix}", **options)
+    Image.fromarray(pixels[:8, :8]).save(tmp_path / f"small{suffix}", **options)
+    limits = [0, 2, 5, 8, 11, 14, 18, 23, 30, 40, 60, 1000]
+    command = [sys.executable, "-c", SHORT, tmp_path / f"large{suffix}", tmp_path / f"small{suffix}", *map(str, limits)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=250, env={**os.environ, "OMP_NUM_THREADS": "1"}
+    )
+    codes = json.loads(done.stdout)
+    assert set(codes) == {0, 3}, (codes, done.stderr[-500:])  # no signal, no other exception
+    assert codes[:3] == [3, 3, 3]
+    assert codes[-1] == 0
+    assert "panicked" not in done.stderr

@@ -1,0 +1,70 @@
+import subprocess
+import sys
+
+RUN = "import sys; from kfgs.__main__ import run; sys.argv = ['kfgs', *sys.argv[1:]]; sys.exit(run())"
+BEFORE = "import atexit, os, signal; ctrl_c = lambda: os.kill(os.getpid(), signal.SIGINT)\n"
+
+
+def run(folder, *words, code=RUN):
+    done = subprocess.run(
+        [sys.executable, "-c", code, *map(str, words)], cwd=folder, capture_output=True, text=True, timeout=250
+    )
+    return done.returncode, done.stderr
+
+
+CPP = """
+import os, signal
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    for _ in range(1000):
+        pass
+except BaseException:  # as a module in C++ does
+    os.abort()
+def encode(picture):
+    raise AssertionError("it was to end before")
+"""
+
+
+def test_while_a_module_loads_the_process_ends_at_once(tmp_path):
+    from small_room import make_room
+
+    room = make_room(tmp_path / "room")
+    (tmp_path / "native.py").write_text(CPP)
+    words = ["features", room, "--teacher", "native:encode", "--out", tmp_path / "maps"]
+    assert run(tmp_path, *words) == (130, "interrupted\n")
+
+
+def test_while_the_command_line_itself_loads(tmp_path):
+    (tmp_path / "tyro.py").write_text(CPP)
+    assert run(tmp_path, "--help") == (130, "interrupted\n")
+
+
+def test_after_the_command_has_ended(tmp_path):
+    assert run(tmp_path, "--version", code=BEFORE + "atexit.register(ctrl_c)\n" + RUN) == (130, "interrupted\n")
+
+
+DELETED = """
+from kfgs import cli
+def probe() -> None:
+    "Delete an object."
+    class Interrupted:
+        def __del__(self):
+            ctrl_c()
+    Interrupted()
+    print("went on")
+cli.COMMANDS["probe"] = probe
+"""
+
+
+def test_where_python_forgets_exceptions(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", BEFORE + DELETED + RUN, "probe"], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr, done.stdout) == (130, "interrupted\n", "")
+
+
+def test_a_shell_that_ignores_ctrl_c_for_its_jobs_is_obeyed():
+    code = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" + RUN
+    end = "\nassert signal.getsignal(signal.SIGINT) is signal.SIG_IGN"
+    code = code.replace("sys.exit(run())", "run()") + end
+    assert subprocess.run([sys.executable, "-c", code, "--version"], capture_output=True).returncode == 0
