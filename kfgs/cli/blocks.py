@@ -8,7 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from .files import check_folder
+from .._files import check_output
+from .files import inputs_of
 from .options import FieldMethod, Given, Maps, Positional, SceneFolder, Training, fit_config
 from .output import say, wrote
 
@@ -41,7 +42,7 @@ def blocks(
     """
     from ..scale import fit_blocks, split_scene
 
-    check_folder("out", out, scene, maps.features)
+    check_output("out", out, "a folder", apart=inputs_of(scene), other=[maps.features])
     config = fit_config(FieldMethod(), seed=training.seed, steps=training.steps, max_gaussians=training.max_gaussians)
     config = dataclasses.replace(config, undistorted_features=maps.undistorted_features, device=training.device)
     split_scene(scene, out, count, features=maps.folder(scene), splat=splat, latents=latents, report=say)
@@ -69,7 +70,7 @@ def join(
     from ..scale import FieldInBlocks
 
     corners = _corners(box)
-    check_folder("out", out)
+    check_output("out", out, "a folder")
     check_place(out)
     found = FieldInBlocks.open(city)
     field = found.joined() if corners is None else found.within(corners[:3], corners[3:])
