@@ -1,11 +1,12 @@
 """What failing machines cost a batch: a simulation of `kfgs batch` with measured seconds of its stages.
 
-    python benchmarks/failures.py [--scenes 1000] [--workers 100] [--seconds sfm=60 features=120 fit=300 segment=15 evaluate=5] [--days 0.1 1 7] [--seed 0]
+    python benchmarks/failures.py [--scenes 1000] [--workers 100] [--days 0.1 1 7] [--seed 0]
+        [--seconds sfm=60 features=120 fit=300 segment=15 evaluate=5]
 
 Workers fail at random (exponential, with a mean time between failures per worker), and come back after a while. What a stage
 had done is lost, except that `features` keeps its pictures and `fit` its checkpoints, as the real ones do. A task is
-submitted at most four times. Told are the hours until all scenes are done, the work that was lost, and the scenes that were given up. Once there is
-a worker, the scheduler takes no time: 1,000 scenes are 5,000 tasks, and Dask's costs some 1 ms a task.
+submitted at most four times. Told are the hours until all scenes are done, the work that was lost, and the scenes that were
+given up. The scheduler takes no time here: 1,000 scenes are 5,000 tasks, and Dask's costs some 1 ms a task.
 """
 
 from __future__ import annotations

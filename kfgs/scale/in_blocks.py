@@ -16,8 +16,9 @@ from .._check import as_array
 from .._files import as_path, read_json
 from ..cameras import Camera
 from ..fields import SemanticField, join_fields, select_gaussians
-from ..labels import Selection
-from ..scenes.blocks import Block
+from ..gaussians import Gaussians
+from ..labels import LabelSet, Selection, transfer_labels
+from ..scenes.blocks import Array, Block
 
 BLOCKS, CORE, FORMAT = "blocks.json", "core", "kfgs.blocks"
 GRID = 9  # points along each side of a box that are tried for being in view
@@ -87,18 +88,22 @@ class FieldInBlocks:
         Raises:
             ValueError: if there is no Gaussian.
         """
-        lower, upper = np.asarray(low, np.float64), np.asarray(high, np.float64)
-        parts = []
-        for block, box in zip(self.blocks, self.boxes, strict=True):
-            if (lower <= box[1]).all() and (upper >= box[0]).all():
-                field = self.field(block.name)
-                means = as_array(field.gaussians.means)
-                inside = ((means >= lower) & (means <= upper)).all(1)
-                if inside.any():
-                    parts.append(select_gaussians(field, torch.from_numpy(inside)))
+        parts = self._touching(np.asarray(low, np.float64), np.asarray(high, np.float64))
         if not parts:
             raise ValueError(f"low, high: expected a box with Gaussians, got none from {list(low)} to {list(high)}")
         return join_fields(parts)
+
+    def _touching(self, low: Array, high: Array) -> list[SemanticField]:
+        """The Gaussians of each block whose centres lie in a box."""
+        parts = []
+        for block, box in zip(self.blocks, self.boxes, strict=True):
+            if (low <= box[1]).all() and (high >= box[0]).all():
+                field = self.field(block.name)
+                means = as_array(field.gaussians.means)
+                inside = ((means >= low) & (means <= high)).all(1)
+                if inside.any():
+                    parts.append(select_gaussians(field, torch.from_numpy(inside)))
+        return parts
 
     def seen_from(self, camera: Camera) -> SemanticField:
         """The blocks that a camera may see, as one field: those whose box is in its picture."""
@@ -110,6 +115,29 @@ class FieldInBlocks:
     def segment(self, camera: Camera, *args: Any, **options: Any) -> Tensor:  # [H, W] int64
         """As `SemanticField.segment`; only the blocks that the camera may see are read."""
         return self.seen_from(camera).segment(camera, *args, **options)
+
+    def transfer(
+        self, dst: Gaussians, distance: float, classes: LabelSet | None = None, **options: Any
+    ) -> Tensor:  # [N] int64
+        """Labels for a cloud, as `transfer_labels` gives them from the joined field, one block's surroundings at a time.
+
+        Args:
+            dst: N Gaussians in the field's frame.
+            distance: lambda, world units.
+            classes: to label with; None: those that the field remembers.
+            options: of `transfer_labels`.
+        """
+        means = as_array(dst.means)
+        labels = torch.full((len(means),), -1, dtype=torch.int64)
+        for block in self.blocks:
+            rows = np.flatnonzero(block.holds(means))
+            near = self._touching(means[rows].min(0) - distance, means[rows].max(0) + distance) if len(rows) else []
+            if near:
+                field = join_fields(near)
+                known = field.classify(classes).labels
+                own = torch.from_numpy(rows)
+                labels[own] = transfer_labels(field.gaussians, known, dst.select(own), distance, **options).labels
+        return labels
 
 
 def read_blocks(folder: Path) -> list[Block]:

@@ -13,8 +13,9 @@ from kfgs.cli import main
 from kfgs.evaluation import load_label_map
 from kfgs.features import FeatureFolder
 from kfgs.fields import SemanticField, UpliftConfig, join_fields, sample_latents, select_gaussians, uplift_maps
-from kfgs.formats import SplatFile, write_splats
+from kfgs.formats import SplatFile, read_splats, write_splats
 from kfgs.gaussians import Gaussians
+from kfgs.labels import transfer_labels
 from kfgs.pipeline import FitConfig
 from kfgs.quant import LinearLatents
 from kfgs.scale import FieldInBlocks, fit_block, fit_blocks, split_scene
@@ -54,8 +55,6 @@ def fitted(town, splat):
 @pytest.fixture(scope="module")
 def whole(town, splat, fitted):
     """The same Gaussians with the same latents, fused at once."""
-    from kfgs.formats import read_splats
-
     scene = load_scene(town)
     cameras, maps = (
         [scene.cameras[i] for i in scene.views("train")],
@@ -118,6 +117,15 @@ def test_a_view_needs_the_blocks_in_its_picture(fitted, town):
         assert torch.equal(seen.segment(scene.cameras[i]), joined.segment(scene.cameras[i])) or (
             float((seen.segment(scene.cameras[i]) == joined.segment(scene.cameras[i])).float().mean()) > 0.999
         )
+
+
+@pytest.mark.parametrize("distance", [0.05, 0.5])
+def test_labels_are_those_of_the_joined_field(fitted, splat, distance):
+    joined, dst = fitted.joined(), read_splats(splat).gaussians
+    dst = dst.replace(means=dst.means + 0.03 * torch.randn(dst.means.shape, generator=torch.Generator().manual_seed(0)))
+    expected = transfer_labels(joined.gaussians, joined.classify().labels, dst, distance).labels
+    assert int((expected >= 0).sum()) > 1000
+    assert torch.equal(fitted.transfer(dst, distance), expected)
 
 
 def test_a_second_fit_repeats_nothing(fitted):
