@@ -8,7 +8,7 @@ const REST = 160; // milliseconds without a change, after which the picture is d
 export class Panes {
   /** @param {object} model see model.js */
   constructor(canvas, model) {
-    Object.assign(this, { canvas, model, layout: "one", slider: 0.5, sent: {} });
+    Object.assign(this, { canvas, model, layout: "one", slider: 0.5 });
     this.list = [{ mode: "labels", side: model.side }]; // what each pane shows
     this.active = this.list[0];
     this.ratio = 1; // device pixels in a CSS pixel
@@ -165,7 +165,8 @@ export class Panes {
     const { model, renderer } = this;
     const { answer } = model;
     renderer.setSide(pane.side);
-    this.sendCloud(pane.side);
+    renderer.update(model.clouds[pane.side]);
+    renderer.setSelected(model.byHand ? model.selected(pane.side) : null);
     const [low, high] = answer ? [answer.low, answer.high] : model.packed.header.clim;
     const hidden = new Uint8Array(model.names.length + 1);
     for (const label of model.hidden) hidden[label < 0 ? model.names.length : label] = 1;
@@ -183,16 +184,5 @@ export class Panes {
       this.renderer.setScores(answer.number, answer.scores);
     }
     return answer.number;
-  }
-
-  /** Give the renderer the cloud of a side, if it changed, and the selection by hand. */
-  sendCloud(side) {
-    const { renderer, model } = this;
-    const cloud = model.clouds[side];
-    renderer.update(cloud);
-    const wanted = model.byHand ? `${model.now.id} ${cloud.id} ${cloud.count}` : null;
-    if (this.sent[side] === wanted && (wanted === null) === (cloud.selected === null)) return;
-    renderer.setSelected(model.byHand ? model.selected(side) : null);
-    this.sent[side] = wanted;
   }
 }

@@ -140,30 +140,30 @@ export class Renderer {
 
   /** Mark Gaussians of the current side as selected, instead of what the question selects; null takes the marks away. */
   setSelected(mask) {
-    const {cloud} = this.#current();
-    cloud.selected = mask;
-    cloud.stamps.marks++;
-    this.update(cloud);
+    const state = this.#current();
+    if (state.selected === mask) return;
+    state.selected = mask;
+    this.#showMarks(state);
   }
 
-  /** Show a cloud in place of the one of its side, or what was changed in it. */
+  /** Show a cloud in place of the one of its side: send what is not the same array (see Cloud). */
   update(cloud) {
-    const had = this.sides[cloud.side];
-    const {stamps} = cloud;
-    if (had.cloud !== cloud || had.count !== cloud.count) {
+    const state = this.sides[cloud.side];
+    const {cloud: before} = state;
+    state.cloud = cloud;
+    if (before.source !== cloud.source) { // there are copies, or none any more
       const {side} = this;
-      this.#dropSide(had);
+      this.#dropSide(state);
       this.#addSide(cloud);
       this.side = side;
       return;
     }
-    if (had.stamps.splats !== stamps.splats) {
-      fill(this.gl, had.textures.splats, this.gl.RGBA32UI, cloud.splats);
-      this.#sendMeans(had);
+    if (before.splats !== cloud.splats) {
+      fill(this.gl, state.textures.splats, this.gl.RGBA32UI, cloud.splats);
+      this.#sendMeans(state);
     }
-    if (had.stamps.colors !== stamps.colors) this.#showColors(had);
-    if (had.stamps.marks !== stamps.marks) this.#showMarks(had);
-    had.stamps = {...stamps};
+    if (before.dc !== cloud.dc) this.#showColors(state);
+    if (before.removed !== cloud.removed) this.#showMarks(state);
   }
 
   /**
@@ -268,7 +268,7 @@ export class Renderer {
     };
     const prepared = frame(gl, [shape, paint]);
     const state = {
-      cloud, count, textures, rows, shape, paint, prepared, id: ++this.loads, stamps: {...cloud.stamps},
+      cloud, count, textures, rows, shape, paint, prepared, id: ++this.loads, selected: null,
       length: 0, asked: null, fresh: null, busy: false,
     };
     this.sides[cloud.side] = state;
@@ -291,8 +291,7 @@ export class Renderer {
     for (let t = 0; t < planes; t++) fill(gl, textures.shs, gl.RG32UI, sh.subarray(2 * t * count, 2 * (t + 1) * count), t * rows);
   }
 
-  #showMarks({cloud, textures}) {
-    const {selected, removed} = cloud;
+  #showMarks({cloud: {removed}, selected, textures}) {
     fill(this.gl, textures.marks, this.gl.R8UI, removed.map((gone, i) => (selected?.[i] ? 1 : 0) | (gone << 1)));
   }
 
@@ -344,7 +343,7 @@ export class Renderer {
     const {scale} = level;
     const width = Math.max(1, Math.round(view.width * scale));
     const height = Math.max(1, Math.round(view.height * scale));
-    const chosen = Boolean(look.outline) && (look.question !== null || Boolean(state.cloud.selected));
+    const chosen = Boolean(look.outline) && (look.question !== null || Boolean(state.selected));
     this.#fitTarget(width, height, chosen);
     this.#prepare(state, width, height);
     const {target} = this;
@@ -398,7 +397,7 @@ export class Renderer {
     gl.uniform1i(at.mode, MODES.indexOf(look.mode));
     gl.uniform1i(at.carried, cloud.source ? 1 : 0);
     gl.uniform1i(at.asked, look.question === null ? 0 : 1);
-    gl.uniform1i(at.masked, cloud.selected ? 1 : 0);
+    gl.uniform1i(at.masked, state.selected ? 1 : 0);
     gl.uniform1i(at.dim, look.dim ? 1 : 0);
     gl.uniform3fv(at.center, meta.center);
     gl.uniform3fv(at.spread, meta.half);
@@ -516,7 +515,7 @@ export class Renderer {
     const holds = ({x: left, y: top, width, height}) => x >= left && x < left + width && y >= top && y < top + height;
     const view = views.find((one) => holds(one.clip ?? one)) ?? (anyway ? views[0] : null);
     if (!view) return {};
-    const {cloud} = this.sides[view.side];
+    const {cloud, selected} = this.sides[view.side];
     const {camera, look} = this;
     const [sx, sy] = [view.width / camera.width, view.height / camera.height];
     const stretched = {
@@ -531,7 +530,8 @@ export class Renderer {
       return !hidden[label < 0 ? this.names.length : label];
     };
     const scores = look.question === null ? null : this.scores[look.question];
-    const chosen = look.dim && (scores || cloud.selected) ? (i) => cloud.chosen(i, scores, look.gamma, lambda) : null;
+    const asked = scores && ((i) => cloud.chosen(i, scores, look.gamma, lambda));
+    const chosen = look.dim ? (selected ? (i) => selected[i] : asked) : null;
     return {cloud, camera: stretched, left: view.x, top: view.y, drawn, chosen};
   }
 

@@ -203,7 +203,9 @@ def test_suggestions_show_names_as_words_and_arrow_keys_choose(page):
 def test_letters_of_one_class_only_are_enough(page):
     ask(page, "HAI")
     page.wait_for_selector("h2:has-text('Search: chair')")
+    assert page.evaluate("document.activeElement === viewer.stage")  # its keys work now
     ask(page, "a")  # chair, table
+    assert page.evaluate("document.activeElement === viewer.top.search.input")  # to type other words
     assert "“a” is none of the classes" in page.locator("[role=alert]:visible").inner_text()
 
 
@@ -447,17 +449,25 @@ def test_a_ball_selects_what_lies_in_it_and_a_drag_moves_it(page):
     assert place_of(page, "color", int(selected[0])) == pytest.approx(before)
 
 
-def test_a_drag_that_goes_on_does_not_repeat_the_earlier_edits(page):
+def test_undo_and_drags_repeat_no_earlier_edit(page):
+    """The clouds of every step are kept; what an edit did not change is the same array."""
     ask(page, "table")
     page.evaluate("viewer.model.recolor([0.1, 0.8, 0.3])")
+    before = page.evaluate_handle("viewer.model.clouds.color")
     page.evaluate("viewer.model.move([1, 0, 0])")
-    cloud = page.evaluate_handle("viewer.model.clouds.color")
     page.evaluate("viewer.model.move([0, 1, 0], true)")
-    assert page.evaluate("cloud => cloud === viewer.model.clouds.color", cloud)
-    moved = page.evaluate("[...viewer.model.clouds.color.means]")
-    page.keyboard.press("Control+z")
+    moved = page.evaluate_handle("viewer.model.clouds.color")
+    assert page.evaluate("([a, b]) => a.dc === b.dc && a.means !== b.means", [before, moved])
+    offset = page.evaluate(
+        "([a, b]) => { const i = [...viewer.model.selected('color')].indexOf(1); "
+        "return [0, 1, 2].map((axis) => b.means[3 * i + axis] - a.means[3 * i + axis]); }",
+        [before, moved],
+    )
+    assert offset == pytest.approx([1, 1, 0], abs=1e-6)
+    page.keyboard.press("Control+z")  # after Enter in the search box, keys are those of the view
+    assert page.evaluate("cloud => cloud === viewer.model.clouds.color", before)
     page.keyboard.press("Control+Shift+Z")
-    assert page.evaluate("[...viewer.model.clouds.color.means]") == pytest.approx(moved, abs=1e-5)
+    assert page.evaluate("cloud => cloud === viewer.model.clouds.color", moved)
 
 
 def test_parts_end_when_their_gaussians_go_elsewhere(page):

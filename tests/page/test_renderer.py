@@ -169,9 +169,8 @@ def test_a_selection_is_that_of_python_and_the_rest_dims(viewer, state):
 
 
 EDIT = """(edits) => {
-  const cloud = new kfgs.Cloud(packed, "color");
-  for (const {rows, ...edit} of edits) cloud.apply({...edit, rows: {color: Uint32Array.from(rows)}});
-  renderer.update(cloud);
+  const done = (cloud, {rows, ...edit}) => cloud.edited({...edit, rows: {color: Uint32Array.from(rows)}});
+  renderer.update(edits.reduce(done, new kfgs.Cloud(packed, "color")));
 }"""
 
 
