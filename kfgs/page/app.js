@@ -527,17 +527,18 @@ class App {
     return best;
   }
 
+  /** Lay the photo of a view over the scene, null: none. */
   showPhoto(at) {
-    this.photo = this.thumbnail(at) ? at : null;
-    this.photoOver.show(this.thumbnail(at));
+    const url = at === null ? null : this.thumbnail(at);
+    this.photo = url && at;
+    this.eye.whole = url !== null;
+    this.photoOver.show(url);
+    this.panes.forgetCamera();
     this.refresh();
   }
 
   hidePhoto() {
-    if (this.photo === null) return;
-    this.photo = null;
-    this.photoOver.show(null);
-    this.refresh();
+    if (this.photo !== null) this.showPhoto(null);
   }
 
   placePhoto() {

@@ -32,11 +32,11 @@ export function cameraOf(view, width, height, fov, near) {
 }
 
 /**
- * Change a camera of the pack to another picture size, so that its whole picture is visible in the middle.
+ * Change a camera of the pack to another picture size, so that its picture lies in the middle.
  * @param {object} camera {viewmat, K: [fx, fy, cx, cy], width, height, near}
+ * @param {number} scale of its picture; by default all of it is visible
  */
-export function letterboxed({viewmat, K, width, height, near}, toWidth, toHeight) {
-  const scale = Math.min(toWidth / width, toHeight / height);
+export function letterboxed({viewmat, K, width, height, near}, toWidth, toHeight, scale = Math.min(toWidth / width, toHeight / height)) {
   const [fx, fy, cx, cy] = K.map((value) => value * scale);
   const [left, top] = [(toWidth - scale * width) / 2, (toHeight - scale * height) / 2];
   return {viewmat, fx, fy, cx: cx + left, cy: cy + top, width: toWidth, height: toHeight, near};

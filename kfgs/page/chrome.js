@@ -117,20 +117,24 @@ export function makeCaptions(app) {
 
 const cloudName = (side) => (side === "color" ? "Colour cloud" : "Semantic field");
 
-/** Buttons that go to the scene's cameras, with their thumbnails. Returns {element, set(at)}. */
+/** Buttons that go to the scene's cameras, with their thumbnails; one of them is reached by Tab. Returns {element, set(at)}. */
 export function makeViews(app) {
   const buttons = app.header.cameras.map((camera, at) => {
     const [url, label] = [app.thumbnail(at), `Go to ${camera.name || `view ${at + 1}`}`];
-    const width = Math.round((48 * camera.width) / camera.height); // known before the picture is loaded: see `set`
+    const width = Math.max(36, Math.round((48 * camera.width) / camera.height)); // known before the picture is loaded: see `set`
     const content = url ? h("img", { src: url, alt: "", loading: "lazy", width }) : String(at + 1);
     return h("button", { type: "button", title: label, "aria-label": label, onclick: () => app.goTo(at) }, content);
   });
   const scroll = (event) => (event.currentTarget.scrollLeft += event.deltaY);
   const group = { class: "views card", role: "group", "aria-label": "The scene's views", hidden: !buttons.length, onwheel: scroll };
   const set = (at) => {
-    buttons.forEach((button, own) => button.setAttribute("aria-current", String(own === at)));
+    buttons.forEach((button, own) => {
+      button.setAttribute("aria-current", String(own === at));
+      button.tabIndex = own === (at ?? 0) ? 0 : -1;
+    });
     buttons[at]?.scrollIntoView({ block: "nearest", inline: "nearest" });
   };
+  set(null);
   return { element: h("div", group, ...buttons), set };
 }
 

@@ -432,7 +432,10 @@ export class Model extends EventTarget {
    * @throws {Error} a sentence for people, if it is of another scene, or somebody changed it into what cannot be done
    */
   fromJSON(saved, answer) {
-    if (saved?.format !== "kfgs.view" || saved.version !== 1) throw new Error("This file is no state of the viewer (“Save state”).");
+    if (saved?.format !== "kfgs.view" || saved.version !== 1) {
+      const what = saved?.format === "kfgs.edits" ? "has the edits of one cloud, for “kfgs edit --replay”" : "is no state of the viewer";
+      throw new Error(`This file ${what}. Choose the file that “Save state” downloaded, kfgs_view.json.`);
+    }
     const other = this.sides.find((side) => saved.sides?.[side]?.count !== this.packed.header.sides[side].count);
     if (other) {
       const [count, own] = [saved.sides?.[other]?.count ?? 0, this.packed.header.sides[other].count];

@@ -4,6 +4,7 @@ import io
 import itertools
 import json
 import re
+from dataclasses import replace
 from functools import partial
 
 import cases_explorer
@@ -421,10 +422,13 @@ def test_a_state_that_somebody_changed_is_refused_as_a_whole(page, tmp_path):
     ]
     states = [own | {"sides": own["sides"] | {"color": own["sides"]["color"] | {"edits": [edit]}}} for edit in wrong]
     other = {"format": "kfgs.view", "version": 1}
-    for state in (*states, {}, "no JSON", other, other | {"sides": {"color": {"count": 3}}}):
+    edits = {"format": "kfgs.edits", "version": 1, "edits": []}  # of "Save edited scene"
+    for state in (*states, {}, "no JSON", edits, other, other | {"sides": {"color": {"count": 3}}}):
         open_state(page, tmp_path, state)
         page.wait_for_selector("[role=alert]:visible")
-        assert re.match("This (state|file) (is|has) ", page.locator("[role=alert]:visible").inner_text())
+        said = page.locator("[role=alert]:visible").inner_text()
+        assert re.match("This (state|file) (is|has) ", said)
+        assert ("kfgs_view.json" in said) == ("This file" in said)  # which file is wanted instead
         assert page.evaluate("JSON.stringify(viewer.model)") == before
 
 
@@ -566,6 +570,7 @@ def test_buttons_go_to_the_scenes_views(browser, tmp_path):
         assert current.get_attribute("aria-label") == "Go to view_0"
         page.keyboard.press("]")
         until(page, lambda tab: tab.locator("[aria-current=true][aria-label='Go to view_1']").count())
+        assert page.locator(".views button:not([tabindex='-1'])").count() == 1  # Tab leaves the views at once
         until(page, lambda tab: np.allclose(tab.evaluate(VIEWMAT), views[1].viewmat.flatten(), atol=1e-6))
         ask(page, "chair")
         page.locator(".stage").focus()
@@ -579,6 +584,29 @@ def test_buttons_go_to_the_scenes_views(browser, tmp_path):
         page.keyboard.press("Escape")
         page.keyboard.press("f")
         until(page, lambda tab: np.allclose(tab.evaluate(VIEWMAT), views[0].viewmat.flatten(), atol=1e-6))
+
+
+def test_beside_an_upright_photo_no_wider_angle_is_seen_than_its_own(browser, tmp_path, monkeypatch):
+    monkeypatch.setattr(html, "Photos", BlackPhotos)
+    upright = [replace(view, width=28, height=60) for view in cases_explorer.cameras()]
+    file = save_html(cases_explorer.line(cameras=upright), tmp_path / "page.html", scene=object())
+    angles = "() => { const { fx, fy, width, height } = viewer.panes.camera; return [width / fx, height / fy]; }"
+    for page in show(browser, file):
+        page.set_viewport_size({"width": 1400, "height": 600})
+        until(page, lambda tab: tab.evaluate("viewer.canvas.width > 1000"))
+        page.evaluate("viewer.settled()")
+        wide, high = page.evaluate(angles)
+        assert wide == pytest.approx(60 / 40, rel=0.01)  # K has fx = 40, fy = 44
+        page.locator(".stage").focus()
+        page.keyboard.press("p")
+        until(page, lambda tab: tab.locator(".photo:visible").count())
+        page.evaluate("viewer.settled()")
+        assert page.evaluate(angles)[1] == pytest.approx(60 / 44, rel=0.01)  # all of it
+        photo, stage = page.locator(".photo").bounding_box(), page.locator(".stage").bounding_box()
+        assert photo["height"] == pytest.approx(stage["height"], abs=1)
+        page.keyboard.press("p")
+        page.evaluate("viewer.settled()")
+        assert page.evaluate(angles) == pytest.approx([wide, high])
 
 
 def test_the_photo_is_of_the_view_that_looks_the_same_way(browser, tmp_path):
