@@ -70,7 +70,6 @@ export class Cloud {
     this.source = side === "color" ? own("source") : null; // the semantic Gaussian that gives the class; null: itself
     this.far = side === "color" ? own("far") : null; // its distance
     this.origin = null; // the Gaussian of the pack that each one is, or is a copy of; null: itself
-    this.labels = bufferOf(packed, "semantic/labels");
     this.means = this.#decodeMeans();
     this.removed = new Uint8Array(this.count);
     this.reach = null; // of pick.js
@@ -88,18 +87,6 @@ export class Cloud {
     const cloud = Object.assign(Object.create(Cloud.prototype), this, { id: ++made });
     EDITS[op](cloud, own, values);
     return cloud;
-  }
-
-  /** The label of Gaussian i, -1 = none, when labels reach as far as lambda. */
-  labelOf(i, lambda) {
-    if (!this.source) return this.labels[i];
-    return this.far[i] < lambda ? this.labels[this.source[i]] : -1;
-  }
-
-  /** Whether Gaussian i has a score > gamma (compared in float32, as torch does), given the semantic side's scores. */
-  chosen(i, scores, gamma, lambda) {
-    const at = this.source ? (this.far[i] < lambda ? this.source[i] : -1) : i;
-    return at >= 0 && scores[at] > Math.fround(gamma);
   }
 
   /** The opacity of Gaussian i. */

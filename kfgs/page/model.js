@@ -176,9 +176,10 @@ export class Model extends EventTarget {
 
   /** Gaussians that are neither hidden nor removed. */
   drawn(side) {
-    const labels = this.labels(side);
-    const { removed } = this.clouds[side];
-    return Uint8Array.from(labels, (label, i) => (this.hidden.has(label) || removed[i] ? 0 : 1));
+    return this.cached(`drawn ${[...this.hidden]} ${this.key(side)}`, () => {
+      const { removed } = this.clouds[side];
+      return Uint8Array.from(this.labels(side), (label, i) => (this.hidden.has(label) || removed[i] ? 0 : 1));
+    });
   }
 
   /** Counts of a side, without removed Gaussians: {total, selected, removed, classes: [..], none}. */

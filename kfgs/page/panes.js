@@ -51,17 +51,23 @@ export class Panes {
     return this.active;
   }
 
-  /** The Gaussian at a place (CSS pixels) in a pane; -1 if there is none. `evenly`: faint ones are as good as bright ones. */
+  /** The Gaussian at a place (CSS pixels) in a pane; -1 if there is none. A selected one first, unless `evenly`. */
   under(x, y, pane = this.active, evenly = false) {
+    const { model, ratio } = this;
     this.prepare(pane);
-    if (evenly) this.renderer.setLook({ dim: false });
-    return this.renderer.pick(x * this.ratio, y * this.ratio);
+    const first = this.dims(pane) && !evenly ? model.selected(pane.side) : null;
+    return this.renderer.pick(x * ratio, y * ratio, model.drawn(pane.side), first);
   }
 
   /** A mask of the Gaussians in a polygon (CSS pixels) in the active pane. */
   inside(polygon) {
     this.prepare(this.active);
-    return this.renderer.within({ polygon: polygon.map((place) => place.map((value) => value * this.ratio)) });
+    return this.renderer.within(polygon.map((place) => place.map((value) => value * this.ratio)), this.model.drawn(this.active.side));
+  }
+
+  /** Whether a pane dims what is not selected. The colours of scores say where gamma should be. */
+  dims(pane) {
+    return this.model.selecting && pane.mode !== "score";
   }
 
   /** How far a point lies in front of the camera. */
@@ -173,7 +179,7 @@ export class Panes {
     renderer.setLook({
       mode: pane.mode, question: answer ? this.question(answer) : null, gamma: model.gamma ?? 0, lambda: model.lambda,
       low, high, hidden, mixing: pane.mode === "labels" ? MIXING : 1,
-      dim: model.selecting && pane.mode !== "score", // the colours of the rest say where gamma should be
+      dim: this.dims(pane),
     });
   }
 

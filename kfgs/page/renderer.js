@@ -83,7 +83,7 @@ export class Renderer {
     this.names = header.classes;
     this.scores = {null: bufferOf(packed, "semantic/label_scores")};
     for (const {buffer} of Object.values(header.query)) this.scores[questionNumber(buffer)] = bufferOf(packed, buffer);
-    const {labels} = clouds.semantic;
+    const labels = bufferOf(packed, "semantic/labels");
     const latents = bufferOf(packed, "semantic/latents");
     this.shared = {
       labels: sheet(gl, gl.R16I, labels.length, labels),
@@ -206,37 +206,18 @@ export class Renderer {
     this.side = side;
   }
 
-  /** The number of the Gaussian seen at a pixel of the canvas, a selected one first if the others are dim; -1: none. */
-  pick(x, y) {
-    const {cloud, camera, left, top, drawn, chosen} = this.#under(x, y);
+  /** The number of the Gaussian seen at a pixel of the canvas, of those that a mask has; one of `first`, if there is one. */
+  pick(x, y, drawn, first = null) {
+    const {cloud, camera, left, top} = this.#under(x, y);
     if (!cloud) return -1;
-    if (chosen) {
-      const found = gaussianAt(cloud, camera, x - left, y - top, (i) => chosen(i) && drawn(i));
-      if (found >= 0) return found;
-    }
-    return gaussianAt(cloud, camera, x - left, y - top, drawn);
+    const found = first ? gaussianAt(cloud, camera, x - left, y - top, first.map((on, i) => on & drawn[i])) : -1;
+    return found >= 0 ? found : gaussianAt(cloud, camera, x - left, y - top, drawn);
   }
 
-  /** A mask of the drawn Gaussians in a region; see `gaussiansIn`. Polygons are in pixels of the canvas. */
-  within(region) {
-    const [x, y] = region.polygon?.[0] ?? [0, 0];
-    const {cloud, camera, left, top, drawn} = this.#under(x, y, true);
-    const polygon = region.polygon?.map(([px, py]) => [px - left, py - top]);
-    return gaussiansIn(cloud, {...region, polygon}, camera, drawn);
-  }
-
-  /** What is on the canvas, as ImageData. */
-  toImage() {
-    const {gl} = this;
-    const {width, height} = this.canvas;
-    const pixels = new Uint8ClampedArray(4 * width * height);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
-    const flipped = new Uint8ClampedArray(pixels.length);
-    for (let y = 0; y < height; y++) {
-      flipped.set(pixels.subarray(4 * width * (height - 1 - y), 4 * width * (height - y)), 4 * width * y);
-    }
-    return new ImageData(flipped, width, height);
+  /** A mask of the Gaussians in a polygon (pixels of the canvas), of those that a mask has. */
+  within(polygon, drawn) {
+    const {cloud, camera, left, top} = this.#under(...polygon[0], true);
+    return gaussiansIn(cloud, polygon.map(([x, y]) => [x - left, y - top]), camera, drawn);
   }
 
   /** Free the worker and the graphics memory. */
@@ -509,30 +490,19 @@ export class Renderer {
     setTimeout(look, 0);
   }
 
-  /** Which Gaussians can be picked, and the camera of the viewport under a pixel. */
+  /** The cloud and the camera of the viewport under a pixel; `anyway`: of the last one, if there is none. */
   #under(x, y, anyway = false) {
     const views = [...this.views.values()].reverse();
     const holds = ({x: left, y: top, width, height}) => x >= left && x < left + width && y >= top && y < top + height;
     const view = views.find((one) => holds(one.clip ?? one)) ?? (anyway ? views[0] : null);
     if (!view) return {};
-    const {cloud, selected} = this.sides[view.side];
-    const {camera, look} = this;
+    const {camera} = this;
     const [sx, sy] = [view.width / camera.width, view.height / camera.height];
     const stretched = {
       ...camera, fx: camera.fx * sx, cx: camera.cx * sx, fy: camera.fy * sy, cy: camera.cy * sy,
       width: view.width, height: view.height,
     };
-    const {hidden, lambda} = look;
-    const drawn = (i) => {
-      if (cloud.removed[i]) return false;
-      if (!hidden) return true;
-      const label = cloud.labelOf(i, lambda);
-      return !hidden[label < 0 ? this.names.length : label];
-    };
-    const scores = look.question === null ? null : this.scores[look.question];
-    const asked = scores && ((i) => cloud.chosen(i, scores, look.gamma, lambda));
-    const chosen = look.dim ? (selected ? (i) => selected[i] : asked) : null;
-    return {cloud, camera: stretched, left: view.x, top: view.y, drawn, chosen};
+    return {cloud: this.sides[view.side].cloud, camera: stretched, left: view.x, top: view.y};
   }
 
   #dropSide({textures, shape, paint, prepared}) {

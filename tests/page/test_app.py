@@ -244,6 +244,10 @@ def test_hidden_classes_are_not_drawn_picked_or_selected_by_hand(page, state):
         np.testing.assert_array_equal(mask(page, side, "drawn"), state.drawn(side))
     page.evaluate("viewer.shape([[0, 0], [5000, 0], [5000, 5000], [0, 5000]], 'replace')")
     assert not (mask(page, "color") & ~state.drawn("color")).any()
+    x, y = np.mean([place_of(page, "color", i) for i in range(150, 300)], axis=0)  # where the chairs are
+    page.mouse.click(x, y)
+    found = page.evaluate("viewer.model.picked?.index ?? -1")
+    assert found < 0 or state.drawn("color")[found]
     state.set_hidden([])
     page.hover("li[data-label='0']")
     page.click("button[aria-label='Show only table']")
