@@ -27,7 +27,7 @@ class Display:
     show: Given[Literal["labels", "rgb", "score", "latents"]] = None
     """The meaning of the colours at the start. When not given: the page shows colours if there are any, all else labels."""
     style: Literal["auto", "gaussians", "points"] = "auto"
-    """Window and picture: gaussians as they are rasterised, points (quick); auto: Gaussians if a frame of them is quick."""
+    """Window and picture: gaussians as they are rasterised, or points (quick); auto: points if there are many."""
     host: str = "127.0.0.1"
     """Address on which the page listens. Anything but 127.0.0.1 lets others look and save."""
     port: int = 0
