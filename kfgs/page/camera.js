@@ -102,15 +102,6 @@ export function fit(view, center, radius, fov, most = Infinity) {
   return {...view, distance, position: add(center, axis(view, 2), -distance)};
 }
 
-/** Turn about the viewing direction until the horizon is level. */
-export function level(view, up) {
-  const z = axis(view, 2);
-  const x = cross(z, up);
-  if (Math.hypot(...x) < 1e-6) return view;
-  const right = unit(x);
-  return {...view, R: [...right, ...cross(z, right), ...z]};
-}
-
 /** The view that looks from a position at a point. */
 export function lookAt(position, point, up) {
   const z = unit(add(point, position, -1));

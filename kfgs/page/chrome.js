@@ -11,6 +11,10 @@ export const TOOLS = {
 const HOWS = [
   ["replace", "=", "Select anew"], ["add", "+", "Add to the selection (Shift)"], ["subtract", "−", "Subtract from the selection (Alt)"],
 ];
+const MEANINGS = {
+  color: "The scene as photographed", labels: "The class of each Gaussian", latents: "The features as colours: what is alike has one colour",
+  score: "How well each Gaussian fits the search, or its class: dark to bright",
+};
 const LAYOUTS = [["one", "One view"], ["split", "Side by side"], ["slider", "Slider"]];
 const HELP = [
   ["Drag", "turn the view"], ["Right drag, Shift + drag", "move it sideways"], ["Middle drag, Ctrl + drag", "look around"], ["Wheel, two fingers, + −", "zoom"],
@@ -38,7 +42,7 @@ export function makeTop(app) {
     const found = link.phrases ? [] : suggestions(words, names);
     return found.length === 1 ? found[0] : words; // the only class that the typed letters can become
   };
-  const modes = Object.entries(app.modes).map(([mode, text]) => [mode, text, `Show ${text.toLowerCase()} (M)`]);
+  const modes = Object.entries(app.modes).map(([mode, text]) => [mode, text, `${MEANINGS[mode]} (M)`]);
   const photos = header.cameras.some((camera) => camera.thumbnail);
   if (photos) modes.unshift(["photo", "Photo", "Lay the photo of the nearest view over the scene (P)"]);
   const mode = choice("Colours", modes, (own) => (own === "photo" ? app.togglePhoto() : app.setMode(own)));
