@@ -37,7 +37,7 @@ TIME = """async ([change, turns]) => {
   const v = document.querySelector(".kfgs").viewer, m = v.model, lambda = m.lambda;
   const words = m.names.filter((_, label) => m.own.includes(label)).slice(0, 6);
   const run = new Function("v", "m", "turn", "words", "lambda", `return (async () => {${change}})()`);
-  const drawn = (moving) => { v.panes.moving = moving; v.panes.draw(); v.panes.renderer.toImage(); };
+  const drawn = (moving) => { v.panes.moving = moving; v.panes.draw(); wait(v); };
   const quick = [], full = [];
   for (let turn = 0; turn < turns; turn++) {
     let began = performance.now();
@@ -50,18 +50,20 @@ TIME = """async ([change, turns]) => {
   }
   return [quick, full];
 }"""
-FIRST = """addEventListener("DOMContentLoaded", () => new MutationObserver((_, watcher) => {
+FIRST = """globalThis.wait = ({panes: {renderer: {gl}}}) =>
+  gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+addEventListener("DOMContentLoaded", () => new MutationObserver((_, watcher) => {
   const root = document.querySelector(".kfgs:not([aria-busy])");
   if (!root?.viewer?.eye) return;
   watcher.disconnect();
-  root.viewer.panes.renderer.toImage();
+  wait(root.viewer);
   globalThis.first = Date.now();
 }).observe(document, {attributes: true, subtree: true, attributeFilter: ["aria-busy"]}))"""
 FULL = """async () => {
   while (!globalThis.first) await new Promise((resolve) => setTimeout(resolve, 20));
   const v = document.querySelector(".kfgs").viewer;
   while (v.panes.moving) await new Promise(requestAnimationFrame);
-  v.panes.renderer.toImage();
+  wait(v);
   return [first / 1000, Date.now() / 1000];
 }"""
 TURN = """async (frames) => {
@@ -72,7 +74,7 @@ TURN = """async (frames) => {
     v.panes.forgetCamera();
     v.panes.moving = true;
     v.panes.draw();
-    v.panes.renderer.toImage();
+    wait(v);
     await new Promise((resolve) => setTimeout(resolve));
   }
   return (1000 * frames) / (performance.now() - began);

@@ -52,7 +52,7 @@ PICTURE = """async ({camera, side, look, marks}) => {
   renderer.setCamera(camera);
   renderer.draw();
   await renderer.settled();
-  return base64(renderer.toImage().data);
+  return base64(shown());
 }"""
 
 BASE64 = """
@@ -60,6 +60,12 @@ const base64 = (bytes) => {
   let text = "";
   for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
   return btoa(text);
+};
+const shown = () => {
+  const { width, height } = canvas;
+  const flat = new OffscreenCanvas(width, height).getContext("2d");
+  flat.drawImage(canvas, 0, 0);
+  return flat.getImageData(0, 0, width, height).data;
 };
 """
 PAPER = torch.tensor([0.25, 0.5, 0.75])

@@ -1,6 +1,8 @@
 """`kfgs view` without a display: its picture, and what it says of wrong input before anything is drawn."""
 
 import json
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from PIL import Image
 from small_room import make_room
 
 from kfgs.cli import main
-from kfgs.fields import SemanticField
+from kfgs.fields import SemanticField, remember
 from kfgs.formats import SplatFile, write_splats
 from kfgs.scenes import load_scene
 from kfgs.splat import rgb_to_sh0
@@ -123,6 +125,22 @@ def test_a_file_to_share_needs_no_driver(room, files, tmp_path, monkeypatch, cap
     assert header["start"]["words"] == "zebra crossing"
     assert header["title"] == files.name  # of files/field: all fields have this name
     assert header["cameras"][0]["thumbnail"] == "thumbnails/0"
+
+
+def test_a_run_folder_brings_its_colours_and_the_photos_of_its_scene(room, files, tmp_path, capsys):
+    scene = load_scene(room)
+    made = SemanticField.load(files / "field")
+    train = tuple(scene.cameras[i] for i in scene.views("train"))
+    info = made.info | remember(room, files / "field")
+    replace(made, info=info, cameras=train).save(tmp_path / "run" / "field")
+    shutil.copy(files / "color.ply", tmp_path / "run" / "color.ply")
+    words = ["--text", files / "text.safetensors"]
+    assert main(["view", *map(str, [tmp_path / "run", *words, "--where", "html", "--out", tmp_path / "out"])]) == 0
+    assert f"colours: {tmp_path / 'run' / 'color.ply'}" in capsys.readouterr().out
+    header = json.loads((tmp_path / "out" / "view.html").read_text().split('id="header">')[1].split("</script>")[0])
+    assert list(header["sides"]) == ["semantic", "color"]
+    assert [camera["thumbnail"] for camera in header["cameras"]] == [f"thumbnails/{i}" for i in range(len(train))]
+    assert header["title"] == "run"
 
 
 def test_no_driver_is_told_before_anything_is_read(files, monkeypatch, capsys):

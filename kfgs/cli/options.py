@@ -225,6 +225,18 @@ class Classes(SceneOption):
         given = any(path is not None for path in (self.scene, self.classes, self.text))
         return self.load_classes() if given or not field.has_classes else field.label_set()
 
+    def scene_of(self, field: Any | None) -> Any:
+        """The scene of --scene or of the field, for its photographs; None if there is none, or it is gone."""
+        from ..scenes import load_scene
+
+        if self.scene is not None:
+            return self.load_scene().undistorted()
+        folder = None if field is None else remembered_scene(field)
+        try:
+            return None if folder is None else load_scene(folder).undistorted()
+        except (OSError, ValueError):
+            return None
+
     def open_field(self, name: str, path: Path) -> Any:
         """Open a field with fused features; an old field computes them from the views of --scene, if given."""
         field = open_field(name, path)
@@ -245,6 +257,16 @@ class Classes(SceneOption):
                 f"{len(loaded.cameras)} others in {self.scene}; pass the field's own scene, or --classes and --text instead"
             )
         return field.with_answers(voting)
+
+
+def remembered_scene(field: Any) -> Path | None:
+    """The scene folder that a field remembers; None if there is none, or it is gone."""
+    from ..fields import recall_scene
+
+    try:
+        return recall_scene(field.info, field.folder)
+    except (OSError, ValueError):
+        return None
 
 
 def fit_config(

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from .._files import atomic_folder, check_output
 from .files import check_alone, inputs_of, is_field, open_field, open_splats
-from .options import Classes, Given, Positional, Teacher
+from .options import Classes, Given, Positional, Teacher, remembered_scene
 from .output import say, say_counts, wrote
 from .text import ask
 
@@ -69,13 +69,13 @@ def select(
     if asked_by_text:
         field = classes.open_field("source", source)
         if out is not None and classes.scene is None:
-            check_output("out", out, "a folder", apart=inputs_of(_remembered(field)))
+            check_output("out", out, "a folder", apart=inputs_of(remembered_scene(field)))
         label_set, target = ask(query, classes, teacher, field)
         query = target if isinstance(target, str) else query
         how = None if score == "auto" else score
         found = field.query(target, label_set, threshold, negatives=_negatives(negatives, score), score=how)
         cloud, cameras = SplatFile(field.gaussians, {"score": found.scores.numpy()}), field.cameras or None
-        scene = _scene_of(field, classes) if out is not None else None
+        scene = classes.scene_of(field) if out is not None else None
     else:
         given = {"classes": classes.classes, "text": classes.text, "negatives": negatives, "score": score}
         for name, value in (given | dataclasses.asdict(teacher)).items():
@@ -273,29 +273,6 @@ def _save(folder: Path, query: str, cloud: Any, found: Any, things: list[Any]) -
     facts = {"query": query, "threshold": found.threshold, "how": found.how, "count": len(found), "parts": parts}
     write_json(folder / "selection.json", facts)
     write_splats(folder / "selection.ply", cloud.select(found.mask))
-
-
-def _scene_of(field: Any, classes: Classes) -> Any:
-    """The scene of --scene or of the field, for its photographs; None if it is not there any more."""
-    from ..scenes import load_scene
-
-    if classes.scene is not None:
-        return classes.load_scene().undistorted()
-    folder = _remembered(field)
-    try:
-        return None if folder is None else load_scene(folder).undistorted()
-    except (OSError, ValueError):
-        return None
-
-
-def _remembered(field: Any) -> Path | None:
-    """The scene folder that a field remembers; None if there is none, or it is gone."""
-    from ..fields import recall_scene
-
-    try:
-        return recall_scene(field.info, field.folder)
-    except (OSError, ValueError):
-        return None
 
 
 def _draw(path: Path, query: str, gaussians: Any, things: list[Any], cameras: Any, scene: Any) -> None:

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._files import check_output
-from .files import inputs_of, is_field, open_splats
+from .files import inputs_of
 from .options import Classes, Given, Positional, Teacher
 from .output import say, wrote
-from .view import open_meaning
+from .view import open_colors, open_meaning
 
 # Heavy imports happen inside the commands, so that `kfgs --help` answers at once.
 
@@ -68,7 +68,7 @@ def render(
     meaning, cameras = open_meaning(source if found is None else found, classes, teacher)
     if classes.scene is not None:
         cameras = classes.load_scene().undistorted().cameras
-    colors = _colors(found, color, meaning)
+    colors = open_colors(found, color, meaning)
     semantic = meaning.gaussians
     if path == "orbit":
         semantic, colors = _opened(meaning.names, semantic, colors)
@@ -87,24 +87,6 @@ def render(
             progress=lambda *_: bar.update(),
         )
     wrote([out])
-
-
-def _colors(field: Path | None, color: Path | None, meaning: Any) -> Any:
-    """The colour cloud: the given one, the source's own, or that of the run; None if there is none."""
-    from ..fields.store import read_description
-
-    if color is not None:
-        return open_splats("color", color).gaussians
-    if meaning.gaussians.sh is not None:
-        return meaning.gaussians
-    if field is None or field.is_file():
-        return None
-    geometry = read_description(field).get("info", {}).get("geometry")
-    for place in (field.parent / "color.ply", Path(str(geometry))):
-        if place.is_file() and not is_field(place):
-            say(f"colours: {place}")
-            return open_splats("color", place).gaussians
-    return None
 
 
 def _opened(names: Any, semantic: Any, colors: Any) -> tuple[Any, Any]:

@@ -28,7 +28,7 @@ class Display:
     show: Given[Literal["labels", "rgb", "score", "latents"]] = None
     """The meaning of the colours at the start. When not given: the page shows colours if there are any, all else labels."""
     style: Literal["auto", "gaussians", "points"] = "auto"
-    """Window and picture: gaussians as they are rasterised, points (quick); auto: Gaussians if a frame of them is quick."""
+    """Window and picture: gaussians as they are rasterised, or points (quick); auto: points if there are many."""
     host: str = "127.0.0.1"
     """Address on which the page listens. Anything but 127.0.0.1 lets others look and save."""
     port: int = 0
@@ -54,19 +54,19 @@ def view(
     lights up too.
 
     Examples:
-        kfgs view run/field --color run/color.ply
-        kfgs view run/field --color run/color.ply --where html    # one file to share
+        kfgs view run/
+        kfgs view run/ --where html    # one file to share
         kfgs view labelled.ply --ask chair --where picture --out pictures/
-        kfgs view run/field --teacher lseg --weights demo_e200.ckpt    # any text
+        kfgs view run/ --teacher lseg --weights demo_e200.ckpt    # any text
 
     Args:
-        source: A field folder (RUN/field), asked by text; or a splat with classes (`kfgs attach`), asked by class.
-        color: Colour splat in the same frame, any splat file; without it the source is shown alone.
+        source: A run folder of `kfgs fit` or its field, asked by text; or a splat with classes (`kfgs attach`), asked by class.
+        color: Colour splat in the same frame, any splat file. Of a field, by default: RUN/color.ply, or the splat it was made on.
         ask: A first question.
         distance: Lambda at the start, in world units; by default from the clouds' spacing.
         where: browser; html (writes OUT/view.html, one file that any browser opens without kfgs, and ends); window (pyvista:
-            two clouds side by side); or picture (writes OUT/view.png and ends). auto: browser. With --scene the first two
-            show small photos, too.
+            two clouds side by side); or picture (writes OUT/view.png and ends). auto: browser. The first two show small
+            photos of the scene, too.
         out: Folder for saved pictures and selections.
     """
     place = "browser" if where == "auto" else where
@@ -118,7 +118,8 @@ def _key(source: Path, color: Path | None, *options: Any) -> str | None:
     words = [source.resolve(), color and color.resolve(), *options]
     named = [value for option in options if dataclasses.is_dataclass(option) for value in vars(option).values()]
     files = [Path(value) for value in named if isinstance(value, str | Path) and Path(value).exists()]
-    return scene_key(words, [source, *([color] if color else []), *files])
+    run = source.parent if source.name == "field" else source  # its colours are shown, too
+    return scene_key(words, [run, *([color] if color else []), *files])
 
 
 def _check_drawing(place: Where) -> None:
@@ -139,14 +140,17 @@ def _read(
 ) -> Any:
     """The exploration."""
     from .._check import check_range
+    from ..fields.store import find_field
     from ..viz.explorer import Exploration
 
     if distance is not None:
         check_range("distance", distance, 0, closed=(False, False))
     classes.check_images()
     say("reading")
-    meaning, cameras = open_meaning(source, classes, teacher)
-    cloud = None if color is None else open_splats("color", color).gaussians
+    found = find_field(source)
+    meaning, cameras = open_meaning(found or source, classes, teacher)
+    colors = open_colors(found, color, meaning)
+    cloud = None if colors is meaning.gaussians else colors
     state = Exploration(meaning, cloud, cameras=cameras, distance=distance)
     _note(state)
     if ask is not None:
@@ -160,7 +164,7 @@ def _viewer(state: Any, source: Path, out: Path, classes: Classes, display: Disp
     from ..viz.explorer import ExploreOptions, Viewer
 
     state.set_show(display.show or state.first_show)
-    scene = None if classes.scene is None else classes.load_scene().undistorted()
+    scene = classes.scene_of(getattr(state.meaning, "field", None))
     return Viewer(state, ExploreOptions(out=out), title=_title(source), scene=scene)
 
 
@@ -182,6 +186,24 @@ def _draw(state: Any, place: Where, out: Path, display: Display) -> None:
         else:
             explorer.screenshot(out / "view.png")
             wrote([out / "view.png"])
+
+
+def open_colors(field: Path | None, color: Path | None, meaning: Any) -> Any:
+    """The colour cloud: the given one, the source's own, or that of the run; None if there is none."""
+    from ..fields.store import read_description
+
+    if color is not None:
+        return open_splats("color", color).gaussians
+    if meaning.gaussians.sh is not None:
+        return meaning.gaussians
+    if field is None or field.is_file():
+        return None
+    geometry = read_description(field).get("info", {}).get("geometry")
+    for place in (field.parent / "color.ply", Path(str(geometry))):
+        if place.is_file() and not is_field(place):
+            say(f"colours: {place}")
+            return open_splats("color", place).gaussians
+    return None
 
 
 def open_meaning(source: Path, classes: Classes, teacher: Teacher) -> tuple[Any, list[Any]]:

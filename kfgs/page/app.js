@@ -177,19 +177,24 @@ class App {
 
   // what a person does
 
-  /** Search; a message says why there is no answer. No words clear the search. Only the last search is answered. */
+  /**
+   * Search; a message says why there is no answer. No words clear the search. Only the last search is answered. Then keys are
+   * those of the view, if they were those of the search box.
+   */
   async ask(words) {
     const turn = (this.asking = {});
     const before = this.model.answer;
     const wanted = () => this.asking === turn && this.model.answer === before;
-    const { element } = this.top.search;
+    const { element, input } = this.top.search;
     this.say("");
     element.removeAttribute("aria-busy");
     if (!words?.trim()) return this.model.ask(null);
     element.setAttribute("aria-busy", "true");
     try {
       const answer = await this.link.ask(words);
-      if (wanted()) this.model.ask(answer);
+      if (!wanted()) return;
+      this.model.ask(answer);
+      if (document.activeElement === input) this.stage.focus({ preventScroll: true });
     } catch (error) {
       if (wanted()) this.say(error.message);
     } finally {
@@ -522,17 +527,18 @@ class App {
     return best;
   }
 
+  /** Lay the photo of a view over the scene, null: none. */
   showPhoto(at) {
-    this.photo = this.thumbnail(at) ? at : null;
-    this.photoOver.show(this.thumbnail(at));
+    const url = at === null ? null : this.thumbnail(at);
+    this.photo = url && at;
+    this.eye.whole = url !== null;
+    this.photoOver.show(url);
+    this.panes.forgetCamera();
     this.refresh();
   }
 
   hidePhoto() {
-    if (this.photo === null) return;
-    this.photo = null;
-    this.photoOver.show(null);
-    this.refresh();
+    if (this.photo !== null) this.showPhoto(null);
   }
 
   placePhoto() {

@@ -32,11 +32,11 @@ export function cameraOf(view, width, height, fov, near) {
 }
 
 /**
- * Change a camera of the pack to another picture size, so that its whole picture is visible in the middle.
+ * Change a camera of the pack to another picture size, so that its picture lies in the middle.
  * @param {object} camera {viewmat, K: [fx, fy, cx, cy], width, height, near}
+ * @param {number} scale of its picture; by default all of it is visible
  */
-export function letterboxed({viewmat, K, width, height, near}, toWidth, toHeight) {
-  const scale = Math.min(toWidth / width, toHeight / height);
+export function letterboxed({viewmat, K, width, height, near}, toWidth, toHeight, scale = Math.min(toWidth / width, toHeight / height)) {
   const [fx, fy, cx, cy] = K.map((value) => value * scale);
   const [left, top] = [(toWidth - scale * width) / 2, (toHeight - scale * height) / 2];
   return {viewmat, fx, fy, cx: cx + left, cy: cy + top, width: toWidth, height: toHeight, near};
@@ -100,15 +100,6 @@ export function fly(view, [right, up, forward]) {
 export function fit(view, center, radius, fov, most = Infinity) {
   const distance = Math.min(Math.max(radius, 1e-6) / Math.sin(fov / 2), most);
   return {...view, distance, position: add(center, axis(view, 2), -distance)};
-}
-
-/** Turn about the viewing direction until the horizon is level. */
-export function level(view, up) {
-  const z = axis(view, 2);
-  const x = cross(z, up);
-  if (Math.hypot(...x) < 1e-6) return view;
-  const right = unit(x);
-  return {...view, R: [...right, ...cross(z, right), ...z]};
 }
 
 /** The view that looks from a position at a point. */

@@ -11,6 +11,10 @@ export const TOOLS = {
 const HOWS = [
   ["replace", "=", "Select anew"], ["add", "+", "Add to the selection (Shift)"], ["subtract", "−", "Subtract from the selection (Alt)"],
 ];
+const MEANINGS = {
+  color: "The scene as photographed", labels: "The class of each Gaussian", latents: "The features as colours: what is alike has one colour",
+  score: "How well each Gaussian fits the search, or its class: dark to bright",
+};
 const LAYOUTS = [["one", "One view"], ["split", "Side by side"], ["slider", "Slider"]];
 const HELP = [
   ["Drag", "turn the view"], ["Right drag, Shift + drag", "move it sideways"], ["Middle drag, Ctrl + drag", "look around"], ["Wheel, two fingers, + −", "zoom"],
@@ -38,7 +42,7 @@ export function makeTop(app) {
     const found = link.phrases ? [] : suggestions(words, names);
     return found.length === 1 ? found[0] : words; // the only class that the typed letters can become
   };
-  const modes = Object.entries(app.modes).map(([mode, text]) => [mode, text, `Show ${text.toLowerCase()} (M)`]);
+  const modes = Object.entries(app.modes).map(([mode, text]) => [mode, text, `${MEANINGS[mode]} (M)`]);
   const photos = header.cameras.some((camera) => camera.thumbnail);
   if (photos) modes.unshift(["photo", "Photo", "Lay the photo of the nearest view over the scene (P)"]);
   const mode = choice("Colours", modes, (own) => (own === "photo" ? app.togglePhoto() : app.setMode(own)));
@@ -117,20 +121,24 @@ export function makeCaptions(app) {
 
 const cloudName = (side) => (side === "color" ? "Colour cloud" : "Semantic field");
 
-/** Buttons that go to the scene's cameras, with their thumbnails. Returns {element, set(at)}. */
+/** Buttons that go to the scene's cameras, with their thumbnails; one of them is reached by Tab. Returns {element, set(at)}. */
 export function makeViews(app) {
   const buttons = app.header.cameras.map((camera, at) => {
     const [url, label] = [app.thumbnail(at), `Go to ${camera.name || `view ${at + 1}`}`];
-    const width = Math.round((48 * camera.width) / camera.height); // known before the picture is loaded: see `set`
+    const width = Math.max(36, Math.round((48 * camera.width) / camera.height)); // known before the picture is loaded: see `set`
     const content = url ? h("img", { src: url, alt: "", loading: "lazy", width }) : String(at + 1);
     return h("button", { type: "button", title: label, "aria-label": label, onclick: () => app.goTo(at) }, content);
   });
   const scroll = (event) => (event.currentTarget.scrollLeft += event.deltaY);
   const group = { class: "views card", role: "group", "aria-label": "The scene's views", hidden: !buttons.length, onwheel: scroll };
   const set = (at) => {
-    buttons.forEach((button, own) => button.setAttribute("aria-current", String(own === at)));
+    buttons.forEach((button, own) => {
+      button.setAttribute("aria-current", String(own === at));
+      button.tabIndex = own === (at ?? 0) ? 0 : -1;
+    });
     buttons[at]?.scrollIntoView({ block: "nearest", inline: "nearest" });
   };
+  set(null);
   return { element: h("div", group, ...buttons), set };
 }
 

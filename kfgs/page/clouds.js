@@ -53,13 +53,13 @@ let made = 0;
 export const cloudsOf = (packed) => Object.fromEntries(Object.keys(packed.header.sides).map((side) => [side, new Cloud(packed, side)]));
 
 /**
- * One cloud of the pack, and what became of it. Arrays are indexed by Gaussian, as in Python; copies come after the originals.
- * `stamps` count the changes of its arrays.
+ * One cloud of the pack, or what an edit made of it. Arrays are indexed by Gaussian, as in Python; copies come after the
+ * originals. Nothing changes a cloud: `edited` gives another one, which shares every array that the edit does not change.
  */
 export class Cloud {
   constructor(packed, side) {
-    const own = (name) => bufferOf(packed, `${side}/${name}`)?.slice() ?? null;
-    this.id = ++made; // another one after an undo
+    const own = (name) => bufferOf(packed, `${side}/${name}`);
+    this.id = ++made;
     this.side = side;
     this.meta = packed.header.sides[side];
     this.count = this.meta.count;
@@ -70,12 +70,9 @@ export class Cloud {
     this.source = side === "color" ? own("source") : null; // the semantic Gaussian that gives the class; null: itself
     this.far = side === "color" ? own("far") : null; // its distance
     this.origin = null; // the Gaussian of the pack that each one is, or is a copy of; null: itself
-    this.labels = bufferOf(packed, "semantic/labels");
     this.means = this.#decodeMeans();
     this.removed = new Uint8Array(this.count);
-    this.selected = null; // a mask, or null: what the question selects
     this.reach = null; // of pick.js
-    this.stamps = { splats: 0, colors: 0, marks: 0 };
   }
 
   /** Whether its colours can be changed: it has its own. */
@@ -83,93 +80,13 @@ export class Cloud {
     return this.meta.sh_degree !== null;
   }
 
-  /** Do an edit: {op, rows: {side: Uint32Array}, rgb?, factor?, translation?}; see Model.edit. */
-  apply({ op, rows, rgb, factor, translation }) {
+  /** The cloud after an edit: {op, rows: {side: Uint32Array}, rgb?, factor?, translation?}; see Model.edit. */
+  edited({ op, rows, ...values }) {
     const own = rows[this.side];
-    if (!own) return;
-    if (op === "remove") this.#remove(own);
-    if (op === "opacity") this.#fade(own, factor);
-    if (op === "recolor") this.#paint(own, rgb);
-    if (op === "move") this.move(own, translation);
-    if (op === "duplicate") this.move(this.#copy(own), translation);
-  }
-
-  #remove(rows) {
-    for (const i of rows) this.removed[i] = 1;
-    this.stamps.marks++;
-  }
-
-  #fade(rows, factor) {
-    for (const i of rows) {
-      const word = this.splats[4 * i + 3];
-      this.splats[4 * i + 3] = (word & 0xffffff) | (Math.round((word >>> 24) * factor) << 24);
-    }
-    this.reach = null; // see pick.js
-    this.stamps.splats++;
-  }
-
-  /** Move Gaussians by a vector. */
-  move(rows, translation) {
-    const means = new Float32Array(3 * rows.length);
-    rows.forEach((i, k) => translation.forEach((shift, axis) => (means[3 * k + axis] = this.means[3 * i + axis] + shift)));
-    this.#setMeans(rows, means);
-    this.stamps.splats++;
-  }
-
-  /** Append copies; returns their numbers. */
-  #copy(rows) {
-    const { count, planes, sh } = this;
-    this.origin ??= Uint32Array.from({ length: count }, (_, i) => i);
-    this.source ??= Int32Array.from({ length: count }, (_, i) => i);
-    this.far ??= new Float32Array(count); // its own class, at any lambda
-    for (const [name, width] of [["splats", 4], ["dc", 1], ["means", 3], ["removed", 1], ["source", 1], ["far", 1], ["origin", 1]])
-      this[name] = withRows(this[name], rows, width);
-    this.count += rows.length;
-    if (sh) {
-      this.sh = new sh.constructor(2 * planes * this.count);
-      for (let t = 0; t < planes; t++)
-        this.sh.set(withRows(sh.subarray(2 * t * count, 2 * (t + 1) * count), rows, 2), 2 * t * this.count);
-    }
-    this.selected = this.reach = null;
-    return Uint32Array.from(rows, (_, k) => count + k);
-  }
-
-  /** Give Gaussians one hue and keep their shading: `Recolor` of kfgs, in its mode "tint". */
-  #paint(rows, rgb) {
-    const [low, step] = this.meta.dc;
-    const colors = Array.from(rows, (i) => [0, 10, 20].map((shift) => low + step * ((this.dc[i] >>> shift) & 1023)));
-    const lights = Float64Array.from(colors, luminance);
-    const sizes = Float64Array.from(rows, (i) => {
-      const sides = this.scalesOf(i).sort((a, b) => b - a);
-      return this.opacityOf(i) * sides[0] * sides[1];
-    });
-    const shade = tint(rgb, weightedMedian(lights, sizes));
-    const bytes = this.sh && new Int8Array(this.sh.buffer);
-    rows.forEach((i, k) => {
-      const [color, slopes] = shade(lights[k]);
-      const [r, g, b] = color.map((value) => Math.min(Math.max(Math.round((value - low) / step), 0), 1023));
-      this.dc[i] = r | (g << 10) | (b << 20);
-      for (let first = 0; first < 8 * this.planes - 2; first += 3) {
-        const at = [first, first + 1, first + 2].map((j) => 8 * ((j >> 3) * this.count + i) + (j & 7));
-        const light = luminance(at.map((place) => bytes[place]));
-        at.forEach((place, axis) => (bytes[place] = Math.min(Math.max(Math.round(slopes[axis] * light), -127), 127)));
-      }
-    });
-    this.stamps.colors++;
-  }
-
-  /** The label of Gaussian i, -1 = none, when labels reach as far as lambda. */
-  labelOf(i, lambda) {
-    if (!this.source) return this.labels[i];
-    return this.far[i] < lambda ? this.labels[this.source[i]] : -1;
-  }
-
-  /** Whether Gaussian i has a score > gamma (compared in float32, as torch does), given the semantic side's scores. */
-  chosen(i, scores, gamma, lambda) {
-    if (this.selected) return this.selected[i] > 0;
-    if (!scores) return false;
-    const at = this.source ? (this.far[i] < lambda ? this.source[i] : -1) : i;
-    return at >= 0 && scores[at] > Math.fround(gamma);
+    if (!own) return this;
+    const cloud = Object.assign(Object.create(Cloud.prototype), this, { id: ++made });
+    EDITS[op](cloud, own, values);
+    return cloud;
   }
 
   /** The opacity of Gaussian i. */
@@ -206,20 +123,6 @@ export class Cloud {
     return radii;
   }
 
-  #setMeans(indices, means) {
-    const {center, half} = this.meta;
-    for (let k = 0; k < indices.length; k++) {
-      const whole = [0, 1, 2].map((axis) => {
-        const u = (means[3 * k + axis] - center[axis]) / half[axis];
-        const v = Math.abs(u) <= 1 ? u : (2 - 1 / Math.abs(u)) * Math.sign(u);
-        this.means[3 * indices[k] + axis] = means[3 * k + axis];
-        return Math.round(((v + 2) / 4) * MEAN_STEPS);
-      });
-      this.splats[4 * indices[k]] = whole[0] | (whole[1] << 21);
-      this.splats[4 * indices[k] + 1] = (whole[1] >>> 11) | (whole[2] << 10);
-    }
-  }
-
   #decodeMeans() {
     const {center, half} = this.meta;
     const means = new Float32Array(3 * this.count);
@@ -236,6 +139,92 @@ export class Cloud {
     }
     return means;
   }
+}
+
+// Edits of a cloud that nobody else has yet: each replaces the arrays that it changes.
+
+const EDITS = {
+  remove(cloud, rows) {
+    renew(cloud, "removed");
+    for (const i of rows) cloud.removed[i] = 1;
+  },
+  opacity(cloud, rows, { factor }) {
+    renew(cloud, "splats");
+    for (const i of rows) {
+      const word = cloud.splats[4 * i + 3];
+      cloud.splats[4 * i + 3] = (word & 0xffffff) | (Math.round((word >>> 24) * factor) << 24);
+    }
+    cloud.reach = null; // see pick.js
+  },
+  move(cloud, rows, { translation }) {
+    renew(cloud, "splats", "means");
+    shift(cloud, rows, translation);
+  },
+  duplicate(cloud, rows, { translation }) {
+    shift(cloud, append(cloud, rows), translation);
+  },
+  recolor(cloud, rows, { rgb }) {
+    renew(cloud, "dc", "sh");
+    paint(cloud, rows, rgb);
+  },
+};
+
+function renew(cloud, ...names) {
+  for (const name of names) cloud[name] = cloud[name]?.slice() ?? null;
+}
+
+/** Append copies; returns their numbers. */
+function append(cloud, rows) {
+  const { count, planes, sh } = cloud;
+  cloud.origin ??= Uint32Array.from({ length: count }, (_, i) => i);
+  cloud.source ??= Int32Array.from({ length: count }, (_, i) => i);
+  cloud.far ??= new Float32Array(count); // its own class, at any lambda
+  for (const [name, width] of [["splats", 4], ["dc", 1], ["means", 3], ["removed", 1], ["source", 1], ["far", 1], ["origin", 1]])
+    cloud[name] = withRows(cloud[name], rows, width);
+  cloud.count += rows.length;
+  if (sh) {
+    cloud.sh = new sh.constructor(2 * planes * cloud.count);
+    for (let t = 0; t < planes; t++)
+      cloud.sh.set(withRows(sh.subarray(2 * t * count, 2 * (t + 1) * count), rows, 2), 2 * t * cloud.count);
+  }
+  cloud.reach = null;
+  return Uint32Array.from(rows, (_, k) => count + k);
+}
+
+function shift({ meta, means, splats }, rows, translation) {
+  for (const i of rows) {
+    const [x, y, z] = translation.map((step, axis) => {
+      means[3 * i + axis] += step;
+      const u = (means[3 * i + axis] - meta.center[axis]) / meta.half[axis];
+      const v = Math.abs(u) <= 1 ? u : (2 - 1 / Math.abs(u)) * Math.sign(u);
+      return Math.round(((v + 2) / 4) * MEAN_STEPS);
+    });
+    splats[4 * i] = x | (y << 21);
+    splats[4 * i + 1] = (y >>> 11) | (z << 10);
+  }
+}
+
+/** Give Gaussians one hue and keep their shading: `Recolor` of kfgs, in its mode "tint". */
+function paint(cloud, rows, rgb) {
+  const [low, step] = cloud.meta.dc;
+  const colors = Array.from(rows, (i) => [0, 10, 20].map((bits) => low + step * ((cloud.dc[i] >>> bits) & 1023)));
+  const lights = Float64Array.from(colors, luminance);
+  const sizes = Float64Array.from(rows, (i) => {
+    const sides = cloud.scalesOf(i).sort((a, b) => b - a);
+    return cloud.opacityOf(i) * sides[0] * sides[1];
+  });
+  const shade = tint(rgb, weightedMedian(lights, sizes));
+  const bytes = cloud.sh && new Int8Array(cloud.sh.buffer);
+  rows.forEach((i, k) => {
+    const [color, slopes] = shade(lights[k]);
+    const [r, g, b] = color.map((value) => Math.min(Math.max(Math.round((value - low) / step), 0), 1023));
+    cloud.dc[i] = r | (g << 10) | (b << 20);
+    for (let first = 0; first < 8 * cloud.planes - 2; first += 3) {
+      const at = [first, first + 1, first + 2].map((j) => 8 * ((j >> 3) * cloud.count + i) + (j & 7));
+      const light = luminance(at.map((place) => bytes[place]));
+      at.forEach((place, axis) => (bytes[place] = Math.min(Math.max(Math.round(slopes[axis] * light), -127), 127)));
+    }
+  });
 }
 
 /** Rows of an array, with some of them once more at its end. */

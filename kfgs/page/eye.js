@@ -17,6 +17,8 @@ export class Eye {
     this.ball = ball;
     this.lens = cameras[0] ?? null;
     this.focal = 1; // CSS pixels, of the last picture
+    this.size = [100, 100]; // of the last picture
+    this.whole = false; // whether all of the lens's photo must be visible
     this.loose = true; // whether the pivot's distance is only a guess
     const aside = Math.abs(up[0]) < 0.9 ? [1, 0.6, 0.6] : [0.6, 1, 0.6];
     const away = aside.map((value, axis) => ball.center[axis] + ball.radius * (value + up[axis]));
@@ -24,11 +26,16 @@ export class Eye {
     this.fit(ball);
   }
 
-  /** What Renderer.setCamera takes. */
+  /**
+   * What Renderer.setCamera takes. No angle of view is wider than the photo's: beside an upright photo lies what few photos
+   * show, and a very wide angle distorts. Thus some of the photo's longer side may be cut off, unless `whole`.
+   */
   at(width, height) {
-    const near = this.lens?.near ?? 0.01;
-    if (!this.lens) return cameraOf(this.view, width, height, Math.min(FOV, (FOV * height) / width), near);
-    return letterboxed({ ...this.lens, viewmat: viewmatOf(this.view) }, width, height);
+    const { lens } = this;
+    this.size = [width, height];
+    if (!lens) return cameraOf(this.view, width, height, Math.min(FOV, (FOV * height) / width), 0.01);
+    const scale = this.whole ? undefined : Math.max(width, height) / Math.max(lens.width, lens.height);
+    return letterboxed({ ...lens, viewmat: viewmatOf(this.view) }, width, height, scale);
   }
 
   /** Look through a camera of the pack. */
@@ -39,12 +46,14 @@ export class Eye {
     this.loose = true;
   }
 
-  /** Show a ball as large as possible; `from`: no farther away than a camera, and from its side (a room has walls). */
+  /** Show a ball as large as possible; `from`: from a camera's side, and never smaller than the camera shows it (a room has walls). */
   fit({ center, radius }, from = null) {
-    const { fx, fy, width, height } = this.at(100, 100);
+    const { fx, fy, width, height } = this.at(...this.size);
     if (from) this.view = lookAt(viewOf(from.viewmat, 1).position, center, this.up);
-    const most = from ? this.view.distance : Infinity;
-    this.view = fit(this.view, center, radius, 2 * Math.atan(Math.min(width / fx, height / fy) / 2), most);
+    const half = Math.min(width / fx, height / fy) / 2; // tangent
+    const own = from && Math.min(from.width / from.K[0], from.height / from.K[1]) / 2;
+    const most = from ? this.view.distance * Math.max(own / half, 1) : Infinity;
+    this.view = fit(this.view, center, radius, 2 * Math.atan(half), most);
     this.loose = false;
   }
 

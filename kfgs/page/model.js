@@ -1,9 +1,10 @@
 /** The viewer's state and rules: question, gamma, lambda, hidden classes, selection, edits, undo. Uses no DOM. */
 
-import { Cloud, bufferOf, cloudsOf } from "./clouds.js";
+import { bufferOf, cloudsOf } from "./clouds.js";
 import { near, spacing, squared } from "./points.js";
 
-const MOST_UNDONE = 50; // steps; a step holds at most the masks that it changed
+const MOST_UNDONE = 50; // steps
+const MOST_KEPT = 2e7; // Gaussians in all steps: a step keeps up to 80 bytes of each
 const BINS = 64; // of the histograms
 const REACH = 3; // grow by so many typical distances between neighbours
 const NOTHING = { answer: null, gamma: null, gammaHow: "", hand: {} }; // asked or selected
@@ -26,8 +27,7 @@ export class Model extends EventTarget {
     this.names = header.classes.map((one) => one.name);
     this.sides = ["color", "semantic"].filter((side) => header.sides[side]);
     this.side = this.sides[0];
-    this.clouds = cloudsOf(packed); // as the edits left them
-    this.applied = []; // edits
+    this.original = cloudsOf(packed);
     this.answers = 0; // so far
     this.own = bufferOf(packed, "semantic/labels");
     this.ownScores = bufferOf(packed, "semantic/label_scores");
@@ -35,7 +35,7 @@ export class Model extends EventTarget {
     this.hidden = new Set();
     this.picked = null; // {side, index}
     this.parts = null; // {side, name, parts, numbers}
-    this.now = { ...NOTHING, edits: [], what: "", id: 0 };
+    this.now = { ...NOTHING, edits: [], clouds: this.original, what: "", id: 0 };
     this.past = [];
     this.future = [];
     this.cache = new Map();
@@ -54,6 +54,11 @@ export class Model extends EventTarget {
   /** Whether labels reach the colour cloud from the semantic one. */
   get carried() {
     return this.packed.header.buffers["color/source"] !== undefined;
+  }
+
+  /** Both sides as the edits made them. */
+  get clouds() {
+    return this.now.clouds;
   }
 
   get answer() {
@@ -80,7 +85,7 @@ export class Model extends EventTarget {
 
   /** Show connected parts of the selection of a side, see `PythonLink.parts`; null hides them. */
   setParts(found) {
-    this.parts = found;
+    this.parts = found && { ...found, cloud: this.clouds[found.side] };
     this.changed();
   }
 
@@ -162,18 +167,21 @@ export class Model extends EventTarget {
     return this.cached(`selected ${this.answer.id} ${gamma} ${this.key(side)}`, make);
   }
 
-  /** Selected Gaussians that are not removed, Uint8Array. */
+  /** Selected Gaussians that are not removed, Uint8Array; the same array while nothing changes. */
   selected(side) {
-    const mask = this.byHand ? this.now.hand[side] ?? new Uint8Array(this.total(side)) : this.questioned(side);
-    const { removed } = this.clouds[side];
-    return mask.map((on, i) => on & ~removed[i] & 1);
+    return this.cached(`chosen ${this.now.id} ${this.key(side)}`, () => {
+      const mask = this.byHand ? this.now.hand[side] ?? new Uint8Array(this.total(side)) : this.questioned(side);
+      const { removed } = this.clouds[side];
+      return mask.map((on, i) => on & ~removed[i] & 1);
+    });
   }
 
   /** Gaussians that are neither hidden nor removed. */
   drawn(side) {
-    const labels = this.labels(side);
-    const { removed } = this.clouds[side];
-    return Uint8Array.from(labels, (label, i) => (this.hidden.has(label) || removed[i] ? 0 : 1));
+    return this.cached(`drawn ${[...this.hidden]} ${this.key(side)}`, () => {
+      const { removed } = this.clouds[side];
+      return Uint8Array.from(this.labels(side), (label, i) => (this.hidden.has(label) || removed[i] ? 0 : 1));
+    });
   }
 
   /** Counts of a side, without removed Gaussians: {total, selected, removed, classes: [..], none}. */
@@ -292,7 +300,7 @@ export class Model extends EventTarget {
   }
 
   /**
-   * An edit of the selected Gaussians, as kfgs.labels.edits has it: the clouds are what all edits in order make of the pack.
+   * An edit of the selected Gaussians, as kfgs.labels.edits has it.
    * @param {function?} join makes one of the last edit and this one, if that was of the same Gaussians
    */
   edit(op, values, change = {}, join = null) {
@@ -302,8 +310,9 @@ export class Model extends EventTarget {
     const { edits, what } = this.now;
     const last = edits.at(-1);
     const joins = join !== null && what === op && sameRows(last.rows, rows);
-    const made = joins ? [...edits.slice(0, -1), join(last)] : [...edits, { op, rows, ...values }];
-    this.step(op, { edits: made, ...change }, joins);
+    const before = joins ? this.past.at(-1) : this.now;
+    const made = joins ? join(last) : { op, rows, ...values };
+    this.step(op, { edits: [...before.edits, made], clouds: after(before.clouds, made), ...change }, joins);
     return count;
   }
 
@@ -316,7 +325,7 @@ export class Model extends EventTarget {
 
   /** Undo everything that changed the Gaussians; a step of its own. */
   restore() {
-    this.step("restore all", { edits: [], hand: {} });
+    this.step("restore all", { edits: [], clouds: this.original, hand: {} });
   }
 
   get edited() {
@@ -426,7 +435,10 @@ export class Model extends EventTarget {
    * @throws {Error} a sentence for people, if it is of another scene, or somebody changed it into what cannot be done
    */
   fromJSON(saved, answer) {
-    if (saved?.format !== "kfgs.view" || saved.version !== 1) throw new Error("This file is no state of the viewer (“Save state”).");
+    if (saved?.format !== "kfgs.view" || saved.version !== 1) {
+      const what = saved?.format === "kfgs.edits" ? "has the edits of one cloud, for “kfgs edit --replay”" : "is no state of the viewer";
+      throw new Error(`This file ${what}. Choose the file that “Save state” downloaded, kfgs_view.json.`);
+    }
     const other = this.sides.find((side) => saved.sides?.[side]?.count !== this.packed.header.sides[side].count);
     if (other) {
       const [count, own] = [saved.sides?.[other]?.count ?? 0, this.packed.header.sides[other].count];
@@ -445,7 +457,7 @@ export class Model extends EventTarget {
     }
     this.hidden = new Set(saved.hidden);
     const given = answer && Number.isFinite(saved.gamma) && saved.gamma !== answer.gamma;
-    this.step("open", { ...this.answered(answer), ...(given ? { gamma: saved.gamma, gammaHow: "given" } : {}), hand, edits });
+    this.step("open", { ...this.answered(answer), ...(given ? { gamma: saved.gamma, gammaHow: "given" } : {}), hand, edits, clouds: edits.reduce(after, this.original) });
     this.setLambda(Number(saved.lambda ?? this.lambda));
   }
 
@@ -496,7 +508,8 @@ export class Model extends EventTarget {
     const last = this.now;
     if (!(joins && last.what === what)) {
       this.past.push(last);
-      if (this.past.length > MOST_UNDONE) this.past.shift();
+      const total = this.sides.reduce((all, side) => all + this.total(side), 0);
+      if (this.past.length > Math.min(MOST_UNDONE, MOST_KEPT / total)) this.past.shift();
     }
     this.future = [];
     this.now = { ...last, ...change, what, id: (this.steps = (this.steps ?? 0) + 1) };
@@ -504,30 +517,9 @@ export class Model extends EventTarget {
   }
 
   changed() {
-    this.apply();
+    const { cloud, side } = this.parts ?? {};
+    if (cloud && ["means", "removed"].some((name) => cloud[name] !== this.clouds[side][name])) this.parts = null;
     this.dispatchEvent(new Event("change"));
-  }
-
-  /** Make the clouds what the edits make of them. */
-  apply() {
-    const [had, wanted] = [this.applied, this.now.edits];
-    let same = 0;
-    while (same < had.length && had[same] === wanted[same]) same++;
-    const others = [...had.slice(same), ...wanted.slice(same)];
-    if (others.some(({ op }) => ["remove", "move", "duplicate"].includes(op))) this.parts = null; // their places are others now
-    this.applied = wanted;
-    const [last, next] = others;
-    if (others.length === 2 && wanted.length === had.length && next.op === "move" && next.rows === last.rows) {
-      const translation = next.translation.map((value, axis) => value - last.translation[axis]); // a drag goes on
-      for (const side of this.sides) this.clouds[side].apply({ ...next, translation });
-      return;
-    }
-    const changed = new Set(had.slice(same).flatMap(({ rows }) => Object.keys(rows)));
-    for (const side of changed) {
-      this.clouds[side] = new Cloud(this.packed, side);
-      for (const edit of wanted.slice(0, same)) this.clouds[side].apply(edit);
-    }
-    for (const edit of wanted.slice(same)) for (const side of this.sides) this.clouds[side].apply(edit);
   }
 
   bySides() {
@@ -536,8 +528,7 @@ export class Model extends EventTarget {
 
   /** What labels and masks of a side depend on. */
   key(side) {
-    const { id, count } = this.clouds[side];
-    return `${id} ${count} ${side === "color" ? this.lambda : ""}`;
+    return `${this.clouds[side].id} ${side === "color" ? this.lambda : ""}`;
   }
 
   /** Values of the semantic Gaussians for all Gaussians of a side. */
@@ -557,6 +548,9 @@ export class Model extends EventTarget {
     return this.cache.get(key);
   }
 }
+
+/** The clouds of both sides after an edit. */
+const after = (clouds, edit) => Object.fromEntries(Object.entries(clouds).map(([side, cloud]) => [side, cloud.edited(edit)]));
 
 /** Sum of a mask: how many are set. */
 export function sum(mask) {

@@ -8,7 +8,7 @@ const REST = 160; // milliseconds without a change, after which the picture is d
 export class Panes {
   /** @param {object} model see model.js */
   constructor(canvas, model) {
-    Object.assign(this, { canvas, model, layout: "one", slider: 0.5, sent: {} });
+    Object.assign(this, { canvas, model, layout: "one", slider: 0.5 });
     this.list = [{ mode: "labels", side: model.side }]; // what each pane shows
     this.active = this.list[0];
     this.ratio = 1; // device pixels in a CSS pixel
@@ -51,17 +51,23 @@ export class Panes {
     return this.active;
   }
 
-  /** The Gaussian at a place (CSS pixels) in a pane; -1 if there is none. `evenly`: faint ones are as good as bright ones. */
+  /** The Gaussian at a place (CSS pixels) in a pane; -1 if there is none. A selected one first, unless `evenly`. */
   under(x, y, pane = this.active, evenly = false) {
+    const { model, ratio } = this;
     this.prepare(pane);
-    if (evenly) this.renderer.setLook({ dim: false });
-    return this.renderer.pick(x * this.ratio, y * this.ratio);
+    const first = this.dims(pane) && !evenly ? model.selected(pane.side) : null;
+    return this.renderer.pick(x * ratio, y * ratio, model.drawn(pane.side), first);
   }
 
   /** A mask of the Gaussians in a polygon (CSS pixels) in the active pane. */
   inside(polygon) {
     this.prepare(this.active);
-    return this.renderer.within({ polygon: polygon.map((place) => place.map((value) => value * this.ratio)) });
+    return this.renderer.within(polygon.map((place) => place.map((value) => value * this.ratio)), this.model.drawn(this.active.side));
+  }
+
+  /** Whether a pane dims what is not selected. The colours of scores say where gamma should be. */
+  dims(pane) {
+    return this.model.selecting && pane.mode !== "score";
   }
 
   /** How far a point lies in front of the camera. */
@@ -165,14 +171,15 @@ export class Panes {
     const { model, renderer } = this;
     const { answer } = model;
     renderer.setSide(pane.side);
-    this.sendCloud(pane.side);
+    renderer.update(model.clouds[pane.side]);
+    renderer.setSelected(model.byHand ? model.selected(pane.side) : null);
     const [low, high] = answer ? [answer.low, answer.high] : model.packed.header.clim;
     const hidden = new Uint8Array(model.names.length + 1);
     for (const label of model.hidden) hidden[label < 0 ? model.names.length : label] = 1;
     renderer.setLook({
       mode: pane.mode, question: answer ? this.question(answer) : null, gamma: model.gamma ?? 0, lambda: model.lambda,
       low, high, hidden, mixing: pane.mode === "labels" ? MIXING : 1,
-      dim: model.selecting && pane.mode !== "score", // the colours of the rest say where gamma should be
+      dim: this.dims(pane),
     });
   }
 
@@ -183,16 +190,5 @@ export class Panes {
       this.renderer.setScores(answer.number, answer.scores);
     }
     return answer.number;
-  }
-
-  /** Give the renderer the cloud of a side, if it changed, and the selection by hand. */
-  sendCloud(side) {
-    const { renderer, model } = this;
-    const cloud = model.clouds[side];
-    renderer.update(cloud);
-    const wanted = model.byHand ? `${model.now.id} ${cloud.id} ${cloud.count}` : null;
-    if (this.sent[side] === wanted && (wanted === null) === (cloud.selected === null)) return;
-    renderer.setSelected(model.byHand ? model.selected(side) : null);
-    this.sent[side] = wanted;
   }
 }

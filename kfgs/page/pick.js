@@ -9,7 +9,7 @@ const BACKGROUND = 0.05; // a pixel covered less shows the background
  * @param {{viewmat: Float32Array, fx: number, fy: number, cx: number, cy: number, width: number, height: number, near: number}} camera
  * @param {number} x pixels from the left
  * @param {number} y pixels from the top
- * @param {function(number): boolean} drawn which Gaussians exist here
+ * @param {Uint8Array} drawn which Gaussians exist here
  */
 export function gaussianAt(cloud, camera, x, y, drawn) {
   const hits = hitsAt(cloud, camera, x, y, drawn);
@@ -44,7 +44,7 @@ function hitsAt(cloud, camera, x, y, drawn) {
     const dx = x - (fx * tx + cx), dy = y - (fy * ty + cy);
     const rx = (fx / z) * reach[i], ry = (fy / z) * reach[i]; // 3.4 = what the low-pass of 0.3 adds, squared
     if (dx * dx > rx * rx * (1 + jx * jx) + 3.4 || dy * dy > ry * ry * (1 + jy * jy) + 3.4) continue;
-    if (!drawn(i)) continue;
+    if (!drawn[i]) continue;
     const alpha = alphaAt(cloud, i, m, [fx / z, fy / z], [jx, jy], [dx, dy]);
     if (alpha >= LEAST) hits.push({index: i, depth: Math.fround(z), alpha});
   }
@@ -75,28 +75,15 @@ function alphaAt(cloud, i, m, focal, tangent, offset) {
 }
 
 /**
- * Which Gaussians lie in a region.
- * @param {Cloud} cloud
- * @param {object} region {polygon: [[x, y], ...] in pixels} | {box: {min: [3], max: [3]}} | {sphere: {center: [3], radius}}
- * @param {object} camera of the picture that a polygon lies in
- * @param {function(number): boolean} drawn
- * @returns {Uint8Array} 1 where the centre of a drawn Gaussian is inside
+ * A mask of the Gaussians whose centres lie in a polygon.
+ * @param {number[][]} polygon [x, y] in pixels of the camera's picture
+ * @param {Uint8Array} drawn which Gaussians exist here
  */
-export function gaussiansIn(cloud, region, camera, drawn) {
-  const inside = region.polygon ? inPolygon(region.polygon, camera) : region.box ? inBox(region.box) : inSphere(region.sphere);
-  const mask = new Uint8Array(cloud.count);
+export function gaussiansIn(cloud, polygon, camera, drawn) {
+  const inside = inPolygon(polygon, camera);
   const {means} = cloud;
-  for (let i = 0, j = 0; i < cloud.count; i++, j += 3) {
-    if (inside(means[j], means[j + 1], means[j + 2]) && drawn(i)) mask[i] = 1;
-  }
-  return mask;
+  return drawn.map((on, i) => (on && inside(means[3 * i], means[3 * i + 1], means[3 * i + 2]) ? 1 : 0));
 }
-
-const inBox = ({min, max}) => (x, y, z) =>
-  x >= min[0] && x <= max[0] && y >= min[1] && y <= max[1] && z >= min[2] && z <= max[2];
-
-const inSphere = ({center, radius}) => (x, y, z) =>
-  (x - center[0]) ** 2 + (y - center[1]) ** 2 + (z - center[2]) ** 2 <= radius * radius;
 
 /** Even-odd rule on the projected centre. */
 function inPolygon(polygon, {viewmat: m, fx, fy, cx, cy, near}) {

@@ -92,7 +92,7 @@ export class Renderer {
     this.names = header.classes;
     this.scores = {null: bufferOf(packed, "semantic/label_scores")};
     for (const {buffer} of Object.values(header.query)) this.scores[questionNumber(buffer)] = bufferOf(packed, buffer);
-    const {labels} = clouds.semantic;
+    const labels = bufferOf(packed, "semantic/labels");
     const latents = bufferOf(packed, "semantic/latents");
     this.shared = {
       labels: sheet(gl, gl.R16I, labels.length, labels),
@@ -149,30 +149,30 @@ export class Renderer {
 
   /** Mark Gaussians of the current side as selected, instead of what the question selects; null takes the marks away. */
   setSelected(mask) {
-    const {cloud} = this.#current();
-    cloud.selected = mask;
-    cloud.stamps.marks++;
-    this.update(cloud);
+    const state = this.#current();
+    if (state.selected === mask) return;
+    state.selected = mask;
+    this.#showMarks(state);
   }
 
-  /** Show a cloud in place of the one of its side, or what was changed in it. */
+  /** Show a cloud in place of the one of its side: send what is not the same array (see Cloud). */
   update(cloud) {
-    const had = this.sides[cloud.side];
-    const {stamps} = cloud;
-    if (had.cloud !== cloud || had.count !== cloud.count) {
+    const state = this.sides[cloud.side];
+    const {cloud: before} = state;
+    state.cloud = cloud;
+    if (before.source !== cloud.source) { // there are copies, or none any more
       const {side} = this;
-      this.#dropSide(had);
+      this.#dropSide(state);
       this.#addSide(cloud);
       this.side = side;
       return;
     }
-    if (had.stamps.splats !== stamps.splats) {
-      fill(this.gl, had.textures.splats, this.gl.RGBA32UI, cloud.splats);
-      this.#sendMeans(had);
+    if (before.splats !== cloud.splats) {
+      fill(this.gl, state.textures.splats, this.gl.RGBA32UI, cloud.splats);
+      this.#sendMeans(state);
     }
-    if (had.stamps.colors !== stamps.colors) this.#showColors(had);
-    if (had.stamps.marks !== stamps.marks) this.#showMarks(had);
-    had.stamps = {...stamps};
+    if (before.dc !== cloud.dc) this.#showColors(state);
+    if (before.removed !== cloud.removed) this.#showMarks(state);
   }
 
   /**
@@ -215,37 +215,18 @@ export class Renderer {
     this.side = side;
   }
 
-  /** The number of the Gaussian seen at a pixel of the canvas, a selected one first if the others are dim; -1: none. */
-  pick(x, y) {
-    const {cloud, camera, left, top, drawn, chosen} = this.#under(x, y);
+  /** The number of the Gaussian seen at a pixel of the canvas, of those that a mask has; one of `first`, if there is one. */
+  pick(x, y, drawn, first = null) {
+    const {cloud, camera, left, top} = this.#under(x, y);
     if (!cloud) return -1;
-    if (chosen) {
-      const found = gaussianAt(cloud, camera, x - left, y - top, (i) => chosen(i) && drawn(i));
-      if (found >= 0) return found;
-    }
-    return gaussianAt(cloud, camera, x - left, y - top, drawn);
+    const found = first ? gaussianAt(cloud, camera, x - left, y - top, first.map((on, i) => on & drawn[i])) : -1;
+    return found >= 0 ? found : gaussianAt(cloud, camera, x - left, y - top, drawn);
   }
 
-  /** A mask of the drawn Gaussians in a region; see `gaussiansIn`. Polygons are in pixels of the canvas. */
-  within(region) {
-    const [x, y] = region.polygon?.[0] ?? [0, 0];
-    const {cloud, camera, left, top, drawn} = this.#under(x, y, true);
-    const polygon = region.polygon?.map(([px, py]) => [px - left, py - top]);
-    return gaussiansIn(cloud, {...region, polygon}, camera, drawn);
-  }
-
-  /** What is on the canvas, as ImageData. */
-  toImage() {
-    const {gl} = this;
-    const {width, height} = this.canvas;
-    const pixels = new Uint8ClampedArray(4 * width * height);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
-    const flipped = new Uint8ClampedArray(pixels.length);
-    for (let y = 0; y < height; y++) {
-      flipped.set(pixels.subarray(4 * width * (height - 1 - y), 4 * width * (height - y)), 4 * width * y);
-    }
-    return new ImageData(flipped, width, height);
+  /** A mask of the Gaussians in a polygon (pixels of the canvas), of those that a mask has. */
+  within(polygon, drawn) {
+    const {cloud, camera, left, top} = this.#under(...polygon[0], true);
+    return gaussiansIn(cloud, polygon.map(([x, y]) => [x - left, y - top]), camera, drawn);
   }
 
   /** Free the worker and the graphics memory. */
@@ -277,7 +258,7 @@ export class Renderer {
     };
     const prepared = frame(gl, [shape, paint]);
     const state = {
-      cloud, count, textures, rows, shape, paint, prepared, id: ++this.loads, stamps: {...cloud.stamps},
+      cloud, count, textures, rows, shape, paint, prepared, id: ++this.loads, selected: null,
       length: 0, asked: null, fresh: null, busy: false,
     };
     this.sides[cloud.side] = state;
@@ -300,8 +281,7 @@ export class Renderer {
     for (let t = 0; t < planes; t++) fill(gl, textures.shs, gl.RG32UI, sh.subarray(2 * t * count, 2 * (t + 1) * count), t * rows);
   }
 
-  #showMarks({cloud, textures}) {
-    const {selected, removed} = cloud;
+  #showMarks({cloud: {removed}, selected, textures}) {
     fill(this.gl, textures.marks, this.gl.R8UI, removed.map((gone, i) => (selected?.[i] ? 1 : 0) | (gone << 1)));
   }
 
@@ -353,7 +333,7 @@ export class Renderer {
     const {scale} = level;
     const width = Math.max(1, Math.round(view.width * scale));
     const height = Math.max(1, Math.round(view.height * scale));
-    const chosen = Boolean(look.outline) && (look.question !== null || Boolean(state.cloud.selected));
+    const chosen = Boolean(look.outline) && (look.question !== null || Boolean(state.selected));
     this.#fitTarget(width, height, chosen);
     this.#prepare(state, width, height);
     const {target} = this;
@@ -407,7 +387,7 @@ export class Renderer {
     gl.uniform1i(at.mode, MODES.indexOf(look.mode));
     gl.uniform1i(at.carried, cloud.source ? 1 : 0);
     gl.uniform1i(at.asked, look.question === null ? 0 : 1);
-    gl.uniform1i(at.masked, cloud.selected ? 1 : 0);
+    gl.uniform1i(at.masked, state.selected ? 1 : 0);
     gl.uniform1i(at.dim, look.dim ? 1 : 0);
     gl.uniform3fv(at.center, meta.center);
     gl.uniform3fv(at.spread, meta.half);
@@ -518,29 +498,19 @@ export class Renderer {
     setTimeout(look, 0);
   }
 
-  /** Which Gaussians can be picked, and the camera of the viewport under a pixel. */
+  /** The cloud and the camera of the viewport under a pixel; `anyway`: of the last one, if there is none. */
   #under(x, y, anyway = false) {
     const views = [...this.views.values()].reverse();
     const holds = ({x: left, y: top, width, height}) => x >= left && x < left + width && y >= top && y < top + height;
     const view = views.find((one) => holds(one.clip ?? one)) ?? (anyway ? views[0] : null);
     if (!view) return {};
-    const {cloud} = this.sides[view.side];
-    const {camera, look} = this;
+    const {camera} = this;
     const [sx, sy] = [view.width / camera.width, view.height / camera.height];
     const stretched = {
       ...camera, fx: camera.fx * sx, cx: camera.cx * sx, fy: camera.fy * sy, cy: camera.cy * sy,
       width: view.width, height: view.height,
     };
-    const {hidden, lambda} = look;
-    const drawn = (i) => {
-      if (cloud.removed[i]) return false;
-      if (!hidden) return true;
-      const label = cloud.labelOf(i, lambda);
-      return !hidden[label < 0 ? this.names.length : label];
-    };
-    const scores = look.question === null ? null : this.scores[look.question];
-    const chosen = look.dim && (scores || cloud.selected) ? (i) => cloud.chosen(i, scores, look.gamma, lambda) : null;
-    return {cloud, camera: stretched, left: view.x, top: view.y, drawn, chosen};
+    return {cloud: this.sides[view.side].cloud, camera: stretched, left: view.x, top: view.y};
   }
 
   #dropSide({textures, shape, paint, prepared}) {

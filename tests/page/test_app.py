@@ -4,6 +4,7 @@ import io
 import itertools
 import json
 import re
+from dataclasses import replace
 from functools import partial
 
 import cases_explorer
@@ -203,7 +204,9 @@ def test_suggestions_show_names_as_words_and_arrow_keys_choose(page):
 def test_letters_of_one_class_only_are_enough(page):
     ask(page, "HAI")
     page.wait_for_selector("h2:has-text('Search: chair')")
+    assert page.evaluate("document.activeElement === viewer.stage")  # its keys work now
     ask(page, "a")  # chair, table
+    assert page.evaluate("document.activeElement === viewer.top.search.input")  # to type other words
     assert "“a” is none of the classes" in page.locator("[role=alert]:visible").inner_text()
 
 
@@ -241,6 +244,10 @@ def test_hidden_classes_are_not_drawn_picked_or_selected_by_hand(page, state):
         np.testing.assert_array_equal(mask(page, side, "drawn"), state.drawn(side))
     page.evaluate("viewer.shape([[0, 0], [5000, 0], [5000, 5000], [0, 5000]], 'replace')")
     assert not (mask(page, "color") & ~state.drawn("color")).any()
+    x, y = np.mean([place_of(page, "color", i) for i in range(150, 300)], axis=0)  # where the chairs are
+    page.mouse.click(x, y)
+    found = page.evaluate("viewer.model.picked?.index ?? -1")
+    assert found < 0 or state.drawn("color")[found]
     state.set_hidden([])
     page.hover("li[data-label='0']")
     page.click("button[aria-label='Show only table']")
@@ -419,10 +426,13 @@ def test_a_state_that_somebody_changed_is_refused_as_a_whole(page, tmp_path):
     ]
     states = [own | {"sides": own["sides"] | {"color": own["sides"]["color"] | {"edits": [edit]}}} for edit in wrong]
     other = {"format": "kfgs.view", "version": 1}
-    for state in (*states, {}, "no JSON", other, other | {"sides": {"color": {"count": 3}}}):
+    edits = {"format": "kfgs.edits", "version": 1, "edits": []}  # of "Save edited scene"
+    for state in (*states, {}, "no JSON", edits, other, other | {"sides": {"color": {"count": 3}}}):
         open_state(page, tmp_path, state)
         page.wait_for_selector("[role=alert]:visible")
-        assert re.match("This (state|file) (is|has) ", page.locator("[role=alert]:visible").inner_text())
+        said = page.locator("[role=alert]:visible").inner_text()
+        assert re.match("This (state|file) (is|has) ", said)
+        assert ("kfgs_view.json" in said) == ("This file" in said)  # which file is wanted instead
         assert page.evaluate("JSON.stringify(viewer.model)") == before
 
 
@@ -447,17 +457,25 @@ def test_a_ball_selects_what_lies_in_it_and_a_drag_moves_it(page):
     assert place_of(page, "color", int(selected[0])) == pytest.approx(before)
 
 
-def test_a_drag_that_goes_on_does_not_repeat_the_earlier_edits(page):
+def test_undo_and_drags_repeat_no_earlier_edit(page):
+    """The clouds of every step are kept; what an edit did not change is the same array."""
     ask(page, "table")
     page.evaluate("viewer.model.recolor([0.1, 0.8, 0.3])")
+    before = page.evaluate_handle("viewer.model.clouds.color")
     page.evaluate("viewer.model.move([1, 0, 0])")
-    cloud = page.evaluate_handle("viewer.model.clouds.color")
     page.evaluate("viewer.model.move([0, 1, 0], true)")
-    assert page.evaluate("cloud => cloud === viewer.model.clouds.color", cloud)
-    moved = page.evaluate("[...viewer.model.clouds.color.means]")
-    page.keyboard.press("Control+z")
+    moved = page.evaluate_handle("viewer.model.clouds.color")
+    assert page.evaluate("([a, b]) => a.dc === b.dc && a.means !== b.means", [before, moved])
+    offset = page.evaluate(
+        "([a, b]) => { const i = [...viewer.model.selected('color')].indexOf(1); "
+        "return [0, 1, 2].map((axis) => b.means[3 * i + axis] - a.means[3 * i + axis]); }",
+        [before, moved],
+    )
+    assert offset == pytest.approx([1, 1, 0], abs=1e-6)
+    page.keyboard.press("Control+z")  # after Enter in the search box, keys are those of the view
+    assert page.evaluate("cloud => cloud === viewer.model.clouds.color", before)
     page.keyboard.press("Control+Shift+Z")
-    assert page.evaluate("[...viewer.model.clouds.color.means]") == pytest.approx(moved, abs=1e-5)
+    assert page.evaluate("cloud => cloud === viewer.model.clouds.color", moved)
 
 
 def test_parts_end_when_their_gaussians_go_elsewhere(page):
@@ -556,6 +574,7 @@ def test_buttons_go_to_the_scenes_views(browser, tmp_path):
         assert current.get_attribute("aria-label") == "Go to view_0"
         page.keyboard.press("]")
         until(page, lambda tab: tab.locator("[aria-current=true][aria-label='Go to view_1']").count())
+        assert page.locator(".views button:not([tabindex='-1'])").count() == 1  # Tab leaves the views at once
         until(page, lambda tab: np.allclose(tab.evaluate(VIEWMAT), views[1].viewmat.flatten(), atol=1e-6))
         ask(page, "chair")
         page.locator(".stage").focus()
@@ -569,6 +588,29 @@ def test_buttons_go_to_the_scenes_views(browser, tmp_path):
         page.keyboard.press("Escape")
         page.keyboard.press("f")
         until(page, lambda tab: np.allclose(tab.evaluate(VIEWMAT), views[0].viewmat.flatten(), atol=1e-6))
+
+
+def test_beside_an_upright_photo_no_wider_angle_is_seen_than_its_own(browser, tmp_path, monkeypatch):
+    monkeypatch.setattr(html, "Photos", BlackPhotos)
+    upright = [replace(view, width=28, height=60) for view in cases_explorer.cameras()]
+    file = save_html(cases_explorer.line(cameras=upright), tmp_path / "page.html", scene=object())
+    angles = "() => { const { fx, fy, width, height } = viewer.panes.camera; return [width / fx, height / fy]; }"
+    for page in show(browser, file):
+        page.set_viewport_size({"width": 1400, "height": 600})
+        until(page, lambda tab: tab.evaluate("viewer.canvas.width > 1000"))
+        page.evaluate("viewer.settled()")
+        wide, high = page.evaluate(angles)
+        assert wide == pytest.approx(60 / 40, rel=0.01)  # K has fx = 40, fy = 44
+        page.locator(".stage").focus()
+        page.keyboard.press("p")
+        until(page, lambda tab: tab.locator(".photo:visible").count())
+        page.evaluate("viewer.settled()")
+        assert page.evaluate(angles)[1] == pytest.approx(60 / 44, rel=0.01)  # all of it
+        photo, stage = page.locator(".photo").bounding_box(), page.locator(".stage").bounding_box()
+        assert photo["height"] == pytest.approx(stage["height"], abs=1)
+        page.keyboard.press("p")
+        page.evaluate("viewer.settled()")
+        assert page.evaluate(angles) == pytest.approx([wide, high])
 
 
 def test_the_photo_is_of_the_view_that_looks_the_same_way(browser, tmp_path):

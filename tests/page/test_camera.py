@@ -113,12 +113,6 @@ def test_fit_makes_a_ball_touch_the_border(call):
     assert np.sin(0.4) * view["distance"] == pytest.approx(0.5)
 
 
-def test_level_removes_the_roll(call):
-    view = a_view(call)
-    rolled = view | {"R": [*(-np.array(view["R"][:6])).tolist(), *view["R"][6:]]}
-    assert call("level", rolled, UP)["R"] == pytest.approx(view["R"])
-
-
 def test_between_starts_and_ends_where_it_should(call):
     one, two = a_view(call), call("orbit", a_view(call), 1, 0.1, UP)
     for t, end in ((0, one), (1, two)):

@@ -141,13 +141,7 @@ def test_compressed_data_come_back(viewer, state):
     assert viewer.run(INFLATED, text)
 
 
-CHOSEN = """([question, gamma, lambda]) => {
-  const {cloud} = renderer.sides.color;
-  return base64(Uint8Array.from({length: cloud.count}, (_, i) => cloud.chosen(i, renderer.scores[question], gamma, lambda)));
-}"""
-
-
-def test_a_selection_is_that_of_python_and_the_rest_dims(viewer, state):
+def test_what_is_not_selected_dims(viewer, state):
     camera = state.cameras[2]
     state.set_distance(0.15)
     asked = state.ask(state.meaning.names[0])
@@ -155,7 +149,6 @@ def test_a_selection_is_that_of_python_and_the_rest_dims(viewer, state):
     state.set_gamma(gamma)
     chosen = state.selected("color")
     assert 0 < chosen.sum() < len(chosen)
-    assert numbers(viewer.run(CHOSEN, [0, gamma, 0.15]), np.uint8).astype(bool).tolist() == chosen.tolist()
     look = {"mode": "color", "question": 0, "gamma": gamma, "lambda": 0.15, "dim": True}
     dimmed, plain = viewer.picture(camera, **look), viewer.picture(camera)
     colors = np.where(chosen, 255, 0)[:, None].repeat(3, axis=1).astype(np.uint8)
@@ -169,9 +162,8 @@ def test_a_selection_is_that_of_python_and_the_rest_dims(viewer, state):
 
 
 EDIT = """(edits) => {
-  const cloud = new kfgs.Cloud(packed, "color");
-  for (const {rows, ...edit} of edits) cloud.apply({...edit, rows: {color: Uint32Array.from(rows)}});
-  renderer.update(cloud);
+  const done = (cloud, {rows, ...edit}) => cloud.edited({...edit, rows: {color: Uint32Array.from(rows)}});
+  renderer.update(edits.reduce(done, new kfgs.Cloud(packed, "color")));
 }"""
 
 
@@ -232,44 +224,32 @@ def test_a_pick_is_that_of_gaussian_at(viewer, state, side):
     camera = state.cameras[3]
     viewer.picture(camera, side)
     places = [(x + 0.5, y + 0.5) for x in range(4, camera.width, 9) for y in range(4, camera.height, 9)]
-    picked = viewer.run("(places) => places.map(([x, y]) => renderer.pick(x, y))", places)
+    some = np.arange(len(state.cloud(side))) % 3 > 0
+    pick = "([places, drawn]) => places.map(([x, y]) => renderer.pick(x, y, Uint8Array.from(drawn)))"
+    rest = {index for index in viewer.run(pick, [places, some.astype(int).tolist()]) if index >= 0}
+    assert rest
+    assert some[list(rest)].all()
+    picked = viewer.run(pick, [places, np.ones(len(some), int).tolist()])
     wanted = [gaussian_at(state.cloud(side), camera, x, y) for x, y in places]
     same = [a == (-1 if b is None else b) for a, b in zip(picked, wanted, strict=True)]
     assert sum(b is not None for b in wanted) > 20
     assert np.mean(same) > 0.95  # two may have the same weight but for the rounding of the pack
 
 
-def test_a_pick_ignores_what_is_hidden(viewer, state):
-    camera = state.cameras[3]
-    state.set_distance(0.2)
-    viewer.picture(camera, hidden=[1] * len(state.meaning.names) + [0], **{"lambda": 0.2})
-    labels = state.labels("color")
-    for index in viewer.run("() => [[20, 30], [40, 30], [60, 40]].map(([x, y]) => renderer.pick(x, y))"):
-        assert index == -1 or labels[index] == -1
-    viewer.picture(camera, hidden=[1] * (len(state.meaning.names) + 1))
-    assert viewer.run("() => renderer.pick(40, 30)") == -1
-    assert viewer.run("() => renderer.pick(-1, 30)") == -1
-
-
-def test_regions(viewer, state):
+def test_a_polygon(viewer, state):
     camera, means = state.cameras[3], state.cloud("color").means
     viewer.picture(camera)
     seen = means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     xy = (seen @ camera.K.T)[:, :2] / seen[:, 2:]
     lasso = [[10, 10], [50, 12], [30, 50]]
-    inside = (seen[:, 2] > camera.near).numpy()
+    drawn = np.arange(len(means)) % 3 > 0
+    inside = (seen[:, 2] > camera.near).numpy() & drawn
     for (ax, ay), (bx, by) in zip(lasso, lasso[1:] + lasso[:1], strict=True):
         inside &= ((bx - ax) * (xy[:, 1] - ay) - (by - ay) * (xy[:, 0] - ax) > 0).numpy()
-    middle = means.median(dim=0).values
-    regions = {
-        "polygon": (lasso, inside),
-        "box": ({"min": (middle - 1.2).tolist(), "max": (middle + 1.2).tolist()}, ((means - middle).abs() <= 1.2).all(1).numpy()),
-        "sphere": ({"center": middle.tolist(), "radius": 1.4}, ((means - middle).norm(dim=1) <= 1.4).numpy()),
-    }  # fmt: skip
-    for kind, (region, wanted) in regions.items():
-        mask = numbers(viewer.run("(region) => base64(renderer.within(region))", {kind: region}), np.uint8) > 0
-        assert wanted.sum() > 5
-        assert (mask != wanted).sum() <= 1  # the pack's rounding at the border
+    within = "([lasso, drawn]) => base64(renderer.within(lasso, Uint8Array.from(drawn)))"
+    mask = numbers(viewer.run(within, [lasso, drawn.astype(int).tolist()]), np.uint8) > 0
+    assert inside.sum() > 5
+    assert (mask != inside).sum() <= 1  # the pack's rounding at the border
 
 
 SPLIT = """async (camera) => {
@@ -281,7 +261,7 @@ SPLIT = """async (camera) => {
   renderer.setSide("semantic");
   renderer.draw({...one, clip: {...one, x: middle, width: middle}});
   await renderer.settled();
-  return base64(renderer.toImage().data);
+  return base64(shown());
 }"""
 
 
@@ -303,7 +283,7 @@ MOVING = """async (camera) => {
     renderer.draw({moving: true});
     while (renderer.sides.color.fresh !== renderer.sides.color.asked) await new Promise((done) => setTimeout(done, 1));
     renderer.draw({moving: true});
-    taken.push(base64(renderer.toImage().data));
+    taken.push(base64(shown()));
   }
   [renderer.level, renderer.timing] = [0, false];
   return taken;

@@ -19,7 +19,6 @@ from ..headless import make_plotter
 from ..linked import look_over, upwards
 from ..pictures import save_picture
 from .drawing import Drawn, Pane
-from .first_frame import FirstFrame
 from .html import save_html
 from .meaning import Asked
 from .numbered_files import numbered_path
@@ -37,6 +36,7 @@ Array = np.ndarray[Any, Any]
 
 SIDE_NAMES: dict[Side, str] = {"semantic": "semantic field", "color": "colour field"}
 SHOW_NAMES: dict[Show, str] = {"labels": "classes", "rgb": "colours", "score": "scores", "latents": "latents"}
+MANY = 150_000  # Gaussians: a frame of them takes half a second in software
 HIGHLIGHT = np.array((255, 120, 0))  # tints a selection shown in its own colours: a white sofa is hard to see on white
 
 
@@ -85,11 +85,8 @@ class Explorer:
             ]
             self.plotter.link_views()
             self.reset_view()
-            self._style: Drawn = "points" if options.style == "points" else "gaussians"
+            self._style = self._drawn_as(options.style)
             self._draw()
-            count = sum(len(pane.cloud) for pane in self.panes)
-            self._first = FirstFrame(self.plotter.render_window, count, self._to_points)
-            self._choose_style(options.style)
         except BaseException:
             self.close()
             raise
@@ -143,11 +140,9 @@ class Explorer:
 
     @while_open
     def set_style(self, style: Style) -> None:
-        """Draw Gaussians or points; `auto`: points if a frame of Gaussians takes over 1 s."""
+        """Draw Gaussians or points; `auto`: points if there are more than 150,000."""
         check_choice("style", style, get_args(Style))
-        self._style = "points" if style == "points" else "gaussians"
-        self._draw()
-        self._choose_style(style)
+        self._style = self._drawn_as(style)
         self._changed()
 
     @property
@@ -325,12 +320,6 @@ class Explorer:
             clim = state.clim if state.show == "score" and pane is self.panes[-1] else None
             pane.annotate(f"{SIDE_NAMES[side]}: {question}{SHOW_NAMES[state.show]}", labels, state.meaning.names, clim)
 
-    def _choose_style(self, style: Style) -> None:
-        """For "auto" with many Gaussians: time a frame now, or, in a window, time the first frame it draws."""
-        self._first.waits = style == "auto"
-        if self._first.waits and self._first.unsure and self.plotter.off_screen:
-            self.screenshot()
-
-    def _to_points(self) -> None:
-        self._style = "points"
-        self._draw()
+    def _drawn_as(self, style: Style) -> Drawn:
+        many = sum(len(pane.cloud) for pane in self.panes) > MANY
+        return "points" if style == "points" or (style == "auto" and many) else "gaussians"

@@ -112,8 +112,8 @@ class FieldMeaning:
         classes = field.label_set() if classes is None else classes
         class_rows(classes, field.dim, field.info)  # checks them before views are rendered
         self._classes = replace(classes, info={})  # the teachers were compared just now: warn once, not per question
-        self._field, self.by = _with_answers(field, cameras or field.cameras)
-        labels, self.scores = self._field.classify(self._classes)
+        self.field, self.by = _with_answers(field, cameras or field.cameras)
+        labels, self.scores = self.field.classify(self._classes)
         self._embed = embed
         self._answers: dict[str, Asked] = {}
         self.names = classes.names
@@ -140,7 +140,7 @@ class FieldMeaning:
         Raises:
             ValueError: if nothing is known about any of them.
         """
-        field = self._field
+        field = self.field
         chosen = as_tensor("mask", mask).to(field.known.device) & field.known
         if not bool(chosen.any()):
             raise ValueError("selection: expected Gaussians with features, got none; select others, or raise lambda")
@@ -156,7 +156,7 @@ class FieldMeaning:
 
     def feature_colors(self) -> FeatureColors:
         """The field's projection, so latents have the same colours as in its rendered views."""
-        return feature_colors(self._field)
+        return feature_colors(self.field)
 
     def _phrase(self, words: str) -> Tensor:  # [D]
         if self._embed is None or not words:
@@ -167,17 +167,17 @@ class FieldMeaning:
                 raise ValueError(f"{error}{more}") from None
         assert self._embed is not None
         target = torch.as_tensor(self._embed(words)).detach()
-        if tuple(target.shape) != (self._field.dim,):
+        if tuple(target.shape) != (self.field.dim,):
             raise ValueError(
-                f"embed: expected [{self._field.dim}] (from the field) for {words!r}, got {tuple(target.shape)}; "
+                f"embed: expected [{self.field.dim}] (from the field) for {words!r}, got {tuple(target.shape)}; "
                 "pass the text encoder of the teacher whose features this field was fitted to"
             )
         return target
 
     def _answer(self, words: str, target: str | Tensor) -> Asked:
-        found = self._field.query(target, self._classes)
-        question = make_question(target, self._classes, "auto", self._field.dim, {})
-        return _asked(words, found, self._field.known, question.negatives is not None, isinstance(target, str))
+        found = self.field.query(target, self._classes)
+        question = make_question(target, self._classes, "auto", self.field.dim, {})
+        return _asked(words, found, self.field.known, question.negatives is not None, isinstance(target, str))
 
 
 class SplatMeaning:

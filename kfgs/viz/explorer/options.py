@@ -20,7 +20,7 @@ class ExploreOptions:
     width: int = 1200
     """Width of a window with two panes, pixels; one pane alone has half of it."""
     style: Style = "auto"
-    """`gaussians` (as kfgs's rasteriser draws them), `points`, or `auto`: points if a frame takes over 1 s."""
+    """`gaussians` (as kfgs's rasteriser draws them), `points`, or `auto`: points if there are more than 150,000."""
     rest: float = 0.04
     """Factor on the opacity of Gaussians that are not selected, in [0, 1)."""
     background: str = "white"

@@ -278,8 +278,9 @@ class Exploration:
                 chosen = f"{int(self.selected(side).sum()):,} of "
             lines.append(f"{SIDE_WORDS[side]}: {chosen}{total:,} Gaussians")
         if "color" in self.sides:
-            orphaned = int((self.labels("color") < 0).sum())
-            lines.append(f"lambda {self.distance:.3g} ({self.distance_how}), {orphaned:,} out of reach")
+            orphaned, total = int((self.labels("color") < 0).sum()), len(self.cloud("color"))
+            far = f"farther than lambda = {self.distance:.3g} from any labelled one"
+            lines.append(f"{orphaned:,} of {total:,} colour Gaussians are {far}, so they have no class")
         return lines
 
     def save_selection(self, folder: str | Path) -> list[Path]:

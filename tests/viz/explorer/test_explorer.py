@@ -103,23 +103,18 @@ def test_a_verb_draws_no_frame_before_somebody_looks(explorer):
     assert len(frames) == 1
 
 
-def test_auto_draws_points_where_a_frame_is_slow(monkeypatch):
-    from kfgs.viz.explorer import first_frame as module
+def test_auto_draws_points_where_there_are_many_gaussians(monkeypatch):
+    from kfgs.viz.explorer import explorer as module
 
-    monkeypatch.setattr(module, "SURE", 10)
-    with an_explorer() as quick:
-        assert quick.style == "gaussians"
-    monkeypatch.setattr(module, "SLOW", 0.0)
-    with an_explorer() as slow:
-        assert slow.style == "points"
-        slow.set_style("gaussians")
-        slow.screenshot()
-        assert slow.style == "gaussians"
-        slow.set_style("auto")
-        assert slow.style == "points"
-    monkeypatch.setattr(module, "SURE", 1000)
-    with an_explorer() as small:
-        assert small.style == "gaussians"
+    with an_explorer() as few:
+        assert few.style == "gaussians"
+    monkeypatch.setattr(module, "MANY", 10)
+    with an_explorer() as many:
+        assert many.style == "points"
+        many.set_style("gaussians")
+        assert many.style == "gaussians"
+        many.set_style("auto")
+        assert many.style == "points"
 
 
 def test_closing_twice_is_fine_and_errors_close(monkeypatch):

@@ -189,7 +189,7 @@ def test_facts_are_json_and_lines_say_them():
         "'chair': score > 0 (all of the class)",
         "semantic: 1 of 3 Gaussians",
         "colour: 1 of 5 Gaussians",
-        "lambda 1 (given), 3 out of reach",
+        "3 of 5 colour Gaussians are farther than lambda = 1 from any labelled one, so they have no class",
     ]
     made.ask(None)
     assert made.lines()[0] == "semantic: 3 Gaussians"
