@@ -210,9 +210,9 @@ def check_range(
     name: str, value: float, low: float, high: float = float("inf"), *, closed: tuple[bool, bool] = (True, True)
 ) -> None:
     """Raise a ValueError unless `value` is a finite number between `low` and `high` (`closed`: are the ends included)."""
-    shape = tuple(getattr(value, "shape", ()))
-    if math.prod(shape) != 1:
-        raise TypeError(f"{name}: expected one number, got {type(value).__name__} of shape {shape}; pass a float")
+    if isinstance(value, Tensor | np.ndarray) and math.prod(value.shape) != 1:
+        got = f"{type(value).__name__} of shape {tuple(value.shape)}"
+        raise TypeError(f"{name}: expected one number, got {got}; pass a float")
     over = value >= low if closed[0] else value > low
     under = value <= high if closed[1] else value < high
     if not (over and under and -math.inf < value < math.inf):  # NaN fails every comparison
