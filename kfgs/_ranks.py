@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -175,7 +176,10 @@ def _meet(rank: int, size: int, timeout: float) -> Any:
     try:
         if dist.is_initialized():
             return dist.new_group(**options)
-        dist.init_process_group(rank=rank, world_size=size, **options)
+        store, _, _ = next(iter(dist.rendezvous("env://", rank, size, timeout=options["timeout"])))
+        # torchrun keeps its store when it starts all again after a kill, with the addresses of those that ended
+        store = dist.PrefixStore(f"kfgs {os.environ.get('TORCHELASTIC_RESTART_COUNT', 0)}", store)
+        dist.init_process_group(store=store, rank=rank, world_size=size, **options)
     except (RuntimeError, ValueError) as error:
         raise LostError(
             f"processes: expected {size} of them to meet (torchrun sets MASTER_ADDR and MASTER_PORT), got: {_line(error)}"
@@ -269,4 +273,5 @@ def _watching() -> Iterator[None]:
 
 
 def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]
+    """The first sentence of an error of torch, without the place in its source."""
+    return re.sub(r"\[\S*\.cc:\d+\] ", "", " ".join(str(error).split())).split(". ")[0][:200]

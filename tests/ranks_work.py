@@ -6,17 +6,19 @@ Each process writes FOLDER/<rank>.json, what it found by name.
 """
 
 import dataclasses
+import io
 import json
 import os
 import signal
 import sys
 import time
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import small_room
 import torch
 
-from kfgs import _ranks
+from kfgs import _ranks, cli
 from kfgs.features import FeatureFolder
 from kfgs.fields import FieldConfig, GaussianParams, UpliftConfig, fit_field, fused_answers, uplift_maps
 from kfgs.fields.trainer import Trainer
@@ -37,9 +39,7 @@ def inputs(room, seed=0):
     scene = load_scene(room)
     views = scene.views("train")[:5]
     maps = FeatureFolder(room / "features").of(scene, "train")
-    start = GaussianParams.from_points(
-        scene.points, 8, max_points=300, generator=torch.Generator().manual_seed(seed)
-    )
+    start = GaussianParams.from_points(scene.points, 8, max_points=300, generator=torch.Generator().manual_seed(seed))
     return start, [scene.cameras[i].resized(30, 40) for i in views], [maps[i][..., :8].float() for i in range(5)]
 
 
@@ -53,7 +53,9 @@ def shared(folder, room):
     found["field"] = digest_tensors(*fit.params.to_tensors().values())
     found["losses"] = [row["loss"] for row in fit.history]
     up = uplift_maps(cloud, views, maps, UpliftConfig(max_gaussians=100))
-    found["uplift"] = digest_tensors(up.gaussians.features, up.gaussians.means, up.latents.basis, up.pixels, up.agreement)
+    found["uplift"] = digest_tensors(
+        up.gaussians.features, up.gaussians.means, up.latents.basis, up.pixels, up.agreement
+    )
     book = fit_codebook(maps, CodebookConfig(maximum=16)).codebook
     found["codebook"] = digest_tensors(book.codewords)
     paper = CodebookConfig.paper(maximum=12, initial=3, epochs=3, eager_epochs=1, step_every=2)
@@ -114,11 +116,17 @@ def work(folder, room):
         with together():
             _ranks.meet() if rank else _ranks.once(lambda: 1)
 
+    with redirect_stderr(io.StringIO()) as errors, redirect_stdout(io.StringIO()) as output:
+        arguments = ["fit", room, "--features", room / "broken", "--out", folder / "failed", "--steps", "2"]
+        found["code"] = cli.main([str(word) for word in arguments])
+    found["errors"], found["output"] = errors.getvalue(), output.getvalue()
     found["broken"] = told(break_one, ValueError, _ranks.PeerError)
     found["other start"] = told(disagree, ValueError)
     found["parted"] = told(part_ways, _ranks.LostError)
     with together():
-        found["in step again"] = [int(part["i"]) for part in _ranks.in_order(range(5), lambda i: {"i": torch.tensor(i)})]
+        found["in step again"] = [
+            int(part["i"]) for part in _ranks.in_order(range(5), lambda i: {"i": torch.tensor(i)})
+        ]
     return found
 
 
