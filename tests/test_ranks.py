@@ -48,7 +48,7 @@ def start(size, *arguments):
 
 
 def finish(processes):
-    return [(*process.communicate(timeout=200), process.returncode) for process in processes]
+    return [(*process.communicate(timeout=600), process.returncode) for process in processes]
 
 
 @pytest.fixture(scope="module")
@@ -197,7 +197,7 @@ def test_after_a_kill_torchrun_goes_on_from_the_checkpoint_to_the_same_bits(room
         script = [HERE / "ranks_work.py", "colors", tmp_path / "two", room]
         torchrun = subprocess.Popen([*command, *map(str, script)], env=environment(), stderr=subprocess.PIPE, text=True)
         assert ranks_work.colors(tmp_path / "one", room)["first step"] == 0
-        _, log = torchrun.communicate(timeout=200)
+        _, log = torchrun.communicate(timeout=600)
     finally:
         torch.set_num_threads(threads)
     assert torchrun.returncode == 0, log
