@@ -17,7 +17,7 @@ from .._progress import Progress, as_progress
 from .._ranks import agree, first
 from ..cameras import Camera
 from ..cameras.bounds import camera_extent
-from .checkpoint import digest_tensors, identify_fit, read_checkpoint, write_checkpoint
+from .checkpoint import identify_fit, read_checkpoint, write_checkpoint
 from .config import FieldConfig, check_extent
 from .loss import Loss, l1_loss
 from .params import GaussianParams
@@ -89,7 +89,7 @@ def fit_field(
         saved = read_checkpoint(path, identity)
         if saved is not None:
             trainer.restore_(saved)
-    agree("the start of a fit", lambda: f"{trainer.step} {identity} {digest_tensors(params.to_tensors().values())}")
+    agree("the start of a fit", lambda: f"{trainer.step} {identity} {trainer.digest()}")
     if trainer.step < config.steps:
         trainer.warm_up()
     with tqdm(total=config.steps, initial=trainer.step, disable=progress is not True, desc="field", unit="step") as bar:
@@ -100,12 +100,10 @@ def fit_field(
                 bar.set_postfix(loss=f"{row['loss']:.4f}", Gaussians=row["count"], refresh=False)
                 if callable(progress):
                     progress(dict(row))
-            if (
-                path is not None
-                and first()
-                and (trainer.step % config.checkpoint_every == 0 or trainer.step == config.steps)
-            ):
-                write_checkpoint(path, trainer.snapshot(), identity)
+            if trainer.step % config.checkpoint_every == 0 or trainer.step == config.steps:
+                agree(f"the Gaussians at step {trainer.step}", trainer.digest)
+                if path is not None and first():
+                    write_checkpoint(path, trainer.snapshot(), identity)
     return FieldFit(trainer.optimizer.params.map(torch.Tensor.detach), trainer.history)
 
 

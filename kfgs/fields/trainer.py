@@ -134,9 +134,9 @@ class Trainer:
                 f"config: expected some Gaussian to outlast pruning, got none at step {self.step}; raise prune_extent "
                 f"(now {config.prune_extent}) or lower prune_opacity ({config.prune_opacity}), or check extent"
             )
-        agree(f"the Gaussians at step {self.step}", lambda: digest_tensors(grown.params.to_tensors().values()))
         self.optimizer.replace_(*grown)
         self.statistics = GradientStatistics.zeros(grown.params)
+        agree(f"the Gaussians at step {self.step}", self.digest)
 
     def _report_(self) -> dict[str, Any]:
         since = self.step - (self.history[-1]["step"] if self.history else 0)
@@ -184,6 +184,10 @@ class Trainer:
                 camera = camera.resized(min(height, camera.height), min(width, camera.width))
             self._render_cameras[view, divisor] = camera if divisor == 1 else shrink_camera(camera, divisor)
         return self._render_cameras[view, divisor]
+
+    def digest(self) -> str:
+        """SHA-256 of the Gaussians as they are now."""
+        return digest_tensors(self.optimizer.params.to_tensors().values())
 
     def snapshot(self) -> Checkpoint:
         """Everything that `restore_` needs."""
