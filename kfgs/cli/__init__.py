@@ -21,6 +21,7 @@ from typing import Any, get_type_hints
 import tyro
 
 from .._interrupts import interruptible
+from .._ranks import LostError, PeerError, place, together
 from .blocks import blocks, join
 from .evaluate import compare, evaluate
 from .features import features, plan
@@ -45,6 +46,7 @@ GROUPS: dict[str, tuple[Any, ...]] = {
 }
 COMMANDS = {command.__name__: command for group in GROUPS.values() for command in group}
 RESUMED = {"demo", "features", "fit", "color", "blocks"}  # commands that reuse their earlier work
+SHARED = {"fit", "uplift", "color"}  # commands that several processes (torchrun) do together
 STYLE = (
     tyro.conf.DisallowNone,
     tyro.conf.FlagCreatePairsOff,
@@ -75,17 +77,26 @@ def main(arguments: list[str] | None = None) -> int:
     command = COMMANDS[name]
     called[:] = ["kfgs", name, *given]
     names: dict[str, str] = {}
+    rank, size = place()
+    if size > 1 and name not in SHARED:
+        if rank == 0:
+            say(f"error: expected one process for `kfgs {name}`, got {size} by torchrun; start it without", sys.stderr)
+        return 1
 
     def spoken(message: str) -> str:
         return _in_options(message, names)
 
     try:
-        with interruptible(), warnings_as_notes(spoken), said_on_stderr():
+        with interruptible(), warnings_as_notes(spoken), said_on_stderr(), together():
             names |= _shown_names(command)
             command.__doc__ = re.sub(
                 r"\n {8,}(?!kfgs)", " ", inspect.getdoc(command) or ""
             )  # an option's text on one line
             tyro.cli(command, prog=f"kfgs {name}", description=_description(command), args=given, config=STYLE)
+    except PeerError as error:  # that process has said it, perhaps into another log
+        if rank == 0:
+            say(f"error: {spoken(str(error))}", sys.stderr)
+        return 1
     except KeyboardInterrupt:
         say("interrupted" + ("; the same command goes on where it stopped" if name in RESUMED else ""), sys.stderr)
         return 130
@@ -93,7 +104,8 @@ def main(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter complains when it ends
         return 141
     except (ValueError, TypeError, OSError, ImportError, ArithmeticError) as error:
-        say(f"error: {spoken(str(error))}", sys.stderr)
+        if rank == 0 or isinstance(error, LostError):  # the first process says it for all
+            say(f"error: {spoken(str(error))}", sys.stderr)
         return 1
     return 0
 

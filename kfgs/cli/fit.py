@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._files import check_output
+from .._ranks import once
 from .features import check_discard, choose_teacher, stored_maps
 from .files import check_alone, inputs_of, is_field, open_field, open_splats
 from .options import FieldMethod, Flag, Given, Maps, MapTeacher, Positional, SceneFolder, Training, Views, fit_config
@@ -122,7 +123,12 @@ def fit(
     from ..pipeline.train import check_scene
 
     config = fit_config(
-        method, seed=training.seed, steps=training.steps, max_gaussians=training.max_gaussians, split=views.split
+        method,
+        seed=training.seed,
+        steps=training.steps,
+        max_gaussians=training.max_gaussians,
+        views_per_step=training.views_per_step,
+        split=views.split,
     )
     config = dataclasses.replace(config, undistorted_features=maps.undistorted_features, device=training.device)
     check_output("out", out, "a folder", apart=inputs_of(scene, views.images), other=[maps.features])
@@ -130,6 +136,8 @@ def fit(
         check_alone("splat", splat, "with --method paper, which trains its own Gaussians")
     elif splat is not None:
         check_alone("steps", training.steps, "with --splat, which needs no training")
+    else:
+        training.say_idle()
     as_taken = views.load(scene)
     loaded = as_taken.undistorted()
     chosen = loaded.views(views.split)
@@ -151,17 +159,19 @@ def fit(
         if discard_features:
             check_discard(found, config)
     result = fit_scene(loaded, found, out, config, splat=splat, report=say, progress=True)
-    if teacher.teacher is not None:
-        found.clear()  # the samples; the stages made of them are found without
-    say(result.field.summary())
-    command = f"cd {shlex.quote(os.getcwd())}\n{shlex.join(called)}"
-    written = [result.field_path, *write_run_report(result, loaded, config, command=command)]
-    if discard_features:
-        freed = discard_maps(found.path, found.stems)
-        say(
-            f"{found.path}: {bytes_in_words(freed)} of {len(found)} dense maps deleted; what was made of them is in {out}"
-        )
-    wrote(written)
+
+    def finish() -> None:
+        if teacher.teacher is not None:
+            found.clear()  # the samples; the stages made of them are found without
+        say(result.field.summary())
+        command = f"cd {shlex.quote(os.getcwd())}\n{shlex.join(called)}"
+        written = [result.field_path, *write_run_report(result, loaded, config, command=command)]
+        if discard_features:
+            freed = bytes_in_words(discard_maps(found.path, found.stems))
+            say(f"{found.path}: {freed} of {len(found)} dense maps deleted; what was made of them is in {out}")
+        wrote(written)
+
+    once(finish)
 
 
 def uplift(
@@ -198,7 +208,7 @@ def uplift(
     fused = UpliftConfig(max_gaussians=max_gaussians)
     config = FitConfig(uplift=fused, split=views.split, undistorted_features=maps.undistorted_features)
     field = uplift_scene(loaded, found, cloud, config, folder=out, progress=True, report=say)
-    field.save(out)
+    once(lambda: field.save(out))
     say(field.summary())
     wrote([out])
 
@@ -233,7 +243,9 @@ def color(
     check_whole("pictures", pictures, 0)
     check_output("out", out, "a folder", apart=inputs_of(scene, views.images))
     config = {"quick": ColorConfig.quick, "cpu": ColorConfig.cpu, "paper": ColorConfig.paper}[preset]()
+    training.say_idle()
     fields = config.field if training.steps is None else config.field.with_steps(training.steps)
+    fields = dataclasses.replace(fields, views_per_step=training.views_per_step)
     if training.max_gaussians is not None:
         fields = dataclasses.replace(fields, max_gaussians=training.max_gaussians)
     config = dataclasses.replace(config, seed=training.seed, split=views.split, field=fields)
@@ -241,13 +253,17 @@ def color(
     result = fit_color(loaded, out, config, report=say, progress=True, device=training.device)
     took = f"{result.seconds / 60:.1f} min" if result.seconds >= 60 else f"{result.seconds:.0f} s"
     say(f"{result.gaussians!r} in {took}")
-    written = [result.path]
-    if loaded.splits.get("test"):
-        beside = PhotoPictures(out / "views", [loaded.stem(i) for i in loaded.views("test")], pictures)
-        scores = score_views(result.gaussians, loaded, "test", show=beside)
-        say(str(scores))
-        write_report(out / "scores.json", color=scores)
-        written += [*beside.written, out / "scores.json"]
-    else:
-        say("note: no views are held out (split 'test'): nothing to score against")
-    wrote(written)
+
+    def finish() -> None:
+        written = [result.path]
+        if loaded.splits.get("test"):
+            beside = PhotoPictures(out / "views", [loaded.stem(i) for i in loaded.views("test")], pictures)
+            scores = score_views(result.gaussians, loaded, "test", show=beside)
+            say(str(scores))
+            write_report(out / "scores.json", color=scores)
+            written += [*beside.written, out / "scores.json"]
+        else:
+            say("note: no views are held out (split 'test'): nothing to score against")
+        wrote(written)
+
+    once(finish)

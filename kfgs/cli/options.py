@@ -10,6 +10,7 @@ import tyro
 from tyro.conf import Positional as Positional
 from tyro.constructors import PrimitiveConstructorSpec
 
+from .._ranks import place
 from .files import check_alone, open_field
 from .output import say
 
@@ -137,12 +138,23 @@ class Training:
 
     steps: Given[int] = None
     """Training steps; the preset's when not given."""
+    views_per_step: int = 1
+    """Views whose gradients are averaged in a step; several processes (torchrun) share them."""
     max_gaussians: Given[int] = None
     """At most this many Gaussians; the preset's when not given."""
     seed: int = 0
     """Every random choice follows from it."""
     device: Device = "auto"
     """auto (a GPU if there is one), cpu or cuda."""
+
+    def say_idle(self) -> None:
+        """Say so if steps have fewer views than there are processes."""
+        size = place()[1]
+        if self.views_per_step < size:
+            say(
+                f"note: a training step has {self.views_per_step} view(s), so only as many of the {size} processes train; "
+                f"--views-per-step {size} gives each a view (and another result)"
+            )
 
 
 @dataclass(frozen=True)
@@ -275,6 +287,7 @@ def fit_config(
     seed: int = 0,
     steps: int | None = None,
     max_gaussians: int | None = None,
+    views_per_step: int = 1,
     split: str = "train",
 ) -> Any:
     """The options of a fit, from a preset and the given options."""
@@ -289,6 +302,9 @@ def fit_config(
     if steps is not None:
         color = replace(config.color, field=config.color.field.with_steps(steps))
         config = replace(config, color=color, field=config.field.with_steps(steps))
+    if views_per_step != 1:
+        color = replace(config.color, field=replace(config.color.field, views_per_step=views_per_step))
+        config = replace(config, color=color, field=replace(config.field, views_per_step=views_per_step))
     if max_gaussians is not None:
         fields = replace(config.field, max_gaussians=max_gaussians)
         uplift = replace(config.uplift, max_gaussians=max_gaussians)

@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
 
+from .._ranks import first
+
 LINE, END = 2000, 600
 """Most characters of a printed line, and how many of them are from its end, where an error says what to do."""
 called: list[str] = []
@@ -19,9 +21,10 @@ def say(text: str, file: TextIO | None = None) -> None:
     r"""Print a line at once, to standard output or a file; the place that prints.
 
     Names from foreign files may hold anything: what is not printable is shown as Python writes it (`\x1b`), and the middle
-    of a very long line is left out.
+    of a very long line is left out. Of several processes on one job, only the first prints.
     """
-    print("\n".join(_shown(line) for line in text.split("\n")), file=file, flush=True)
+    if first():
+        print("\n".join(_shown(line) for line in text.split("\n")), file=file, flush=True)
 
 
 def _shown(line: str) -> str:
@@ -73,7 +76,8 @@ def said_on_stderr() -> Iterator[None]:
     from .._compiling import say_compiling
 
     def tell(text: str) -> None:
-        print(f"note: {text}", file=sys.stderr, flush=True)  # noqa: T201
+        if first():
+            print(f"note: {text}", file=sys.stderr, flush=True)  # noqa: T201
 
     with say_compiling(tell):
         yield

@@ -17,7 +17,8 @@ from .._card import short_repr
 from .._rows import EPS, row_norms, unit_rows
 from ..cameras import Camera
 from ..gaussians import Gaussians
-from ..labels import average_views, nearest_codeword
+from ..labels import nearest_codeword
+from ..labels.views import average_shown
 from ..quant import Autoencoder, Codebook, LinearLatents, fit_linear_latents
 from ..splat import rasterize
 
@@ -82,7 +83,7 @@ def fused_answers(
             return rows.view(*camera.size, -1) * something[..., None]
 
         small = [_shrunk(camera) for camera in cameras]
-        mean = average_views(gaussians, ((camera, shown(camera)) for camera in small))
+        mean = average_shown(gaussians, small, lambda camera: (camera, shown(camera)))
         length = torch.linalg.vector_norm(mean.values, dim=1)
         scale = sum(a.width * a.height for a in cameras) / max(1, sum(b.width * b.height for b in small))
     return Answers(mean.values, linear, Seen(mean.weights * scale, length.clamp_max(1)))

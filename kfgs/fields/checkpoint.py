@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -49,16 +49,16 @@ def identify_fit(
     The extent of the config may be None, so the caller puts the one in use into `others`. Near planes count where one is not
     at 0.2: checkpoints from before cameras had one stay valid.
     """
-    options = {name: value for name, value in asdict(config).items() if name not in ("checkpoint_every", "extent")}
+    options = {name: value for name, value in config.identity().items() if name not in ("checkpoint_every", "extent")}
     views = [tensor for camera in cameras for tensor in (camera.viewmat, camera.K, torch.tensor(camera.size))]
     near = torch.tensor([camera.near for camera in cameras], dtype=torch.float64)
     views += [near] if (near != NEAR).any() else []
     return {
-        "params": _digest_tensors(list(params.to_tensors().values())),
-        "cameras": _digest_tensors(views),
-        "targets": _digest_tensors([torch.tensor(len(targets)), as_tensor("targets[0]", targets[0], floating=True)]),
+        "params": digest_tensors(list(params.to_tensors().values())),
+        "cameras": digest_tensors(views),
+        "targets": digest_tensors([torch.tensor(len(targets)), as_tensor("targets[0]", targets[0], floating=True)]),
         "config": digest_value(options),
-        "generator": _digest_tensors([generator.get_state()]),
+        "generator": digest_tensors([generator.get_state()]),
         **{name: digest_value(value) for name, value in others.items()},
     }
 
@@ -97,7 +97,8 @@ def read_checkpoint(path: Path, identity: dict[str, str]) -> Checkpoint | None:
     return Checkpoint(tensors, state)
 
 
-def _digest_tensors(tensors: Sequence[Tensor]) -> str:
+def digest_tensors(tensors: Iterable[Tensor]) -> str:
+    """SHA-256 over shapes, dtypes and values, in hexadecimal."""
     digest = hashlib.sha256()
     for tensor in tensors:
         digest.update(f"{tuple(tensor.shape)} {tensor.dtype}".encode())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import numbers
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from .._check import check_choice, check_range
@@ -21,7 +21,10 @@ class FieldConfig:
     """
 
     steps: int = 30_000
-    """Optimisation steps, one view each."""
+    """Optimisation steps, `views_per_step` views each."""
+    views_per_step: int = 1
+    """Views whose gradients are averaged in a step. Several processes (`kfgs.pipeline.together`) share them, so set it to a
+    multiple of their number; the result does not depend on that number."""
     extent: float | None = None
     """Size of the scene in world units; it scales the means' learning rate and what counts as a large Gaussian. None computes
     it: `fit_scene` and `fit_color` take `Scene.extent`, `fit_field` the same formula for its own cameras."""
@@ -82,7 +85,7 @@ class FieldConfig:
     """Steps between checkpoints, when `fit_field` is given a file for them."""
 
     def __post_init__(self) -> None:
-        for name in ("steps", "densify_every", "report_every", "checkpoint_every"):
+        for name in ("steps", "views_per_step", "densify_every", "report_every", "checkpoint_every"):
             _check_count(name, getattr(self, name), 1)
         for name in ("densify_from", "densify_until", "reset_every", "sh_degree_every"):
             _check_count(name, getattr(self, name), 0)
@@ -111,6 +114,13 @@ class FieldConfig:
             raise ValueError(
                 f"coarse: expected () with render_scale = {self.render_scale}, got {self.coarse}; use one of the two"
             )
+
+    def identity(self) -> dict[str, Any]:
+        """The options as JSON, to tell fits apart. `views_per_step` counts if it is not 1: older fits did not have it."""
+        options = asdict(self)
+        if self.views_per_step == 1:
+            del options["views_per_step"]
+        return options
 
     def divisor(self, step: int) -> int:
         """The divisor of picture sizes at a step (`coarse`)."""

@@ -14,6 +14,7 @@ from tqdm.auto import tqdm
 from .._card import short_repr
 from .._files import as_path
 from .._progress import Progress, as_progress
+from .._ranks import agree, first
 from ..cameras import Camera
 from ..cameras.bounds import camera_extent
 from .checkpoint import identify_fit, read_checkpoint, write_checkpoint
@@ -50,7 +51,7 @@ def fit_field(
 ) -> FieldFit:
     """Train Gaussians until their renderings match the targets (Eq. 4), growing and pruning them on the way.
 
-    Each step uses one view, in random order; each view is used once before any is repeated.
+    Each step uses `config.views_per_step` views, in random order; each view is used once before any is repeated.
 
     Args:
         params: the start; not changed. They decide dtype and device of the fit.
@@ -88,6 +89,7 @@ def fit_field(
         saved = read_checkpoint(path, identity)
         if saved is not None:
             trainer.restore_(saved)
+    agree("the start of a fit", lambda: f"{trainer.step} {identity} {trainer.digest()}")
     if trainer.step < config.steps:
         trainer.warm_up()
     with tqdm(total=config.steps, initial=trainer.step, disable=progress is not True, desc="field", unit="step") as bar:
@@ -98,8 +100,10 @@ def fit_field(
                 bar.set_postfix(loss=f"{row['loss']:.4f}", Gaussians=row["count"], refresh=False)
                 if callable(progress):
                     progress(dict(row))
-            if path is not None and (trainer.step % config.checkpoint_every == 0 or trainer.step == config.steps):
-                write_checkpoint(path, trainer.snapshot(), identity)
+            if trainer.step % config.checkpoint_every == 0 or trainer.step == config.steps:
+                agree(f"the Gaussians at step {trainer.step}", trainer.digest)
+                if path is not None and first():
+                    write_checkpoint(path, trainer.snapshot(), identity)
     return FieldFit(trainer.optimizer.params.map(torch.Tensor.detach), trainer.history)
 
 

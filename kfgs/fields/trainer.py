@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from .._check import as_tensor
+from .._ranks import agree, in_order
 from ..cameras import Camera
 from ..splat import rasterize
-from .checkpoint import Checkpoint
+from .checkpoint import Checkpoint, digest_tensors
 from .config import FieldConfig
 from .densify import GradientStatistics, densify, lowered_opacities
 from .loss import ColorLoss, Loss, l1_loss
@@ -54,7 +55,7 @@ class Trainer:
         started = time.perf_counter()
         config = self._config
         self.step += 1
-        self._learn_(self._next_view())
+        self._learn_()
         if self.step < config.densify_until:
             if self.step > config.densify_from and self.step % config.densify_every == 0:
                 self._densify_()
@@ -75,7 +76,24 @@ class Trainer:
             value.backward()
         self.optimizer.forget_()
 
-    def _learn_(self, view: int) -> None:
+    def _learn_(self) -> None:
+        """Average the gradients of the views of this step, in their order, and follow them."""
+        views, params = [self._next_view() for _ in range(self._config.views_per_step)], self.optimizer.params
+        gradients: dict[str, Tensor] = {}
+        for part in in_order(views, self._look):
+            self._losses += float(part.pop("loss")) / len(views)
+            if "pixels" in part:
+                index, moved, (height, width) = part.pop("index"), part.pop("pixels"), part.pop("size").tolist()
+                self.statistics.add_(index, moved, (height, width))
+            for name, value in part.items():
+                gradients[name] = gradients[name] + value if name in gradients else value
+        for name, value in params.to_tensors().items():
+            if name in gradients:
+                value.grad = gradients[name] if len(views) == 1 else gradients[name] / len(views)
+        self.optimizer.step_(self.step)
+
+    def _look(self, view: int) -> dict[str, Tensor]:
+        """Loss and gradients of one view: of the parameters by name, and of the places in the picture that densifying needs."""
         params = self.optimizer.params
         target = self._target(view)
         camera = self._camera(view, target)
@@ -91,13 +109,15 @@ class Trainer:
                 f"loss: expected a finite number at step {self.step}, got {value} (view {camera.name!r}); "
                 "check the targets for infinities, or lower the learning rates"
             )
-        self._losses += value
+        found = {"loss": torch.tensor(value, dtype=torch.float64)}
         if loss.requires_grad:  # not so when the view shows no Gaussian
             loss.backward()
             if means2d.grad is not None and self.step < self._config.densify_until:
-                size = camera.size if self._config.densify_gradient_size == "render" else (len(target), target.shape[1])
-                self.statistics.add_(rendering.projected.index, means2d.grad, size)
-        self.optimizer.step_(self.step)
+                size = camera.size if self._config.densify_gradient_size == "render" else tuple(target.shape[:2])
+                found |= {"index": rendering.projected.index, "pixels": means2d.grad, "size": torch.tensor(size)}
+            found |= {name: one.grad for name, one in params.to_tensors().items() if one.grad is not None}
+            self.optimizer.forget_()
+        return found
 
     def _densify_(self) -> None:
         config = self._config
@@ -116,6 +136,7 @@ class Trainer:
             )
         self.optimizer.replace_(*grown)
         self.statistics = GradientStatistics.zeros(grown.params)
+        agree(f"the Gaussians at step {self.step}", self.digest)
 
     def _report_(self) -> dict[str, Any]:
         since = self.step - (self.history[-1]["step"] if self.history else 0)
@@ -163,6 +184,10 @@ class Trainer:
                 camera = camera.resized(min(height, camera.height), min(width, camera.width))
             self._render_cameras[view, divisor] = camera if divisor == 1 else shrink_camera(camera, divisor)
         return self._render_cameras[view, divisor]
+
+    def digest(self) -> str:
+        """SHA-256 of the Gaussians as they are now."""
+        return digest_tensors(self.optimizer.params.to_tensors().values())
 
     def snapshot(self) -> Checkpoint:
         """Everything that `restore_` needs."""

@@ -21,6 +21,7 @@ from tqdm import tqdm
 from .._card import short_repr
 from .._check import check_range, check_whole
 from .._progress import as_bar
+from .._ranks import first, in_order
 from .._rows import row_norms, unit_rows
 from ..cameras import Camera, resize_map
 from ..gaussians import Gaussians
@@ -124,7 +125,8 @@ def uplift_maps(
         To continue by training, start `fit_field` with `GaussianParams.from_gaussians(found.gaussians)` and the maps
         `found.latents.encode(unit features)`.
     """
-    config, say, progress = config or UpliftConfig(), report or (lambda text: None), as_bar(progress)
+    config, progress = config or UpliftConfig(), as_bar(progress)
+    say = report if report is not None and first() else lambda text: None
     if len(gaussians) == 0:
         raise ValueError("gaussians: expected at least one, got none; there is nothing to carry features to")
     if len(cameras) == 0 or len(cameras) != len(maps):
@@ -189,23 +191,29 @@ def sample_latents(maps: FeatureMaps, *, count: int = 32, views: int = 256) -> L
     return LinearLatents(working_directions(maps, count, views))
 
 
-def _add(cloud: Gaussians, camera: Camera, signal: Tensor, sums: Tensor) -> None:  # [h, w, c], [N, c + 1]
-    """Add the signal of one view to the sums by rendering weight, and in the last column the weight of its known pixels."""
+def _part(cloud: Gaussians, camera: Camera, signal: Tensor, scale: float) -> dict[str, Tensor]:  # signal [h, w, c]
+    """What one view adds to the rows `index` [M]: `total` [M, c + 1], the sums of the signal by rendering weight and, in the last
+    column, the weight of the known pixels. A weight of 1 stands for `scale` original pixels.
+    """
     known = ~signal[..., :1].isnan()
     both = torch.cat([torch.where(known, signal, 0), known.to(signal)], dim=-1)
     both = resize_map(both, camera.size).contiguous()
     index, total, _ = sum_pixels(cloud, camera, both)
-    sums.index_add_(0, index, total)
+    return {"index": index, "total": total, "scale": torch.tensor(scale, dtype=torch.float64)}
 
 
 def _average(cloud: Gaussians, views: WorkingMaps, bar: Any) -> tuple[Tensor, Tensor]:  # [2, N, d' + 1], [N]
     """Sums of features and weights, over the even and the odd views, and the number of pixels that each Gaussian fills."""
     sums, shown = cloud.means.new_zeros(2, len(cloud), views.channels + 1), torch.zeros_like(cloud.opacities)
-    for i in range(len(views)):
+
+    def look(i: int) -> dict[str, Tensor]:
         camera, features, _, scale = views[i]
+        return _part(cloud, camera, features, scale)
+
+    for i, part in enumerate(in_order(range(len(views)), look)):
         before = sums[i % 2, :, -1].clone()
-        _add(cloud, camera, features, sums[i % 2])
-        shown += scale * (sums[i % 2, :, -1] - before)
+        sums[i % 2].index_add_(0, part["index"], part["total"])
+        shown += float(part["scale"]) * (sums[i % 2, :, -1] - before)
         bar.update()
     return sums, shown
 
@@ -219,11 +227,15 @@ def _correct(cloud: Gaussians, sums: Tensor, views: WorkingMaps, bar: Any) -> Te
     weights = sums[..., -1:]
     halves = sums[..., :-1] / _some(weights)
     lacking = torch.zeros_like(sums)
-    for i in range(len(views)):
-        camera, features, factor, _ = views[i]
+
+    def look(i: int) -> dict[str, Tensor]:
+        camera, features, factor, scale = views[i]
         rendered, alpha, _ = rasterize(cloud.replace(features=halves[i % 2]), camera)
         covered = shrink_map(alpha[..., None], factor)  # the rest of the pixel is empty: no Gaussian can explain it
-        _add(cloud, camera, covered * features - shrink_map(rendered, factor), lacking[i % 2])
+        return _part(cloud, camera, covered * features - shrink_map(rendered, factor), scale)
+
+    for i, part in enumerate(in_order(range(len(views)), look)):
+        lacking[i % 2].index_add_(0, part["index"], part["total"])
         bar.update()
     corrections = lacking[..., :-1] / _some(lacking[..., -1:])
     share = _reliability(corrections[0], corrections[1], _neighbours(cloud.means))

@@ -14,6 +14,7 @@ from torch import Tensor
 from .._arrays import read_arrays
 from .._check import as_tensor, check_shapes
 from .._files import atomic_path
+from .._ranks import in_order
 from .._rows import ENCODE, EPS, check_directions, row_norms, unit_rows
 from ..cameras import Camera
 from ..cameras.resample import from_bchw, to_bchw
@@ -134,7 +135,8 @@ def working_directions(maps: FeatureMaps, count: int = WORKING, most: int | None
     samples = LOOKED_AT[1]
     views = sorted({round(i) for i in np.linspace(0, len(maps) - 1, min(most or LOOKED_AT[0], len(maps)))})
     moment: Tensor | float = 0.0
-    for i in views:
+
+    def look(i: int) -> dict[str, Tensor]:
         grid: Callable[..., Tensor] | None = getattr(maps, "grid", None)
         channels = "D" if isinstance(moment, float) else len(moment)
         if grid is None:
@@ -147,7 +149,10 @@ def working_directions(maps: FeatureMaps, count: int = WORKING, most: int | None
         rows = rows.float()
         check_directions(f"maps[{i}]", rows, advice=ENCODE)
         rows = unit_rows(rows)
-        moment = moment + rows.T @ rows
+        return {"moment": rows.T @ rows}
+
+    for part in in_order(views, look):
+        moment = moment + part["moment"]
     assert isinstance(moment, Tensor)
     values, directions = principal_directions(moment)
     if not float(values[0]) > 0:

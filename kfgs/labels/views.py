@@ -7,18 +7,20 @@ of Eq. 3.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from .._card import short_repr
 from .._check import check_range
+from .._ranks import in_order
 from ..cameras import Camera
 from ..gaussians import Gaussians
 from ..splat import accumulate_pixels, bin_tiles, project
 
+T = TypeVar("T")
 MIN_SHARE = 0.7
 """A class needs 70 % of the votes. Gaussians with less lie across a border: in the toy room about 65 % of those with a
 share below 0.8 had the right class, and about 95 % of the others."""
@@ -75,20 +77,32 @@ def average_views(
     Raises:
         ValueError: if there is no view, or a map has another size than its camera or other channels than the first.
     """
+    return average_shown(gaussians, views, lambda view: view, engine=engine)
+
+
+def average_shown(
+    gaussians: Gaussians, views: Iterable[T], show: Callable[[T], tuple[Camera, Tensor]], *, engine: str = "auto"
+) -> ViewAverage:
+    """`average_views`, with a function that makes the camera and the map of a view; several processes share the views."""
     sums, weights = None, torch.zeros(len(gaussians)).to(gaussians.means)
+
+    def look(view: T) -> dict[str, Tensor]:
+        camera, signal = show(view)
+        channels = signal.shape[-1] if sums is None and signal.ndim else 0 if sums is None else sums.shape[1]
+        if tuple(signal.shape) != (*camera.size, channels):
+            raise ValueError(
+                f"views: expected a map {(*camera.size, channels)} for camera {camera.name!r}, got "
+                f"{tuple(signal.shape)}; resize it with resize_map"
+            )
+        index, total, weight = sum_pixels(gaussians, camera, signal.to(gaussians.means), engine=engine)
+        return {"index": index, "total": total, "weight": weight}
+
     with torch.no_grad():
-        for camera, signal in views:
-            channels = signal.shape[-1] if sums is None and signal.ndim else 0 if sums is None else sums.shape[1]
-            if tuple(signal.shape) != (*camera.size, channels):
-                raise ValueError(
-                    f"views: expected a map {(*camera.size, channels)} for camera {camera.name!r}, got "
-                    f"{tuple(signal.shape)}; resize it with resize_map"
-                )
+        for part in in_order(views, look):
             if sums is None:
-                sums = torch.zeros(len(gaussians), channels).to(gaussians.means)
-            index, total, weight = sum_pixels(gaussians, camera, signal.to(sums), engine=engine)
-            sums.index_add_(0, index, total)
-            weights.index_add_(0, index, weight)
+                sums = torch.zeros(len(gaussians), part["total"].shape[1]).to(gaussians.means)
+            sums.index_add_(0, part["index"], part["total"])
+            weights.index_add_(0, part["index"], part["weight"])
     if sums is None:
         raise ValueError("views: expected at least one camera, got none; pass those that the field was trained on")
     return ViewAverage(_per_weight(sums, weights[:, None]), weights)

@@ -1,5 +1,6 @@
 """The whole job (the paper's Figure 2) as a few resumable calls, and the uses of a finished field."""
 
+from .._ranks import together
 from ..viz.field_colors import feature_colors
 from .apply import (
     label_cloud,
@@ -54,6 +55,7 @@ __all__ = [
     "score_teacher",
     "segment_scene",
     "select_labelled",
+    "together",
     "true_labels",
     "uplift",
     "views_of_change",

@@ -17,6 +17,7 @@ from .._card import short_repr
 from .._check import check_range, check_whole
 from .._files import check_output, read_json
 from .._progress import Progress, as_progress
+from .._ranks import once
 from ..cameras import Camera, resize_map
 from ..fields import ColorLoss, FieldConfig, FieldFit, GaussianParams, fit_field
 from ..formats import write_splats
@@ -232,16 +233,20 @@ def make_color(
 
     params = _color_stage(run, scene, scene.views(config.split), config, device, progress, check)
     result = ColorResult(params.activated().detach(), path, run.stages)
-    if run.look_only or is_saved(path, result.gaussians):
-        return result
-    if os.path.lexists(path):
-        if not overwrite:
-            here = f"the {len(result.gaussians):,} Gaussians of the field are in {result.stages[-1].folder}"
-            run.say(f"color.ply: left as it is; it {what_is(path)}; {here}")
-            return result
-        check()  # it may have come during training
-        run.say(f"color.ply: replaced; Gaussians that were trained in {run.folder} before stay in its stages")
-    write_splats(path, result.gaussians)
+
+    def write() -> None:
+        if run.look_only or is_saved(path, result.gaussians):
+            return
+        if os.path.lexists(path):
+            if not overwrite:
+                here = f"the {len(result.gaussians):,} Gaussians of the field are in {result.stages[-1].folder}"
+                run.say(f"color.ply: left as it is; it {what_is(path)}; {here}")
+                return
+            check()  # it may have come during training
+            run.say(f"color.ply: replaced; Gaussians that were trained in {run.folder} before stay in its stages")
+        write_splats(path, result.gaussians)
+
+    once(write)
     return result
 
 
@@ -268,7 +273,7 @@ def find_color(run: Run, scene: Scene, config: ColorConfig) -> tuple[Gaussians, 
 
 def _inputs(run: Run, scene: Scene, views: Sequence[int], config: ColorConfig) -> dict[str, Any]:
     """What decides the colour stage."""
-    options = asdict(replace(config, field=with_extent(config.field, scene)))
+    options = asdict(config) | {"field": with_extent(config.field, scene).identity()}
     extent = options["field"].pop("extent")
     return {
         "pictures": run.digests([scene.image_paths[i] for i in views]),
@@ -293,7 +298,7 @@ def _color_stage(
     inputs = _inputs(run, scene, views, config)
 
     def train(checkpoint: Path) -> FieldFit:
-        check()
+        once(check)
         generator = stage_generator(config.seed, "color")
         start = GaussianParams.from_points(
             scene.points,

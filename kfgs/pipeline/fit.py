@@ -20,6 +20,7 @@ from torch import Tensor
 from .._card import short_repr
 from .._files import as_path, check_output, digest_value, read_json, write_json
 from .._progress import Progress, as_progress
+from .._ranks import once
 from ..cameras import Camera
 from ..fields import (
     FieldFit,
@@ -123,7 +124,7 @@ def _index_stage(job: _Job, codebook: Codebook, upstream: Stage) -> tuple[IndexM
         quantize_maps(job.maps, codebook, progress=progress, scratch=scratch).save(folder / "index_maps.safetensors")
 
     stage = job.run.stage("index_maps", inputs, make)
-    shutil.rmtree(scratch, ignore_errors=True)
+    once(lambda: shutil.rmtree(scratch, ignore_errors=True))
     return IndexMaps.load(stage.folder / "index_maps.safetensors"), stage
 
 
@@ -147,7 +148,7 @@ def _field_stage(job: _Job, targets: Sequence[Tensor], inputs: dict[str, Any]) -
     """The decoupled field, Sec. 3.2: Gaussians whose rendered latents follow the targets (Eq. 4)."""
     scene, config = job.scene, job.config
     field = with_extent(config.field, scene)
-    options = asdict(field)
+    options = field.identity()
     extent = options.pop("extent")
     inputs = inputs | {
         "scene": digest_scene(scene, job.views),
@@ -242,11 +243,16 @@ def fit_scene(
         done = FitResult(found, run.folder, run.stages)
         about |= _facts(job, found, done.field_path, getattr(maps, "identity", None))
         done = replace(done, field=replace(found, info=about, folder=done.field_path))
-        if not holds_field(done.field_path, vars(done.field)):
-            before = keep_field(run.folder)
-            done.field.save(done.field_path)
-            say_kept(run, before)
+        once(lambda: _save(done, run))
     return done
+
+
+def _save(done: FitResult, run: Run) -> None:
+    """Make the field the current one of the run; one with other numbers is kept."""
+    if not holds_field(done.field_path, vars(done.field)):
+        before = keep_field(run.folder)
+        done.field.save(done.field_path)
+        say_kept(run, before)
 
 
 def _facts(job: _Job, field: SemanticField, path: Path, teacher: Any) -> dict[str, Any]:

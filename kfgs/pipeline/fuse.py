@@ -13,6 +13,7 @@ import torch
 from .._arrays import read_safetensors
 from .._files import as_path, write_json
 from .._progress import Progress
+from .._ranks import once
 from .._tensors import save_tensors
 from ..cameras import Camera
 from ..fields import Answers, Seen, SemanticField, UpliftConfig, fused_answers, remember, uplift_maps
@@ -91,7 +92,7 @@ def uplift_stage(
         write_json(folder / "facts.json", {"gaussians": len(cloud), "latents": found.latents.latent})
 
     stage = run.stage("uplift", inputs, make)
-    shutil.rmtree(scratch, ignore_errors=True)
+    once(lambda: shutil.rmtree(scratch, ignore_errors=True))
     tensors = read_safetensors(stage.folder / "uplift.safetensors")[0]
     return SemanticField(
         Gaussians(**{name: tensors[name] for name in (*SHAPE, "features")}),

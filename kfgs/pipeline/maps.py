@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from .._check import as_tensor
+from .._ranks import once
 from .._rows import EPS, row_norms
 from ..cameras import Camera, undistort
 from ..quant.maps import read_blocks
@@ -153,7 +154,7 @@ class KnownFeatures(Sequence[Tensor]):
 
 def map_digests(run: Run, maps: Maps) -> list[list[str]]:
     """[file name, SHA-256] of each map: from the maps if they know (they may have been discarded), else from the files."""
-    known = _own_digests(maps)
+    known = once(lambda: _own_digests(maps))
     return run.digests(maps.files) if known is None else known
 
 

@@ -11,9 +11,10 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -22,6 +23,7 @@ from torch import Tensor
 from .._arrays import reading
 from .._compiling import say_compiling
 from .._files import atomic_folder, digest_file, digest_value, finish_writing, locked, read_json, write_json
+from .._ranks import first, meet, once
 from ..cameras import Camera
 from ..cameras.camera import NEAR
 from ..scenes import Scene
@@ -75,6 +77,8 @@ class Run:
     def stage(self, name: str, inputs: dict[str, Any], make: Callable[[Path], float | None]) -> Stage:
         """Return the finished stage of these inputs; make it if it does not exist.
 
+        Several processes make it together (`together`): each calls `make`, and what the first one writes is kept.
+
         Args:
             name: a word for the folder's name.
             inputs: everything that decides the result, as JSON; for earlier stages, their keys.
@@ -86,7 +90,7 @@ class Run:
         """
         key = _key(name, inputs)
         target = self.folder / "stages" / f"{name}-{key}"
-        if (target / STAGE_FILE).is_file():
+        if once((target / STAGE_FILE).is_file):
             about = read_stage(target / STAGE_FILE)
             if about.get("inputs") != json.loads(json.dumps(inputs)):
                 raise ValueError(
@@ -104,11 +108,12 @@ class Run:
         else:
             self.say(f"{name}: working")
             start = time.perf_counter()
-            with atomic_folder(target) as temporary, say_compiling(self.say):
+            with _stage_folder(target) as temporary, say_compiling(self.say):
                 earlier = make(temporary) or 0.0
                 seconds = time.perf_counter() - start + earlier
                 about = {"name": name, "inputs": inputs, "seconds": seconds, "files": _sizes(temporary)}
                 write_json(temporary / STAGE_FILE, about)
+            seconds = once(lambda: seconds)  # which also waits until the stage is in place
             done = Stage(name, key, target, seconds, False)
             self.say(f"{name}: done in {seconds:.1f} s")
         self.stages.append(done)
@@ -121,10 +126,13 @@ class Run:
         Raises:
             ValueError: if one works there already; the message says which. Nothing is written then.
         """
-        with locked(self.folder, LOCK):
-            for place in (self.folder, self.folder / "field"):  # a run that finds all it needs writes neither
-                finish_writing(place)
+        with locked(self.folder, LOCK) if first() else nullcontext():
+            if first():
+                for place in (self.folder, self.folder / "field"):  # a run that finds all it needs writes neither
+                    finish_writing(place)
+            meet()
             yield
+            meet()
 
     def scratch(self, name: str, inputs: dict[str, Any]) -> Path:
         """A path for the unfinished work of a stage (checkpoints), kept until the stage is done."""
@@ -135,6 +143,9 @@ class Run:
 
         With `look_only`, a file that would have to be read gets "unknown", which matches no finished stage.
         """
+        return once(lambda: self._digests(paths))  # type: ignore[no-any-return]
+
+    def _digests(self, paths: Sequence[Path]) -> list[list[str]]:
         cache_path = self.folder / "digests.json"
         cache: dict[str, Any] = read_json(cache_path) if cache_path.is_file() else {}
         result, changed = [], False
@@ -155,13 +166,20 @@ class Run:
         return result
 
     def say(self, text: str) -> None:
-        """Report a line, if anyone listens."""
-        if self.report is not None:
+        """Report a line, if anyone listens; of several processes, only the first does."""
+        if self.report is not None and first():
             self.report(text)
 
 
 def _key(name: str, inputs: dict[str, Any]) -> str:
     return digest_value({"name": name, "inputs": inputs, "version": STAGE_VERSION})[:12]
+
+
+@contextmanager
+def _stage_folder(target: Path) -> Iterator[Path]:
+    """The folder to fill. Of several processes that make a stage together, only the first one's is kept."""
+    with atomic_folder(target) if first() else TemporaryDirectory(prefix="kfgs_") as folder:
+        yield Path(folder)
 
 
 def _sizes(folder: Path) -> dict[str, int]:

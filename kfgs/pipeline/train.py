@@ -12,6 +12,7 @@ import torch
 
 from .._arrays import read_safetensors
 from .._files import write_json
+from .._ranks import once
 from .._tensors import save_tensors
 from ..cameras.projection import project_points
 from ..fields import FieldConfig, FieldFit, GaussianParams
@@ -93,5 +94,5 @@ def field_stage(
         return max(0.0, fit.history[-1]["seconds"] - (time.perf_counter() - started))  # before it was killed
 
     stage = run.stage(name, inputs, make)
-    scratch.unlink(missing_ok=True)
+    once(lambda: scratch.unlink(missing_ok=True))
     return GaussianParams.from_tensors(read_safetensors(stage.folder / "params.safetensors")[0]), stage

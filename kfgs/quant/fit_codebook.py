@@ -13,6 +13,7 @@ from tqdm import tqdm
 from .._card import short_repr
 from .._check import as_tensor, check_range, check_shapes, check_whole
 from .._progress import Progress, as_progress
+from .._ranks import in_order
 from .._rows import ENCODE, EPS, check_directions, row_norms, unit_rows
 from .codebook import Codebook
 from .evolve import EvolvingCodebook, Tally, prune
@@ -206,11 +207,17 @@ def _share(similarity: Tensor, alpha: float) -> float:
 def _pool(maps: FeatureMaps, config: CodebookConfig, progress: Progress) -> Tensor:  # [n, D] unit
     """Unit features from the grid of every map, in order."""
     parts, most = list[Tensor](), config.samples_of(len(maps))
-    for i in tqdm(range(len(maps)), desc="codebook", disable=progress is not True):
+
+    def look(i: int) -> dict[str, Tensor]:
         features = _samples(maps, i, config, dim=parts[0].shape[1] if parts else None)
         if len(features) > most:  # on a grid that the caller chose
             features = features[torch.arange(most, device=features.device) * len(features) // most]
-        parts.append(unit_rows(features))
+        return {"features": unit_rows(features)}
+
+    shared = in_order(range(len(maps)), look)
+    for i, part in enumerate(tqdm(shared, desc="codebook", total=len(maps), disable=progress is not True)):
+        parts.append(part["features"])
+        check_shapes((f"maps[{i}]", parts[-1], ("n", parts[0].shape[1])))
     pool = torch.cat(parts)
     if len(pool) == 0:
         raise ValueError(
@@ -248,14 +255,18 @@ def _fit_paper(
         maximum=config.maximum,
         joins=config.joins_per_image or -(-(config.maximum - config.initial) // len(maps)) or 1,
     )
+
+    def look(i: int) -> dict[str, Tensor]:
+        return {"features": _samples(maps, i, config, dim=book.dim)}
+
     history: list[dict[str, Any]] = []
     with tqdm(total=(config.epochs + 1) * len(maps), desc="codebook", disable=progress is not True) as bar:
         for epoch in range(config.epochs):
             order = torch.randperm(len(maps), generator=generator, device=generator.device).tolist()
             tally = Tally(alpha)
             period = 1 if epoch < config.eager_epochs else config.step_every
-            for seen, i in enumerate(order, start=1):
-                book.learn_from(_samples(maps, i, config, dim=book.dim), tally)
+            for seen, part in enumerate(in_order(order, look), start=1):
+                book.learn_from(part["features"], tally)
                 if seen % period == 0 or seen == len(order):
                     book.step(tally)
                 bar.update()
@@ -265,8 +276,8 @@ def _fit_paper(
                 progress(dict(history[-1]))
         codebook = Codebook(book.adam.rows)
         usage, tally = torch.zeros(codebook.size, dtype=torch.int64), Tally(alpha)
-        for i in range(len(maps)):
-            index, similarity = codebook.nearest(_samples(maps, i, config, dim=book.dim))
+        for part in in_order(range(len(maps)), look):
+            index, similarity = codebook.nearest(part["features"])
             usage += torch.bincount(index, minlength=codebook.size).cpu()
             tally.see(similarity)
             bar.update()

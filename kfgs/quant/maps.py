@@ -15,6 +15,8 @@ from tqdm import tqdm
 from .._arrays import read_array, reading
 from .._check import as_tensor, check_shapes
 from .._files import atomic_path
+from .._progress import as_bar
+from .._ranks import in_order
 from .._rows import ENCODE, EPS, check_directions
 from ._store import read_tensors, write_tensors
 from .codebook import Codebook, compare
@@ -168,17 +170,19 @@ def quantize_maps(
     Raises:
         ValueError: if a map is not [h, w, D] with the codebook's D, or holds NaN or infinity.
     """
-    quantised = []
-    for i in tqdm(range(len(maps)), desc="quantise", disable=not progress):
+
+    def look(i: int) -> dict[str, Tensor]:
         kept = None if scratch is None else scratch / f"{i}.npy"
         if kept is not None and kept.is_file():
-            quantised.append(read_array(kept))
-            continue
-        quantised.append(_quantize_map(maps, i, codebook))
+            return {"index": torch.from_numpy(read_array(kept))}
+        index = _quantize_map(maps, i, codebook)
         if kept is not None:
             with atomic_path(kept) as temporary:
-                np.save(temporary, quantised[-1])
-    return IndexMaps(quantised, codebook.size)
+                np.save(temporary, index)
+        return {"index": torch.from_numpy(index)}
+
+    shared = tqdm(in_order(range(len(maps)), look), desc="quantise", total=len(maps), disable=not as_bar(progress))
+    return IndexMaps([part["index"].numpy() for part in shared], codebook.size)
 
 
 def _quantize_map(maps: FeatureMaps, i: int, codebook: Codebook) -> NDArray[np.uint16]:  # [h, w]
