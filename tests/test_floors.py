@@ -17,7 +17,7 @@ ROOT = Path(kfgs.__file__).parent
 
 # From the bottom up. Places of one row never import each other; evaluation lies under pipeline, which scores with it.
 FLOORS = (
-    {"_card"},
+    {"_card", "_names"},
     {"_check", "_compiling", "_files", "_progress", "_rows", "_tensors"},
     {"_arrays", "gaussians", "cameras", "page"},
     {"splat", "quant", "metrics"},
@@ -28,6 +28,7 @@ FLOORS = (
     {"features"},
     {"evaluation"},
     {"pipeline"},
+    {"scale"},
     {""},  # kfgs/__init__.py, the public names
     {"cli"},
     {"__main__"},
