@@ -1,7 +1,7 @@
 """The command line: `kfgs COMMAND ...`; `kfgs --help` lists the commands.
 
 Every command names the files it wrote, shows progress on long work, and ends with 0 (done), 1 (bad input, with one
-message that says what to do), 2 (wrong usage), 130 (interrupted; demo, features, fit and color continue where they stopped)
+message that says what to do), 2 (wrong usage), 130 (interrupted; demo, features, fit, color and search continue where they stopped)
 or 141 (its output was closed).
 """
 
@@ -31,6 +31,7 @@ from .pack import pack
 from .query import info, label, segment, select
 from .render import render
 from .runs import runs
+from .search import search
 from .splats import attach, convert, edit
 from .text import text
 from .view import view
@@ -38,13 +39,13 @@ from .view import view
 GROUPS: dict[str, tuple[Any, ...]] = {
     "Start here": (demo, info),
     "Make a semantic field": (sfm, plan, features, text, fit, uplift),
-    "Ask it": (select, segment, label, view, render),
+    "Ask it": (select, search, segment, label, view, render),
     "Store it": (pack, runs),
     "Score it": (evaluate, compare),
     "Colour splats": (color, attach, edit, convert),
 }
 COMMANDS = {command.__name__: command for group in GROUPS.values() for command in group}
-RESUMED = {"demo", "features", "fit", "color"}  # commands that reuse their earlier work
+RESUMED = {"demo", "features", "fit", "color", "search"}  # commands that reuse their earlier work
 STYLE = (
     tyro.conf.DisallowNone,
     tyro.conf.FlagCreatePairsOff,

@@ -9,17 +9,19 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 _WHERE = {
-    "PartFound": ".search",
-    "SceneFound": ".search",
+    "Found": ".search_found",
+    "PartFound": ".search_found",
+    "SceneFound": ".search_found",
     "SearchIndex": ".search",
     "SharedCodebook": ".shared_codebook",
 }
 __all__ = sorted(_WHERE)
 
 if TYPE_CHECKING:
-    from .search import PartFound as PartFound
-    from .search import SceneFound as SceneFound
     from .search import SearchIndex as SearchIndex
+    from .search_found import Found as Found
+    from .search_found import PartFound as PartFound
+    from .search_found import SceneFound as SceneFound
     from .shared_codebook import SharedCodebook as SharedCodebook
 
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .._files import as_path
 from .._names import class_index
-from .search_file import NAME, Array, Contents, Entry, Rows, read_index
+from .search_file import NAME, Array, Contents, Entry, read_index
+from .search_found import Changes, Found, SceneFound, part_found, ranked, scene_found
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -21,69 +21,6 @@ if TYPE_CHECKING:
     from ..labels.questions import Negatives
 
 # Torch is imported inside the methods that need it.
-
-
-@dataclass(frozen=True)
-class PartFound:
-    """A connected part of what was found in a scene ("one of the chairs"). Positions are in the scene's frame and units."""
-
-    count: int
-    """Gaussians."""
-    score: float
-    """Their mean score."""
-    center: tuple[float, ...]  # [3] mean of their centres
-    low: tuple[float, ...]  # [3] lowest corner of the box around their centres, along the world's axes
-    high: tuple[float, ...]  # [3] highest corner
-    view: str | None
-    """Name of the training view that shows it largest; None if the field has no views, or none shows it."""
-    share: float
-    """Its share of that picture, in [0, 1)."""
-
-
-@dataclass(frozen=True)
-class SceneFound:
-    """What was found in one field."""
-
-    path: str
-    """Of the field, relative to the folder that was searched."""
-    count: int
-    """Gaussians found, those of small parts included."""
-    gaussians: int
-    """Of the whole field."""
-    score: float
-    """The highest mean score among its parts; scenes are ranked by it."""
-    exact: bool
-    """Whether count, parts and scores are those of `SemanticField.query` and `connected_parts`; else words stand for
-    Gaussians."""
-    parts: tuple[PartFound, ...]
-    """The largest first; those below 5 % of the largest are left out."""
-
-
-@dataclass(frozen=True)
-class Found:
-    """The answer of a search."""
-
-    scenes: tuple[SceneFound, ...]
-    """The best first."""
-    searched: int
-    """Fields that could be asked."""
-    unasked: dict[str, str] = field(default_factory=dict)
-    """Fields that could not be asked, and why."""
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain numbers, lists and strings."""
-        return dataclasses.asdict(self)
-
-
-@dataclass(frozen=True)
-class Changes:
-    """What an update of an index did; paths are relative to its folder."""
-
-    added: tuple[str, ...] = ()
-    """New fields, and changed ones."""
-    removed: tuple[str, ...] = ()
-    failed: dict[str, str] = field(default_factory=dict)
-    """Fields that could not be read, and why."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +77,9 @@ class SearchIndex:
         state = compare_fields(self.folder, self.contents)
         return not (state.changed or state.removed)
 
-    def update(self, *, progress: bool = False, report: Callable[[str], None] | None = None) -> tuple[SearchIndex, Changes]:
+    def update(
+        self, *, progress: bool = False, report: Callable[[str], None] | None = None
+    ) -> tuple[SearchIndex, Changes]:
         """Add fields that are new or have changed, drop those that are gone, and write the file if anything changed.
 
         Words keep their ids. The file is replaced in one step, some times a minute in a long update, so a killed one loses
@@ -190,7 +129,8 @@ class SearchIndex:
             ValueError: if no field knows the class, no field has as many channels as the embedding, or an option is wrong.
         """
         plain = isinstance(target, str) and classes is None and threshold is None and score is None
-        found, unasked, others = [], dict[str, str](), []
+        found, others = list[SceneFound](), list[Entry]()
+        unasked = {name: one.reason for name, one in self.contents.unread.items()}
         for entry in self.contents.entries.values():
             label = self._label(entry, target) if plain and isinstance(target, str) and negatives == "auto" else None
             if label is None:
@@ -198,16 +138,35 @@ class SearchIndex:
             else:
                 found.append(_class_answer(entry, label))
         if others:
-            from .search_words import ask_words
+            from .search_words import ask_fields, ask_words
 
             options = {"threshold": threshold, "negatives": negatives, "score": score}
-            more, unasked = ask_words(self.contents, others, target, classes, options)
-            found += more
+            more, refused = ask_words(self.contents, others, target, classes, options)
+            found, unasked = found + more, unasked | refused
             if exact:
-                from .search_words import ask_fields
-
                 found = ask_fields(self.folder, self.contents, ranked(found), exact, target, classes, options)
-        return Found(ranked(found), len(self) - len(unasked), unasked)
+        return Found(ranked(found), len(self) + len(self.contents.unread) - len(unasked), unasked)
+
+    def like(self, source: str | Path, index: int, threshold: float | None = None, *, exact: int = 0) -> Found:
+        """Find what resembles one Gaussian of a field: by the cosine of features, without text.
+
+        Args:
+            source: the field of the example, in the index or not.
+            index: of the Gaussian, from 0.
+            threshold: the cosine to exceed; None: the tolerance of the words, 0.9.
+            exact: as in `search`.
+
+        Raises:
+            ValueError: if there is no such Gaussian, no view shows it, or no field in the index is of its teacher.
+        """
+        from .search_words import example_of
+
+        row, mine, tolerance = example_of(self.contents, as_path(source), index)
+        contents = Contents(self.contents.spaces, self.contents.tables, mine, self.contents.unread)
+        gamma = tolerance if threshold is None else threshold
+        found = SearchIndex(self.folder, contents).search(row, None, gamma, negatives="none", exact=exact)
+        others = {name: "another teacher" for name in self.fields if name not in mine}
+        return Found(found.scenes, found.searched, found.unasked | others)
 
     def _label(self, entry: Entry, name: str) -> int | None:
         """The label of a class in the field's own table, if the index holds the answers about it."""
@@ -217,25 +176,6 @@ class SearchIndex:
             return class_index(name, self.contents.tables[entry.table].names)
         except ValueError:
             return None
-
-
-def ranked(found: list[SceneFound]) -> tuple[SceneFound, ...]:
-    """Scenes in which something was found, the best first; equally good ones by count, then by name."""
-    return tuple(sorted((one for one in found if one.count), key=lambda one: (-one.score, -one.count, one.path)))
-
-
-def scene_found(entry: Entry, count: int, score: float, exact: bool, parts: Iterator[PartFound]) -> SceneFound:
-    """A scene with its parts; without parts its score is `score`."""
-    kept = tuple(parts)
-    best = max((part.score for part in kept), default=score)
-    return SceneFound(entry.path, count, entry.gaussians, best, exact, kept)
-
-
-def part_found(entry: Entry, rows: Rows, i: int, view: int, share: float) -> PartFound:
-    """Row i of some columns as a part."""
-    corners = (tuple(map(float, rows[name][i])) for name in ("center", "low", "high"))
-    name = entry.views[view] if view >= 0 else None
-    return PartFound(int(rows["count"][i]), float(rows["score"][i]), *corners, name, float(share) if view >= 0 else 0.0)
 
 
 def _class_answer(entry: Entry, label: int) -> SceneFound:

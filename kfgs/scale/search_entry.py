@@ -13,7 +13,7 @@ from ..cameras import Camera
 from ..fields import SemanticField
 from ..gaussians import Gaussians
 from ..labels import LabelSet, connected_parts
-from ..labels.components import component_distance, radius_components
+from ..labels.components import MOST_SPACINGS, NEIGHBOUR, QUANTILE, SPACINGS, radius_components
 from ..labels.parts import Part, gaussian_shares
 from ..labels.selection import Selection
 from .search_file import VIEWS, Array, Rows, empty_rows
@@ -60,7 +60,9 @@ def describe(field: SemanticField, book: SharedCodebook, classes: LabelSet | Non
     selections = [field.query(name, classes) for name in asked]
     parts = [(label, part) for label, one in enumerate(selections) for part in connected_parts(field.gaussians, one)]
     atoms = _atoms(field.gaussians, word)
-    in_atoms, in_parts = _shares(field.gaussians, field.cameras, atoms, [part.indices.cpu().numpy() for _, part in parts])
+    in_atoms, in_parts = _shares(
+        field.gaussians, field.cameras, atoms, [part.indices.cpu().numpy() for _, part in parts]
+    )
     rows: dict[str, Rows] = {
         "atoms": _atom_rows(field.gaussians.means.detach().cpu().double().numpy(), atoms, in_atoms),
         "links": {"pair": atoms.links},
@@ -79,23 +81,32 @@ def _atoms(gaussians: Gaussians, word: Array) -> Grouped:
     group = np.full(len(word), -1, np.int64)
     if not len(inside):
         return Grouped(group, group[:0], group[:0] > 0, np.zeros((0, 2), np.int32))
-    distance = component_distance(gaussians.means, torch.ones(len(word), dtype=torch.bool, device=gaussians.means.device))
     points, words = gaussians.means.detach().cpu().double().numpy()[inside], word[inside]
-    part = radius_components(np.column_stack([points, words * 2 * distance]), distance)  # words lie apart on a 4th axis
+    near, index = cKDTree(points).query(points, k=min(NEIGHBOURS + 1, len(points)))
+    near, index = near.reshape(len(points), -1), index.reshape(len(points), -1)
+    reach = _reach(near[:, min(NEIGHBOUR, near.shape[1] - 1)], words)
+    part = radius_components(
+        np.column_stack([points / reach[:, None], 2.0 * words]), 1.0
+    )  # words lie apart on a 4th axis
     large = int((np.bincount(part) >= SMALLEST).sum())
     small, pool = np.unique(words[part >= large], return_inverse=True)
     part[part >= large] = large + pool
+    own, other = part[:, None], part[index]
+    touch = (own < other) & (other < large) & (near <= (reach[:, None] + reach[index]) / 2)
+    links = np.unique(np.column_stack([np.broadcast_to(own, other.shape)[touch], other[touch]]), axis=0)
     first = np.unique(part, return_index=True)[1]
     group[inside] = part
-    placed = part < large
-    near = cKDTree(points[placed]).query(points[placed], k=NEIGHBOURS + 1, distance_upper_bound=distance)[1] if large else None
-    links = np.zeros((0, 2), np.int64)
-    if near is not None:
-        own = part[placed]
-        other = np.append(own, -1)[near]  # -1: fewer neighbours in reach
-        pairs = np.stack([np.broadcast_to(own[:, None], other.shape), other], axis=-1)
-        links = np.unique(np.sort(pairs[(other >= 0) & (other != own[:, None])], axis=1), axis=0)
     return Grouped(group, words[first], np.arange(large + len(small)) >= large, links.astype(np.int32))
+
+
+def _reach(spacing: Array, words: Array) -> Array:  # [n], [n] -> [n]
+    """How far the Gaussians of each word are connected: `labels.components.component_distance`, with spacings in the cloud."""
+    order = np.lexsort((spacing, words))
+    first, count = np.unique(words[order], return_index=True, return_counts=True)[1:]
+    most = MOST_SPACINGS * float(np.quantile(spacing, QUANTILE)) or 1.0
+    quantile = spacing[order][first + np.floor(QUANTILE * (count - 1)).astype(np.int64)]
+    reach = np.clip(SPACINGS * quantile, 1e-6 * most, most)
+    return np.asarray(reach[np.unique(words, return_inverse=True)[1]])
 
 
 def _shares(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,14 @@ class Table:
     negatives: Array  # [M, D] float32; M may be 0
 
 
+@dataclass(frozen=True)
+class Unread:
+    """A field that could not be read. It is tried again when its file changes."""
+
+    mark: tuple[int, int]
+    reason: str
+
+
 @dataclass(frozen=True, eq=False)
 class Contents:
     """All of an index."""
@@ -102,6 +111,8 @@ class Contents:
     spaces: list[Space] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
     entries: dict[str, Entry] = field(default_factory=dict)
+    """By path."""
+    unread: dict[str, Unread] = field(default_factory=dict)
     """By path."""
 
 
@@ -123,6 +134,7 @@ def write_index(path: Path, contents: Contents) -> None:
             {"space": one.space, "names": one.names, "negative_names": one.negative_names, "info": one.info}
             for one in contents.tables
         ],
+        "unread": {name: [*one.mark, one.reason] for name, one in sorted(contents.unread.items())},
     }
     text = json.dumps(about, allow_nan=False).encode()
     if len(text) > WORDS:
@@ -163,7 +175,9 @@ def read_index(path: Path) -> Contents:
         raise
     except (SafetensorError, ArithmeticError, AttributeError, LookupError, OSError, TypeError, ValueError) as error:
         why = f"{type(error).__name__}: {error}" if isinstance(error, LookupError) else str(error)
-        raise ValueError(f"{path}: expected a kfgs {KIND}, but it is damaged ({ascii(why)[1:160]}); {advice}") from error
+        raise ValueError(
+            f"{path}: expected a kfgs {KIND}, but it is damaged ({ascii(why)[1:160]}); {advice}"
+        ) from error
     got = f"version {version!r:.20}" if kind == KIND else f"{kind!r:.40}"
     raise ValueError(f"{path}: expected a kfgs {KIND}, version {VERSION}, got {got}; {advice}")
 
@@ -195,20 +209,19 @@ def _contents(tensors: dict[str, Array]) -> Contents:
         (path,), (size, time) = _texts([one["path"]]), one["mark"]
         mark, facts = (int(size), int(time)), (int(one["gaussians"]), space, table, views, float(one["outside"]))
         entries[path] = Entry(path, mark, str(one["sha256"]), *facts, rows)
-    return Contents(spaces, tables, entries)
+    unread = {name: Unread((int(size), int(time)), str(why)) for name, (size, time, why) in about["unread"].items()}
+    return Contents(spaces, tables, entries, unread)
 
 
 def _rows(tensors: dict[str, Array], kind: str, fields: int) -> list[dict[str, Array]]:
     """The rows of one kind of each field."""
-    columns = {
-        name: _column(tensors, f"{kind}.{name}", dtype, tail) for name, (dtype, tail) in COLUMNS[kind].items()
-    }
+    columns = {name: _column(tensors, f"{kind}.{name}", dtype, tail) for name, (dtype, tail) in COLUMNS[kind].items()}
     start = _column(tensors, f"{kind}.start", "<i8", ())
     lengths = {len(column) for column in columns.values()}
     good = len(start) == fields + 1 and start[0] == 0 and (np.diff(start) >= 0).all() and lengths == {int(start[-1])}
     if not good:
         raise ValueError(f"the rows of {kind} do not fit to {fields} fields")
-    places = [slice(int(a), int(b)) for a, b in zip(start[:-1], start[1:], strict=True)]
+    places = [slice(int(a), int(b)) for a, b in pairwise(start)]
     return [{name: column[place] for name, column in columns.items()} for place in places]
 
 

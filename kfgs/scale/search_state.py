@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from .._files import current_file, digest_file
 from .._files.fields import DESCRIPTION, fields_below
-from .search_file import Contents, Entry
+from .search_file import Contents, Entry, Unread
 
 
 class State(NamedTuple):
@@ -19,6 +19,8 @@ class State(NamedTuple):
     changed: dict[str, Path]
     """New fields, and changed ones."""
     removed: tuple[str, ...]
+    unread: dict[str, Unread]
+    """Fields that could not be read before, and have not changed since."""
 
 
 def mark_of(path: Path) -> tuple[Path, tuple[int, int]]:
@@ -32,11 +34,17 @@ def compare_fields(folder: Path, contents: Contents) -> State:
     """Compare an index with the fields that are there."""
     same: dict[str, Entry] = {}
     changed: dict[str, Path] = {}
+    unread: dict[str, Unread] = {}
     for path in fields_below(folder):
-        name, known = path.relative_to(folder).as_posix(), contents.entries.get(path.relative_to(folder).as_posix())
+        name = path.relative_to(folder).as_posix()
+        known, failed = contents.entries.get(name), contents.unread.get(name)
         file, mark = mark_of(path)
         if known is not None and (known.mark == mark or known.sha256 == digest_file(file)):
             same[name] = replace(known, mark=mark)
+        elif failed is not None and failed.mark == mark:
+            unread[name] = failed
         else:
             changed[name] = path
-    return State(same, changed, tuple(name for name in contents.entries if name not in same and name not in changed))
+    before = {**contents.entries, **contents.unread}
+    gone = tuple(name for name in before if name not in same and name not in changed and name not in unread)
+    return State(same, changed, gone, unread)

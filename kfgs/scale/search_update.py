@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,11 +14,11 @@ from .._card import error_line
 from .._files import digest_file, locked
 from ..fields import SemanticField
 from ..labels import LabelSet
-from ..labels.label_set import teacher_difference
-from .search import Changes
 from .search_entry import describe
-from .search_file import NAME, Contents, Entry, Space, Table, read_index, write_index
+from .search_file import NAME, Contents, Entry, Space, Table, Unread, read_index, write_index
+from .search_found import Changes
 from .search_state import compare_fields, mark_of
+from .search_words import find_space, teacher_of
 from .shared_codebook import TOLERANCE, SharedCodebook
 
 LOCK = ".search.lock"
@@ -34,21 +33,21 @@ def update_index(
     with locked(folder, LOCK):
         contents = read_index(file) if file.is_file() else Contents()
         state = compare_fields(folder, contents)
-        marks_moved = any(contents.entries[name].mark != entry.mark for name, entry in state.same.items())
-        contents = Contents(list(contents.spaces), list(contents.tables), dict(state.same))
+        moved = any(contents.entries[name].mark != entry.mark for name, entry in state.same.items())
+        contents = Contents(list(contents.spaces), list(contents.tables), dict(state.same), dict(state.unread))
         added, failed, written = list[str](), dict[str, str](), time.monotonic()
         for name, path in tqdm(state.changed.items(), desc="index", unit="field", disable=not progress):
             try:
                 contents.entries[name] = add_field(contents, name, path)
+                added.append(name)
             except (OSError, ValueError, TypeError) as error:
                 failed[name] = error_line(error)
+                contents.unread[name] = Unread(mark_of(path)[1], failed[name])
                 say(f"{path} is left out: {failed[name]}")
-                continue
-            added.append(name)
             if time.monotonic() - written > EVERY:
                 write_index(file, contents)
                 written = time.monotonic()
-        if added or state.removed or marks_moved or not file.is_file():
+        if added or failed or moved or state.removed or not file.is_file():
             write_index(file, contents)
     return contents, Changes(tuple(added), state.removed, failed)
 
@@ -79,18 +78,11 @@ def _classes_of(field: SemanticField) -> LabelSet | None:
 
 def _space_of(contents: Contents, field: SemanticField) -> int:
     """The space of a field's teacher; a new one if no field of that teacher is known."""
-    teacher = field.info.get("teacher")
-    teacher = teacher if isinstance(teacher, dict) else None
-    for i, one in enumerate(contents.spaces):
-        both_named = (one.teacher is None) == (teacher is None)
-        if one.words.shape[1] == field.dim and both_named and teacher_difference(_info(one.teacher), _info(teacher)) is None:
-            return i
-    contents.spaces.append(Space(teacher, TOLERANCE, np.zeros((0, field.dim), np.float32)))
-    return len(contents.spaces) - 1
-
-
-def _info(teacher: dict[str, Any] | None) -> dict[str, Any]:
-    return {"teacher": teacher}
+    space = find_space(contents, field)
+    if space is None:
+        contents.spaces.append(Space(teacher_of(field), TOLERANCE, np.zeros((0, field.dim), np.float32)))
+        space = len(contents.spaces) - 1
+    return space
 
 
 def _table_of(contents: Contents, space: int, classes: LabelSet) -> int:

@@ -12,16 +12,15 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from .._card import error_line
-from .._check import as_tensor, check_whole
+from .._check import as_tensor, check_whole, one_line
 from .._rows import unit_embeddings
 from ..fields import SemanticField
 from ..labels import LabelSet, connected_parts, select_by_similarity
 from ..labels.label_set import teacher_difference
 from ..labels.parts import SPECK
 from ..labels.questions import make_question
-from .search import PartFound, SceneFound, part_found, ranked, scene_found
 from .search_file import Array, Contents, Entry, Table
+from .search_found import PartFound, SceneFound, part_found, ranked, scene_found
 
 
 def ask_words(
@@ -50,7 +49,8 @@ def ask_words(
                 cosines[key] = error
         known = cosines[key]
         if isinstance(known, ValueError):
-            unasked[entry.path] = error_line(known)
+            unknown = isinstance(target, str) and str(known).startswith("class")
+            unasked[entry.path] = f"no class {target!r}" if unknown else one_line(known, 160)
             errors.append(known)
         else:
             found.append(_word_answer(entry, *known, options))
@@ -97,6 +97,40 @@ def ask_fields(
         mean = float(selection.scores[selection.mask].double().mean()) if len(selection) else 0.0
         result.append(scene_found(entry, len(selection), mean, True, shown))
     return list(ranked(result))
+
+
+def example_of(contents: Contents, path: Path, index: int) -> tuple[Tensor, dict[str, Entry], float]:
+    """The feature [D] of a Gaussian, the entries of fields of the same teacher, and the tolerance of their words."""
+    field = SemanticField.load(path)
+    check_whole("index", index, 0, len(field) - 1)
+    row = field.own_features(torch.tensor([index]))[0]
+    if not bool(row.any()):
+        raise ValueError(
+            f"index: expected a Gaussian that a training view shows, got {index}, which none shows; name another"
+        )
+    space = find_space(contents, field)
+    mine = {name: entry for name, entry in contents.entries.items() if entry.space == space}
+    if space is None or not mine:
+        raise ValueError(
+            f"like: expected a field of the teacher of those in the index, got {path} of another; name another"
+        )
+    return row, mine, contents.spaces[space].tolerance
+
+
+def find_space(contents: Contents, field: SemanticField) -> int | None:
+    """The space of a field's teacher; None if no field of that teacher is in the index."""
+    teacher = teacher_of(field)
+    for i, one in enumerate(contents.spaces):
+        same = teacher_difference({"teacher": one.teacher}, {"teacher": teacher}) is None
+        if same and one.words.shape[1] == field.dim and (one.teacher is None) == (teacher is None):
+            return i
+    return None
+
+
+def teacher_of(field: SemanticField) -> dict[str, Any] | None:
+    """What a field says of its teacher; None if it says nothing."""
+    teacher = field.info.get("teacher")
+    return teacher if isinstance(teacher, dict) else None
 
 
 def table_to_ask(contents: Contents, entry: Entry, target: str | Tensor) -> int | None:
