@@ -82,8 +82,8 @@ def _atoms(gaussians: Gaussians, word: Array) -> Grouped:
     if not len(inside):
         return Grouped(group, group[:0], group[:0] > 0, np.zeros((0, 2), np.int32))
     points, words = gaussians.means.detach().cpu().double().numpy()[inside], word[inside]
-    near, index = cKDTree(points).query(points, k=min(NEIGHBOURS + 1, len(points)))
-    near, index = near.reshape(len(points), -1), index.reshape(len(points), -1)
+    found = cKDTree(points).query(points, k=min(NEIGHBOURS + 1, len(points)))
+    near, index = (np.reshape(one, (len(points), -1)) for one in found)
     reach = _reach(near[:, min(NEIGHBOUR, near.shape[1] - 1)], words)
     part = radius_components(
         np.column_stack([points / reach[:, None], 2.0 * words]), 1.0

@@ -204,16 +204,16 @@ def _contents(tensors: dict[str, Array]) -> Contents:
     for i, one in enumerate(about["fields"]):
         table = None if one["table"] is None else _index(one["table"], len(tables))
         space, views = _index(one["space"], len(spaces)), _texts(one["views"])
-        rows = {kind: kinds[kind][i] for kind in COLUMNS}
-        _check_rows(rows, len(spaces[space].words), 0 if table is None else len(tables[table].names), len(views))
+        own = {kind: kinds[kind][i] for kind in COLUMNS}
+        _check_rows(own, len(spaces[space].words), 0 if table is None else len(tables[table].names), len(views))
         (path,), (size, time) = _texts([one["path"]]), one["mark"]
         mark, facts = (int(size), int(time)), (int(one["gaussians"]), space, table, views, float(one["outside"]))
-        entries[path] = Entry(path, mark, str(one["sha256"]), *facts, rows)
+        entries[path] = Entry(path, mark, str(one["sha256"]), *facts, own)
     unread = {name: Unread((int(size), int(time)), str(why)) for name, (size, time, why) in about["unread"].items()}
     return Contents(spaces, tables, entries, unread)
 
 
-def _rows(tensors: dict[str, Array], kind: str, fields: int) -> list[dict[str, Array]]:
+def _rows(tensors: dict[str, Array], kind: str, fields: int) -> list[Rows]:
     """The rows of one kind of each field."""
     columns = {name: _column(tensors, f"{kind}.{name}", dtype, tail) for name, (dtype, tail) in COLUMNS[kind].items()}
     start = _column(tensors, f"{kind}.start", "<i8", ())
@@ -225,7 +225,7 @@ def _rows(tensors: dict[str, Array], kind: str, fields: int) -> list[dict[str, A
     return [{name: column[place] for name, column in columns.items()} for place in places]
 
 
-def _check_rows(rows: dict[str, dict[str, Array]], words: int, classes: int, views: int) -> None:
+def _check_rows(rows: Mapping[str, Rows], words: int, classes: int, views: int) -> None:
     atoms, parts = rows["atoms"], rows["parts"]
     bounded = (
         (atoms["word"], 0, words),

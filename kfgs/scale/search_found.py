@@ -87,6 +87,6 @@ def scene_found(entry: Entry, count: int, score: float, exact: bool, parts: Iter
 
 def part_found(entry: Entry, rows: Rows, i: int, view: int, share: float) -> PartFound:
     """Row i of some columns as a part."""
-    corners = (tuple(map(float, rows[name][i])) for name in ("center", "low", "high"))
-    name = entry.views[view] if view >= 0 else None
-    return PartFound(int(rows["count"][i]), float(rows["score"][i]), *corners, name, float(share) if view >= 0 else 0.0)
+    center, low, high = (tuple(map(float, rows[name][i])) for name in ("center", "low", "high"))
+    shown = (entry.views[view], float(share)) if view >= 0 else (None, 0.0)
+    return PartFound(int(rows["count"][i]), float(rows["score"][i]), center, low, high, *shown)
