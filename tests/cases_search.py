@@ -9,7 +9,7 @@ from kfgs.quant import fit_linear_latents
 
 DIM = 24
 NAMES = ("wall", "chair", "table", "lamp", "boat")
-PLACES = {"wall": 0.0, "chair": 2.0, "table": 4.0, "lamp": 6.0, "boat": 8.0}
+PLACES = {"wall": 0.0, "chair": 2.0, "table": 4.0, "lamp": 6.0, "boat": 6.1}  # lamp and boat touch
 COUNT = 60
 
 

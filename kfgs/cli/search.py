@@ -71,6 +71,8 @@ def search(
 
         check_output("json", json, "a file")
     known = _up_to_date(SearchIndex.open(folder))
+    if len(known) == 0:
+        raise ValueError(f"folder: expected fields below {folder}, got none that can be read; make one with `kfgs fit`")
     found = _ask(known, query, like, index, text, threshold, exact, teacher)
     what = f"like {like}:{index}" if like is not None else query
     count = sum(scene.count for scene in found.scenes)

@@ -47,7 +47,7 @@ def update_index(
             if time.monotonic() - written > EVERY:
                 write_index(file, contents)
                 written = time.monotonic()
-        if added or failed or moved or state.removed or not file.is_file():
+        if added or failed or moved or state.removed:
             write_index(file, contents)
     return contents, Changes(tuple(added), state.removed, failed)
 
