@@ -17,7 +17,8 @@ def table(names=NAMES, **changes):
     """Classes with one embedding each, the same in every table. All share a part, which the canonical words consist of."""
     rows = torch.linalg.qr(torch.randn(DIM, DIM, generator=torch.Generator().manual_seed(7))).Q
     rows[:-2] = (rows[:-2] + 0.5 * rows[-1]) / 1.25**0.5
-    kept = {"negatives": torch.stack([rows[-1], rows[-1] + 0.2 * rows[-2]]), "negative_names": ("object", "things"), "info": {"teacher": {"name": "toy"}}}
+    kept: dict[str, object] = {"info": {"teacher": {"name": "toy"}}}
+    kept |= {"negatives": torch.stack([rows[-1], rows[-1] + 0.2 * rows[-2]]), "negative_names": ("object", "things")}
     return LabelSet(names, torch.stack([rows[NAMES.index(name)] for name in names]), **kept | changes)
 
 
@@ -40,10 +41,9 @@ def scene(things, seed=0, words=None, teacher="toy", noise=0.05):
         pose = torch.eye(4)
         pose[:3, 3] = torch.tensor([-PLACES[name], 0.0, 3.0])
         cameras.append(Camera(pose, K, 40, 30, f"at the {name}"))
-    return SemanticField(
-        cloud, linear=linear, info={"teacher": {"name": teacher}}, words=table(info={"teacher": {"name": teacher}}) if words is None else words,
-        cameras=tuple(cameras),
-    )  # fmt: skip
+    info = {"teacher": {"name": teacher}}
+    words = table(info=info) if words is None else words
+    return SemanticField(cloud, linear=linear, info=info, words=words, cameras=tuple(cameras))
 
 
 def save_scenes(folder, **scenes):

@@ -29,9 +29,9 @@ class SharedCodebook:
 
     Example:
         >>> import torch
-        >>> book = SharedCodebook.fit(torch.eye(3)[[0, 0, 0, 0, 1, 1, 1, 1]])
-        >>> book.words.tolist(), len(book.extended(torch.eye(3)[[2] * 9]))
-        ([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], 3)
+        >>> book = SharedCodebook.fit(torch.tensor([[2.0, 0, 0]] * 4))
+        >>> book.extended(torch.tensor([[0.99, 0.1, 0], [0.0, 3.0, 0.0]] * 4)).words.tolist()
+        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
     """
 
     words: Tensor  # [K, D] unit rows

@@ -92,7 +92,7 @@ def _load_views(path: Path, root: Path, images: str | Path | None) -> Scene:
         for name in MODEL_FOLDERS:
             if has_model(path / name):
                 model = path / name
-                scene = load_colmap(model, images if images is not None else _image_folder(path, model))
+                scene = load_colmap(model, images if images is not None else find_images(path, model))
                 others = sorted(f.name for f in model.parent.iterdir() if f != model and has_model(f))
                 if name == "sparse/0" and others:
                     note = f"{model.parent} holds other models too ({some(others)}): COLMAP split the images; 0 is used"
@@ -130,7 +130,8 @@ def _advice(path: Path) -> str:
     return "estimate the cameras first: `kfgs sfm <images> <scene>` or kfgs.scenes.run_sfm"
 
 
-def _image_folder(root: Path, model: Path) -> Path:
+def find_images(root: Path, model: Path) -> Path:
+    """The folder with the pictures of a scene's model; see `load_scene`."""
     places = list(dict.fromkeys((root, model.resolve().parent, model.resolve().parent.parent)))
     for above in places:
         if (above / "images").is_dir():

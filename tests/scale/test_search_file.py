@@ -5,6 +5,7 @@ import os
 import struct
 import subprocess
 import sys
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -107,11 +108,8 @@ def test_cut_and_flipped_bytes_are_one_error_or_an_index(runs, tmp_path):
         data = bytearray(whole)
         data[place] ^= 1 << int(rng.integers(8))
         bad.write_bytes(bytes(data))
-        try:
-            found = SearchIndex.open(tmp_path)
-            found.search("chair")
-        except ValueError as error:
-            assert str(error)  # of the file, or: no such class
+        with suppress(ValueError):  # damaged, or: no such class
+            SearchIndex.open(tmp_path).search("chair")
 
 
 def test_a_damaged_index_stops_an_update_and_is_made_again_when_deleted(tmp_path):

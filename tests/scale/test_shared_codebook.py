@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import pytest
 import torch
 from cases_search import scene, table
@@ -26,7 +28,7 @@ def test_new_scenes_append_and_move_no_old_id():
     for one in features[1:]:
         books.append(books[-1].extended(one))
     assert len(books[-1]) == 8  # of directions 0 to 7, of which each scene shares two with the one before
-    for before, after in zip(books, books[1:], strict=False):
+    for before, after in pairwise(books):
         assert torch.equal(after.words[: len(before)], before.words)
     before = [book.nearest(one).codeword for book, one in zip(books, features, strict=True)]
     after = [books[-1].nearest(one).codeword for one in features]
