@@ -15,7 +15,7 @@ from ..quant.codebook import Nearest
 from ..quant.grow import grow, nearest_cells
 
 TOLERANCE = 0.9  # room_0: 370 words; 96 % of the Gaussians keep the class of their own feature (0.8: 95 %, 0.95: 97 %)
-LEFT = 0.01  # of a scene's features may stay outside the tolerance: at borders of things every blend is another word
+SUPPORT = 20  # features that a new word needs within its tolerance: at borders of things, every blend is another direction
 MOST = 1000  # words that one scene may add
 COVERAGE = 0.9  # of the features of one new word must be within the tolerance, or its cell is split
 
@@ -30,7 +30,7 @@ class SharedCodebook:
     Example:
         >>> import torch
         >>> book = SharedCodebook.fit(torch.tensor([[2.0, 0, 0]] * 4))
-        >>> book.extended(torch.tensor([[0.99, 0.1, 0], [0.0, 3.0, 0.0]] * 4)).words.tolist()
+        >>> book.extended(torch.tensor([[0.99, 0.1, 0], [0.0, 3.0, 0.0]] * 20)).words.tolist()
         [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
     """
 
@@ -96,8 +96,8 @@ class SharedCodebook:
         """This codebook with words appended for those features that no word resembles. All old ids stay.
 
         Features within the tolerance of a word keep that word. The others are grouped (`quant.grow`), and a group whose
-        centre is within the tolerance of an old word takes that one. If at most 1 % of the features are left over,
-        nothing is appended: the same scene a second time adds no word.
+        centre is within the tolerance of an old word takes that one. A new word needs 20 features that are within its
+        tolerance and of no other word, unless the codebook was empty. The same scene a second time adds no word.
 
         Args:
             features: of one scene, or of samples of many; all-zero rows are left out.
@@ -112,12 +112,15 @@ class SharedCodebook:
         while True:
             far = unit if len(words) == 0 else unit[nearest_cells(unit, words).similarity < self.tolerance]
             room = MOST - (len(words) - old)
-            if len(far) == 0 or (len(words) and len(far) <= LEFT * len(unit)) or room <= 0:
+            if len(far) < (SUPPORT if len(words) else 1) or room <= 0:
                 break
             generator = torch.Generator(device=unit.device).manual_seed(0)  # the same features give the same centres
             centres = grow(far, room, alpha=self.tolerance, coverage=COVERAGE, generator=generator).cells.centres
             if len(words):
-                centres = centres[nearest_cells(centres, words).similarity < self.tolerance]
+                near = nearest_cells(far, centres)
+                support = torch.bincount(near.index[near.similarity >= self.tolerance], minlength=len(centres))
+                new = nearest_cells(centres, words).similarity < self.tolerance
+                centres = centres[new & (support >= SUPPORT)]
             if len(centres) == 0:
                 break
             words = torch.cat([words, centres])

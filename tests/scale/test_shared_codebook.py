@@ -44,15 +44,19 @@ def test_a_word_within_the_tolerance_is_taken_and_one_outside_is_appended():
     torch.testing.assert_close(grown.words, torch.stack([first, outside]))
 
 
-def test_the_same_scene_again_and_a_hundredth_of_outliers_add_nothing():
+def test_the_same_scene_again_adds_nothing():
     features = torch.randn(3000, 16, generator=torch.Generator().manual_seed(3))  # no groups at all
     book = SharedCodebook.fit(features, tolerance=0.7)
     assert len(book.extended(features)) == len(book)
+
+
+def test_a_small_thing_gets_a_word_and_a_few_outliers_do_not():
     rows = torch.eye(16)
     book = SharedCodebook.fit(rows[[0] * 500])
-    few = torch.cat([rows[[0] * 495], rows[[1] * 5]])
-    assert len(book.extended(few)) == 1
-    assert len(book.extended(torch.cat([few, rows[[1] * 5]]))) == 2
+    many = rows[[0] * 50_000]
+    assert len(book.extended(torch.cat([many, rows[[1] * 19]]))) == 1
+    grown = book.extended(torch.cat([many, rows[[1] * 20], rows[[2] * 19]]))
+    torch.testing.assert_close(grown.words, rows[:2])
 
 
 def test_latents_give_the_words_of_their_features():
