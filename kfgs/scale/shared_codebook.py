@@ -15,7 +15,9 @@ from ..quant.codebook import Nearest
 from ..quant.grow import grow, nearest_cells
 
 TOLERANCE = 0.9  # room_0: 370 words; 96 % of the Gaussians keep the class of their own feature (0.8: 95 %, 0.95: 97 %)
-SUPPORT = 20  # features that a new word needs within its tolerance: at borders of things, every blend is another direction
+SUPPORT = (
+    20  # features that a new word needs within its tolerance: at borders of things, every blend is another direction
+)
 MOST = 1000  # words that one scene may add
 COVERAGE = 0.9  # of the features of one new word must be within the tolerance, or its cell is split
 

@@ -78,7 +78,8 @@ def extend_sfm(
         known = pycolmap.Reconstruction(str(model))
         _fill_database(pycolmap, run.database, known)
         camera = _shared_camera(old, images / new[0]) if config.single_camera else None
-        seconds = {"features": timed(lambda: (run.extract(names, None, False), run.extract(new, camera))[0])}
+        seconds = {"features": timed(lambda: run.extract(names, None, False))}
+        seconds["features"] += timed(lambda: run.extract(new, camera))
         seconds["matching"] = timed(run.match)
         found: list[Any] = []
         seconds["mapping"] = timed(lambda: found.append(_place(run, known, Path(scratch), len(new))))

@@ -79,7 +79,9 @@ def test_a_class_that_only_other_tables_know_is_asked_by_words(index, runs):
     same_as_select(exact, runs, "boat", table())
 
 
-@pytest.mark.parametrize("options", [{"threshold": 0.9}, {"score": "cosine"}, {"negatives": "canonical"}, {"score": "softmax"}])
+@pytest.mark.parametrize(
+    "options", [{"threshold": 0.9}, {"score": "cosine"}, {"negatives": "canonical"}, {"score": "softmax"}]
+)
 def test_other_options_are_answered_by_words_and_exactly_if_asked(index, runs, options):
     words = {one.path: one for one in index.search("chair", **options).scenes}
     exact = {one.path: one for one in index.search("chair", exact=9, **options).scenes}
