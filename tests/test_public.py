@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = [
     "kfgs.cameras", "kfgs.evaluation", "kfgs.evaluation.datasets", "kfgs.evaluation.foreign",
     "kfgs.fields", "kfgs.formats", "kfgs.labels", "kfgs.labels.edits", "kfgs.pipeline",
-    "kfgs.quant", "kfgs.scenes", "kfgs.splat", "kfgs.teachers", "kfgs.viz",
+    "kfgs.quant", "kfgs.scale", "kfgs.scenes", "kfgs.splat", "kfgs.teachers", "kfgs.viz",
 ]  # fmt: skip
 
 

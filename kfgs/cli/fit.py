@@ -42,6 +42,7 @@ def demo(out: Path = Path("kfgs_demo"), seed: int = 0) -> None:
 def sfm(
     images: Positional[Path],
     out: Path,
+    onto: Given[Path] = None,
     matching: Literal["exhaustive", "sequential"] = "exhaustive",
     camera_model: str = "SIMPLE_RADIAL",
     no_single_camera: Flag = False,
@@ -54,10 +55,13 @@ def sfm(
     Examples:
         kfgs sfm photos/ --out scene/
         kfgs sfm frames/ --out scene/ --matching sequential    # frames of a video
+        kfgs sfm more/ --onto scene/ --out larger/             # new photographs of a known scene
 
     Args:
         images: Folder of photographs.
         out: Scene folder to make; OUT/sparse/0 receives the COLMAP model.
+        onto: A scene with a COLMAP model: place the photographs in it. Its own cameras do not move, and it is not written to;
+            OUT has the pictures of both, as links.
         matching: sequential for the frames of a video, exhaustive for everything else.
         camera_model: COLMAP's name of the lens model.
         no_single_camera: The photographs were taken with several cameras, or with changes of zoom.
@@ -65,9 +69,9 @@ def sfm(
         seed: Every random choice follows from it.
         replace: Replace a model that is in OUT/sparse/0 already; without it that is an error.
     """
-    from ..scenes import SfmConfig, run_sfm
+    from ..scenes import SfmConfig, extend_sfm, run_sfm
 
-    check_output("out", out, "a folder", other=[images])
+    check_output("out", out, "a folder", apart=inputs_of(onto), other=[images])
 
     config = SfmConfig(
         matching=matching,
@@ -76,6 +80,11 @@ def sfm(
         min_registered=min_registered,
         seed=seed,
     )
+    if onto is not None:
+        check_alone("replace", replace, "with --onto, which needs a new folder")
+        say(str(extend_sfm(images, onto, out, config=config, progress=True)))
+        wrote([out / "sparse" / "0", out / "images"])
+        return
     say(str(run_sfm(images, out, config=config, replace=replace, progress=True)))
     written = [out / "sparse" / "0"]
     beside = out / "images"

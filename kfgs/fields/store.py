@@ -13,6 +13,9 @@ from torch import Tensor
 from .._arrays import read_safetensors
 from .._check import check_choice
 from .._files import as_path, atomic_folder, atomic_path, current_file, digest_file, open_current, read_json, write_json
+from .._files.fields import DESCRIPTION as DESCRIPTION
+from .._files.fields import SUFFIX as SUFFIX
+from .._files.fields import describes_field as describes_field
 from .._tensors import save_tensors
 from ..cameras import Camera
 from ..gaussians import Gaussians
@@ -26,9 +29,7 @@ from .remembered import check_notes, rebased, recall_classes
 
 FORMAT, VERSIONS = "kfgs.semantic_field", (1, 2, 3)
 """Version 2 may hold linear latents, fused answers and cameras; version 3 the classes."""
-TENSORS, DESCRIPTION = "field.safetensors", "field.json"
-SUFFIX = ".kfgs.safetensors"
-"""Of a field in one file."""
+TENSORS = "field.safetensors"
 
 
 def find_field(path: str | Path) -> Path | None:
@@ -36,11 +37,6 @@ def find_field(path: str | Path) -> Path | None:
     path = as_path(path)
     found = (one for one in (path, path / "field") if describes_field(one))
     return next(found, path if _peek(path) is not None else None)
-
-
-def describes_field(folder: Path) -> bool:
-    """Whether a folder is that of a field."""
-    return current_file(folder, DESCRIPTION).is_file() or (folder / DESCRIPTION).is_file()  # it was just moved there
 
 
 def field_data(path: Path) -> Path:

@@ -1,8 +1,7 @@
-"""Look up the labels of a class name; the error for an unknown name offers similar names."""
+"""Classes by name or by index, as arguments of labels and edits name them."""
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,56 +9,8 @@ import torch
 from torch import Tensor
 
 from .._check import check_whole
-
-SHOWN = 20  # names listed in a message
-
-
-def class_index(name: str, names: Sequence[str]) -> int:
-    """The label of a class: its place in `names`, found as `class_indices` does.
-
-    Raises:
-        ValueError: if the name is unknown (the message offers the nearest names), or several labels have it.
-
-    Example:
-        >>> class_index("chair", ["wall", "chair"])
-        1
-    """
-    found = class_indices(name, names)
-    if len(found) > 1:
-        raise ValueError(
-            f"class: expected one class called {name!r}, got {len(found)} (labels {', '.join(map(str, found))}); "
-            "rename all but one, or ask for one by its index"
-        )
-    return found[0]
-
-
-def class_indices(name: str, names: Sequence[str]) -> tuple[int, ...]:
-    """The labels of a class, ascending. There are several if several classes have the same name.
-
-    A name is looked up exactly, then without regard to case, if only one spelling fits.
-
-    Raises:
-        ValueError: if the name is unknown; the message offers the nearest names.
-
-    Example:
-        >>> class_indices("chair", ["chair", "wall", "chair"]), class_indices("Wall", ["chair", "wall"])
-        ((0, 2), (1,))
-    """
-    folded = {one for one in names if one.casefold() == name.casefold()}
-    spelled = name if name in names else folded.pop() if len(folded) == 1 else None
-    if spelled is not None:
-        return tuple(index for index, one in enumerate(names) if one == spelled)
-    if not names:
-        raise ValueError(
-            f"class: expected class names to look {name!r} up in, got none; pass the names or use an index"
-        )
-    lower = {one.lower(): one for one in names}
-    near = sorted(folded)
-    near += [lower[m] for m in difflib.get_close_matches(name.lower(), lower, 3) if lower[m] not in near]
-    near += [one for one in dict.fromkeys(names) if name and name.lower() in one.lower() and one not in near][:3]
-    listed = ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
-    hint = f"did you mean {' or '.join(map(repr, near))}?" if near else "add its embedding to the classes"
-    raise ValueError(f"class: expected one of {listed}, got {name!r}; {hint}")
+from .._names import class_index as class_index
+from .._names import class_indices as class_indices
 
 
 def class_of(argument: str, value: Any) -> str | int:

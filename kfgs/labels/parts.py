@@ -13,13 +13,12 @@ from .._check import check_shapes, check_whole
 from .._rows import check_finite
 from ..cameras import Camera
 from ..gaussians import Gaussians
-from ..splat import rasterize
 from .boxes import OrientedBox
 from .components import component_numbers
 from .selection import Selection
+from .views import sum_pixels
 
 LONGEST = 160  # longer side in pixels of the views compared; on room_0 shares change by at most 0.3 % of the picture
-TOGETHER = 16  # parts drawn in one rendering, as channels
 SPECK = 0.05  # parts smaller than this share of the largest are left out
 
 
@@ -170,7 +169,7 @@ def view_shares(
     """The share of each camera's picture that each part fills: the mean over pixels of its rendering weights w = T alpha.
 
     Hidden parts do not count, and a transparent part counts by its opacity. Pictures are rendered with at most 160 pixels
-    a side, 16 parts at a time.
+    a side. The share of two parts together is the sum of their shares.
 
     Args:
         gaussians: the whole cloud.
@@ -179,18 +178,24 @@ def view_shares(
         engine: compositing engine.
     """
     shares = torch.zeros(len(cameras), len(parts), dtype=gaussians.means.dtype, device=gaussians.means.device)
-    with torch.no_grad():
-        for start in range(0, len(parts), TOGETHER):
-            some = parts[start : start + TOGETHER]
-            member = torch.zeros(len(gaussians), len(some)).to(gaussians.means)
-            for i, part in enumerate(some):
-                member[part, i] = 1
-            marked = gaussians.replace(features=member, sh=None)
-            for c, camera in enumerate(cameras):
-                scale = min(1.0, LONGEST / max(camera.size))
-                small = camera.resized(*(max(1, round(side * scale)) for side in camera.size))
-                shares[c, start : start + len(some)] = rasterize(marked, small, engine=engine).map.mean(dim=(0, 1))
+    if not parts:
+        return shares
+    members = torch.cat(list(parts)).to(shares.device)
+    owner = torch.repeat_interleave(torch.tensor([len(part) for part in parts])).to(shares.device)
+    for c, camera in enumerate(cameras):
+        shares[c].index_add_(0, owner, gaussian_shares(gaussians, camera, engine=engine)[members])
     return shares
+
+
+def gaussian_shares(gaussians: Gaussians, camera: Camera, *, engine: str = "auto") -> Tensor:  # [N]
+    """The share of a camera's picture that each Gaussian fills; see `view_shares`."""
+    scale = min(1.0, LONGEST / max(camera.size))
+    small = camera.resized(*(max(1, round(side * scale)) for side in camera.size))
+    with torch.no_grad():
+        ones = torch.ones(*small.size, 1).to(gaussians.means)
+        index, _, weights = sum_pixels(gaussians, small, ones, engine=engine)
+        found = torch.zeros(len(gaussians)).to(gaussians.means)
+        return found.index_add_(0, index, weights.to(found) / (small.width * small.height))
 
 
 def _described(

@@ -19,10 +19,11 @@ from typing import Any
 
 from .._check import one_line
 from .._files import as_path, atomic_folder, atomic_path, current_file
+from .._files.fields import KEPT
 from ..fields.store import DESCRIPTION, TENSORS, check_place, describes_field, load_field, read_description
 from .stages import Run
 
-FIELD, KEPT = "field", "field@"
+FIELD = "field"
 KEY = 12  # hexadecimal digits of a key
 SHOWN = ("report.html", "preview.png", "codebook.png", "field.png")  # what `write_run_report` writes
 LONGEST = 40  # characters of a value in a comparison

@@ -6,6 +6,7 @@ from .files import SceneError, file_stem, list_images, read_image
 from .load import load_scene
 from .scene import Scene
 from .sfm import SfmConfig, run_sfm
+from .sfm_onto import extend_sfm
 from .splits import make_split
 from .undistort import undistort_scene
 
@@ -15,6 +16,7 @@ __all__ = [
     "Scene",
     "SceneError",
     "SfmConfig",
+    "extend_sfm",
     "file_stem",
     "list_images",
     "load_scene",

@@ -95,7 +95,7 @@ def picture_folders(path: str | Path, images: str | Path | None = None) -> list[
     try:
         given, model = _given_folder(root, images), find_model(path)
         if model is not None:
-            found = {as_path(given) if given is not None else _image_folder(path, model)}
+            found = {as_path(given) if given is not None else find_images(path, model)}
         else:
             found = {file.parent for file in _load_views(path, given).image_paths}
     except (OSError, ValueError):
@@ -112,7 +112,7 @@ def _given_folder(root: Path, images: str | Path | None) -> str | Path | None:
 def _load_views(path: Path, images: str | Path | None) -> Scene:
     model = find_model(path)
     if model is not None:
-        scene = load_colmap(model, images if images is not None else _image_folder(path, model))
+        scene = load_colmap(model, images if images is not None else find_images(path, model))
         others = sorted(f.name for f in model.parent.iterdir() if f != model and has_model(f))
         if model == path / "sparse/0" and others:
             note = f"{model.parent} holds other models too ({some(others)}): COLMAP split the images; 0 is used"
@@ -158,7 +158,8 @@ def _advice(path: Path) -> str:
     return "estimate the cameras first: `kfgs sfm <images> <scene>` or kfgs.scenes.run_sfm"
 
 
-def _image_folder(root: Path, model: Path) -> Path:
+def find_images(root: Path, model: Path) -> Path:
+    """The folder with the pictures of a scene's model; see `load_scene`."""
     places = list(dict.fromkeys((root, model.resolve().parent, model.resolve().parent.parent)))
     for above in places:
         if (above / "images").is_dir():

@@ -130,9 +130,9 @@ def run_sfm(
         ),
         tqdm(disable=not progress, unit="image") as bar,
     ):
-        run = _Run(pycolmap, images, names, Path(scratch), config, bar)
-        seconds = {name: _timed(stage) for name, stage in (("features", run.extract), ("matching", run.match))}
-        seconds["mapping"] = _timed(run.map)
+        run = SfmRun(pycolmap, images, names, Path(scratch), config, bar)
+        seconds = {name: timed(stage) for name, stage in (("features", run.extract), ("matching", run.match))}
+        seconds["mapping"] = timed(run.map)
         models = sorted(run.models, key=lambda model: -model.num_reg_images())
         sizes = tuple(model.num_reg_images() for model in models)
         _require_one_model(images, sizes, names, config)
@@ -150,14 +150,15 @@ def run_sfm(
         )
 
 
-def _timed(stage: Callable[[], None]) -> float:
+def timed(stage: Callable[[], None]) -> float:
+    """Seconds of wall-clock time that a stage takes."""
     start = time.perf_counter()
     stage()
     return time.perf_counter() - start
 
 
 @dataclass
-class _Run:
+class SfmRun:
     """The three stages, over one database."""
 
     pycolmap: Any
@@ -170,42 +171,53 @@ class _Run:
 
     @property
     def database(self) -> str:
+        """Where features and matches are kept."""
         return str(self.scratch / "database.db")
 
-    def _stage(self, name: str, total: int, unit: str) -> None:
+    def begin(self, name: str, total: int, unit: str) -> None:
+        """Start the bar of a stage."""
         self.bar.reset(total=total)
         self.bar.unit = unit
         self.bar.set_description(name)
 
-    def extract(self) -> None:
-        """Compute features of a few images at a time, so that the bar moves and Ctrl-C works."""
+    def extract(self, names: list[str] | None = None, camera: int | None = None, single: bool | None = None) -> None:
+        """Compute features of a few images at a time, so that the bar moves and Ctrl-C works.
+
+        Args:
+            names: which images; None: all.
+            camera: the camera of the database that took them; None makes one, or one for each image.
+            single: whether one camera took them; None: as the config says. An image of the database keeps its camera.
+        """
         colmap, config = self.pycolmap, self.config
+        names, single = self.names if names is None else names, config.single_camera if single is None else single
         colmap.set_random_seed(config.seed)
-        self._stage("features", len(self.names), "image")
-        mode = colmap.CameraMode.SINGLE if config.single_camera else colmap.CameraMode.PER_IMAGE
+        self.begin("features", len(names), "image")
+        mode = colmap.CameraMode.SINGLE if single else colmap.CameraMode.PER_IMAGE
         reader: dict[str, Any] = {"camera_model": config.camera_model}
+        if camera is not None:
+            reader["existing_camera_id"] = camera
         options = {"num_threads": config.num_threads, "sift": {"max_num_features": config.max_features}}
-        for start in range(0, len(self.names), 8):
-            some_names = self.names[start : start + 8]
+        for start in range(0, len(names), 8):
+            some_names = names[start : start + 8]
             colmap.extract_features(
                 self.database, str(self.images), image_names=some_names, camera_mode=mode, reader_options=reader,
                 extraction_options=options, device=colmap.Device.cpu,
             )  # fmt: skip
-            if config.single_camera and "existing_camera_id" not in reader:
-                reader.update(self._first_camera())
+            if single and "existing_camera_id" not in reader:
+                reader.update(self._camera_of(some_names))
             self.bar.update(len(some_names))
 
-    def _first_camera(self) -> dict[str, Any]:
-        """The option that makes the next images share the camera of the first; empty while no image could be read."""
+    def _camera_of(self, names: list[str]) -> dict[str, Any]:
+        """The option that makes the next images share the camera of these; empty while no image could be read."""
         with self.pycolmap.Database.open(self.database) as database:
-            cameras = database.read_all_cameras()
-        return {"existing_camera_id": int(cameras[0].camera_id)} if cameras else {}
+            found = [image for image in database.read_all_images() if image.name in names]
+        return {"existing_camera_id": int(found[0].camera_id)} if found else {}
 
     def match(self) -> None:
         """Compare pairs; pycolmap reports no progress meanwhile."""
         colmap, config, count = self.pycolmap, self.config, len(self.names)
         exhaustive = config.matching == "exhaustive"
-        self._stage("matching", count * (count - 1) // 2 if exhaustive else count, "pair" if exhaustive else "image")
+        self.begin("matching", count * (count - 1) // 2 if exhaustive else count, "pair" if exhaustive else "image")
         match, pairing = (colmap.match_exhaustive, {}) if exhaustive else self._sequential(colmap)
         match(
             self.database, matching_options={"num_threads": config.num_threads}, **pairing,
@@ -230,12 +242,17 @@ class _Run:
         listed.write_text("".join(f"{a} {b}\n" for a, b in sequential_pairs(self.names)), encoding="utf-8")
         return colmap.match_image_pairs, {"pairing_options": colmap.ImportedPairingOptions(match_list_path=str(listed))}
 
+    def options(self) -> Any:
+        """Of the mapping, with its seeds."""
+        seed = self.config.seed
+        options = self.pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=self.config.num_threads)
+        options.mapper.random_seed = options.triangulation.random_seed = seed
+        return options
+
     def map(self) -> None:
         """Estimate the pose of one image after the other."""
-        colmap, seed = self.pycolmap, self.config.seed
-        self._stage("mapping", len(self.names), "image")
-        options = colmap.IncrementalPipelineOptions(random_seed=seed, num_threads=self.config.num_threads)
-        options.mapper.random_seed = options.triangulation.random_seed = seed
+        colmap, options = self.pycolmap, self.options()
+        self.begin("mapping", len(self.names), "image")
         (self.scratch / "models").mkdir()
         found = colmap.incremental_mapping(
             self.database, str(self.images), str(self.scratch / "models"), options=options,

@@ -4,31 +4,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from kornia.geometry import resize
+from cases_sfm import WIDTH, downsized
 from kornia.io import write_image
 from messages import tells
 from oracles_cameras import align_similarity
 from tqdm import tqdm
 
-from kfgs.scenes import SceneError, SfmConfig, load_scene, read_image, run_sfm
+from kfgs.scenes import SceneError, SfmConfig, load_scene, run_sfm
 from kfgs.scenes.pycolmap_import import import_pycolmap
-from kfgs.scenes.sfm import SfmReport, _require_one_model, _Run, sequential_pairs
-
-WIDTH = 320
-
-
-def _downsized(source: Path, target: Path, count: int) -> Path:
-    target.mkdir()
-    for file in sorted(source.iterdir())[:count]:
-        image = read_image(file).permute(2, 0, 1)[None]
-        height = round(image.shape[2] * WIDTH / image.shape[3])
-        small = resize(image, (height, WIDTH), antialias=True)[0].clamp(0, 1)
-        write_image(str(target / f"{file.stem}.png"), (small * 255).round().to(torch.uint8))
-    return target
+from kfgs.scenes.sfm import SfmReport, SfmRun, _require_one_model, sequential_pairs
 
 
 def test_sfm_finds_the_true_poses(shared_data: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    images = _downsized(shared_data / "lund_door/images", tmp_path / "images", 8)
+    images = downsized(shared_data / "lund_door/images", tmp_path / "images", 8)
     (images / "notes.txt").write_text("not an image")
     report = run_sfm(images, tmp_path, config=SfmConfig(max_features=3000), progress=True)
     assert (report.registered, report.total, report.missing, report.model_sizes) == (8, 8, (), (8,))
@@ -127,7 +115,7 @@ def _matched(folder: Path, names: list[str]) -> set[frozenset[str]]:
         write_image(str(folder / "images" / name), picture.repeat_interleave(4, 2))
     config = SfmConfig(matching="sequential", max_features=200, num_threads=1)
     with tqdm(disable=True) as bar:
-        run = _Run(pycolmap, folder / "images", names, folder, config, bar)
+        run = SfmRun(pycolmap, folder / "images", names, folder, config, bar)
         run.extract()
         run.match()
     with pycolmap.Database.open(run.database) as database:
@@ -170,7 +158,7 @@ class _Placed:
 
 
 def test_a_model_is_replaced_only_when_asked_and_other_files_stay(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("kfgs.scenes.sfm._Run", _Placed)
+    monkeypatch.setattr("kfgs.scenes.sfm.SfmRun", _Placed)
     (tmp_path / "photos").mkdir()
     for name in "abc":
         (tmp_path / "photos" / f"{name}.png").touch()

@@ -1,0 +1,163 @@
+"""The command search: ask all fields below a folder at once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from .files import check_alone
+from .options import Given, Positional, Teacher
+from .output import say, wrote
+
+# Heavy imports happen inside the functions; a class that the fields know is found without torch.
+
+SHOWN = 5  # parts of a scene in the table; all are in the JSON file
+
+
+def search(
+    query: Positional[str],
+    folder: Positional[Given[Path]] = None,
+    *,
+    like: Given[Path] = None,
+    index: Given[int] = None,
+    text: Given[Path] = None,
+    threshold: Given[float] = None,
+    exact: int = 0,
+    top: int = 20,
+    json: Given[Path] = None,
+    teacher: Teacher,
+) -> None:
+    """Find a class, a phrase or an example in all fields below a folder: which scenes, where, how many, and the best view.
+
+    The first search makes an index, FOLDER/search.kfgs; later ones extend it when fields are new or have changed. A class
+    of a field's own table is answered exactly as `kfgs select` does. Other phrases, examples, and other thresholds are
+    answered by words that stand for many Gaussians each; --exact asks the fields themselves.
+
+    Examples:
+        kfgs search chair runs/
+        kfgs search "a red chair" runs/ --teacher lseg --weights demo_e200.ckpt --exact 5
+        kfgs search runs/ --like runs/room_0/field --index 17    # what resembles Gaussian 17
+
+    Args:
+        query: A class name; with --teacher any phrase, compared with its canonical words in every scene.
+        folder: Folder with run folders or fields in it, at any depth. With --like it is the only argument.
+        like: A field folder, or a field in one file, that shows an example, instead of a query.
+        index: Number of the example's Gaussian, from 0, for --like.
+        text: A table of `kfgs text` to look the class up, instead of each field's own classes.
+        threshold: Scores must be above it: by default 0.5 for a relevancy; 0.9 for --like, where it is a cosine.
+        exact: Ask the fields themselves for so many of the best scenes, and rank these again.
+        top: So many scenes are printed.
+        json: File for the whole answer.
+    """
+    from ..scale import SearchIndex
+
+    if like is not None and folder is None:
+        folder, query = Path(query), ""
+    if folder is None or (like is None) != (index is None) or (like is not None and query):
+        raise ValueError(
+            "query, folder, like, index: expected QUERY FOLDER, or FOLDER --like FIELD --index N, got something else; see "
+            "`kfgs search --help`"
+        )
+    for name, given, least in (("exact", exact, 0), ("top", top, 1)):
+        if given < least:
+            raise ValueError(f"{name}: expected a whole number from {least}, got {given}; give another")
+    if like is not None:
+        for name, other in (("text", text), ("teacher", teacher.teacher)):
+            check_alone(name, other, "with --like, which needs no words")
+    teacher.check_weights()
+    if json is not None:
+        from .._files import check_output
+
+        check_output("json", json, "a file")
+    known = _up_to_date(SearchIndex.open(folder))
+    if len(known) == 0:
+        raise ValueError(f"folder: expected fields below {folder}, got none that can be read; make one with `kfgs fit`")
+    found = _ask(known, query, like, index, text, threshold, exact, teacher)
+    what = f"like {like}:{index}" if like is not None else query
+    count = sum(scene.count for scene in found.scenes)
+    say(f"{what}: in {len(found.scenes)} of {found.searched} scenes, {count} Gaussians")
+    _say_table(found.scenes[:top])
+    if len(found.scenes) > top:
+        say(f"  and {len(found.scenes) - top} more scenes; --top {len(found.scenes)} shows all")
+    if any(not scene.exact for scene in found.scenes[:top]):
+        say("~: by words, not by Gaussians; --exact N asks the N best scenes themselves")
+    for name, why in list(found.unasked.items())[:SHOWN]:
+        say(f"note: not asked: {name} ({why})")
+    if len(found.unasked) > SHOWN:
+        say(f"note: not asked: {len(found.unasked) - SHOWN} more")
+    if json is not None:
+        from .._files import write_json
+
+        write_json(json, {"query": what, "folder": str(folder)} | found.to_json())
+        wrote([json])
+
+
+def _up_to_date(known: Any) -> Any:
+    """The index, extended if fields are new or have changed. While another process extends it, the old one answers."""
+    if known.is_current():
+        return known
+    try:
+        known, changes = known.update(progress=True)
+    except ValueError as error:
+        if len(known) == 0:
+            raise
+        say(f"note: the index is not extended now: {error}")
+        return known
+    gone = f", {len(changes.removed)} removed" if changes.removed else ""
+    say(f"index: {len(changes.added)} fields added{gone}; {len(known)} in {known.file}")
+    return known
+
+
+def _ask(
+    known: Any,
+    query: str,
+    like: Path | None,
+    index: int | None,
+    text: Path | None,
+    threshold: float | None,
+    exact: int,
+    teacher: Teacher,
+) -> Any:
+    if like is not None:
+        return known.like(like, index, threshold, exact=exact)
+    classes = None
+    if teacher.teacher is not None:
+        from .text import text_encoder
+
+        check_alone("text", text, "with --teacher, which embeds the query itself")
+        templates = next((one.info["templates"] for one in known.contents.tables if "templates" in one.info), None)
+        classes = text_encoder(teacher)([query], templates=templates)
+        query = classes.names[0]
+    elif text is not None:
+        from ..labels import load_label_set
+
+        classes = load_label_set(text)
+    try:
+        return known.search(query, classes, threshold, exact=exact)
+    except ValueError as error:
+        if classes is not None or not str(error).startswith("class: "):
+            raise
+        raise ValueError(f"{error}; for any other phrase pass --teacher and --weights") from error
+
+
+def _say_table(scenes: Iterable[Any]) -> None:
+    """A line for each part of each scene, the largest first."""
+    rows = [("scene", "score", "Gaussians", "center", "size", "best view")]
+    for scene in scenes:
+        mark = "" if scene.exact else "~"
+        if not scene.parts:
+            rows.append((scene.path, f"{mark}{scene.score:.3f}", f"{mark}{scene.count}", "scattered", "", ""))
+        for i, part in enumerate(scene.parts[:SHOWN]):
+            size = " x ".join(f"{high - low:.3g}" for low, high in zip(part.low, part.high, strict=True))
+            center = ", ".join(f"{x:.3g}" for x in part.center)
+            view = "" if part.view is None else f"{part.share:.1%} of {part.view}"
+            name = scene.path if i == 0 else ""
+            rows.append((name, f"{mark}{part.score:.3f}", f"{mark}{part.count}", f"({center})", size, view))
+        if len(scene.parts) > SHOWN:
+            rows.append(("", "", "", f"and {len(scene.parts) - SHOWN} more parts", "", ""))
+    if len(rows) == 1:
+        return
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    for row in rows:
+        say("  " + "  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True)).rstrip())

@@ -1,0 +1,99 @@
+"""Extend the index of a search: describe the fields that are new or have changed, and write it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from .._card import error_line
+from .._files import digest_file, locked
+from ..fields import SemanticField
+from ..labels import LabelSet
+from .search_entry import describe
+from .search_file import NAME, Contents, Entry, Space, Table, Unread, read_index, write_index
+from .search_found import Changes
+from .search_state import compare_fields, mark_of
+from .search_words import find_space, teacher_of
+from .shared_codebook import TOLERANCE, SharedCodebook
+
+LOCK = ".search.lock"
+EVERY = 20.0  # seconds between two writes of a long update
+
+
+def update_index(
+    folder: Path, *, progress: bool = False, report: Callable[[str], None] | None = None
+) -> tuple[Contents, Changes]:
+    """See `SearchIndex.update`. The file is read again under the lock: another process may have extended it."""
+    file, say = folder / NAME, report or (lambda text: None)
+    with locked(folder, LOCK):
+        contents = read_index(file) if file.is_file() else Contents()
+        state = compare_fields(folder, contents)
+        moved = any(contents.entries[name].mark != entry.mark for name, entry in state.same.items())
+        contents = Contents(list(contents.spaces), list(contents.tables), dict(state.same), dict(state.unread))
+        added, failed, written = list[str](), dict[str, str](), time.monotonic()
+        for name, path in tqdm(state.changed.items(), desc="index", unit="field", disable=not progress):
+            try:
+                contents.entries[name] = add_field(contents, name, path)
+                added.append(name)
+            except (OSError, ValueError, TypeError) as error:
+                failed[name] = error_line(error)
+                contents.unread[name] = Unread(mark_of(path)[1], failed[name])
+                say(f"{path} is left out: {failed[name]}")
+            if time.monotonic() - written > EVERY:
+                write_index(file, contents)
+                written = time.monotonic()
+        if added or failed or moved or state.removed:
+            write_index(file, contents)
+    return contents, Changes(tuple(added), state.removed, failed)
+
+
+def add_field(contents: Contents, name: str, path: Path) -> Entry:
+    """Describe a field in the words of its teacher's space; the space, and the table of its classes, are added if new."""
+    file, mark = mark_of(path)
+    sha256 = digest_file(file)  # before it is read: if it changes meanwhile, the next update reads it again
+    field = SemanticField.load(path)
+    classes = _classes_of(field)
+    space = _space_of(contents, field)
+    one = contents.spaces[space]
+    found = describe(field, SharedCodebook(torch.from_numpy(one.words), one.tolerance), classes)
+    contents.spaces[space] = Space(one.teacher, one.tolerance, found.book.words.cpu().float().numpy())
+    table = None if classes is None else _table_of(contents, space, classes)
+    views = tuple(camera.name for camera in field.cameras)
+    return Entry(name, mark, sha256, len(field), space, table, views, found.outside, found.rows)
+
+
+def _classes_of(field: SemanticField) -> LabelSet | None:
+    """The classes of a field; None if it has none, or they cannot be read any more."""
+    try:
+        found = field.label_set() if field.has_classes else None
+    except (OSError, ValueError):
+        return None
+    return found if found is not None and found.dim == field.dim else None
+
+
+def _space_of(contents: Contents, field: SemanticField) -> int:
+    """The space of a field's teacher; a new one if no field of that teacher is known."""
+    space = find_space(contents, field)
+    if space is None:
+        contents.spaces.append(Space(teacher_of(field), TOLERANCE, np.zeros((0, field.dim), np.float32)))
+        space = len(contents.spaces) - 1
+    return space
+
+
+def _table_of(contents: Contents, space: int, classes: LabelSet) -> int:
+    rows = classes.embeddings.detach().cpu().float().numpy()
+    negatives = np.zeros((0, classes.dim), np.float32)
+    if classes.negatives is not None:
+        negatives = classes.negatives.detach().cpu().float().numpy()
+    made = Table(space, classes.names, classes.negative_names, classes.info, rows, negatives)
+    for i, one in enumerate(contents.tables):
+        texts = (one.space, one.names, one.negative_names) == (space, made.names, made.negative_names)
+        if texts and np.array_equal(one.embeddings, rows) and np.array_equal(one.negatives, negatives):
+            return i
+    contents.tables.append(made)
+    return len(contents.tables) - 1

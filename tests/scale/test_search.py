@@ -1,0 +1,222 @@
+"""Search over many fields: exact answers about classes, answers by words, and what keeps the index right."""
+
+import dataclasses
+import shutil
+
+import pytest
+import torch
+from cases_search import COUNT, NAMES, save_scenes, scene, table
+from messages import tells
+
+from kfgs.fields import SemanticField
+from kfgs.labels import connected_parts
+from kfgs.scale import SearchIndex
+from kfgs.scale.search_file import NAME
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Four scenes of one teacher and one of another."""
+    folder = tmp_path_factory.mktemp("runs")
+    return save_scenes(
+        folder,
+        a=scene([("wall", 0.0), ("chair", 0.0), ("chair", 3.0)], 1),
+        b=scene([("wall", 0.0), ("table", 0.0)], 2),
+        c=scene([("wall", 0.0), ("chair", 1.0)], 3),
+        d=scene([("wall", 0.0), ("boat", 0.0)], 4, words=table(("wall", "chair"))),
+        other=scene([("wall", 0.0), ("chair", 0.0)], 5, teacher="another"),
+    )
+
+
+@pytest.fixture(scope="module")
+def index(runs):
+    found, changes = SearchIndex.open(runs).update()
+    assert changes.added == tuple(f"{name}/field" for name in ("a", "b", "c", "d", "other"))
+    return found
+
+
+def same_as_select(found, folder, target, *arguments, **options):
+    """A scene's answer is what the field itself answers."""
+    field = SemanticField.load(folder / found.path)
+    selection = field.query(target, *arguments, **options)
+    parts = connected_parts(field.gaussians, selection, field.cameras)
+    assert found.exact
+    assert found.gaussians == len(field)
+    assert found.count == len(selection)
+    assert [part.count for part in found.parts] == [part.count for part in parts]
+    for mine, theirs in zip(found.parts, parts, strict=True):
+        assert mine.score == pytest.approx(theirs.score, abs=1e-6)
+        assert mine.center == pytest.approx(theirs.centroid.tolist(), abs=1e-5)
+        assert (mine.low, mine.high) == tuple(pytest.approx(corner.tolist(), abs=1e-5) for corner in theirs.extent)
+        assert mine.view == theirs.best_view.camera
+        assert mine.share == pytest.approx(theirs.best_view.share, rel=1e-4)
+    assert found.score == pytest.approx(max(part.score for part in parts), abs=1e-6)
+
+
+def test_a_class_is_answered_exactly_as_the_fields_do(index, runs):
+    found = index.search("chair")
+    assert {scene.path for scene in found.scenes} - {"d/field"} == {"a/field", "c/field", "other/field"}
+    assert (found.searched, found.unasked) == (5, {})
+    for one in found.scenes:
+        same_as_select(one, runs, "chair")
+    assert {one.path: len(one.parts) for one in found.scenes if one.path != "d/field"} == {
+        "a/field": 2,
+        "c/field": 1,
+        "other/field": 1,
+    }
+    assert next(one for one in found.scenes if one.path == "c/field").parts[0].view == "at the chair"
+    scores = [one.score for one in found.scenes]
+    assert scores == sorted(scores, reverse=True)
+    assert index.search("CHAIR").scenes == found.scenes
+
+
+def test_a_class_that_only_other_tables_know_is_asked_by_words(index, runs):
+    (found,) = (one for one in index.search("boat").scenes if one.path == "d/field")  # its own table lacks it
+    assert not found.exact
+    field = SemanticField.load(runs / "d" / "field")
+    assert found.count == len(field.query("boat", table())) == COUNT - 3
+    (exact,) = (one for one in index.search("boat", exact=5).scenes if one.path == "d/field")
+    same_as_select(exact, runs, "boat", table())
+
+
+@pytest.mark.parametrize(
+    "options", [{"threshold": 0.9}, {"score": "cosine"}, {"negatives": "canonical"}, {"score": "softmax"}]
+)
+def test_other_options_are_answered_by_words_and_exactly_if_asked(index, runs, options):
+    words = {one.path: one for one in index.search("chair", **options).scenes}
+    exact = {one.path: one for one in index.search("chair", exact=9, **options).scenes}
+    assert not any(one.exact for one in words.values())
+    for name in ("a/field", "c/field"):
+        same_as_select(exact[name], runs, "chair", **options)
+        assert words[name].count == exact[name].count
+        assert [part.count for part in words[name].parts] == [part.count for part in exact[name].parts]
+        assert words[name].parts[0].view == exact[name].parts[0].view
+        assert words[name].parts[0].center == pytest.approx(exact[name].parts[0].center, abs=1e-4)
+        assert words[name].parts[0].high == pytest.approx(exact[name].parts[0].high, abs=1e-4)
+
+
+def test_an_embedding_finds_its_class_in_every_scene(index):
+    row = table().embeddings[NAMES.index("table")]
+    found = index.search(row)
+    assert [one.path for one in found.scenes] == ["b/field"]
+    assert found.scenes[0].count == COUNT - 3
+    assert index.search(row.numpy()).scenes == found.scenes
+
+
+def test_a_table_of_another_teacher_is_refused_where_it_does_not_fit(index):
+    found = index.search("chair", table())
+    assert found.unasked.keys() == {"other/field"}
+    assert "another" in found.unasked["other/field"]
+    assert found.searched == 4
+    with pytest.raises(ValueError, match=tells("embedding:", "24", "(7,)")):
+        index.search(torch.ones(7))
+
+
+def test_an_example_finds_its_like_by_the_same_teacher(index, runs):
+    found = index.like(runs / "a" / "field", COUNT + 3)  # a Gaussian of the first chair
+    assert {one.path for one in found.scenes} == {"a/field", "c/field"}
+    assert sum(one.count for one in found.scenes) == 2 * COUNT - 3 + COUNT - 3
+    assert found.unasked == {"other/field": "another teacher"}
+    exact = index.like(runs / "a" / "field", COUNT + 3, 0.8, exact=2)
+    assert all(one.exact for one in exact.scenes)
+    with pytest.raises(ValueError, match=tells("index:", "none shows")):
+        index.like(runs / "a" / "field", 3 * COUNT - 1)
+    with pytest.raises(ValueError, match=tells("index", 3 * COUNT)):
+        index.like(runs / "a" / "field", 3 * COUNT)
+
+
+def test_an_unknown_class_offers_near_names(index):
+    with pytest.raises(ValueError, match=tells("class:", "'chiar'", "'chair'")):
+        index.search("chiar")
+
+
+def test_words_of_old_scenes_stay_when_scenes_come_and_go(tmp_path):
+    save_scenes(tmp_path, a=scene([("wall", 0.0), ("chair", 0.0)], 1))
+    before, _ = SearchIndex.open(tmp_path).update()
+    save_scenes(tmp_path, b=scene([("table", 0.0), ("lamp", 0.0)], 2))
+    assert not before.is_current()
+    after, changes = before.update()
+    assert changes.added == ("b/field",)
+    old, new = before.contents.spaces[0].words, after.contents.spaces[0].words
+    assert len(new) > len(old)
+    assert (new[: len(old)] == old).all()
+    rows = (one.contents.entries["a/field"].rows["atoms"]["word"] for one in (before, after))
+    assert next(rows).tolist() == next(rows).tolist()
+    shutil.rmtree(tmp_path / "a")
+    last, changes = after.update()
+    assert (changes.removed, last.fields) == (("a/field",), ("b/field",))
+    assert (last.contents.spaces[0].words == new).all()
+    assert {one.path for one in SearchIndex.open(tmp_path).search("lamp").scenes} == {"b/field"}
+
+
+def test_a_changed_field_is_described_again_and_a_touched_one_is_not(tmp_path):
+    save_scenes(tmp_path, a=scene([("wall", 0.0), ("chair", 0.0)], 1), b=scene([("wall", 0.0)], 2))
+    index, _ = SearchIndex.open(tmp_path).update()
+    assert index.is_current()
+    (tmp_path / "b" / "field" / "field.json").touch()
+    assert index.is_current()  # by its digest
+    assert index.update()[1].added == ()
+    save_scenes(tmp_path, b=scene([("wall", 0.0), ("chair", 0.0)], 2))
+    assert not index.is_current()
+    index, changes = index.update()
+    assert changes.added == ("b/field",)
+    assert {one.path for one in index.search("chair").scenes} == {"a/field", "b/field"}
+    assert len(index) == 2
+
+
+def test_a_damaged_field_is_left_out_until_it_changes(tmp_path):
+    save_scenes(tmp_path, a=scene([("wall", 0.0), ("chair", 0.0)], 1), b=scene([("chair", 0.0)], 2))
+    numbers = tmp_path / "b" / "field" / "field.safetensors"
+    whole = numbers.read_bytes()
+    numbers.write_bytes(whole[:-4])
+    said = []
+    index, changes = SearchIndex.open(tmp_path).update(report=said.append)
+    assert changes.failed.keys() == {"b/field"}
+    assert "b/field" in said[0].replace("\\", "/")
+    index = SearchIndex.open(tmp_path)
+    assert index.is_current()  # it is not tried at every search
+    assert index.search("chair").unasked.keys() == {"b/field"}
+    save_scenes(tmp_path, b=scene([("chair", 0.0)], 2))
+    assert not index.is_current()
+    assert index.update()[0].search("chair").unasked == {}
+
+
+def test_packed_fields_runs_and_nested_folders_are_found_earlier_fields_are_not(tmp_path):
+    field = scene([("wall", 0.0), ("chair", 0.0)], 1)
+    for place in ("deep/er/run/field", "run/field", "run/field@0123456789ab", "run/stages/x", ".hidden/field"):
+        field.save(tmp_path / place)
+    field.save(tmp_path / "one.kfgs.safetensors")
+    index, _ = SearchIndex.open(tmp_path).update()
+    assert index.fields == ("deep/er/run/field", "one.kfgs.safetensors", "run/field")
+    assert len(index.search("chair").scenes) == 3
+    with pytest.raises(NotADirectoryError, match=tells("folder:", "nowhere")):
+        SearchIndex.open(tmp_path / "nowhere")
+
+
+def test_fields_without_classes_views_or_fused_features_can_be_searched(tmp_path):
+    bare = dataclasses.replace(scene([("wall", 0.0), ("chair", 0.0)], 1), words=None, cameras=())
+    old = scene([("wall", 0.0), ("chair", 0.0)], 2)
+    old = SemanticField(old.gaussians.replace(features=old.linear.decode(old.features)), words=table(), info=old.info)
+    nothing = scene([("wall", 0.0)], 3)
+    nothing = dataclasses.replace(nothing, gaussians=nothing.gaussians.replace(features=nothing.features * 0))
+    save_scenes(tmp_path, bare=bare, old=old, nothing=nothing)
+    index, changes = SearchIndex.open(tmp_path).update()
+    assert changes.failed == {}
+    found = {one.path: one for one in index.search("chair").scenes}
+    assert found.keys() == {"bare/field", "old/field"}
+    assert (found["bare/field"].exact, found["old/field"].exact) == (False, True)
+    assert found["bare/field"].count == found["old/field"].count == COUNT - 3
+    assert found["bare/field"].parts[0].view is None
+    empty, _ = SearchIndex.open(tmp_path / "nothing").update()
+    assert empty.search("wall").scenes == ()
+
+
+def test_fifty_fields_are_searched_from_one_file(tmp_path):
+    things = [("wall", 0.0), ("chair", 0.0)], [("wall", 0.0), ("lamp", 0.0)]
+    for i in range(50):
+        scene(things[i % 5 == 0], seed=i).save(tmp_path / f"scene_{i:02d}" / "field")
+    index, _ = SearchIndex.open(tmp_path).update()
+    assert len(index) == 50
+    assert len(index.contents.spaces[0].words) < 12  # shared: three classes
+    assert {one.path for one in index.search("lamp").scenes} == {f"scene_{i:02d}/field" for i in range(0, 50, 5)}
+    assert (tmp_path / NAME).stat().st_size < 50 * 8_000
