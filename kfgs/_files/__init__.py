@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from .atomic import HIDDEN, FullDiskError, atomic_folder, atomic_path, current_file, finish_writing, hidden_folder
-from .locks import locked
+from .locks import InUseError, locked
 from .paths import as_path, check_output
 
 __all__ = [
     "HIDDEN",
     "FullDiskError",
+    "InUseError",
     "as_path",
     "atomic_folder",
     "atomic_path",
