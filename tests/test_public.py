@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = [
     "kfgs.cameras", "kfgs.evaluation", "kfgs.evaluation.datasets", "kfgs.evaluation.foreign",
     "kfgs.fields", "kfgs.formats", "kfgs.labels", "kfgs.labels.edits", "kfgs.pipeline",
-    "kfgs.quant", "kfgs.scenes", "kfgs.splat", "kfgs.teachers", "kfgs.viz",
+    "kfgs.quant", "kfgs.scale", "kfgs.scenes", "kfgs.splat", "kfgs.teachers", "kfgs.viz",
 ]  # fmt: skip
 
 
@@ -66,4 +66,4 @@ def test_the_package_stays_small():
     packed = {
         path: len(zlib.compress(path.read_bytes())) + 2 * len(str(path.relative_to(root))) + 130 for path in files
     }
-    assert sum(packed.values()) + 11_000 < 1_200_000, sorted(packed, key=packed.__getitem__)[-5:]
+    assert sum(packed.values()) + 11_000 < 1_250_000, sorted(packed, key=packed.__getitem__)[-5:]

@@ -1,7 +1,7 @@
 """The command line: `kfgs COMMAND ...`; `kfgs --help` lists the commands.
 
 Every command names the files it wrote, shows progress on long work, and ends with 0 (done), 1 (bad input, with one
-message that says what to do), 2 (wrong usage), 130 (interrupted; demo, features, fit and color continue where they stopped)
+message that says what to do), 2 (wrong usage), 130 (interrupted; demo, features, fit, color and batch continue where they stopped)
 or 141 (its output was closed).
 """
 
@@ -23,6 +23,7 @@ from typing import Any, get_type_hints
 
 import tyro
 
+from .batch import batch
 from .evaluate import compare, evaluate
 from .features import features, plan
 from .fit import color, demo, fit, sfm, uplift
@@ -37,14 +38,14 @@ from .view import view
 
 GROUPS: dict[str, tuple[Any, ...]] = {
     "Start here": (demo, info),
-    "Make a semantic field": (sfm, plan, features, text, fit, uplift),
+    "Make a semantic field": (sfm, plan, features, text, fit, uplift, batch),
     "Ask it": (select, segment, label, view, render),
     "Store it": (pack, runs),
     "Score it": (evaluate, compare),
     "Colour splats": (color, attach, edit, convert),
 }
 COMMANDS = {command.__name__: command for group in GROUPS.values() for command in group}
-RESUMED = {"demo", "features", "fit", "color"}  # commands that reuse their earlier work
+RESUMED = {"demo", "features", "fit", "color", "batch"}  # commands that reuse their earlier work
 STYLE = (
     tyro.conf.DisallowNone,
     tyro.conf.FlagCreatePairsOff,

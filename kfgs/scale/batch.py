@@ -212,7 +212,8 @@ class _Record:
     def add(self, event: Event) -> None:
         """Note an event."""
         row, stage = self.row, event.stage
-        row.seconds[stage] = row.seconds.get(stage, 0.0) + event.seconds
+        if event.seconds:
+            row.seconds[stage] = round(row.seconds.get(stage, 0.0) + event.seconds, 3)
         if event.kind == "started":
             row.stages[stage] = "running"
         elif event.kind == "done":
@@ -223,7 +224,7 @@ class _Record:
             row.stages[stage], row.failure = "failed", event.failure
         elif event.kind == "finished":
             row.value = event.results[0]
-        lines = [f"{stage}: {line}" for line in event.lines]
+        lines = [f"{stage}: {line.removeprefix(f'{stage}: ')}" for line in event.lines]
         if event.kind in ("done", "failed"):
             lines.append(f"{stage}: {row.stages[stage]} in {event.seconds:.1f} s")
         if event.failure is not None:

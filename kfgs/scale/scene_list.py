@@ -93,5 +93,5 @@ def _fault(entry: SceneEntry) -> str | None:
         return f"{one_line(entry.name)!r} cannot be the name of a run; write `NAME = SCENE`"
     if not is_url(entry.source) and not Path(entry.source).is_dir():
         what = "is a file" if Path(entry.source).exists() else "does not exist"
-        return f"{one_line(entry.source)} {what}; expected the folder of a scene or of photos"
+        return f"{one_line(entry.source, 300)} {what}; expected the folder of a scene or of photos"
     return None
