@@ -62,7 +62,7 @@ def open_client(
     else:
         count = workers or max(1, (os.cpu_count() or 1) // threads)
         cluster = LocalCluster(
-            n_workers=count, threads_per_worker=1, memory_limit=0, dashboard_address=None, scheduler_kwargs=once
+            n_workers=count, threads_per_worker=1, memory_limit=0, dashboard_address="127.0.0.1:0", scheduler_kwargs=once
         )
     with cluster, Client(cluster, set_as_default=False) as client:
         yield client
@@ -81,5 +81,5 @@ def _slurm(partition: str, threads: int, memory: str, scheduler: dict[str, Any])
         memory=memory,
         walltime=WALLTIME,
         job_script_prologue=[f"export OMP_NUM_THREADS={threads}"],
-        scheduler_options={"dashboard_address": None, **scheduler},
+        scheduler_options={"dashboard_address": ":0", **scheduler},
     )

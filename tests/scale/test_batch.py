@@ -267,7 +267,7 @@ def test_the_command_takes_a_list_to_the_end_and_fails_if_a_scene_does(rooms, cl
     assert "kitchen: fit done in " in said.out
     assert "garden: scene failed: " in said.out
     assert "2 scenes: 1 finished, 1 failed, mean mIoU" in said.out
-    assert re.search(tells("scenes", "1 failed (garden)", "log.txt", "--retry-failed"), said.err)
+    assert re.search(tells("SCENES", "1 failed (garden)", "log.txt", "--retry-failed"), said.err)
     (tmp_path / "scenes.txt").write_text(f"kitchen = {rooms[0]}\n")
     assert main(line) == 0
     said = capsys.readouterr().out
@@ -316,17 +316,17 @@ def test_the_table_keeps_to_its_height_and_shows_failures_first():
 def test_jobs_of_slurm(tmp_path, monkeypatch):
     """A stand-in for sbatch runs the script on this machine, so its contents are right as far as a shell can tell."""
     pytest.importorskip("dask_jobqueue")
-    scripts = tmp_path / "scripts"
-    scripts.mkdir()
-    (tmp_path / "sbatch").write_text(f'#!/bin/sh\ncp "$1" {scripts}/\nsetsid sh "$1" >{tmp_path}/job.log 2>&1 &\necho "Submitted batch job 1"\n')
+    script = tmp_path / "job.sh"
+    (tmp_path / "sbatch").write_text(
+        f'#!/bin/sh\ncp "$1" {script}\nsetsid bash {script} >{tmp_path}/job.log 2>&1 &\necho "Submitted batch job 1"\n'
+    )
     (tmp_path / "scancel").write_text("#!/bin/sh\n")
     for name in ("sbatch", "scancel"):
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     with open_client(slurm="gpu", threads=3, memory="8GB") as found:
         assert found.submit(os.environ.get, "OMP_NUM_THREADS", pure=False).result(timeout=60) == "3"
-    script = next(scripts.iterdir()).read_text()
     for part in ("#SBATCH -p gpu", "#SBATCH --cpus-per-task=3", "#SBATCH --mem=8G", "#SBATCH -t 24:00:00", "--nthreads 1"):
-        assert part in script
+        assert part in script.read_text()
 
 
