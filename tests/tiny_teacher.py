@@ -5,7 +5,6 @@ import signal
 from pathlib import Path
 
 import torch
-
 from small_room import ROOM
 
 MATRIX = torch.randn(ROOM.feature_dim, 3, generator=torch.Generator().manual_seed(1))

@@ -1,8 +1,8 @@
 """The command line: `kfgs COMMAND ...`; `kfgs --help` lists the commands.
 
 Every command names the files it wrote, shows progress on long work, and ends with 0 (done), 1 (bad input, with one
-message that says what to do), 2 (wrong usage), 130 (interrupted; demo, features, fit, color and batch continue where they stopped)
-or 141 (its output was closed).
+message that says what to do), 2 (wrong usage), 130 (interrupted; demo, features, fit, color and batch continue where they
+stopped) or 141 (its output was closed).
 """
 
 from __future__ import annotations

@@ -75,7 +75,11 @@ def batch(
     given: dict[str, Any] = {}
     if teacher.teacher is None:
         teacher.check_weights()
-        for name, value in (("size", teacher.size or None), ("fast", teacher.fast), ("discard_features", discard_features)):
+        for name, value in (
+            ("size", teacher.size or None),
+            ("fast", teacher.fast),
+            ("discard_features", discard_features),
+        ):
             check_alone(name, value, "without --teacher, whose option it is")
     else:
         check_teacher_name(teacher.teacher)

@@ -60,9 +60,9 @@ def extract_features(
 
     Raises:
         TypeError: if `teacher` is no teacher, it returns no tensor, or JSON cannot hold its identity.
-        ValueError: if `part` is no such word, or given with `overwrite`; if there are no pictures, two have the same stem, a map is not finite in float16, maps differ in
-            channels, or in size for pictures of equal size; if the folder holds maps of another teacher, or another
-            process is writing to it.
+        ValueError: if `part` is no such word, or given with `overwrite`; if there are no pictures, two have the same stem, a
+            map is not finite in float16, maps differ in channels, or in size for pictures of equal size; if the folder
+            holds maps of another teacher, or another process is writing to it.
         OSError: if the folder cannot be written to, or the disk has no space for the maps.
     """
     folder, teacher, chosen = as_path(folder), as_teacher(teacher), as_pictures(pictures, split, exist=True)
@@ -128,7 +128,9 @@ def join_features(folder: str | Path, stems: Sequence[str]) -> Manifest:
         teachers = [one.teacher for one in (whole, *parts) if one is not None]
         if missing or any(teacher != teachers[0] for teacher in teachers):
             got = f"none of {missing[0]!r} ({len(missing)} in all)" if missing else "those of different teachers"
-            raise ValueError(f"stems: expected a record of one teacher for each view in {folder}, got {got}; encode it again")
+            raise ValueError(
+                f"stems: expected a record of one teacher for each view in {folder}, got {got}; encode it again"
+            )
         order = known if whole is not None else {**{stem: known[stem] for stem in stems}, **known}
         discarded = whole is not None and whole.discarded and not set(whole.maps) <= set(made)
         joined = Manifest(teachers[0], order, discarded)

@@ -40,7 +40,9 @@ def open_client(
         OSError: if the scheduler does not answer, or there is no Slurm.
     """
     if scheduler is not None and (workers is not None or slurm is not None):
-        raise ValueError("scheduler: expected none with workers or slurm, which start their own, got both; leave one out")
+        raise ValueError(
+            "scheduler: expected none with workers or slurm, which start their own, got both; leave one out"
+        )
     if workers is not None:
         check_range("workers", workers, 1)
     try:
@@ -51,7 +53,9 @@ def open_client(
         try:
             client = Client(scheduler, timeout=START, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
-            raise OSError(f"scheduler: expected one that answers at {scheduler}, got {error}; start `dask scheduler`") from error
+            raise OSError(
+                f"scheduler: expected one that answers at {scheduler}, got {error}; start `dask scheduler`"
+            ) from error
         with client:
             yield client
         return
@@ -62,7 +66,11 @@ def open_client(
     else:
         count = workers or max(1, (os.cpu_count() or 1) // threads)
         cluster = LocalCluster(
-            n_workers=count, threads_per_worker=1, memory_limit=0, dashboard_address="127.0.0.1:0", scheduler_kwargs=once
+            n_workers=count,
+            threads_per_worker=1,
+            memory_limit=0,
+            dashboard_address="127.0.0.1:0",
+            scheduler_kwargs=once,
         )
     with cluster, Client(cluster, set_as_default=False) as client:
         yield client
@@ -80,6 +88,5 @@ def _slurm(partition: str, threads: int, memory: str, scheduler: dict[str, Any])
         processes=1,
         memory=memory,
         walltime=WALLTIME,
-        job_script_prologue=[f"export OMP_NUM_THREADS={threads}"],
         scheduler_options={"dashboard_address": ":0", **scheduler},
     )

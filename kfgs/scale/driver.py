@@ -137,7 +137,7 @@ def drive(
         report: called for each event, in this thread.
         at_once: scenes in progress at the same time.
     """
-    engine, waiting, lanes = _Engine(client), list(reversed(plans.items())), list[_Lane]()
+    engine, waiting, lanes = _Engine(client), list(plans.items())[::-1], list[_Lane]()
     try:
         while waiting or lanes:
             moved = False

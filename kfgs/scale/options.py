@@ -48,7 +48,9 @@ class BatchOptions:
             if given is not None and as_path(given).exists():
                 object.__setattr__(self, name, str(as_path(given).absolute()))
         if self.discard_features and self.fit.needs_maps:
-            raise ValueError("discard_features: expected False for mode 'decouple', which learns from the maps, got True; leave it out")
+            raise ValueError(
+                "discard_features: expected False for mode 'decouple', which learns from the maps, got True; leave out"
+            )
 
     @property
     def sfm_config(self) -> SfmConfig:

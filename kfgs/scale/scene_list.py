@@ -46,20 +46,28 @@ def read_scenes(path: str | Path) -> list[SceneEntry]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: expected a list of scenes in UTF-8, got other bytes ({error}); save it as text") from error
+        raise ValueError(
+            f"{path}: expected a list of scenes in UTF-8, got other bytes ({error}); save it as text"
+        ) from error
     numbered = [(number, re.sub(r"(^|\s)#.*", "", line).strip()) for number, line in enumerate(lines, start=1)]
     found = {number: _entry(line, path.parent) for number, line in numbered if line}
     if not found:
-        raise ValueError(f"{path}: expected a scene in a line, got none in {len(lines)} lines; write a folder or an URL into each")
+        raise ValueError(
+            f"{path}: expected a scene in a line, got none in {len(lines)} lines; write a folder or an URL into one"
+        )
     faults = {number: fault for number, entry in found.items() if (fault := _fault(entry)) is not None}
     first: dict[str, int] = {}
     for number, entry in found.items():
         if first.setdefault(entry.name, number) != number and number not in faults:
-            faults[number] = f"the run of line {first[entry.name]} is called {entry.name!r}, too; write `NAME = SCENE` to name it"
+            faults[number] = (
+                f"the run of line {first[entry.name]} is called {entry.name!r}, too; write `NAME = SCENE` to name it"
+            )
     if faults:
         shown = [f"line {number}: {fault}" for number, fault in sorted(faults.items())[:SHOWN]]
         more = [f"and {len(faults) - SHOWN} more"] if len(faults) > SHOWN else []
-        raise ValueError(f"{path}: expected an existing scene and a new name in each line, got " + "; ".join(shown + more))
+        raise ValueError(
+            f"{path}: expected an existing scene and a new name in each line, got " + "; ".join(shown + more)
+        )
     return list(found.values())
 
 
@@ -70,13 +78,17 @@ def as_entries(scenes: Iterable[str | Path | SceneEntry]) -> list[SceneEntry]:
         ValueError: if there are none, or two runs have the same name.
     """
     if isinstance(scenes, str | Path):
-        raise ValueError(f"scenes: expected a list, got {str(scenes)!r}; put it into one, or call read_scenes for a file")
+        raise ValueError(
+            f"scenes: expected a list, got {str(scenes)!r}; put it into one, or call read_scenes for a file"
+        )
     entries = [scene if isinstance(scene, SceneEntry) else _entry(str(scene), Path()) for scene in scenes]
     names = [entry.name for entry in entries]
     if not entries or len(set(names)) < len(names):
         twice = next((name for name in names if names.count(name) > 1), None)
         got = "none" if twice is None else f"{twice!r} more than once"
-        raise ValueError(f"scenes: expected scenes, each with a name of its own, got {got}; pass SceneEntry(name, source)")
+        raise ValueError(
+            f"scenes: expected scenes, each with a name of its own, got {got}; pass SceneEntry(name, source)"
+        )
     return entries
 
 

@@ -22,7 +22,7 @@ import torch
 from .._files import InUseError, digest_value, read_json, write_json
 from ..evaluation import LabelSet
 from ..features import FeatureFolder, Picture, discard_maps, extract_features, join_features, pictures_of
-from ..features.manifest import MANIFEST, manifest_file
+from ..features.manifest import manifest_file
 from ..fields import SemanticField
 from ..fields.remembered import CLASSES
 from ..labels import load_label_set
@@ -136,7 +136,9 @@ def fit(job: Job, key: str, *, report: Report) -> dict[str, Any]:
             scene = _load(source, out)
             folder = (source if options.teacher is None else out).path / "features"
             if not folder.is_dir():
-                raise SceneError(f"{job.source}: expected feature maps in features/, got none; name a teacher (--teacher)")
+                raise SceneError(
+                    f"{job.source}: expected feature maps in features/, got none; name a teacher (--teacher)"
+                )
             maps = FeatureFolder(folder).of(scene, options.fit.split)
             found = fit_scene(scene.undistorted(), maps, out.path, options.fit, report=report).field
             return {"gaussians": len(found), "latents": found.features.shape[1]}
@@ -277,7 +279,9 @@ def _photos(source: Place) -> str | None:
         raise FileNotFoundError(f"{source.path}: no such folder; expected a scene or photos there")
     if is_scene(source.path):
         return None
-    found = next((name for name in ("images", ".") if (source.path / name).is_dir() and list_images(source.path / name)), None)
+    found = next(
+        (name for name in ("images", ".") if (source.path / name).is_dir() and list_images(source.path / name)), None
+    )
     if found is None:
         raise SceneError(
             f"{source.path}: expected a COLMAP model, a transforms.json, or photos to find their cameras, got none of them; name "
@@ -308,7 +312,9 @@ def _counts_alike(job: Job, source: Place, report: Report) -> bool:
     listed = source.path / "classes.json"
     if job.text_file is None or (listed.is_file() and tuple(read_json(listed)) == load_label_set(job.text_file).names):
         return True
-    report(f"note: not scored: the scene's labels count the classes of its classes.json, and {job.text_file} has others")
+    report(
+        f"note: not scored: the scene's labels count the classes of its classes.json, and {job.text_file} has others"
+    )
     return False
 
 

@@ -6,9 +6,9 @@ import pytest
 from messages import tells
 from small_batch import timeless
 
-from tests.features.test_extract import Counting, paint
 from kfgs._files import InUseError, locked
 from kfgs.features import FeatureFolder, Picture, extract_features, join_features, read_manifest
+from tests.features.test_extract import Counting, paint
 
 STEMS = ["d", "b", "sub/c", "a"]
 
@@ -22,8 +22,12 @@ def pictures(tmp_path):
 
 
 def files(folder):
-    found = {file.relative_to(folder).as_posix(): file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
-    return {name: timeless(data) if name.endswith(".json") else data for name, data in found.items() if "lock" not in name}
+    found = {
+        file.relative_to(folder).as_posix(): file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()
+    }
+    return {
+        name: timeless(data) if name.endswith(".json") else data for name, data in found.items() if "lock" not in name
+    }
 
 
 def test_parts_in_any_order_join_to_what_one_call_writes(pictures, tmp_path):
