@@ -2,10 +2,10 @@
 
     python benchmarks/batch.py OUT [--rooms 6] [--room-0 FOLDER] [--kills 3] [--teacher NAME --weights FILE] [--steps N]
 
-Toy rooms (48 views of 192x256, half as large with --small) go through features, fit, segment and evaluate by `run_batch`: with one
-worker, with two, and with two of which --kills are killed at random moments (SIGKILL). Each worker has one thread. The rooms' own
-teacher is looked up by the pictures, so its time is that of reading and writing maps; --room-0 adds a real scene, which needs a
---teacher of its kind, and then all scenes take that one.
+Toy rooms (48 views of 192x256; 24 of half the size with --small) go through features, fit, segment and evaluate by `run_batch`:
+with one worker, with two, and with two of which --kills are killed at random moments (SIGKILL). Each worker has one thread. The
+rooms' own teacher is looked up by the pictures, so its time is that of reading and writing maps. --room-0 adds a real scene, which
+needs a --teacher of its kind, and then all scenes take that one.
 
 Start it with OMP_NUM_THREADS=1, or numpy's threads differ from those of Dask's workers in the last bits.
 """
@@ -127,7 +127,9 @@ def main() -> None:
     if given.room_0 is not None:
         scenes.append(SceneEntry("real", str(given.room_0.absolute())))
     color = dataclasses.replace(ColorConfig.quick(), field=ColorConfig.quick().field.with_steps(given.steps))
-    os.environ["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parent), *sys.path[:1], os.environ.get("PYTHONPATH", "")])
+    os.environ["PYTHONPATH"] = os.pathsep.join(
+        [str(Path(__file__).parent), *sys.path[:1], os.environ.get("PYTHONPATH", "")]
+    )
     teacher = {"teacher": given.teacher, "weights": given.weights} if given.teacher else {
         "teacher": "batch:LookedUp",
         "teacher_options": {"rooms": str(base)},

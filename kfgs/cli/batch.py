@@ -100,7 +100,13 @@ def batch(
     with open_client(**dataclasses.asdict(workers)) as client:
         say(f"{len(entries)} scenes; workers: {client.cluster or client.scheduler.address}")
         results = run_batch(
-            entries, out, options, client=client, retry_failed=retry_failed, report=screen.show, at_once=screen.scenes
+            entries,
+            out,
+            options,
+            client=client,
+            retry_failed=retry_failed,
+            report=screen.show,
+            at_once=lambda: 2 * len(client.nthreads()) + 2,  # enough to keep workers busy; more would need more disk
         )
     screen.end()
     failed = [one.name for one in results if one.failure is not None]
@@ -114,8 +120,6 @@ def batch(
 
 class _Screen:
     """The table of all scenes: drawn again at each event on a terminal, else a line for each finished stage."""
-
-    scenes = 64  # in progress at the same time
 
     def __init__(self) -> None:
         self.terminal = sys.stdout.isatty()

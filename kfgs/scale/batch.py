@@ -57,7 +57,7 @@ def map_scenes(
     scenes: Iterable[str | Path | SceneEntry],
     *,
     client: Engine | Callable[[], Engine],
-    at_once: int = 64,
+    at_once: int | Callable[[], int] = 64,
     report: Callable[[Event], None] | None = None,
 ) -> list[SceneResult]:
     """Call a function for many scenes, in the workers of any engine.
@@ -72,7 +72,7 @@ def map_scenes(
         client: a `dask.distributed.Client`, or anything with `submit(function, *arguments)` whose results have `done()` and
             `result()`: executors of concurrent.futures, submitit, Ray or MPI. Or a function that makes one: a process pool is
             of no use any more when one of its processes has died, and then another one is made.
-        at_once: calls in progress at the same time.
+        at_once: calls in progress at the same time, or a function that says how many.
         report: receives an event when a call begins, ends or is repeated.
 
     Returns:
@@ -108,7 +108,8 @@ def map_scenes(
     def plan(entry: SceneEntry) -> Plan:
         return (yield "call", [Task(_call, (sent, entry.source))])[0]
 
-    check_range("at_once", at_once, 1)
+    if not callable(at_once):
+        check_range("at_once", at_once, 1)
     drive({entry.name: plan(entry) for entry in entries}, client, note, at_once=at_once)
     return [found[entry.name] for entry in entries]
 
@@ -124,7 +125,7 @@ def run_batch(
     *,
     client: Engine | Callable[[], Engine],
     retry_failed: bool = False,
-    at_once: int = 64,
+    at_once: int | Callable[[], int] = 64,
     report: Callable[[Event, Sequence[Row]], None] | None = None,
 ) -> list[SceneResult]:
     """Take scenes through sfm, features, fit, segment and evaluate. What is done is not repeated, whoever did it.
@@ -139,7 +140,7 @@ def run_batch(
         options: what is done with each.
         client: see `map_scenes`. A worker should run one task at a time.
         retry_failed: also try scenes that failed before; without it their old failure is returned.
-        at_once: scenes in progress at the same time.
+        at_once: scenes in progress at the same time, or a function that says how many. Fewer need less disk for feature maps.
         report: receives each event, and the state of all scenes.
 
     Returns:
@@ -149,7 +150,8 @@ def run_batch(
         ValueError: if there are no scenes, two have the same name, or another batch works in `out`.
         OSError: if `out` cannot be written to.
     """
-    check_range("at_once", at_once, 1)
+    if not callable(at_once):
+        check_range("at_once", at_once, 1)
     options, entries = options or BatchOptions(), as_entries(scenes)
     local = None if is_url(str(out)) else check_output("out", out, "a folder").absolute()
     root = str(out).rstrip("/") if local is None else str(local)

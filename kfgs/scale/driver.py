@@ -126,7 +126,7 @@ def drive(
     client: Engine | Callable[[], Engine],
     report: Callable[[Event], None],
     *,
-    at_once: int = 64,
+    at_once: int | Callable[[], int] = 64,
 ) -> None:
     """Take all plans to their ends; a failed one does not hold up the others.
 
@@ -135,13 +135,13 @@ def drive(
         client: an engine, or a function that makes one: then it is made again when it broke, as a process pool does when
             one of its processes dies.
         report: called for each event, in this thread.
-        at_once: scenes in progress at the same time.
+        at_once: scenes in progress at the same time; a function is asked each time, for workers that come and go.
     """
     engine, waiting, lanes = _Engine(client), list(plans.items())[::-1], list[_Lane]()
     try:
         while waiting or lanes:
             moved = False
-            while waiting and len(lanes) < at_once:
+            while waiting and len(lanes) < (at_once() if callable(at_once) else at_once):
                 lane = _Lane(*waiting.pop())
                 if _advance(lane, None, engine, report):
                     lanes.append(lane)

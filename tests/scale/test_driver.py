@@ -92,7 +92,8 @@ def _double(number, *, report):
     return 2 * number
 
 
-def test_no_more_scenes_than_asked_are_in_progress():
+@pytest.mark.parametrize("at_once", [2, lambda: 2])
+def test_no_more_scenes_than_asked_are_in_progress(at_once):
     inside, most = set(), []
 
     def note(event):
@@ -100,7 +101,7 @@ def test_no_more_scenes_than_asked_are_in_progress():
         most.append(len(inside))
 
     with ThreadPoolExecutor(4) as pool:
-        map_scenes(len, SCENES, client=pool, at_once=2, report=note)
+        map_scenes(len, SCENES, client=pool, at_once=at_once, report=note)
     assert max(most) == 2
 
 
