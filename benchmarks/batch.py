@@ -4,7 +4,7 @@
 
 Toy rooms (48 views of 192x256; 24 of half the size with --small) go through features, fit, segment and evaluate by `run_batch`:
 with one worker, with two, and with two of which --kills are killed at random moments (SIGKILL). Each worker has one thread. The
-rooms' own teacher is looked up by the pictures, so its time is that of reading and writing maps. --room-0 adds a real scene, which
+rooms' own teacher is looked up by the pictures, so its time is that of reading and writing maps. --room-0 adds a real scene; it
 needs a --teacher of its kind, and then all scenes take that one.
 
 Start it with OMP_NUM_THREADS=1, or numpy's threads differ from those of Dask's workers in the last bits.
@@ -64,7 +64,7 @@ class LookedUp:
 def kill_some(client, kills: int, seed: int, stop: threading.Event, log: list[str]) -> None:
     """Kill a worker process that has a task, `kills` times, some seconds after each other."""
     chance = random.Random(seed)
-    while len(log) < kills and not stop.wait(chance.uniform(5, 30)):
+    while len(log) < kills and not stop.wait(chance.uniform(2, 12)):
         busy = sorted(address for address, tasks in client.processing().items() if tasks)
         if not busy:
             continue

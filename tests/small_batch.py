@@ -22,7 +22,7 @@ COLOR = dataclasses.replace(
 )
 FIT = FitConfig.cpu(color=COLOR, device="cpu")
 OPTIONS = BatchOptions(teacher="tiny_teacher:Tiny", fit=FIT, share=2, pictures=0)
-TIMES = ("seconds", "mtime_ns", "command", "machine")
+TIMES = ("seconds", "mtime_ns", "command", "machine", "history.json")  # the last: its size, in a list of files
 NOT_RESULTS = ("log.txt", "state.json", "digests.json", "done/")
 
 

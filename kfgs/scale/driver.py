@@ -15,7 +15,7 @@ from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import BrokenExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from .._card import error_line
 
@@ -32,8 +32,9 @@ class Engine(Protocol):
         ...
 
 
-class Task(NamedTuple):
-    """A call in a worker, which imports the function: `function(*arguments, report=...)`."""
+@dataclass(frozen=True)
+class Task:
+    """A call in a worker, which imports the function: `function(*arguments, report=...)`."""  # a tuple would be Dask's
 
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
@@ -97,7 +98,7 @@ class _Lane:
     done: dict[int, dict[str, Any]] = field(default_factory=dict)
 
 
-class _Engine:
+class _Submitter:
     """Submits tasks; if a process pool broke, to a new one, if it knows how to make one."""
 
     def __init__(self, client: Engine | Callable[[], Engine]) -> None:
@@ -137,7 +138,7 @@ def drive(
         report: called for each event, in this thread.
         at_once: scenes in progress at the same time; a function is asked each time, for workers that come and go.
     """
-    engine, waiting, lanes = _Engine(client), list(plans.items())[::-1], list[_Lane]()
+    engine, waiting, lanes = _Submitter(client), list(plans.items())[::-1], list[_Lane]()
     try:
         while waiting or lanes:
             moved = False
@@ -160,7 +161,7 @@ def drive(
         engine.close()
 
 
-def _advance(lane: _Lane, results: list[Any] | None, engine: _Engine, report: Callable[[Event], None]) -> bool:
+def _advance(lane: _Lane, results: list[Any] | None, engine: _Submitter, report: Callable[[Event], None]) -> bool:
     """Submit the next stage of a plan; False if it has none."""
     try:
         lane.stage, lane.tasks = next(lane.plan) if results is None else lane.plan.send(results)
@@ -173,7 +174,7 @@ def _advance(lane: _Lane, results: list[Any] | None, engine: _Engine, report: Ca
     return True
 
 
-def _look(lane: _Lane, engine: _Engine, report: Callable[[Event], None]) -> bool:
+def _look(lane: _Lane, engine: _Submitter, report: Callable[[Event], None]) -> bool:
     """Take the results of tasks that are done; submit those again whose worker died."""
     finished = [i for i, future in lane.futures.items() if future.done()]
     for i in finished:
@@ -194,7 +195,7 @@ def _look(lane: _Lane, engine: _Engine, report: Callable[[Event], None]) -> bool
     return bool(finished)
 
 
-def _end_stage(lane: _Lane, engine: _Engine, report: Callable[[Event], None]) -> bool:
+def _end_stage(lane: _Lane, engine: _Submitter, report: Callable[[Event], None]) -> bool:
     """All tasks of a stage have ended: go on with the next; False if the scene has ended."""
     done = [lane.done[i] for i in range(len(lane.tasks))]
     lines = tuple(line for one in done for line in one["lines"])
