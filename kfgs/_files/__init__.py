@@ -18,12 +18,13 @@ from .atomic import (
     hidden_folder,
     open_current,
 )
-from .locks import locked
+from .locks import InUseError, locked
 from .paths import as_path, check_output
 
 __all__ = [
     "HIDDEN",
     "FullDiskError",
+    "InUseError",
     "as_path",
     "atomic_folder",
     "atomic_path",

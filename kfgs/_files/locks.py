@@ -19,6 +19,10 @@ except ImportError:  # Windows: two processes that write to one place are not no
 LONGEST = 300  # characters of a lock file that are read and shown
 
 
+class InUseError(ValueError):
+    """Another process works in a folder; the message says which."""
+
+
 def try_lock(handle: int) -> bool | None:
     """Lock an open file until it is closed. False if another process or call holds it; None if there are no locks here."""
     if fcntl is None:
@@ -42,7 +46,7 @@ def locked(folder: Path, name: str) -> Iterator[None]:
             hold locks of the same name.
 
     Raises:
-        ValueError: if another process holds the lock; the message says which.
+        InUseError: if another process holds the lock; the message says which.
         OSError: if the folder cannot be made or written to; the message says so.
     """
     try:
@@ -55,7 +59,7 @@ def locked(folder: Path, name: str) -> Iterator[None]:
     try:
         if try_lock(handle) is False:
             holder = ascii(os.read(handle, LONGEST).decode(errors="replace").strip())[1:-1] or "another process"
-            raise ValueError(
+            raise InUseError(
                 f"folder: expected one that no other process writes to, got {folder}, which is in use by {holder}; wait "
                 "until that process has ended, or name another folder"
             )

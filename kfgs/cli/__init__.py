@@ -1,8 +1,8 @@
 """The command line: `kfgs COMMAND ...`; `kfgs --help` lists the commands.
 
 Every command names the files it wrote, shows progress on long work, and ends with 0 (done), 1 (bad input, with one
-message that says what to do), 2 (wrong usage), 130 (interrupted; demo, features, fit, color and search continue where
-they stopped) or 141 (its output was closed).
+message that says what to do), 2 (wrong usage), 130 (interrupted; demo, features, fit, color, blocks, search and batch
+continue where they stopped) or 141 (its output was closed).
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import tyro
 
 from .._interrupts import interruptible
 from .._ranks import LostError, PeerError, place, together
+from .batch import batch
 from .blocks import blocks, join
 from .evaluate import compare, evaluate
 from .features import features, plan
@@ -39,14 +40,14 @@ from .view import view
 GROUPS: dict[str, tuple[Any, ...]] = {
     "Start here": (demo, info),
     "Make a semantic field": (sfm, plan, features, text, fit, uplift),
-    "More than one machine": (blocks, join),
+    "More than one machine": (batch, blocks, join),
     "Ask it": (select, search, segment, label, view, render),
     "Store it": (pack, runs),
     "Score it": (evaluate, compare),
     "Colour splats": (color, attach, edit, convert),
 }
 COMMANDS = {command.__name__: command for group in GROUPS.values() for command in group}
-RESUMED = {"demo", "features", "fit", "color", "blocks", "search"}  # commands that reuse their earlier work
+RESUMED = {"demo", "features", "fit", "color", "batch", "blocks", "search"}  # commands that reuse their earlier work
 SHARED = {"fit", "uplift", "color"}  # commands that several processes (torchrun) do together
 STYLE = (
     tyro.conf.DisallowNone,

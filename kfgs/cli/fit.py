@@ -69,7 +69,7 @@ def sfm(
         seed: Every random choice follows from it.
         replace: Replace a model that is in OUT/sparse/0 already; without it that is an error.
     """
-    from ..scenes import SfmConfig, extend_sfm, run_sfm
+    from ..scenes import SfmConfig, extend_sfm, link_images, run_sfm
 
     check_output("out", out, "a folder", apart=inputs_of(onto), other=[images])
 
@@ -88,8 +88,7 @@ def sfm(
     say(str(run_sfm(images, out, config=config, replace=replace, progress=True)))
     written = [out / "sparse" / "0"]
     beside = out / "images"
-    if not os.path.lexists(beside):
-        beside.symlink_to(images.resolve(), target_is_directory=True)  # so that `kfgs fit OUT` finds the pictures
+    if link_images(images, out):
         written.append(beside)
     elif beside.resolve() != images.resolve():
         say(f"note: {beside} is another folder; pass --images {images} to the other commands")

@@ -1,6 +1,6 @@
 """Feature maps on disk: written by a teacher, or found as other programs left them."""
 
-from .extract import discard_maps, extract_features
+from .extract import discard_maps, extract_features, join_features
 from .folder import FeatureFolder
 from .layouts import save_feature_map, write_npy_map
 from .manifest import read_manifest
@@ -13,6 +13,7 @@ __all__ = [
     "RecomputedMaps",
     "discard_maps",
     "extract_features",
+    "join_features",
     "pictures_of",
     "read_manifest",
     "save_feature_map",

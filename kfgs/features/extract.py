@@ -29,6 +29,7 @@ def extract_features(
     split: Split = "train",
     *,
     overwrite: bool = False,
+    part: str | None = None,
     progress: bool = False,
     report: Callable[[str], None] | None = None,
 ) -> Manifest:
@@ -49,24 +50,31 @@ def extract_features(
         overwrite: replace maps that were made by another teacher (or with other weights or options), and maps with these
             names from other programs. Maps of the same teacher are kept. If the call is killed, `FeatureFolder` refuses
             the remaining maps of other programs.
+        part: a word of letters and digits, if several processes fill the folder at the same time, each with other pictures
+            and another word. The maps are recorded in `features.part-<word>.json` until `join_features` joins all parts.
         progress: show a progress bar.
         report: receives one line about what will be done, and one per map that is made again.
 
     Returns:
-        The manifest, with a record of every map in the folder.
+        The manifest, with a record of every map in the folder (or of the part).
 
     Raises:
         TypeError: if `teacher` is no teacher, it returns no tensor, or JSON cannot hold its identity.
-        ValueError: if there are no pictures, two have the same stem, a map is not finite in float16, maps differ in
-            channels, or in size for pictures of equal size; if the folder holds maps of another teacher, or another
-            process is writing to it.
+        ValueError: if `part` is no such word, or given with `overwrite`; if there are no pictures, two have the same stem, a
+            map is not finite in float16, maps differ in channels, or in size for pictures of equal size; if the folder
+            holds maps of another teacher, or another process is writing to it.
         OSError: if the folder cannot be written to, or the disk has no space for the maps.
     """
     folder, teacher, chosen = as_path(folder), as_teacher(teacher), as_pictures(pictures, split, exist=True)
-    with locked(folder, LOCK):
+    if part is not None and (overwrite or not (part.isascii() and part.isalnum())):
+        raise ValueError(
+            f"part: expected letters and digits, and no overwrite, which would delete the maps of other parts, got {part!r}, "
+            f"overwrite={overwrite}; use another word, or another folder"
+        )
+    with locked(folder, LOCK if part is None else f".features.part-{part}.lock"):
         for place in {folder, *(map_file(folder, picture.stem).parent for picture in chosen)}:
             finish_writing(place)  # if all maps are there, nothing is written that would sweep
-        writer = MapWriter(folder, identify(teacher), chosen, overwrite=overwrite)
+        writer = MapWriter(folder, identify(teacher), chosen, overwrite=overwrite, part=part)
         digests = {picture.stem: digest_file(picture.path) for picture in chosen}
         doubts = {stem: writer.doubt(stem, digest) for stem, digest in digests.items()}
         todo = [picture for picture in chosen if doubts[picture.stem] is not None]
@@ -97,6 +105,42 @@ def extract_features(
                 records.append(writer.add(picture, digests[picture.stem], file, (h, w, D), seconds))
                 bar.update()
         return writer.manifest
+
+
+def join_features(folder: str | Path, stems: Sequence[str]) -> Manifest:
+    """Join the parts that several calls of `extract_features` made into one `features.json`, as one call would have left it.
+
+    Only the records are joined: every map has its final name already. A killed call can be repeated.
+
+    Args:
+        folder: the folder of maps; no call for one of its parts may be at work.
+        stems: the views that must have a record, in their order.
+
+    Raises:
+        ValueError: if one has none, parts were made by different teachers, or another process is writing to the folder.
+    """
+    folder = as_path(folder)
+    with locked(folder, LOCK):
+        files = sorted(folder.glob("features.part-*.json"))
+        parts = [found for file in files if (found := read_manifest(folder, file.stem.partition("-")[2])) is not None]
+        whole = read_manifest(folder)
+        made = {stem: record for one in parts for stem, record in one.maps.items()}
+        known = made if whole is None else {**whole.maps, **made}
+        missing = [stem for stem in stems if stem not in known]
+        teachers = [one.teacher for one in (whole, *parts) if one is not None]
+        if missing or any(teacher != teachers[0] for teacher in teachers):
+            got = f"none of {missing[0]!r} ({len(missing)} in all)" if missing else "those of different teachers"
+            raise ValueError(
+                f"stems: expected a record of one teacher for each view in {folder}, got {got}; encode it again"
+            )
+        order = known if whole is not None else {**{stem: known[stem] for stem in stems}, **known}
+        discarded = whole is not None and whole.discarded and not set(whole.maps) <= set(made)
+        joined = Manifest(teachers[0], order, discarded)
+        joined.save(folder)
+        for file in files:
+            file.unlink()
+            (folder / f".{file.stem}.lock").unlink(missing_ok=True)
+        return joined
 
 
 def discard_maps(folder: str | Path, stems: Sequence[str] | None = None, *, dry_run: bool = False) -> int:

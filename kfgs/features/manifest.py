@@ -58,18 +58,27 @@ class Manifest:
         name, discarded = one_line(self.teacher.get("name", "unknown")), ", discarded" if self.discarded else ""
         return f"Manifest({len(self.maps)} maps by {name}{discarded})"
 
-    def save(self, folder: Path) -> None:
-        """Write `features.json`, atomically."""
-        write_json(folder / MANIFEST, {"format": FORMAT, **asdict(self)})
+    def save(self, folder: Path, part: str | None = None) -> None:
+        """Write `features.json`, or the manifest of a part, atomically."""
+        write_json(manifest_file(folder, part), {"format": FORMAT, **asdict(self)})
 
 
-def read_manifest(folder: str | Path) -> Manifest | None:
+def manifest_file(folder: Path, part: str | None = None) -> Path:
+    """The manifest of a folder, or that of a part of its maps, which other processes do not write to."""
+    return folder / (MANIFEST if part is None else f"features.part-{part}.json")
+
+
+def read_manifest(folder: str | Path, part: str | None = None) -> Manifest | None:
     """The manifest of a folder of maps; None if it has none, because another program wrote the maps.
+
+    Args:
+        folder: the folder.
+        part: read the manifest of this part instead, see `extract_features`; None if it has not begun, or was joined.
 
     Raises:
         ValueError: if the manifest is damaged, or of another version.
     """
-    path = as_path(folder) / MANIFEST
+    path = manifest_file(as_path(folder), part)
     if not path.is_file():
         return None
     try:

@@ -15,7 +15,7 @@ from .._files import bytes_in_words, digest_file
 from ..teachers.protocol import Teacher, check_features
 from .finder import MapFinder
 from .layouts import LAYOUTS, OWN, layout_of, map_file
-from .manifest import MANIFEST, Manifest, MapRecord, differences, plain_identity
+from .manifest import MANIFEST, Manifest, MapRecord, differences, plain_identity, read_manifest
 from .pictures import Picture
 
 LOCK = ".features.lock"
@@ -30,6 +30,7 @@ class MapWriter:
         identity: of the teacher, see `identify`.
         pictures: the pictures whose maps will be written, or exist.
         overwrite: replace maps that another teacher or another program made.
+        part: record the maps in the manifest of this part.
 
     Raises:
         TypeError: if JSON cannot hold `identity`.
@@ -37,14 +38,21 @@ class MapWriter:
     """
 
     def __init__(
-        self, folder: Path, identity: Mapping[str, Any], pictures: Sequence[Picture], *, overwrite: bool = False
+        self,
+        folder: Path,
+        identity: Mapping[str, Any],
+        pictures: Sequence[Picture],
+        *,
+        overwrite: bool = False,
+        part: str | None = None,
     ) -> None:
-        wanted = plain_identity(identity)
-        found = _make_room(MapFinder(folder), [picture.stem for picture in pictures], wanted, overwrite=overwrite)
-        self.folder, self.manifest = folder, found or Manifest(wanted)
+        wanted, stems, finder = plain_identity(identity), [picture.stem for picture in pictures], MapFinder(folder)
+        known = finder.manifest if part is None else _known(finder.manifest, read_manifest(folder, part), stems)
+        found = _make_room(finder, known, stems, wanted, overwrite=overwrite)
+        self.folder, self.part, self.manifest = folder, part, found or Manifest(wanted)
         self._missing = {stem for stem, one in self.manifest.maps.items() if not (folder / one.file).is_file()}
         if found is None:
-            self.manifest.save(folder)  # from now on, a map without a record is one that a killed process left
+            self.manifest.save(folder, part)  # from now on, a map without a record is one that a killed process left
 
     def doubt(self, stem: str, image_digest: str) -> str | None:
         """Why a picture's map must be made (again); None if the existing map can be used."""
@@ -77,7 +85,7 @@ class MapWriter:
         maps = {**self.manifest.maps, stem: record}
         # while one of the discarded maps is missing, its record still describes it
         self.manifest = replace(self.manifest, maps=maps, discarded=self.manifest.discarded and bool(self._missing))
-        self.manifest.save(self.folder)
+        self.manifest.save(self.folder, self.part)
 
     def check_space(self, maps: int, map_bytes: int) -> None:
         """Raise an OSError unless the disk has space for `maps` maps of `map_bytes` bytes."""
@@ -89,9 +97,20 @@ class MapWriter:
             )
 
 
-def _make_room(finder: MapFinder, stems: list[str], identity: dict[str, Any], *, overwrite: bool) -> Manifest | None:
+def _known(whole: Manifest | None, begun: Manifest | None, stems: list[str]) -> Manifest | None:
+    """What is recorded of a part's pictures: in the manifest of the folder, and in the part's own."""
+    if whole is None:
+        return begun
+    own = begun.maps if begun is not None and begun.teacher == whole.teacher else {}
+    found = {stem: own.get(stem) or whole.maps.get(stem) for stem in stems}
+    return replace(whole, maps={stem: record for stem, record in found.items() if record is not None})
+
+
+def _make_room(
+    finder: MapFinder, found: Manifest | None, stems: list[str], identity: dict[str, Any], *, overwrite: bool
+) -> Manifest | None:
     """The manifest, if this teacher made the maps in the folder. Other maps are an error, or replaced with `overwrite`."""
-    folder, found, hint = finder.path, finder.manifest, "use another folder, or pass overwrite=True (--overwrite)"
+    folder, hint = finder.path, "use another folder, or pass overwrite=True (--overwrite)"
     expected = "folder: expected one without maps of other programs, got"
     files = [map_file(folder, stem) for stem in stems]
     finder.own |= set(files)

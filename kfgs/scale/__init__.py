@@ -9,23 +9,37 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 _WHERE = {
+    "BatchOptions": ".options",
     "FieldInBlocks": ".in_blocks",
     "Found": ".search_found",
     "PartFound": ".search_found",
     "SceneFound": ".search_found",
+    "SceneEntry": ".scene_list",
+    "SceneResult": ".batch",
     "SearchIndex": ".search",
     "SharedCodebook": ".shared_codebook",
     "fit_block": ".blocks",
     "fit_blocks": ".blocks",
+    "map_scenes": ".batch",
+    "open_client": ".clients",
+    "read_scenes": ".scene_list",
+    "run_batch": ".batch",
     "split_scene": ".blocks",
 }
 __all__ = sorted(_WHERE)
 
 if TYPE_CHECKING:
+    from .batch import SceneResult as SceneResult
+    from .batch import map_scenes as map_scenes
+    from .batch import run_batch as run_batch
     from .blocks import fit_block as fit_block
     from .blocks import fit_blocks as fit_blocks
     from .blocks import split_scene as split_scene
+    from .clients import open_client as open_client
     from .in_blocks import FieldInBlocks as FieldInBlocks
+    from .options import BatchOptions as BatchOptions
+    from .scene_list import SceneEntry as SceneEntry
+    from .scene_list import read_scenes as read_scenes
     from .search import SearchIndex as SearchIndex
     from .search_found import Found as Found
     from .search_found import PartFound as PartFound

@@ -3,9 +3,9 @@
 from ..cameras.bounds import Bounds, robust_bounds
 from .colmap_model import ColmapModel, read_model
 from .files import SceneError, file_stem, list_images, read_image
-from .load import load_scene
+from .load import is_scene, load_scene
 from .scene import Scene
-from .sfm import SfmConfig, run_sfm
+from .sfm import SfmConfig, link_images, run_sfm
 from .sfm_onto import extend_sfm
 from .splits import make_split
 from .undistort import undistort_scene
@@ -18,6 +18,8 @@ __all__ = [
     "SfmConfig",
     "extend_sfm",
     "file_stem",
+    "is_scene",
+    "link_images",
     "list_images",
     "load_scene",
     "make_split",

@@ -138,7 +138,8 @@ def find_model(path: Path) -> Path | None:
     return next((path / name for name in MODEL_FOLDERS if path.is_dir() and has_model(path / name)), None)
 
 
-def _is_scene(path: Path) -> bool:
+def is_scene(path: Path) -> bool:
+    """Whether a folder has poses: a COLMAP model, a transforms.json, or the layout of a data set."""
     return (
         find_model(path) is not None
         or any((path / name).is_file() for name in _TRANSFORMS)
@@ -150,10 +151,10 @@ def _advice(path: Path) -> str:
     folders = (
         sorted((f for f in path.iterdir() if f.is_dir()), key=lambda f: natural_key(f.name)) if path.is_dir() else []
     )
-    inside = [folder.name for folder in folders[:100] if _is_scene(folder)]
+    inside = [folder.name for folder in folders[:100] if is_scene(folder)]
     if inside:
         return f"it holds scenes ({some(inside)}): give one of them, as in {path / inside[0]}"
-    if _is_scene(path.resolve().parent):
+    if is_scene(path.resolve().parent):
         return f"the folder above is a scene: give {path.resolve().parent}"
     return "estimate the cameras first: `kfgs sfm <images> <scene>` or kfgs.scenes.run_sfm"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 import time
 from collections.abc import Callable
@@ -148,6 +149,15 @@ def run_sfm(
             missing=tuple(name for name in names if name not in placed),
             model_sizes=sizes,
         )
+
+
+def link_images(images: str | Path, out: str | Path) -> bool:
+    """Link `out/images` to the folder of the images, so that `load_scene(out)` finds them; False if something is there."""
+    beside = as_path(out) / "images"
+    if os.path.lexists(beside):
+        return False
+    beside.symlink_to(as_path(images).resolve(), target_is_directory=True)
+    return True
 
 
 def timed(stage: Callable[[], None]) -> float:

@@ -1,0 +1,239 @@
+"""Many scenes through all stages: the plan of a scene, its record in the run folder, and the calls for Python."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import time
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from .._check import check_range
+from .._files import check_output, locked
+from .driver import Engine, Event, Failure, Plan, Task, drive
+from .options import BatchOptions, Job
+from .places import Place, StoredPlace
+from .scene_list import SceneEntry, as_entries, is_url
+
+STAGES = ("scene", "features", "fit", "segment", "evaluate")
+STATE, LOG, LOCK, FORMAT = "state.json", "log.txt", ".batch.lock", "kfgs-batch/1"
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """What became of a scene."""
+
+    name: str
+    value: Any
+    """What the function returned; of a batch, `gaussians`, `latents` and `miou`, as far as they exist. None if it failed."""
+    failure: Failure | None
+    seconds: float
+    """Of all its tasks, together."""
+
+
+@dataclass
+class Row:
+    """A scene in the table of a batch, and in its `state.json`."""
+
+    name: str
+    source: str
+    stages: dict[str, str] = field(default_factory=dict)
+    """running, done, found (made earlier) or failed, by stage; a stage that is not there waits, or is not needed."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    value: dict[str, Any] | None = None
+    failure: Failure | None = None
+
+    @property
+    def ended(self) -> bool:
+        """Whether there is nothing left to do."""
+        return self.failure is not None or self.value is not None
+
+
+def map_scenes(
+    function: Callable[[str], Any],
+    scenes: Iterable[str | Path | SceneEntry],
+    *,
+    client: Engine | Callable[[], Engine],
+    at_once: int | Callable[[], int] = 64,
+    report: Callable[[Event], None] | None = None,
+) -> list[SceneResult]:
+    """Call a function for many scenes, in the workers of any engine.
+
+    A call that dies with its worker is repeated, at most 3 times. A call that raises is a failure in its result; the others
+    go on.
+
+    Args:
+        function: receives a scene's place, an absolute path or an URL; returns something small. It is sent by cloudpickle, so
+            it may be a lambda, or defined in a notebook.
+        scenes: folders, URLs, or entries; see `read_scenes` for a file.
+        client: a `dask.distributed.Client`, or anything with `submit(function, *arguments)` whose results have `done()` and
+            `result()`: executors of concurrent.futures, submitit, Ray or MPI. Or a function that makes one: a process pool is
+            of no use any more when one of its processes has died, and then another one is made.
+        at_once: calls in progress at the same time, or a function that says how many.
+        report: receives an event when a call begins, ends or is repeated.
+
+    Returns:
+        A result per scene, in their order.
+
+    Raises:
+        ValueError: if there are no scenes, or two have the same name.
+        ImportError: if cloudpickle is missing.
+
+    Example:
+        >>> from concurrent.futures import ThreadPoolExecutor
+        >>> with ThreadPoolExecutor(2) as pool:
+        ...     found = map_scenes(len, ["s3://a/kitchen", "s3://a/hall"], client=pool)
+        >>> [(one.name, one.value) for one in found]
+        [('kitchen', 14), ('hall', 11)]
+    """
+    try:
+        import cloudpickle
+    except ImportError as error:
+        raise ImportError(f"map_scenes: expected cloudpickle, got {error}; pip install 'kfgs[scale]'") from error
+    entries, sent = as_entries(scenes), cloudpickle.dumps(function)
+    found: dict[str, SceneResult] = {}
+    seconds: dict[str, float] = {}
+
+    def note(event: Event) -> None:
+        seconds[event.name] = seconds.get(event.name, 0.0) + event.seconds
+        if event.kind in ("failed", "finished"):
+            value = event.results[0] if event.results else None
+            found[event.name] = SceneResult(event.name, value, event.failure, seconds[event.name])
+        if report is not None:
+            report(event)
+
+    def plan(entry: SceneEntry) -> Plan:
+        return (yield "call", [Task(_call, (sent, entry.source))])[0]
+
+    if not callable(at_once):
+        check_range("at_once", at_once, 1)
+    drive({entry.name: plan(entry) for entry in entries}, client, note, at_once=at_once)
+    return [found[entry.name] for entry in entries]
+
+
+def _call(sent: bytes, source: str, *, report: Callable[[str], None]) -> Any:
+    return pickle.loads(sent)(source)
+
+
+def run_batch(
+    scenes: Iterable[str | Path | SceneEntry],
+    out: str | Path,
+    options: BatchOptions | None = None,
+    *,
+    client: Engine | Callable[[], Engine],
+    retry_failed: bool = False,
+    at_once: int | Callable[[], int] = 64,
+    report: Callable[[Event, Sequence[Row]], None] | None = None,
+) -> list[SceneResult]:
+    """Take scenes through sfm, features, fit, segment and evaluate. What is done is not repeated, whoever did it.
+
+    Each scene gets a folder `out/<name>`: `scene/` (if its cameras had to be found), `features/`, `field/`, `segmented/`,
+    `scores.json` (if it has true labels), `log.txt`, `state.json`. A task that dies with its worker is repeated, at most 3
+    times. A scene that fails is recorded, and the others go on.
+
+    Args:
+        scenes: folders or URLs of fsspec, or entries (`read_scenes`); each with a COLMAP model, a transforms.json, or photos.
+        out: folder or URL of the runs. Paths must be the same in all workers.
+        options: what is done with each.
+        client: see `map_scenes`. A worker should run one task at a time.
+        retry_failed: also try scenes that failed before; without it their old failure is returned.
+        at_once: scenes in progress at the same time, or a function that says how many. Fewer need less disk for feature maps.
+        report: receives each event, and the state of all scenes.
+
+    Returns:
+        A result per scene, in their order.
+
+    Raises:
+        ValueError: if there are no scenes, two have the same name, or another batch works in `out`.
+        OSError: if `out` cannot be written to.
+    """
+    if not callable(at_once):
+        check_range("at_once", at_once, 1)
+    options, entries = options or BatchOptions(), as_entries(scenes)
+    local = None if is_url(str(out)) else check_output("out", out, "a folder").absolute()
+    root = str(out).rstrip("/") if local is None else str(local)
+    jobs = {entry.name: Job(entry.source, f"{root}/{entry.name}", options) for entry in entries}
+    with nullcontext() if local is None else locked(local, LOCK):
+        records = {entry.name: _Record(entry, jobs[entry.name].out) for entry in entries}
+        rows = [record.row for record in records.values()]
+
+        def note(event: Event) -> None:
+            records[event.name].add(event)
+            if report is not None:
+                report(event, rows)
+
+        plans = {name: _plan(jobs[name]) for name, record in records.items() if record.begin(retry_failed)}
+        drive(plans, client, note, at_once=at_once)
+    return [SceneResult(row.name, row.value, row.failure, sum(row.seconds.values())) for row in rows]
+
+
+def _plan(job: Job) -> Generator[tuple[str, list[Task]], list[Any], Any]:
+    """The stages of a scene that are not done yet."""
+    from . import stages  # torch and all, which the options of a command do not need
+
+    found = (yield "scene", [Task(stages.find_scene, (job,))])[0]
+    keys, done = found["keys"], dict(found["done"])
+    if "fit" not in done:
+        if job.options.teacher is not None and "features" not in done:
+            pictures, share = found["pictures"], job.options.share
+            parts = [pictures[i : i + share] for i in range(0, len(pictures), share)]
+            yield "features", [Task(stages.encode_part, (job, i, part)) for i, part in enumerate(parts)]
+            stems = [stem for stem, _ in pictures]
+            yield "features", [Task(stages.join_parts, (job, keys["features"], stems))]
+        done["fit"] = (yield "fit", [Task(stages.fit, (job, keys["fit"]))])[0]
+    if found["classes"] and "segment" not in done:
+        yield "segment", [Task(stages.segment, (job, keys["segment"], found["split"]))]
+    if found["classes"] and found["labels"] and "evaluate" not in done:
+        done["evaluate"] = (yield "evaluate", [Task(stages.score, (job, keys["evaluate"]))])[0]
+    return {name: done["fit"][name] for name in ("gaussians", "latents")} | {
+        "miou": done.get("evaluate", {}).get("miou")
+    }
+
+
+class _Record:
+    """A scene's `state.json` and `log.txt`, written by the driver alone."""
+
+    def __init__(self, entry: SceneEntry, out: str) -> None:
+        self.place = StoredPlace(out, Path()) if is_url(out) else Place(Path(out))
+        self.row = Row(entry.name, entry.source)
+        self._log = ""
+
+    def begin(self, retry_failed: bool) -> bool:
+        """Read what an earlier batch left; whether its failure is to be forgotten."""
+        self._log = self.place.read_text(LOG) or ""
+        before = self.place.read_json(STATE)
+        if before.get("format") == FORMAT and before.get("failure") and not retry_failed:
+            self.row.failure = Failure(**before["failure"])
+            self.row.stages = {self.row.failure.stage: "failed"}
+            return False
+        return True
+
+    def add(self, event: Event) -> None:
+        """Note an event."""
+        row, stage = self.row, event.stage
+        if event.seconds:
+            row.seconds[stage] = round(row.seconds.get(stage, 0.0) + event.seconds, 3)
+        if event.kind == "started":
+            row.stages[stage] = "running"
+        elif event.kind == "done":
+            row.stages[stage] = "found" if all(one.get("reused") for one in event.results) else "done"
+            if stage == "scene":
+                row.stages |= {name: "found" for name in STAGES if name in event.results[0]["done"]}
+        elif event.kind == "failed":
+            row.stages[stage], row.failure = "failed", event.failure
+        elif event.kind == "finished":
+            row.value = event.results[0]
+        lines = [f"{stage}: {line.removeprefix(f'{stage}: ')}" for line in event.lines]
+        if event.kind in ("done", "failed"):
+            lines.append(f"{stage}: {row.stages[stage]} in {event.seconds:.1f} s")
+        if event.failure is not None:
+            lines += [f"{stage}: {event.failure.message}", event.failure.traceback]
+        if lines:
+            now = time.strftime("%Y-%m-%d %H:%M:%S")
+            self._log += "".join(f"{now} {line}\n" for line in lines)
+            self.place.write_text(LOG, self._log)
+        if event.kind != "lost":
+            self.place.write_json(STATE, json.loads(json.dumps({"format": FORMAT, **asdict(row)})))

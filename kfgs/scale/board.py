@@ -1,0 +1,56 @@
+"""The table of a batch: a row per scene, with its stages, seconds and score."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from .._card import cut
+from .._files import seconds_in_words
+from .batch import STAGES, Row
+from .driver import Event
+
+LONGEST = 24  # characters of a name
+
+
+def event_line(event: Event, rows: Sequence[Row]) -> str | None:
+    """A line for an event; None for the start of a stage."""
+    row = next(row for row in rows if row.name == event.name)
+    if event.kind == "done":
+        return f"{event.name}: {event.stage} {row.stages[event.stage]} in {seconds_in_words(event.seconds)}"
+    if event.kind == "lost":
+        return f"{event.name}: {event.stage}: {event.lines[0]}"
+    if event.failure is not None:
+        return f"{event.name}: {event.stage} failed: {cut(event.failure.message, 300)}"
+    return None
+
+
+def table(rows: Sequence[Row], most: int | None = None) -> str:
+    """All scenes with their stages, and a line that counts them.
+
+    Args:
+        rows: of a batch.
+        most: show at most this many scenes: those that failed first, then those at work, then the others.
+    """
+    shown = list(rows)
+    if most is not None and len(shown) > most:
+        order = sorted(rows, key=lambda row: 0 if row.failure else 1 if row.stages and not row.ended else 2)
+        chosen = {id(row) for row in order[: max(most, 0)]}
+        shown = [row for row in rows if id(row) in chosen]
+    width = max([5, *(min(len(row.name), LONGEST) for row in shown)])
+    lines = [" ".join(["name".ljust(width), *(stage.ljust(8) for stage in STAGES), "seconds", " mIoU"]).rstrip()]
+    for row in shown:
+        miou = (row.value or {}).get("miou")
+        score = "    -" if miou is None else f"{miou:5.3f}"
+        cells = [cut(row.name, LONGEST).ljust(width), *(row.stages.get(stage, "-").ljust(8) for stage in STAGES)]
+        lines.append(" ".join([*cells, f"{sum(row.seconds.values()):7.1f}", score]))
+        if row.failure is not None:
+            lines.append(f"  {row.failure.stage}: {cut(row.failure.message, 300 if most is None else 90)}")
+    counts = {
+        "finished": sum(row.value is not None for row in rows),
+        "failed": sum(row.failure is not None for row in rows),
+        "at work": sum(bool(row.stages) and not row.ended for row in rows),
+    }
+    scores = [row.value["miou"] for row in rows if row.value is not None and row.value.get("miou") is not None]
+    words = [f"{count} {what}" for what, count in counts.items() if count]
+    words += [f"mean mIoU {sum(scores) / len(scores):.3f} of {len(scores)}"] if scores else []
+    return "\n".join([*lines, f"{len(rows)} scenes: {', '.join(words) or 'all wait'}"])

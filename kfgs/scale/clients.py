@@ -1,0 +1,94 @@
+"""Start or find workers by Dask: processes of this machine, a running scheduler, or jobs of Slurm."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from .._check import check_range
+
+START = "60s"  # to wait for a scheduler
+WALLTIME = "24:00:00"  # of a Slurm job; a batch goes on after it ended
+
+
+@contextmanager
+def open_client(
+    *,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    slurm: str | None = None,
+    threads: int = 1,
+    memory: str = "16GB",
+) -> Iterator[Any]:
+    """A `dask.distributed.Client` whose workers run one task at a time; what was started is ended again.
+
+    Args:
+        scheduler: the address of a running Dask scheduler, `tcp://host:8786`. Its workers should have one thread each
+            (`dask worker --nthreads 1`).
+        workers: processes to start on this machine (by default one for each `threads` processors), or jobs of Slurm
+            (by default 1).
+        slurm: a partition: each worker is a job of dask-jobqueue, and is submitted again if it ends early. Other options of
+            the jobs are read from dask-jobqueue's configuration (`~/.config/dask/jobqueue.yaml`).
+        threads: processors of each worker.
+        memory: of each Slurm job. Workers of this machine have no limit.
+
+    Raises:
+        ImportError: if Dask, or for Slurm dask-jobqueue, is missing.
+        ValueError: if both a scheduler and workers or Slurm are given.
+        OSError: if the scheduler does not answer, or there is no Slurm.
+    """
+    if scheduler is not None and (workers is not None or slurm is not None):
+        raise ValueError(
+            "scheduler: expected none with workers or slurm, which start their own, got both; leave one out"
+        )
+    if workers is not None:
+        check_range("workers", workers, 1)
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise ImportError(f"batch: expected Dask, got {error}; pip install 'kfgs[scale]'") from error
+    if scheduler is not None:
+        try:
+            client = Client(scheduler, timeout=START, set_as_default=False)
+        except (OSError, ValueError, TypeError) as error:
+            raise OSError(
+                f"scheduler: expected one that answers at {scheduler}, got {error}; start `dask scheduler`"
+            ) from error
+        with client:
+            yield client
+        return
+    once = {"allowed_failures": 0}  # the driver submits again what dies
+    if slurm is not None:
+        cluster: Any = _slurm(slurm, threads, memory, once)
+        cluster.adapt(minimum=workers or 1, maximum=workers or 1)  # also replaces jobs that ended
+    else:
+        count = workers or max(1, (os.cpu_count() or 1) // threads)
+        cluster = LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            memory_limit=0,
+            dashboard_address="127.0.0.1:0",
+            scheduler_kwargs=once,
+            silence_logs=logging.CRITICAL,
+        )
+    with cluster, Client(cluster, set_as_default=False) as client:
+        yield client
+
+
+def _slurm(partition: str, threads: int, memory: str, scheduler: dict[str, Any]) -> Any:
+    try:
+        from dask_jobqueue import SLURMCluster
+    except ImportError as error:
+        raise ImportError(f"slurm: expected dask-jobqueue, got {error}; pip install 'kfgs[scale]'") from error
+    return SLURMCluster(
+        queue=partition,
+        cores=1,  # Dask's threads: one task at a time
+        job_cpu=threads,
+        processes=1,
+        memory=memory,
+        walltime=WALLTIME,
+        scheduler_options={"dashboard_address": ":0", **scheduler},
+    )

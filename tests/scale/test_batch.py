@@ -1,0 +1,339 @@
+"""Batches: what several workers make, kills included, is what one process makes; nothing is done twice."""
+
+import dataclasses
+import os
+import re
+import shutil
+import signal
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+from messages import tells
+from PIL import Image
+from small_batch import OPTIONS, make_rooms, one_process, results
+
+from kfgs._files import read_json
+from kfgs.cli import main
+from kfgs.scale import BatchOptions, open_client, run_batch
+from kfgs.scale.board import event_line, table
+
+FIT_STAGES = ["scene", "features", "features", "fit", "segment", "evaluate"]
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory):
+    return make_rooms(tmp_path_factory.mktemp("rooms"), 2)
+
+
+@pytest.fixture(scope="module")
+def alone(rooms):
+    """The results of one process."""
+    return {room.name: results(one_process(room, room.parent / "alone" / room.name)) for room in rooms}
+
+
+@pytest.fixture(scope="module")
+def client():
+    with open_client(workers=2) as found:
+        yield found
+
+
+class Events(list):
+    def __call__(self, event, rows):
+        self.append(event)
+        self.rows = rows
+
+    def stages(self, name, kind="done"):
+        return [event.stage for event in self if event.name == name and event.kind == kind]
+
+
+def kill_fit(run: Path, killed: list):
+    """Kill the process that fits a scene, whose id is in the lock of the run."""
+    end = time.monotonic() + 100
+    while not killed and time.monotonic() < end:
+        lock = run / ".run.lock"
+        found = re.match(r"process (\d+) ", lock.read_text()) if lock.is_file() else None
+        if found and (run / "unfinished").is_dir():
+            os.kill(int(found[1]), signal.SIGKILL)
+            killed.append(int(found[1]))
+        time.sleep(0.01)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")
+def test_killed_workers_change_no_byte_and_a_second_batch_does_nothing(rooms, alone, client, tmp_path):
+    runs, events, killed = rooms[0].parent / "runs", Events(), []
+    (tmp_path / "broken").mkdir()
+    deadly = dataclasses.replace(OPTIONS, teacher_options={"deadly": str(tmp_path)})
+    killer = threading.Thread(target=kill_fit, args=(runs / "room1", killed))
+    killer.start()
+    found = run_batch([tmp_path / "broken", *rooms], runs, deadly, client=client, report=events)
+    killer.join()
+    assert (tmp_path / "killed").exists()
+    assert os.getpid() not in killed
+    assert len(killed) == 1
+    assert {"features", "fit"} <= {event.stage for event in events if event.kind == "lost"}
+    for room in rooms:
+        assert results(runs / room.name) == alone[room.name]
+        assert events.stages(room.name) == FIT_STAGES
+    assert [one.failure is None for one in found] == [False, True, True]
+    assert found[0].failure.stage == "scene"
+    assert "expected a COLMAP model, a transforms.json, or photos" in found[0].failure.message
+    assert read_json(runs / "broken" / "state.json")["failure"]["message"] == found[0].failure.message
+    assert "Traceback" in (runs / "broken" / "log.txt").read_text()
+    assert "a worker died" in (runs / "room1" / "log.txt").read_text()
+
+    before = {path: path.stat().st_mtime_ns for path in runs.rglob("*") if path.is_file()}
+    more = Events()
+    second = run_batch([tmp_path / "broken", *rooms], runs, deadly, client=client, report=more)
+    assert [one.value for one in second] == [one.value for one in found]
+    assert [more.stages(name) for name in ("broken", "room0", "room1")] == [[], ["scene"], ["scene"]]
+    changed = {path.name for path, when in before.items() if path.stat().st_mtime_ns != when}
+    assert changed <= {"state.json", "log.txt", ".batch.lock"}
+    assert second[0].failure == found[0].failure
+
+
+def test_a_failed_scene_is_tried_again_when_asked(rooms, tmp_path):
+    scene, events = tmp_path / "room", Events()
+    shutil.copytree(rooms[0], scene, ignore=shutil.ignore_patterns("images", "depth", "features"))
+    with ThreadPoolExecutor(1) as pool:
+        first = run_batch([scene], tmp_path / "runs", OPTIONS, client=pool)
+        shutil.copytree(rooms[0] / "images", scene / "images")
+        skipped = run_batch([scene], tmp_path / "runs", OPTIONS, client=pool, report=events)
+        assert first[0].failure == skipped[0].failure
+        assert first[0].failure is not None
+        assert events == []
+        tried = run_batch([scene], tmp_path / "runs", OPTIONS, client=pool, retry_failed=True, report=events)
+    assert tried[0].failure is None
+    assert read_json(tmp_path / "runs" / "room" / "state.json")["failure"] is None
+    assert events.stages("room") == FIT_STAGES
+
+
+def test_only_what_depends_on_a_change_is_done_again(rooms, alone, tmp_path):
+    scene, runs = tmp_path / "room0", tmp_path / "runs"
+    shutil.copytree(rooms[0], scene)
+
+    def batch(**changes):
+        events = Events()
+        with ThreadPoolExecutor(1) as pool:
+            found = run_batch([scene], runs, dataclasses.replace(OPTIONS, **changes), client=pool, report=events)
+        assert found[0].failure is None, found[0].failure.traceback
+        return events.stages("room0"), events.rows[0].stages
+
+    assert batch()[0] == FIT_STAGES
+    assert {name: data for name, data in results(runs / "room0").items() if name != "field/field.json"} == {
+        name: data for name, data in alone["room0"].items() if name != "field/field.json"
+    }
+    assert batch(pictures=1)[0] == ["scene", "segment"]
+    assert (runs / "room0" / "segmented" / "sheets").is_dir()
+    shutil.rmtree(runs / "room0" / "field")
+    assert batch(pictures=1) == (
+        ["scene", "fit"],
+        {"scene": "done", "features": "found", "fit": "done", "segment": "found", "evaluate": "found"},
+    )
+    one = next((runs / "room0" / "features").glob("*.npy"))
+    whole = one.read_bytes()
+    one.write_bytes(whole[:100])
+    assert batch(pictures=1)[0] == ["scene"]  # the field is there: its maps are not asked
+    (runs / "room0" / "done" / "fit.json").unlink()
+    assert batch(pictures=1)[0] == ["scene", "features", "features", "fit"]
+    assert one.read_bytes() == whole
+    picture = scene / "images" / f"{one.stem}.png"
+    Image.open(picture).rotate(180).save(picture)
+    assert batch(pictures=1)[0] == FIT_STAGES
+    assert one.read_bytes() != whole
+
+
+def test_maps_are_deleted_when_asked_and_not_missed(rooms, tmp_path):
+    less, events = dataclasses.replace(OPTIONS, discard_features=True), Events()
+    with ThreadPoolExecutor(1) as pool:
+        for _ in range(2):
+            run_batch(rooms[:1], tmp_path, less, client=pool, report=events)
+    assert list((tmp_path / "room0" / "features").glob("*.npy")) == []
+    assert events.stages("room0") == [*FIT_STAGES, "scene"]
+
+
+@pytest.mark.parametrize("kind", ["memory", "file"])
+def test_scenes_and_runs_in_an_object_store(rooms, alone, tmp_path, kind):
+    fsspec = pytest.importorskip("fsspec")
+    root = f"memory://{tmp_path.name}" if kind == "memory" else f"file://{tmp_path}/store"
+    files, _ = fsspec.core.url_to_fs(root)
+    files.put(str(rooms[0]), f"{root}/scenes/room0", recursive=True)
+    check_store(root, files, alone, tmp_path)
+
+
+def test_an_s3_server(rooms, alone, tmp_path, monkeypatch):
+    server_module = pytest.importorskip("moto.server")
+    s3fs = pytest.importorskip("s3fs")
+    server = server_module.ThreadedMotoServer(port=0, verbose=False)
+    server.start()
+    try:
+        host, port = server.get_host_and_port()
+        for name, value in {
+            "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+            "AWS_ACCESS_KEY_ID": "one",
+            "AWS_SECRET_ACCESS_KEY": "two",
+            "AWS_DEFAULT_REGION": "us-east-1",
+        }.items():
+            monkeypatch.setenv(name, value)
+        files = s3fs.S3FileSystem()
+        files.mkdir("captures")
+        files.put(str(rooms[0]), "s3://captures/scenes/room0", recursive=True)
+        check_store("s3://captures", files, alone, tmp_path)
+    finally:
+        server.stop()
+
+
+def check_store(root, files, alone, tmp_path):
+    """Two batches from a store to a store: the results of one process, and nothing done twice."""
+    events, scenes = Events(), [f"{root}/scenes/room0"]
+    with ThreadPoolExecutor(2) as pool:
+        first = run_batch(scenes, f"{root}/runs", OPTIONS, client=pool, report=events)
+        assert first[0].failure is None, first[0].failure.traceback
+        assert run_batch(scenes, f"{root}/runs", OPTIONS, client=pool, report=events)[0].value == first[0].value
+    assert events.stages("room0") == [*FIT_STAGES, "scene"]
+    files.get(f"{root}/runs/room0", str(tmp_path / "got"), recursive=True)
+    found = results(tmp_path / "got")
+    for name in set(alone["room0"]) - {"field/field.json"}:  # which says where the scene was
+        assert found[name] == alone["room0"][name], name
+    assert set(found) == set(alone["room0"])
+    assert (tmp_path / "got" / "state.json").is_file()
+    assert "fit: color: done" in (tmp_path / "got" / "log.txt").read_text()
+
+
+def test_photos_get_their_cameras_first(rooms, tmp_path, monkeypatch):
+    """What sfm itself does is tested elsewhere; here it finds the cameras of the room."""
+    from kfgs.scale import stages
+    from kfgs.scenes.sfm import SfmReport
+
+    calls = []
+
+    def found(images, out, *, config, replace):
+        calls.append((Path(images).name, config.num_threads, replace))
+        shutil.copytree(rooms[0] / "sparse", Path(out) / "sparse")
+        return SfmReport(6, 6, 1500, 0.5)
+
+    monkeypatch.setattr(stages, "run_sfm", found)
+    photos, table_ = tmp_path / "photos", tmp_path / "text"
+    shutil.copytree(rooms[0] / "images", photos)
+    with ThreadPoolExecutor(1) as pool:
+        for _ in range(2):
+            result = run_batch([photos], tmp_path / "runs", OPTIONS, client=pool)[0]
+            assert result.failure is None, result.failure.traceback
+    assert calls == [("photos", 1, True)]
+    run = tmp_path / "runs" / "photos"
+    assert (run / "scene" / "images").resolve() == photos
+    assert (run / "field" / "field.json").is_file()
+    assert not (run / "segmented").exists()  # no classes are known
+    assert not table_.exists()
+
+
+def test_a_scene_without_maps_or_teacher_says_what_to_name(rooms, tmp_path):
+    scene = tmp_path / "room"
+    shutil.copytree(rooms[0], scene, ignore=shutil.ignore_patterns("features"))
+    with ThreadPoolExecutor(1) as pool:
+        found = run_batch([scene], tmp_path / "runs", dataclasses.replace(OPTIONS, teacher=None), client=pool)
+    assert found[0].failure.stage == "fit"
+    assert re.search(tells("features/", "--teacher"), found[0].failure.message)
+
+
+def test_two_batches_in_one_folder_are_refused(rooms, tmp_path):
+    from kfgs._files import locked
+
+    with locked(tmp_path, ".batch.lock"), pytest.raises(ValueError, match=tells("in use by")):
+        run_batch(rooms, tmp_path, OPTIONS, client=ThreadPoolExecutor(1))
+
+
+def test_options_are_checked():
+    with pytest.raises(ValueError, match=tells("share", 0)):
+        BatchOptions(share=0)
+    with pytest.raises(ValueError, match=tells("discard_features", "decouple")):
+        BatchOptions(discard_features=True, fit=dataclasses.replace(OPTIONS.fit, method="paper", mode="decouple"))
+    with (
+        pytest.raises(ValueError, match=tells("scheduler", "leave one out")),
+        open_client(scheduler="tcp://a:1", workers=2),
+    ):
+        pass
+    with pytest.raises(ValueError, match=tells("workers", 0)), open_client(workers=0):
+        pass
+
+
+def test_the_command_takes_a_list_to_the_end_and_fails_if_a_scene_does(rooms, client, tmp_path, capsys):
+    (tmp_path / "garden").mkdir()
+    (tmp_path / "scenes.txt").write_text(f"garden\nkitchen = {rooms[0]}\n")
+    line = ["batch", str(tmp_path / "scenes.txt"), "--out", str(tmp_path / "runs"), "--teacher", "tiny_teacher:Tiny"]
+    line += ["--steps", "20", "--max-gaussians", "800", "--pictures", "0", "--scheduler", client.scheduler.address]
+    assert main(line) == 1
+    said = capsys.readouterr()
+    assert "kitchen: fit done in " in said.out
+    assert "garden: scene failed: " in said.out
+    assert "2 scenes: 1 finished, 1 failed, mean mIoU" in said.out
+    assert re.search(tells("SCENES", "1 failed (garden)", "log.txt", "--retry-failed"), said.err)
+    (tmp_path / "scenes.txt").write_text(f"kitchen = {rooms[0]}\n")
+    assert main(line) == 0
+    said = capsys.readouterr().out
+    assert "kitchen: fit" not in said
+    assert re.search(r"kitchen +done +found +found +found +found", said)
+
+
+@pytest.mark.parametrize(
+    ("line", "parts"),
+    [
+        ("nothing.txt --out runs", ("no such file",)),
+        ("scenes.txt --out runs --teacher lsegg", ("teacher", "lseg")),
+        ("scenes.txt --out runs --weights a.ckpt", ("--weights", "without --teacher")),
+        ("scenes.txt --out runs --discard-features", ("--discard-features", "without --teacher")),
+        ("scenes.txt --out runs --scheduler tcp://a:1 --workers 2", ("--scheduler", "leave one out")),
+        ("scenes.txt --out runs --share 0", ("--share", "0")),
+    ],
+)
+def test_wrong_use_is_one_line_before_any_work(line, parts, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scenes.txt").write_text("room\n")
+    (tmp_path / "room").mkdir()
+    assert main(["batch", *line.split()]) == 1
+    assert re.search(tells(*parts), capsys.readouterr().err)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_the_table_keeps_to_its_height_and_shows_failures_first():
+    from kfgs.scale.batch import Row
+    from kfgs.scale.driver import Event, Failure
+
+    rows = [Row(f"room{i}", "") for i in range(9)]
+    rows[7].failure = failure = Failure("fit", "no space " * 60)
+    rows[7].stages = {"scene": "done", "fit": "failed"}
+    rows[5].stages = {"scene": "running"}
+    rows[3].value = {"miou": 0.5}
+    rows[3].seconds = {"fit": 3.0, "scene": 1.5}
+    text = table(rows, most=2)
+    assert [line.split()[0] for line in text.splitlines()] == ["name", "room5", "room7", "fit:", "9"]
+    assert "1 finished, 1 failed, 1 at work, mean mIoU 0.500 of 1" in text
+    assert re.search(r"room3 .* 4\.5 0\.500", table(rows))
+    assert event_line(Event("room7", "failed", "fit", failure=failure), rows).startswith("room7: fit failed: no space")
+    assert event_line(Event("room5", "started", "scene"), rows) is None
+
+
+def test_jobs_of_slurm(tmp_path, monkeypatch):
+    """A stand-in for sbatch runs the script on this machine, so its contents are right as far as a shell can tell."""
+    pytest.importorskip("dask_jobqueue")
+    script = tmp_path / "job.sh"
+    (tmp_path / "sbatch").write_text(
+        f'#!/bin/sh\ncp "$1" {script}\nsetsid bash {script} >{tmp_path}/job.log 2>&1 &\necho "Submitted batch job 1"\n'
+    )
+    (tmp_path / "scancel").write_text("#!/bin/sh\n")
+    for name in ("sbatch", "scancel"):
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    with open_client(slurm="gpu", threads=3, memory="8GB") as found:
+        assert found.submit(len, "job").result(timeout=100) == 3
+    for part in (
+        "#SBATCH -p gpu",
+        "#SBATCH --cpus-per-task=3",
+        "#SBATCH --mem=8G",
+        "#SBATCH -t 24:00:00",
+        "--nthreads 1",
+    ):
+        assert part in script.read_text()
