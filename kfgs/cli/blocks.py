@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -23,12 +24,13 @@ def blocks(
     *,
     splat: Given[Path] = None,
     latents: int = 32,
+    workers: Given[int] = None,
     maps: Maps,
     training: Training,
 ) -> None:
     """Make the field of a large scene in blocks, one after the other, so that memory does not grow with the scene.
 
-    Each block is a scene folder of its own (OUT/block00, ...), which other machines can fit, too: `kfgs.scale.fit_block`.
+    Each block is a scene folder of its own (OUT/block00, ...), which any machine can fit.
 
     Examples:
         kfgs blocks town/ --out city/ --count 16
@@ -39,14 +41,16 @@ def blocks(
         count: Number of blocks.
         splat: Gaussians of the whole scene; without it each block trains its own.
         latents: Numbers per Gaussian, the same in all blocks.
+        workers: Fit so many blocks at once, in processes of this machine (Dask).
     """
-    from ..scale import fit_blocks, split_scene
+    from ..scale import fit_blocks, open_client, split_scene
 
     check_output("out", out, "a folder", apart=inputs_of(scene), other=[maps.features])
     config = fit_config(FieldMethod(), seed=training.seed, steps=training.steps, max_gaussians=training.max_gaussians)
     config = dataclasses.replace(config, undistorted_features=maps.undistorted_features, device=training.device)
     split_scene(scene, out, count, features=maps.folder(scene), splat=splat, latents=latents, report=say)
-    done = fit_blocks(out, config, report=say)
+    with nullcontext() if workers is None else open_client(workers=workers) as client:
+        done = fit_blocks(out, config, client=client, report=say)
     say(f"{len(done):,} Gaussians in {len(done.blocks)} blocks")
     say(f"next: kfgs join {out} --out field")
     wrote([out / "blocks.json", *(out / block.name / "core" for block in done.blocks)])

@@ -7,6 +7,7 @@ whole scene's, and blocks join without a seam.
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -24,6 +25,7 @@ from ..quant import LinearLatents
 from ..scenes import Scene, SceneError, load_scene
 from ..scenes.blocks import Block, partition, write_part
 from ..scenes.load import find_model
+from .batch import map_scenes
 from .in_blocks import BLOCKS, CORE, FORMAT, FieldInBlocks, read_blocks
 
 LATENTS, SPLAT = "latents.safetensors", "splat.ply"
@@ -163,15 +165,22 @@ def fit_blocks(
         config: of method `fuse`; `max_gaussians` is per block.
         client: where blocks are fitted, as in `map_scenes`; None: here.
         report: called with a line per block.
+
+    Raises:
+        ValueError: if a block failed; the others are finished then.
     """
     out, say = as_path(out), report or (lambda text: None)
-    names = [block.name for block in read_blocks(out)]
-    submitted = (
-        {name: client.submit(fit_block, str(out / name), config) for name in names} if client is not None else {}
-    )
-    for name in names:
-        facts = submitted[name].result() if client is not None else fit_block(out / name, config)
-        say(f"{name}: {facts['gaussians']:,} Gaussians of {facts['of']:,} in {facts['seconds']} s")
+    folders = {block.name: out / block.name for block in read_blocks(out)}
+    if client is None:
+        facts = {name: fit_block(folder, config) for name, folder in folders.items()}
+    else:
+        results = map_scenes(functools.partial(fit_block, config=config), folders.values(), client=client)
+        for result in results:
+            if result.failure is not None:
+                raise ValueError(f"{out / result.name}: {result.failure.message}")
+        facts = {result.name: result.value for result in results}
+    for name, found in facts.items():
+        say(f"{name}: {found['gaussians']:,} Gaussians of {found['of']:,} in {found['seconds']} s")
     return FieldInBlocks.open(out)
 
 

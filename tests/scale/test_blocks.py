@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -133,6 +134,19 @@ def test_a_second_fit_repeats_nothing(fitted):
     fit_block(fitted.folder / "block00", EVERY, report=said.append)
     assert any("found in" in line for line in said)
     assert not any("working" in line for line in said)
+
+
+def test_any_engine_fits_blocks(fitted, town, splat, tmp_path):
+    split_scene(town, tmp_path / "pool", 2, splat=splat, latents=12)
+    with ThreadPoolExecutor(2) as pool:
+        one = fit_blocks(tmp_path / "pool", EVERY, client=pool)
+        shutil.rmtree(tmp_path / "pool/block01/run")
+        (tmp_path / "pool/block01/splat.ply").write_bytes(b"damaged")
+        with pytest.raises(ValueError, match=tells("block01", "splat.ply")):
+            fit_blocks(tmp_path / "pool", EVERY, client=pool)
+    split_scene(town, tmp_path / "alone", 2, splat=splat, latents=12)
+    other = fit_blocks(tmp_path / "alone", EVERY)
+    assert torch.equal(one.joined().gaussians.features, other.joined().gaussians.features)
 
 
 def test_other_blocks_are_not_overwritten(fitted, town):
