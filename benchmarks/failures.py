@@ -80,7 +80,7 @@ def simulate(
             ready.append((tries + 1, scene, stage, left - kept))
         else:
             given_up += 1
-    return {"hours": now / 3600, "lost": 1 - useful / spent, "given_up": float(given_up)}
+    return {"hours": now / 3600, "lost": max(0.0, 1 - useful / spent), "given_up": float(given_up)}
 
 
 def main() -> None:
