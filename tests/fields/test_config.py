@@ -92,3 +92,11 @@ def test_wrong_values_of_colours(change, message):
 def test_an_extent_that_is_no_number_is_refused(extent):
     with pytest.raises(TypeError, match=tells("extent", repr(extent), "float")):
         FieldConfig(extent=extent)
+
+
+def test_fits_from_before_several_views_per_step_keep_their_identity():
+    """Else every run folder would be fitted again."""
+    before = {name for name in FieldConfig().identity()}
+    assert "views_per_step" not in before
+    assert len(before) == 29
+    assert FieldConfig(views_per_step=2).identity() == FieldConfig().identity() | {"views_per_step": 2}

@@ -374,3 +374,25 @@ def test_progress_is_a_truth_value_or_a_function(capfd):
         assert "field" not in capfd.readouterr().err
     with pytest.raises(TypeError, match=tells("progress", "'bar'", "function")):
         fit_field(start(), cameras, targets, SHORT, progress="bar")
+
+
+def test_a_step_of_several_views_follows_their_mean_gradient_and_loss():
+    cameras, targets = scene()
+    config = replace(SHORT, steps=1, report_every=1, views_per_step=2)
+    found = fit_field(start(), cameras, targets, config)
+    order = torch.randperm(5, generator=torch.Generator().manual_seed(0)).tolist()[::-1]  # the last is taken first
+    params = start().map(lambda value: value.clone().requires_grad_(True))
+    losses = []
+    for i in order[:2]:
+        rendering = rasterize(params.activated(), cameras[i])
+        losses.append(l1_loss(rendering.map, rendering.alpha, targets[i]))
+    mean = torch.stack(losses).mean()
+    mean.backward()
+    assert found.history[0]["loss"] == pytest.approx(float(mean.detach()))
+    gradient = params.features.grad
+    clear = gradient.abs() > 1e-7
+    assert int(clear.sum()) > 20
+    moved = found.params.features[clear]  # from 0; Adam's first step is the rate, against the gradient
+    torch.testing.assert_close(moved, -SHORT.features_lr * gradient[clear].sign(), rtol=1e-3, atol=1e-6)
+    single = fit_field(start(), cameras, targets, replace(config, views_per_step=1))
+    assert not torch.equal(single.params.features, found.params.features)
