@@ -14,7 +14,7 @@ from ..quant import LinearLatents
 from ..quant.codebook import Nearest
 from ..quant.grow import grow, nearest_cells
 
-TOLERANCE = 0.9  # room_0: 370 words; 96 % of the Gaussians keep the class of their own feature (0.8: 95 %, 0.95: 97 %)
+TOLERANCE = 0.9  # of a feature with its word; 96.5 % of room_0's Gaussians then keep the class of their own feature
 SUPPORT = (
     20  # features that a new word needs within its tolerance: at borders of things, every blend is another direction
 )
