@@ -15,9 +15,7 @@ from ..quant.codebook import Nearest
 from ..quant.grow import grow, nearest_cells
 
 TOLERANCE = 0.9  # of a feature with its word; 96.5 % of room_0's Gaussians then keep the class of their own feature
-SUPPORT = (
-    20  # features that a new word needs within its tolerance: at borders of things, every blend is another direction
-)
+SUPPORT = 20  # features within its tolerance that a new word needs: at borders, every blend has another direction
 MOST = 500  # words that one scene may add
 FINER, COVERAGE = 0.5, 0.9
 """A new word is split until 90 % of its features are within half the tolerance's distance (0.95): the word between two
