@@ -14,12 +14,12 @@ from ..quant import LinearLatents
 from ..quant.codebook import Nearest
 from ..quant.grow import grow, nearest_cells
 
-TOLERANCE = 0.9  # room_0: 370 words; 96 % of the Gaussians keep the class of their own feature (0.8: 95 %, 0.95: 97 %)
-SUPPORT = (
-    20  # features that a new word needs within its tolerance: at borders of things, every blend is another direction
-)
-MOST = 1000  # words that one scene may add
-COVERAGE = 0.9  # of the features of one new word must be within the tolerance, or its cell is split
+TOLERANCE = 0.9  # of a feature with its word; 96.5 % of room_0's Gaussians then keep the class of their own feature
+SUPPORT = 20  # features within its tolerance that a new word needs: at borders, every blend has another direction
+MOST = 500  # words that one scene may add
+FINER, COVERAGE = 0.5, 0.9
+"""A new word is split until 90 % of its features are within half the tolerance's distance (0.95): the word between two
+classes with a cosine of 0.8 would be within 0.95 of both."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,8 @@ class SharedCodebook:
             if len(far) < (SUPPORT if len(words) else 1) or room <= 0:
                 break
             generator = torch.Generator(device=unit.device).manual_seed(0)  # the same features give the same centres
-            centres = grow(far, room, alpha=self.tolerance, coverage=COVERAGE, generator=generator).cells.centres
+            alpha = 1 - FINER * (1 - self.tolerance)
+            centres = grow(far, room, alpha=alpha, coverage=COVERAGE, generator=generator).cells.centres
             if len(words):
                 near = nearest_cells(far, centres)
                 support = torch.bincount(near.index[near.similarity >= self.tolerance], minlength=len(centres))

@@ -82,3 +82,11 @@ def test_wrong_input_is_named():
         SharedCodebook(table().embeddings).nearest(torch.zeros(2, 3))
     with pytest.raises(ValueError, match=tells("words:", "none", "extend")):
         SharedCodebook(torch.zeros(0, 3)).nearest(torch.zeros(2, 3))
+
+
+def test_classes_with_a_cosine_of_four_fifths_keep_words_of_their_own():
+    rows = torch.eye(16)
+    classes = torch.stack([rows[0], 0.8 * rows[0] + 0.6 * rows[1]])  # the direction between them is within 0.95 of both
+    book = SharedCodebook.fit(around(classes, 200, 0.05))
+    assert len(book) == 2
+    assert float((book.words @ classes.T).amax(dim=0).min()) > 0.99
