@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ._card import error_line
+from ._card import error_line, short_of_memory
 
 PARTS = ("embeddings", "codewords", "map", "means", "gaussians")  # where our objects keep what is mostly meant
 
@@ -114,6 +114,8 @@ def moved_to(value: Tensor, *args: Any, **kwargs: Any) -> Tensor:
     try:
         return value.to(*args, **kwargs)
     except (AssertionError, RuntimeError) as error:  # torch without CUDA; no driver, no such GPU, no such name
+        if short_of_memory(error):
+            raise
         asked = ", ".join(map(str, (*args, *kwargs.values())))
         raise ValueError(
             f"device: expected one that this torch can use, got {asked} ({error_line(error)}); use 'cpu', or install a torch "
