@@ -8,7 +8,7 @@ import shlex
 from pathlib import Path
 from typing import Any, Literal
 
-from .._files import check_output
+from .._files import check_output, real_path
 from .features import check_discard, choose_teacher, stored_maps
 from .files import check_alone, inputs_of, is_field, open_field, open_splats
 from .options import FieldMethod, Flag, Given, Maps, MapTeacher, Positional, SceneFolder, Training, Views, fit_config
@@ -79,9 +79,9 @@ def sfm(
     written = [out / "sparse" / "0"]
     beside = out / "images"
     if not os.path.lexists(beside):
-        beside.symlink_to(images.resolve(), target_is_directory=True)  # so that `kfgs fit OUT` finds the pictures
+        beside.symlink_to(real_path(images), target_is_directory=True)  # so that `kfgs fit OUT` finds the pictures
         written.append(beside)
-    elif beside.resolve() != images.resolve():
+    elif real_path(beside) != real_path(images):
         say(f"note: {beside} is another folder; pass --images {images} to the other commands")
     wrote(written)
 

@@ -50,7 +50,9 @@ def _writing(stream: TextIO) -> Iterator[None]:
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         if isinstance(error, BrokenPipeError):
             raise
-        raise type(error)(f"standard output cannot be written ({error.strerror}); choose another place for it") from error
+        raise type(error)(
+            f"standard output cannot be written ({error.strerror}); choose another place for it"
+        ) from error
 
 
 def open_streams() -> None:

@@ -194,6 +194,13 @@ class _Run:
             if config.single_camera and "existing_camera_id" not in reader:
                 reader.update(self._first_camera())
             self.bar.update(len(some_names))
+        with colmap.Database.open(self.database) as database:
+            read = {image.name for image in database.read_all_images()}
+        if len(read) < 3:
+            raise SceneError(
+                f"{self.images}: expected at least 3 images that can be decoded, got {len(read)} of {len(self.names)}; not "
+                f"{some([name for name in self.names if name not in read], 3)}: save them again as PNG or JPEG"
+            )
 
     def _first_camera(self) -> dict[str, Any]:
         """The option that makes the next images share the camera of the first; empty while no image could be read."""
