@@ -24,7 +24,10 @@ def cloud(n=5, **changes):
 
 WRONG = {
     "opacities of 2": ({"opacities": torch.tensor([0.5, 2, 0.5, 0.5, 0.5])}, ("opacities", "from 0 to 1", "leave")),
-    "negative scales": ({"scales": torch.tensor([[0.1], [-1], [0.1], [0.1], [0.1]]).expand(5, 3)}, ("scales", "above 0")),
+    "negative scales": (
+        {"scales": torch.tensor([[0.1], [-1], [0.1], [0.1], [0.1]]).expand(5, 3)},
+        ("scales", "above 0"),
+    ),
     "a NaN mean": ({"means": torch.full((5, 3), torch.nan)}, ("means", "finite")),
     "a NaN opacity": ({"opacities": torch.full((5,), torch.nan)}, ("opacities", "leave")),
     "logarithms": ({"scales": torch.full((5, 3), -4.0)}, ("scales", "logarithms", "scales.exp()")),
