@@ -13,7 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._check import one_line
-from .._files import as_path, bytes_in_words, digest_file, locked, seconds_in_words
+from .._files import as_path, bytes_in_words, digest_file, finish_writing, locked, seconds_in_words
 from ..scenes import Scene
 from ..teachers.protocol import Teacher, as_teacher, identify
 from .layouts import map_file, write_npy_map
@@ -64,6 +64,8 @@ def extract_features(
     """
     folder, teacher, chosen = as_path(folder), as_teacher(teacher), as_pictures(pictures, split, exist=True)
     with locked(folder, LOCK):
+        for place in {folder, *(map_file(folder, picture.stem).parent for picture in chosen)}:
+            finish_writing(place)  # if all maps are there, nothing is written that would sweep
         writer = MapWriter(folder, identify(teacher), chosen, overwrite=overwrite)
         digests = {picture.stem: digest_file(picture.path) for picture in chosen}
         doubts = {stem: writer.doubt(stem, digest) for stem, digest in digests.items()}

@@ -334,6 +334,8 @@ import os, resource, socket, time
 from contextlib import suppress
 from urllib.parse import urlsplit
 from kfgs.page.server import PageServer
+asked, accept = [], socket.socket.accept
+socket.socket.accept = lambda self: asked.append(1) or accept(self)
 with PageServer("<p>page</p>") as server:
     address = urlsplit(server.url)
     resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))
@@ -342,12 +344,11 @@ with PageServer("<p>page</p>") as server:
         while True:
             os.dup(0)
     one.connect((address.hostname, address.port))  # the server has no handle for it
-    began, used = time.monotonic(), time.process_time()
     time.sleep(2)
-    print((time.process_time() - used) / (time.monotonic() - began))
+    print(len(asked))
 """
 
 
 def test_without_file_handles_the_server_does_not_spin():
     done = subprocess.run([sys.executable, "-c", FULL], capture_output=True, text=True, timeout=60)
-    assert float(done.stdout) < 0.3, done.stderr
+    assert 1 < int(done.stdout) < 40, done.stderr  # one in 0.1 s
