@@ -196,7 +196,7 @@ class _Run:
             self.bar.update(len(some_names))
         with colmap.Database.open(self.database) as database:
             read = {image.name for image in database.read_all_images()}
-        if len(read) < 3:
+        if len(read) < min(3, len(self.names)):
             raise SceneError(
                 f"{self.images}: expected at least 3 images that can be decoded, got {len(read)} of {len(self.names)}; not "
                 f"{some([name for name in self.names if name not in read], 3)}: save them again as PNG or JPEG"
